@@ -1,0 +1,1 @@
+"""From several calibrated cameras to every person in the room in 3D, with a body."""

@@ -1,0 +1,198 @@
+"""Where a camera stands and what it sees: pinhole cameras in the world, and a rig of them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
+"""A world axis, as a calibration names the direction that is up."""
+
+_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+_ROTATION_TOLERANCE = 1e-3
+"""How far R Rᵀ may be from the identity: calibrations are printed with four to six digits."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A calibrated pinhole camera: OpenCV's convention, x right, y down, z forward."""
+
+    name: str
+    """What the calibration and the detection files call it."""
+    K: NDArray[np.float64]
+    """(3, 3) intrinsic matrix, pixels."""
+    wTc: NDArray[np.float64]
+    """(4, 4) world-from-camera pose, metres."""
+    image_size: tuple[int, int]
+    """(width, height), pixels."""
+    distortion: NDArray[np.float64] = field(default_factory=lambda: np.zeros(5))
+    """(5,) k1 k2 p1 p2 k3, as OpenCV orders them; zero for a camera without distortion."""
+
+    def __post_init__(self) -> None:
+        for name, shape in (("K", (3, 3)), ("wTc", (4, 4)), ("distortion", (5,))):
+            value = np.asarray(getattr(self, name), dtype=np.float64)
+            if value.shape != shape:
+                raise ValueError(f"camera {self.name}: {name} must be {shape}, got {value.shape}")
+            if not np.isfinite(value).all():
+                raise ValueError(f"camera {self.name}: {name} holds a value that is not finite")
+            object.__setattr__(self, name, value)
+        if self.K[0, 0] <= 0 or self.K[1, 1] <= 0 or np.any(np.abs(self.K[2] - (0, 0, 1)) > 1e-9):
+            raise ValueError(f"camera {self.name}: K must have positive focal lengths and a last row 0 0 1")
+        R = self.wTc[:3, :3]
+        if np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(R) < 0:
+            raise ValueError(
+                f"camera {self.name}: the rotation of wTc must be orthonormal with determinant 1"
+            )
+        if min(self.image_size) <= 0:
+            raise ValueError(f"camera {self.name}: image_size must be positive, got {self.image_size}")
+
+    @classmethod
+    def from_camera_from_world(
+        cls,
+        name: str,
+        K: NDArray[np.float64],
+        cTw: NDArray[np.float64],
+        image_size: tuple[int, int],
+        distortion: Sequence[float] = (),
+    ) -> "Camera":
+        """Make a camera from a camera-from-world matrix `cTw` (3, 4) or (4, 4): [R | t], metres.
+
+        The rotation is projected on the nearest orthonormal one, so that the few printed digits of a
+        calibration do not become a scale. `distortion` may have 0 to 5 coefficients.
+        """
+        cTw = np.asarray(cTw, dtype=np.float64)
+        R = np.asarray(cTw[:3, :3])
+        if not np.isfinite(cTw).all() or np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE:
+            raise ValueError(f"camera {name}: the rotation must be orthonormal and finite")
+        U, _, Vt = np.linalg.svd(R)
+        wTc = np.eye(4)
+        wTc[:3, :3] = (U @ Vt).T
+        wTc[:3, 3] = -wTc[:3, :3] @ cTw[:3, 3]
+        coefficients = np.zeros(5)
+        coefficients[: len(distortion)] = distortion
+        return cls(name, np.asarray(K, dtype=np.float64), wTc, image_size, coefficients)
+
+    @cached_property
+    def cTw(self) -> NDArray[np.float64]:
+        """(3, 4) camera-from-world, [R | t]."""
+        R = self.wTc[:3, :3].T
+        return np.hstack([R, -R @ self.wTc[:3, 3:]])
+
+    @property
+    def centre(self) -> NDArray[np.float64]:
+        """(3,) optical centre in the world, metres."""
+        return self.wTc[:3, 3]
+
+    def project(self, points_world: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Project `points_world` (..., 3) to *undistorted* pixels (..., 2) and depths (...,) in metres.
+
+        A point that is not in front of the camera (depth <= 0) gets NaN pixels.
+        """
+        points_camera = points_world @ self.cTw[:, :3].T + self.cTw[:, 3]
+        return _to_pixels(points_camera, self.K)
+
+    def undistort(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Map measured pixels (N, 2) to the pixels of the same camera without distortion."""
+        if len(xy) == 0 or not self.distortion.any():
+            return np.asarray(xy, dtype=np.float64)
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-6)
+        points = np.ascontiguousarray(xy, dtype=np.float64).reshape(-1, 1, 2)
+        ideal = cv2.undistortPoints(points, self.K, self.distortion, R=np.eye(3), P=self.K, criteria=criteria)
+        return np.asarray(ideal, dtype=np.float64).reshape(-1, 2)
+
+    def distort(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Map undistorted pixels (N, 2) to the pixels that the real lens gives (inverse of `undistort`)."""
+        if len(xy) == 0 or not self.distortion.any():
+            return np.asarray(xy, dtype=np.float64)
+        rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1) @ np.linalg.inv(self.K).T
+        pixels, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), self.K, self.distortion)
+        return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Cameras in a fixed order, in one world whose unit is the metre and whose up axis is known."""
+
+    cameras: tuple[Camera, ...]
+    """The V cameras; a view is an index into them."""
+    up: Axis
+    """Which axis of the world points up."""
+
+    def __post_init__(self) -> None:
+        names = [camera.name for camera in self.cameras]
+        if len(names) < 2:
+            raise ValueError(f"a rig needs at least 2 cameras to see depth, got {len(names)}")
+        if len(set(names)) != len(names):
+            raise ValueError(f"camera names must differ, got {names}")
+        if self.up not in ("x", "-x", "y", "-y", "z", "-z"):
+            raise ValueError(f"up must be one of x -x y -y z -z, got {self.up!r}")
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The cameras' names, in order."""
+        return tuple(camera.name for camera in self.cameras)
+
+    @property
+    def up_vector(self) -> NDArray[np.float64]:
+        """(3,) unit vector that points up in the world."""
+        return np.array(_AXES[self.up[-1]]) * (-1.0 if self.up.startswith("-") else 1.0)
+
+    @cached_property
+    def K(self) -> NDArray[np.float64]:
+        """(V, 3, 3) intrinsic matrices."""
+        return np.stack([camera.K for camera in self.cameras])
+
+    @cached_property
+    def cTw(self) -> NDArray[np.float64]:
+        """(V, 3, 4) camera-from-world matrices."""
+        return np.stack([camera.cTw for camera in self.cameras])
+
+    @cached_property
+    def centres(self) -> NDArray[np.float64]:
+        """(V, 3) optical centres in the world, metres."""
+        return np.stack([camera.centre for camera in self.cameras])
+
+    @cached_property
+    def image_sizes(self) -> NDArray[np.float64]:
+        """(V, 2) width and height, pixels."""
+        return np.array([camera.image_size for camera in self.cameras], dtype=np.float64)
+
+    @cached_property
+    def focal_px(self) -> NDArray[np.float64]:
+        """(V,) mean of the two focal lengths, pixels."""
+        return self.K[:, [0, 1], [0, 1]].mean(axis=1)
+
+    def project(self, points_world: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Project `points_world` (..., 3) into every view: undistorted pixels (V, ..., 2), depths (V, ...).
+
+        NaN pixels where the depth is not positive.
+        """
+        shape = points_world.shape[:-1]
+        flat = points_world.reshape(-1, 3)
+        points_camera = flat @ self.cTw[:, :, :3].transpose(0, 2, 1) + self.cTw[:, None, :, 3]
+        xy, depth = _to_pixels(points_camera, self.K)
+        return xy.reshape(len(self), *shape, 2), depth.reshape(len(self), *shape)
+
+    def normalise(self, view: NDArray[np.intp], xy: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Normalised image coordinates (D, 2) of undistorted pixels `xy` (D, 2) seen in `view` (D,)."""
+        K_inverse = np.linalg.inv(self.K)[view]
+        return np.einsum("dij,dj->di", K_inverse[:, :2, :2], xy) + K_inverse[:, :2, 2]
+
+
+def _to_pixels(
+    points_camera: NDArray[np.float64], K: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Pixels and depths of points (..., 3) in camera coordinates; `K` is (3, 3) or (V, 3, 3)."""
+    depth = points_camera[..., 2]
+    safe = np.where(depth > 0, depth, np.nan)
+    normalised = points_camera[..., :2] / safe[..., None]
+    return normalised @ np.swapaxes(K[..., :2, :2], -1, -2) + K[..., None, :2, 2].reshape(
+        K.shape[:-2] + (1,) * (normalised.ndim - K.ndim + 1) + (2,)
+    ), depth
