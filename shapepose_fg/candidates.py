@@ -1,0 +1,217 @@
+"""Where joints may be: pairs of views triangulated, and clustered by confidence-aware voting.
+
+Stage I (b) and (c) of the paper (section 3.1, "3D Joint Candidates Reconstruction" and "Candidates Association").
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from shapepose_fg.camera import Rig
+from shapepose_fg.detections import Detections
+
+
+@dataclass(frozen=True)
+class CandidateConfig:
+    """How pairs of detections become 3D joint candidates."""
+
+    gate_m: float = 0.10
+    """Largest reprojection error of a pair's point, as a length at the point's depth: five times the 2 cm by
+    which a 2D detector places a visible joint beside where the other views see it."""
+    min_angle_deg: float = 3.0
+    """Smallest angle between the two rays; below it depth is guessed, not measured."""
+    vote_radius_m: float = 0.12
+    """rho: points of one joint closer than this to the most confident one vote for it."""
+    min_votes: int = 3
+    """The paper's three points: fewer make a *weak* candidate, which cannot anchor a person. With two cameras
+    there is one pair only, so what counts is min(min_votes, pairs of views)."""
+
+    def __post_init__(self) -> None:
+        for name in ("gate_m", "min_angle_deg", "vote_radius_m", "min_votes"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class PairPoints:
+    """Points triangulated from two detections of the same joint in different views."""
+
+    xyz: NDArray[np.float64]
+    """(M, 3) position in the world, metres."""
+    joint: NDArray[np.intp]
+    """(M,) index of the joint in the skeleton."""
+    pair: NDArray[np.intp]
+    """(M, 2) indices of the two detections."""
+    score: NDArray[np.float64]
+    """(M,) confidence of the point: the geometric mean of the two detections' confidences."""
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """3D joint candidates: clusters of pair points."""
+
+    xyz: NDArray[np.float64]
+    """(C, 3) position in the world, metres."""
+    joint: NDArray[np.intp]
+    """(C,) index of the joint in the skeleton."""
+    score: NDArray[np.float64]
+    """(C,) mean confidence of the supporting detections."""
+    votes: NDArray[np.intp]
+    """(C,) number of pair points in the cluster."""
+    strong: NDArray[np.bool_]
+    """(C,) whether the cluster has the votes that the paper asks for."""
+    support: NDArray[np.intp]
+    """(S, 2) rows (candidate, detection): which detections made which candidate, sorted by candidate."""
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+
+def triangulate_pairs(detections: Detections, rig: Rig, config: CandidateConfig) -> PairPoints:
+    """Triangulate all pairs of same-joint detections of different views (A y = 0 with C = 2 in the paper).
+
+    The linear system is written in normalised image coordinates and solved for the inhomogeneous point. Points
+    behind a camera, with a reprojection error above `gate_m` or with almost parallel rays are dropped.
+    """
+    first, second = _same_joint_pairs(detections)
+    normalised = rig.normalise(detections.view, detections.xy)
+    rays = np.einsum(
+        "dji,dj->di",
+        rig.cTw[detections.view, :, :3],
+        np.concatenate([normalised, np.ones((len(detections), 1))], axis=1),
+    )
+    near = _rays_meet(rays, rig.centres[detections.view], first, second, config)
+    first, second = first[near], second[near]
+    xyz = _linear_points(rig, detections.view, normalised, first, second)
+    error_m = np.maximum(
+        _reprojection_error(rig, detections.view[first], normalised[first], xyz),
+        _reprojection_error(rig, detections.view[second], normalised[second], xyz),
+    )
+    keep = error_m < config.gate_m
+    first, second = first[keep], second[keep]
+    return PairPoints(
+        xyz=xyz[keep],
+        joint=detections.joint[first],
+        pair=np.stack([first, second], axis=1),
+        score=np.sqrt(detections.confidence[first] * detections.confidence[second]),
+    )
+
+
+def vote(points: PairPoints, detections: Detections, views: int, config: CandidateConfig) -> Candidates:
+    """Cluster the points of each joint around its most confident ones (the paper's set S_i).
+
+    The paper picks the most confident point, gives it all its neighbours within rho, removes them and starts
+    again. All joints are done at once here and many picks in a round: a point that is more confident than all
+    its remaining neighbours would be picked before them in any case, so the result is the same.
+    """
+    if len(points.xyz) == 0:
+        return _no_candidates()
+    seed = _greedy_seeds(points, config.vote_radius_m)
+    _, cluster = np.unique(seed, return_inverse=True)
+    count = cluster.max() + 1
+    votes = np.bincount(cluster, minlength=count)
+    # The centre of the cluster is weighted by confidence: one bad view must not drag the point of four good ones.
+    weight = points.score**2
+    total = np.bincount(cluster, weight, count)
+    xyz = np.stack([np.bincount(cluster, weight * x, count) / total for x in points.xyz.T], axis=1)
+    joint = np.zeros(count, dtype=np.intp)
+    joint[cluster] = points.joint
+    member = np.stack([np.repeat(cluster, 2), points.pair.ravel()], axis=1)
+    support = np.unique(member, axis=0)
+    confidence = np.bincount(support[:, 0], detections.confidence[support[:, 1]], count)
+    score = confidence / np.bincount(support[:, 0], minlength=count)
+    needed = min(config.min_votes, views * (views - 1) // 2)
+    return Candidates(xyz, joint, score, votes, votes >= needed, support)
+
+
+def _no_candidates() -> Candidates:
+    none = np.zeros(0, dtype=np.intp)
+    return Candidates(
+        np.zeros((0, 3)), none, np.zeros(0), none, np.zeros(0, dtype=bool), np.zeros((0, 2), dtype=np.intp)
+    )
+
+
+def _same_joint_pairs(detections: Detections) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Indices of all unordered pairs of detections of the same joint in different views."""
+    order = np.argsort(detections.joint, kind="stable")
+    joint = detections.joint[order]
+    # With the detections sorted by joint, detection k pairs with all that follow it in its joint's block.
+    follow = np.searchsorted(joint, joint, side="right") - np.arange(len(joint)) - 1
+    first = np.repeat(np.arange(len(joint)), follow)
+    step = np.arange(len(first)) - np.repeat(np.cumsum(follow) - follow, follow)
+    first, second = order[first], order[first + 1 + step]
+    differ = detections.view[first] != detections.view[second]
+    return first[differ], second[differ]
+
+
+def _rays_meet(
+    rays: NDArray[np.float64],
+    origins: NDArray[np.float64],
+    first: NDArray[np.intp],
+    second: NDArray[np.intp],
+    config: CandidateConfig,
+) -> NDArray[np.bool_]:
+    """Cheap test before triangulation: do two rays pass each other at less than twice the gate?"""
+    normal = np.cross(rays[first], rays[second])
+    sine = np.sqrt(np.einsum("mi,mi->m", normal, normal))
+    between = origins[second] - origins[first]
+    gap = np.abs(np.einsum("mi,mi->m", normal, between))
+    lengths = np.sqrt(np.einsum("di,di->d", rays, rays))
+    parallel = np.sin(np.deg2rad(config.min_angle_deg)) * lengths[first] * lengths[second]
+    return (gap < 2.0 * config.gate_m * sine) & (sine > parallel)
+
+
+def _linear_points(
+    rig: Rig,
+    view: NDArray[np.intp],
+    normalised: NDArray[np.float64],
+    first: NDArray[np.intp],
+    second: NDArray[np.intp],
+) -> NDArray[np.float64]:
+    """Solve A y = 0, two rows x P_3 - P_1 and y P_3 - P_2 a view, for y = (X, 1): (M, 3)."""
+    P = rig.cTw[view]
+    rows = normalised[:, :, None] * P[:, 2:3, :] - P[:, :2, :]
+    A = np.concatenate([rows[first], rows[second]], axis=1)
+    At = A[:, :, :3].transpose(0, 2, 1)
+    return np.linalg.solve(At @ A[:, :, :3], -At @ A[:, :, 3:])[:, :, 0]
+
+
+def _reprojection_error(
+    rig: Rig, view: NDArray[np.intp], normalised: NDArray[np.float64], xyz: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Reprojection error (M,) as a length at the point's depth, metres; infinite behind the camera."""
+    P = rig.cTw[view]
+    camera = np.einsum("mij,mj->mi", P[:, :, :3], xyz) + P[:, :, 3]
+    error = np.hypot(*(camera[:, :2] - normalised * camera[:, 2:]).T)
+    return np.where(camera[:, 2] > 0, error, np.inf)
+
+
+def _greedy_seeds(points: PairPoints, radius_m: float) -> NDArray[np.intp]:
+    """The seed (M,) whose cluster each point joins, as if points were picked one by one by confidence."""
+    count = len(points.xyz)
+    rank = np.empty(count, dtype=np.intp)
+    rank[np.argsort(-points.score, kind="stable")] = np.arange(count)
+    # A fourth coordinate keeps different joints apart.
+    tree = cKDTree(np.column_stack([points.xyz, points.joint * (4.0 * radius_m)]))
+    edges = tree.query_pairs(radius_m, output_type="ndarray")
+    swap = rank[edges[:, 0]] > rank[edges[:, 1]]
+    better = np.where(swap, edges[:, 1], edges[:, 0])
+    worse = np.where(swap, edges[:, 0], edges[:, 1])
+    is_seed = np.zeros(count, dtype=bool)
+    undecided = np.ones(count, dtype=bool)
+    live_better, live_worse = better, worse
+    while undecided.any():
+        live = undecided[live_better] & undecided[live_worse]
+        live_better, live_worse = live_better[live], live_worse[live]
+        picked = undecided.copy()
+        picked[live_worse] = False
+        is_seed |= picked
+        undecided &= ~picked
+        undecided[live_worse[picked[live_better]]] = False
+    # A point near several seeds belongs to the one that is picked first.
+    seed_rank = np.where(is_seed, rank, count)
+    from_seed = is_seed[better]
+    np.minimum.at(seed_rank, worse[from_seed], rank[better[from_seed]])
+    return np.argsort(rank)[seed_rank]
