@@ -1,0 +1,77 @@
+"""GTSAM factors for people seen by calibrated cameras: keys, noise, projection, body priors.
+
+Only GTSAM and NumPy. A builder takes keys, arrays and noise and returns native `gtsam.NonlinearFactor`s for
+a graph of your own. Units: metres in the world, pixels in the image; cameras look along +z, x right, y down.
+"""
+
+from factors.body_prior import body_prior_factor, body_prior_factors
+from factors.keys import (
+    CameraKey,
+    JointKey,
+    camera_key,
+    format_key,
+    joint_key,
+    joint_keys,
+    split_camera_key,
+    split_key,
+    velocity_key,
+)
+from factors.noise import (
+    DEFAULT_WIDTH_SIGMA,
+    Kernel,
+    KernelName,
+    diagonal,
+    gaussian,
+    isotropic,
+    isotropic_models,
+    robust,
+    robust_kernel,
+    sigma_px,
+)
+from factors.projection import (
+    in_front,
+    inlier_gate,
+    make_calibration,
+    make_camera,
+    posed_projection_factor,
+    projection_factor,
+    projection_factors,
+)
+from factors.rank import determined, joint_information, projection_jacobians
+from factors.testing import assert_jacobian, assert_zero_at_truth
+
+__all__ = [
+    "DEFAULT_WIDTH_SIGMA",
+    "CameraKey",
+    "JointKey",
+    "Kernel",
+    "KernelName",
+    "assert_jacobian",
+    "assert_zero_at_truth",
+    "body_prior_factor",
+    "body_prior_factors",
+    "camera_key",
+    "determined",
+    "diagonal",
+    "format_key",
+    "gaussian",
+    "in_front",
+    "inlier_gate",
+    "isotropic",
+    "isotropic_models",
+    "joint_information",
+    "joint_key",
+    "joint_keys",
+    "make_calibration",
+    "make_camera",
+    "posed_projection_factor",
+    "projection_factor",
+    "projection_factors",
+    "projection_jacobians",
+    "robust",
+    "robust_kernel",
+    "sigma_px",
+    "split_camera_key",
+    "split_key",
+    "velocity_key",
+]

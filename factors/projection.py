@@ -1,0 +1,119 @@
+"""A camera sees a joint: native projection factors for cameras that stand still, stand posed or move.
+
+Residual of every factor here, in pixels (x right, y down, image points undistorted):
+
+    r = project(camera, joint) - uv
+
+GTSAM does not complain about a point behind the camera: residual (2 fx, 2 fx), Jacobian 0, so the factor
+pulls at nothing and keeps its error. Gate on depth (`in_front`) before adding one.
+"""
+
+from collections.abc import Sequence
+
+import gtsam
+import numpy as np
+from gtsam import noiseModel
+from numpy.typing import ArrayLike, NDArray
+
+from factors.noise import Kernel, isotropic, isotropic_models
+
+
+def make_camera(K: ArrayLike, wTc: ArrayLike) -> gtsam.PinholeCameraCal3_S2:
+    """Make GTSAM's camera from `K` (3, 3) in pixels and the world-from-camera pose `wTc` (4, 4) in metres.
+
+    OpenCV's convention: x right, y down, z forward. Make it once per view; factors share it.
+    """
+    pose = np.asarray(wTc, dtype=np.float64)
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise ValueError(f"wTc must be a finite (4, 4) matrix, got {pose.shape}")
+    return gtsam.PinholeCameraCal3_S2(gtsam.Pose3(pose), make_calibration(K))
+
+
+def make_calibration(K: ArrayLike) -> gtsam.Cal3_S2:
+    """Make GTSAM's calibration from the intrinsic matrix `K` (3, 3), pixels."""
+    matrix = np.asarray(K, dtype=np.float64)
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+        raise ValueError(f"K must be a finite (3, 3) matrix, got {matrix.shape}")
+    return gtsam.Cal3_S2(matrix[0, 0], matrix[1, 1], matrix[0, 1], matrix[0, 2], matrix[1, 2])
+
+
+def projection_factor(
+    camera: gtsam.PinholeCameraCal3_S2,
+    uv: ArrayLike,
+    sigma_px: float,
+    key: int,
+    kernel: Kernel | None = None,
+) -> gtsam.NonlinearFactor:
+    """A camera that stands still sees the joint `key` at `uv` (2,): one variable, a `Point3`."""
+    return gtsam.TriangulationFactorCal3_S2(camera, _pixel(uv), isotropic(2, sigma_px, kernel), key)
+
+
+def projection_factors(
+    cameras: Sequence[gtsam.PinholeCameraCal3_S2],
+    view: ArrayLike,
+    keys: ArrayLike,
+    xy: ArrayLike,
+    sigmas_px: ArrayLike,
+    kernel: Kernel | None = None,
+) -> list[gtsam.NonlinearFactor]:
+    """One projection factor for each of D observations: `projection_factor` for arrays (Eq. 1).
+
+    Observation d: `cameras[view[d]]` sees the joint `keys[d]` at `xy[d]` (D, 2) to within `sigmas_px[d]`.
+    A factor is immutable and may sit in several graphs: when only the gates change between two solves,
+    select from this list again instead of building it again. ValueError for shapes that disagree or pixels
+    that are not finite.
+    """
+    points = np.asarray(xy, dtype=np.float64)
+    views, key_list = np.asarray(view), np.asarray(keys)
+    count = len(points)
+    if points.shape != (count, 2) or not views.shape == key_list.shape == np.shape(sigmas_px) == (count,):
+        raise ValueError(
+            f"view, keys and sigmas_px must be (D,) and xy (D, 2), got {views.shape}, {key_list.shape}, "
+            f"{np.shape(sigmas_px)}, {points.shape}"
+        )
+    if not np.isfinite(points).all():
+        raise ValueError("xy holds a value that is not finite: drop unseen joints first")
+    if count and (views.min() < 0 or views.max() >= len(cameras)):
+        raise ValueError(f"view must be 0 to {len(cameras) - 1}, got {views.min()} to {views.max()}")
+    models = isotropic_models(2, sigmas_px, kernel)
+    chosen = [cameras[index] for index in views.tolist()]
+    return list(map(gtsam.TriangulationFactorCal3_S2, chosen, points, models, key_list.tolist()))
+
+
+def posed_projection_factor(
+    calibration: gtsam.Cal3_S2,
+    uv: ArrayLike,
+    sigma_px: float,
+    pose_key: int,
+    key: int,
+    kernel: Kernel | None = None,
+    body_T_sensor: gtsam.Pose3 | None = None,
+) -> gtsam.NonlinearFactor:
+    """A camera whose pose is unknown, or moves, sees the joint `key` at `uv` (2,): two variables.
+
+    `pose_key` is a `Pose3`, world from camera; or, with `body_T_sensor`, world from the robot that carries
+    the camera there. The world is free to move as a whole: anchor a pose with a prior.
+    """
+    model: noiseModel.Base = isotropic(2, sigma_px, kernel)
+    if body_T_sensor is None:
+        return gtsam.GenericProjectionFactorCal3_S2(_pixel(uv), model, pose_key, key, calibration)
+    return gtsam.GenericProjectionFactorCal3_S2(_pixel(uv), model, pose_key, key, calibration, body_T_sensor)
+
+
+def in_front(depth_m: ArrayLike, min_depth_m: float = 0.1) -> NDArray[np.bool_]:
+    """Which depths (...,) along the optical axis are at least `min_depth_m`; NaN is not."""
+    return np.asarray(depth_m, dtype=np.float64) >= min_depth_m
+
+
+def inlier_gate(residual_px: ArrayLike, rho_2d_px: float) -> NDArray[np.bool_]:
+    """delta_ij of Eq. 2: which reprojection distances (...,) are under `rho_2d_px`; NaN is not."""
+    if not rho_2d_px > 0:
+        raise ValueError(f"rho_2d_px must be positive, got {rho_2d_px}")
+    return np.asarray(residual_px, dtype=np.float64) < rho_2d_px
+
+
+def _pixel(uv: ArrayLike) -> NDArray[np.float64]:
+    point = np.asarray(uv, dtype=np.float64)
+    if point.shape != (2,) or not np.isfinite(point).all():
+        raise ValueError(f"uv must be two finite pixels, got {uv}")
+    return point

@@ -1,0 +1,64 @@
+"""Is a joint determined? Asked before the solver: Levenberg-Marquardt returns silently on one that is not.
+
+A joint that one camera sees can slide along its ray, and one on the line through two cameras between them.
+The information of a joint is J^T W J, summed over its observations and priors, (3, 3) in 1/m².
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+def projection_jacobians(
+    points_world: NDArray[np.float64], K: NDArray[np.float64], cTw: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Derivative (D, 2, 3) of pixels by position, pixels per metre, of D points each seen by its own camera.
+
+    `points_world` (D, 3) metres; `K` (D, 3, 3) pixels; `cTw` (D, 3, 4) camera-from-world. NaN where the depth
+    is not positive.
+    """
+    rotation = cTw[:, :, :3]
+    x, y, z = (np.einsum("dij,dj->di", rotation, points_world) + cTw[:, :, 3]).T
+    z = np.where(z > 0, z, np.nan)
+    zero = np.zeros_like(z)
+    pinhole = np.stack([np.stack([1 / z, zero, -x / z**2], -1), np.stack([zero, 1 / z, -y / z**2], -1)], 1)
+    return K[:, :2, :2] @ pinhole @ rotation
+
+
+def joint_information(
+    points_world: ArrayLike,
+    joint: ArrayLike,
+    view: ArrayLike,
+    sigmas_px: ArrayLike,
+    K: ArrayLike,
+    cTw: ArrayLike,
+    prior_information: ArrayLike | None = None,
+) -> NDArray[np.float64]:
+    """Information (J, 3, 3), in 1/m², that D observations and the priors give about J joints.
+
+    Observation d is of `joint[d]` (D,) in `view[d]` (D,) to within `sigmas_px[d]` (D,); `points_world` (J, 3) is
+    where the joints are thought to be; `K` (V, 3, 3) and `cTw` (V, 3, 4) are the cameras; `prior_information`
+    (J, 3, 3), zero where a joint has no prior. Observations from behind a camera count nothing.
+    """
+    points = np.asarray(points_world, dtype=np.float64)
+    joints, views = np.asarray(joint, dtype=np.intp), np.asarray(view, dtype=np.intp)
+    jacobian = projection_jacobians(points[joints], np.asarray(K)[views], np.asarray(cTw)[views])
+    jacobian = np.nan_to_num(jacobian) / np.asarray(sigmas_px, dtype=np.float64)[:, None, None]
+    information = np.zeros((len(points), 3, 3))
+    np.add.at(information, joints, jacobian.transpose(0, 2, 1) @ jacobian)
+    return information if prior_information is None else information + np.asarray(prior_information)
+
+
+def determined(
+    information: ArrayLike, *, max_sigma_m: float = 1.0, max_condition: float = 1e10
+) -> NDArray[np.bool_]:
+    """Which of J joints their `information` (J, 3, 3), in 1/m², pins down in all three directions.
+
+    Rank 3 in numbers: the standard deviation along the weakest direction is at most `max_sigma_m`, and the
+    ratio of the largest to the smallest eigenvalue at most `max_condition`, so that the solver's Cholesky
+    factorisation keeps digits. A joint without observations, or with NaN, is not determined.
+    """
+    matrices = np.asarray(information, dtype=np.float64)
+    finite = np.isfinite(matrices).all(axis=(1, 2))
+    eigenvalues = np.linalg.eigvalsh(np.where(finite[:, None, None], matrices, 0.0))
+    smallest, largest = eigenvalues[:, 0], eigenvalues[:, 2]
+    return (smallest > 0) & (smallest >= max_sigma_m**-2) & (largest <= max_condition * smallest)
