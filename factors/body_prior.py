@@ -20,7 +20,7 @@ def body_prior_factor(
     *,
     sigma_m: float | None = None,
     kernel: Kernel | None = None,
-) -> gtsam.NonlinearFactor:
+) -> gtsam.NoiseModelFactor:
     """The body model expects the joint `key` at `mean` (3,), metres.
 
     Give either its `covariance` (3, 3), metres squared, or one `sigma_m` for all axes.
@@ -39,7 +39,7 @@ def body_prior_factors(
     means: ArrayLike,
     covariances: ArrayLike,
     kernel: Kernel | None = None,
-) -> list[gtsam.NonlinearFactor]:
+) -> list[gtsam.NoiseModelFactor]:
     """One prior for each of D joints: `keys` (D,), `means` (D, 3) metres, `covariances` (D, 3, 3)."""
     key_list = np.asarray(keys)
     points = np.asarray(means, dtype=np.float64)

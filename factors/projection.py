@@ -43,7 +43,7 @@ def projection_factor(
     sigma_px: float,
     key: int,
     kernel: Kernel | None = None,
-) -> gtsam.NonlinearFactor:
+) -> gtsam.NoiseModelFactor:
     """A camera that stands still sees the joint `key` at `uv` (2,): one variable, a `Point3`."""
     return gtsam.TriangulationFactorCal3_S2(camera, _pixel(uv), isotropic(2, sigma_px, kernel), key)
 
@@ -55,7 +55,7 @@ def projection_factors(
     xy: ArrayLike,
     sigmas_px: ArrayLike,
     kernel: Kernel | None = None,
-) -> list[gtsam.NonlinearFactor]:
+) -> list[gtsam.NoiseModelFactor]:
     """One projection factor for each of D observations: `projection_factor` for arrays (Eq. 1).
 
     Observation d: `cameras[view[d]]` sees the joint `keys[d]` at `xy[d]` (D, 2) to within `sigmas_px[d]`.
@@ -88,7 +88,7 @@ def posed_projection_factor(
     key: int,
     kernel: Kernel | None = None,
     body_T_sensor: gtsam.Pose3 | None = None,
-) -> gtsam.NonlinearFactor:
+) -> gtsam.NoiseModelFactor:
     """A camera whose pose is unknown, or moves, sees the joint `key` at `uv` (2,): two variables.
 
     `pose_key` is a `Pose3`, world from camera; or, with `body_T_sensor`, world from the robot that carries

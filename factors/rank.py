@@ -35,9 +35,9 @@ def joint_information(
 ) -> NDArray[np.float64]:
     """Information (J, 3, 3), in 1/m², that D observations and the priors give about J joints.
 
-    Observation d is of `joint[d]` (D,) in `view[d]` (D,) to within `sigmas_px[d]` (D,); `points_world` (J, 3) is
-    where the joints are thought to be; `K` (V, 3, 3) and `cTw` (V, 3, 4) are the cameras; `prior_information`
-    (J, 3, 3), zero where a joint has no prior. Observations from behind a camera count nothing.
+    Observation d is of `joint[d]` (D,) in `view[d]` (D,) to within `sigmas_px[d]` (D,); `points_world` (J, 3)
+    is where the joints are thought to be; `K` (V, 3, 3) and `cTw` (V, 3, 4) are the cameras;
+    `prior_information` is (J, 3, 3), zero where a joint has no prior. Observations from behind a camera count nothing.
     """
     points = np.asarray(points_world, dtype=np.float64)
     joints, views = np.asarray(joint, dtype=np.intp), np.asarray(view, dtype=np.intp)
@@ -58,7 +58,7 @@ def determined(
     factorisation keeps digits. A joint without observations, or with NaN, is not determined.
     """
     matrices = np.asarray(information, dtype=np.float64)
-    finite = np.isfinite(matrices).all(axis=(1, 2))
-    eigenvalues = np.linalg.eigvalsh(np.where(finite[:, None, None], matrices, 0.0))
+    unknown = ~np.isfinite(matrices).all(axis=(1, 2), keepdims=True)
+    eigenvalues = np.linalg.eigvalsh(np.where(unknown, 0.0, matrices))
     smallest, largest = eigenvalues[:, 0], eigenvalues[:, 2]
     return (smallest > 0) & (smallest >= max_sigma_m**-2) & (largest <= max_condition * smallest)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 
 def assert_jacobian(
-    factor: gtsam.NonlinearFactor,
+    factor: gtsam.NoiseModelFactor,
     values: gtsam.Values,
     *,
     step: float = 1e-5,
@@ -33,15 +33,15 @@ def assert_jacobian(
         )
 
 
-def assert_zero_at_truth(factor: gtsam.NonlinearFactor, values: gtsam.Values, *, atol: float = 1e-9) -> None:
+def assert_zero_at_truth(factor: gtsam.NoiseModelFactor, values: gtsam.Values, *, atol: float = 1e-9) -> None:
     """AssertionError unless the factor's raw residual at `values` is zero to `atol`, in its own unit."""
     residual = np.asarray(factor.unwhitenedError(values))
     if not np.all(np.abs(residual) <= atol):
         raise AssertionError(f"residual at the truth is {residual}, not zero to {atol}")
 
 
-def analytic_jacobian(factor: gtsam.NonlinearFactor, values: gtsam.Values) -> NDArray[np.float64]:
-    """The factor's own Jacobian (residual, tangent), whitened by its Gaussian noise, in the order of its keys."""
+def analytic_jacobian(factor: gtsam.NoiseModelFactor, values: gtsam.Values) -> NDArray[np.float64]:
+    """The factor's own Jacobian (residual, tangent), over its Gaussian noise, in the order of its keys."""
     jacobian, right_hand_side = factor.linearize(values).jacobian()
     model = factor.noiseModel()
     if not isinstance(model, noiseModel.Robust):
@@ -55,11 +55,12 @@ def analytic_jacobian(factor: gtsam.NonlinearFactor, values: gtsam.Values) -> ND
 
 
 def numeric_jacobian(
-    factor: gtsam.NonlinearFactor, values: gtsam.Values, step: float = 1e-5
+    factor: gtsam.NoiseModelFactor, values: gtsam.Values, step: float = 1e-5
 ) -> NDArray[np.float64]:
-    """Central differences of the residual whitened by its Gaussian noise, in the order of the factor's keys."""
+    """Central differences of the residual over its Gaussian noise, in the order of the factor's keys."""
     columns = []
-    for key in factor.keys():
+    keys = list(factor.keys())
+    for key in keys:
         dimension = len(values.zeroVectors().at(key))
         for axis in range(dimension):
             delta = np.zeros(dimension)
@@ -70,7 +71,7 @@ def numeric_jacobian(
     return np.stack(columns, axis=1)
 
 
-def _whitened(factor: gtsam.NonlinearFactor, values: gtsam.Values) -> NDArray[np.float64]:
+def _whitened(factor: gtsam.NoiseModelFactor, values: gtsam.Values) -> NDArray[np.float64]:
     """Residual over its Gaussian noise, without any robust kernel."""
     residual = np.asarray(factor.unwhitenedError(values))
     model = factor.noiseModel()
