@@ -37,7 +37,8 @@ def joint_information(
 
     Observation d is of `joint[d]` (D,) in `view[d]` (D,) to within `sigmas_px[d]` (D,); `points_world` (J, 3)
     is where the joints are thought to be; `K` (V, 3, 3) and `cTw` (V, 3, 4) are the cameras;
-    `prior_information` is (J, 3, 3), zero where a joint has no prior. Observations from behind a camera count nothing.
+    `prior_information` is (J, 3, 3), zero where a joint has no prior. Observations from behind a camera
+    count nothing.
     """
     points = np.asarray(points_world, dtype=np.float64)
     joints, views = np.asarray(joint, dtype=np.intp), np.asarray(view, dtype=np.intp)
