@@ -1,0 +1,79 @@
+"""What pydantic found wrong, said once and plainly."""
+
+import math
+from typing import Any
+
+from pydantic import ValidationError
+
+
+def first_problem(error: ValidationError) -> tuple[tuple[int | str, ...], str]:
+    """The first problem of `error`: where (keys and indices), and a sentence that begins with the key.
+
+    For example `(("RT",), "RT must hold 12 values, got 11")`.
+    """
+    problem = error.errors(include_url=False)[0]
+    place = problem["loc"]
+    return place, f"{_key(place)} {_complaint(problem['type'], problem)}".strip()
+
+
+def describe(value: object) -> str:
+    """A short name for a value of a JSON or TOML file: "a list of 3", "text 'abc'", "null"."""
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, dict):
+        return "an object"
+    if isinstance(value, list | tuple):
+        return f"a list of {len(value)}"
+    if isinstance(value, str):
+        return f"text {value[:20]!r}" + ("..." if len(value) > 20 else "")
+    if isinstance(value, float) and not math.isfinite(value):
+        return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+    return str(value)[:40]
+
+
+def _key(place: tuple[int | str, ...]) -> str:
+    """`("cameras", 1, "K", 0)` as `cameras[1].K[0]`."""
+    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in place)
+    return key.removeprefix(".") or "the file"
+
+
+def _complaint(kind: str, problem: Any) -> str:
+    """What is wrong with the value, after its key."""
+    got = describe(problem["input"])
+    context = problem.get("ctx", {})
+    if kind == "missing":
+        return "is missing"
+    if kind == "extra_forbidden":
+        return "is not a known key"
+    if kind in ("too_short", "too_long"):
+        bound = context["min_length" if kind == "too_short" else "max_length"]
+        return f"must hold {bound} value{'s' if bound != 1 else ''}, got {len(problem['input'])}"
+    if kind == "finite_number":
+        return f"must be a finite number, got {got}"
+    if kind == "literal_error":
+        return f"must be {context['expected']}, got {got}"
+    wanted = _WANTED.get(kind)
+    if wanted is not None:
+        return f"must be {wanted}, got {got}"
+    if kind in ("value_error", "assertion_error"):
+        return f"is refused: {context.get('error', problem['msg'])}"
+    return f"is refused: {problem['msg'][:1].lower()}{problem['msg'][1:]}, got {got}"
+
+
+_WANTED = {
+    "float_type": "a number",
+    "float_parsing": "a number",
+    "int_type": "a whole number",
+    "int_parsing": "a whole number",
+    "int_from_float": "a whole number",
+    "string_type": "text",
+    "bool_type": "true or false",
+    "list_type": "a list",
+    "tuple_type": "a list",
+    "dict_type": "an object",
+    "model_type": "an object",
+    "dataclass_type": "a table",
+}
+"""What each of pydantic's type errors asks for, in words."""
