@@ -49,6 +49,24 @@ class Skeleton:
                 depth[joint] += 1
         return tuple(np.flatnonzero(depth == level) for level in range(depth.max() + 1))
 
+    @cached_property
+    def adjacency(self) -> NDArray[np.intp]:
+        """(J, J) 1 where a limb joins two joints."""
+        joined = np.zeros((len(self), len(self)), dtype=np.intp)
+        first, second = np.array(self.limbs).T
+        joined[first, second] = joined[second, first] = 1
+        return joined
+
+    @cached_property
+    def tree_neighbours(self) -> NDArray[np.intp]:
+        """(J, N) parent and children of each joint in the tree, filled up with -1."""
+        children = [[j for j in range(len(self)) if self.parents[j] == joint] for joint in range(len(self))]
+        lists = [[p for p in (self.parents[joint],) if p >= 0] + children[joint] for joint in range(len(self))]
+        table = np.full((len(self), max(len(row) for row in lists)), -1, dtype=np.intp)
+        for joint, row in enumerate(lists):
+            table[joint, : len(row)] = row
+        return table
+
 
 def _limbs(text: str) -> tuple[tuple[int, int], ...]:
     """Limbs from their usual notation: "1-8 9-10"."""

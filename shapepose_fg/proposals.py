@@ -1,0 +1,244 @@
+"""Who is there: people anchored at hip candidates and grown along the skeleton by part affinities.
+
+Stage I (d) and the first half of (e) of the paper (section 3.1, "Human Proposal Generation").
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.candidates import Candidates
+from shapepose_fg.detections import Detections
+from shapepose_fg.skeleton import Skeleton
+
+
+@dataclass(frozen=True)
+class ProposalConfig:
+    """When a hip candidate is a person, and which candidates are that person's joints."""
+
+    box_horizontal_m: float = 1.0
+    """Half the width of the box around the hip: arms and legs stretched reach 1 m from it."""
+    box_vertical_m: float = 1.2
+    """Half the height of the box: a raised hand is 1.2 m above the hip."""
+    min_parts: float = 0.9
+    """Least fraction of the core joints (trunk, arms, legs) with a candidate in the box (the paper's 90 %)."""
+    min_confidence: float = 0.2
+    """Least mean confidence of the box's best candidates: clutter that a detector doubts stays below."""
+    separation_m: float = 0.15
+    """Non-maximum suppression: of two anchors closer than this the better one stays. Two pelvises are about
+    30 cm wide and cannot be closer than half of that."""
+    doubt: float = 0.2
+    """Affinity below which a view speaks against a limb: unrelated pairs are mostly 0, true ones above 0.4."""
+    max_limb_m: float = 0.75
+    """No limb is longer: the trunk of a tall adult, hip to neck, is about 0.65 m."""
+    sweeps: int = 2
+    """How often the joints are chosen again once all their neighbours are known."""
+    min_grown_parts: float = 0.4
+    """Least fraction of the core joints that must be linked to the hip at the end; an anchor whose joints all
+    belong to others has fewer."""
+
+    def __post_init__(self) -> None:
+        for name in ("box_horizontal_m", "box_vertical_m", "separation_m", "max_limb_m"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        for name in ("min_parts", "min_confidence", "min_grown_parts", "doubt"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class Proposals:
+    """People found in one frame, each with a candidate per joint."""
+
+    candidate: NDArray[np.intp]
+    """(P, J) index of the 3D candidate of each joint, -1 where there is none."""
+    score: NDArray[np.float64]
+    """(P,) mean confidence of the box's best candidates."""
+    dropped: dict[str, int]
+    """How many anchors were dropped, by reason."""
+
+    def __len__(self) -> int:
+        return len(self.candidate)
+
+
+@dataclass(frozen=True)
+class Links:
+    """Limbs between 3D candidates, as the part affinities of all views support them."""
+
+    ends: NDArray[np.intp]
+    """(L, 2) two candidates, joined by a limb of the skeleton, first joint of the limb first."""
+    score: NDArray[np.float64]
+    """(L,) sum over the views that see both of (affinity - doubt): positive when the views agree."""
+
+
+def propose(
+    candidates: Candidates,
+    detections: Detections,
+    skeleton: Skeleton,
+    up: NDArray[np.float64],
+    config: ProposalConfig,
+) -> Proposals:
+    """Find the people of a frame: anchors at the root joint, their boxes checked, their joints grown.
+
+    `up` is the (3,) unit vector that points up. Two people do not share a candidate.
+    """
+    anchors, score, dropped = _anchors(candidates, skeleton, up, config)
+    links = link(candidates, detections, config)
+    chosen = grow(anchors, candidates, links, skeleton, config)
+    core = (chosen[:, skeleton.core] >= 0).mean(axis=1)
+    keep = core >= config.min_grown_parts
+    dropped["too few joints linked to the hip"] = int((~keep).sum())
+    return Proposals(chosen[keep], score[keep], dropped)
+
+
+def _anchors(
+    candidates: Candidates, skeleton: Skeleton, up: NDArray[np.float64], config: ProposalConfig
+) -> tuple[NDArray[np.intp], NDArray[np.float64], dict[str, int]]:
+    """Root candidates whose box holds enough confident parts, best first, without near-duplicates."""
+    anchors = np.flatnonzero(candidates.strong & (candidates.joint == skeleton.root))
+    offset = candidates.xyz[None] - candidates.xyz[anchors, None]
+    height = offset @ up
+    horizontal = np.linalg.norm(offset - height[..., None] * up, axis=-1)
+    in_box = (horizontal < config.box_horizontal_m) & (np.abs(height) < config.box_vertical_m)
+    best = np.zeros((len(anchors), len(skeleton)))
+    anchor, candidate = np.nonzero(in_box)
+    np.maximum.at(best, (anchor, candidates.joint[candidate]), candidates.score[candidate])
+    core = best[:, skeleton.core]
+    parts = (core > 0).mean(axis=1)
+    score = core.sum(axis=1) / np.maximum((core > 0).sum(axis=1), 1)
+    enough = parts >= config.min_parts
+    confident = score >= config.min_confidence
+    kept = enough & confident
+    order = np.flatnonzero(kept)[np.argsort(-_evidence(candidates, anchors[kept]), kind="stable")]
+    distance = np.linalg.norm(candidates.xyz[anchors[order], None] - candidates.xyz[anchors[order]][None], axis=-1)
+    alone = np.ones(len(order), dtype=bool)
+    for i in range(len(order)):  # a handful of people
+        alone[i] = not (alone[:i] & (distance[i, :i] < config.separation_m)).any()
+    dropped = {
+        "too few parts in the box": int((~enough).sum()),
+        "low confidence": int((enough & ~confident).sum()),
+        "same hip as a better one": int((~alone).sum()),
+    }
+    order = order[alone]
+    return anchors[order], score[order], dropped
+
+
+def _evidence(candidates: Candidates, index: NDArray[np.intp]) -> NDArray[np.float64]:
+    """How much speaks for candidates: confidence times votes."""
+    return candidates.score[index] * candidates.votes[index]
+
+
+def link(candidates: Candidates, detections: Detections, config: ProposalConfig) -> Links:
+    """Sum the part affinities of all views between the detections that support two candidates."""
+    owner, detection = candidates.support.T
+    by_detection = np.argsort(detection, kind="stable")
+    owners, counts = owner[by_detection], np.bincount(detection, minlength=len(detections))
+    start = np.cumsum(counts) - counts
+    head, tail = detections.pairs.T
+    # Each affinity speaks for every pair of candidates that its two detections support.
+    repeat = counts[head] * counts[tail]
+    which = np.repeat(np.arange(len(head)), repeat)
+    step = np.arange(len(which)) - np.repeat(np.cumsum(repeat) - repeat, repeat)
+    first = owners[start[head][which] + step // np.maximum(counts[tail][which], 1)]
+    second = owners[start[tail][which] + step % np.maximum(counts[tail][which], 1)]
+    key, inverse = np.unique(first * len(candidates) + second, return_inverse=True)
+    ends = np.stack(np.divmod(key, max(len(candidates), 1)), axis=1)
+    total = np.bincount(inverse, detections.affinity[which], len(key))
+    sees = np.zeros((len(candidates), int(detections.view.max(initial=0)) + 1), dtype=bool)
+    sees[owner, detections.view[detection]] = True
+    shared = (sees[ends[:, 0]] & sees[ends[:, 1]]).sum(axis=1)
+    length = np.linalg.norm(candidates.xyz[ends[:, 0]] - candidates.xyz[ends[:, 1]], axis=1)
+    plausible = length < config.max_limb_m
+    return Links(ends[plausible], (total - config.doubt * shared)[plausible])
+
+
+def grow(
+    anchors: NDArray[np.intp],
+    candidates: Candidates,
+    links: Links,
+    skeleton: Skeleton,
+    config: ProposalConfig,
+) -> NDArray[np.intp]:
+    """Choose a candidate per person and joint: (P, J), -1 where none is linked to the person.
+
+    First outwards from the hip, level by level of the skeleton's tree, then `sweeps` times all joints at once,
+    each with the sum of the links to all its chosen neighbours.
+    """
+    people, joints = len(anchors), len(skeleton)
+    chosen = np.full((people, joints), -1, dtype=np.intp)
+    chosen[:, skeleton.root] = anchors
+    both_ways = np.concatenate([links.ends, links.ends[:, ::-1]])
+    score = np.concatenate([links.score, links.score])
+    parent = np.array(skeleton.parents)
+    downward = parent[candidates.joint[both_ways[:, 1]]] == candidates.joint[both_ways[:, 0]]
+    down, down_score = both_ways[downward], score[downward]
+    depth = np.zeros(joints, dtype=int)
+    for level, members in enumerate(skeleton.tree_levels):
+        depth[members] = level
+    for level in range(1, len(skeleton.tree_levels)):
+        here = depth[candidates.joint[down[:, 1]]] == level
+        support = _support(chosen, down[here], down_score[here], len(candidates))
+        _choose(chosen, support, candidates, np.flatnonzero(depth == level))
+    others = np.setdiff1d(np.arange(joints), [skeleton.root])
+    for _ in range(config.sweeps):
+        support = _support(chosen, both_ways, score, len(candidates))
+        _choose(chosen, support, candidates, others)
+    return chosen
+
+
+def _support(
+    chosen: NDArray[np.intp], ends: NDArray[np.intp], score: NDArray[np.float64], count: int
+) -> NDArray[np.float64]:
+    """(P, C) sum of the links from each person's chosen candidates to every candidate."""
+    has = np.zeros((len(chosen), count + 1), dtype=bool)
+    np.put_along_axis(has, chosen, True, axis=1)  # -1 marks the spare last column
+    person, edge = np.nonzero(has[:, ends[:, 0]])
+    key = person * count + ends[edge, 1]
+    return np.bincount(key, score[edge], len(chosen) * count).reshape(len(chosen), count)
+
+
+def _choose(
+    chosen: NDArray[np.intp],
+    support: NDArray[np.float64],
+    candidates: Candidates,
+    joints: NDArray[np.intp],
+) -> None:
+    """Set `chosen` of these joints to the best supported candidates, one candidate serving one person."""
+    person, candidate = np.nonzero(support > 0)
+    of_these = np.isin(candidates.joint[candidate], joints)
+    person, candidate = person[of_these], candidate[of_these]
+    # Confidence and votes break ties between candidates that the affinities support alike.
+    score = support[person, candidate] + 0.1 * candidates.score[candidate]
+    slot = person * chosen.shape[1] + candidates.joint[candidate]
+    picked = match_best_first(slot, candidate, score)
+    chosen[:, joints] = -1
+    chosen.reshape(-1)[slot[picked]] = candidate[picked]
+
+
+def match_best_first(
+    left: NDArray[np.intp], right: NDArray[np.intp], score: NDArray[np.float64]
+) -> NDArray[np.intp]:
+    """Greedy one-to-one matching of edges (left, right) by falling score; returns indices of picked edges.
+
+    Edges that are the best of both their ends would be picked before any rival, so all of them are picked in a
+    round; a few rounds give the same matching as one edge at a time.
+    """
+    rank = np.empty(len(score), dtype=np.intp)
+    rank[np.argsort(-score, kind="stable")] = np.arange(len(score))
+    live = np.arange(len(score))
+    picked = []
+    ends = max(left.max(initial=-1), right.max(initial=-1)) + 1
+    while len(live) > 0:
+        best_left = np.full(ends, len(score))
+        best_right = np.full(ends, len(score))
+        np.minimum.at(best_left, left[live], rank[live])
+        np.minimum.at(best_right, right[live], rank[live])
+        wins = live[(best_left[left[live]] == rank[live]) & (best_right[right[live]] == rank[live])]
+        picked.append(wins)
+        used_left = np.zeros(ends, dtype=bool)
+        used_right = np.zeros(ends, dtype=bool)
+        used_left[left[wins]] = True
+        used_right[right[wins]] = True
+        live = live[~used_left[left[live]] & ~used_right[right[live]]]
+    return np.concatenate(picked) if picked else live
