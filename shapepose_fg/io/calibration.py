@@ -91,9 +91,7 @@ class _AssociationCamera(BaseModel):
     R: Annotated[list[FiniteFloat], Field(min_length=3, max_length=9)] | None = None
     T: Row3 | None = None
     imgSize: ImageSize
-    distortion: Distortion = Field(
-        default=[], validation_alias=AliasChoices("distCoeff", "dist", "distortion")
-    )
+    distortion: Distortion = Field(default=[], validation_alias=AliasChoices("distCoeff", "dist", "distortion"))
 
 
 class _OwnCamera(BaseModel):
