@@ -1,1 +1,39 @@
 """From several calibrated cameras to every person in the room in 3D, with a body."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from shapepose_fg.errors import InputError as InputError
+    from shapepose_fg.io.calibration import read_rig as read_rig
+    from shapepose_fg.io.calibration import write_rig as write_rig
+    from shapepose_fg.io.config import read_config as read_config
+    from shapepose_fg.io.detections import read_detections as read_detections
+    from shapepose_fg.pipeline import PipelineConfig as PipelineConfig
+    from shapepose_fg.pipeline import reconstruct as reconstruct
+    from shapepose_fg.reconstruction import Reconstruction as Reconstruction
+
+_HOMES = {
+    "InputError": "shapepose_fg.errors",
+    "PipelineConfig": "shapepose_fg.pipeline",
+    "Reconstruction": "shapepose_fg.reconstruction",
+    "read_config": "shapepose_fg.io.config",
+    "read_detections": "shapepose_fg.io.detections",
+    "read_rig": "shapepose_fg.io.calibration",
+    "reconstruct": "shapepose_fg.pipeline",
+    "write_rig": "shapepose_fg.io.calibration",
+}
+"""Where each public name lives. It is imported when it is asked for, so that this import loads no torch."""
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name on first use (PEP 562)."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(_HOMES[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOMES])

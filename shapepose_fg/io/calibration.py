@@ -12,7 +12,7 @@ from pydantic import AliasChoices, BaseModel, ConfigDict, Field, FiniteFloat, Va
 
 from shapepose_fg.camera import Axis, Camera, Rig
 from shapepose_fg.errors import InputError
-from shapepose_fg.io.files import read_json, write_atomically
+from shapepose_fg.files import read_json, write_atomically
 from shapepose_fg.io.validation import describe, first_problem
 
 Unit = Literal["m", "cm", "mm"]

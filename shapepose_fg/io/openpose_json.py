@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from shapepose_fg.errors import InputError
 from shapepose_fg.io.detection_table import ViewCandidates
-from shapepose_fg.io.files import read_text
+from shapepose_fg.files import read_text
 from shapepose_fg.io.validation import first_problem
 from shapepose_fg.skeleton import BODY_25
 
