@@ -49,6 +49,28 @@ def robust_kernel(name: KernelName | None, width_sigma: float | None = None) -> 
     return _ESTIMATORS[name].Create(width)
 
 
+def kernel_weight(
+    name: KernelName | None, whitened_norm: ArrayLike, width_sigma: float | None = None
+) -> NDArray[np.float64]:
+    """Weight (...,) that the kernel gives residuals whose whitened norm is `whitened_norm` (...,): 1 at 0.
+
+    What GTSAM multiplies the squared residual with when it linearises a robust factor, for whole arrays.
+    """
+    r = np.asarray(whitened_norm, dtype=np.float64)
+    if name is None:
+        return np.ones_like(r)
+    robust_kernel(name, width_sigma)  # refuses an unknown name and a width that is not positive
+    width = DEFAULT_WIDTH_SIGMA[name] if width_sigma is None else float(width_sigma)
+    ratio = (r / width) ** 2
+    if name == "huber":
+        return 1.0 / np.sqrt(np.maximum(ratio, 1.0))
+    if name == "cauchy":
+        return 1.0 / (1.0 + ratio)
+    if name == "geman_mcclure":
+        return 1.0 / (1.0 + ratio) ** 2
+    return np.maximum(1.0 - ratio, 0.0) ** 2  # tukey
+
+
 def sigma_px(
     confidence: ArrayLike,
     depth_m: ArrayLike,
