@@ -1,0 +1,245 @@
+"""How good a reconstruction of the Shelf recording is: PCP@0.5, MPJPE and recall against its annotation.
+
+No precision: not everyone in view is annotated, so a prediction without an annotation may well be right.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.table import Table
+
+from shapepose_fg.errors import InputError
+from shapepose_fg.evaluation.shelf_ground_truth import (
+    ShelfGroundTruth,
+    read_shelf_ground_truth,
+    shelf_joints,
+)
+from shapepose_fg.skeleton import BODY_25
+
+__all__ = ["ShelfGroundTruth", "ShelfScore", "evaluate_shelf", "read_shelf_ground_truth", "shelf_joints"]
+
+LIMBS = ((9, 10), (8, 7), (10, 11), (7, 6), (3, 4), (2, 1), (4, 5), (1, 0), (12, 13), (12, 14))
+"""The 10 scored limbs, as pairs of `SHELF_JOINTS`."""
+LIMB_NAMES = (
+    "left upper arm",
+    "right upper arm",
+    "left lower arm",
+    "right lower arm",
+    "left upper leg",
+    "right upper leg",
+    "left lower leg",
+    "right lower leg",
+    "head",
+    "torso",
+)
+ACTORS = (0, 1, 2)
+"""The scored ids of the annotation: actors 1, 2 and 3."""
+
+MISSING_JOINT_M = 0.5
+"""What a missing joint counts in the choice of a prediction, metres."""
+RECALL_M = 0.2
+"""A joint is recalled when it is at most this far from the annotated one, metres."""
+
+_A, _B = np.array(LIMBS).T
+
+
+class People(Protocol):
+    """What is scored: a `Reconstruction`, or anything with its two arrays."""
+
+    @property
+    def frame(self) -> NDArray[np.integer]:
+        """(N,) frame of each row."""
+        ...
+
+    @property
+    def joints(self) -> NDArray[np.floating]:
+        """(N, 25, 3) BODY_25 joints of each row, metres, NaN where unknown."""
+        ...
+
+
+@dataclass(frozen=True)
+class ShelfScore:
+    """What `evaluate_shelf` found."""
+
+    limbs_right: NDArray[np.int64]
+    """(3, 10) limbs that are right, by actor and limb."""
+    limbs_all: NDArray[np.int64]
+    """(3, 10) limbs that are annotated, by actor and limb."""
+    mpjpe_mm: float
+    """Mean distance of the joints of people who were found (mean joint distance under 0.5 m), millimetres."""
+    recall: float
+    """Share of the actors' annotated joints with a prediction within 0.2 m."""
+    people_found: int
+    """Annotated people with a prediction whose mean joint distance is under 0.5 m."""
+    people: int
+    """Annotated people who were scored: the actors, in the scored frames."""
+    frames: int
+    """Frames that were scored: annotated, and reconstructed."""
+    frames_annotated: int
+    """Frames with an annotated actor."""
+
+    @property
+    def pcp(self) -> NDArray[np.float64]:
+        """(3,) percentage of right limbs of each actor; NaN for one who is not in the scored frames."""
+        return _percent(self.limbs_right.sum(axis=1), self.limbs_all.sum(axis=1))
+
+    @property
+    def pcp_average(self) -> float:
+        """Mean of the actors' PCP, per cent: the figure that papers call Avg."""
+        scored = self.pcp[np.isfinite(self.pcp)]
+        return float(scored.mean()) if len(scored) else float("nan")
+
+    @property
+    def pcp_pooled(self) -> float:
+        """Right limbs of all limbs whoever they belong to, per cent."""
+        return float(_percent(self.limbs_right.sum(), self.limbs_all.sum()))
+
+    def as_dict(self) -> dict[str, Any]:
+        """The figures under plain names, for JSON; None where there is nothing to score."""
+        by_limb = _percent(self.limbs_right, self.limbs_all)
+        return {
+            "pcp_average": _plain(self.pcp_average),
+            "pcp_actor": {f"actor {a + 1}": _plain(self.pcp[a]) for a in ACTORS},
+            "pcp_limb": {
+                f"actor {a + 1}": {name: _plain(by_limb[a, i]) for i, name in enumerate(LIMB_NAMES)}
+                for a in ACTORS
+            },
+            "limbs_right": int(self.limbs_right.sum()),
+            "limbs": int(self.limbs_all.sum()),
+            "mpjpe_mm": _plain(self.mpjpe_mm),
+            "recall_at_200mm": _plain(100 * self.recall),
+            "people_found": self.people_found,
+            "people": self.people,
+            "frames": self.frames,
+            "frames_annotated": self.frames_annotated,
+        }
+
+    def table(self) -> Table:
+        """PCP by limb and actor, for a terminal."""
+        table = Table(title=f"Shelf, {self.frames} of {self.frames_annotated} annotated frames: PCP@0.5, %")
+        table.add_column("limb")
+        for actor in ACTORS:
+            table.add_column(f"actor {actor + 1}", justify="right")
+        table.add_column("pooled", justify="right")
+        table.add_column("right / all", justify="right")
+        by_actor = _percent(self.limbs_right, self.limbs_all)
+        right, count = self.limbs_right.sum(axis=0), self.limbs_all.sum(axis=0)
+        for i, name in enumerate(LIMB_NAMES):
+            cells = [*by_actor[:, i], float(_percent(right[i], count[i]))]
+            table.add_row(name, *map(_cell, cells), f"{right[i]} / {count[i]}")
+        table.add_section()
+        totals = f"{right.sum()} / {count.sum()}"
+        table.add_row("all limbs", *map(_cell, [*self.pcp, self.pcp_pooled]), totals, style="bold")
+        table.caption = (
+            f"Avg {_cell(self.pcp_average)} %   MPJPE {_cell(self.mpjpe_mm)} mm\n"
+            f"recall at 0.2 m {100 * self.recall:.2f} %   people found {self.people_found} / {self.people}"
+        )
+        return table
+
+
+def evaluate_shelf(
+    people: People, ground_truth: ShelfGroundTruth, frames: Iterable[int] | None = None
+) -> ShelfScore:
+    """Score `people` against the annotated actors, in `frames` or in all annotated frames.
+
+    Each annotated person takes the prediction of its frame with the smallest mean joint distance; two may take
+    the same one; a missing joint counts 0.5 m in that choice and makes its limbs wrong. A limb is right when
+    the mean error of its two ends is at most half its annotated length. Without `frames`, a reconstruction
+    whose run says which frames it covered (`run["frames"]`, [start, stop]) is scored on those.
+    InputError if no annotated frame is left to score.
+    """
+    actor = np.isin(ground_truth.actor, ACTORS)
+    scored = actor & _covered(ground_truth.frame, _frames_run(people) if frames is None else frames)
+    if not scored.any():
+        raise InputError(
+            "none of the reconstructed frames is annotated; reconstruct frames that the ground truth covers: "
+            f"{_spans(np.unique(ground_truth.frame[actor]))}"
+        )
+    truth = ground_truth.joints[scored]
+    chosen = _choose(truth, ground_truth.frame[scored], people)
+    distance = np.linalg.norm(chosen - truth, axis=2)
+    right = _limbs_right(distance, truth)
+    found = np.where(np.isfinite(distance), distance, MISSING_JOINT_M).mean(axis=1) < MISSING_JOINT_M
+    member = ground_truth.actor[scored][:, None] == np.array(ACTORS)
+    known = np.isfinite(distance) & found[:, None]
+    return ShelfScore(
+        limbs_right=member.T.astype(np.int64) @ right,
+        limbs_all=np.repeat(member.sum(axis=0)[:, None], len(LIMBS), axis=1),
+        mpjpe_mm=1e3 * float(distance[known].mean()) if known.any() else float("nan"),
+        recall=float((distance <= RECALL_M).mean()),
+        people_found=int(found.sum()),
+        people=len(truth),
+        frames=len(np.unique(ground_truth.frame[scored])),
+        frames_annotated=len(np.unique(ground_truth.frame[actor])),
+    )
+
+
+def _choose(truth: NDArray[np.float64], frame: NDArray[np.int64], people: People) -> NDArray[np.float64]:
+    """(G, 15, 3) the prediction that each annotated person takes; NaN where its frame has none."""
+    joints = shelf_joints(_body25(people))
+    person, row = np.nonzero(frame[:, None] == np.asarray(people.frame)[None, :])
+    distance = np.linalg.norm(joints[row] - truth[person], axis=2)
+    cost = np.where(np.isfinite(distance), distance, MISSING_JOINT_M).mean(axis=1)
+    order = np.lexsort((cost, person))
+    first, where = np.unique(person[order], return_index=True)
+    chosen = np.full_like(truth, np.nan)
+    chosen[first] = joints[row[order[where]]]
+    return chosen
+
+
+def _body25(people: People) -> NDArray[np.float64]:
+    """The joints (N, 25, 3) of `people`; InputError if they are not those of BODY_25, in its order."""
+    names = getattr(people, "joint_names", BODY_25.joints)
+    if tuple(names) != BODY_25.joints:
+        raise InputError("the people's joints are not those of BODY_25, which this protocol maps to Shelf's 15")
+    return np.asarray(people.joints, dtype=np.float64)
+
+
+def _limbs_right(distance: NDArray[np.float64], truth: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(G, 10) which limbs are right: PCP@0.5. A missing end (NaN) makes the comparison false."""
+    length = np.linalg.norm(truth[:, _A] - truth[:, _B], axis=2)
+    return (distance[:, _A] + distance[:, _B]) / 2 <= 0.5 * length
+
+
+def _frames_run(people: People) -> Iterable[int] | None:
+    """The frames that the reconstruction says it covered, if it says so."""
+    run = getattr(people, "run", None) or {}
+    span = run.get("frames")
+    if span is None:
+        return None
+    try:
+        start, stop = span
+        return range(int(start), int(stop))
+    except (TypeError, ValueError):
+        raise InputError(f'run.json: "frames" must be [start, stop], got {span!r}; restore the file') from None
+
+
+def _covered(frame: NDArray[np.int64], frames: Iterable[int] | None) -> NDArray[np.bool_]:
+    if frames is None:
+        return np.ones(len(frame), dtype=bool)
+    return np.isin(frame, np.fromiter(frames, dtype=np.int64))
+
+
+def _spans(frames: NDArray[np.int64]) -> str:
+    """Frames as people write them: "0-100, 216-230"."""
+    if len(frames) == 0:
+        return "none"
+    runs = np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1)
+    return ", ".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs)
+
+
+def _percent(part: Any, whole: Any) -> NDArray[np.float64]:
+    """100 part / whole, NaN where there is nothing."""
+    whole = np.asarray(whole, dtype=np.float64)
+    return 100 * np.asarray(part) / np.where(whole > 0, whole, np.nan)
+
+
+def _plain(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _cell(value: float) -> str:
+    return f"{value:.2f}" if np.isfinite(value) else "-"

@@ -1,0 +1,174 @@
+"""The annotation of the Shelf recording: its text file, its 15 joints, and how BODY_25 maps to them."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.errors import InputError
+from shapepose_fg.files import read_text
+from shapepose_fg.skeleton import BODY_25
+
+SHELF_JOINTS = tuple(
+    "RAnkle RKnee RHip LHip LKnee LAnkle RWrist RElbow RShoulder LShoulder LElbow LWrist Neck HeadTop "
+    "MidHip".split()
+)
+"""The 15 annotated joints, in the order of the file."""
+
+_MAX_PEOPLE = 1000
+"""A count of people beyond this is not a count of people."""
+
+
+@dataclass(frozen=True)
+class ShelfGroundTruth:
+    """Annotated people, one row per person and frame."""
+
+    frame: NDArray[np.int64]
+    """(G,) frame of the recording, counted from 0 in the file."""
+    actor: NDArray[np.int64]
+    """(G,) id as written: 0, 1, 2 are the actors 1, 2, 3; others are not scored."""
+    joints: NDArray[np.float64]
+    """(G, 15, 3) metres in the world, in the order of `SHELF_JOINTS`."""
+    frame_count: int
+    """Frames that the file spans, annotated or not."""
+
+    def __post_init__(self) -> None:
+        rows = len(self.frame)
+        if self.actor.shape != (rows,) or self.joints.shape != (rows, 15, 3):
+            raise ValueError(
+                f"actor must be (G,) and joints (G, 15, 3) for frame ({rows},), got {self.actor.shape}, "
+                f"{self.joints.shape}"
+            )
+
+
+def read_shelf_ground_truth(path: Path | str) -> ShelfGroundTruth:
+    """Read annotated people from the text format of the 4D Association Graph's Shelf data.
+
+    InputError that names file and line for a missing, malformed or truncated file.
+    """
+    path = Path(path)
+    lines = _Lines(path)
+    joint_count, frame_count = lines.integers(2, "the number of joints and of frames")
+    if joint_count != len(SHELF_JOINTS) or frame_count < 0:
+        lines.refuse(f"must say 15 joints and the number of frames, got {joint_count} and {frame_count}")
+    frames: list[int] = []
+    actors: list[int] = []
+    joints: list[NDArray[np.float64]] = []
+    for frame in range(frame_count):
+        (people,) = lines.integers(1, f"the number of people in frame {frame}")
+        if not 0 <= people <= _MAX_PEOPLE:
+            lines.refuse(f"must be the number of people in frame {frame}, got {people}")
+        seen: set[int] = set()
+        for _ in range(people):
+            (actor,) = lines.integers(1, f"a person's id in frame {frame}")
+            if actor in seen or actor < 0:
+                lines.refuse(f"gives the id {actor} in frame {frame}; ids must be 0 or more and differ")
+            seen.add(actor)
+            rows = [lines.numbers(f"15 values of {row} in frame {frame}") for row in ("x", "y", "z", "confidence")]
+            frames.append(frame)
+            actors.append(actor)
+            joints.append(np.stack(rows[:3], axis=1))
+    lines.expect_end(frame_count)
+    return ShelfGroundTruth(
+        np.array(frames, dtype=np.int64),
+        np.array(actors, dtype=np.int64),
+        np.stack(joints) if joints else np.zeros((0, 15, 3)),
+        frame_count,
+    )
+
+
+_SAME_NAME = [BODY_25.index(name) for name in SHELF_JOINTS[:12]]
+
+
+def shelf_joints(body25: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Map BODY_25 joints (N, 25, 3), metres, z up, to Shelf's (N, 15, 3); NaN stays NaN.
+
+    The hips, limbs and MidHip are the joints of the same name. With s and e the middles of shoulders and
+    ears, Neck is s + 0.5 (e - s) and HeadTop is Neck + 0.125 f + 0.145 z, f the unit vector of
+    (neck - midhip) x (RShoulder - LShoulder). The mapping is fixed: tuning it on the annotation would lift the
+    figure in sample only. Where one ear is unknown, e is the other ear brought into the plane halfway between
+    the shoulders, which is where the middle of two mirrored ears lies.
+    """
+    body25 = np.asarray(body25, dtype=np.float64)
+    if body25.ndim != 3 or body25.shape[1:] != (25, 3):
+        raise ValueError(f"body25 must be (N, 25, 3), got {body25.shape}")
+    right, left = body25[:, BODY_25.index("RShoulder")], body25[:, BODY_25.index("LShoulder")]
+    shoulders = 0.5 * (right + left)
+    midhip = body25[:, BODY_25.index("MidHip")]
+    forward = _unit(np.cross(body25[:, BODY_25.index("Neck")] - midhip, right - left))
+    result = np.empty((len(body25), 15, 3))
+    result[:, :12] = body25[:, _SAME_NAME]
+    result[:, 12] = shoulders + 0.5 * (_ear_middle(body25, shoulders, _unit(right - left)) - shoulders)
+    result[:, 13] = result[:, 12] + 0.125 * forward + 0.145 * np.array([0.0, 0.0, 1.0])
+    result[:, 14] = midhip
+    return result
+
+
+def _ear_middle(
+    body25: NDArray[np.float64], shoulders: NDArray[np.float64], across: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Middle of the ears (N, 3); from one ear and its mirror image where the other is unknown."""
+    ears = body25[:, [BODY_25.index("REar"), BODY_25.index("LEar")]]
+    known = np.isfinite(ears.sum(axis=2))
+    single = np.where(known[:, :1], ears[:, 0], ears[:, 1])
+    mirrored = single - np.sum((single - shoulders) * across, axis=1, keepdims=True) * across
+    return np.where(known.all(axis=1, keepdims=True), ears.mean(axis=1), mirrored)
+
+
+def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Vectors (N, 3) of length one; NaN for one of no length."""
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return vectors / np.where(length > 0, length, np.nan)
+
+
+class _Lines:
+    """The lines of a text file that are not blank, one after the other, and where we are in it."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._place = 0
+        self._lines: Iterator[tuple[int, str]] = (
+            (place, line) for place, line in enumerate(read_text(path).splitlines(), 1) if line.strip()
+        )
+
+    def refuse(self, complaint: str) -> None:
+        raise InputError(f"{self._path}: line {self._place} {complaint}; copy the annotation again")
+
+    def integers(self, count: int, meaning: str) -> list[int]:
+        words = self._next(count, meaning)
+        try:
+            return [int(word) for word in words]
+        except ValueError:
+            raise InputError(
+                f"{self._path}: line {self._place} must hold {meaning}, got {' '.join(words)[:40]!r}; "
+                "copy the annotation again"
+            ) from None
+
+    def numbers(self, meaning: str) -> NDArray[np.float64]:
+        words = self._next(len(SHELF_JOINTS), meaning)
+        try:
+            values = np.array([float(word) for word in words])
+        except ValueError:
+            values = np.array([np.nan])
+        if not np.isfinite(values).all():
+            self.refuse(f"must hold {meaning}, all finite numbers")
+        return values
+
+    def expect_end(self, frame_count: int) -> None:
+        for place, _ in self._lines:
+            self._place = place
+            self.refuse(f"goes on after the {frame_count} frames that line 1 promises")
+
+    def _next(self, count: int, meaning: str) -> list[str]:
+        entry = next(self._lines, None)
+        if entry is None:
+            raise InputError(
+                f"{self._path}: the file ends after line {self._place}, before {meaning}; copy it again whole"
+            )
+        self._place, line = entry
+        words = line.split()
+        if len(words) != count:
+            self.refuse(f"must hold {meaning}, got {len(words)} values")
+        return words
