@@ -10,7 +10,7 @@ from typing import Any, BinaryIO
 from shapepose_fg.errors import InputError
 
 
-def read_text(path: Path) -> str:
+def read_text(path: Path, *, may_be_empty: bool = False) -> str:
     """Text of the UTF-8 file at `path`; InputError where it is missing, unreadable, not text, or empty."""
     try:
         text = path.read_bytes().decode("utf-8-sig")
@@ -24,7 +24,7 @@ def read_text(path: Path) -> str:
         ) from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
-    if not text.strip():
+    if not may_be_empty and not text.strip():
         raise InputError(f"{path}: the file is empty; write or copy it again")
     return text
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from shapepose_fg.camera import Camera
 from shapepose_fg.errors import InputError
-from shapepose_fg.io.detection_table import ViewCandidates
 from shapepose_fg.files import read_text
+from shapepose_fg.io.detection_table import ViewCandidates
 from shapepose_fg.skeleton import BODY_25
 
 _SKELETON_TYPES = ("SKEL19", "SKEL17", "SKEL15", "COCO18", "BODY25", "OPTITRACK21", "SHELF15", "MPIIHAND21")

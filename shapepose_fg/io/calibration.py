@@ -13,7 +13,7 @@ from pydantic import AliasChoices, BaseModel, ConfigDict, Field, FiniteFloat, Va
 from shapepose_fg.camera import Axis, Camera, Rig
 from shapepose_fg.errors import InputError
 from shapepose_fg.files import read_json, write_atomically
-from shapepose_fg.io.validation import describe, first_problem
+from shapepose_fg.io.validation import describe, first_problem, key_text
 
 Unit = Literal["m", "cm", "mm"]
 """The unit of lengths in a calibration file."""
@@ -243,8 +243,7 @@ def _scaled(camera: Camera, metres: float) -> Camera:
 def _sentence(error: ValidationError, place: str) -> str:
     """The first problem of `error` at `place`, with the cure for its key."""
     keys, problem = first_problem(error)
-    cure = _cure(keys)
-    return f"{place}: {problem}; {cure}"
+    return f"{place}: {key_text(keys)} {problem}; {_cure(keys)}"
 
 
 def _cure(keys: Sequence[int | str]) -> str:

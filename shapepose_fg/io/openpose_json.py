@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from shapepose_fg.errors import InputError
-from shapepose_fg.io.detection_table import ViewCandidates
 from shapepose_fg.files import read_text
-from shapepose_fg.io.validation import first_problem
+from shapepose_fg.io.detection_table import ViewCandidates
+from shapepose_fg.io.validation import first_problem, key_text
 from shapepose_fg.skeleton import BODY_25
 
 _FILE = re.compile(r"(?:^|_)(\d+)_keypoints\.json$")
@@ -113,7 +113,7 @@ def _people(file: Path) -> NDArray[np.float64]:
         cure = _CURE
         if place[-1:] == ("pose_keypoints_2d",) and isinstance(error.errors()[0]["input"], list):
             cure = _KEYPOINT_CURES.get(len(error.errors()[0]["input"]), _CURE)
-        raise InputError(f"{file}: {problem}; {cure}") from None
+        raise InputError(f"{file}: {key_text(place)} {problem}; {cure}") from None
     return np.array([person.pose_keypoints_2d for person in frame.people]).reshape(-1, len(BODY_25), 3)
 
 

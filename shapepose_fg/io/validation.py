@@ -7,13 +7,18 @@ from pydantic import ValidationError
 
 
 def first_problem(error: ValidationError) -> tuple[tuple[int | str, ...], str]:
-    """The first problem of `error`: where (keys and indices), and a sentence that begins with the key.
+    """The first problem of `error`: where (keys and indices), and what is wrong there.
 
-    For example `(("RT",), "RT must hold 12 values, got 11")`.
+    For example `(("RT",), "must hold 12 values, got 11")`.
     """
     problem = error.errors(include_url=False)[0]
-    place = problem["loc"]
-    return place, f"{_key(place)} {_complaint(problem['type'], problem)}".strip()
+    return problem["loc"], _complaint(problem["type"], problem)
+
+
+def key_text(place: tuple[int | str, ...]) -> str:
+    """`("cameras", 1, "K", 0)` as `cameras[1].K[0]`; the whole file where there is no key."""
+    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in place)
+    return key.removeprefix(".") or "the file"
 
 
 def describe(value: object) -> str:
@@ -31,12 +36,6 @@ def describe(value: object) -> str:
     if isinstance(value, float) and not math.isfinite(value):
         return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
     return str(value)[:40]
-
-
-def _key(place: tuple[int | str, ...]) -> str:
-    """`("cameras", 1, "K", 0)` as `cameras[1].K[0]`."""
-    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in place)
-    return key.removeprefix(".") or "the file"
 
 
 def _complaint(kind: str, problem: Any) -> str:

@@ -1,0 +1,115 @@
+"""Settings as TOML: tables onto nested dataclasses and back, each setting with its comment."""
+
+import ast
+import inspect
+import json
+import textwrap
+import tomllib
+from dataclasses import fields, is_dataclass
+from difflib import get_close_matches
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, TypeVar, cast, get_type_hints
+
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+
+from shapepose_fg.errors import InputError
+from shapepose_fg.files import read_text
+from shapepose_fg.io.validation import describe, first_problem
+
+T = TypeVar("T")
+
+_STRICT = ConfigDict(strict=True, allow_inf_nan=False)
+
+
+def read_config(path: str | Path, kind: type[T]) -> T:
+    """Read settings of the dataclass `kind` from a TOML file; what is not in the file keeps its default.
+
+    A field that is itself a dataclass is a table. Raises InputError naming the file, the key and the cure
+    for bad TOML, an unknown key, a wrong type, or a value that the dataclass refuses.
+    """
+    path = Path(path)
+    try:
+        table = tomllib.loads(read_text(path, may_be_empty=True))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: this is not TOML: {error}; correct it there") from None
+    return _build(kind, table, path)
+
+
+def toml_text(config: object) -> str:
+    """`config` (a dataclass) as TOML that `read_config` reads back, each field's docstring above it."""
+    return "\n".join(_lines(config)).strip() + "\n"
+
+
+def _build(kind: type[T], table: dict[str, Any], path: Path, prefix: str = "") -> T:
+    """A dataclass from its table; `prefix` is the dotted name of the table, with its dot."""
+    hints = get_type_hints(kind)
+    known = [field.name for field in fields(cast(Any, kind)) if field.init]
+    values = {}
+    for key, value in table.items():
+        if key not in known:
+            near = get_close_matches(key, known, n=1, cutoff=0)[0]
+            raise InputError(f"{path}: {prefix}{key} is not a known key; did you mean {prefix}{near}?")
+        values[key] = _value(hints[key], value, path, f"{prefix}{key}")
+    try:
+        return kind(**values)
+    except ValueError as error:
+        raise InputError(f"{path}: {prefix}{error}; `shapepose-fg config` shows the defaults") from None
+
+
+def _value(hint: Any, value: Any, path: Path, key: str) -> Any:
+    """One setting, in the type that its field has."""
+    if is_dataclass(hint):
+        if not isinstance(value, dict):
+            raise InputError(f"{path}: {key} must be a table, got {describe(value)}; write [{key}] above its keys")
+        return _build(cast(type, hint), value, path, f"{key}.")
+    try:
+        # As JSON, strict types still let a list be a tuple and a text be an enumeration.
+        return TypeAdapter(hint, config=_STRICT).validate_json(json.dumps(value, default=str))
+    except ValidationError as error:
+        place, problem = first_problem(error)
+        index = "".join(f"[{part}]" for part in place if isinstance(part, int))
+        raise InputError(f"{path}: {key}{index} {problem}; `shapepose-fg config` shows the default") from None
+
+
+def _lines(config: Any, table: str = "") -> list[str]:
+    """TOML lines of a dataclass: its own settings first, then its tables."""
+    comments = _field_docstrings(type(config))
+    settings, tables = [], []
+    for field in fields(config):
+        value = getattr(config, field.name)
+        if is_dataclass(value):
+            name = f"{table}.{field.name}" if table else field.name
+            tables += ["", *_comment(comments.get(field.name)), f"[{name}]", *_lines(value, name)]
+        else:
+            settings += _comment(comments.get(field.name))
+            settings.append(f"# {field.name} is not set" if value is None else f"{field.name} = {_toml(value)}")
+    return settings + tables
+
+
+def _comment(text: str | None) -> list[str]:
+    """`text` as comment lines."""
+    return [] if text is None else [f"# {line}" for line in textwrap.wrap(" ".join(text.split()), 100)]
+
+
+def _toml(value: Any) -> str:
+    """A plain value as TOML."""
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_toml, value))}]"
+    if isinstance(value, float):
+        return repr(value)  # inf and nan are spelled the same in TOML
+    return json.dumps(value)
+
+
+def _field_docstrings(kind: type) -> dict[str, str]:
+    """The string below each field of a dataclass, which Python itself does not keep."""
+    try:
+        body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0]
+    except (OSError, TypeError):  # no source beside the byte code
+        return {}
+    comments = {}
+    for statement, following in pairwise(cast(ast.ClassDef, body).body):
+        if isinstance(statement, ast.AnnAssign) and isinstance(following, ast.Expr):
+            text = ast.literal_eval(following.value) if isinstance(following.value, ast.Constant) else None
+            comments[cast(ast.Name, statement.target).id] = text
+    return {name: text for name, text in comments.items() if isinstance(text, str)}
