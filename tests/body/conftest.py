@@ -1,0 +1,61 @@
+"""A tiny random body in SMPL's file format: nothing human about it, so that no symmetry hides a mistake."""
+
+import numpy as np
+import pytest
+import torch
+
+from shapepose_fg.body.model import BodyModel, BodyParameters
+from shapepose_fg.body.smpl_file import SMPL_PARENTS
+
+NUM_VERTICES = 60
+
+
+def make_smpl_arrays(num_betas: int = 10, num_vertices: int = NUM_VERTICES) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    weights = rng.random((num_vertices, 24)) ** 4
+    regressor = rng.random((24, num_vertices)) ** 4
+    keypoints = rng.random((25, num_vertices)) ** 4
+    return {
+        "v_template": rng.normal(0, 0.5, (num_vertices, 3)),
+        "shapedirs": rng.normal(0, 0.05, (num_vertices, 3, num_betas)),
+        "posedirs": rng.normal(0, 0.02, (num_vertices, 3, 207)),
+        "J_regressor": regressor / regressor.sum(1, keepdims=True),
+        "weights": weights / weights.sum(1, keepdims=True),
+        "kintree_table": np.array([(2**32 - 1, *SMPL_PARENTS[1:]), range(24)], dtype=np.uint32),
+        "f": rng.integers(0, num_vertices, (40, 3)).astype(np.uint32),
+        "keypoint_regressor": keypoints / keypoints.sum(1, keepdims=True),
+    }
+
+
+def random_parameters(batch: int = 5, dtype: torch.dtype = torch.float64) -> BodyParameters:
+    generator = torch.Generator().manual_seed(0)
+
+    def draw(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64).to(dtype)
+
+    return BodyParameters(draw(batch, 10), draw(batch, 3), draw(batch, 23, 3), draw(batch, 3))
+
+
+@pytest.fixture(name="make_smpl_arrays")
+def _make_smpl_arrays():
+    return make_smpl_arrays
+
+
+@pytest.fixture(name="random_parameters")
+def _random_parameters():
+    return random_parameters
+
+
+@pytest.fixture(params=["with pose blend shapes", "without"])
+def tiny_file(request, tmp_path):
+    arrays = make_smpl_arrays()
+    if request.param == "without":
+        arrays["posedirs"] *= 0
+    path = tmp_path / "tiny.npz"
+    np.savez(path, **arrays)
+    return path
+
+
+@pytest.fixture
+def tiny_model(tiny_file) -> BodyModel:
+    return BodyModel.load(tiny_file).to(torch.float64)

@@ -1,0 +1,128 @@
+"""The model against SMPL's formulas written out bone by bone, and its shortcuts against the mesh."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from shapepose_fg.body.model import BodyModel, BodyParameters
+from shapepose_fg.body.rotation import exp_so3, log_so3
+from shapepose_fg.body.smpl_file import SMPL_PARENTS
+
+
+def smpl_by_hand(arrays, parameters, b):
+    """Vertices and joints of body b, as in the SMPL paper: 4 x 4 transforms, one bone after the other."""
+    betas, transl = parameters.betas[b].numpy(), parameters.transl[b].numpy()
+    poses = torch.cat((parameters.global_orient[b][None], parameters.body_pose[b])).numpy()
+    R = Rotation.from_rotvec(poses).as_matrix()
+    shaped = arrays["v_template"] + arrays["shapedirs"] @ betas
+    rest = arrays["J_regressor"] @ shaped
+    posed = shaped + arrays["posedirs"] @ (R[1:] - np.eye(3)).ravel()
+    G = np.tile(np.eye(4), (24, 1, 1))
+    for j in range(24):
+        G[j, :3, :3] = R[j]
+        G[j, :3, 3] = rest[j] - (rest[SMPL_PARENTS[j]] if j else 0)
+        if j:
+            G[j] = G[SMPL_PARENTS[j]] @ G[j]
+    joints = G[:, :3, 3].copy()
+    G[:, :3, 3] -= np.einsum("jxy,jy->jx", G[:, :3, :3], rest)
+    per_vertex = np.einsum("vj,jxy->vxy", arrays["weights"], G)
+    vertices = np.einsum("vxy,vy->vx", per_vertex[:, :3, :3], posed) + per_vertex[:, :3, 3]
+    return vertices + transl, joints + transl
+
+
+def test_vertices_and_joints_are_smpls(tiny_file, random_parameters):
+    model = BodyModel.load(tiny_file).to(torch.float64)
+    parameters = random_parameters()
+    with np.load(tiny_file) as arrays:
+        expected = [smpl_by_hand(arrays, parameters, b) for b in range(5)]
+    np.testing.assert_allclose(model.vertices(parameters).numpy(), [v for v, _ in expected], atol=1e-12)
+    np.testing.assert_allclose(model.joints(parameters).numpy(), [j for _, j in expected], atol=1e-12)
+
+
+def test_keypoints_are_the_regressor_on_the_mesh(tiny_model, random_parameters):
+    parameters = random_parameters()
+    regressor = torch.from_numpy(tiny_model.arrays.keypoint_regressor)
+    expected = regressor @ tiny_model.vertices(parameters)
+    np.testing.assert_allclose(tiny_model.keypoints(parameters).numpy(), expected.numpy(), atol=1e-12)
+
+
+def test_rows_that_do_not_sum_to_one(tmp_path, make_smpl_arrays, random_parameters):
+    arrays = make_smpl_arrays()
+    arrays["keypoint_regressor"] *= np.linspace(-0.5, 2, 25)[:, None]
+    np.savez(tmp_path / "odd.npz", **arrays)
+    model = BodyModel.load(tmp_path / "odd.npz").to(torch.float64)
+    expected = torch.from_numpy(arrays["keypoint_regressor"]) @ model.vertices(random_parameters())
+    keypoints, _ = model.keypoints_with_jacobian(random_parameters())
+    np.testing.assert_allclose(keypoints.numpy(), expected.numpy(), atol=1e-12)
+
+
+def moved(parameters, column, step):
+    """The parameters after a step along one column of the Jacobian."""
+    pose = torch.cat((parameters.global_orient[:, None], parameters.body_pose), 1)
+    betas, transl = parameters.betas.clone(), parameters.transl.clone()
+    if column < 10:
+        betas[:, column] += step
+    elif column >= 82:
+        transl[:, column - 82] += step
+    else:
+        delta = torch.zeros(3, dtype=pose.dtype)
+        delta[(column - 10) % 3] = step
+        joint = (column - 10) // 3
+        pose[:, joint] = log_so3(exp_so3(pose[:, joint]) @ exp_so3(delta))
+    return BodyParameters(betas, pose[:, 0], pose[:, 1:], transl)
+
+
+def test_jacobian_against_differences(tiny_model, random_parameters):
+    parameters = random_parameters()
+    keypoints, jacobian = tiny_model.keypoints_with_jacobian(parameters)
+    assert jacobian.shape == (5, 25, 3, 85)
+    np.testing.assert_allclose(keypoints.numpy(), tiny_model.keypoints(parameters).numpy(), atol=1e-13)
+    for column in range(85):
+        ahead = tiny_model.keypoints(moved(parameters, column, 1e-5))
+        behind = tiny_model.keypoints(moved(parameters, column, -1e-5))
+        # Central differences: truncation 1e-10, rounding 1e-16 / 1e-5.
+        np.testing.assert_allclose(jacobian[..., column].numpy(), (ahead - behind).numpy() / 2e-5, atol=2e-9)
+
+
+def test_batches_longer_than_a_chunk(tiny_model, random_parameters):
+    parameters = random_parameters(150)
+    keypoints, jacobian = tiny_model.keypoints_with_jacobian(parameters)
+    for b in (0, 63, 64, 149):
+        one = BodyParameters(*(getattr(parameters, n)[b : b + 1] for n in parameters.__dataclass_fields__))
+        alone, jacobian_alone = tiny_model.keypoints_with_jacobian(one)
+        np.testing.assert_allclose(keypoints[b].numpy(), alone[0].numpy(), atol=1e-13)
+        np.testing.assert_allclose(jacobian[b].numpy(), jacobian_alone[0].numpy(), atol=1e-13)
+
+
+def test_empty_batch(tiny_model):
+    keypoints, jacobian = tiny_model.keypoints_with_jacobian(BodyParameters.zeros(0, torch.float64))
+    assert keypoints.shape == (0, 25, 3)
+    assert jacobian.shape == (0, 25, 3, 85)
+
+
+def test_keypoints_carry_gradients(tiny_model, random_parameters):
+    parameters = random_parameters(2)
+    parameters.body_pose.requires_grad_()
+    tiny_model.keypoints(parameters).square().sum().backward()
+    _, jacobian = tiny_model.keypoints_with_jacobian(parameters)
+    assert not jacobian.requires_grad
+    assert torch.isfinite(parameters.body_pose.grad).all()
+    assert parameters.body_pose.grad.abs().max() > 0.1
+
+
+def test_float32_agrees(tiny_file, random_parameters):
+    parameters = random_parameters()
+    single, double = BodyModel.load(tiny_file), BodyModel.load(tiny_file).to(torch.float64)
+    assert single.dtype == torch.float32
+    keypoints, jacobian = single.keypoints_with_jacobian(parameters.to(torch.float32))
+    expected, jacobian_expected = double.keypoints_with_jacobian(parameters)
+    np.testing.assert_allclose(keypoints.numpy(), expected.numpy(), atol=2e-5)  # metres; values up to 10
+    np.testing.assert_allclose(jacobian.numpy(), jacobian_expected.numpy(), atol=2e-5)
+
+
+def test_misuse_is_named(tiny_model):
+    with pytest.raises(ValueError, match=r"body_pose must be \(B, 23, 3\)"):
+        BodyParameters(torch.zeros(2, 10), torch.zeros(2, 3), torch.zeros(2, 69), torch.zeros(2, 3))
+    with pytest.raises(ValueError, match=r"\.to\(dtype\)"):
+        tiny_model.keypoints(BodyParameters.zeros(1))

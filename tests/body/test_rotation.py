@@ -1,0 +1,74 @@
+"""Rotations against scipy's, and their Jacobians against differences."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from shapepose_fg.body.rotation import exp_so3, hat, log_so3, right_jacobian, right_jacobian_inverse
+
+ANGLES = (0.0, 1e-12, 1e-7, 1e-4, 0.0999, 0.1001, 1.0, 3.0, np.pi - 1e-4, np.pi - 1e-9)
+
+
+def axis_angles() -> torch.Tensor:
+    axes = np.random.default_rng(0).normal(size=(40, 3))
+    axes = np.concatenate((axes / np.linalg.norm(axes, axis=1, keepdims=True), np.eye(3), -np.eye(3)))
+    return torch.from_numpy((np.array(ANGLES)[:, None, None] * axes).reshape(-1, 3))
+
+
+def test_exp_equals_scipy():
+    vectors = axis_angles() * torch.tensor([1.0, 2.5]).view(2, 1, 1)  # beyond pi, too
+    expected = Rotation.from_rotvec(vectors.reshape(-1, 3).numpy()).as_matrix().reshape(2, -1, 3, 3)
+    np.testing.assert_allclose(exp_so3(vectors).numpy(), expected, atol=1e-14)
+
+
+def test_log_undoes_exp():
+    vectors = axis_angles()
+    np.testing.assert_allclose(log_so3(exp_so3(vectors)).numpy(), vectors.numpy(), atol=1e-13)
+
+
+def test_log_of_half_a_turn():
+    axes = torch.tensor(
+        [[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0, 0.8], [-0.6, 0.8, 0]], dtype=torch.float64
+    )
+    R = 2 * axes[:, :, None] * axes[:, None] - torch.eye(3, dtype=torch.float64)
+    found = log_so3(R)
+    np.testing.assert_allclose(found.norm(dim=-1).numpy(), np.pi, atol=1e-15)
+    np.testing.assert_allclose(exp_so3(found).numpy(), R.numpy(), atol=1e-15)
+
+
+def test_log_norm_is_at_most_pi():
+    R = exp_so3(torch.randn(1000, 3, generator=torch.Generator().manual_seed(0)) * 3)
+    assert log_so3(R).norm(dim=-1).max() <= np.pi * (1 + 1e-6)  # float32
+
+
+def test_gradients_at_zero_and_near_pi():
+    for angle in (0.0, 1e-9, 0.3, np.pi - 1e-3):
+        vector = torch.tensor([[0.0, 0.6, 0.8]], dtype=torch.float64) * angle
+        vector.requires_grad_()
+        assert torch.autograd.gradcheck(exp_so3, vector, atol=1e-6)
+        jacobian = torch.autograd.functional.jacobian(lambda a: log_so3(exp_so3(a)), vector.detach())
+        np.testing.assert_allclose(jacobian.squeeze().numpy(), np.eye(3), atol=1e-8)
+
+
+def test_right_jacobian_is_the_derivative():
+    vectors = axis_angles()
+    step = 1e-6
+    Jr = right_jacobian(vectors)
+    for c, e in enumerate(torch.eye(3, dtype=torch.float64) * step):
+        turned = log_so3(exp_so3(vectors - e).mT @ exp_so3(vectors + e)) / (2 * step)
+        np.testing.assert_allclose(Jr[..., c].numpy(), turned.numpy(), atol=1e-8)  # differences: 1e-16 / 1e-6
+
+
+def test_right_jacobian_inverse():
+    vectors = axis_angles()
+    product = right_jacobian(vectors) @ right_jacobian_inverse(vectors)
+    np.testing.assert_allclose(product.numpy(), np.broadcast_to(np.eye(3), product.shape), atol=1e-13)
+
+
+@pytest.mark.parametrize("shape", [(3,), (2, 4, 3)])
+def test_batch_dimensions(shape):
+    vectors = torch.ones(shape)
+    for function in (hat, exp_so3, right_jacobian, right_jacobian_inverse):
+        assert function(vectors).shape == (*shape, 3)
+    assert log_so3(exp_so3(vectors)).shape == shape
