@@ -119,9 +119,7 @@ class BodyModel:
         shaped = self._mesh.template + (parameters.betas @ self._mesh.shapes).unflatten(-1, (-1, 3))
         if self._mesh.pose_blend is not None:
             shaped = shaped + (self._pose_feature(parameters) @ self._mesh.pose_blend).unflatten(-1, (-1, 3))
-        rest = self._mesh.rest_joints + (parameters.betas @ self._mesh.rest_joint_shapes).unflatten(
-            -1, (-1, 3)
-        )
+        rest = self._mesh.rest_joints + (parameters.betas @ self._mesh.rest_joint_shapes).unflatten(-1, (-1, 3))
         posed = self._joints.positions(rotations, parameters.betas, parameters.transl, None)
         shift = posed - (rotations @ rest[..., None]).squeeze(-1)
         transforms = torch.cat((rotations, shift[..., None]), -1).flatten(2)  # (B, 24, 12)
@@ -183,9 +181,7 @@ class BodyModel:
         return _Mesh(
             template=torch.from_numpy(arrays.template).to(self.dtype),
             shapes=torch.from_numpy(shapes.reshape(NUM_BETAS, -1)).to(self.dtype),
-            pose_blend=None
-            if blend is None
-            else torch.from_numpy(blend.reshape(-1, 207).T.copy()).to(self.dtype),
+            pose_blend=None if blend is None else torch.from_numpy(blend.reshape(-1, 207).T.copy()).to(self.dtype),
             rest_joints=torch.from_numpy(rest).to(self.dtype),
             rest_joint_shapes=torch.from_numpy(rest_shapes.reshape(NUM_BETAS, -1)).to(self.dtype),
             weights=torch.from_numpy(arrays.weights).to(self.dtype),

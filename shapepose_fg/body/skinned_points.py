@@ -48,9 +48,7 @@ class SkinnedPoints:
         converted = {name: value.to(dtype) for name, value in vars(self).items() if value is not None}
         return replace(self, **converted)
 
-    def positions(
-        self, rotations: Tensor, betas: Tensor, transl: Tensor, pose_feature: Tensor | None
-    ) -> Tensor:
+    def positions(self, rotations: Tensor, betas: Tensor, transl: Tensor, pose_feature: Tensor | None) -> Tensor:
         """(B, K, 3) world positions from world rotations (B, 24, 3, 3), betas (B, 10) and transl (B, 3)."""
         terms = self._terms(rotations, self._offsets(betas, pose_feature))
         return terms.sum(-1) + self._anchor(betas, transl)
@@ -85,9 +83,7 @@ class SkinnedPoints:
 
     def _anchor(self, betas: Tensor, transl: Tensor) -> Tensor:
         """(B, K, 3) what does not turn: the root joint's rest position and the translation."""
-        root = torch.addmm(self.root.flatten(), betas, self.root_shape.flatten(1)).unflatten(
-            -1, self.root.shape
-        )
+        root = torch.addmm(self.root.flatten(), betas, self.root_shape.flatten(1)).unflatten(-1, self.root.shape)
         return root + self.translation[:, None] * transl[:, None]
 
     @staticmethod

@@ -116,9 +116,7 @@ class _Entries:
         try:
             return value if isinstance(value, np.ndarray) else as_array(value)
         except Exception as error:  # records of a damaged pickle can hold anything
-            raise InputError(
-                f"{self.path}: {name} is not an array ({error}): fetch the file again"
-            ) from error
+            raise InputError(f"{self.path}: {name} is not an array ({error}): fetch the file again") from error
 
     def floats(self, name: str, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
         """The float64 array called `name`, of that shape and finite."""
@@ -161,9 +159,7 @@ class _Entries:
         weights = self.floats("weights", (count, 24))
         total = weights.sum(1, keepdims=True)
         if np.any(weights < -1e-6) or np.any(np.abs(total - 1) > 1e-2):  # files round to some digits
-            raise InputError(
-                f"{self.path}: weights must be >= 0 with rows that sum to 1: not this model's file"
-            )
+            raise InputError(f"{self.path}: weights must be >= 0 with rows that sum to 1: not this model's file")
         return weights / total
 
     def faces(self, count: int) -> NDArray[np.int64]:

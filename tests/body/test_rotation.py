@@ -28,9 +28,7 @@ def test_log_undoes_exp():
 
 
 def test_log_of_half_a_turn():
-    axes = torch.tensor(
-        [[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0, 0.8], [-0.6, 0.8, 0]], dtype=torch.float64
-    )
+    axes = torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0, 0.8], [-0.6, 0.8, 0]], dtype=torch.float64)
     R = 2 * axes[:, :, None] * axes[:, None] - torch.eye(3, dtype=torch.float64)
     found = log_so3(R)
     np.testing.assert_allclose(found.norm(dim=-1).numpy(), np.pi, atol=1e-15)
