@@ -124,6 +124,10 @@ class Reconstruction:
         """The people of one frame."""
         return self.rows(self.frame == frame)
 
+    def with_run(self, **entries: Any) -> "Reconstruction":
+        """The same people, with more to say in run.json."""
+        return replace(self, run=self.run | entries)
+
     def save(self, folder: str | Path) -> None:
         """Write people.npz and run.json into `folder`, each whole or not at all (docs/conventions.md).
 

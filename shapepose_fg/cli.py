@@ -1,0 +1,252 @@
+"""The command line: reconstruct a recording, evaluate a reconstruction, see a demo."""
+
+import json
+import re
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, cast
+
+import typer
+
+from shapepose_fg.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+    from shapepose_fg.camera import Axis
+    from shapepose_fg.io.calibration import Unit
+    from shapepose_fg.reconstruction import Reconstruction
+
+# Everything else is imported inside the commands: `--help` must not wait for torch.
+
+app = typer.Typer(
+    name="shapepose-fg",
+    help="Every person in the room in 3D, with a body, from several calibrated cameras.",
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+evaluate = typer.Typer(help="Score a reconstruction against an annotation.")
+app.add_typer(evaluate, name="evaluate")
+
+_UsageProblem = typer.BadParameter.__mro__[2]
+"""What typer raises for a wrong command line; older and newer versions keep the class in different places."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line. An error is one sentence on stderr and exit code 2."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        code = app(arguments or ["--help"], standalone_mode=False)
+    except _UsageProblem as error:
+        code = _fail(f"{cast(Any, error).format_message().rstrip('.')}; see shapepose-fg --help")
+    except InputError as error:
+        code = _fail(str(error))
+    except BrokenPipeError:  # the reader of our output, such as `head`, has had enough
+        sys.stderr.close()  # or Python would complain at exit that it cannot flush
+        code = 1
+    except OSError as error:
+        place = f"{error.filename}: " if error.filename is not None else ""
+        code = _fail(f"{place}{error.strerror or error}; check the path, its permissions and the space left")
+    except (typer.Abort, KeyboardInterrupt):
+        code = 130
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+@app.command()
+def reconstruct(
+    calibration: Annotated[Path, typer.Option(help="Cameras: 4D Association's calibration.json, or a rig file.")],
+    detections: Annotated[Path, typer.Option(help="Folder with <camera>.txt, or <camera>/*_keypoints.json.")],
+    output: Annotated[Path, typer.Option(help="Folder for people.npz and run.json; made if it is not there.")],
+    config: Annotated[
+        Path | None, typer.Option(help="Settings as TOML; `shapepose-fg config` prints all.")
+    ] = None,
+    frames: Annotated[
+        str | None, typer.Option(metavar="A:B", help="Frames A to B-1; either may be left out.")
+    ] = None,
+    up: Annotated[
+        str | None, typer.Option(metavar="AXIS", help="World axis that points up: x -x y -y z -z.")
+    ] = None,
+    unit: Annotated[str | None, typer.Option(metavar="UNIT", help="Unit of the calibration: m, cm or mm.")] = None,
+    body: Annotated[
+        Path | None, typer.Option(help="Body model in SMPL's file format, instead of the built-in.")
+    ] = None,
+) -> None:
+    """Reconstruct the people of a recording: 3D joints with covariances, and bodies."""
+    from shapepose_fg.io.calibration import read_rig
+    from shapepose_fg.io.config import read_config
+    from shapepose_fg.io.detections import read_detections
+    from shapepose_fg.provenance import checksums, versions
+
+    rig = read_rig(calibration, up=cast("Axis | None", up), unit=cast("Unit | None", unit))
+    recording = read_detections(detections, rig)
+    span = _frame_range(frames, len(recording))
+    _prepare(output)
+    from shapepose_fg.pipeline import PipelineConfig
+    from shapepose_fg.pipeline import reconstruct as run_pipeline
+
+    settings = PipelineConfig() if config is None else read_config(config, PipelineConfig)
+    start = time.perf_counter()
+    with _progress("reconstructing") as progress:
+        people = run_pipeline(recording, rig, settings, frames=span, progress=progress)
+    seconds = time.perf_counter() - start
+    inputs = [path for path in (calibration, detections, config, body) if path is not None]
+    people = people.with_run(
+        versions=versions(), inputs=checksums(inputs), frames=[span.start, span.stop], wall_seconds=seconds
+    )
+    people.save(output)
+    _print(_summary(people, span, len(rig), seconds, output))
+
+
+@evaluate.command("shelf")
+def evaluate_shelf_command(
+    people: Annotated[Path, typer.Option(help="people.npz of a reconstruction, or the folder it is in.")],
+    ground_truth: Annotated[Path, typer.Option(help="Annotation of the Shelf recording, as text.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
+) -> None:
+    """PCP per limb and actor, MPJPE and recall on the Shelf recording."""
+    from shapepose_fg.evaluation.shelf import evaluate_shelf, read_shelf_ground_truth
+    from shapepose_fg.reconstruction import Reconstruction
+
+    score = evaluate_shelf(Reconstruction.load(people), read_shelf_ground_truth(ground_truth))
+    if as_json:
+        print(json.dumps(score.as_dict(), indent=2, allow_nan=False))
+    else:
+        _print(score.table())
+
+
+@app.command()
+def demo(
+    output: Annotated[Path, typer.Option(help="Folder for the result and the picture.")] = Path("demo"),
+) -> None:
+    """Reconstruct a built-in scene of four people, and compare with the truth."""
+    raise InputError("the built-in scene is not wired to the command line yet")
+
+
+@app.command("config")
+def print_config() -> None:
+    """Print every setting with its default, as TOML."""
+    from shapepose_fg.io.config import toml_text
+    from shapepose_fg.pipeline import PipelineConfig
+
+    print(toml_text(PipelineConfig()), end="")
+
+
+@app.command()
+def version() -> None:
+    """Print the versions of this program and of what it stands on."""
+    from shapepose_fg.provenance import versions
+
+    for name, number in versions().items():
+        print(name, number)
+
+
+def _frame_range(text: str | None, count: int) -> range:
+    """Frames that `A:B` selects of a recording of `count` frames: half-open, either end optional."""
+    if text is None:
+        return range(count)
+    match = re.fullmatch(r"(\d*):(\d*)", text.strip())
+    if match is None:
+        raise InputError(f"--frames {text}: must be A:B, two frame numbers with a colon between, such as 0:100")
+    start, stop = int(match[1] or 0), int(match[2] or count)
+    if not start < stop <= count:
+        raise InputError(
+            f"--frames {text}: not in the recording, which has {count} frames; give A:B with 0 <= A < B <= {count}"
+        )
+    return range(start, stop)
+
+
+def _prepare(output: Path) -> None:
+    """Make the output folder and try it, before the long work and not after."""
+    from shapepose_fg.files import write_atomically
+
+    try:
+        trial = output / ".trial"
+        write_atomically(trial, lambda stream: stream.write(b""))
+        trial.unlink()
+    except OSError as error:
+        raise InputError(
+            f"{output}: results cannot be written here ({error.strerror}); give a folder that can be written"
+        ) from None
+
+
+@contextmanager
+def _progress(what: str) -> Iterator[Callable[[int, int], None]]:
+    """A progress bar on stderr while the block runs: a function of frames done and frames in all.
+
+    Nothing is shown where stderr is not a terminal.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("frames"),
+        TimeRemainingColumn(compact=True),
+    )
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def _summary(
+    people: "Reconstruction", span: range, camera_count: int, seconds: float, output: Path
+) -> "RenderableType":
+    """What was reconstructed, how well it went, how long it took, and where it is."""
+    import numpy as np
+    from rich.table import Table
+
+    per_frame = np.bincount(people.frame - span.start, minlength=len(span))
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    table.add_column(style="bold")
+    table.add_column(overflow="fold")
+    table.add_row("frames", f"{len(span)} ({span.start}:{span.stop}) of {camera_count} cameras")
+    table.add_row(
+        "people", f"{len(people)} in all, {per_frame.mean():.1f} a frame ({per_frame.min()} to {per_frame.max()})"
+    )
+    for status, count in zip(*np.unique(people.status, return_counts=True), strict=True):
+        table.add_row("", f"{count} {status}", style="green" if status == "ok" else "yellow")
+    known = np.isfinite(people.joints).all(axis=2)
+    if len(people) > 0:
+        table.add_row("joints", f"{100 * known.mean():.1f} % placed{_spread(people, known)}")
+    table.add_row("time", f"{1e3 * seconds / len(span):.1f} ms a frame, {seconds:.1f} s in all")
+    for stage, spent in people.run.get("seconds", {}).items():
+        table.add_row("", f"{1e3 * spent / len(span):.1f} ms {stage}", style="dim")
+    table.add_row("written", str(output / "people.npz"))
+    table.add_row("", str(output / "run.json"))
+    return table
+
+
+def _spread(people: "Reconstruction", known: Any) -> str:
+    """The median standard deviation of the joints, as words."""
+    import numpy as np
+
+    variance = np.trace(people.covariance[known], axis1=-2, axis2=-1) / 3
+    variance = variance[np.isfinite(variance) & (variance >= 0)]
+    return f", median sigma {1e3 * np.sqrt(np.median(variance)):.0f} mm" if len(variance) > 0 else ""
+
+
+def _print(content: "RenderableType") -> None:
+    """Print on stdout; with colours on a terminal only."""
+    from rich.console import Console
+
+    Console().print(content)
+
+
+def _fail(message: str) -> int:
+    """Say what went wrong, in one line on stderr."""
+    from rich.console import Console
+    from rich.text import Text
+
+    line = Text.assemble(("error: ", "bold red"), " ".join(message.split()))
+    Console(stderr=True).print(line, soft_wrap=True)
+    return 2
+
+
+if __name__ == "__main__":
+    main()
