@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from shapepose_fg.camera import Rig
 from shapepose_fg.candidates import Candidates
 from shapepose_fg.detections import Detections
+from shapepose_fg.observations import Observations
 from shapepose_fg.proposals import Proposals, match_best_first
 from shapepose_fg.skeleton import Skeleton
 
@@ -20,8 +21,7 @@ class AssociationConfig:
     """When a 2D detection is an observation of a proposal's joint."""
 
     near_m: float = 0.08
-    """Distance from the projected joint, as a length at its depth, at which closeness has lost most of its
-    weight (one sigma of a Gaussian); a detector is 2 cm off on a visible joint and several on a hidden one."""
+    """How closeness to the projected joint falls off: sigma of a Gaussian, as a length at the joint's depth; a detector is 2 cm off on a visible joint and several on a hidden one."""
     far_m: float = 0.25
     """No detection farther than this from the projection of a joint whose place is known is taken."""
     reach_m: float = 0.6
@@ -33,21 +33,15 @@ class AssociationConfig:
     """Two people's projected joints closer than this overlap: the one detection there serves both."""
     passes: int = 2
     """How often the choice is made again with the neighbours that the last one chose."""
+    min_observed_parts: float = 0.4
+    """Least fraction of the core joints (trunk, arms, legs) that two views must see. A person of whom only the
+    upper body shows has 9 of 15; a phantom, born where rays of different people cross, finds that all its
+    detections belong better to somebody else."""
 
     def __post_init__(self) -> None:
         for name in ("near_m", "far_m", "reach_m", "overlap_px", "passes"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-
-
-@dataclass(frozen=True)
-class Observations:
-    """The 2D observations of the people of one frame."""
-
-    detection: NDArray[np.intp]
-    """(P, J, V) index of the detection that is person p's joint j in view v, -1 where there is none."""
-    initial: NDArray[np.float64]
-    """(P, J, 3) where the joints are before refinement (X_0), metres; NaN where not known."""
 
 
 def associate(
@@ -57,36 +51,67 @@ def associate(
     rig: Rig,
     skeleton: Skeleton,
     config: AssociationConfig,
-) -> Observations:
-    """Give every proposal at most one detection per joint and view, and every detection to one proposal.
+) -> tuple[Observations, int]:
+    """Give every person at most one detection per joint and view, and every detection to one person.
 
     A pair is scored by how near the detection is to the projected joint and by its affinities to the detections
-    already chosen for the joint's neighbours in that view. Detections of a person in full overlap with another
-    serve both.
+    already chosen for the joint's neighbours in that view. A detection on which two people's joints lie serves
+    both. Proposals that are left with hardly any joint seen by two views are dropped, and what they took is given
+    out anew; the second value is their number.
     """
-    people = len(proposals)
-    initial = np.full((people, len(skeleton), 3), np.nan)
+    places = np.full((len(proposals), len(skeleton), 3), np.nan)
     known = proposals.candidate >= 0
-    initial[known] = candidates.xyz[proposals.candidate[known]]
-    distance_m, distance_px = _distances(initial, detections, rig)
-    closeness = np.exp(-0.5 * (distance_m / config.near_m) ** 2)
-    placed = known[:, detections.joint]
-    reachable = ~placed & _reachable(initial, detections, rig, skeleton, config)
+    places[known] = candidates.xyz[proposals.candidate[known]]
     owns = _by_support(proposals, candidates, len(detections))
-    chosen = np.full((people, len(skeleton), len(rig)), -1, dtype=np.intp)
+    chosen = _choose(places, owns, detections, rig, skeleton, config)
+    real = _observed_parts(chosen, skeleton) >= config.min_observed_parts
+    places, chosen = places[real], chosen[real]
     for _ in range(config.passes):
-        affinity, neighbours = _affinity(owns, detections, skeleton, len(rig))
-        # Where no neighbour is seen, the affinities say nothing: neither for nor against.
-        score = closeness + np.where(neighbours > 0, affinity, config.least_affinity)
-        likely = placed & (distance_m < config.far_m) & (score >= 2 * config.least_affinity)
-        likely |= reachable & (affinity >= config.least_affinity)
-        chosen = _match(likely, score, detections, chosen.shape)
-        overlap = placed & (distance_px < config.overlap_px) & (affinity >= config.least_affinity)
-        _share(chosen, overlap, distance_px, detections)
-        owns = np.zeros_like(owns)
-        person, _, _ = np.nonzero(chosen >= 0)
-        owns[person, chosen[chosen >= 0]] = True
-    return Observations(chosen, initial)
+        chosen = _choose(places, _owned(chosen, len(detections)), detections, rig, skeleton, config)
+    seen = chosen >= 0
+    observations = Observations(
+        xy=np.where(seen[..., None], detections.xy[chosen] if len(detections) > 0 else 0.0, 0.0),
+        confidence=np.where(seen, detections.confidence[chosen] if len(detections) > 0 else 0.0, 0.0),
+        initial=places,
+    )
+    return observations, int((~real).sum())
+
+
+def _choose(
+    places: NDArray[np.float64],
+    owns: NDArray[np.bool_],
+    detections: Detections,
+    rig: Rig,
+    skeleton: Skeleton,
+    config: AssociationConfig,
+) -> NDArray[np.intp]:
+    """(P, J, V) detections for people whose joints are at `places` and who are thought to own `owns` (P, D)."""
+    distance_m, distance_px = _distances(places, detections, rig)
+    placed = np.isfinite(places[:, detections.joint, 0])
+    affinity, neighbours = _affinity(owns, detections, skeleton, len(rig))
+    # Where no neighbour is seen, the affinities say nothing: neither for nor against.
+    spoken = np.where(neighbours > 0, affinity, config.least_affinity)
+    score = np.exp(-0.5 * (distance_m / config.near_m) ** 2) + spoken
+    likely = placed & (distance_m < config.far_m) & (score >= 2 * config.least_affinity)
+    reachable = ~placed & _reachable(places, detections, rig, skeleton, config)
+    likely |= reachable & (affinity >= config.least_affinity)
+    chosen = _match(likely, score, detections, (*places.shape[:2], len(rig)))
+    overlap = placed & (distance_px < config.overlap_px) & (affinity >= config.least_affinity)
+    _share(chosen, overlap, distance_px, detections)
+    return chosen
+
+
+def _owned(chosen: NDArray[np.intp], count: int) -> NDArray[np.bool_]:
+    """(P, D) whether a detection is chosen for a person."""
+    owns = np.zeros((len(chosen), count), dtype=bool)
+    person, _, _ = np.nonzero(chosen >= 0)
+    owns[person, chosen[chosen >= 0]] = True
+    return owns
+
+
+def _observed_parts(chosen: NDArray[np.intp], skeleton: Skeleton) -> NDArray[np.float64]:
+    """(P,) fraction of the core joints that at least two views see."""
+    return ((chosen >= 0).sum(axis=2) >= 2)[:, skeleton.core].mean(axis=1)
 
 
 def _by_support(proposals: Proposals, candidates: Candidates, count: int) -> NDArray[np.bool_]:

@@ -1,0 +1,192 @@
+"""The whole way: triangulate, vote, propose, associate, refine; frame by frame, refined in batches of frames."""
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from shapepose_fg.association import AssociationConfig, associate
+from shapepose_fg.body.baseline import PlainFitterConfig
+from shapepose_fg.body.fitter import BodyFitter
+from shapepose_fg.camera import Rig
+from shapepose_fg.candidates import CandidateConfig, triangulate_pairs, vote
+from shapepose_fg.detections import Detections, DetectionSequence
+from shapepose_fg.observations import ObservationConfig, Observations
+from shapepose_fg.person_graph import PersonGraphConfig
+from shapepose_fg.proposals import ProposalConfig, propose
+from shapepose_fg.provenance import versions
+from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.refine import ExtraFactors, RefineConfig, Refined, refine
+from shapepose_fg.skeleton import Skeleton
+
+Progress = Callable[[int, int], None]
+"""Called with the number of frames that are done and the number of all."""
+
+
+@dataclass(frozen=True)
+class PipelineConfig:
+    """The settings of every step, and how the work is cut."""
+
+    candidates: CandidateConfig = field(default_factory=CandidateConfig)
+    """Stage I (b, c): pairs of views to 3D joint candidates."""
+    proposals: ProposalConfig = field(default_factory=ProposalConfig)
+    """Stage I (d): candidates to people."""
+    association: AssociationConfig = field(default_factory=AssociationConfig)
+    """Stage I (e): people to their 2D observations."""
+    observations: ObservationConfig = field(default_factory=ObservationConfig)
+    """How far a 2D observation is trusted."""
+    person_graph: PersonGraphConfig = field(default_factory=PersonGraphConfig)
+    """Stage II: the factor graph of a person."""
+    body: PlainFitterConfig = field(default_factory=PlainFitterConfig)
+    """Stage II: how bodies are fitted."""
+    refine: RefineConfig = field(default_factory=RefineConfig)
+    """Stage II: the alternation."""
+    batch_frames: int = 64
+    """Frames whose people are refined together: bodies are fitted fastest by the hundred."""
+
+    def __post_init__(self) -> None:
+        if self.batch_frames <= 0:
+            raise ValueError(f"batch_frames must be positive, got {self.batch_frames}")
+
+
+def reconstruct(
+    detections: DetectionSequence,
+    rig: Rig,
+    config: PipelineConfig | None = None,
+    *,
+    frames: range | None = None,
+    fitter: BodyFitter | None = None,
+    extra_factors: ExtraFactors | None = None,
+    progress: Progress | None = None,
+) -> Reconstruction:
+    """Reconstruct the people of a recording, every frame by itself.
+
+    `frames` picks frames of the recording (all of them by default). `fitter` replaces the body fitter, and
+    `extra_factors` adds factors of your own to every person's graph. In the result a person's number counts the
+    people of a frame; it is not an identity over time. `run` of the result holds the configuration, versions,
+    seconds per stage, and how many people were found and dropped, with reasons.
+    """
+    config = PipelineConfig() if config is None else config
+    frames = range(len(detections)) if frames is None else frames
+    if frames.step != 1 or not 0 <= frames.start <= frames.stop <= len(detections):
+        raise ValueError(f"frames must be a range of step 1 within 0:{len(detections)}, got {frames}")
+    run = _Run()
+    with run.stage("load"):
+        fitter = _default_fitter(config) if fitter is None else fitter
+    parts = []
+    for start in range(0, len(frames), config.batch_frames):
+        batch = frames[start : start + config.batch_frames]
+        parts.append(_reconstruct_batch(detections, rig, config, batch, fitter, extra_factors, run))
+        if progress is not None:
+            progress(start + len(batch), len(frames))
+    people = Reconstruction.concatenate(parts) if parts else Reconstruction.empty(detections.skeleton.joints)
+    return replace(people, run=run.summary(config, frames, people))
+
+
+def find_people(
+    detections: Detections, rig: Rig, skeleton: Skeleton, config: PipelineConfig, run: "_Run | None" = None
+) -> Observations:
+    """Stage I, one frame: the people's 2D observations and where their joints are to begin with."""
+    run = _Run() if run is None else run
+    with run.stage("triangulate"):
+        points = triangulate_pairs(detections, rig, config.candidates)
+    with run.stage("vote"):
+        candidates = vote(points, detections, len(rig), config.candidates)
+    with run.stage("propose"):
+        proposals = propose(candidates, detections, skeleton, rig.up_vector, config.proposals)
+    with run.stage("associate"):
+        observations, phantoms = associate(proposals, candidates, detections, rig, skeleton, config.association)
+    run.dropped.update(proposals.dropped)
+    run.dropped["hardly any joint seen by two views"] += phantoms
+    return observations
+
+
+def _reconstruct_batch(
+    detections: DetectionSequence,
+    rig: Rig,
+    config: PipelineConfig,
+    frames: range,
+    fitter: BodyFitter,
+    extra_factors: ExtraFactors | None,
+    run: "_Run",
+) -> Reconstruction:
+    """Stage I frame by frame, then stage II for all people of these frames together."""
+    found = []
+    for index in frames:
+        with run.stage("read"):
+            seen = detections[index]
+        found.append(find_people(seen, rig, detections.skeleton, config, run))
+    counts = np.array([len(observations) for observations in found])
+    frame = np.repeat(np.array(frames), counts)
+    person = np.arange(len(frame)) - np.repeat(np.cumsum(counts) - counts, counts)
+    with run.stage("refine"):
+        refined = refine(
+            Observations.concatenate(found),
+            rig,
+            fitter,
+            config.observations,
+            config.person_graph,
+            config.refine,
+            person=person,
+            frame=frame,
+            extra_factors=extra_factors,
+        )
+    return _rows(refined, frame, person, detections.skeleton)
+
+
+def _rows(refined: Refined, frame: np.ndarray, person: np.ndarray, skeleton: Skeleton) -> Reconstruction:
+    """The refined people as rows of the result; bodies that were not fitted are NaN there."""
+    fit = refined.fit
+    body = {name: getattr(fit, name).copy() for name in ("betas", "global_orient", "body_pose", "transl")}
+    for values in body.values():
+        values[~fit.ok] = np.nan
+    return Reconstruction(
+        frame=frame,
+        person=person,
+        joint_names=np.array(skeleton.joints),
+        joints=refined.joints,
+        covariance=refined.covariance,
+        confidence=refined.confidence,
+        status=refined.status,
+        **body,
+    )
+
+
+def _default_fitter(config: PipelineConfig) -> BodyFitter:
+    """The plain optimiser on the shipped body; torch is loaded here and not before."""
+    from shapepose_fg.body.baseline import LevenbergMarquardtFitter
+
+    return LevenbergMarquardtFitter(config=config.body)
+
+
+class _Run:
+    """What a run notes down for run.json."""
+
+    def __init__(self) -> None:
+        self.seconds: Counter[str] = Counter()
+        self.dropped: Counter[str] = Counter()
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Add the time of a block to a stage."""
+        start = time.perf_counter()
+        yield
+        self.seconds[name] += time.perf_counter() - start
+
+    def summary(self, config: PipelineConfig, frames: range, people: Reconstruction) -> dict[str, Any]:
+        """The contents of `Reconstruction.run`."""
+        return {
+            "configuration": asdict(config),
+            "versions": versions(),
+            "frames": [frames.start, frames.stop],
+            "seconds": dict(self.seconds),
+            "people": {
+                "found": len(people),
+                "status": dict(Counter(people.status.tolist())),
+                "dropped": {reason: count for reason, count in self.dropped.items() if count > 0},
+            },
+        }

@@ -1,0 +1,155 @@
+"""Stage II: joints and bodies in alternation, as in Algorithm 1 of the paper."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from factors import determined
+from shapepose_fg.body.fitter import BodyFit, BodyFitter, JointTargets
+from shapepose_fg.camera import Rig
+from shapepose_fg.observations import (
+    Evidence,
+    ObservationConfig,
+    Observations,
+    mean_confidence,
+    observation_sigmas,
+    triangulate,
+    weigh,
+)
+from shapepose_fg.person_graph import PersonGraph, PersonGraphConfig, make_cameras
+from shapepose_fg.reconstruction import Status
+
+ExtraFactors = Callable[[PersonGraph], Iterable[gtsam.NonlinearFactor]]
+"""Your own factors for a person's graph, made from its keys."""
+
+
+@dataclass(frozen=True)
+class RefineConfig:
+    """How the alternation runs."""
+
+    alternations: int = 3
+    """N of Algorithm 1: how often the body is fitted and the joints are solved."""
+    max_sigma_m: float = 0.5
+    """A joint whose views leave it less certain than this in some direction is not determined by them."""
+    min_joints: int = 4
+    """Fewer joints than this determined by the views are not a person that can be placed in space."""
+
+    def __post_init__(self) -> None:
+        for name in ("alternations", "max_sigma_m", "min_joints"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class Refined:
+    """P people after stage II."""
+
+    joints: NDArray[np.float64]
+    """(P, J, 3) X, metres in the world; NaN where unknown."""
+    covariance: NDArray[np.float64]
+    """(P, J, 3, 3) marginal covariance of each joint, m²; NaN where unknown."""
+    confidence: NDArray[np.float64]
+    """(P, J) w_i of Eq. 4, mean confidence over all views of the observations that were kept."""
+    inlier: NDArray[np.bool_]
+    """(P, J, V) delta_ij of Eq. 2: which observations were kept."""
+    fit: BodyFit
+    """Theta: the bodies, P rows."""
+    status: NDArray[np.str_]
+    """(P,) a `Status` each."""
+
+
+def refine(
+    observations: Observations,
+    rig: Rig,
+    fitter: BodyFitter,
+    observation_config: ObservationConfig,
+    graph_config: PersonGraphConfig,
+    config: RefineConfig,
+    *,
+    person: NDArray[np.intp],
+    frame: NDArray[np.intp],
+    extra_factors: ExtraFactors | None = None,
+) -> Refined:
+    """Refine P people, of one frame or of many: `person` (P,) and `frame` (P,) name them in the keys.
+
+    In each round the body is fitted to what the views alone say of all joints, and then pulls the joints of low
+    confidence. What it says of a joint leaves that joint's own views out (`BodyFit.prior_xyz`), so that nothing
+    is counted twice and the covariances stay honest.
+    """
+    sigmas = observation_sigmas(observations, observations.initial, rig, observation_config)
+    X = triangulate(observations, rig, sigmas, observation_config)
+    graphs = _graphs(observations, sigmas, rig, observation_config, graph_config, person, frame, extra_factors)
+    fit: BodyFit | None = None
+    enough = np.zeros(len(X), dtype=bool)
+    for n in range(config.alternations):
+        evidence = weigh(observations, sigmas, X, rig, observation_config)
+        placed = determined(evidence.information.reshape(-1, 3, 3), max_sigma_m=config.max_sigma_m).reshape(
+            X.shape[:2]
+        )
+        if n == 0:
+            enough = placed.sum(axis=1) >= config.min_joints
+        fit = fitter.fit(_targets(evidence, enough), fit)  # the Theta step
+        X = _solve(graphs, evidence, placed, fit, mean_confidence(observations, evidence.inlier), graph_config)
+    assert fit is not None
+    covariance = np.stack([graph.covariance() for graph in graphs]) if graphs else np.zeros((*X.shape, 3))
+    status = np.where(fit.ok, Status.OK, np.where(enough, Status.BODY_UNDETERMINED, Status.TOO_FEW_VIEWS))
+    return Refined(X, covariance, mean_confidence(observations, evidence.inlier), evidence.inlier, fit, status)
+
+
+def _graphs(
+    observations: Observations,
+    sigmas: NDArray[np.float64],
+    rig: Rig,
+    observation_config: ObservationConfig,
+    graph_config: PersonGraphConfig,
+    person: NDArray[np.intp],
+    frame: NDArray[np.intp],
+    extra_factors: ExtraFactors | None,
+) -> list[PersonGraph]:
+    """One graph per person, with the user's factors in it."""
+    cameras = make_cameras(rig)
+    graphs = []
+    for row in range(len(observations)):
+        graph = PersonGraph(
+            cameras,
+            observations.xy[row],
+            sigmas[row],
+            graph_config,
+            observation_config.kernel,
+            person=int(person[row]),
+            frame=int(frame[row]),
+        )
+        for factor in extra_factors(graph) if extra_factors is not None else ():
+            graph.add(factor)
+        graphs.append(graph)
+    return graphs
+
+
+def _targets(evidence: Evidence, enough: NDArray[np.bool_]) -> JointTargets:
+    """All joints with what the views say of them; nothing for people who are not determined."""
+    information = np.where(enough[:, None, None, None], evidence.information, 0.0)
+    return JointTargets(np.nan_to_num(evidence.target), information)
+
+
+def _solve(
+    graphs: list[PersonGraph],
+    evidence: Evidence,
+    placed: NDArray[np.bool_],
+    fit: BodyFit,
+    confidence: NDArray[np.float64],
+    config: PersonGraphConfig,
+) -> NDArray[np.float64]:
+    """The X step for every person: (P, J, 3)."""
+    # Eq. 4; and a joint that its views do not determine needs the body, however sure the one view is.
+    pulled = ((confidence < config.rho_3d) | ~placed) & fit.ok[:, None]
+    solved = placed | pulled
+    start = np.where(placed[..., None], evidence.points, np.where(pulled[..., None], fit.prior_xyz, np.nan))
+    X = np.full(evidence.points.shape, np.nan)
+    for row, graph in enumerate(graphs):
+        graph.set_gates(evidence.inlier[row] & solved[row, :, None])
+        graph.set_priors(pulled[row], fit.prior_xyz[row], fit.prior_covariance[row])
+        X[row] = graph.solve(start[row])
+    return X
