@@ -1,0 +1,175 @@
+"""Puppets to poses: where pelvis, hands and feet are, turned into SMPL's joint rotations.
+
+A `Puppet` says where the ends of the body go; legs and arms are two-bone chains and are solved in closed
+form. All of it is batched over frames, for one person at a time.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+
+PELVIS, SPINE, NECK, HEAD = 0, (3, 6, 9), 12, 15
+LEGS = ((1, 4, 7), (2, 5, 8))
+"""Hip, knee, ankle: left, right."""
+ARMS = ((13, 16, 18, 20), (14, 17, 19, 21))
+"""Collar, shoulder, elbow, wrist: left, right."""
+_PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
+_KNEE_HINGE = np.array([1.0, 0.0, 0.0])
+_ELBOW_HINGE = (np.array([0.0, -1.0, 0.0]), np.array([0.0, 1.0, 0.0]))
+_REACH = 0.995
+"""A limb is never quite straight: the bend keeps the side on which the joint lies."""
+
+
+@dataclass(frozen=True)
+class Puppet:
+    """Where one person's pelvis, feet, hands and eyes are in T frames; world z up, metres and radians."""
+
+    pelvis: Array
+    """(T, 3) pelvis joint."""
+    heading: Array
+    """(T,) direction that the pelvis faces, from the x axis towards the y axis."""
+    lean: Array
+    """(T, 3) of the trunk, over its three joints in all: forward, twist to the left, towards the right."""
+    ankles: Array
+    """(T, 2, 3) ankle joints, left and right."""
+    foot_heading: Array
+    """(T, 2) where the feet point."""
+    foot_pitch: Array
+    """(T, 2) heel above toes."""
+    wrists: Array
+    """(T, 2, 3) wrist joints, left and right, where `reach` is 1."""
+    reach: Array
+    """(T, 2) 1 where the wrist follows `wrists`, 0 where the arm swings as it likes."""
+    swing: Array
+    """(T, 2) how far a free hand is in front of its resting place, metres."""
+    gaze: Array
+    """(T, 3) point that the head turns to."""
+
+
+def pose(puppet: Puppet, rest: Array) -> tuple[Array, Array, Array]:
+    """SMPL's global_orient (T, 3), body_pose (T, 23, 3) and transl (T, 3) of a puppet.
+
+    `rest` (24, 3) are the joints of the shaped body in the T-pose, y up and facing +z.
+    """
+    count = len(puppet.heading)
+    turned = np.tile(np.eye(3), (count, 24, 1, 1))  # world from joint
+    turned[:, PELVIS] = _facing(puppet.heading)
+    position = np.zeros((count, 24, 3))
+    position[:, PELVIS] = puppet.pelvis
+    bones = rest - rest[np.maximum(_PARENTS, 0)]
+
+    def grow(joint: int, local: Array | None = None) -> None:
+        """Place a joint after its parent; without `local` it keeps the parent's rotation."""
+        parent = _PARENTS[joint]
+        position[:, joint] = position[:, parent] + turned[:, parent] @ bones[joint]
+        turned[:, joint] = turned[:, parent] if local is None else turned[:, parent] @ local
+
+    bend = Rotation.from_euler("YXZ", puppet.lean[:, [1, 0, 2]] / len(SPINE)).as_matrix()
+    for joint in SPINE:
+        grow(joint, bend)
+    for joint in (NECK, HEAD):
+        grow(joint)
+    _turn_head(turned, position, puppet.gaze)
+    for side, (hip, knee, ankle) in enumerate(LEGS):
+        grow(hip)
+        pole = turned[:, PELVIS] @ np.array([0.12 * (1, -1)[side], 0.0, 1.0])
+        _two_bones(turned, position, bones, (hip, knee, ankle), puppet.ankles[:, side], pole, _KNEE_HINGE)
+        turned[:, ankle] = _facing(puppet.foot_heading[:, side]) @ _about("x", puppet.foot_pitch[:, side])
+        turned[:, ankle + 3] = turned[:, ankle]
+    for side, (collar, shoulder, elbow, wrist) in enumerate(ARMS):
+        sign = (1.0, -1.0)[side]
+        grow(collar)
+        grow(shoulder)
+        target = _hand_target(puppet, turned, position, bones, side)
+        raise_by = np.clip((target[:, 2] - position[:, shoulder, 2]) / 0.4, 0.0, 1.0) * 0.35
+        grow(collar, _about("z", sign * raise_by))
+        grow(shoulder)
+        pole = turned[:, SPINE[2]] @ np.array([0.45 * sign, -0.5, -1.0])
+        chain = (shoulder, elbow, wrist)
+        _two_bones(turned, position, bones, chain, target, pole, _ELBOW_HINGE[side])
+        turned[:, wrist] = turned[:, wrist + 2] = turned[:, elbow]
+    local = np.swapaxes(turned[:, _PARENTS[1:]], -1, -2) @ turned[:, 1:]
+    axis_angle = Rotation.from_matrix(local.reshape(-1, 3, 3)).as_rotvec().reshape(count, 23, 3)
+    orient = Rotation.from_matrix(turned[:, PELVIS]).as_rotvec()
+    return orient, axis_angle, puppet.pelvis - rest[PELVIS]
+
+
+def _facing(heading: Array) -> Array:
+    """World from body (T, 3, 3) of a body (y up, facing +z) that stands upright in a world with z up."""
+    return _about("z", heading + np.pi / 2) @ _about("x", np.full(1, np.pi / 2))
+
+
+def _about(axis: str, angle: Array) -> Array:
+    """Rotations (T, 3, 3) by `angle` (T,) about a coordinate axis."""
+    return Rotation.from_rotvec(np.eye(3)["xyz".index(axis)] * angle[:, None]).as_matrix()
+
+
+def _turn_head(turned: Array, position: Array, gaze: Array) -> None:
+    """Turn neck and head, half each, towards `gaze` (T, 3), as far as a neck goes."""
+    chest = turned[:, SPINE[2]]
+    sight = np.einsum("tji,tj->ti", chest, gaze - position[:, HEAD])
+    yaw = np.clip(np.arctan2(sight[:, 0], sight[:, 2]), -1.0, 1.0)
+    pitch = np.clip(-np.arctan2(sight[:, 1], np.hypot(sight[:, 0], sight[:, 2])), -0.5, 0.6)
+    half = Rotation.from_euler("YX", np.stack([yaw, pitch], axis=1) / 2).as_matrix()
+    turned[:, NECK] = chest @ half
+    turned[:, HEAD] = chest @ half @ half
+
+
+def _hand_target(puppet: Puppet, turned: Array, position: Array, bones: Array, side: int) -> Array:
+    """Where a wrist goes (T, 3): to its target, or to hang beside the hip and swing, or between the two."""
+    shoulder, elbow, wrist = ARMS[side][1:]
+    length = np.linalg.norm(bones[elbow]) + np.linalg.norm(bones[wrist])
+    sign = (1.0, -1.0)[side]
+    swing = puppet.swing[:, side]
+    out, front = np.full_like(swing, 0.16 * sign), 0.04 + swing
+    down = -np.sqrt(np.maximum((0.965 * length) ** 2 - out**2 - front**2, (0.5 * length) ** 2))
+    upright = _facing(puppet.heading)  # arms hang by gravity, whatever the trunk does
+    twist = _facing(puppet.heading + puppet.lean[:, 1] * 0.5)
+    hanging = np.einsum("tij,tj->ti", twist, np.stack([out, np.zeros_like(out), front], axis=1))
+    hanging += upright[:, :, 1] * down[:, None] + position[:, shoulder]
+    weight = puppet.reach[:, side, None]
+    return (1.0 - weight) * hanging + weight * puppet.wrists[:, side]
+
+
+def _two_bones(
+    turned: Array,
+    position: Array,
+    bones: Array,
+    chain: tuple[int, int, int],
+    target: Array,
+    pole: Array,
+    hinge: Array,
+) -> None:
+    """Turn the first two joints of `chain` so that the third reaches `target` (T, 3), as far as it can.
+
+    The middle joint goes to the side of `pole` (T, 3), and bends about `hinge` (3,), an axis of the
+    T-pose about which a positive angle bends the limb.
+    """
+    first, middle, last = chain
+    upper, lower = np.linalg.norm(bones[middle]), np.linalg.norm(bones[last])
+    line = target - position[:, first]
+    reach = np.linalg.norm(line, axis=1, keepdims=True)
+    u = line / reach
+    distance = np.clip(reach, abs(upper - lower) + 0.1, (upper + lower) * _REACH)
+    v = pole - (pole * u).sum(axis=1, keepdims=True) * u
+    v /= np.linalg.norm(v, axis=1, keepdims=True)
+    along = (upper**2 - lower**2 + distance**2) / (2 * distance)  # law of cosines
+    aside = np.sqrt(np.maximum(upper**2 - along**2, 0.0))
+    position[:, middle] = position[:, first] + along * u + aside * v
+    position[:, last] = position[:, first] + distance * u
+    axis = np.cross(v, u)
+    for joint, end in ((first, middle), (middle, last)):
+        bone = position[:, end] - position[:, joint]
+        turned[:, joint] = _frame(bone, axis) @ _frame(bones[end][None], hinge[None]).swapaxes(-1, -2)
+
+
+def _frame(bone: Array, axis: Array) -> Array:
+    """Right-handed frames (T, 3, 3) with the first column along `bone` and the second towards `axis`."""
+    e = bone / np.linalg.norm(bone, axis=1, keepdims=True)
+    n = axis - (axis * e).sum(axis=1, keepdims=True) * e
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    return np.stack([e, n, np.cross(e, n)], axis=-1)

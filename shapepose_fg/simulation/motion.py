@@ -1,0 +1,280 @@
+"""People who dance, walk and stand close to each other: motions made of footsteps and reaching hands.
+
+No recorded motion is needed: each role says where pelvis, hands and eyes go (a `Puppet`), and `limbs.pose`
+turns that into SMPL's parameters. World z up, floor at z = 0, metres, radians.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.simulation.gait import Path, footsteps
+from shapepose_fg.simulation.limbs import LEGS, Puppet, pose
+
+Array = NDArray[np.float64]
+
+COUPLE, LOOP, WAVER = np.array([[-0.15, 0.0], [1.05, 0.0], [0.92, -0.1]])
+"""Where in a group the middle of the couple, of the walker's loop, and who waves are, metres."""
+_PADDING_S = 3.0
+"""Paths are known this long before the first and after the last frame, for the steps to come."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """P people's bodies in T frames, in SMPL's parameters."""
+
+    betas: Array
+    """(P, 10) shapes, in standard deviations."""
+    global_orient: Array
+    """(T, P, 3) axis-angle."""
+    body_pose: Array
+    """(T, P, 23, 3) axis-angle."""
+    transl: Array
+    """(T, P, 3) metres."""
+
+    def __post_init__(self) -> None:
+        frames, people = self.transl.shape[:2]
+        shapes = {"betas": (people, 10), "global_orient": (frames, people, 3)}
+        shapes |= {"body_pose": (frames, people, 23, 3), "transl": (frames, people, 3)}
+        for name, shape in shapes.items():
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"{name} must be {shape}, got {getattr(self, name).shape}")
+
+
+@dataclass(frozen=True)
+class Build:
+    """The measures of a body that a role needs."""
+
+    rest: Array
+    """(24, 3) joints in the T-pose, y up, facing +z."""
+    floor: float
+    """y of the soles in the T-pose."""
+
+    @property
+    def pelvis_m(self) -> float:
+        """Height of the pelvis of who stands upright."""
+        return float(self.rest[0, 1] - self.floor)
+
+    @property
+    def ankle_m(self) -> float:
+        """Height of the ankles of who stands."""
+        return float(self.rest[7, 1] - self.floor)
+
+    @property
+    def shoulder_m(self) -> float:
+        """Height of the shoulders of who stands upright."""
+        return float(self.rest[16, 1] - self.floor)
+
+    @property
+    def leg_m(self) -> float:
+        """Length of thigh and shank together."""
+        hip, knee, ankle = self.rest[list(LEGS[0])]
+        return float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
+
+
+def close_motion(
+    builds: list[Build], frames: int, fps: float, rng: np.random.Generator
+) -> tuple[Array, Array, Array]:
+    """Poses of people in close motion, by fours: a couple that dances, one who walks through, one who waves.
+
+    Returns global_orient (T, P, 3), body_pose (T, P, 23, 3), transl (T, P, 3). The first four are in the
+    middle of the room, each further four in a corner of their own; who is left over fills the first roles,
+    and who would dance alone waves.
+    """
+    time = np.arange(frames) / fps
+    puppets: list[Puppet] = []
+    corners = np.array([[0.0, 0.0], [0.55, 1.15], [-1.0, -1.1], [-0.9, 1.2], [1.0, -1.2]])
+    for first in range(0, len(builds), 4):
+        group = builds[first : first + 4]
+        centre = corners[(first // 4) % len(corners)] + rng.normal(0.0, 0.02, 2)
+        if len(group) >= 2:
+            puppets += dance(group[:2], time, centre + COUPLE, rng)
+        if len(group) >= 3:
+            puppets.append(walk(group[2], time, centre + LOOP, rng))
+        if len(group) in (1, 4):
+            puppets.append(wave(group[-1], time, centre + WAVER, np.pi, rng))
+    posed = [pose(puppet, build.rest) for puppet, build in zip(puppets, builds, strict=True)]
+    if len(posed) == 0:
+        return np.zeros((frames, 0, 3)), np.zeros((frames, 0, 23, 3)), np.zeros((frames, 0, 3))
+    orient, body_pose, transl = (np.stack(part, axis=1) for part in zip(*posed, strict=True))
+    return orient, body_pose, transl
+
+
+def dance(pair: list[Build], time: Array, centre: Array, rng: np.random.Generator) -> list[Puppet]:
+    """Two who face each other, hold both hands and turn around each other; one pair of hands goes up."""
+    turn = rng.choice([-1.0, 1.0]) * rng.uniform(0.8, 1.1)  # rad/s
+    beat = rng.uniform(1.0, 1.15)  # s
+    start = rng.uniform(-0.2, 0.2)
+
+    def angle(t: Array) -> Array:
+        return np.pi / 2 + turn * (t - 1.2) + start
+
+    def middle(t: Array) -> Array:
+        sway = 0.06 * np.sin(2 * np.pi * t / (2 * beat))
+        return centre + np.stack([-np.sin(angle(t)), np.cos(angle(t))], axis=-1) * sway[:, None]
+
+    def half_distance(t: Array) -> Array:
+        return 0.29 + 0.04 * np.sin(2 * np.pi * t / (3 * beat) + start)
+
+    def path_of(sign: float) -> Callable[[Array], tuple[Array, Array]]:
+        def path(t: Array) -> tuple[Array, Array]:
+            away = np.stack([np.cos(angle(t)), np.sin(angle(t))], axis=-1) * sign
+            facing = angle(t) + (np.pi if sign > 0 else 0.0)
+            return middle(t) + away * half_distance(t)[:, None], facing + 0.15 * np.sin(np.pi * t / beat)
+
+        return path
+
+    shoulder = np.mean([build.shoulder_m for build in pair])
+    across = np.stack([-np.sin(angle(time)), np.cos(angle(time))], axis=-1)
+    up = _bump(time % 2.4, 0.5, 1.9)
+    held = []
+    for side, lift in ((1.0, up), (-1.0, np.zeros_like(up))):
+        xy = middle(time) + side * across * (0.34 - 0.16 * lift)[:, None]
+        z = shoulder - 0.32 + 0.62 * lift + 0.03 * np.sin(2 * np.pi * time / beat)
+        held.append(np.concatenate([xy, z[:, None]], axis=1))
+    puppets = []
+    for sign, build, other in ((1.0, pair[0], pair[1]), (-1.0, pair[1], pair[0])):
+        away = np.stack([np.cos(angle(time)), np.sin(angle(time)), np.zeros_like(time)], axis=1) * sign
+        # Seen by who faces the middle from the far end, `across` is on the right; for the other on the left.
+        hands = held if sign < 0 else held[::-1]
+        wrists = np.stack([hand + 0.07 * away for hand in hands], axis=1)
+        xy, _ = path_of(-sign)(time)
+        gaze = np.concatenate([xy, np.full((len(time), 1), other.shoulder_m + 0.12)], axis=1)
+        puppets.append(
+            _puppet(
+                build,
+                time,
+                path_of(sign),
+                stride_s=beat,
+                phase=0.25 if sign > 0 else 0.75,
+                dip=0.03 + 0.02 * np.sin(2 * np.pi * time / beat),
+                lean=np.stack([0.08 + 0.05 * up, 0.12 * np.sin(np.pi * time / beat), 0.1 * up * sign], axis=1),
+                wrists=wrists,
+                reach=np.ones((len(time), 2)),
+                gaze=gaze,
+            )
+        )
+    return puppets
+
+
+def walk(build: Build, time: Array, centre: Array, rng: np.random.Generator) -> Puppet:
+    """One who walks on a long loop around `centre` (2,), past the others, swinging the arms."""
+    speed = rng.uniform(1.0, 1.2)  # m/s
+    half_axes = np.array([0.62, 1.15])
+    lap = 2 * np.pi * np.sqrt((half_axes**2).mean()) / speed
+
+    def path(t: Array) -> tuple[Array, Array]:
+        phi = 2 * np.pi * (t - 1.2) / lap
+        xy = centre + half_axes * np.stack([-np.cos(phi), np.sin(phi)], axis=-1)
+        return xy, np.unwrap(np.arctan2(half_axes[1] * np.cos(phi), half_axes[0] * np.sin(phi)))
+
+    xy, heading = path(time)
+    ahead = xy + 2.0 * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+    twist = 0.12 * np.sin(2 * np.pi * time / 1.05)
+    return _puppet(
+        build,
+        time,
+        path,
+        stride_s=1.05,
+        phase=rng.uniform(),
+        dip=np.full_like(time, 0.02),
+        lean=np.stack([np.full_like(time, 0.06), twist, np.zeros_like(time)], axis=1),
+        wrists=np.zeros((len(time), 2, 3)),
+        reach=np.zeros((len(time), 2)),
+        gaze=np.concatenate([ahead, np.full((len(time), 1), 1.3)], axis=1),
+    )
+
+
+def wave(build: Build, time: Array, spot: Array, heading: float, rng: np.random.Generator) -> Puppet:
+    """One who stays at `spot` (2,): waves with the right hand, then crouches and reaches down."""
+    cycle = (time + rng.uniform(-0.1, 0.1)) % 2.8
+    waving, crouching = _bump(cycle, -0.4, 1.45), _bump(cycle, 1.25, 2.75)
+
+    def path(t: Array) -> tuple[Array, Array]:
+        shift = 0.04 * np.sin(2 * np.pi * t / 2.8)
+        left = np.array([-np.sin(heading), np.cos(heading)])
+        return spot + shift[:, None] * left, heading + 0.25 * np.sin(2 * np.pi * t / 2.8)
+
+    xy, facing = path(time)
+    forward = np.stack([np.cos(facing), np.sin(facing)], axis=-1)
+    left = np.stack([-forward[:, 1], forward[:, 0]], axis=-1)
+    beat = 0.13 * np.sin(2 * np.pi * time / 0.62)
+    hello = xy + 0.2 * forward - (0.38 + beat)[:, None] * left
+    hello = np.concatenate([hello, np.full((len(time), 1), build.shoulder_m + 0.32)], axis=1)
+    floor = xy + 0.42 * forward + 0.1 * left
+    floor = np.concatenate([floor, np.full((len(time), 1), 0.42)], axis=1)
+    right = hello + (crouching / np.maximum(waving + crouching, 1e-9))[:, None] * (floor - 0.2 * _up(left) - hello)
+    reach = np.stack([crouching, np.maximum(waving, crouching)], axis=1)
+    gaze = np.concatenate([xy + 1.2 * forward, (1.45 - 1.1 * crouching)[:, None]], axis=1)
+    return _puppet(
+        build,
+        time,
+        path,
+        stride_s=1.4,
+        phase=rng.uniform(),
+        dip=0.02 + 0.3 * crouching,
+        lean=np.stack([0.03 + 0.75 * crouching, 0.2 * np.sin(2 * np.pi * time / 2.8), -0.06 * waving], axis=1),
+        wrists=np.stack([floor, right], axis=1),
+        reach=reach,
+        gaze=gaze,
+    )
+
+
+def _puppet(
+    build: Build,
+    time: Array,
+    path: Callable[[Array], tuple[Array, Array]],
+    *,
+    stride_s: float,
+    phase: float,
+    dip: Array,
+    lean: Array,
+    wrists: Array,
+    reach: Array,
+    gaze: Array,
+) -> Puppet:
+    """Put a body on the footsteps of `path`, its pelvis `dip` (T,) metres lower than upright."""
+    end = (time[-1] if len(time) else 0.0) + _PADDING_S
+    known = np.arange(-_PADDING_S, end, 0.02)
+    steps = footsteps(Path(known, *path(known)), time, stride_s, width_m=0.19, phase=phase)
+    xy, heading = path(time)
+    ankles = np.concatenate([steps.xy, (build.ankle_m + steps.lift)[..., None]], axis=-1)
+    # Nobody walks on stretched legs: the pelvis is low enough for both feet, softly.
+    aside = np.linalg.norm(steps.xy - xy[:, None], axis=-1) - 0.5 * 0.16
+    drop = np.sqrt(np.maximum((0.985 * build.leg_m) ** 2 - np.maximum(aside, 0.0) ** 2, 0.1))
+    allowed = (ankles[..., 2] + drop).min(axis=1) + (build.pelvis_m - build.rest[1, 1] + build.floor)
+    height = _soften(np.minimum(build.pelvis_m - dip, allowed))
+    lean_back = -0.22 * np.maximum(dip - 0.05, 0.0)  # the hips go back over the heels in a crouch
+    xy = xy + lean_back[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+    return Puppet(
+        pelvis=np.concatenate([xy, height[:, None]], axis=1),
+        heading=heading,
+        lean=lean,
+        ankles=ankles,
+        foot_heading=steps.heading,
+        foot_pitch=steps.pitch,
+        wrists=wrists,
+        reach=reach,
+        swing=np.clip(0.55 * steps.swing[:, ::-1], -0.25, 0.3),
+        gaze=gaze,
+    )
+
+
+def _bump(time: Array, start: float, stop: float) -> Array:
+    """Smoothly 0 outside start..stop and 1 in the middle of it."""
+    inside = np.clip((time - start) / (stop - start), 0.0, 1.0)
+    return np.clip(1.6 * np.sin(np.pi * inside) ** 2, 0.0, 1.0)
+
+
+def _soften(height: Array) -> Array:
+    """A running mean over five frames, ends repeated."""
+    if len(height) == 0:
+        return height
+    padded = np.concatenate([np.repeat(height[:1], 2), height, np.repeat(height[-1:], 2)])
+    return np.convolve(padded, np.full(5, 0.2), mode="valid")
+
+
+def _up(xy: Array) -> Array:
+    return np.concatenate([xy, np.zeros((len(xy), 1))], axis=1)

@@ -1,0 +1,161 @@
+"""People with known truth before calibrated cameras: the built-in scene of `demo` and the tests."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from shapepose_fg.body.model import BodyModel, BodyParameters
+from shapepose_fg.camera import Camera, Rig
+from shapepose_fg.rendering import look_at
+from shapepose_fg.simulation.motion import Build, Motion, close_motion
+
+UP = np.array([0.0, 0.0, 1.0])
+_FEET = (19, 20, 21, 22, 23, 24)
+"""Toes and heels in BODY_25."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Who stood where, exactly, and the cameras that looked on. World z up, floor at z = 0, metres."""
+
+    rig: Rig
+    """The cameras."""
+    body: BodyModel
+    """The model whose parameters `motion` holds."""
+    motion: Motion
+    """P people in T frames."""
+    fps: float
+    """Frames a second."""
+
+    def __len__(self) -> int:
+        """Count of frames, T."""
+        return len(self.motion.transl)
+
+    @property
+    def people(self) -> int:
+        """Count of people, P."""
+        return len(self.motion.betas)
+
+    @cached_property
+    def keypoints(self) -> NDArray[np.float64]:
+        """(T, P, 25, 3) true BODY_25 keypoints."""
+        return keypoints_of(self.body, self.motion)
+
+    def truth_at(self, frame: int) -> NDArray[np.float64]:
+        """(P, 25, 3) true BODY_25 keypoints of one frame."""
+        return self.keypoints[frame]
+
+    def vertices_at(self, frame: int) -> NDArray[np.float32]:
+        """(P, Nv, 3) the true surfaces of one frame."""
+        if self.people == 0:
+            return np.zeros((0, self.body.num_vertices, 3), dtype=np.float32)
+        with torch.no_grad():
+            return self.body.vertices(_parameters(self.body, self.motion, slice(frame, frame + 1))).numpy()
+
+    @cached_property
+    def standing(self) -> NDArray[np.float32]:
+        """(Nv, 3) the mean body in its T-pose, y up."""
+        with torch.no_grad():
+            return self.body.vertices(BodyParameters.zeros(1, self.body.dtype))[0].numpy()
+
+
+def built_in_scene(
+    seed: int = 0,
+    *,
+    people: int = 4,
+    cameras: int = 6,
+    frames: int = 60,
+    fps: float = 25.0,
+    body: BodyModel | None = None,
+) -> Scene:
+    """Close motion in a room of 4 x 4 m: two dance, one walks through, one waves and crouches.
+
+    Any number of `people` from 0, of `cameras` from 2 and of `frames` from 0; everything that is drawn
+    (shapes, phases, places) comes from `seed`. `body` is the model that is posed, by default the shipped one.
+    """
+    if people < 0 or frames < 0 or cameras < 2:
+        raise ValueError(f"need people >= 0, frames >= 0, cameras >= 2; got {people}, {frames}, {cameras}")
+    body = _default_body() if body is None else body
+    rng = np.random.default_rng(seed)
+    rig = ring_of_cameras(cameras, rng)
+    betas = np.clip(rng.normal(0.0, 1.0, (people, body.num_betas)), -1.8, 1.8)
+    builds = builds_of(body, betas)
+    motion = Motion(betas, *close_motion(builds, frames, fps, rng))
+    return Scene(rig, body, _on_the_floor(body, motion, builds), fps)
+
+
+def _default_body() -> BodyModel:
+    try:
+        return BodyModel.default()
+    except (OSError, ValueError):
+        from shapepose_fg.simulation.stick_body import stick_body
+
+        return stick_body()
+
+
+def ring_of_cameras(count: int, rng: np.random.Generator, *, image_size: tuple[int, int] = (1280, 720)) -> Rig:
+    """Cameras on the walls around the room, 3 to 3.6 m from its middle and 1.9 to 2.7 m high, looking inward.
+
+    1280 x 720 px and a focal length near 900 px by default: a field of view of 71 by 44 degrees.
+    """
+    cameras = []
+    angles = 2 * np.pi * (np.arange(count) + rng.uniform(-0.18, 0.18, count)) / count + 0.35
+    for index, angle in enumerate(angles):
+        distance, height = rng.uniform(3.1, 3.6), rng.uniform(2.0, 2.5) + (0.2, -0.1)[index % 2]
+        eye = np.array([distance * np.cos(angle), distance * np.sin(angle), height])
+        target = np.array([*rng.uniform(-0.15, 0.15, 2), 0.85])
+        focal = rng.uniform(860.0, 940.0)
+        centre = np.array(image_size) / 2 + rng.uniform(-8.0, 8.0, 2)
+        K = np.array([[focal, 0.0, centre[0]], [0.0, focal, centre[1]], [0.0, 0.0, 1.0]])
+        cameras.append(Camera(f"cam{index}", K, look_at(eye, target, UP), image_size))
+    return Rig(tuple(cameras), up="z")
+
+
+def builds_of(body: BodyModel, betas: NDArray[np.float64]) -> list[Build]:
+    """The measures of P shapes `betas` (P, 10) that motions are made to."""
+    if len(betas) == 0:
+        return []
+    standing = Motion(betas, *(np.zeros((1, len(betas), *shape)) for shape in ((3,), (23, 3), (3,))))
+    parameters = _parameters(body, standing, slice(0, 1))
+    with torch.no_grad():
+        joints = body.joints(parameters).numpy().astype(np.float64)
+        floors = body.vertices(parameters).numpy()[..., 1].min(axis=1)
+    return [Build(rest, float(floor)) for rest, floor in zip(joints, floors, strict=True)]
+
+
+def keypoints_of(body: BodyModel, motion: Motion) -> NDArray[np.float64]:
+    """BODY_25 keypoints (T, P, 25, 3) of a motion."""
+    frames, people = motion.transl.shape[:2]
+    if frames * people == 0:
+        return np.zeros((frames, people, 25, 3))
+    with torch.no_grad():
+        points = body.keypoints(_parameters(body, motion, slice(0, frames))).numpy()
+    return points.astype(np.float64).reshape(frames, people, -1, 3)
+
+
+def _on_the_floor(body: BodyModel, motion: Motion, builds: list[Build]) -> Motion:
+    """Shift everybody up or down so that in each frame the lowest toe or heel is as high as in standing."""
+    frames, people = motion.transl.shape[:2]
+    if frames * people == 0:
+        return motion
+    standing = Motion(motion.betas, *(np.zeros((1, people, *shape)) for shape in ((3,), (23, 3), (3,))))
+    floors = np.array([build.floor for build in builds])
+    soles = keypoints_of(body, standing)[0][:, _FEET, 1].min(axis=1) - floors
+    transl = motion.transl.copy()
+    transl[..., 2] += soles - keypoints_of(body, motion)[:, :, _FEET, 2].min(axis=2)
+    return Motion(motion.betas, motion.global_orient, motion.body_pose, transl)
+
+
+def _parameters(body: BodyModel, motion: Motion, frames: slice) -> BodyParameters:
+    """The bodies of some frames, frame by frame, as one batch."""
+    count = len(range(*frames.indices(len(motion.transl))))
+    tensors = {
+        "betas": np.tile(motion.betas, (count, 1)),
+        "global_orient": motion.global_orient[frames].reshape(-1, 3),
+        "body_pose": motion.body_pose[frames].reshape(-1, 23, 3),
+        "transl": motion.transl[frames].reshape(-1, 3),
+    }
+    return BodyParameters(**{name: torch.from_numpy(value).to(body.dtype) for name, value in tensors.items()})
