@@ -21,7 +21,8 @@ class AssociationConfig:
     """When a 2D detection is an observation of a proposal's joint."""
 
     near_m: float = 0.08
-    """How closeness to the projected joint falls off: sigma of a Gaussian, as a length at the joint's depth; a detector is 2 cm off on a visible joint and several on a hidden one."""
+    """How closeness to the projected joint falls off: sigma of a Gaussian, as a length at the joint's depth. A
+    detector is 2 cm off on a visible joint and several on a hidden one."""
     far_m: float = 0.25
     """No detection farther than this from the projection of a joint whose place is known is taken."""
     reach_m: float = 0.6
@@ -157,7 +158,7 @@ def _reachable(
 def _affinity(
     owns: NDArray[np.bool_], detections: Detections, skeleton: Skeleton, views: int
 ) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-    """(P, D) mean affinity of each detection to those the person owns at its limbs' other ends, and their number."""
+    """(P, D) mean affinity of each detection to what the person owns at its limbs' other ends, and the number."""
     people, count = owns.shape
     head, tail = detections.pairs.T
     total = np.zeros((people, count))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections
@@ -175,7 +175,7 @@ def _linear_points(
     rows = normalised[:, :, None] * P[:, 2:3, :] - P[:, :2, :]
     A = np.concatenate([rows[first], rows[second]], axis=1)
     At = A[:, :, :3].transpose(0, 2, 1)
-    return np.linalg.solve(At @ A[:, :, :3], -At @ A[:, :, 3:])[:, :, 0]
+    return np.asarray(np.linalg.solve(At @ A[:, :, :3], -At @ A[:, :, 3:])[:, :, 0], dtype=np.float64)
 
 
 def _reprojection_error(
@@ -185,7 +185,7 @@ def _reprojection_error(
     P = rig.cTw[view]
     camera = np.einsum("mij,mj->mi", P[:, :, :3], xyz) + P[:, :, 3]
     error = np.hypot(*(camera[:, :2] - normalised * camera[:, 2:]).T)
-    return np.where(camera[:, 2] > 0, error, np.inf)
+    return np.where(camera[:, 2] > 0, error, np.inf).astype(np.float64)
 
 
 def _greedy_seeds(points: PairPoints, radius_m: float) -> NDArray[np.intp]:
@@ -194,7 +194,7 @@ def _greedy_seeds(points: PairPoints, radius_m: float) -> NDArray[np.intp]:
     rank = np.empty(count, dtype=np.intp)
     rank[np.argsort(-points.score, kind="stable")] = np.arange(count)
     # A fourth coordinate keeps different joints apart.
-    tree = cKDTree(np.column_stack([points.xyz, points.joint * (4.0 * radius_m)]))
+    tree = KDTree(np.column_stack([points.xyz, points.joint * (4.0 * radius_m)]))
     edges = tree.query_pairs(radius_m, output_type="ndarray")
     swap = rank[edges[:, 0]] > rank[edges[:, 1]]
     better = np.where(swap, edges[:, 1], edges[:, 0])

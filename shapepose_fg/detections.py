@@ -51,8 +51,10 @@ class DetectionSequence(Protocol):
     Any object with these members serves; a list of `Detections` in a `Recording` is the simplest.
     """
 
-    skeleton: Skeleton
-    """The detector's joints."""
+    @property
+    def skeleton(self) -> Skeleton:
+        """The detector's joints."""
+        ...
 
     def __len__(self) -> int: ...
 

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import DEFAULT_WIDTH_SIGMA, KernelName, in_front, kernel_weight, sigma_px
+from factors import KernelName, in_front, kernel_weight, sigma_px
 from shapepose_fg.camera import Rig
 
 

@@ -1,7 +1,7 @@
 """The whole way: triangulate, vote, propose, associate, refine; frame by frame, refined in batches of frames."""
 
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
@@ -167,7 +167,7 @@ class _Run:
     """What a run notes down for run.json."""
 
     def __init__(self) -> None:
-        self.seconds: Counter[str] = Counter()
+        self.seconds: defaultdict[str, float] = defaultdict(float)
         self.dropped: Counter[str] = Counter()
 
     @contextmanager

@@ -195,7 +195,7 @@ def _support(
     np.put_along_axis(has, chosen, True, axis=1)  # -1 marks the spare last column
     person, edge = np.nonzero(has[:, ends[:, 0]])
     key = person * count + ends[edge, 1]
-    return np.bincount(key, score[edge], len(chosen) * count).reshape(len(chosen), count)
+    return np.bincount(key, score[edge], len(chosen) * count).reshape(len(chosen), count).astype(float)
 
 
 def _choose(
