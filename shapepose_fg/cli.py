@@ -93,10 +93,7 @@ def reconstruct(
         people = run_pipeline(recording, rig, settings, frames=span, progress=progress)
     seconds = time.perf_counter() - start
     inputs = [path for path in (calibration, detections, config, body) if path is not None]
-    people = people.with_run(
-        versions=versions(), inputs=checksums(inputs), frames=[span.start, span.stop], wall_seconds=seconds
-    )
-    people.save(output)
+    people.with_run(inputs=checksums(inputs)).save(output)
     _print(_summary(people, span, len(rig), seconds, output))
 
 

@@ -216,7 +216,7 @@ def _check_rotation(R: NDArray[np.float64], key: str, place: str) -> None:
     if off > _ROTATION_TOLERANCE:
         raise InputError(
             f"{place}: the rotation of {key} is not orthonormal (R Rᵀ is off by {off:.2g});"
-            " give a pure rotation, without scale and not transposed into the translation"
+            " give a pure rotation without scale, row by row"
         )
     if np.linalg.det(R) < 0:
         raise InputError(

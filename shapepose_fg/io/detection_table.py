@@ -36,6 +36,8 @@ class ViewCandidates:
     """(E, 2) candidates (rows of this table) that a limb joins, both in one frame; sorted by frame."""
     affinity: NDArray[np.float64]
     """(E,) how well the image supports the pair."""
+    first_number: int = 0
+    """What the source itself calls its first frame."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +90,11 @@ def assemble(views: Sequence[ViewCandidates], rig: Rig, skeleton: Skeleton) -> D
             raise InputError(
                 f"{view.source} holds {view.frame_count} frames, but {views[0].source} holds"
                 f" {views[0].frame_count}; give the same frames of every camera"
+            )
+        if view.first_number != views[0].first_number:
+            raise InputError(
+                f"{view.source} starts at frame {view.first_number}, but {views[0].source} starts at frame"
+                f" {views[0].first_number}; give the same frames of every camera"
             )
     ideal = [_undistorted(view, camera) for view, camera in zip(views, rig.cameras, strict=True)]
     counts = [len(view.frame) for view in ideal]

@@ -50,7 +50,7 @@ def read_openpose_folder(folder: Path) -> ViewCandidates:
 
     A frame's number is in its file's name. Numbers must follow each other; the first file is frame 0.
     """
-    files = _files(folder)
+    first_number, files = _files(folder)
     people = [_people(file) for file in files]
     counts = np.array([len(each) for each in people], dtype=np.intp)
     keypoints = np.concatenate(people)  # (N, J, 3)
@@ -75,12 +75,13 @@ def read_openpose_folder(folder: Path) -> ViewCandidates:
         joint=joint,
         xy=keypoints[person, joint, :2],
         confidence=np.minimum(score[person, joint], 1.0),
+        first_number=first_number,
         **_pairs(person, joint, person_frame),
     )
 
 
-def _files(folder: Path) -> list[Path]:
-    """The frames' files, in order and without a gap."""
+def _files(folder: Path) -> tuple[int, list[Path]]:
+    """The number of the first frame, and the frames' files, in order and without a gap."""
     numbered = [
         (int(match[1]), file)
         for file in folder.iterdir()
@@ -101,7 +102,7 @@ def _files(folder: Path) -> list[Path]:
                 f"{missing}: this frame is missing, {other.name} comes next; {_CURE}"
                 " (a frame without people has a file too)"
             )
-    return [file for _, file in numbered]
+    return numbered[0][0], [file for _, file in numbered]
 
 
 def _people(file: Path) -> NDArray[np.float64]:

@@ -51,6 +51,8 @@ def _complaint(kind: str, problem: Any) -> str:
         return f"must hold {bound} value{'s' if bound != 1 else ''}, got {len(problem['input'])}"
     if kind == "finite_number":
         return f"must be a finite number, got {got}"
+    if kind == "greater_than":
+        return f"must be greater than {context['gt']}, got {got}"
     if kind == "literal_error":
         return f"must be {context['expected']}, got {got}"
     wanted = _WANTED.get(kind)
