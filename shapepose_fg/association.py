@@ -63,12 +63,12 @@ def associate(
     places = np.full((len(proposals), len(skeleton), 3), np.nan)
     known = proposals.candidate >= 0
     places[known] = candidates.xyz[proposals.candidate[known]]
-    owns = _by_support(proposals, candidates, len(detections))
-    chosen = _choose(places, owns, detections, rig, skeleton, config)
+    nearness = _nearness(places, detections, rig, skeleton, config)
+    chosen = _choose(nearness, _by_support(proposals, candidates, len(detections)), detections, skeleton, config)
     real = _observed_parts(chosen, skeleton) >= config.min_observed_parts
-    places, chosen = places[real], chosen[real]
+    places, chosen, nearness = places[real], chosen[real], nearness.of(real)
     for _ in range(config.passes):
-        chosen = _choose(places, _owned(chosen, len(detections)), detections, rig, skeleton, config)
+        chosen = _choose(nearness, _owned(chosen, len(detections)), detections, skeleton, config)
     seen = chosen >= 0
     observations = Observations(
         xy=np.where(seen[..., None], detections.xy[chosen] if len(detections) > 0 else 0.0, 0.0),
@@ -78,27 +78,76 @@ def associate(
     return observations, int((~real).sum())
 
 
-def _choose(
+@dataclass(frozen=True)
+class _Nearness:
+    """How near D detections are to the projections of P people's joints; it does not change between passes."""
+
+    views: int
+    placed: NDArray[np.bool_]
+    """(P, D) whether it is known where the person's joint of the detection's kind is."""
+    distance_m: NDArray[np.float64]
+    """(P, D) distance from the projection of that joint, as a length at its depth; infinite if not placed."""
+    distance_px: NDArray[np.float64]
+    """(P, D) the same in pixels."""
+    reachable: NDArray[np.bool_]
+    """(P, D) not placed, but within a limb's length of a neighbour on the skeleton that is."""
+
+    def of(self, people: NDArray[np.bool_]) -> "_Nearness":
+        """The nearness for some of the people."""
+        return _Nearness(
+            self.views,
+            self.placed[people],
+            self.distance_m[people],
+            self.distance_px[people],
+            self.reachable[people],
+        )
+
+
+def _nearness(
     places: NDArray[np.float64],
-    owns: NDArray[np.bool_],
     detections: Detections,
     rig: Rig,
     skeleton: Skeleton,
     config: AssociationConfig,
-) -> NDArray[np.intp]:
-    """(P, J, V) detections for people whose joints are at `places` and who are thought to own `owns` (P, D)."""
-    distance_m, distance_px = _distances(places, detections, rig)
+) -> _Nearness:
+    """Compare all detections with the projections of all joints at `places` (P, J, 3)."""
+    xy, depth = rig.project(places)
+    focal = rig.focal_px[detections.view]
+
+    def distance_px(joint: NDArray[np.intp]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        at = (detections.view, slice(None), joint)
+        offset_px = np.hypot(*np.moveaxis(xy[at] - detections.xy[:, None], -1, 0)).T
+        unknown = np.isnan(offset_px)
+        offset_m = np.where(unknown, np.inf, offset_px * depth[at].T / focal)
+        return np.where(unknown, np.inf, offset_px), offset_m
+
+    own_px, own_m = distance_px(detections.joint)
     placed = np.isfinite(places[:, detections.joint, 0])
-    affinity, neighbours = _affinity(owns, detections, skeleton, len(rig))
+    reachable = np.zeros(placed.shape, dtype=bool)
+    if not placed.all():
+        for neighbour in skeleton.tree_neighbours.T:  # a joint has few
+            of_each = neighbour[detections.joint]
+            reachable |= (of_each >= 0) & (distance_px(of_each)[1] < config.reach_m)
+    return _Nearness(len(rig), placed, own_m, own_px, reachable & ~placed)
+
+
+def _choose(
+    nearness: _Nearness,
+    owns: NDArray[np.bool_],
+    detections: Detections,
+    skeleton: Skeleton,
+    config: AssociationConfig,
+) -> NDArray[np.intp]:
+    """(P, J, V) detections for the people who are thought to own `owns` (P, D)."""
+    affinity, neighbours = _affinity(owns, detections, skeleton, nearness.views)
     # Where no neighbour is seen, the affinities say nothing: neither for nor against.
     spoken = np.where(neighbours > 0, affinity, config.least_affinity)
-    score = np.exp(-0.5 * (distance_m / config.near_m) ** 2) + spoken
-    likely = placed & (distance_m < config.far_m) & (score >= 2 * config.least_affinity)
-    reachable = ~placed & _reachable(places, detections, rig, skeleton, config)
-    likely |= reachable & (affinity >= config.least_affinity)
-    chosen = _match(likely, score, detections, (*places.shape[:2], len(rig)))
-    overlap = placed & (distance_px < config.overlap_px) & (affinity >= config.least_affinity)
-    _share(chosen, overlap, distance_px, detections)
+    score = np.exp(-0.5 * (nearness.distance_m / config.near_m) ** 2) + spoken
+    likely = (nearness.distance_m < config.far_m) & (score >= 2 * config.least_affinity)
+    likely |= nearness.reachable & (affinity >= config.least_affinity)
+    chosen = _match(likely, score, detections, (len(owns), len(skeleton), nearness.views))
+    overlap = (nearness.distance_px < config.overlap_px) & (affinity >= config.least_affinity)
+    _share(chosen, overlap, nearness.distance_px, detections)
     return chosen
 
 
@@ -123,36 +172,6 @@ def _by_support(proposals: Proposals, candidates: Candidates, count: int) -> NDA
     owns = np.zeros((len(proposals), count), dtype=bool)
     owns[person, candidates.support[row, 1]] = True
     return owns
-
-
-def _distances(
-    points_world: NDArray[np.float64], detections: Detections, rig: Rig
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(P, D) distance of each detection from the projection of each person's same joint: metres at the joint's
-    depth, and pixels; infinite where the joint is unknown or behind the camera.
-    """
-    xy, depth = rig.project(points_world)
-    at = (detections.view, slice(None), detections.joint)
-    offset_px = np.linalg.norm(xy[at] - detections.xy[:, None], axis=-1).T
-    offset_m = offset_px * depth[at].T / rig.focal_px[detections.view]
-    return np.nan_to_num(offset_m, nan=np.inf), np.nan_to_num(offset_px, nan=np.inf)
-
-
-def _reachable(
-    initial: NDArray[np.float64],
-    detections: Detections,
-    rig: Rig,
-    skeleton: Skeleton,
-    config: AssociationConfig,
-) -> NDArray[np.bool_]:
-    """(P, D) whether a detection is within reach of a known neighbour of its joint."""
-    reachable = np.zeros((len(initial), len(detections)), dtype=bool)
-    for neighbour in skeleton.tree_neighbours.T:  # two or three: a joint has few neighbours
-        exists = neighbour >= 0
-        around = np.where(exists[:, None], initial[:, neighbour], np.nan)
-        distance_m, _ = _distances(around, detections, rig)
-        reachable |= distance_m < config.reach_m
-    return reachable
 
 
 def _affinity(
