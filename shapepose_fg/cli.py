@@ -16,8 +16,10 @@ from shapepose_fg.errors import InputError
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
+    from shapepose_fg.body.fitter import BodyFitter
     from shapepose_fg.camera import Axis
     from shapepose_fg.io.calibration import Unit
+    from shapepose_fg.pipeline import PipelineConfig
     from shapepose_fg.reconstruction import Reconstruction
 
 # Everything else is imported inside the commands: `--help` must not wait for torch.
@@ -31,7 +33,7 @@ app = typer.Typer(
 evaluate = typer.Typer(help="Score a reconstruction against an annotation.")
 app.add_typer(evaluate, name="evaluate")
 
-_UsageProblem = typer.BadParameter.__mro__[2]
+_UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
 """What typer raises for a wrong command line; older and newer versions keep the class in different places."""
 
 
@@ -78,7 +80,7 @@ def reconstruct(
     from shapepose_fg.io.calibration import read_rig
     from shapepose_fg.io.config import read_config
     from shapepose_fg.io.detections import read_detections
-    from shapepose_fg.provenance import checksums, versions
+    from shapepose_fg.provenance import checksums
 
     rig = read_rig(calibration, up=cast("Axis | None", up), unit=cast("Unit | None", unit))
     recording = read_detections(detections, rig)
@@ -90,7 +92,9 @@ def reconstruct(
     settings = PipelineConfig() if config is None else read_config(config, PipelineConfig)
     start = time.perf_counter()
     with _progress("reconstructing") as progress:
-        people = run_pipeline(recording, rig, settings, frames=span, progress=progress)
+        people = run_pipeline(
+            recording, rig, settings, frames=span, fitter=_fitter(body, settings), progress=progress
+        )
     seconds = time.perf_counter() - start
     inputs = [path for path in (calibration, detections, config, body) if path is not None]
     people.with_run(inputs=checksums(inputs)).save(output)
@@ -169,6 +173,16 @@ def _prepare(output: Path) -> None:
         ) from None
 
 
+def _fitter(body: Path | None, settings: "PipelineConfig") -> "BodyFitter | None":
+    """The body fitter with the model of the file `body`; without one, the pipeline takes its own."""
+    if body is None:
+        return None
+    from shapepose_fg.body.baseline import LevenbergMarquardtFitter
+    from shapepose_fg.body.model import BodyModel
+
+    return LevenbergMarquardtFitter(BodyModel.load(body), config=settings.body)
+
+
 @contextmanager
 def _progress(what: str) -> Iterator[Callable[[int, int], None]]:
     """A progress bar on stderr while the block runs: a function of frames done and frames in all.
@@ -211,9 +225,11 @@ def _summary(
     known = np.isfinite(people.joints).all(axis=2)
     if len(people) > 0:
         table.add_row("joints", f"{100 * known.mean():.1f} % placed{_spread(people, known)}")
-    table.add_row("time", f"{1e3 * seconds / len(span):.1f} ms a frame, {seconds:.1f} s in all")
-    for stage, spent in people.run.get("seconds", {}).items():
-        table.add_row("", f"{1e3 * spent / len(span):.1f} ms {stage}", style="dim")
+    # Loading torch and the body takes a second or two, once; it says nothing about the time of a frame.
+    stages = {name: spent for name, spent in people.run.get("seconds", {}).items() if name != "load"}
+    per_stage = "  ".join(f"{name} {1e3 * spent / len(span):.1f}" for name, spent in stages.items())
+    table.add_row("time", f"{1e3 * sum(stages.values()) / len(span):.1f} ms a frame, {seconds:.1f} s in all")
+    table.add_row("", per_stage, style="dim")
     table.add_row("written", str(output / "people.npz"))
     table.add_row("", str(output / "run.json"))
     return table
