@@ -5,13 +5,14 @@ No precision: not everyone in view is annotated, so a prediction without an anno
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
 from shapepose_fg.errors import InputError
+from shapepose_fg.evaluation.matching import People
 from shapepose_fg.evaluation.shelf_ground_truth import (
     ShelfGroundTruth,
     read_shelf_ground_truth,
@@ -44,20 +45,6 @@ RECALL_M = 0.2
 """A joint is recalled when it is at most this far from the annotated one, metres."""
 
 _A, _B = np.array(LIMBS).T
-
-
-class People(Protocol):
-    """What is scored: a `Reconstruction`, or anything with its two arrays."""
-
-    @property
-    def frame(self) -> NDArray[np.integer]:
-        """(N,) frame of each row."""
-        ...
-
-    @property
-    def joints(self) -> NDArray[np.floating]:
-        """(N, 25, 3) BODY_25 joints of each row, metres, NaN where unknown."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -211,8 +198,7 @@ def _frames_run(people: People) -> Iterable[int] | None:
     if span is None:
         return None
     try:
-        start, stop = span
-        return range(int(start), int(stop))
+        return range(*(int(bound) for bound in span))
     except (TypeError, ValueError):
         raise InputError(f'run.json: "frames" must be [start, stop], got {span!r}; restore the file') from None
 

@@ -9,6 +9,7 @@ from factors import (
     gaussian,
     isotropic,
     isotropic_models,
+    kernel_weight,
     robust_kernel,
     sigma_px,
 )
@@ -134,3 +135,13 @@ def _at(point):
     values = gtsam.Values()
     values.insert(1, point)
     return values
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_kernel_weights_for_arrays_are_those_of_gtsam(name):
+    norms = np.linspace(0.0, 12.0, 60)
+    for width in (None, 0.8):
+        kernel = robust_kernel(name, width)
+        expected = [kernel.weight(norm) for norm in norms]
+        np.testing.assert_allclose(kernel_weight(name, norms, width), expected, rtol=1e-12, atol=1e-15)
+    assert kernel_weight(None, norms).tolist() == [1.0] * 60

@@ -1,0 +1,215 @@
+"""How good joints are against a known truth: precision, recall, MPJPE, people found, honest covariances."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.table import Table
+from scipy.special import gammaincinv
+
+from shapepose_fg.evaluation.matching import People, match_people
+
+CORRECT_M = 0.2
+"""A joint is correct if it is at most this far from the true one (the protocol of Zhang et al.), metres."""
+
+COVERAGE_LEVELS = (0.5, 0.9, 0.95)
+"""The levels at which `covariance_calibration` asks how many truths lie inside the ellipsoid."""
+
+
+@dataclass(frozen=True)
+class JointMetrics:
+    """What `joint_metrics` found; counts of joints and of people are over all frames."""
+
+    joints_correct: int
+    """Predicted joints within 0.2 m of the true joint of the person they are matched with."""
+    joints_predicted: int
+    """Predicted joints, of people who are nobody too."""
+    joints_true: int
+    """Joints that the truth knows."""
+    mpjpe_mm: float
+    """Mean distance of the joints of matched people, near or far, millimetres; NaN if there are none."""
+    people_true: int
+    """People who were there."""
+    people_found: int
+    """People whom a prediction is (mean joint distance under 0.5 m)."""
+    people_duplicated: int
+    """Further predictions of people who were found already."""
+    people_invented: int
+    """Predictions that are nobody."""
+
+    @property
+    def precision(self) -> float:
+        """Share of the predicted joints that are correct; NaN if none was predicted."""
+        return _share(self.joints_correct, self.joints_predicted)
+
+    @property
+    def recall(self) -> float:
+        """Share of the true joints that were predicted correctly; NaN if there are none."""
+        return _share(self.joints_correct, self.joints_true)
+
+    @property
+    def f1(self) -> float:
+        """Harmonic mean of precision and recall."""
+        return _share(2 * self.joints_correct, self.joints_predicted + self.joints_true)
+
+    @property
+    def people_missed(self) -> int:
+        """People whom no prediction is."""
+        return self.people_true - self.people_found
+
+    @property
+    def everyone_once(self) -> bool:
+        """Whether every person was found in every frame, exactly once, and nobody else."""
+        return self.people_missed == self.people_duplicated == self.people_invented == 0
+
+    def as_dict(self) -> dict[str, Any]:
+        """The figures under plain names, for JSON; None where there is nothing to measure."""
+        figures = {
+            "precision": self.precision,
+            "recall": self.recall,
+            "f1": self.f1,
+            "mpjpe_mm": self.mpjpe_mm,
+        }
+        counts = {
+            "people": self.people_true,
+            "people_found": self.people_found,
+            "people_missed": self.people_missed,
+            "people_duplicated": self.people_duplicated,
+            "people_invented": self.people_invented,
+        }
+        return {name: value if np.isfinite(value) else None for name, value in figures.items()} | counts
+
+    def table(self, title: str = "Joints against the truth") -> Table:
+        """The figures for a terminal."""
+        table = Table(title=title, show_header=False)
+        table.add_column("figure")
+        table.add_column("value", justify="right")
+        table.add_row("precision at 0.2 m", _cell(100 * self.precision, " %"))
+        table.add_row("recall at 0.2 m", _cell(100 * self.recall, " %"))
+        table.add_row("F1", _cell(100 * self.f1, " %"))
+        table.add_row("MPJPE", _cell(self.mpjpe_mm, " mm"))
+        table.add_section()
+        table.add_row("people found", f"{self.people_found} of {self.people_true}")
+        table.add_row("found twice", str(self.people_duplicated))
+        table.add_row("invented", str(self.people_invented))
+        return table
+
+
+def joint_metrics(
+    predicted: People | Sequence[NDArray[np.floating]],
+    truth: NDArray[np.floating],
+    frames: Sequence[int] | range | None = None,
+    *,
+    correct_m: float = CORRECT_M,
+) -> JointMetrics:
+    """Compare predictions with the `truth` (T, P, J, 3), metres, NaN where a person or joint is absent.
+
+    `predicted` is a `Reconstruction`, or one array (P_t, J, 3) for each frame; NaN joints are missing. `frames`
+    (T,) says which frame numbers of a `Reconstruction` the truth has, 0 to T - 1 by default; other frames are
+    not scored. People are matched by `match_people`. A predicted joint that the truth does not know counts
+    neither way.
+    """
+    truth = np.asarray(truth, dtype=np.float64)
+    if isinstance(predicted, Sequence):
+        frame, joints = _rows(predicted, truth)
+        matches = match_people(frame, joints, truth)
+    else:
+        joints = np.asarray(predicted.joints, dtype=np.float64)
+        matches = match_people(predicted.frame, joints, truth, frames)
+    true_known = np.isfinite(truth.sum(axis=3))
+    distance = np.linalg.norm(joints[matches.row] - truth[matches.frame, matches.person], axis=2)
+    both = np.isfinite(distance)
+    strangers = np.concatenate([matches.duplicated, matches.invented])
+    return JointMetrics(
+        joints_correct=int((distance <= correct_m).sum()),
+        joints_predicted=int(both.sum() + np.isfinite(joints[strangers]).all(axis=2).sum()),
+        joints_true=int(true_known.sum()),
+        mpjpe_mm=1e3 * float(distance[both].mean()) if both.any() else float("nan"),
+        people_true=int(true_known.any(axis=2).sum()),
+        people_found=len(matches.row),
+        people_duplicated=len(matches.duplicated),
+        people_invented=len(matches.invented),
+    )
+
+
+@dataclass(frozen=True)
+class CovarianceCalibration:
+    """Whether covariances say how far the joints really are from the truth."""
+
+    nees: NDArray[np.float64]
+    """(M,) normalised estimation error squared e^T C^-1 e of each joint: chi-squared with 3 degrees of freedom
+    if the covariances are true."""
+    coverage: dict[float, float]
+    """Share of the truths inside the ellipsoid that should hold 50, 90 and 95 % of them."""
+
+    @property
+    def mean_nees(self) -> float:
+        """3 if the covariances are true; more if they promise too much; NaN without joints."""
+        return float(self.nees.mean()) if len(self.nees) else float("nan")
+
+    @property
+    def median_nees(self) -> float:
+        """2.37 if the covariances are true; does not see outliers."""
+        return float(np.median(self.nees)) if len(self.nees) else float("nan")
+
+    def table(self, title: str = "Covariances against the truth") -> Table:
+        """The figures for a terminal."""
+        table = Table(title=title)
+        for heading in ("figure", "measured", "if true"):
+            table.add_column(heading, justify="left" if heading == "figure" else "right")
+        table.add_row("joints", str(len(self.nees)), "")
+        table.add_row("mean NEES", _cell(self.mean_nees), "3.00")
+        table.add_row("median NEES", _cell(self.median_nees), f"{_chi_squared_3(0.5):.2f}")
+        for level, share in self.coverage.items():
+            table.add_row(
+                f"inside the {100 * level:.0f} % ellipsoid", _cell(100 * share, " %"), f"{100 * level:.0f} %"
+            )
+        return table
+
+
+def covariance_calibration(
+    errors: NDArray[np.floating], covariances: NDArray[np.floating]
+) -> CovarianceCalibration:
+    """Compare `errors` (..., 3), metres, with the `covariances` (..., 3, 3), m², that came with them.
+
+    Pairs with NaN are left out. ValueError for a covariance that is not positive definite.
+    """
+    error = np.asarray(errors, dtype=np.float64).reshape(-1, 3)
+    covariance = np.asarray(covariances, dtype=np.float64).reshape(-1, 3, 3)
+    if len(error) != len(covariance):
+        raise ValueError(f"one covariance for each error: got {len(covariance)} for {len(error)}")
+    finite = np.isfinite(error).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
+    error, covariance = error[finite], covariance[finite]
+    try:
+        root = np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        raise ValueError("a covariance is not positive definite") from None
+    nees = np.sum(np.linalg.solve(root, error[..., None])[..., 0] ** 2, axis=1)
+    inside = {level: _share((nees <= _chi_squared_3(level)).sum(), len(nees)) for level in COVERAGE_LEVELS}
+    return CovarianceCalibration(nees, inside)
+
+
+def _rows(
+    predicted: Sequence[NDArray[np.floating]], truth: NDArray[np.float64]
+) -> tuple[NDArray[np.integer], NDArray[np.float64]]:
+    """Frame (N,) and joints (N, J, 3) of one array of people for each frame."""
+    if len(predicted) != len(truth):
+        raise ValueError(f"give one array for each of the {len(truth)} frames of the truth, got {len(predicted)}")
+    parts = [np.asarray(part, dtype=np.float64) for part in predicted]
+    frame = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    return frame, np.concatenate([np.zeros((0, *truth.shape[2:])), *parts])
+
+
+def _chi_squared_3(level: float) -> float:
+    """What a chi-squared variable with 3 degrees of freedom is under with probability `level`."""
+    return float(2 * gammaincinv(1.5, level))
+
+
+def _share(part: float, whole: float) -> float:
+    return float(part / whole) if whole > 0 else float("nan")
+
+
+def _cell(value: float, unit: str = "") -> str:
+    return f"{value:.2f}{unit}" if np.isfinite(value) else "-"

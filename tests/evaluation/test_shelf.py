@@ -1,0 +1,360 @@
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from shapepose_fg.errors import InputError
+from shapepose_fg.evaluation.shelf import (
+    LIMB_NAMES,
+    LIMBS,
+    ShelfGroundTruth,
+    evaluate_shelf,
+    read_shelf_ground_truth,
+    shelf_joints,
+)
+from shapepose_fg.evaluation.shelf_ground_truth import SHELF_JOINTS
+from shapepose_fg.skeleton import BODY_25
+
+UPRIGHT = dict(
+    RAnkle=(0.09, 0, 0.1),
+    RKnee=(0.09, 0, 0.5),
+    RHip=(0.09, 0, 0.9),
+    LHip=(-0.09, 0, 0.9),
+    LKnee=(-0.09, 0, 0.5),
+    LAnkle=(-0.09, 0, 0.1),
+    RWrist=(0.2, 0, 0.9),
+    RElbow=(0.2, 0, 1.15),
+    RShoulder=(0.2, 0, 1.4),
+    LShoulder=(-0.2, 0, 1.4),
+    LElbow=(-0.2, 0, 1.15),
+    LWrist=(-0.2, 0, 0.9),
+    Neck=(0, 0, 1.4),
+    MidHip=(0, 0, 0.9),
+    REar=(0.07, 0, 1.6),
+    LEar=(-0.07, 0, 1.6),
+)
+"""Someone who stands upright at the origin and faces +y (right is +x): head and limbs of known lengths."""
+
+
+def upright(*at):
+    """(1, 25, 3) the upright person at a place; what the protocol does not use is unknown."""
+    joints = np.full((1, 25, 3), np.nan)
+    for name, xyz in UPRIGHT.items():
+        joints[0, BODY_25.index(name)] = np.add(xyz, at)
+    return joints
+
+
+def people(*rows, frame=None, **more):
+    joints = np.concatenate(rows) if rows else np.zeros((0, 25, 3))
+    return SimpleNamespace(
+        frame=np.zeros(len(joints), int) if frame is None else np.array(frame), joints=joints, **more
+    )
+
+
+def annotated(*rows, actor=None, frame=None, frame_count=10):
+    joints = shelf_joints(np.concatenate(rows))
+    count = len(joints)
+    return ShelfGroundTruth(
+        np.zeros(count, int) if frame is None else np.array(frame),
+        np.arange(count) if actor is None else np.array(actor),
+        joints,
+        frame_count,
+    )
+
+
+HERE, THERE = (0.0, 0, 0), (3.0, 0, 0)
+
+
+def test_the_mapping_by_hand():
+    mapped = dict(zip(SHELF_JOINTS, shelf_joints(upright(*HERE))[0], strict=True))
+    for name in SHELF_JOINTS[:12]:
+        np.testing.assert_allclose(mapped[name], UPRIGHT[name])
+    np.testing.assert_allclose(mapped["MidHip"], UPRIGHT["MidHip"])
+    # Half way from the shoulders (1.4) to the ears (1.6), then 12.5 cm forward (+y) and 14.5 cm up.
+    np.testing.assert_allclose(mapped["Neck"], [0, 0, 1.5], atol=1e-12)
+    np.testing.assert_allclose(mapped["HeadTop"], [0, 0.125, 1.645], atol=1e-12)
+
+
+@pytest.mark.parametrize("lost", ["REar", "LEar"])
+def test_one_ear_is_mirrored_in_the_middle_of_the_shoulders(lost):
+    joints = upright(*HERE)
+    joints[0, BODY_25.index(lost)] = np.nan
+    np.testing.assert_allclose(shelf_joints(joints), shelf_joints(upright(*HERE)), atol=1e-12)
+
+
+def test_what_is_unknown_stays_unknown():
+    joints = upright(*HERE)
+    joints[0, [BODY_25.index("REar"), BODY_25.index("LEar"), BODY_25.index("RWrist")]] = np.nan
+    unknown = np.isnan(shelf_joints(joints)[0]).any(axis=1)
+    assert [name for name, u in zip(SHELF_JOINTS, unknown, strict=True) if u] == ["RWrist", "Neck", "HeadTop"]
+    with pytest.raises(ValueError, match=r"\(N, 25, 3\)"):
+        shelf_joints(np.zeros((1, 17, 3)))
+    assert shelf_joints(np.zeros((0, 25, 3))).shape == (0, 15, 3)
+
+
+def test_perfect_is_exactly_100():
+    score = evaluate_shelf(people(upright(*HERE), upright(*THERE)), annotated(upright(*HERE), upright(*THERE)))
+    assert score.pcp[:2].tolist() == [100.0, 100.0]
+    assert np.isnan(score.pcp[2])
+    assert score.pcp_average == score.pcp_pooled == 100.0
+    assert score.mpjpe_mm == 0.0
+    assert score.recall == 1.0
+    assert (score.people_found, score.people, score.frames) == (2, 2, 1)
+
+
+def test_one_limb_wrong_by_hand():
+    """The right wrist 26 cm off: the lower arm is 25 cm long, half of it 12.5 cm, the mean error 13 cm."""
+    predicted = upright(*HERE)
+    predicted[0, BODY_25.index("RWrist"), 1] += 0.26
+    score = evaluate_shelf(people(predicted), annotated(upright(*HERE)))
+    wrong = np.flatnonzero(score.limbs_right[0] == 0)
+    assert [LIMB_NAMES[i] for i in wrong] == ["right lower arm"]
+    assert score.pcp[0] == pytest.approx(90.0)
+    assert score.recall == pytest.approx(14 / 15)
+    assert score.mpjpe_mm == pytest.approx(260 / 15)
+
+
+def test_a_limb_at_the_bound_is_right():
+    """24 cm: a mean error of 12 cm against 12.5 cm."""
+    predicted = upright(*HERE)
+    predicted[0, BODY_25.index("RWrist"), 1] += 0.24
+    assert evaluate_shelf(people(predicted), annotated(upright(*HERE))).pcp[0] == 100.0
+
+
+def test_both_ends_share_the_error():
+    """Elbow and wrist both 12 cm off: the lower arm's mean is 12 cm; the upper arm's only 6 cm."""
+    predicted = upright(*HERE)
+    predicted[0, [BODY_25.index("RWrist"), BODY_25.index("RElbow")], 1] += 0.12
+    assert evaluate_shelf(people(predicted), annotated(upright(*HERE))).pcp[0] == 100.0
+    predicted[0, [BODY_25.index("RWrist"), BODY_25.index("RElbow")], 1] += 0.01
+    assert evaluate_shelf(people(predicted), annotated(upright(*HERE))).pcp[0] == pytest.approx(90.0)
+
+
+def test_left_and_right_swapped_by_hand():
+    """Arms are 40 cm apart: all four arm limbs wrong (25 cm long). Legs 18 cm apart against half of 40: right.
+
+    The head goes wrong too: forward becomes backward, so that HeadTop is 25 cm off, 12.5 cm in the mean,
+    against half of |(0.125, 0.145)| = 9.6 cm.
+    """
+    score = evaluate_shelf(people(upright(*HERE)[:, list(BODY_25.mirror)]), annotated(upright(*HERE)))
+    wrong = {LIMB_NAMES[i] for i in np.flatnonzero(score.limbs_right[0] == 0)}
+    assert wrong == {"left upper arm", "right upper arm", "left lower arm", "right lower arm", "head"}
+    assert score.pcp[0] == pytest.approx(50.0)
+    # 6 arm joints 40 cm, 6 leg joints 18 cm, HeadTop 25 cm, Neck and MidHip none.
+    assert score.mpjpe_mm == pytest.approx((6 * 400 + 6 * 180 + 250) / 15)
+    assert score.recall == pytest.approx(8 / 15)
+
+
+def test_a_missing_joint_makes_its_limbs_wrong():
+    """Without the right elbow both limbs of the arm are wrong; the joint is not recalled and not in MPJPE."""
+    predicted = upright(*HERE)
+    predicted[0, BODY_25.index("RElbow")] = np.nan
+    score = evaluate_shelf(people(predicted), annotated(upright(*HERE)))
+    wrong = {LIMB_NAMES[i] for i in np.flatnonzero(score.limbs_right[0] == 0)}
+    assert wrong == {"right upper arm", "right lower arm"}
+    assert score.pcp[0] == pytest.approx(80.0)
+    assert score.recall == pytest.approx(14 / 15)
+    assert score.mpjpe_mm == 0.0
+
+
+def test_a_missing_joint_counts_half_a_metre_in_the_choice():
+    """One elbow missing costs 0.5 / 15 = 33 mm in the mean: a complete one 30 mm off wins, 40 mm off loses."""
+    holey = upright(*HERE)
+    holey[0, BODY_25.index("RElbow")] = np.nan
+    truth = annotated(upright(*HERE))
+    assert evaluate_shelf(people(holey, upright(0, 0, 0.030)), truth).mpjpe_mm == pytest.approx(30.0)
+    assert evaluate_shelf(people(holey, upright(0, 0, 0.040)), truth).mpjpe_mm == 0.0
+
+
+def test_sharing_is_allowed_and_extra_people_cost_nothing():
+    truth = annotated(upright(*HERE), upright(0, 0.05, 0))
+    score = evaluate_shelf(people(upright(*HERE), upright(*THERE), upright(9, 9, 9)), truth)
+    assert score.pcp[:2].tolist() == [100.0, 100.0]
+    assert score.mpjpe_mm == pytest.approx(25.0)
+
+
+def test_nobody_there():
+    """One of two people is predicted, the other takes the far prediction: no limb, no joint, not found."""
+    score = evaluate_shelf(people(upright(*HERE)), annotated(upright(*HERE), upright(*THERE)))
+    assert score.pcp[:2].tolist() == [100.0, 0.0]
+    assert score.pcp_average == score.pcp_pooled == 50.0
+    assert (score.people_found, score.people) == (1, 2)
+    assert score.recall == 0.5
+    assert score.mpjpe_mm == 0.0
+
+    score = evaluate_shelf(people(), annotated(upright(*HERE)))
+    assert score.pcp[0] == score.recall == 0.0
+    assert np.isnan(score.mpjpe_mm)
+    assert score.as_dict()["mpjpe_mm"] is None
+
+
+def test_average_is_over_actors_and_pooled_over_limbs():
+    """Actor 1 in three frames, all right; actor 3 in one, all wrong."""
+    truth = annotated(
+        *[upright(*HERE)] * 3, upright(*THERE), upright(5, 0, 0), actor=[0, 0, 0, 2, 3], frame=[0, 1, 2, 2, 2]
+    )
+    score = evaluate_shelf(people(*[upright(*HERE)] * 3, frame=[0, 1, 2]), truth)
+    assert score.pcp[[0, 2]].tolist() == [100.0, 0.0]
+    assert score.pcp_average == 50.0
+    assert score.pcp_pooled == 75.0
+    assert score.people == 4  # id 3 is not scored
+
+
+def test_predictions_of_other_frames_are_not_taken():
+    truth = annotated(upright(*HERE), upright(*HERE), actor=[0, 0], frame=[3, 4])
+    assert evaluate_shelf(people(upright(*HERE), frame=[3]), truth).pcp[0] == 50.0
+
+
+def test_only_reconstructed_frames_are_scored_if_the_run_says_which():
+    truth = annotated(*[upright(*HERE)] * 3, actor=[0, 0, 0], frame=[2, 3, 7])
+    part = people(upright(*HERE), frame=[3], run={"frames": [3, 6]})
+    score = evaluate_shelf(part, truth)
+    assert (score.frames, score.frames_annotated, score.pcp[0]) == (1, 3, 100.0)
+    assert evaluate_shelf(part, truth, frames=range(10)).pcp[0] == pytest.approx(100 / 3)
+    assert evaluate_shelf(people(upright(*HERE), frame=[3], run={}), truth).pcp[0] == pytest.approx(100 / 3)
+    with pytest.raises(InputError, match="2-3, 7"):
+        evaluate_shelf(part, truth, frames=[5])
+    with pytest.raises(InputError, match=r"run\.json"):
+        evaluate_shelf(people(upright(*HERE), run={"frames": "all"}), truth)
+
+
+def test_other_joints_than_body_25_are_refused():
+    names = [*BODY_25.joints[1:], BODY_25.joints[0]]
+    with pytest.raises(InputError, match="BODY_25"):
+        evaluate_shelf(people(upright(*HERE), joint_names=names), annotated(upright(*HERE)))
+
+
+def test_figures_for_json_and_for_a_terminal():
+    predicted = upright(*HERE)
+    predicted[0, BODY_25.index("RWrist"), 1] += 0.26
+    score = evaluate_shelf(people(predicted), annotated(upright(*HERE)))
+    figures = score.as_dict()
+    assert figures["pcp_actor"] == {"actor 1": pytest.approx(90.0), "actor 2": None, "actor 3": None}
+    assert figures["pcp_limb"]["actor 1"]["right lower arm"] == 0.0
+    assert (figures["limbs_right"], figures["limbs"]) == (9, 10)
+    console = Console(width=100)
+    with console.capture() as capture:
+        console.print(score.table())
+    assert "90.00" in capture.get()
+    assert "17.33 mm" in capture.get()
+
+
+FILE = """15\t3
+1
+2
+{row}
+{row}
+{row}
+{row}
+0
+2
+0
+{row}
+{row}
+{row}
+{row}
+3
+{row}
+{row}
+{row}
+{row}
+""".format(row=" ".join(str(i / 10) for i in range(15)))
+
+
+def test_reading_a_small_file(tmp_path):
+    path = tmp_path / "gt.txt"
+    path.write_text(FILE)
+    truth = read_shelf_ground_truth(path)
+    assert truth.frame.tolist() == [0, 2, 2]
+    assert truth.actor.tolist() == [2, 0, 3]
+    assert truth.frame_count == 3
+    np.testing.assert_allclose(truth.joints[1, 4], [0.4, 0.4, 0.4])
+
+
+LINES = FILE.splitlines()
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        (["17 3", *LINES[1:]], "line 1 must say 15 joints"),
+        (["15", *LINES[1:]], "line 1 must hold the number of joints and of frames, got 1 values"),
+        (LINES[:5], "ends after line 5, before 15 values of z in frame 0"),
+        (LINES[:8], "ends after line 8, before the number of people in frame 2"),
+        ([*LINES[:2], "two", *LINES[3:]], "line 3 must hold a person's id in frame 0, got 'two'"),
+        ([*LINES[:3], LINES[3] + " 1", *LINES[4:]], "line 4 must hold 15 values of x in frame 0, got 16"),
+        ([*LINES[:3], LINES[3].replace("0.3", "nan"), *LINES[4:]], "line 4 .* finite"),
+        ([*LINES[:3], LINES[3].replace("0.3", "0,3"), *LINES[4:]], "line 4 .* finite"),
+        ([*LINES[:1], "-1", *LINES[2:]], "line 2 must be the number of people in frame 0, got -1"),
+        ([*LINES[:1], "1e3", *LINES[2:]], "line 2 must hold the number of people"),
+        ([*LINES[:1], "99999999999", *LINES[2:]], "line 2 must be the number of people"),
+        ([*LINES[:14], "0", *LINES[15:]], "line 15 gives the id 0 in frame 2"),
+        ([*LINES, "1"], "line 20 goes on after the 3 frames"),
+    ],
+)
+def test_a_broken_file_is_one_clear_sentence(tmp_path, lines, message):
+    path = tmp_path / "gt.txt"
+    path.write_text("\n".join(lines))
+    with pytest.raises(InputError, match=message) as caught:
+        read_shelf_ground_truth(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_no_file_and_no_text(tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        read_shelf_ground_truth(tmp_path / "gt.txt")
+    (tmp_path / "gt.txt").write_bytes(b"\xff\xfe\x00\x80")
+    with pytest.raises(InputError, match=r"gt\.txt"):
+        read_shelf_ground_truth(tmp_path / "gt.txt")
+
+
+def test_limbs_join_the_joints_that_their_names_say():
+    named = {name: {SHELF_JOINTS[a], SHELF_JOINTS[b]} for name, (a, b) in zip(LIMB_NAMES, LIMBS, strict=True)}
+    assert named["left upper arm"] == {"LShoulder", "LElbow"}
+    assert named["right upper arm"] == {"RShoulder", "RElbow"}
+    assert named["left lower arm"] == {"LElbow", "LWrist"}
+    assert named["right lower arm"] == {"RElbow", "RWrist"}
+    assert named["left upper leg"] == {"LHip", "LKnee"}
+    assert named["right upper leg"] == {"RHip", "RKnee"}
+    assert named["left lower leg"] == {"LKnee", "LAnkle"}
+    assert named["right lower leg"] == {"RKnee", "RAnkle"}
+    assert named["head"] == {"Neck", "HeadTop"}
+    assert named["torso"] == {"Neck", "MidHip"}
+
+
+@pytest.fixture(scope="module")
+def shelf(shared_data):
+    return read_shelf_ground_truth(shared_data / "shelf" / "gt_dev.txt")
+
+
+def test_the_real_annotation(shelf):
+    assert shelf.frame_count == 301
+    assert np.bincount(shelf.actor).tolist() == [131, 19, 93, 11]
+    assert np.unique(shelf.frame).tolist() == [*range(101), *range(216, 231), *range(270, 285)]
+    assert np.isfinite(shelf.joints).all()
+    # People: lower legs of 30 to 60 cm, in a room of a few metres, standing on the floor z = 0.
+    shin = np.linalg.norm(shelf.joints[:, 0] - shelf.joints[:, 1], axis=1)
+    assert 0.3 < shin.min() < shin.max() < 0.6
+    assert np.abs(shelf.joints[..., 2].min()) < 0.2
+
+
+def test_the_real_annotation_against_itself(shelf):
+    """Ears put where they give the annotated Neck: all limbs but heads are exact, heads depend on the mapping."""
+    body25 = np.full((len(shelf.frame), 25, 3), np.nan)
+    for i, name in enumerate(SHELF_JOINTS[:12]):
+        body25[:, BODY_25.index(name)] = shelf.joints[:, i]
+    body25[:, BODY_25.index("MidHip")] = shelf.joints[:, 14]
+    body25[:, BODY_25.index("Neck")] = shelf.joints[:, 12]
+    shoulders = shelf.joints[:, 8:10].mean(axis=1)
+    for ear in ("REar", "LEar"):
+        body25[:, BODY_25.index(ear)] = shoulders + 2 * (shelf.joints[:, 12] - shoulders)
+    score = evaluate_shelf(SimpleNamespace(frame=shelf.frame, joints=body25), shelf)
+    assert score.people == score.people_found == 131 + 19 + 93
+    assert score.limbs_all.sum(axis=1).tolist() == [1310, 190, 930]
+    no_head = np.array(LIMB_NAMES) != "head"
+    np.testing.assert_array_equal(score.limbs_right[:, no_head], score.limbs_all[:, no_head])
+    # The annotated head differs from the fixed mapping by 5 to 10 cm; nine in ten are within half its length.
+    assert score.limbs_right[:, ~no_head].sum() > 0.9 * score.people
+    assert score.recall == 1.0
