@@ -1,9 +1,26 @@
-"""Shared fixtures: where the real recordings are, if they are."""
+"""Shared fixtures: where the real recordings are, cameras around a room, and people seen without error."""
 
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
+
+from shapepose_fg.camera import Rig
+from shapepose_fg.detections import Detections
+from shapepose_fg.skeleton import BODY_25, Skeleton
+
+# A person who stands with the arms a little out: BODY_25, metres, x to their left, z up, facing -y.
+STANDING = np.array(
+    [
+        [0, -0.1, 1.55], [0, 0, 1.42], [-0.18, 0, 1.40], [-0.35, 0, 1.15], [-0.45, -0.1, 0.95],
+        [0.18, 0, 1.40], [0.35, 0, 1.15], [0.45, -0.1, 0.95], [0, 0, 0.92], [-0.1, 0, 0.92],
+        [-0.11, -0.02, 0.5], [-0.12, 0.03, 0.08], [0.1, 0, 0.92], [0.11, -0.02, 0.5], [0.12, 0.03, 0.08],
+        [-0.03, -0.09, 1.59], [0.03, -0.09, 1.59], [-0.07, 0, 1.57], [0.07, 0, 1.57], [0.14, -0.15, 0.02],
+        [0.19, -0.12, 0.02], [0.12, 0.08, 0.03], [-0.14, -0.15, 0.02], [-0.19, -0.12, 0.02], [-0.12, 0.08, 0.03],
+    ]
+)  # fmt: skip
 
 
 @pytest.fixture(scope="session")
@@ -13,3 +30,42 @@ def shared_data() -> Path:
     if not (root / "data").is_dir():
         pytest.skip(f"no real recordings at {root}: set SHAPEPOSE_DATA to their folder to run this test")
     return root / "data"
+
+
+@pytest.fixture(scope="session")
+def five_cameras() -> Rig:
+    """Five cameras around the origin, 3 to 4 m away."""
+    from shapepose_fg.simulation.scene import ring_of_cameras
+
+    return ring_of_cameras(5, np.random.default_rng(0))
+
+
+@pytest.fixture(scope="session")
+def two_people() -> NDArray[np.float64]:
+    """(2, 25, 3) two people 0.9 m apart, who face different ways."""
+    turn = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    return np.stack([STANDING + [-0.45, 0.0, 0.0], STANDING @ turn + [0.45, 0.1, 0.0]])
+
+
+@pytest.fixture(scope="session")
+def seen_exactly():
+    """A function (rig, people (P, J, 3)) -> Detections: every joint in every view, affinities 0.9 and 0."""
+    return detect_exactly
+
+
+def detect_exactly(rig: Rig, people: NDArray[np.float64], skeleton: Skeleton = BODY_25) -> Detections:
+    """Every joint of every person in every view where it is, confidence 0.8; candidates in random order."""
+    xy, _ = rig.project(people)
+    view, person, joint = (index.ravel() for index in np.indices(xy.shape[:3]))
+    order = np.random.default_rng(0).permutation(len(view))
+    place = np.argsort(order).reshape(xy.shape[:3])
+    first, second = np.array(skeleton.limbs).T
+    pairs = np.stack([place[:, :, first], place[:, :, second]], axis=-1).reshape(-1, 2)
+    return Detections(
+        view[order],
+        joint[order],
+        xy.reshape(-1, 2)[order],
+        np.full(len(view), 0.8),
+        pairs,
+        np.full(len(pairs), 0.9),
+    )

@@ -1,0 +1,94 @@
+import cv2
+import numpy as np
+import pytest
+
+from shapepose_fg.camera import Camera, Rig
+
+K = np.array([[1000.0, 2.0, 500.0], [0.0, 1010.0, 400.0], [0.0, 0.0, 1.0]])
+LENS = np.array([-0.3, 0.1, 0.001, -0.002, 0.02])
+
+
+def posed(name: str = "a", lens: np.ndarray = LENS) -> Camera:
+    R, _ = cv2.Rodrigues(np.array([0.3, -0.5, 0.2]))
+    return Camera.from_camera_from_world(name, K, np.hstack([R, [[0.1], [0.2], [4.0]]]), (1000, 800), list(lens))
+
+
+def test_projects_like_opencv():
+    camera = posed()
+    points = np.random.default_rng(0).uniform(-1, 1, (40, 3))
+    xy, depth = camera.project(points)
+    rotation, _ = cv2.Rodrigues(camera.cTw[:, :3])
+    # OpenCV's projectPoints has no skew, so the skew's part is added by hand.
+    without_skew = K.copy()
+    without_skew[0, 1] = 0.0
+    expected, _ = cv2.projectPoints(points, rotation, camera.cTw[:, 3], without_skew, np.zeros(5))
+    expected = expected[:, 0]
+    expected[:, 0] += 2.0 * (expected[:, 1] - 400.0) / 1010.0
+    np.testing.assert_allclose(xy, expected, atol=1e-8)
+    np.testing.assert_allclose(depth, (points @ camera.cTw[:, :3].T + camera.cTw[:, 3])[:, 2])
+
+
+def test_undistort_inverts_distort():
+    plain = K.copy()
+    plain[0, 1] = 0.0
+    camera = Camera("a", plain, np.eye(4), (1000, 800), LENS)
+    xy = np.random.default_rng(0).uniform((0, 0), (1000, 800), (50, 2))
+    # The inverse is iterated to 1e-6 of a normalised coordinate, a thousandth of a pixel.
+    np.testing.assert_allclose(camera.distort(camera.undistort(xy)), xy, atol=1e-3)
+    assert np.abs(camera.undistort(xy) - xy).max() > 5.0, "the lens must bend something for this to test anything"
+
+
+def test_behind_the_camera_is_nan():
+    xy, depth = Camera("a", K, np.eye(4), (1000, 800)).project(np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]))
+    assert np.isnan(xy[0]).all() and depth[0] == -1.0
+    np.testing.assert_allclose(xy[1], [500.0, 400.0])
+
+
+def test_rig_projects_as_its_cameras(five_cameras, two_people):
+    xy, depth = five_cameras.project(two_people)
+    for view, camera in enumerate(five_cameras.cameras):
+        expected_xy, expected_depth = camera.project(two_people)
+        np.testing.assert_allclose(xy[view], expected_xy, atol=1e-9)
+        np.testing.assert_allclose(depth[view], expected_depth, atol=1e-12)
+
+
+def test_normalise_inverts_the_intrinsics(five_cameras, two_people):
+    xy, depth = five_cameras.project(two_people[0])
+    view = np.repeat(np.arange(5), 25)
+    rays = np.concatenate([five_cameras.normalise(view, xy.reshape(-1, 2)), np.ones((125, 1))], axis=1)
+    points_camera = rays * depth.reshape(-1, 1)
+    cTw = five_cameras.cTw[view]
+    points = np.einsum("dji,dj->di", cTw[:, :, :3], points_camera - cTw[:, :, 3])
+    np.testing.assert_allclose(points, np.tile(two_people[0], (5, 1)), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"K": np.eye(4)}, "K must be"),
+        ({"K": np.diag([-1.0, 1.0, 1.0])}, "positive focal"),
+        ({"wTc": np.diag([1.0, 1.0, 1.1, 1.0])}, "orthonormal"),
+        ({"wTc": np.diag([1.0, 1.0, -1.0, 1.0])}, "orthonormal"),
+        ({"wTc": np.full((4, 4), np.nan)}, "not finite"),
+        ({"image_size": (0, 5)}, "image_size"),
+    ],
+)
+def test_refuses_what_is_no_camera(changed, message):
+    with pytest.raises(ValueError, match=message):
+        Camera(**({"name": "a", "K": K, "wTc": np.eye(4), "image_size": (10, 10)} | changed))
+
+
+def test_printed_digits_do_not_scale():
+    R, _ = cv2.Rodrigues(np.array([0.3, -0.5, 0.2]))
+    camera = Camera.from_camera_from_world("a", K, np.hstack([R.round(4), np.ones((3, 1))]), (10, 10))
+    np.testing.assert_allclose(camera.wTc[:3, :3] @ camera.wTc[:3, :3].T, np.eye(3), atol=1e-12)
+
+
+def test_rig_needs_two_cameras_with_different_names_and_an_up_axis():
+    with pytest.raises(ValueError, match="at least 2 cameras"):
+        Rig((posed(),), "z")
+    with pytest.raises(ValueError, match="names must differ"):
+        Rig((posed(), posed()), "z")
+    with pytest.raises(ValueError, match="up must be"):
+        Rig((posed(), posed("b")), "up")  # type: ignore[arg-type]
+    np.testing.assert_array_equal(Rig((posed(), posed("b")), "-y").up_vector, [0, -1, 0])
