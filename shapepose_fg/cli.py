@@ -1,6 +1,7 @@
 """The command line: reconstruct a recording, evaluate a reconstruction, see a demo."""
 
 import json
+import os
 import re
 import sys
 import time
@@ -42,12 +43,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     try:
         code = app(arguments or ["--help"], standalone_mode=False)
+        sys.stdout.flush()
     except _UsageProblem as error:
         code = _fail(f"{cast(Any, error).format_message().rstrip('.')}; see shapepose-fg --help")
     except InputError as error:
         code = _fail(str(error))
     except BrokenPipeError:  # the reader of our output, such as `head`, has had enough
-        sys.stderr.close()  # or Python would complain at exit that it cannot flush
+        # Or Python would complain at exit that it cannot flush.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 1
     except OSError as error:
         place = f"{error.filename}: " if error.filename is not None else ""

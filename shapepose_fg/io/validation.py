@@ -53,7 +53,7 @@ def _complaint(kind: str, problem: Any) -> str:
         return f"must be a finite number, got {got}"
     if kind == "greater_than":
         return f"must be greater than {context['gt']}, got {got}"
-    if kind == "literal_error":
+    if kind in ("literal_error", "enum"):
         return f"must be {context['expected']}, got {got}"
     wanted = _WANTED.get(kind)
     if wanted is not None:

@@ -1,0 +1,238 @@
+"""The command line: what it prints, where it writes, and one sentence for everything that goes wrong."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import shapepose_fg.pipeline
+from shapepose_fg.cli import main
+from shapepose_fg.reconstruction import Reconstruction, Status
+from shapepose_fg.skeleton import BODY_25
+
+K = [1000.0, 0, 500, 0, 1000, 400, 0, 0, 1]
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> list[str]:
+    """Options for five empty frames of two cameras, with results going to `out`."""
+    poses = {"left": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0], "right": [1, 0, 0, -1, 0, 1, 0, 0, 0, 0, 1, 0]}
+    cameras = {name: {"K": K, "RT": RT, "imgSize": [1001, 801]} for name, RT in poses.items()}
+    (tmp_path / "calibration.json").write_text(json.dumps(cameras))
+    for name in cameras:
+        (tmp_path / f"{name}.txt").write_text("4 5\n" + "0\n" * 125)
+    options = {
+        "--calibration": tmp_path / "calibration.json",
+        "--detections": tmp_path,
+        "--output": tmp_path / "out",
+    }
+    return ["reconstruct", *(str(word) for option in options.items() for word in option)]
+
+
+@pytest.fixture
+def pipeline(monkeypatch) -> dict:
+    """Replace the pipeline by one that finds two people in every frame; returns what it was called with."""
+    called: dict = {}
+
+    def fake(detections, rig, config, *, frames, fitter, progress):
+        called.update(detections=detections, rig=rig, config=config, frames=frames, fitter=fitter)
+        progress(len(frames), len(frames))
+        N = 2 * len(frames)
+        return Reconstruction(
+            frame=np.repeat(np.array(frames), 2),
+            person=np.arange(N),
+            joint_names=np.array(BODY_25.joints),
+            joints=np.ones((N, 25, 3)),
+            covariance=np.tile(4e-4 * np.eye(3), (N, 25, 1, 1)),
+            confidence=np.ones((N, 25)),
+            betas=np.zeros((N, 10)),
+            global_orient=np.zeros((N, 3)),
+            body_pose=np.zeros((N, 23, 3)),
+            transl=np.zeros((N, 3)),
+            status=np.array([Status.OK, Status.TOO_FEW_VIEWS] * len(frames), dtype=str),
+            run={"frames": [frames.start, frames.stop], "seconds": {"load": 3.0, "vote": 0.005 * len(frames)}},
+        )
+
+    monkeypatch.setattr(shapepose_fg.pipeline, "reconstruct", fake)
+    return called
+
+
+def run(*arguments: str) -> int:
+    """Exit code of a command line."""
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    return caught.value.code
+
+
+def test_reconstruct_writes_results_and_says_what_it_found(recording, pipeline, tmp_path, capsys):
+    assert run(*recording) == 0
+    people = Reconstruction.load(tmp_path / "out")
+    assert len(people) == 10
+    assert set(people.run["inputs"]) == {str(tmp_path / "calibration.json"), str(tmp_path)}
+    assert all(len(digest) == 64 for digest in people.run["inputs"].values())
+    printed = capsys.readouterr()
+    assert printed.err == ""  # no progress bar where nobody watches
+    words = " ".join(printed.out.split())
+    for part in ("5 (0:5) of 2 cameras", "10 in all, 2.0 a frame (2 to 2)", "5 ok", "5 too few views"):
+        assert part in words
+    for part in (
+        "100.0 % placed, median sigma 20 mm",
+        "5.0 ms a frame",
+        "vote 5.0",
+        "out/people.npz",
+        "out/run.json",
+    ):
+        assert part.replace(" ", "") in words.replace(" ", "")
+
+
+def test_options_reach_the_pipeline(recording, pipeline, tmp_path):
+    (tmp_path / "settings.toml").write_text("batch_frames = 7\n")
+    config = str(tmp_path / "settings.toml")
+    assert run(*recording, "--frames", "1:4", "--up", "-y", "--unit", "mm", "--config", config) == 0
+    assert pipeline["frames"] == range(1, 4)
+    assert pipeline["rig"].up == "-y"
+    assert pipeline["rig"].centres[1].tolist() == [0.001, 0, 0]
+    assert pipeline["config"].batch_frames == 7
+    assert pipeline["fitter"] is None
+    assert config in Reconstruction.load(tmp_path / "out").run["inputs"]
+
+
+@pytest.mark.parametrize(
+    ("text", "frames"), [(":2", range(2)), ("3:", range(3, 5)), (":", range(5)), ("4:5", range(4, 5))]
+)
+def test_frames_are_half_open(recording, pipeline, text, frames):
+    assert run(*recording, "--frames", text) == 0
+    assert pipeline["frames"] == frames
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (
+            ["--frames", "2:9"],
+            "--frames 2:9: not in the recording, which has 5 frames; give A:B with 0 <= A < B <= 5",
+        ),
+        (["--frames", "3:3"], "--frames 3:3: not in the recording, which has 5 frames"),
+        (["--frames", "-2:"], "--frames -2:: must be A:B, two frame numbers with a colon between, such as 0:100"),
+        (["--frames", "all"], "--frames all: must be A:B"),
+        (["--up", "up"], "up must be one of x -x y -y z -z, got 'up'"),
+        (["--unit", "inch"], "unit must be one of m cm mm, got 'inch'"),
+        (["--config", "/nothing.toml"], "/nothing.toml: there is no such file; check the path"),
+        (["--body", "/nothing.npz"], "/nothing.npz: no such file"),
+        (["--calibration", "/nothing.json"], "/nothing.json: there is no such file; check the path"),
+        (["--detections", "/nothing"], "/nothing: there is no such folder; check the path of the detections"),
+        (["--output", f"{__file__}/out"], "out: results cannot be written here (Not a directory); give a folder"),
+        (["--loud"], "No such option: --loud"),
+    ],
+)
+def test_errors_are_one_sentence_and_exit_code_2(recording, pipeline, capsys, options, sentence):
+    assert run(*recording, *options) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.startswith("error: ")
+    assert sentence in printed.err
+    assert printed.err.count("\n") == 1
+    assert "people" not in pipeline  # nothing was reconstructed in vain
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["reconstruct"], "Missing option '--calibration'; see shapepose-fg --help"),
+        (["rebuild"], "No such command 'rebuild'"),
+        (
+            ["evaluate", "shelf", "--people", "/nothing", "--ground-truth", "/gt.txt"],
+            "/nothing: there is no such file",
+        ),
+    ],
+)
+def test_wrong_command_lines(capsys, arguments, sentence):
+    assert run(*arguments) == 2
+    assert sentence in capsys.readouterr().err
+
+
+def test_a_disk_that_is_full_is_one_sentence_too(recording, pipeline, monkeypatch, capsys):
+    def full(self, folder):
+        raise OSError(28, "No space left on device", str(folder))
+
+    monkeypatch.setattr(Reconstruction, "save", full)
+    assert run(*recording) == 2
+    assert (
+        "out: No space left on device; check the path, its permissions and the space left"
+        in capsys.readouterr().err
+    )
+
+
+def test_help_names_the_commands(capsys):
+    for arguments in ([], ["--help"]):
+        assert run(*arguments) == 0
+        printed = capsys.readouterr().out
+        assert all(command in printed for command in ("reconstruct", "evaluate", "demo", "config"))
+
+
+def test_config_prints_every_table_with_units(capsys):
+    assert run("config") == 0
+    printed = capsys.readouterr().out
+    assert "[candidates]" in printed
+    assert "gate_m = " in printed
+
+
+def test_evaluate_shelf(shared_data, tmp_path, capsys):
+    """Frame 0 of the annotation, one person of whom is found where nobody is: PCP 0 of 30 limbs or fewer."""
+    N = 1
+    Reconstruction(
+        frame=np.zeros(N, dtype=int),
+        person=np.zeros(N, dtype=int),
+        joint_names=np.array(BODY_25.joints),
+        joints=np.full((N, 25, 3), 100.0),
+        covariance=np.zeros((N, 25, 3, 3)),
+        confidence=np.ones((N, 25)),
+        betas=np.zeros((N, 10)),
+        global_orient=np.zeros((N, 3)),
+        body_pose=np.zeros((N, 23, 3)),
+        transl=np.zeros((N, 3)),
+        status=np.array(["ok"]),
+        run={"frames": [0, 1]},
+    ).save(tmp_path)
+    arguments = ["evaluate", "shelf", "--people", str(tmp_path / "people.npz")]
+    arguments += ["--ground-truth", str(shared_data / "shelf" / "gt_dev.txt")]
+    assert run(*arguments, "--json") == 0
+    score = json.loads(capsys.readouterr().out)
+    assert score["pcp_average"] == 0
+    assert score["frames"] == 1
+    assert run(*arguments) == 0
+    assert "left lower arm" in capsys.readouterr().out
+
+
+LIGHT = """
+import sys
+import shapepose_fg, shapepose_fg.cli
+from shapepose_fg import InputError, Reconstruction, read_detections, read_rig
+assert "torch" not in sys.modules, "torch is loaded"
+try:
+    shapepose_fg.cli.main(["--help"])
+except SystemExit as end:
+    assert end.code == 0
+assert "torch" not in sys.modules, "help loads torch"
+"""
+
+
+def test_importing_and_help_load_no_torch():
+    result = subprocess.run([sys.executable, "-c", LIGHT], check=False, timeout=60, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    assert "reconstruct" in result.stdout
+
+
+def test_a_reader_that_stops_reading_is_no_error():
+    """`shapepose-fg version | head -n 0`: no traceback, no sentence."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "shapepose_fg.cli", "version"]
+    result = subprocess.run(command, check=False, timeout=60, stdout=writer, stderr=subprocess.PIPE, text=True)
+    os.close(writer)
+    assert result.stderr == ""
+    assert result.returncode == 1
