@@ -44,7 +44,7 @@ def five_cameras() -> Rig:
 def two_people() -> NDArray[np.float64]:
     """(2, 25, 3) two people 0.9 m apart, who face different ways."""
     turn = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    return np.stack([STANDING + [-0.45, 0.0, 0.0], STANDING @ turn + [0.45, 0.1, 0.0]])
+    return np.stack([STANDING - np.array([0.45, 0.0, 0.0]), STANDING @ turn + np.array([0.45, 0.1, 0.0])])
 
 
 @pytest.fixture(scope="session")
@@ -56,7 +56,7 @@ def seen_exactly():
 def detect_exactly(rig: Rig, people: NDArray[np.float64], skeleton: Skeleton = BODY_25) -> Detections:
     """Every joint of every person in every view where it is, confidence 0.8; candidates in random order."""
     xy, _ = rig.project(people)
-    view, person, joint = (index.ravel() for index in np.indices(xy.shape[:3]))
+    view, _, joint = (index.ravel() for index in np.indices(xy.shape[:3]))
     order = np.random.default_rng(0).permutation(len(view))
     place = np.argsort(order).reshape(xy.shape[:3])
     first, second = np.array(skeleton.limbs).T
