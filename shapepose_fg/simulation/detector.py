@@ -155,7 +155,7 @@ def _confidence(
 ) -> NDArray[np.float64]:
     """About 0.8 where visible and 0.3 where hidden, lower for a joint of poor quality and a large error."""
     size = np.linalg.norm(error, axis=1) / np.maximum(sigma_px, 1e-9)
-    value = _between(0.33, 0.82, seen) - 0.12 * spread - 0.05 * (size - 1.25) + rng.normal(0.0, 0.05, len(seen))
+    value = _between(0.33, 0.8, seen) - 0.12 * spread - 0.05 * (size - 1.25) + rng.normal(0.0, 0.05, len(seen))
     return np.clip(value, _between(0.08, 0.35, seen), _between(0.55, 0.97, seen))
 
 

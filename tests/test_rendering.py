@@ -1,0 +1,150 @@
+"""The z-buffer against surfaces whose depth is known in closed form."""
+
+import numpy as np
+import pytest
+
+from shapepose_fg.camera import Camera
+from shapepose_fg.rendering import look_at, rasterise, render_depth, render_shaded, scaled, vertex_normals, zoom
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def sphere(rings: int) -> tuple[np.ndarray, np.ndarray]:
+    """A unit sphere: vertices, and faces that turn counter-clockwise seen from outside."""
+    theta = np.linspace(0, np.pi, rings)[:, None]
+    phi = np.arange(2 * rings) * np.pi / rings
+    vertices = np.stack(
+        np.broadcast_arrays(np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)), -1
+    )
+    i, j = np.arange(rings - 1)[:, None] * 2 * rings, np.arange(2 * rings)[None]
+    k = (j + 1) % (2 * rings)
+    a, b, c, d = (q.ravel() for q in (i + j, i + 2 * rings + j, i + 2 * rings + k, i + k))
+    return vertices.reshape(-1, 3), np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+
+
+@pytest.fixture
+def camera() -> Camera:
+    K = np.array([[200.0, 0, 79.5], [0, 200.0, 59.5], [0, 0, 1]])
+    return Camera("c", K, look_at(np.array([4.0, 1.0, 0.5]), np.zeros(3), UP), (160, 120))
+
+
+def rays(camera: Camera) -> np.ndarray:
+    """(H, W, 3) directions in camera coordinates with depth 1."""
+    column, row = np.meshgrid(np.arange(camera.image_size[0]), np.arange(camera.image_size[1]))
+    return np.stack([column, row, np.ones_like(row)], axis=-1) @ np.linalg.inv(camera.K).T
+
+
+@pytest.mark.parametrize("cull_back", [False, True])
+def test_depth_of_a_sphere(camera: Camera, cull_back: bool):
+    vertices, faces = sphere(200)
+    surface = render_depth(vertices, faces, camera, cull_back=cull_back)
+    centre = camera.cTw[:, 3]
+    # |s ray - centre| = 1, the smaller root.
+    ray = rays(camera)
+    a, b = (ray**2).sum(-1), ray @ centre
+    root = b**2 - a * (centre @ centre - 1)
+    hit = surface.face >= 0
+    assert 0.995 < hit.sum() / (root > 0).sum() <= 1.0  # the facets lie inside the sphere
+    inner = root > 0.3  # away from the rim, where a facet's error in depth is not multiplied by the slope
+    expected = (b[inner] - np.sqrt(root[inner])) / a[inner]
+    # A facet's edge is pi / 199 long, its diagonal d = 0.022, and lies d^2 / 8 = 6e-5 under the sphere; root > 0.3
+    # is a slope of at most 1 / sqrt(0.3).
+    assert np.abs(surface.depth[inner] - expected).max() < 1.2e-4
+    assert np.isinf(surface.depth[~hit]).all()
+
+
+def test_depth_of_a_tilted_plane_is_exact(camera: Camera):
+    corners = np.array([[-0.4, -0.5, 0.3], [0.5, -0.4, -0.2], [0.3, 0.5, 0.1], [-0.6, 0.6, 0.6]])
+    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    corners[3] -= normal * (normal @ (corners[3] - corners[0])) / (normal @ normal)
+    surface = render_depth(corners, np.array([[0, 1, 2], [0, 2, 3]]), camera)
+    n = camera.cTw[:, :3] @ normal
+    point = camera.cTw[:, :3] @ corners[0] + camera.cTw[:, 3]
+    expected = (n @ point) / (rays(camera) @ n)
+    hit = surface.face >= 0
+    assert hit.sum() > 500
+    assert np.abs(surface.depth[hit] - expected[hit]).max() < 2e-6  # float32 at 4 m
+
+
+def test_the_nearer_of_two_quads_wins_and_neighbours_leave_no_gap():
+    square = np.array([[2.0, 2], [12, 2], [12, 12], [2, 12]])
+    xy = np.concatenate([square, square + np.array([5, 3])])
+    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
+    surface = rasterise(xy, np.repeat([3.0, 2.0], 4), faces, (24, 20))
+    row, column = np.mgrid[:20, :24]
+    first = (column >= 2) & (column <= 12) & (row >= 2) & (row <= 12)
+    second = (column >= 7) & (column <= 17) & (row >= 5) & (row <= 15)
+    expected = np.where(second, 2.0, np.where(first, 3.0, np.inf))
+    np.testing.assert_array_equal(surface.depth, expected.astype(np.float32))
+    assert set(np.unique(surface.face[second])) <= {2, 3}
+    assert set(np.unique(surface.face[first & ~second])) <= {0, 1}
+
+
+def test_nearer_in_the_middle_only_where_planes_cross():
+    xy = np.array([[0.0, 0], [20, 0], [20, 10], [0, 10]] * 2)
+    depth = np.array([1.0, 3, 3, 1, 3, 1, 1, 3])
+    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
+    surface = rasterise(xy, depth, faces, (21, 11))
+    assert (surface.face[:, :10] < 2).all()
+    assert (surface.face[:, 11:] >= 2).all()
+    # 1/depth is linear: halfway between 1 m and 3 m it is 2/3.
+    np.testing.assert_allclose(surface.depth[5, 10], 1.5, rtol=1e-6)
+
+
+def test_what_is_behind_the_camera_or_nan_is_not_drawn(camera: Camera):
+    vertices, faces = sphere(20)
+    behind = vertices + 2 * camera.centre
+    assert (render_depth(behind, faces, camera).face == -1).all()
+    around = vertices + camera.centre  # the camera is in the middle: no face crosses the image plane whole
+    assert np.isfinite(render_depth(around, faces, camera).depth).any()
+    vertices = vertices.copy()
+    vertices[:200] = np.nan
+    assert (render_depth(vertices, faces, camera).face >= 0).any()
+    assert (render_depth(np.zeros((0, 3)), np.zeros((0, 3), dtype=int), camera).face == -1).all()
+
+
+def test_large_images_are_drawn_in_pieces(monkeypatch: pytest.MonkeyPatch, camera: Camera):
+    vertices, faces = sphere(30)
+    whole = render_depth(vertices, faces, camera)
+    monkeypatch.setattr("shapepose_fg.rendering._CHUNK_PIXELS", 97)
+    pieces = render_depth(vertices, faces, camera)
+    np.testing.assert_array_equal(whole.depth, pieces.depth)
+    np.testing.assert_array_equal(whole.face, pieces.face)
+
+
+def test_look_at_puts_the_target_in_the_middle_and_up_up(camera: Camera):
+    (centre, above), depth = camera.project(np.array([[0.0, 0, 0], [0, 0, 0.2]]))
+    np.testing.assert_allclose(centre, (79.5, 59.5), atol=1e-9)
+    np.testing.assert_allclose(depth[0], np.linalg.norm(camera.centre))
+    assert above[1] < centre[1] and abs(above[0] - centre[0]) < 1e-9
+    with pytest.raises(ValueError, match="parallel"):
+        look_at(np.array([0.0, 0, 2]), np.zeros(3), UP)
+
+
+def test_zoom_and_scale_move_points_as_the_pixels_move(camera: Camera):
+    points = np.array([[0.3, -0.2, 0.5], [-0.4, 0.1, 0.0]])
+    xy, _ = camera.project(points)
+    window = zoom(camera, (40.0, 30.0, 120.0, 90.0), 320)
+    assert window.image_size == (320, 240)
+    np.testing.assert_allclose(window.project(points)[0], (xy + 0.5 - (40, 30)) * 4 - 0.5)
+    np.testing.assert_allclose(scaled(camera, 0.5).project(points)[0], (xy + 0.5) / 2 - 0.5)
+
+
+def test_normals_and_shading_of_a_sphere(camera: Camera):
+    vertices, faces = sphere(60)
+    away_from_poles = np.abs(vertices[:, 2]) < 0.99
+    normals = vertex_normals(vertices, faces)
+    # Area weights on quads cut along one diagonal lean the mean by half a facet's angle at most: pi / 60 / 2.
+    assert np.abs(normals - vertices)[away_from_poles].max() < 0.03
+    colours = np.tile([0.5, 0.25, 0.0], (len(vertices), 1))
+    light = camera.centre + 3 * np.eye(3)[1]
+    rgb, coverage = render_shaded(vertices, faces, colours, camera, light=light, samples=2)
+    assert rgb.shape == (120, 160, 3)
+    assert set(np.unique(coverage)) <= {0.0, 0.25, 0.5, 0.75, 1.0}
+    assert (rgb[coverage == 0] == 0).all()
+    inside = coverage == 1
+    np.testing.assert_allclose(rgb[inside, 0], 2 * rgb[inside, 1], rtol=1e-5)
+    assert (rgb[inside, 2] == 0).all()
+    # The side towards the light is brighter; right in the image is +y in the world here.
+    row = rgb[60, :, 0][inside[60]]
+    assert row[-len(row) // 4] > 1.1 * row[len(row) // 4]
