@@ -355,6 +355,6 @@ def test_the_real_annotation_against_itself(shelf):
     assert score.limbs_all.sum(axis=1).tolist() == [1310, 190, 930]
     no_head = np.array(LIMB_NAMES) != "head"
     np.testing.assert_array_equal(score.limbs_right[:, no_head], score.limbs_all[:, no_head])
-    # The annotated head differs from the fixed mapping by 5 to 10 cm; nine in ten are within half its length.
-    assert score.limbs_right[:, ~no_head].sum() > 0.9 * score.people
+    # Annotated head tops are 2 to 16 cm from the fixed mapping; 98 % of the heads are right all the same.
+    assert score.limbs_right[:, ~no_head].sum() > 0.95 * score.people
     assert score.recall == 1.0
