@@ -225,6 +225,8 @@ def _summary(
     )
     for status, count in zip(*np.unique(people.status, return_counts=True), strict=True):
         table.add_row("", f"{count} {status}", style="green" if status == "ok" else "yellow")
+    for reason, count in people.run.get("people", {}).get("dropped", {}).items():
+        table.add_row("", f"{count} dropped: {reason}", style="dim")
     known = np.isfinite(people.joints).all(axis=2)
     if len(people) > 0:
         table.add_row("joints", f"{100 * known.mean():.1f} % placed{_spread(people, known)}")
