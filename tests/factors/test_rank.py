@@ -62,6 +62,7 @@ def test_behind_a_camera_counts_nothing(scene):
 def test_the_bounds_are_those_of_the_weakest_direction():
     information = np.stack([np.diag([1.0, 1, s**-2.0]) * 1e2 for s in (1.0, 9.9, 10.1)])
     np.testing.assert_array_equal(determined(information, max_sigma_m=1.0), [True, True, False])
+    np.testing.assert_array_equal(determined(information, max_sigma_m=0.5), [True, False, False])
     stiff = np.diag([1e4, 1e4, 1e12])[None]
     assert not determined(stiff, max_condition=1e7)[0]
     assert determined(stiff, max_condition=1e9)[0]
