@@ -1,0 +1,191 @@
+"""Bodies by plain optimisation: the SMPLify-style comparison, Levenberg-Marquardt over many rows at once."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from shapepose_fg.body.alignment import RestAlignment
+from shapepose_fg.body.energy import BodyEnergy, Linearisation, WhitenedTargets, robust_weight
+from shapepose_fg.body.evidence import Evidence, EvidenceConfig, weigh
+from shapepose_fg.body.fitter import BodyFit, FitStatus, JointTargets
+from shapepose_fg.body.leave_one_out import joint_posterior
+from shapepose_fg.body.model import BodyModel, BodyParameters
+from shapepose_fg.body.pose_prior import PosePrior
+from shapepose_fg.body.rotation import log_so3
+from shapepose_fg.skeleton import BODY_25
+
+Array = NDArray[np.float64]
+
+_DAMPING_START, _DAMPING_MIN, _DAMPING_MAX = 1e-3, 1e-7, 1e7
+
+
+@dataclass(frozen=True)
+class PlainFitterConfig:
+    """Settings of `LevenbergMarquardtFitter`."""
+
+    evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
+    """How targets are judged and weighed."""
+    kernel_scale: float = 6.0
+    """Mahalanobis distance at which the Geman-McClure kernel has cut a joint's weight to a quarter."""
+    anneal_steps: int = 2
+    """From a cold start the kernel begins 2^anneal_steps times as wide, and is halved every iteration."""
+    max_iterations: int = 40
+    """Levenberg-Marquardt steps, refused ones included."""
+    tolerance: float = 1e-2
+    """A row is done when a step lowers its energy (in squared standard deviations) by less."""
+    unfinished: float = 1.0
+    """Rows whose energy a further Newton step would lower by more than this are NOT_CONVERGED."""
+    limit_sigma_rad: float = 0.1
+    """How softly elbows and knees stop when bent the wrong way, rad."""
+
+    def __post_init__(self) -> None:
+        for name in ("kernel_scale", "tolerance", "unfinished", "limit_sigma_rad"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        if self.max_iterations < 1 or self.anneal_steps < 0:
+            raise ValueError("max_iterations must be >= 1 and anneal_steps >= 0")
+
+
+class LevenbergMarquardtFitter:
+    """Fits a body to 3D joints by minimising `BodyEnergy`; implements `BodyFitter`.
+
+    Rows are independent: a row comes out the same alone and in a batch, up to rounding. Iterations run in
+    single precision around each row's centre; posteriors are computed in double precision at the end.
+    """
+
+    def __init__(
+        self,
+        model: BodyModel | None = None,
+        pose_prior: PosePrior | None = None,
+        config: PlainFitterConfig | None = None,
+    ):
+        model = BodyModel.default() if model is None else model
+        prior = PosePrior.default() if pose_prior is None else pose_prior
+        self.config = PlainFitterConfig() if config is None else config
+        self._align = RestAlignment(model, prior)
+        self._energy = BodyEnergy(model.to(torch.float32), prior, self.config.limit_sigma_rad)
+        self._exact_energy = BodyEnergy(model.to(torch.float64), prior, self.config.limit_sigma_rad)
+        self._mean_angles = prior.mean[self._energy.angles]
+
+    @torch.no_grad()
+    def fit(self, targets: JointTargets, initial: BodyFit | None = None) -> BodyFit:
+        """Fit a body to every row of `targets` (BODY_25 joints); see `BodyFit` for what comes back.
+
+        OK rows of `initial` (as many rows as targets) are warm starts: no closed form, no annealing.
+        """
+        _check(targets, initial)
+        evidence = weigh(targets, self.config.evidence)
+        fit = BodyFit.failed(evidence.status, targets.xyz.shape[1])
+        rows = np.flatnonzero(evidence.status == FitStatus.OK)
+        if len(rows) == 0:
+            return fit
+        # In single precision 10 m from the origin is a micrometre away from exact; 10 km is not.
+        centre = evidence.centre[rows]
+        exact = WhitenedTargets(
+            torch.from_numpy(evidence.xyz[rows] - centre[:, None]), torch.from_numpy(evidence.root[rows])
+        )
+        warm = np.zeros(len(rows), dtype=bool) if initial is None else initial.ok[rows]
+        start = torch.from_numpy(self._start(evidence, rows, centre, warm, initial))
+        free = self._solve(start.float(), WhitenedTargets(exact.xyz.float(), exact.root.float()), warm)
+        return self._finish(fit, rows, free.double(), exact, centre)
+
+    def _start(
+        self, evidence: Evidence, rows: NDArray[np.intp], centre: Array, warm: NDArray[np.bool_],
+        initial: BodyFit | None,
+    ) -> Array:  # fmt: skip
+        """Free parameters (R, P) to start from, with `centre` (R, 3) as origin."""
+        rotation, transl = self._align(evidence.xyz[rows] - centre[:, None], evidence.variance_m2[rows])
+        orient = log_so3(torch.from_numpy(rotation)).numpy()
+        angles = np.broadcast_to(self._mean_angles, (len(rows), len(self._mean_angles)))
+        start = np.concatenate([np.zeros((len(rows), 10)), orient, angles, transl], axis=1)
+        if initial is not None and warm.any():
+            parts = (initial.betas, initial.global_orient, initial.body_pose, initial.transl)
+            known = BodyParameters(*(torch.from_numpy(part[rows[warm]]).double() for part in parts))
+            start[warm] = self._exact_energy.free(known).numpy()
+            start[warm, -3:] -= centre[warm]
+        return start
+
+    def _solve(self, free: Tensor, targets: WhitenedTargets, warm: NDArray[np.bool_]) -> Tensor:
+        """Minimise from `free` (B, P); rows leave the batch as they finish. Returns (B, P)."""
+        config, energy = self.config, self._energy
+        result = free.clone()
+        rows = torch.arange(len(free))
+        widening = torch.where(torch.from_numpy(warm), 0, config.anneal_steps)[:, None]
+        damping = torch.full((len(free),), _DAMPING_START)
+        here = energy.linearise(free, targets, config.kernel_scale * 2.0**widening)
+        for _ in range(config.max_iterations):
+            step, promised = _damped_step(here, damping)
+            trial = energy.retract(free, step)
+            scale = config.kernel_scale * 2.0**widening
+            annealed = widening[:, 0] == 0
+            widening = (widening - 1).clamp_min(0)
+            there = energy.linearise(trial, targets, config.kernel_scale * 2.0**widening)
+            gain = here.energy(scale) - there.energy(scale)  # NaN counts as refused
+            better = gain > 0
+            here = here.replaced(better, there)
+            free = torch.where(better[:, None], trial, free)
+            damping = torch.where(better, damping * _damping_factor(gain / promised), damping * 8)
+            damping = damping.clamp(_DAMPING_MIN, _DAMPING_MAX)
+            settled = torch.where(better, gain < config.tolerance, promised < config.tolerance)
+            going = ~(annealed & settled) & (damping < _DAMPING_MAX)
+            if not bool(going.all()):
+                result[rows[~going]] = free[~going]
+                rows, free, damping, widening = rows[going], free[going], damping[going], widening[going]
+                here, targets = here[going], targets[going]
+                if len(rows) == 0:
+                    break
+        result[rows] = free
+        return result
+
+    def _finish(
+        self, fit: BodyFit, rows: NDArray[np.intp], free: Tensor, targets: WhitenedTargets, centre: Array
+    ) -> BodyFit:
+        """Fill `fit`'s `rows` with the bodies `free` (R, P) and what is known about their joints."""
+        energy, scale = self._exact_energy, torch.tensor(self.config.kernel_scale, dtype=torch.float64)
+        xyz, jacobian = energy.keypoints_with_jacobian(free)
+        here = energy.linearise_at(free, xyz, jacobian, targets, scale)
+        factor, _ = torch.linalg.cholesky_ex(here.hessian)
+        right = torch.cat((jacobian.mT, here.gradient[..., None]), -1)
+        half = torch.linalg.solve_triangular(factor, right, upper=False)
+        left = half[..., -1].square().sum(-1)  # what a Newton step would still gain
+        done = (torch.isfinite(left) & (left < self.config.unfinished)).numpy()
+        root = robust_weight(here.squared, scale).sqrt()[..., None, None] * targets.root
+        posterior = joint_posterior(xyz, half[..., :-1], xyz - targets.xyz, root)
+        body = energy.complete(free)
+        information = targets.root.square().sum(dim=(-1, -2)).sum(-1) / 3
+        fit.status[rows[~done]] = FitStatus.NOT_CONVERGED
+        rows, shift = rows[done], centre[done]
+        fit.betas[rows] = body.betas[done]
+        fit.global_orient[rows] = body.global_orient[done]
+        fit.body_pose[rows] = body.body_pose[done]
+        fit.transl[rows] = body.transl[done].numpy() + shift
+        fit.joints[rows] = xyz[done].numpy() + shift[:, None]
+        fit.covariance[rows] = posterior.covariance[done]
+        fit.prior_xyz[rows] = posterior.left_out_xyz[done].numpy() + shift[:, None]
+        model_error = self.config.evidence.model_sigma_m**2 * np.eye(3)
+        fit.prior_covariance[rows] = posterior.left_out_covariance[done].numpy() + model_error
+        fit.residual_m[rows] = (here.squared.sum(-1) / information).sqrt()[done]
+        return fit
+
+
+def _check(targets: JointTargets, initial: BodyFit | None) -> None:
+    if targets.xyz.shape[1] != len(BODY_25):
+        raise ValueError(f"targets must be the {len(BODY_25)} joints of BODY_25, got {targets.xyz.shape[1]}")
+    if initial is not None and len(initial) != len(targets):
+        raise ValueError(f"initial must have one row per target: {len(targets)}, got {len(initial)}")
+
+
+def _damped_step(here: Linearisation, damping: Tensor) -> tuple[Tensor, Tensor]:
+    """The Levenberg-Marquardt step (B, P), and the fall in energy (B,) that the linearisation promises."""
+    added = damping[:, None] * torch.diagonal(here.hessian, dim1=-2, dim2=-1)
+    factor, _ = torch.linalg.cholesky_ex(here.hessian + torch.diag_embed(added))
+    step = -torch.cholesky_solve(here.gradient[..., None], factor).squeeze(-1)
+    return step, (step * (added * step - here.gradient)).sum(-1)
+
+
+def _damping_factor(ratio: Tensor) -> Tensor:
+    """Nielsen's rule for a step that gained `ratio` of what it promised: down to a tenth, up to double."""
+    return (1 - (2 * ratio - 1) ** 3).clamp(0.1, 2.0)

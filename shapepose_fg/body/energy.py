@@ -1,0 +1,189 @@
+"""The energy of a body given joint targets, and its Gauss-Newton linearisation, batched over rows.
+
+    E(Theta) = sum_i rho(|S_i (x_i(Theta) - z_i)|²) + |betas|² + |theta - mean|²_P + limits(theta)
+
+with S_iᵀ S_i the information of target z_i, rho a robust kernel, P the pose prior's precision: SMPLify (Bogo et
+al. 2016) for 3D joints. There is no factor 1/2, so that the inverse of the Hessian below is a covariance.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from shapepose_fg.body.model import BodyModel, BodyParameters
+from shapepose_fg.body.pose_prior import PosePrior
+from shapepose_fg.body.rotation import exp_so3, log_so3, right_jacobian
+
+VISIBLE_M_PER_RAD = 1e-3
+"""A joint whose rotation moves no keypoint faster than this is invisible: a radian would move 1 mm."""
+
+
+@dataclass(frozen=True)
+class WhitenedTargets:
+    """Targets as the energy wants them: torch, one floating point type."""
+
+    xyz: Tensor
+    """(B, K, 3) metres, finite."""
+    root: Tensor
+    """(B, K, 3, 3) symmetric square root S_i of the information, 1/m."""
+
+    def __getitem__(self, rows: Tensor) -> "WhitenedTargets":
+        return WhitenedTargets(self.xyz[rows], self.root[rows])
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """The energy around a point: gradient and Hessian in the tangent of the free parameters."""
+
+    squared: Tensor
+    """(B, K) squared Mahalanobis distance of every joint to its target."""
+    prior: Tensor
+    """(B,) what betas, pose prior and limits add to the energy."""
+    gradient: Tensor
+    """(B, P) half the gradient."""
+    hessian: Tensor
+    """(B, P, P) half the Gauss-Newton Hessian, robust weights included."""
+
+    def energy(self, kernel_scale: Tensor) -> Tensor:
+        """(B,) the energy with the kernel's scale (B, 1)."""
+        return robust_cost(self.squared, kernel_scale).sum(-1) + self.prior
+
+    def __getitem__(self, rows: Tensor) -> "Linearisation":
+        return Linearisation(*(value[rows] for value in vars(self).values()))
+
+    def replaced(self, where: Tensor, other: "Linearisation") -> "Linearisation":
+        """The same, but with the rows `where` (B,) taken from another."""
+        if bool(where.all()):
+            return other
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return Linearisation(
+            *(torch.where(where.view(-1, *(1,) * (mine.ndim - 1)), new, mine) for mine, new in pairs)
+        )
+
+
+def robust_cost(squared: Tensor, scale: Tensor) -> Tensor:
+    """Geman-McClure: c² s / (c² + s), which grows to c² and no further."""
+    c2 = scale.square()
+    return c2 * squared / (c2 + squared)
+
+
+def robust_weight(squared: Tensor, scale: Tensor) -> Tensor:
+    """Derivative of `robust_cost`: the weight of a joint in iterated least squares, 1 at its target."""
+    c2 = scale.square()
+    return (c2 / (c2 + squared)).square()
+
+
+class BodyEnergy:
+    """Evaluates the energy over the *free* parameters of a row, a vector (P,).
+
+    It holds betas, root orientation, angles, translation. The angles are the axis-angles of joints that some
+    keypoint can see. The others (hands) have no evidence: the prior's marginal over the visible angles accounts
+    for them exactly, and `complete` fills them in with their regression.
+    """
+
+    def __init__(self, model: BodyModel, prior: PosePrior, limit_sigma_rad: float):
+        self.model, self.dtype = model, model.dtype
+        visible = visible_joints(model, prior)
+        self.angles = (visible[:, None] * 3 + np.arange(3)).ravel()
+        """(A,) places of the visible angles among the 69."""
+        self.num_angles = len(self.angles)
+        self.num_free = 10 + 3 + self.num_angles + 3
+        self._angle_slice = slice(13, 13 + self.num_angles)
+        hidden = np.setdiff1d(np.arange(69), self.angles)
+        self._hidden = torch.from_numpy(hidden)
+        self._visible = torch.from_numpy(self.angles)
+        self._regression = self._tensor(prior.regression(self.angles, hidden))
+        self._mean = self._tensor(prior.mean)
+        self._precision = self._tensor(prior.marginal_precision(self.angles))
+        self._lower = self._tensor(prior.lower[self.angles])
+        self._upper = self._tensor(prior.upper[self.angles])
+        self._limit_weight = 1 / limit_sigma_rad**2
+        # From free parameters to the model's 85 columns: identity, but right Jacobians for the angles.
+        spread = torch.zeros(10 + 72 + 3, self.num_free, dtype=self.dtype)
+        spread[:13, :13] = torch.eye(13)
+        spread[-3:, -3:] = torch.eye(3)
+        self._spread = spread
+        joint = torch.from_numpy(visible)
+        within = torch.arange(3)
+        place = torch.arange(len(visible))
+        self._block_rows = (13 + 3 * joint[:, None] + within)[:, :, None]
+        self._block_columns = (13 + 3 * place[:, None] + within)[:, None, :]
+        self._prior_hessian = torch.zeros(self.num_free, self.num_free, dtype=self.dtype)
+        self._prior_hessian[:10, :10] = torch.eye(10)
+        self._prior_hessian[self._angle_slice, self._angle_slice] = self._precision
+
+    def _tensor(self, array: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array)).to(self.dtype)
+
+    def free(self, parameters: BodyParameters) -> Tensor:
+        """The free parameters (B, P) of a body."""
+        angles = parameters.body_pose.flatten(1)[:, self._visible]
+        parts = (parameters.betas, parameters.global_orient, angles, parameters.transl)
+        return torch.cat(parts, 1).to(self.dtype)
+
+    def complete(self, free: Tensor) -> BodyParameters:
+        """The body (B rows) of free parameters (B, P); invisible joints are where the prior expects them."""
+        angles = free[:, self._angle_slice]
+        pose = self._mean.repeat(len(free), 1)
+        pose[:, self._visible] = angles
+        pose[:, self._hidden] += (angles - self._mean[self._visible]) @ self._regression.T
+        return BodyParameters(free[:, :10], free[:, 10:13], pose.unflatten(1, (23, 3)), free[:, -3:])
+
+    def retract(self, free: Tensor, step: Tensor) -> Tensor:
+        """Move by a step (B, P): the orientation by R exp(step), all else by addition.
+
+        Angles are added to as vectors, for in them the pose prior is exactly quadratic.
+        """
+        moved = free + step
+        moved[:, 10:13] = log_so3(exp_so3(free[:, 10:13]) @ exp_so3(step[:, 10:13]))
+        return moved
+
+    def keypoints_with_jacobian(self, free: Tensor) -> tuple[Tensor, Tensor]:
+        """Keypoints (B, K, 3) and their Jacobian by the free parameters (B, 3 K, P)."""
+        xyz, jacobian = self.model.keypoints_with_jacobian(self.complete(free))
+        spread = self._spread.repeat(len(free), 1, 1)
+        blocks = right_jacobian(free[:, self._angle_slice].unflatten(1, (-1, 3)))
+        spread[:, self._block_rows, self._block_columns] = blocks
+        return xyz, jacobian.flatten(1, 2) @ spread
+
+    def linearise(self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor) -> Linearisation:
+        """Energy, gradient and Hessian at free parameters (B, P), with the kernel's scale (B, 1)."""
+        return self.linearise_at(free, *self.keypoints_with_jacobian(free), targets, kernel_scale)
+
+    def linearise_at(
+        self, free: Tensor, xyz: Tensor, jacobian: Tensor, targets: WhitenedTargets, kernel_scale: Tensor
+    ) -> Linearisation:
+        """The same where keypoints `xyz` and their `jacobian` are known already."""
+        residual = (targets.root @ (xyz - targets.xyz)[..., None]).squeeze(-1)
+        squared = residual.square().sum(-1)
+        weight = robust_weight(squared, kernel_scale).sqrt()[..., None]
+        root = weight[..., None] * targets.root
+        rows = (root @ jacobian.unflatten(1, xyz.shape[1:])).flatten(1, 2)
+        gradient = (rows.mT @ (weight * residual).flatten(1)[..., None]).squeeze(-1)
+        hessian = rows.mT @ rows + self._prior_hessian
+        prior = self._add_priors(free, gradient, hessian)
+        return Linearisation(squared, prior, gradient, hessian)
+
+    def _add_priors(self, free: Tensor, gradient: Tensor, hessian: Tensor) -> Tensor:
+        """Add the priors' gradient, and the limits' curvature, in place; returns their energy (B,)."""
+        betas, angles = free[:, :10], free[:, self._angle_slice]
+        error = angles - self._mean[self._visible]
+        pull = error @ self._precision
+        excess = (angles - self._upper).clamp_min(0) + (angles - self._lower).clamp_max(0)
+        gradient[:, :10] += betas
+        gradient[:, self._angle_slice] += pull + self._limit_weight * excess
+        diagonal = torch.diagonal(hessian, dim1=-2, dim2=-1)
+        diagonal[:, self._angle_slice] += self._limit_weight * (excess != 0)
+        return betas.square().sum(-1) + (pull * error).sum(-1) + self._limit_weight * excess.square().sum(-1)
+
+
+def visible_joints(model: BodyModel, prior: PosePrior) -> np.ndarray:
+    """Which of the 23 joints below the root move some keypoint, by the model's own Jacobian (indices)."""
+    poses = torch.from_numpy(prior.sample(np.random.default_rng(0), 8)).to(model.dtype)
+    still = poses.new_zeros(8, 3)
+    parameters = BodyParameters(poses.new_zeros(8, 10), still, poses, still)
+    _, jacobian = model.keypoints_with_jacobian(parameters)
+    speed = jacobian[..., 13:-3].unflatten(-1, (23, 3)).abs().amax(dim=(0, 1, 2, 4))
+    return np.flatnonzero(speed.numpy() > VISIBLE_M_PER_RAD)

@@ -1,0 +1,57 @@
+"""How surely a fitted body knows each joint, with and without that joint's own target."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class JointPosterior:
+    """Gaussian beliefs about the joints of B bodies around their fitted place (Laplace)."""
+
+    covariance: Tensor
+    """(B, K, 3, 3) A_i = J_i H^-1 J_iᵀ: given all targets, m²."""
+    left_out_xyz: Tensor
+    """(B, K, 3) place of each joint without its own target, metres."""
+    left_out_covariance: Tensor
+    """(B, K, 3, 3) and its covariance, m²."""
+
+
+def joint_posterior(xyz: Tensor, half: Tensor, residual: Tensor, root: Tensor) -> JointPosterior:
+    """Take each joint's own target out of the posterior again (the cavity), to first order.
+
+    With A_i the joint's posterior and L_i = S_i² its target's information, the belief without the target is
+
+        C_i = (A_i^-1 - L_i)^-1 = A_i + A_i S_i (I - S_i A_i S_i)^-1 S_i A_i
+        c_i = x_i - C_i L_i (z_i - x_i)
+
+    where the second form of C_i needs no inverse of A_i or L_i: L_i may be singular (a ray) or zero, and
+    S_i A_i S_i < I because the priors are proper.
+
+    Parameters
+    ----------
+    xyz: (B, K, 3) x_i, metres.
+    half: (B, P, 3 K) G^-1 J^T with G G^T the Hessian, so that A_i is its block i squared.
+    residual: (B, K, 3) x_i - z_i, metres.
+    root: (B, K, 3, 3) S_i, symmetric, robust weight included, 1/m.
+    """
+    blocks = half.mT.unflatten(1, (-1, 3))  # (B, K, 3, P)
+    A = blocks @ blocks.mT
+    AS = A @ root
+    remainder = torch.eye(3, dtype=A.dtype) - _symmetric(root @ AS)
+    C = A + _symmetric(AS @ _inverse(remainder) @ AS.mT)
+    pull = root @ (root @ residual[..., None])
+    return JointPosterior(A, xyz + (C @ pull).squeeze(-1), C)
+
+
+def _symmetric(matrix: Tensor) -> Tensor:
+    return (matrix + matrix.mT) / 2
+
+
+def _inverse(matrix: Tensor) -> Tensor:
+    """Inverses of many 3x3 matrices by cross products of their rows; LAPACK takes them one at a time."""
+    a, b, c = matrix.unbind(-2)
+    columns = torch.stack((torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)), -1)
+    determinant = (a * columns[..., 0]).sum(-1)
+    return columns / determinant[..., None, None]
