@@ -212,8 +212,9 @@ def _own_camera(camera: _OwnCamera, place: str, path: Path) -> Camera:
 
 def _check_rotation(R: NDArray[np.float64], key: str, place: str) -> None:
     """Refuse a rotation that is scaled, sheared or mirrored."""
-    off = np.abs(R @ R.T - np.eye(3)).max()
-    if off > _ROTATION_TOLERANCE:
+    with np.errstate(over="ignore", invalid="ignore"):  # of numbers like 1e300, which are refused here
+        off = np.abs(R @ R.T - np.eye(3)).max()
+    if not off <= _ROTATION_TOLERANCE:
         raise InputError(
             f"{place}: the rotation of {key} is not orthonormal (R Rᵀ is off by {off:.2g});"
             " give a pure rotation without scale, row by row"
