@@ -25,9 +25,15 @@ class ProposalConfig:
     """Least fraction of the core joints (trunk, arms, legs) with a candidate in the box (the paper's 90 %)."""
     min_confidence: float = 0.2
     """Least mean confidence of the box's best candidates: clutter that a detector doubts stays below."""
-    separation_m: float = 0.15
-    """Non-maximum suppression: of two anchors closer than this the better one stays. Two pelvises are about
-    30 cm wide and cannot be closer than half of that."""
+    separation_m: float = 0.2
+    """Non-maximum suppression: of two anchors closer than this the better one stays. A pelvis is about 20 cm
+    deep and 30 cm wide: the middles of two are not closer even when people hug."""
+    shadow_m: float = 0.4
+    """Of two people whose hips are closer than this, one who has far fewer votes is the other's shadow: the
+    same person again, from rays that cross a little beside."""
+    shadow_votes: float = 0.4
+    """How few votes, relative to the other's, make a shadow. On simulated people in close motion, 99 % of the
+    real ones have over 0.45 of the median, and most shadows under 0.3."""
     doubt: float = 0.2
     """Affinity below which a view speaks against a limb: unrelated pairs are mostly 0, true ones above 0.4."""
     max_limb_m: float = 0.75
@@ -35,14 +41,15 @@ class ProposalConfig:
     sweeps: int = 2
     """How often the joints are chosen again once all their neighbours are known."""
     min_grown_parts: float = 0.4
-    """Least fraction of the core joints that must be linked to the hip at the end; an anchor whose joints all
-    belong to others has fewer."""
+    """Least fraction of the core joints that must have a strong candidate linked to the hip: one whose upper body
+    alone shows has 0.6. On simulated people in close motion real ones have over 0.47, and three of four phantoms,
+    whose joints belong to others, have less than 0.4."""
 
     def __post_init__(self) -> None:
-        for name in ("box_horizontal_m", "box_vertical_m", "separation_m", "max_limb_m"):
+        for name in ("box_horizontal_m", "box_vertical_m", "separation_m", "shadow_m", "max_limb_m"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        for name in ("min_parts", "min_confidence", "min_grown_parts", "doubt"):
+        for name in ("min_parts", "min_confidence", "min_grown_parts", "doubt", "shadow_votes"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
 
@@ -86,10 +93,23 @@ def propose(
     anchors, score, dropped = _anchors(candidates, skeleton, up, config)
     links = link(candidates, detections, config)
     chosen = grow(anchors, candidates, links, skeleton, config)
-    core = (chosen[:, skeleton.core] >= 0).mean(axis=1)
-    keep = core >= config.min_grown_parts
-    dropped["too few joints linked to the hip"] = int((~keep).sum())
-    return Proposals(chosen[keep], score[keep], dropped)
+    core = chosen[:, skeleton.core]
+    strong = (core >= 0) & candidates.strong[core]
+    linked = strong.mean(axis=1) >= config.min_grown_parts
+    votes = np.where(strong, candidates.votes[core], 0).sum(axis=1)
+    real = linked & ~_shadows(candidates.xyz[anchors], votes, config)
+    dropped["too few joints linked to the hip"] = int((~linked).sum())
+    dropped["shadow of a better one"] = int((linked & ~real).sum())
+    if not real.all():
+        # What the others had taken goes back to those whom it belongs to.
+        chosen = grow(anchors[real], candidates, links, skeleton, config)
+    return Proposals(chosen, score[real], dropped)
+
+
+def _shadows(hips: NDArray[np.float64], votes: NDArray[np.intp], config: ProposalConfig) -> NDArray[np.bool_]:
+    """(P,) who stands where somebody with many more votes stands."""
+    near = np.linalg.norm(hips[:, None] - hips[None], axis=-1) < config.shadow_m
+    return (near & (votes[:, None] < config.shadow_votes * votes[None])).any(axis=1)
 
 
 def _anchors(
