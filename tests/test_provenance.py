@@ -1,0 +1,45 @@
+"""Versions and checksums: what run.json says about where a result comes from."""
+
+import hashlib
+import platform
+
+import numpy as np
+import pytest
+
+from shapepose_fg.errors import InputError
+from shapepose_fg.provenance import checksums, versions
+
+
+def test_versions_are_those_that_run():
+    found = versions()
+    assert found["python"] == platform.python_version()
+    assert found["numpy"] == np.__version__
+    assert set(found) == {"python", "shapepose-fg", "numpy", "scipy", "gtsam", "torch", "opencv"}
+    assert "not installed" not in found.values()
+
+
+def test_a_file_has_its_sha256(tmp_path):
+    (tmp_path / "rig.json").write_bytes(b"{}")
+    path = str(tmp_path / "rig.json")
+    assert checksums([path]) == {path: hashlib.sha256(b"{}").hexdigest()}
+
+
+def test_a_folder_changes_with_the_names_and_contents_of_its_files(tmp_path):
+    def digest() -> str:
+        return checksums([tmp_path])[str(tmp_path)]
+
+    (tmp_path / "a.json").write_text("1")
+    first = digest()
+    (tmp_path / "notes.md").write_text("not an input")
+    assert digest() == first
+    (tmp_path / "a.json").rename(tmp_path / "b.json")
+    assert digest() != first
+    (tmp_path / "b.json").rename(tmp_path / "a.json")
+    assert digest() == first
+    (tmp_path / "a.json").write_text("2")
+    assert digest() != first
+
+
+def test_a_file_that_is_not_there(tmp_path):
+    with pytest.raises(InputError, match="nothing: cannot be read"):
+        checksums([tmp_path / "nothing"])
