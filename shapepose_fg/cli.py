@@ -99,7 +99,7 @@ def reconstruct(
             recording, rig, settings, frames=span, fitter=_fitter(body, settings), progress=progress
         )
     seconds = time.perf_counter() - start
-    inputs = [path for path in (calibration, detections, config, body) if path is not None]
+    inputs = [path for path in (calibration, *recording.sources, config, body) if path is not None]
     people.with_run(inputs=checksums(inputs)).save(output)
     _print(_summary(people, span, len(rig), seconds, output))
 

@@ -1,5 +1,6 @@
 """The command line: what it prints, where it writes, and one sentence for everything that goes wrong."""
 
+import hashlib
 import json
 import os
 import subprocess
@@ -72,8 +73,10 @@ def test_reconstruct_writes_results_and_says_what_it_found(recording, pipeline, 
     assert run(*recording) == 0
     people = Reconstruction.load(tmp_path / "out")
     assert len(people) == 10
-    assert set(people.run["inputs"]) == {str(tmp_path / "calibration.json"), str(tmp_path)}
-    assert all(len(digest) == 64 for digest in people.run["inputs"].values())
+    read = ("calibration.json", "left.txt", "right.txt")
+    assert set(people.run["inputs"]) == {str(tmp_path / name) for name in read}
+    left = hashlib.sha256((tmp_path / "left.txt").read_bytes()).hexdigest()
+    assert people.run["inputs"][str(tmp_path / "left.txt")] == left
     printed = capsys.readouterr()
     assert printed.err == ""  # no progress bar where nobody watches
     words = " ".join(printed.out.split())

@@ -56,6 +56,8 @@ class DetectionTable:
     """(T + 1,) where each frame's candidates begin."""
     pair_start: NDArray[np.intp]
     """(T + 1,) where each frame's pairs begin."""
+    sources: tuple[Path, ...] = ()
+    """The file or folder that each view was read from."""
 
     def __len__(self) -> int:
         return len(self.candidate_start) - 1
@@ -118,7 +120,8 @@ def assemble(views: Sequence[ViewCandidates], rig: Rig, skeleton: Skeleton) -> D
         pairs=pairs,
         affinity=np.concatenate([view.affinity for view in ideal])[pair_order],
     )
-    return DetectionTable(skeleton, candidates, candidate_start, np.searchsorted(pair_frame[pair_order], edges))
+    pair_start = np.searchsorted(pair_frame[pair_order], edges)
+    return DetectionTable(skeleton, candidates, candidate_start, pair_start, tuple(view.source for view in views))
 
 
 def _undistorted(view: ViewCandidates, camera: Camera) -> ViewCandidates:
