@@ -91,24 +91,19 @@ def rasterise(
     x, y = np.ascontiguousarray(xy, dtype=np.float64).T.copy()
     nearness = np.where(depth > NEAR_M, 1.0 / np.maximum(depth, NEAR_M), np.nan).astype(np.float64)
     x[~np.isfinite(nearness)] = np.nan
-    index, low_x, low_y, columns, rows = _boxes(x, y, faces, size, cull_back)
-    planes = _planes(x, y, nearness, faces[index])
+    index, first_row, rows, room = _rows(x, y, faces, size, cull_back)
+    a, b, c = _planes(x, y, nearness, faces[index])
     buffer = np.zeros(width * height, dtype=np.uint64)
-    for start, stop in _chunks(columns * rows):
-        part = slice(start, stop)
-        count = (columns * rows)[part]
-        which = np.repeat(np.arange(start, stop), count)
-        offset = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)
-        row, column = np.divmod(offset, columns[which])
-        column += low_x[which]
-        row += low_y[which]
-        a, b, c = planes
-        value = a[:, which] * column + b[:, which] * row + c[:, which]  # three barycentrics, then 1/depth
-        inside = (value[:3] >= -1e-9).all(axis=0)
-        pixel = row[inside] * width + column[inside]
+    for part in _chunks(room):
+        which, row = _ranges(first_row[part], rows[part])
+        which += part.start
+        first, count = _spans(a[:3, which], b[:3, which] * row + c[:3, which], width)
+        span, column = _ranges(first, count)
+        which, row = which[span], row[span]
+        near = a[3, which] * column + b[3, which] * row + c[3, which]
         # Nearness in the high bits, face in the low ones: the maximum of one integer keeps both.
-        bits = value[3, inside].astype(np.float32).view(np.uint32).astype(np.uint64)
-        np.maximum.at(buffer, pixel, (bits << np.uint64(32)) | index[which[inside]].astype(np.uint64))
+        bits = near.astype(np.float32).view(np.uint32).astype(np.uint64) << np.uint64(32)
+        np.maximum.at(buffer, row * width + column, bits | index[which].astype(np.uint64))
     hit = buffer > 0
     near = (buffer >> np.uint64(32)).astype(np.uint32).view(np.float32)
     met = np.full(width * height, np.inf, dtype=np.float32)
@@ -117,28 +112,46 @@ def rasterise(
     return Surface(met.reshape(height, width), face.reshape(height, width))
 
 
-def _boxes(
+def _rows(
     x: NDArray[np.float64],
     y: NDArray[np.float64],
     faces: NDArray[np.integer],
     size: tuple[int, int],
     cull_back: bool,
-) -> tuple[NDArray[np.intp], ...]:
-    """Faces that hold a pixel centre in their box: index, first column and row, columns, rows, each (G,)."""
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """Faces with a pixel centre in their box: index, first row, count of rows, pixels of the box, each (G,)."""
     i, j, k = faces.T
     xs, ys = (x[i], x[j], x[k]), (y[i], y[j], y[k])
     area = (xs[1] - xs[0]) * (ys[2] - ys[0]) - (xs[2] - xs[0]) * (ys[1] - ys[0])
     keep = area < -1e-12 if cull_back else np.abs(area) > 1e-12  # NaN compares false: such faces go
-    with np.errstate(invalid="ignore"):
-        low_x = np.maximum(np.ceil(np.minimum(np.minimum(*xs[:2]), xs[2])), 0)
-        high_x = np.minimum(np.floor(np.maximum(np.maximum(*xs[:2]), xs[2])), size[0] - 1)
-        low_y = np.maximum(np.ceil(np.minimum(np.minimum(*ys[:2]), ys[2])), 0)
-        high_y = np.minimum(np.floor(np.maximum(np.maximum(*ys[:2]), ys[2])), size[1] - 1)
-        keep &= (high_x >= low_x) & (high_y >= low_y)
-    index = np.flatnonzero(keep)
-    first = [low[index].astype(np.intp) for low in (low_x, low_y)]
-    extent = [(high - low)[index].astype(np.intp) + 1 for high, low in ((high_x, low_x), (high_y, low_y))]
-    return index, *first, *extent
+    low_x = np.maximum(np.ceil(np.minimum(np.minimum(*xs[:2]), xs[2])), 0)
+    high_x = np.minimum(np.floor(np.maximum(np.maximum(*xs[:2]), xs[2])), size[0] - 1)
+    low_y = np.maximum(np.ceil(np.minimum(np.minimum(*ys[:2]), ys[2])), 0)
+    high_y = np.minimum(np.floor(np.maximum(np.maximum(*ys[:2]), ys[2])), size[1] - 1)
+    index = np.flatnonzero(keep & (high_x >= low_x) & (high_y >= low_y))
+    rows = (high_y - low_y)[index].astype(np.intp) + 1
+    return index, low_y[index].astype(np.intp), rows, rows * ((high_x - low_x)[index].astype(np.intp) + 1)
+
+
+def _spans(
+    a: NDArray[np.float64], rest: NDArray[np.float64], width: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """First column and count (S,) of the pixels of a row where all three a x + rest (3, S) are at least 0."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        edge = -rest / a
+    # The margin lets neighbours both draw a pixel centre on their common edge: no gaps.
+    low = np.where(a > 0, edge, -np.inf).max(axis=0) - 1e-7
+    high = np.where(a < 0, edge, np.inf).min(axis=0) + 1e-7
+    outside = ((a == 0) & (rest < -1e-9)).any(axis=0)
+    first = np.ceil(np.clip(low, 0, width)).astype(np.intp)
+    last = np.floor(np.clip(high, -1, width - 1)).astype(np.intp)
+    return first, np.where(outside, 0, np.maximum(last - first + 1, 0))
+
+
+def _ranges(first: NDArray[np.intp], count: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Members of ranges that begin at `first` (G,) and have `count` (G,): whose each is, and the number."""
+    which = np.repeat(np.arange(len(count)), count)
+    return which, np.arange(len(which)) + (first - np.cumsum(count) + count)[which]
 
 
 def _planes(
@@ -157,13 +170,14 @@ def _planes(
     return tuple(np.concatenate([q, (q * corner).sum(axis=0, keepdims=True)]) for q in (a, b, c))  # type: ignore[return-value]
 
 
-def _chunks(counts: NDArray[np.intp]) -> Iterator[tuple[int, int]]:
-    """Ranges of faces with about `_CHUNK_PIXELS` pixels to test in each."""
+def _chunks(counts: NDArray[np.intp]) -> Iterator[slice]:
+    """Ranges of faces with about `_CHUNK_PIXELS` pixels in their boxes."""
     if len(counts) == 0:
         return
     group = np.cumsum(counts) // _CHUNK_PIXELS
     edges = np.concatenate([[0], np.flatnonzero(np.diff(group)) + 1, [len(counts)]])
-    yield from zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)
+    for start, stop in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+        yield slice(start, stop)
 
 
 def vertex_normals(vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> NDArray[np.float64]:
@@ -210,7 +224,21 @@ def render_shaded(
     picture[row, column, :3] = np.clip(base * shade[:, None], 0.0, 1.0)
     picture[row, column, 3] = 1.0
     picture = np.asarray(cv2.resize(picture, camera.image_size, interpolation=cv2.INTER_AREA), dtype=np.float32)
-    return picture[..., :3], picture[..., 3]
+    shadow = _nearness_shadow(surface.depth[samples // 2 :: samples, samples // 2 :: samples])
+    return picture[..., :3] * shadow[..., None], picture[..., 3]
+
+
+def _nearness_shadow(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Darker (H, W) where something nearer is beside a pixel, so that who is in front stands out.
+
+    The depth buffer minus its own blur (Luft, Colditz and Deussen 2006), over pixels that hold a surface.
+    """
+    hit = np.isfinite(depth).astype(np.float32)
+    filled = np.where(hit > 0, depth, 0.0).astype(np.float32)
+    sigma = 0.012 * depth.shape[0]
+    near, weight = (np.asarray(cv2.GaussianBlur(q, (0, 0), sigma), dtype=np.float32) for q in (filled, hit))
+    mean = near / np.maximum(weight, 1e-3)
+    return (1.0 - 0.45 * hit * np.clip((filled - mean) / 0.3, 0.0, 1.0)).astype(np.float32)
 
 
 def _barycentric(

@@ -85,10 +85,13 @@ def pose(puppet: Puppet, rest: Array) -> tuple[Array, Array, Array]:
         grow(collar)
         grow(shoulder)
         target = _hand_target(puppet, turned, position, bones, side)
-        raise_by = np.clip((target[:, 2] - position[:, shoulder, 2]) / 0.4, 0.0, 1.0) * 0.35
-        grow(collar, _about("z", sign * raise_by))
+        above = target[:, 2] - position[:, shoulder, 2]
+        grow(collar, _about("z", sign * 0.35 * np.clip(above / 0.4, 0.0, 1.0)))
         grow(shoulder)
-        pole = turned[:, SPINE[2]] @ np.array([0.45 * sign, -0.5, -1.0])
+        # Elbows point backward under hanging arms and outward under raised ones: never along the arm.
+        raised = np.clip((above + 0.35) / 0.5, 0.0, 1.0)[:, None]
+        pole = (1 - raised) * (0.4 * sign, -0.5, -1.0) + raised * (sign, -0.6, -0.3)
+        pole = np.einsum("tij,tj->ti", turned[:, SPINE[2]], pole)
         chain = (shoulder, elbow, wrist)
         _two_bones(turned, position, bones, chain, target, pole, _ELBOW_HINGE[side])
         turned[:, wrist] = turned[:, wrist + 2] = turned[:, elbow]

@@ -128,7 +128,7 @@ def dance(pair: list[Build], time: Array, centre: Array, rng: np.random.Generato
 
     shoulder = np.mean([build.shoulder_m for build in pair])
     across = np.stack([-np.sin(angle(time)), np.cos(angle(time))], axis=-1)
-    up = _bump(time % 2.4, 0.5, 1.9)
+    up = _bump(time, 0.5, 1.4, period=2.4)
     held = []
     for side, lift in ((1.0, up), (-1.0, np.zeros_like(up))):
         xy = middle(time) + side * across * (0.34 - 0.16 * lift)[:, None]
@@ -189,8 +189,8 @@ def walk(build: Build, time: Array, centre: Array, rng: np.random.Generator) -> 
 
 def wave(build: Build, time: Array, spot: Array, heading: float, rng: np.random.Generator) -> Puppet:
     """One who stays at `spot` (2,): waves with the right hand, then crouches and reaches down."""
-    cycle = (time + rng.uniform(-0.1, 0.1)) % 2.8
-    waving, crouching = _bump(cycle, -0.4, 1.45), _bump(cycle, 1.25, 2.75)
+    clock = time + rng.uniform(-0.1, 0.1)
+    waving, crouching = _bump(clock, -0.4, 1.75, period=2.8), _bump(clock, 1.2, 1.55, period=2.8)
 
     def path(t: Array) -> tuple[Array, Array]:
         shift = 0.04 * np.sin(2 * np.pi * t / 2.8)
@@ -205,8 +205,7 @@ def wave(build: Build, time: Array, spot: Array, heading: float, rng: np.random.
     hello = np.concatenate([hello, np.full((len(time), 1), build.shoulder_m + 0.32)], axis=1)
     floor = xy + 0.42 * forward + 0.1 * left
     floor = np.concatenate([floor, np.full((len(time), 1), 0.42)], axis=1)
-    right = hello + (crouching / np.maximum(waving + crouching, 1e-9))[:, None] * (floor - 0.2 * _up(left) - hello)
-    reach = np.stack([crouching, np.maximum(waving, crouching)], axis=1)
+    reach = np.stack([crouching, waving], axis=1)
     gaze = np.concatenate([xy + 1.2 * forward, (1.45 - 1.1 * crouching)[:, None]], axis=1)
     return _puppet(
         build,
@@ -216,7 +215,7 @@ def wave(build: Build, time: Array, spot: Array, heading: float, rng: np.random.
         phase=rng.uniform(),
         dip=0.02 + 0.3 * crouching,
         lean=np.stack([0.03 + 0.75 * crouching, 0.2 * np.sin(2 * np.pi * time / 2.8), -0.06 * waving], axis=1),
-        wrists=np.stack([floor, right], axis=1),
+        wrists=np.stack([floor, hello], axis=1),
         reach=reach,
         gaze=gaze,
     )
@@ -262,10 +261,10 @@ def _puppet(
     )
 
 
-def _bump(time: Array, start: float, stop: float) -> Array:
-    """Smoothly 0 outside start..stop and 1 in the middle of it."""
-    inside = np.clip((time - start) / (stop - start), 0.0, 1.0)
-    return np.clip(1.6 * np.sin(np.pi * inside) ** 2, 0.0, 1.0)
+def _bump(time: Array, start: float, length: float, *, period: float) -> Array:
+    """Once in each period smoothly up from 0 at `start` to 1 and down again after `length`."""
+    part = np.clip(((time - start) % period) / length, 0.0, 1.0)
+    return np.clip(1.6 * np.sin(np.pi * part) ** 2, 0.0, 1.0)
 
 
 def _soften(height: Array) -> Array:
@@ -274,7 +273,3 @@ def _soften(height: Array) -> Array:
         return height
     padded = np.concatenate([np.repeat(height[:1], 2), height, np.repeat(height[-1:], 2)])
     return np.convolve(padded, np.full(5, 0.2), mode="valid")
-
-
-def _up(xy: Array) -> Array:
-    return np.concatenate([xy, np.zeros((len(xy), 1))], axis=1)

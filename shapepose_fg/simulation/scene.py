@@ -78,22 +78,13 @@ def built_in_scene(
     """
     if people < 0 or frames < 0 or cameras < 2:
         raise ValueError(f"need people >= 0, frames >= 0, cameras >= 2; got {people}, {frames}, {cameras}")
-    body = _default_body() if body is None else body
+    body = BodyModel.default() if body is None else body
     rng = np.random.default_rng(seed)
     rig = ring_of_cameras(cameras, rng)
     betas = np.clip(rng.normal(0.0, 1.0, (people, body.num_betas)), -1.8, 1.8)
     builds = builds_of(body, betas)
     motion = Motion(betas, *close_motion(builds, frames, fps, rng))
     return Scene(rig, body, _on_the_floor(body, motion, builds), fps)
-
-
-def _default_body() -> BodyModel:
-    try:
-        return BodyModel.default()
-    except (OSError, ValueError):
-        from shapepose_fg.simulation.stick_body import stick_body
-
-        return stick_body()
 
 
 def ring_of_cameras(count: int, rng: np.random.Generator, *, image_size: tuple[int, int] = (1280, 720)) -> Rig:
