@@ -117,12 +117,6 @@ class BodyEnergy:
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(array)).to(self.dtype)
 
-    def free(self, parameters: BodyParameters) -> Tensor:
-        """The free parameters (B, P) of a body."""
-        angles = parameters.body_pose.flatten(1)[:, self._visible]
-        parts = (parameters.betas, parameters.global_orient, angles, parameters.transl)
-        return torch.cat(parts, 1).to(self.dtype)
-
     def complete(self, free: Tensor) -> BodyParameters:
         """The body (B rows) of free parameters (B, P); invisible joints are where the prior expects them."""
         angles = free[:, self._angle_slice]

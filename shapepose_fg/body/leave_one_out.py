@@ -18,6 +18,12 @@ class JointPosterior:
     """(B, K, 3, 3) and its covariance, m²."""
 
 
+LIMB_M = 0.4
+"""Radius on which the end of a swinging limb moves, for the curvature that a linearisation leaves out.
+
+Chosen so that hidden wrists, arms and legs of held-out motions lie where their covariance says."""
+
+
 def joint_posterior(xyz: Tensor, half: Tensor, residual: Tensor, root: Tensor) -> JointPosterior:
     """Take each joint's own target out of the posterior again (the cavity), to first order.
 
@@ -28,6 +34,9 @@ def joint_posterior(xyz: Tensor, half: Tensor, residual: Tensor, root: Tensor) -
 
     where the second form of C_i needs no inverse of A_i or L_i: L_i may be singular (a ray) or zero, and
     S_i A_i S_i < I because the priors are proper.
+
+    To first order a limb that may swing moves in a plane; in truth on a sphere. Where A_i is large, the sag
+    tr(A_i) / (2 LIMB_M) is added as a sigma along every axis: a hidden wrist is not a thin disc.
 
     Parameters
     ----------
@@ -42,7 +51,9 @@ def joint_posterior(xyz: Tensor, half: Tensor, residual: Tensor, root: Tensor) -
     remainder = torch.eye(3, dtype=A.dtype) - _symmetric(root @ AS)
     C = A + _symmetric(AS @ _inverse(remainder) @ AS.mT)
     pull = root @ (root @ residual[..., None])
-    return JointPosterior(A, xyz + (C @ pull).squeeze(-1), C)
+    sag = torch.diagonal(A, dim1=-2, dim2=-1).sum(-1) / (2 * LIMB_M)
+    curvature = sag.square()[..., None, None] * torch.eye(3, dtype=A.dtype)
+    return JointPosterior(A + curvature, xyz + (C @ pull).squeeze(-1), C + curvature)
 
 
 def _symmetric(matrix: Tensor) -> Tensor:
