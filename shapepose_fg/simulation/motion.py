@@ -132,7 +132,7 @@ def dance(pair: list[Build], time: Array, centre: Array, rng: np.random.Generato
     held = []
     for side, lift in ((1.0, up), (-1.0, np.zeros_like(up))):
         xy = middle(time) + side * across * (0.34 - 0.16 * lift)[:, None]
-        z = shoulder - 0.32 + 0.62 * lift + 0.03 * np.sin(2 * np.pi * time / beat)
+        z = shoulder - 0.32 + 0.72 * lift + 0.03 * np.sin(2 * np.pi * time / beat)
         held.append(np.concatenate([xy, z[:, None]], axis=1))
     puppets = []
     for sign, build, other in ((1.0, pair[0], pair[1]), (-1.0, pair[1], pair[0])):

@@ -1,0 +1,173 @@
+"""The picture of a frame: made for whoever is there, and bodies where their skeletons are."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from shapepose_fg.camera import Rig
+from shapepose_fg.errors import InputError
+from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.rendering import look_at, render_depth
+from shapepose_fg.simulation import DetectorConfig, Scene, built_in_scene, simulate
+from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.viewer import demo_picture
+from shapepose_fg.viewer.figures import Figures, floor_under, framed, free_viewpoint, two_views
+from shapepose_fg.viewer.floor import Floor, floor_picture
+
+pytest.importorskip("matplotlib")
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return built_in_scene(seed=0, frames=2)
+
+
+@pytest.fixture(scope="module")
+def found(scene: Scene) -> Reconstruction:
+    """The truth of both frames, as a reconstruction."""
+    motion, people = scene.motion, scene.people
+    return Reconstruction.concatenate(
+        [
+            Reconstruction(
+                frame=np.full(people, frame),
+                person=np.arange(people)[::-1],
+                joint_names=np.array(BODY_25.joints),
+                joints=scene.truth_at(frame),
+                covariance=np.tile(1e-4 * np.eye(3), (people, 25, 1, 1)),
+                confidence=np.ones((people, 25)),
+                betas=motion.betas,
+                global_orient=motion.global_orient[frame],
+                body_pose=motion.body_pose[frame],
+                transl=motion.transl[frame],
+                status=np.array(["ok"] * people),
+            )
+            for frame in range(2)
+        ]
+    )
+
+
+def without_body(people: Reconstruction, row: int) -> Reconstruction:
+    """Take the body and the arms of one row away."""
+    columns = {name: getattr(people, name).copy() for name in ("betas", "global_orient", "body_pose", "transl")}
+    for value in columns.values():
+        value[row] = np.nan
+    status, joints = people.status.astype("U20"), people.joints.copy()
+    status[row] = "body undetermined"
+    joints[row, [3, 4, 6, 7]] = np.nan
+    return replace(people, **columns, status=status, joints=joints)
+
+
+def picture(path: Path) -> np.ndarray:
+    image = cv2.imread(str(path))
+    assert image is not None
+    return image
+
+
+def test_the_picture_is_written_with_everything(tmp_path: Path, scene: Scene, found: Reconstruction):
+    detections = simulate(scene, DetectorConfig())[1]
+    path = tmp_path / "people.png"
+    demo_picture(path, scene.rig, found, 1, detections=detections, truth=scene.vertices_at(1), width_px=900)
+    image = picture(path)
+    assert image.shape[1] == 900 and 450 < image.shape[0] < 700
+    # Somebody of each colour is drawn, besides paper and floor: colourful pixels of at least four hues.
+    hsv = cv2.cvtColor(image, cv2.COLOR_BGR2HSV)
+    hues = np.bincount(hsv[hsv[..., 1] > 100][:, 0] // 15, minlength=12)
+    assert (hues > 300).sum() >= 4
+
+
+def test_a_person_without_body_and_an_empty_frame_are_drawn(tmp_path: Path, scene: Scene, found: Reconstruction):
+    partial = without_body(found, 3)  # the blue one: the most saturated
+    for name, people in (("partial", partial), ("full", found), ("nobody", Reconstruction.empty())):
+        demo_picture(tmp_path / f"{name}.png", scene.rig, people, 0, views=(0, 1), width_px=700)
+    partly, full, empty = (picture(tmp_path / f"{name}.png") for name in ("partial", "full", "nobody"))
+
+    def inked(image: np.ndarray) -> int:
+        return int((cv2.cvtColor(image, cv2.COLOR_BGR2HSV)[..., 1] > 100).sum())
+
+    assert inked(empty) < 0.02 * inked(full)
+    assert 0.5 * inked(full) < inked(partly) < 0.95 * inked(full)
+
+
+def test_two_cameras_are_enough(tmp_path: Path, scene: Scene, found: Reconstruction):
+    demo_picture(tmp_path / "two.png", Rig(scene.rig.cameras[:2], up="z"), found, 0, width_px=500)
+    assert picture(tmp_path / "two.png").shape[1] == 500
+
+
+def test_figures_come_by_identity_and_bodies_lie_under_skeletons(scene: Scene, found: Reconstruction):
+    figures = Figures.of(without_body(found, 0).at(0), scene.body)
+    assert figures.labels == ("person 0", "person 1", "person 2", "person 3")
+    # Identities run against the rows, so the row without a body is the last identity.
+    np.testing.assert_array_equal(figures.has_body, [True, True, True, False])
+    bodies = figures.mesh.vertices.reshape(3, -1, 3)
+    np.testing.assert_allclose(bodies, scene.vertices_at(0)[[3, 2, 1]], atol=1e-5)
+    assert len(np.unique(figures.mesh.colours, axis=0)) == 3
+    # In a view, every joint's pixel is covered by a body or next to one: joints lie inside the silhouette.
+    camera = framed(scene.rig.cameras[0], figures.points, (800, 450))
+    surface = render_depth(figures.mesh.vertices, figures.mesh.faces, camera)
+    xy, _ = camera.project(figures.joints[:3].reshape(-1, 3))
+    column, row = np.clip(np.rint(xy), 0, (799, 449)).astype(int).T
+    assert (surface.face[row, column] >= 0).mean() > 0.95
+
+
+def test_views_and_frames_are_well_chosen(scene: Scene, found: Reconstruction):
+    figures = Figures.of(found.at(0), scene.body)
+    first, second = two_views(scene.rig, figures.mesh)
+    assert first != second
+    axes = scene.rig.cTw[:, 2, :3]
+    assert abs(axes[first] @ axes[second]) < 0.8
+    for camera in scene.rig.cameras:
+        window = framed(camera, figures.points, (640, 360))
+        assert window.image_size == (640, 360)
+        inside = camera.project(figures.points)[0]
+        seen = ((inside >= 0) & (inside <= np.array(camera.image_size) - 1)).all(axis=1)
+        xy, _ = window.project(figures.points[seen])
+        assert (xy > -1).all() and (xy < (640, 360)).all()
+    floor = floor_under(scene.rig, figures.points)
+    free = free_viewpoint(scene.rig, figures.points, floor, (900, 800))
+    xy, _ = free.project(figures.points)
+    assert (xy > 0).all() and (xy < (900, 800)).all()
+
+
+@pytest.mark.parametrize("up", [UP, -np.eye(3)[1]])
+def test_a_floor_has_axes_of_its_own_at_its_height(up: np.ndarray):
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    floor = Floor.under(points, up, -0.3, 3.0)
+    np.testing.assert_allclose(floor.axes @ floor.axes.T, np.eye(2), atol=1e-12)
+    np.testing.assert_allclose(floor.axes @ up, 0, atol=1e-12)
+    assert abs(floor.origin @ up + 0.3) < 1e-12
+    xy = np.array([[0.2, -0.4], [1.0, 2.0]])
+    np.testing.assert_allclose(floor.coordinates(floor.at(xy) + 0.7 * up), xy)
+    np.testing.assert_allclose(floor.height(floor.at(xy) + 0.7 * up), 0.7)
+
+
+def test_the_floor_has_lines_below_the_horizon_and_a_shadow_under_a_body(scene: Scene):
+    floor = Floor.under(np.zeros((1, 3)), UP, 0.0, 3.0)
+    camera = replace(
+        scene.rig.cameras[0],
+        K=np.array([[300.0, 0, 160], [0, 300, 90], [0, 0, 1]]),
+        wTc=look_at(np.array([0.0, -4, 1.6]), np.array([0.0, 0, 1.2]), UP),
+        image_size=(320, 180),
+    )
+    nobody = floor_picture(floor, camera, np.zeros((0, 3)), np.zeros((0, 3), dtype=int), UP)
+    assert np.ptp(nobody[:40]) < 0.01  # paper above the horizon
+    crossing, _ = camera.project(np.array([[0.0, 0, 0], [0.25, 0.25, 0]]))
+    (column, row), (beside, above) = np.rint(crossing).astype(int)
+    assert nobody[row, column].mean() < nobody[above, beside].mean() - 0.05
+    square = np.array([[-0.3, -0.3, 0.1], [0.3, -0.3, 0.1], [0.3, 0.3, 0.1], [-0.3, 0.3, 0.1]])
+    shaded = floor_picture(floor, camera, square, np.array([[0, 1, 2], [0, 2, 3]]), UP)
+    darker = nobody.mean(axis=-1) - shaded.mean(axis=-1)
+    assert darker[row - 2, column + 5] > 0.2  # in the middle of the square
+    assert darker[:40].max() == 0 and darker.min() > -1e-9
+
+
+def test_without_matplotlib_the_cure_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scene: Scene, found: Reconstruction
+):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(InputError, match=r"pip install shapepose-fg\[viewer\]"):
+        demo_picture(tmp_path / "none.png", scene.rig, found, 0)
