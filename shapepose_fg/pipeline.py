@@ -47,10 +47,14 @@ class PipelineConfig:
     """Stage II: the alternation."""
     batch_frames: int = 64
     """Frames whose people are refined together: bodies are fitted fastest by the hundred."""
+    threads: int = 1
+    """Threads of torch while bodies are fitted: the matrices are small, and where cores are busy a second thread
+    costs more than it brings."""
 
     def __post_init__(self) -> None:
-        if self.batch_frames <= 0:
-            raise ValueError(f"batch_frames must be positive, got {self.batch_frames}")
+        for name in ("batch_frames", "threads"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
 
 
 def reconstruct(

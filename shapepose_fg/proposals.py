@@ -3,6 +3,7 @@
 Stage I (d) and the first half of (e) of the paper (section 3.1, "Human Proposal Generation").
 """
 
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,12 +29,6 @@ class ProposalConfig:
     separation_m: float = 0.2
     """Non-maximum suppression: of two anchors closer than this the better one stays. A pelvis is about 20 cm
     deep and 30 cm wide: the middles of two are not closer even when people hug."""
-    shadow_m: float = 0.4
-    """Of two people whose hips are closer than this, one who has far fewer votes is the other's shadow: the
-    same person again, from rays that cross a little beside."""
-    shadow_votes: float = 0.4
-    """How few votes, relative to the other's, make a shadow. On simulated people in close motion, 99 % of the
-    real ones have over 0.45 of the median, and most shadows under 0.3."""
     doubt: float = 0.2
     """Affinity below which a view speaks against a limb: unrelated pairs are mostly 0, true ones above 0.4."""
     max_limb_m: float = 0.75
@@ -46,10 +41,10 @@ class ProposalConfig:
     whose joints belong to others, have less than 0.4."""
 
     def __post_init__(self) -> None:
-        for name in ("box_horizontal_m", "box_vertical_m", "separation_m", "shadow_m", "max_limb_m"):
+        for name in ("box_horizontal_m", "box_vertical_m", "separation_m", "max_limb_m"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        for name in ("min_parts", "min_confidence", "min_grown_parts", "doubt", "shadow_votes"):
+        for name in ("min_parts", "min_confidence", "min_grown_parts", "doubt"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
 
@@ -90,63 +85,87 @@ def propose(
 
     `up` is the (3,) unit vector that points up. Two people do not share a candidate.
     """
-    anchors, score, dropped = _anchors(candidates, skeleton, up, config)
+    dropped: Counter[str] = Counter()
     links = link(candidates, detections, config)
+    hips = candidates.joint == skeleton.root
+    anchors = _anchors(np.flatnonzero(hips & candidates.strong), candidates, skeleton, up, config, dropped)
+    anchors = _linked(anchors, candidates, links, skeleton, config, dropped)
     chosen = grow(anchors, candidates, links, skeleton, config)
-    core = chosen[:, skeleton.core]
-    strong = (core >= 0) & candidates.strong[core]
-    linked = strong.mean(axis=1) >= config.min_grown_parts
-    votes = np.where(strong, candidates.votes[core], 0).sum(axis=1)
-    real = linked & ~_shadows(candidates.xyz[anchors], votes, config)
-    dropped["too few joints linked to the hip"] = int((~linked).sum())
-    dropped["shadow of a better one"] = int((linked & ~real).sum())
-    if not real.all():
-        # What the others had taken goes back to those whom it belongs to.
-        chosen = grow(anchors[real], candidates, links, skeleton, config)
-    return Proposals(chosen, score[real], dropped)
+    # A person whose hip too few views saw leaves strong joints over that nobody claims.
+    left = candidates.strong.copy()
+    left[chosen[chosen >= 0]] = False
+    kinds = np.unique(candidates.joint[left & np.isin(candidates.joint, skeleton.core)])
+    if len(kinds) >= config.min_grown_parts * len(skeleton.core):
+        free = np.ones(len(candidates), dtype=bool)
+        free[chosen[chosen >= 0]] = False
+        unclaimed = Links(links.ends[free[links.ends].all(axis=1)], links.score[free[links.ends].all(axis=1)])
+        near = np.linalg.norm(candidates.xyz[:, None] - candidates.xyz[anchors], axis=-1) < config.separation_m
+        apart = hips & free & ~near.any(axis=1)
+        more = _anchors(np.flatnonzero(apart), candidates, skeleton, up, config, Counter())
+        more = _linked(more, candidates, unclaimed, skeleton, config, Counter())
+        if len(more) > 0:
+            anchors = _linked(np.concatenate([anchors, more]), candidates, links, skeleton, config, dropped)
+            chosen = grow(anchors, candidates, links, skeleton, config)
+    score = _box_score(anchors, candidates, skeleton, up, config)[1]
+    return Proposals(chosen, score, dict(dropped))
 
 
-def _shadows(hips: NDArray[np.float64], votes: NDArray[np.intp], config: ProposalConfig) -> NDArray[np.bool_]:
-    """(P,) who stands where somebody with many more votes stands."""
-    near = np.linalg.norm(hips[:, None] - hips[None], axis=-1) < config.shadow_m
-    return (near & (votes[:, None] < config.shadow_votes * votes[None])).any(axis=1)
+def _linked(
+    anchors: NDArray[np.intp],
+    candidates: Candidates,
+    links: Links,
+    skeleton: Skeleton,
+    config: ProposalConfig,
+    dropped: Counter[str],
+) -> NDArray[np.intp]:
+    """The anchors that enough strong joints are linked to; counts the others in `dropped`."""
+    core = grow(anchors, candidates, links, skeleton, config)[:, skeleton.core]
+    linked = ((core >= 0) & candidates.strong[core]).mean(axis=1) >= config.min_grown_parts
+    dropped["too few joints linked to the hip"] += int((~linked).sum())
+    return anchors[linked]
 
 
 def _anchors(
-    candidates: Candidates, skeleton: Skeleton, up: NDArray[np.float64], config: ProposalConfig
-) -> tuple[NDArray[np.intp], NDArray[np.float64], dict[str, int]]:
-    """Root candidates whose box holds enough confident parts, best first, without near-duplicates."""
-    anchors = np.flatnonzero(candidates.strong & (candidates.joint == skeleton.root))
-    offset = candidates.xyz[None] - candidates.xyz[anchors, None]
+    hips: NDArray[np.intp],
+    candidates: Candidates,
+    skeleton: Skeleton,
+    up: NDArray[np.float64],
+    config: ProposalConfig,
+    dropped: Counter[str],
+) -> NDArray[np.intp]:
+    """Those of the root candidates `hips` whose box holds enough confident parts, without near-duplicates."""
+    parts, score = _box_score(hips, candidates, skeleton, up, config)
+    enough = parts >= config.min_parts
+    confident = score >= config.min_confidence
+    anchors = hips[enough & confident]
+    anchors = anchors[np.argsort(-candidates.score[anchors] * candidates.votes[anchors], kind="stable")]
+    distance = np.linalg.norm(candidates.xyz[anchors, None] - candidates.xyz[anchors][None], axis=-1)
+    alone = np.ones(len(anchors), dtype=bool)
+    for i in range(len(anchors)):  # a handful of people
+        alone[i] = not (alone[:i] & (distance[i, :i] < config.separation_m)).any()
+    dropped["too few parts in the box"] += int((~enough).sum())
+    dropped["low confidence"] += int((enough & ~confident).sum())
+    dropped["same hip as a better one"] += int((~alone).sum())
+    return anchors[alone]
+
+
+def _box_score(
+    hips: NDArray[np.intp],
+    candidates: Candidates,
+    skeleton: Skeleton,
+    up: NDArray[np.float64],
+    config: ProposalConfig,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Fraction of the core parts (H,) in the box around each hip, and mean confidence (H,) of the best of each."""
+    offset = candidates.xyz[None] - candidates.xyz[hips, None]
     height = offset @ up
     horizontal = np.linalg.norm(offset - height[..., None] * up, axis=-1)
     in_box = (horizontal < config.box_horizontal_m) & (np.abs(height) < config.box_vertical_m)
-    best = np.zeros((len(anchors), len(skeleton)))
-    anchor, candidate = np.nonzero(in_box)
-    np.maximum.at(best, (anchor, candidates.joint[candidate]), candidates.score[candidate])
+    best = np.zeros((len(hips), len(skeleton)))
+    hip, candidate = np.nonzero(in_box)
+    np.maximum.at(best, (hip, candidates.joint[candidate]), candidates.score[candidate])
     core = best[:, skeleton.core]
-    parts = (core > 0).mean(axis=1)
-    score = core.sum(axis=1) / np.maximum((core > 0).sum(axis=1), 1)
-    enough = parts >= config.min_parts
-    confident = score >= config.min_confidence
-    kept = enough & confident
-    order = np.flatnonzero(kept)[np.argsort(-_evidence(candidates, anchors[kept]), kind="stable")]
-    distance = np.linalg.norm(candidates.xyz[anchors[order], None] - candidates.xyz[anchors[order]][None], axis=-1)
-    alone = np.ones(len(order), dtype=bool)
-    for i in range(len(order)):  # a handful of people
-        alone[i] = not (alone[:i] & (distance[i, :i] < config.separation_m)).any()
-    dropped = {
-        "too few parts in the box": int((~enough).sum()),
-        "low confidence": int((enough & ~confident).sum()),
-        "same hip as a better one": int((~alone).sum()),
-    }
-    order = order[alone]
-    return anchors[order], score[order], dropped
-
-
-def _evidence(candidates: Candidates, index: NDArray[np.intp]) -> NDArray[np.float64]:
-    """How much speaks for candidates: confidence times votes."""
-    return candidates.score[index] * candidates.votes[index]
+    return (core > 0).mean(axis=1), core.sum(axis=1) / np.maximum((core > 0).sum(axis=1), 1)
 
 
 def link(candidates: Candidates, detections: Detections, config: ProposalConfig) -> Links:
