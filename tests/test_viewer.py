@@ -15,7 +15,7 @@ from shapepose_fg.rendering import look_at, render_depth
 from shapepose_fg.simulation import DetectorConfig, Scene, built_in_scene, simulate
 from shapepose_fg.skeleton import BODY_25
 from shapepose_fg.viewer import demo_picture
-from shapepose_fg.viewer.figures import Figures, floor_under, framed, free_viewpoint, two_views
+from shapepose_fg.viewer.figures import Figures, Mesh, floor_under, framed, free_viewpoint, two_views
 from shapepose_fg.viewer.floor import Floor, floor_picture
 
 pytest.importorskip("matplotlib")
@@ -127,7 +127,12 @@ def test_views_and_frames_are_well_chosen(scene: Scene, found: Reconstruction):
         seen = ((inside >= 0) & (inside <= np.array(camera.image_size) - 1)).all(axis=1)
         xy, _ = window.project(figures.points[seen])
         assert (xy > -1).all() and (xy < (640, 360)).all()
-    floor = floor_under(scene.rig, figures.points)
+    floor = floor_under(scene.rig, figures, Mesh.clay(None, scene.body.faces))
+    assert abs(floor.height(np.zeros(3))) < 0.01  # the floor of the built-in scene is at 0
+    sunk = replace(figures, joints=figures.joints - np.array([0.5, 0, 0, 0])[:, None, None] * UP)
+    assert abs(floor_under(scene.rig, sunk, Mesh.clay(None, scene.body.faces)).height(np.zeros(3))) < 0.02
+    truth = Mesh.clay(scene.vertices_at(0), scene.body.faces)
+    assert abs(floor_under(scene.rig, sunk, truth).height(np.zeros(3))) < 0.01
     free = free_viewpoint(scene.rig, figures.points, floor, (900, 800))
     xy, _ = free.project(figures.points)
     assert (xy > 0).all() and (xy < (900, 800)).all()

@@ -1,6 +1,6 @@
 """Who is drawn, in which colour, and from where."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 
 PALETTE = ("#3f7fb8", "#e0962f", "#2f9e80", "#c06c9c", "#6cb6dd", "#c8623f", "#7d70b8", "#a8a03c")
 """One colour per person, after Okabe and Ito's: apart for every kind of colour vision."""
+_SOLE_M = 0.015
+"""How far the lowest keypoint of a foot is above its sole, metres."""
 _CLAY = np.array([0.74, 0.74, 0.75])
 
 
@@ -102,10 +104,18 @@ def _bodies(body: "BodyModel", *parameters: Array) -> Array:
         return body.vertices(BodyParameters(*tensors)).numpy().astype(np.float64)
 
 
-def floor_under(rig: Rig, points: Array) -> Floor:
-    """The floor under the lowest of `points` (K, 3), which for bodies is a sole."""
-    height = (points @ rig.up_vector).min() if len(points) else 0.0
-    return Floor.under(points, rig.up_vector, float(height), radius_m=3.6)
+def floor_under(rig: Rig, figures: Figures, ghosts: Mesh) -> Floor:
+    """The floor under the true soles where they are known, else under most people's lowest joints."""
+    up = rig.up_vector
+    points = np.concatenate([figures.points, ghosts.vertices])
+    lowest = np.where(np.isfinite(figures.joints).all(axis=-1), figures.joints @ up, np.inf).min(axis=1)
+    lowest = lowest[np.isfinite(lowest)] - _SOLE_M
+    # The median: one foot fitted through the floor does not lower it for everybody.
+    heights = [(ghosts.vertices @ up).min()] if len(ghosts.vertices) else lowest
+    height = float(np.median(heights)) if len(heights) else 0.0
+    floor = Floor.under(points, up, height, radius_m=1.0)
+    reach = np.linalg.norm(floor.coordinates(rig.centres), axis=1).max()
+    return replace(floor, radius_m=float(np.clip(1.05 * reach, 3.6, 10.0)))
 
 
 def two_views(rig: Rig, mesh: Mesh) -> tuple[int, int]:

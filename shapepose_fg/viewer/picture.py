@@ -53,7 +53,7 @@ def demo_picture(
         raise InputError("the picture needs matplotlib: pip install shapepose-fg[viewer]") from None
     body = _default_body() if body is None else body
     figures, ghosts = Figures.of(reconstruction.at(frame), body), Mesh.clay(truth, body.faces)
-    floor = floor_under(rig, np.concatenate([figures.points, ghosts.vertices]))
+    floor = floor_under(rig, figures, ghosts)
     views = two_views(rig, figures.mesh) if views is None else views
 
     left = round(0.44 * width_px) - _GAP
