@@ -137,12 +137,15 @@ def _spans(
     a: NDArray[np.float64], rest: NDArray[np.float64], width: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """First column and count (S,) of the pixels of a row where all three a x + rest (3, S) are at least 0."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        edge = -rest / a
-    # The margin lets neighbours both draw a pixel centre on their common edge: no gaps.
-    low = np.where(a > 0, edge, -np.inf).max(axis=0) - 1e-7
-    high = np.where(a < 0, edge, np.inf).min(axis=0) + 1e-7
-    outside = ((a == 0) & (rest < -1e-9)).any(axis=0)
+    low, high = np.full(rest.shape[1], -np.inf), np.full(rest.shape[1], np.inf)
+    outside = np.zeros(rest.shape[1], dtype=bool)
+    for slope, value in zip(a, rest, strict=True):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            edge = -value / slope
+        # The margin lets neighbours both draw a pixel centre on their common edge: no gaps.
+        low = np.where(slope > 0, np.maximum(low, edge - 1e-7), low)
+        high = np.where(slope < 0, np.minimum(high, edge + 1e-7), high)
+        outside |= (slope == 0) & (value < -1e-9)
     first = np.ceil(np.clip(low, 0, width)).astype(np.intp)
     last = np.floor(np.clip(high, -1, width - 1)).astype(np.intp)
     return first, np.where(outside, 0, np.maximum(last - first + 1, 0))

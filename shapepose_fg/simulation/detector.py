@@ -187,9 +187,9 @@ def _merge(found: _Found, merge_px: float) -> _Found:
         return found
     found = found.take(np.argsort(-found.confidence, kind="stable"))
     label = found.view * len(BODY_25) + found.joint
-    near = label[:, None] == label[None]
-    near &= ((found.xy[:, None] - found.xy[None]) ** 2).sum(axis=-1) < merge_px**2
-    better = near & np.tri(len(label), k=-1, dtype=bool)
+    x, y = found.xy.T
+    better = (label[:, None] == label) & np.tri(len(label), k=-1, dtype=bool)
+    better &= np.square(x[:, None] - x) + np.square(y[:, None] - y) < merge_px**2
     lost = better.any(axis=1)
     owner = found.owner.copy()
     np.logical_or.at(owner, better[lost].argmax(axis=1), found.owner[lost])
