@@ -82,11 +82,12 @@ def reconstruct(
     with run.stage("load"):
         fitter = _default_fitter(config) if fitter is None else fitter
     parts = []
-    for start in range(0, len(frames), config.batch_frames):
-        batch = frames[start : start + config.batch_frames]
-        parts.append(_reconstruct_batch(detections, rig, config, batch, fitter, extra_factors, run))
-        if progress is not None:
-            progress(start + len(batch), len(frames))
+    with _torch_threads(config.threads):
+        for start in range(0, len(frames), config.batch_frames):
+            batch = frames[start : start + config.batch_frames]
+            parts.append(_reconstruct_batch(detections, rig, config, batch, fitter, extra_factors, run))
+            if progress is not None:
+                progress(start + len(batch), len(frames))
     people = Reconstruction.concatenate(parts) if parts else Reconstruction.empty(detections.skeleton.joints)
     return replace(people, run=run.summary(config, frames, people))
 
@@ -165,6 +166,19 @@ def _default_fitter(config: PipelineConfig) -> BodyFitter:
     from shapepose_fg.body.baseline import LevenbergMarquardtFitter
 
     return LevenbergMarquardtFitter(config=config.body)
+
+
+@contextmanager
+def _torch_threads(count: int) -> Iterator[None]:
+    """Give torch `count` threads, and back what it had."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 class _Run:

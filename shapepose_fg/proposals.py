@@ -83,31 +83,43 @@ def propose(
 ) -> Proposals:
     """Find the people of a frame: anchors at the root joint, their boxes checked, their joints grown.
 
+    Strong root candidates come first (the paper's hips); weak ones anchor only what the strong ones leave over.
     `up` is the (3,) unit vector that points up. Two people do not share a candidate.
     """
     dropped: Counter[str] = Counter()
     links = link(candidates, detections, config)
-    hips = candidates.joint == skeleton.root
-    anchors = _anchors(np.flatnonzero(hips & candidates.strong), candidates, skeleton, up, config, dropped)
-    anchors = _linked(anchors, candidates, links, skeleton, config, dropped)
-    chosen = grow(anchors, candidates, links, skeleton, config)
-    # A person whose hip too few views saw leaves strong joints over that nobody claims.
-    left = candidates.strong.copy()
-    left[chosen[chosen >= 0]] = False
-    kinds = np.unique(candidates.joint[left & np.isin(candidates.joint, skeleton.core)])
-    if len(kinds) >= config.min_grown_parts * len(skeleton.core):
-        free = np.ones(len(candidates), dtype=bool)
-        free[chosen[chosen >= 0]] = False
-        unclaimed = Links(links.ends[free[links.ends].all(axis=1)], links.score[free[links.ends].all(axis=1)])
-        near = np.linalg.norm(candidates.xyz[:, None] - candidates.xyz[anchors], axis=-1) < config.separation_m
-        apart = hips & free & ~near.any(axis=1)
-        more = _anchors(np.flatnonzero(apart), candidates, skeleton, up, config, Counter())
-        more = _linked(more, candidates, unclaimed, skeleton, config, Counter())
-        if len(more) > 0:
-            anchors = _linked(np.concatenate([anchors, more]), candidates, links, skeleton, config, dropped)
-            chosen = grow(anchors, candidates, links, skeleton, config)
+    hips = np.flatnonzero(candidates.strong & (candidates.joint == skeleton.root))
+    anchors = _anchors(hips, candidates, skeleton, up, config, dropped)
+    anchors, chosen = _linked(anchors, candidates, links, skeleton, config, dropped)
+    more = _unclaimed_anchors(anchors, chosen, candidates, links, skeleton, up, config)
+    if len(more) > 0:
+        everyone = np.concatenate([anchors, more])
+        anchors, chosen = _linked(everyone, candidates, links, skeleton, config, dropped)
     score = _box_score(anchors, candidates, skeleton, up, config)[1]
     return Proposals(chosen, score, dict(dropped))
+
+
+def _unclaimed_anchors(
+    anchors: NDArray[np.intp],
+    chosen: NDArray[np.intp],
+    candidates: Candidates,
+    links: Links,
+    skeleton: Skeleton,
+    up: NDArray[np.float64],
+    config: ProposalConfig,
+) -> NDArray[np.intp]:
+    """Weak root candidates that explain strong joints which nobody claims: people whose hip too few views saw."""
+    free = np.ones(len(candidates), dtype=bool)
+    free[chosen[chosen >= 0]] = False
+    left = np.unique(candidates.joint[free & candidates.strong & np.isin(candidates.joint, skeleton.core)])
+    if len(left) < config.min_grown_parts * len(skeleton.core):
+        return np.zeros(0, dtype=np.intp)
+    both_free = free[links.ends].all(axis=1)
+    unclaimed = Links(links.ends[both_free], links.score[both_free])
+    near = np.linalg.norm(candidates.xyz[:, None] - candidates.xyz[anchors], axis=-1) < config.separation_m
+    apart = free & (candidates.joint == skeleton.root) & ~near.any(axis=1)
+    more = _anchors(np.flatnonzero(apart), candidates, skeleton, up, config, Counter())
+    return _linked(more, candidates, unclaimed, skeleton, config, Counter())[0]
 
 
 def _linked(
@@ -117,12 +129,16 @@ def _linked(
     skeleton: Skeleton,
     config: ProposalConfig,
     dropped: Counter[str],
-) -> NDArray[np.intp]:
-    """The anchors that enough strong joints are linked to; counts the others in `dropped`."""
-    core = grow(anchors, candidates, links, skeleton, config)[:, skeleton.core]
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """The anchors that enough strong joints are linked to, and what they chose; counts the others in `dropped`."""
+    chosen = grow(anchors, candidates, links, skeleton, config)
+    core = chosen[:, skeleton.core]
     linked = ((core >= 0) & candidates.strong[core]).mean(axis=1) >= config.min_grown_parts
+    if linked.all():
+        return anchors, chosen
     dropped["too few joints linked to the hip"] += int((~linked).sum())
-    return anchors[linked]
+    # What the dropped had taken goes back to those whom it belongs to.
+    return anchors[linked], grow(anchors[linked], candidates, links, skeleton, config)
 
 
 def _anchors(
