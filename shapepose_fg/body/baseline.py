@@ -36,13 +36,11 @@ class PlainFitterConfig:
     """Levenberg-Marquardt steps, refused ones included."""
     tolerance: float = 1e-2
     """A row is done when a step lowers its energy (in squared standard deviations) by less."""
-    unfinished: float = 1.0
-    """Rows whose energy a further Newton step would lower by more than this are NOT_CONVERGED."""
-    limit_sigma_rad: float = 0.1
-    """How softly elbows and knees stop when bent the wrong way, rad."""
+    unfinished: float = 9.0
+    """Rows whose energy a Newton step would still lower by more (3 sigma of the posterior) are NOT_CONVERGED."""
 
     def __post_init__(self) -> None:
-        for name in ("kernel_scale", "tolerance", "unfinished", "limit_sigma_rad"):
+        for name in ("kernel_scale", "tolerance", "unfinished"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
         if self.max_iterations < 1 or self.anneal_steps < 0:
@@ -67,7 +65,7 @@ class LevenbergMarquardtFitter:
         prior = PosePrior.default() if pose_prior is None else pose_prior
         self.config = PlainFitterConfig() if config is None else config
         self._align = RestAlignment(model, prior)
-        self._energy = BodyEnergy(model.to(torch.float32), prior, self.config.limit_sigma_rad)
+        self._energy = BodyEnergy(model.to(torch.float32), prior)
         self._mean_angles = prior.mean[self._energy.angles]
 
     @torch.no_grad()
@@ -159,16 +157,16 @@ class LevenbergMarquardtFitter:
         body = self._energy.complete(free)
         fit.status[rows[~done]] = FitStatus.NOT_CONVERGED
         rows, origin = rows[done], centre[done]
-        fit.betas[rows] = body.betas[done]
-        fit.global_orient[rows] = body.global_orient[done]
-        fit.body_pose[rows] = body.body_pose[done]
-        fit.transl[rows] = body.transl[done].numpy() + origin
-        fit.joints[rows] = xyz[done].numpy() + origin[:, None]
-        fit.covariance[rows] = posterior.covariance[done]
-        fit.prior_xyz[rows] = posterior.left_out_xyz[done].numpy() + origin[:, None]
+        fit.betas[rows] = _double(body.betas)[done]
+        fit.global_orient[rows] = _double(body.global_orient)[done]
+        fit.body_pose[rows] = _double(body.body_pose)[done]
+        fit.transl[rows] = _double(body.transl)[done] + origin
+        fit.joints[rows] = _double(xyz)[done] + origin[:, None]
+        fit.covariance[rows] = _double(posterior.covariance)[done]
+        fit.prior_xyz[rows] = _double(posterior.left_out_xyz)[done] + origin[:, None]
         model_error = self.config.evidence.model_sigma_m**2 * np.eye(3)
-        fit.prior_covariance[rows] = posterior.left_out_covariance[done].numpy() + model_error
-        fit.residual_m[rows] = residual_m[done]
+        fit.prior_covariance[rows] = _double(posterior.left_out_covariance)[done] + model_error
+        fit.residual_m[rows] = _double(residual_m)[done]
         return fit
 
 
@@ -181,6 +179,10 @@ def _check(targets: JointTargets, initial: BodyFit | None) -> None:
 
 def _single(array: Array) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(array)).float()
+
+
+def _double(tensor: Tensor) -> Array:
+    return tensor.double().numpy()
 
 
 def _damped_step(here: Linearisation, damping: Tensor) -> tuple[Tensor, Tensor]:

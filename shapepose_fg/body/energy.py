@@ -1,6 +1,6 @@
 """The energy of a body given joint targets, and its Gauss-Newton linearisation, batched over rows.
 
-    E(Theta) = sum_i rho(|S_i (x_i(Theta) - z_i)|²) + |betas|² + |theta - mean|²_P + limits(theta)
+    E(Theta) = sum_i rho(|S_i (x_i(Theta) - z_i)|²) + |betas|² + |theta - mean|²_P
 
 with S_iᵀ S_i the information of target z_i, rho a robust kernel, P the pose prior's precision: SMPLify (Bogo et
 al. 2016) for 3D joints. There is no factor 1/2, so that the inverse of the Hessian below is a covariance.
@@ -40,7 +40,7 @@ class Linearisation:
     squared: Tensor
     """(B, K) squared Mahalanobis distance of every joint to its target."""
     prior: Tensor
-    """(B,) what betas, pose prior and limits add to the energy."""
+    """(B,) what betas and pose prior add to the energy."""
     gradient: Tensor
     """(B, P) half the gradient."""
     hessian: Tensor
@@ -83,7 +83,7 @@ class BodyEnergy:
     for them exactly, and `complete` fills them in with their regression.
     """
 
-    def __init__(self, model: BodyModel, prior: PosePrior, limit_sigma_rad: float):
+    def __init__(self, model: BodyModel, prior: PosePrior):
         self.model, self.dtype = model, model.dtype
         visible = visible_joints(model, prior)
         self.angles = (visible[:, None] * 3 + np.arange(3)).ravel()
@@ -97,9 +97,6 @@ class BodyEnergy:
         self._regression = self._tensor(prior.regression(self.angles, hidden))
         self._mean = self._tensor(prior.mean)
         self._precision = self._tensor(prior.marginal_precision(self.angles))
-        self._lower = self._tensor(prior.lower[self.angles])
-        self._upper = self._tensor(prior.upper[self.angles])
-        self._limit_weight = 1 / limit_sigma_rad**2
         # From free parameters to the model's 85 columns: identity, but right Jacobians for the angles.
         spread = torch.zeros(10 + 72 + 3, self.num_free, dtype=self.dtype)
         spread[:13, :13] = torch.eye(13)
@@ -157,20 +154,16 @@ class BodyEnergy:
         rows = (root @ jacobian.unflatten(1, xyz.shape[1:])).flatten(1, 2)
         gradient = (rows.mT @ (weight * residual).flatten(1)[..., None]).squeeze(-1)
         hessian = rows.mT @ rows + self._prior_hessian
-        prior = self._add_priors(free, gradient, hessian)
+        prior = self._add_priors(free, gradient)
         return Linearisation(squared, prior, gradient, hessian)
 
-    def _add_priors(self, free: Tensor, gradient: Tensor, hessian: Tensor) -> Tensor:
-        """Add the priors' gradient, and the limits' curvature, in place; returns their energy (B,)."""
-        betas, angles = free[:, :10], free[:, self._angle_slice]
-        error = angles - self._mean[self._visible]
+    def _add_priors(self, free: Tensor, gradient: Tensor) -> Tensor:
+        """Add the gradients of shape and pose prior in place; returns their energy (B,)."""
+        betas, error = free[:, :10], free[:, self._angle_slice] - self._mean[self._visible]
         pull = error @ self._precision
-        excess = (angles - self._upper).clamp_min(0) + (angles - self._lower).clamp_max(0)
         gradient[:, :10] += betas
-        gradient[:, self._angle_slice] += pull + self._limit_weight * excess
-        diagonal = torch.diagonal(hessian, dim1=-2, dim2=-1)
-        diagonal[:, self._angle_slice] += self._limit_weight * (excess != 0)
-        return betas.square().sum(-1) + (pull * error).sum(-1) + self._limit_weight * excess.square().sum(-1)
+        gradient[:, self._angle_slice] += pull
+        return betas.square().sum(-1) + (pull * error).sum(-1)
 
 
 def visible_joints(model: BodyModel, prior: PosePrior) -> np.ndarray:
