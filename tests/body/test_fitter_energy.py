@@ -1,0 +1,169 @@
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from shapepose_fg.body.alignment import RestAlignment
+from shapepose_fg.body.energy import (
+    BodyEnergy,
+    WhitenedTargets,
+    robust_cost,
+    robust_weight,
+    visible_joints,
+)
+from shapepose_fg.body.evidence import EvidenceConfig, spread_m, weigh
+from shapepose_fg.body.fitter import JointTargets
+from shapepose_fg.body.model import BodyModel, BodyParameters
+from shapepose_fg.body.pose_prior import PosePrior
+from shapepose_fg.skeleton import BODY_25, SMPL_24
+
+ROWS = 3
+
+
+@pytest.fixture(scope="module")
+def model() -> BodyModel:
+    return BodyModel.default().to(torch.float64)
+
+
+@pytest.fixture(scope="module")
+def energy(model) -> BodyEnergy:
+    return BodyEnergy(model, PosePrior.default())
+
+
+@pytest.fixture
+def free(energy) -> torch.Tensor:
+    """Free parameters (ROWS, P) of people in poses from the prior, turned any way."""
+    rng = np.random.default_rng(0)
+    angles = PosePrior.default().sample(rng, ROWS).reshape(ROWS, 69)[:, energy.angles]
+    orient = Rotation.random(ROWS, random_state=0).as_rotvec()
+    parts = [rng.normal(size=(ROWS, 10)), orient, angles, rng.normal(size=(ROWS, 3))]
+    return torch.from_numpy(np.concatenate(parts, axis=1))
+
+
+@pytest.fixture
+def targets(energy, free) -> WhitenedTargets:
+    """Targets some centimetres off, with full, ray-like and no information."""
+    rng = np.random.default_rng(1)
+    xyz, _ = energy.keypoints_with_jacobian(free)
+    root = rng.normal(size=(ROWS, 25, 3, 3)) * 20
+    root = torch.from_numpy(root + root.swapaxes(-1, -2))
+    root[:, 3] = torch.diag(torch.tensor([40.0, 40.0, 0.0]))
+    root[1, 7] = 0
+    return WhitenedTargets(xyz + torch.from_numpy(rng.normal(0, 0.03, xyz.shape)), root)
+
+
+def test_gradient_is_the_slope_of_the_energy(energy, free, targets):
+    scale = torch.full((ROWS, 1), 6.0, dtype=torch.float64)
+    gradient = energy.linearise(free, targets, scale).gradient
+    step = 1e-5
+    for column in range(energy.num_free):
+        delta = torch.zeros_like(free)
+        delta[:, column] = step
+        ahead, behind = (
+            energy.linearise(energy.retract(free, sign * delta), targets, scale).energy(scale) for sign in (1, -1)
+        )
+        # Half the slope, for the energy has no factor 1/2; central differences leave step² and rounding.
+        torch.testing.assert_close((ahead - behind) / (4 * step), gradient[:, column], rtol=1e-5, atol=1e-3)
+
+
+def test_jacobian_of_the_free_parameters_is_the_numeric_one(energy, free):
+    _, jacobian = energy.keypoints_with_jacobian(free)
+    step = 1e-6
+    for column in range(energy.num_free):
+        delta = torch.zeros_like(free)
+        delta[:, column] = step
+        ahead, behind = (
+            energy.model.keypoints(energy.complete(energy.retract(free, sign * delta))) for sign in (1, -1)
+        )
+        numeric = ((ahead - behind) / (2 * step)).flatten(1)
+        torch.testing.assert_close(jacobian[:, :, column], numeric, rtol=1e-6, atol=1e-7)
+
+
+def test_hessian_is_information_and_priors(energy, free, targets):
+    wide = torch.full((ROWS, 1), 1e6, dtype=torch.float64)
+    _, jacobian = energy.keypoints_with_jacobian(free)
+    information = targets.root @ targets.root
+    J = jacobian.unflatten(1, (25, 3))
+    expected = torch.einsum("bkip,bkij,bkjq->bpq", J, information, J)
+    expected[:, :10, :10] += torch.eye(10)
+    precision = torch.from_numpy(PosePrior.default().marginal_precision(energy.angles))
+    expected[:, 13:-3, 13:-3] += precision
+    torch.testing.assert_close(energy.linearise(free, targets, wide).hessian, expected)
+
+
+def test_weight_is_the_slope_of_the_robust_cost():
+    squared = torch.linspace(0, 400, 9, dtype=torch.float64, requires_grad=True)
+    scale = torch.tensor(6.0, dtype=torch.float64)
+    (slope,) = torch.autograd.grad(robust_cost(squared, scale).sum(), squared)
+    torch.testing.assert_close(slope, robust_weight(squared, scale).detach())
+    assert float(robust_cost(torch.tensor(1e9), scale)) == pytest.approx(36.0)  # no more than c²
+    assert float(robust_weight(torch.tensor(36.0), scale)) == pytest.approx(0.25)
+
+
+def test_hands_are_invisible_and_limbs_are_not(model):
+    names = {SMPL_24[1:][index] for index in visible_joints(model, PosePrior.default())}
+    assert not names & {"left_hand", "right_hand"}
+    assert {"left_hip", "right_knee", "left_ankle", "right_shoulder", "left_elbow", "neck", "spine2"} <= names
+
+
+def test_invisible_joints_follow_the_prior(energy, free):
+    prior = PosePrior.default()
+    pose = energy.complete(free).body_pose.reshape(ROWS, 69).numpy()
+    hidden = np.setdiff1d(np.arange(69), energy.angles)
+    assert len(hidden) > 0
+    np.testing.assert_allclose(pose[:, energy.angles], free[:, 13:-3])
+    # The most probable hidden angles given the others leave the prior's energy no slope there.
+    slope = (pose - prior.mean) @ prior.precision
+    np.testing.assert_allclose(slope[:, hidden], 0, atol=1e-8)
+
+
+def test_orientation_moves_on_the_sphere_of_rotations(energy, free):
+    step = torch.zeros_like(free)
+    step[:, 10:13] = torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)
+    moved = Rotation.from_rotvec(energy.retract(free, step)[:, 10:13].numpy())
+    expected = Rotation.from_rotvec(free[:, 10:13].numpy()) * Rotation.from_rotvec([0.3, -0.2, 0.1])
+    assert (moved * expected.inv()).magnitude().max() < 1e-9
+
+
+@pytest.mark.parametrize("seen", ["all", "trunk", "legs"])
+def test_alignment_of_the_mean_pose_is_exact(model, seen):
+    prior = PosePrior.default()
+    rotation, transl = Rotation.random(4, random_state=0), np.random.default_rng(0).normal(size=(4, 3))
+    pose = np.tile(prior.mean.reshape(1, 23, 3), (4, 1, 1))
+    parts = (np.zeros((4, 10)), rotation.as_rotvec(), pose, transl)
+    xyz = model.keypoints(BodyParameters(*map(torch.from_numpy, parts))).numpy()
+    names = {
+        "all": BODY_25.joints,
+        "trunk": ("RShoulder", "LShoulder", "RHip", "LHip"),
+        "legs": ("RHip", "LHip", "RAnkle", "LKnee"),
+    }[seen]
+    variance = np.full((4, 25), np.inf)
+    variance[:, [BODY_25.index(name) for name in names]] = 1e-4
+    R, t = RestAlignment(model, prior)(np.where(np.isinf(variance)[..., None], 0.0, xyz), variance)
+    np.testing.assert_allclose(R, rotation.as_matrix(), atol=1e-9)
+    np.testing.assert_allclose(t, transl, atol=1e-9)
+
+
+def test_model_error_is_added_to_covariances_and_rays_stay_rays():
+    rng = np.random.default_rng(0)
+    A = rng.normal(size=(1, 25, 3, 3))
+    covariance = 1e-4 * (A @ A.swapaxes(-1, -2) + np.eye(3))
+    information = np.linalg.inv(covariance)
+    information = (information + information.swapaxes(-1, -2)) / 2
+    information[0, 5] = np.diag([1e4, 1e4, 0.0])
+    information[0, 6] = 0
+    root = weigh(JointTargets(rng.normal(size=(1, 25, 3)), information), EvidenceConfig()).root
+    weighed = root @ root
+    full = np.setdiff1d(np.arange(25), [5, 6])
+    expected = np.linalg.inv(covariance[0, full] + 0.02**2 * np.eye(3))
+    np.testing.assert_allclose(weighed[0, full], expected, rtol=1e-7)
+    np.testing.assert_allclose(weighed[0, 5], np.diag([2000.0, 2000.0, 0.0]), atol=1e-8)  # 1 / (1e-4 + 4e-4)
+    assert not weighed[0, 6].any()
+
+
+def test_spread_is_the_distance_from_the_best_line():
+    line = np.arange(-2.0, 3.0)[:, None] * np.array([0.3, 0.4, 0.0])
+    used = np.ones((2, 5), dtype=bool)
+    side = np.array([0.1, -0.1, 0.0, -0.1, 0.1])[:, None] * np.array([0.0, 0.0, 1.0])
+    spread = spread_m(np.stack([line, line + side]), used)
+    np.testing.assert_allclose(spread, [0.0, 0.1 * np.sqrt(4 / 5)], atol=1e-7)

@@ -1,0 +1,122 @@
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from shapepose_fg.body.pose_prior import PosePrior
+from shapepose_fg.skeleton import SMPL_24
+
+HELD_OUT = ("02", "08", "16", "43", "94", "139")
+
+
+@pytest.fixture(scope="module")
+def prior() -> PosePrior:
+    return PosePrior.default()
+
+
+def angle(joint: str, axis: int) -> int:
+    return 3 * (SMPL_24.index(joint) - 1) + axis
+
+
+def test_mean_pose_stands_with_arms_down_and_joints_bent_the_right_way(prior):
+    mean = prior.mean
+    assert 0.3 < mean[angle("left_knee", 0)] < 1.2 and 0.3 < mean[angle("right_knee", 0)] < 1.2
+    assert mean[angle("left_elbow", 1)] < -0.5 and mean[angle("right_elbow", 1)] > 0.5
+    assert mean[angle("left_shoulder", 2)] < -0.7 and mean[angle("right_shoulder", 2)] > 0.7
+    assert np.abs(mean[[angle("spine2", axis) for axis in range(3)]]).max() < 0.2
+
+
+def test_left_and_right_are_mirror_images(prior):
+    swap = {"left": "right", "right": "left"}
+    sides = [name.partition("_") for name in SMPL_24[1:]]
+    swapped = ["".join((swap.get(side, side), *rest)) for side, *rest in sides]
+    order = np.array([[angle(name, axis) for axis in range(3)] for name in swapped]).ravel()
+    sign = np.tile([1.0, -1.0, -1.0], 23)
+    np.testing.assert_allclose(prior.mean[order] * sign, prior.mean, atol=1e-6)
+    np.testing.assert_allclose(
+        prior.covariance[np.ix_(order, order)] * np.outer(sign, sign), prior.covariance, atol=1e-6
+    )
+
+
+def test_every_angle_has_play_and_none_is_free(prior):
+    sigma = np.sqrt(np.diag(prior.covariance))
+    assert sigma.min() > 0.05 and sigma.max() < 1.2
+    assert np.linalg.cond(prior.covariance) < 1e4
+
+
+def test_samples_have_the_moments_and_obey_the_limits(prior):
+    draw = prior.sample(np.random.default_rng(0), 4000)
+    assert draw.shape == (4000, 23, 3)
+    flat = draw.reshape(4000, 69)
+    assert (flat >= prior.lower).all() and (flat <= prior.upper).all()
+    free = np.isinf(prior.lower) & np.isinf(prior.upper)
+    sigma = np.sqrt(np.diag(prior.covariance))
+    # The mean of 4,000 draws is within 4 sigma / sqrt(4000).
+    assert (np.abs(flat.mean(axis=0) - prior.mean)[free] < 4 * sigma[free] / np.sqrt(4000)).all()
+
+
+def test_regression_and_marginal_are_those_of_the_joint_gaussian(prior):
+    given, asked = np.arange(0, 60), np.arange(60, 69)
+    # Rows of the precision give the same regression: -P_aa^-1 P_ag.
+    P = prior.precision
+    expected = -np.linalg.solve(P[np.ix_(asked, asked)], P[np.ix_(asked, given)])
+    np.testing.assert_allclose(prior.regression(given, asked), expected, atol=1e-8)
+    marginal = P[np.ix_(given, given)] - P[np.ix_(given, asked)] @ np.linalg.solve(
+        P[np.ix_(asked, asked)], P[np.ix_(asked, given)]
+    )
+    np.testing.assert_allclose(prior.marginal_precision(given), marginal, rtol=1e-6, atol=1e-6)
+
+
+def test_log_density_is_the_gaussians(prior):
+    poses = prior.sample(np.random.default_rng(1), 5)
+    expected = multivariate_normal(prior.mean, prior.covariance).logpdf(poses.reshape(5, 69))
+    np.testing.assert_allclose(prior.log_density(poses), expected)
+    np.testing.assert_allclose(prior.log_density(poses.reshape(5, 69)), expected)
+
+
+def test_round_trip(prior, tmp_path):
+    prior.save(tmp_path / "prior.npz")
+    again = PosePrior.load(tmp_path / "prior.npz")
+    for name in ("mean", "covariance", "lower", "upper"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(prior, name))
+    assert again.provenance == prior.provenance
+
+
+def test_provenance_carries_the_acknowledgement(prior):
+    assert "obtained from mocap.cs.cmu.edu" in prior.provenance
+    assert "NSF EIA-0196217" in prior.provenance
+    assert "60 61" in prior.provenance  # not used
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"mean": np.zeros(72)}, "mean must be"),
+        ({"mean": np.full(69, np.nan)}, "NaN"),
+        ({"covariance": np.triu(np.ones((69, 69)))}, "symmetric"),
+        ({"covariance": np.ones((69, 69))}, "positive definite"),
+        ({"lower": np.zeros(69), "upper": np.zeros(69)}, "below"),
+    ],
+)
+def test_bad_priors_are_refused(prior, change, message):
+    fields = {name: getattr(prior, name) for name in ("mean", "covariance", "lower", "upper", "provenance")}
+    with pytest.raises(ValueError, match=message):
+        PosePrior(**(fields | change))
+
+
+def test_other_files_are_refused(tmp_path):
+    np.savez(tmp_path / "other.npz", mean=np.zeros(69))
+    with pytest.raises(ValueError, match="has no covariance lower upper provenance"):
+        PosePrior.load(tmp_path / "other.npz")
+
+
+def test_predicts_hidden_joints_of_people_it_never_saw(prior, shared_data):
+    with np.load(shared_data / "cmu_mocap" / "cmu_smpl24.npz", allow_pickle=False) as data:
+        subject = np.repeat(data["subject"], data["seq_len"])
+        poses = data["poses"][np.isin(subject, HELD_OUT)][::10, 1:].reshape(-1, 69).astype(float)
+    for joint, gain in (("left_knee", 0.75), ("right_elbow", 0.9)):
+        asked = np.array([angle(joint, axis) for axis in range(3)])
+        given = np.setdiff1d(np.arange(69), asked)
+        guess = (poses[:, given] - prior.mean[given]) @ prior.regression(given, asked).T + prior.mean[asked]
+        by_rest = np.linalg.norm(poses[:, asked] - guess, axis=1).mean()
+        by_mean = np.linalg.norm(poses[:, asked] - prior.mean[asked], axis=1).mean()
+        assert by_rest < gain * by_mean
