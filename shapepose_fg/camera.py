@@ -44,9 +44,7 @@ class Camera:
             raise ValueError(f"camera {self.name}: K must have positive focal lengths and a last row 0 0 1")
         R = self.wTc[:3, :3]
         if np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(R) < 0:
-            raise ValueError(
-                f"camera {self.name}: the rotation of wTc must be orthonormal with determinant 1"
-            )
+            raise ValueError(f"camera {self.name}: the rotation of wTc must be orthonormal with determinant 1")
         if min(self.image_size) <= 0:
             raise ValueError(f"camera {self.name}: image_size must be positive, got {self.image_size}")
 
