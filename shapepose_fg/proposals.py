@@ -29,6 +29,9 @@ class ProposalConfig:
     separation_m: float = 0.2
     """Non-maximum suppression: of two anchors closer than this the better one stays. A pelvis is about 20 cm
     deep and 30 cm wide: the middles of two are not closer even when people hug."""
+    min_own_views: int = 2
+    """Views in which an anchor needs a detection of its own, not one that made a better anchor: where rays to
+    different people's hips cross, there is a candidate but nobody's."""
     doubt: float = 0.2
     """Affinity below which a view speaks against a limb: unrelated pairs are mostly 0, true ones above 0.4."""
     max_limb_m: float = 0.75
@@ -89,9 +92,10 @@ def propose(
     dropped: Counter[str] = Counter()
     links = link(candidates, detections, config)
     hips = np.flatnonzero(candidates.strong & (candidates.joint == skeleton.root))
-    anchors = _anchors(hips, candidates, skeleton, up, config, dropped)
+    none = np.zeros(0, dtype=np.intp)
+    anchors = _anchors(hips, none, candidates, skeleton, up, detections, config, dropped)
     anchors, chosen = _linked(anchors, candidates, links, skeleton, config, dropped)
-    more = _unclaimed_anchors(anchors, chosen, candidates, links, skeleton, up, config)
+    more = _unclaimed_anchors(anchors, chosen, candidates, links, skeleton, up, detections, config)
     if len(more) > 0:
         everyone = np.concatenate([anchors, more])
         anchors, chosen = _linked(everyone, candidates, links, skeleton, config, dropped)
@@ -106,6 +110,7 @@ def _unclaimed_anchors(
     links: Links,
     skeleton: Skeleton,
     up: NDArray[np.float64],
+    detections: Detections,
     config: ProposalConfig,
 ) -> NDArray[np.intp]:
     """Weak root candidates that explain strong joints which nobody claims: people whose hip too few views saw."""
@@ -116,9 +121,8 @@ def _unclaimed_anchors(
         return np.zeros(0, dtype=np.intp)
     both_free = free[links.ends].all(axis=1)
     unclaimed = Links(links.ends[both_free], links.score[both_free])
-    near = np.linalg.norm(candidates.xyz[:, None] - candidates.xyz[anchors], axis=-1) < config.separation_m
-    apart = free & (candidates.joint == skeleton.root) & ~near.any(axis=1)
-    more = _anchors(np.flatnonzero(apart), candidates, skeleton, up, config, Counter())
+    hips = np.flatnonzero(free & (candidates.joint == skeleton.root))
+    more = _anchors(hips, anchors, candidates, skeleton, up, detections, config, Counter())
     return _linked(more, candidates, unclaimed, skeleton, config, Counter())[0]
 
 
@@ -143,26 +147,42 @@ def _linked(
 
 def _anchors(
     hips: NDArray[np.intp],
+    taken: NDArray[np.intp],
     candidates: Candidates,
     skeleton: Skeleton,
     up: NDArray[np.float64],
+    detections: Detections,
     config: ProposalConfig,
     dropped: Counter[str],
 ) -> NDArray[np.intp]:
-    """Those of the root candidates `hips` whose box holds enough confident parts, without near-duplicates."""
+    """Those of the root candidates `hips` whose box holds enough confident parts, best first.
+
+    Non-maximum suppression: an anchor must stand apart from better ones, and from those already `taken`, in space
+    and in the views.
+    """
     parts, score = _box_score(hips, candidates, skeleton, up, config)
     enough = parts >= config.min_parts
     confident = score >= config.min_confidence
     anchors = hips[enough & confident]
     anchors = anchors[np.argsort(-candidates.score[anchors] * candidates.votes[anchors], kind="stable")]
-    distance = np.linalg.norm(candidates.xyz[anchors, None] - candidates.xyz[anchors][None], axis=-1)
-    alone = np.ones(len(anchors), dtype=bool)
-    for i in range(len(anchors)):  # a handful of people
-        alone[i] = not (alone[:i] & (distance[i, :i] < config.separation_m)).any()
+    kept = list[int]()
+    used = np.isin(candidates.support[:, 1], _made_of(taken, candidates))
+    for anchor in anchors.tolist():  # a handful of people
+        others = candidates.xyz[np.concatenate([taken, kept]).astype(np.intp)]
+        near = np.linalg.norm(others - candidates.xyz[anchor], axis=1) < config.separation_m
+        own = np.unique(detections.view[candidates.support[(candidates.support[:, 0] == anchor) & ~used, 1]])
+        if not near.any() and len(own) >= config.min_own_views:
+            kept.append(anchor)
+            used |= np.isin(candidates.support[:, 1], _made_of(np.array([anchor]), candidates))
     dropped["too few parts in the box"] += int((~enough).sum())
     dropped["low confidence"] += int((enough & ~confident).sum())
-    dropped["same hip as a better one"] += int((~alone).sum())
-    return anchors[alone]
+    dropped["hip seen as a better one's"] += len(anchors) - len(kept)
+    return np.array(kept, dtype=np.intp)
+
+
+def _made_of(chosen: NDArray[np.intp], candidates: Candidates) -> NDArray[np.intp]:
+    """The detections that support these candidates."""
+    return candidates.support[np.isin(candidates.support[:, 0], chosen), 1]
 
 
 def _box_score(
