@@ -10,6 +10,8 @@ from shapepose_fg.body.fitter import FitStatus, JointTargets
 Array = NDArray[np.float64]
 
 _STATUS_TYPE = f"U{max(len(status) for status in FitStatus)}"
+_ROUNDING = 1e-4
+"""Asymmetry or negativity of information, relative, that passes for rounding: inverses of rays lose much."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,7 @@ def weigh(targets: JointTargets, config: EvidenceConfig) -> Evidence:
     """
     xyz, information, valid = _refuse_nonsense(targets)
     values, vectors = np.linalg.eigh((information + information.swapaxes(-1, -2)) / 2)
-    tolerance = 1e-6 * np.maximum(np.abs(values).max(axis=-1), 1.0)
+    tolerance = _ROUNDING * np.maximum(np.abs(values).max(axis=-1), 1.0)
     asymmetry = np.abs(information - information.swapaxes(-1, -2)).max(axis=(-1, -2))
     valid &= ((values[..., 0] > -tolerance) & (asymmetry <= tolerance)).all(axis=1)
     values = np.maximum(values, 0.0)
