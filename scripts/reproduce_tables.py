@@ -215,7 +215,7 @@ def shelf_table(steps: dict[str, ShelfScore]) -> list[str]:
         *(row.replace("| ", "| (ours) ", 1) for row in ours[:2]),
         "",
         f"Ours: {final.pcp_pooled:.2f} % of all {final.limbs_all.sum()} limbs, MPJPE {final.mpjpe_mm:.1f} mm, "
-        f"recall at 0.2 m {100 * final.recall:.2f} %, {final.people_found} of {final.people} annotated people found.",
+        f"recall at 0.2 m {100 * final.recall:.2f} %, {final.people_found} of {final.people} people found.",
     ]
 
 
