@@ -90,6 +90,7 @@ class PersonGraph:
         )
         self._active = np.ones(len(self._projections), dtype=bool)
         self._has_prior = np.zeros(len(xy), dtype=bool)
+        self._added: list[tuple[gtsam.NonlinearFactor, NDArray[np.intp]]] = []
         for factor in self._projections:
             self.graph.push_back(factor)
         self.graph.resize(len(self._projections) + len(xy))
@@ -118,7 +119,15 @@ class PersonGraph:
         self._has_prior = pulled.copy()
 
     def add(self, factor: gtsam.NonlinearFactor) -> None:
-        """Append a factor of your own on `keys`; it stays through all alternations."""
+        """Append a factor of your own on `keys`; it stays through all alternations.
+
+        While one of its joints is not in the problem, because neither views nor body place it, it rests.
+        ValueError if it is on anything but this person's joints.
+        """
+        joints = np.flatnonzero(np.isin(self.keys, factor.keys()))
+        if len(joints) < len(set(factor.keys())):
+            raise ValueError("a factor of your own must be on the graph's own keys (PersonGraph.keys) only")
+        self._added.append((factor, joints))
         self.graph.push_back(factor)
 
     def solve(self, initial: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -126,18 +135,28 @@ class PersonGraph:
 
         A joint with NaN in `initial` is not in the problem: it must have no factor, and stays NaN.
         """
-        present = np.isfinite(initial).all(axis=1)
+        present = np.isfinite(initial.sum(axis=1))
         values = gtsam.Values()
         for key, point in zip(self.keys[present].tolist(), initial[present], strict=True):
             values.insert(key, point)
         if not present.any():
             return initial.copy()
+        self._rest(present)
         optimizer = gtsam.LevenbergMarquardtOptimizer(self.graph, values, self._parameters)
         self.values = optimizer.optimize()
         """The solution, for `gtsam.Marginals` and for graphs that this one is added to."""
         joints = np.full(initial.shape, np.nan)
         joints[present] = [self.values.atPoint3(key) for key in self.keys[present].tolist()]
         return joints
+
+    def _rest(self, present: NDArray[np.bool_]) -> None:
+        """Take out those added factors of which a joint is not `present` (J,), and put back the others."""
+        first = len(self._projections) + len(self.keys)
+        for slot, (factor, joints) in enumerate(self._added, start=first):
+            if present[joints].all():
+                self.graph.replace(slot, factor)
+            else:
+                self.graph.remove(slot)
 
     def covariance(self) -> NDArray[np.float64]:
         """Marginal covariance (J, 3, 3) in m² of each joint at the last solution; NaN where it was not solved."""
