@@ -37,12 +37,6 @@ class AssociationConfig:
     min_observed_parts: float = 0.35
     """Least fraction of the core joints (trunk, arms, legs) that two views must see: 6 of 15. Of one whose upper
     body alone shows there are 9."""
-    beyond_doubt: float = 0.8
-    """A person of whom two views see this fraction of the core joints is real. Others might be phantoms, born
-    where the rays of different people cross, and are put to a test."""
-    absorbed: float = 0.5
-    """The test: somebody whose detections would go to others for the larger part, were they not there, is a
-    phantom."""
 
     def __post_init__(self) -> None:
         for name in ("near_m", "far_m", "reach_m", "overlap_px", "passes"):
@@ -70,7 +64,8 @@ def associate(
     places[known] = candidates.xyz[proposals.candidate[known]]
     nearness = _nearness(places, detections, rig, skeleton, config)
     chosen = _choose(nearness, _by_support(proposals, candidates, len(detections)), detections, skeleton, config)
-    real = _real(nearness, chosen, detections, skeleton, config)
+    seen_twice = ((chosen >= 0).sum(axis=2) >= 2)[:, skeleton.core].mean(axis=1)
+    real = seen_twice >= config.min_observed_parts
     places, chosen, nearness = places[real], chosen[real], nearness.of(real)
     for _ in range(config.passes):
         chosen = _choose(nearness, _owned(chosen, len(detections)), detections, skeleton, config)
@@ -162,26 +157,6 @@ def _owned(chosen: NDArray[np.intp], count: int) -> NDArray[np.bool_]:
     person, _, _ = np.nonzero(chosen >= 0)
     owns[person, chosen[chosen >= 0]] = True
     return owns
-
-
-def _real(
-    nearness: _Nearness,
-    chosen: NDArray[np.intp],
-    detections: Detections,
-    skeleton: Skeleton,
-    config: AssociationConfig,
-) -> NDArray[np.bool_]:
-    """(P,) who is no phantom: beyond doubt, or with detections that nobody else has a use for."""
-    seen_twice = ((chosen >= 0).sum(axis=2) >= 2)[:, skeleton.core].mean(axis=1)
-    real = seen_twice >= config.beyond_doubt
-    owns = _owned(chosen, len(detections))
-    doubtful = np.flatnonzero(~real & (seen_twice >= config.min_observed_parts))
-    for person in doubtful[np.argsort(-owns[doubtful].sum(axis=1), kind="stable")]:
-        others = nearness.of(real)
-        without = _choose(others, _owned(chosen[real], len(detections)), detections, skeleton, config)
-        taken = _owned(without, len(detections)).any(axis=0)
-        real[person] = taken[owns[person]].mean() < config.absorbed
-    return real
 
 
 def _by_support(proposals: Proposals, candidates: Candidates, count: int) -> NDArray[np.bool_]:

@@ -34,6 +34,9 @@ class ProposalConfig:
     different people's hips cross, there is a candidate but nobody's."""
     doubt: float = 0.2
     """Affinity below which a view speaks against a limb: unrelated pairs are mostly 0, true ones above 0.4."""
+    view_weight: float = 0.5
+    """What a view that supports a candidate counts, times its confidence, beside the affinities of its limbs:
+    where these leave a choice, a point that five views agree on is a joint, and a crossing of two rays is not."""
     max_limb_m: float = 0.75
     """No limb is longer: the trunk of a tall adult, hip to neck, is about 0.65 m."""
     sweeps: int = 2
@@ -155,34 +158,50 @@ def _anchors(
     config: ProposalConfig,
     dropped: Counter[str],
 ) -> NDArray[np.intp]:
-    """Those of the root candidates `hips` whose box holds enough confident parts, best first.
-
-    Non-maximum suppression: an anchor must stand apart from better ones, and from those already `taken`, in space
-    and in the views.
-    """
+    """The root candidates of `hips` whose box holds enough confident parts and that stand apart, best first."""
     parts, score = _box_score(hips, candidates, skeleton, up, config)
     enough = parts >= config.min_parts
     confident = score >= config.min_confidence
     anchors = hips[enough & confident]
-    anchors = anchors[np.argsort(-candidates.score[anchors] * candidates.votes[anchors], kind="stable")]
-    kept = list[int]()
-    used = np.isin(candidates.support[:, 1], _made_of(taken, candidates))
-    for anchor in anchors.tolist():  # a handful of people
-        others = candidates.xyz[np.concatenate([taken, kept]).astype(np.intp)]
-        near = np.linalg.norm(others - candidates.xyz[anchor], axis=1) < config.separation_m
-        own = np.unique(detections.view[candidates.support[(candidates.support[:, 0] == anchor) & ~used, 1]])
-        if not near.any() and len(own) >= config.min_own_views:
-            kept.append(anchor)
-            used |= np.isin(candidates.support[:, 1], _made_of(np.array([anchor]), candidates))
+    kept = _apart(anchors, taken, candidates, detections, config)
     dropped["too few parts in the box"] += int((~enough).sum())
     dropped["low confidence"] += int((enough & ~confident).sum())
     dropped["hip seen as a better one's"] += len(anchors) - len(kept)
-    return np.array(kept, dtype=np.intp)
+    return kept
 
 
-def _made_of(chosen: NDArray[np.intp], candidates: Candidates) -> NDArray[np.intp]:
-    """The detections that support these candidates."""
-    return candidates.support[np.isin(candidates.support[:, 0], chosen), 1]
+def _apart(
+    anchors: NDArray[np.intp],
+    taken: NDArray[np.intp],
+    candidates: Candidates,
+    detections: Detections,
+    config: ProposalConfig,
+) -> NDArray[np.intp]:
+    """Non-maximum suppression: `anchors` that stand apart from better ones and from `taken`, best first.
+
+    Apart in space, and in the views: a detection counts for one anchor only, and what is left of a candidate
+    without those that made better anchors decides how good it is.
+    """
+    both = np.concatenate([taken, anchors])
+    views = int(detections.view.max(initial=0)) + 1
+    made_of = np.full((len(candidates), views), -1, dtype=np.intp)
+    made_of[candidates.support[:, 0], detections.view[candidates.support[:, 1]]] = candidates.support[:, 1]
+    made_of = made_of[both]
+    weight = np.where(made_of >= 0, detections.confidence[made_of] if len(detections) > 0 else 0.0, 0.0)
+    distance = np.linalg.norm(candidates.xyz[both, None] - candidates.xyz[both][None], axis=-1)
+    open_ = np.ones(len(both), dtype=bool)
+    kept = []
+    for _ in range(len(both)):  # a handful of people
+        eligible = open_ & ((weight > 0).sum(axis=1) >= config.min_own_views)
+        waiting = np.flatnonzero(open_[: len(taken)])
+        if len(waiting) == 0 and not eligible.any():
+            break
+        best = waiting[0] if len(waiting) > 0 else np.where(eligible, weight.sum(axis=1), -1.0).argmax()
+        kept.append(best)
+        weight[made_of == made_of[best]] = 0.0
+        open_ &= distance[best] >= config.separation_m
+        open_[best] = False
+    return both[np.array(kept[len(taken) :], dtype=np.intp)]
 
 
 def _box_score(
@@ -243,6 +262,9 @@ def grow(
     people, joints = len(anchors), len(skeleton)
     chosen = np.full((people, joints), -1, dtype=np.intp)
     chosen[:, skeleton.root] = anchors
+    evidence = config.view_weight * np.bincount(
+        candidates.support[:, 0], candidates.score[candidates.support[:, 0]], len(candidates)
+    )
     both_ways = np.concatenate([links.ends, links.ends[:, ::-1]])
     score = np.concatenate([links.score, links.score])
     parent = np.array(skeleton.parents)
@@ -254,11 +276,11 @@ def grow(
     for level in range(1, len(skeleton.tree_levels)):
         here = depth[candidates.joint[down[:, 1]]] == level
         support = _support(chosen, down[here], down_score[here], len(candidates))
-        _choose(chosen, support, candidates, np.flatnonzero(depth == level))
+        _choose(chosen, support, evidence, candidates, np.flatnonzero(depth == level))
     others = np.setdiff1d(np.arange(joints), [skeleton.root])
     for _ in range(config.sweeps):
         support = _support(chosen, both_ways, score, len(candidates))
-        _choose(chosen, support, candidates, others)
+        _choose(chosen, support, evidence, candidates, others)
     return chosen
 
 
@@ -276,6 +298,7 @@ def _support(
 def _choose(
     chosen: NDArray[np.intp],
     support: NDArray[np.float64],
+    evidence: NDArray[np.float64],
     candidates: Candidates,
     joints: NDArray[np.intp],
 ) -> None:
@@ -283,8 +306,7 @@ def _choose(
     person, candidate = np.nonzero(support > 0)
     of_these = np.isin(candidates.joint[candidate], joints)
     person, candidate = person[of_these], candidate[of_these]
-    # Confidence and votes break ties between candidates that the affinities support alike.
-    score = support[person, candidate] + 0.1 * candidates.score[candidate]
+    score = support[person, candidate] + evidence[candidate]
     slot = person * chosen.shape[1] + candidates.joint[candidate]
     picked = match_best_first(slot, candidate, score)
     chosen[:, joints] = -1
