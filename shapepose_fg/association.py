@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.assignment import match_best_first
 from shapepose_fg.camera import Rig
 from shapepose_fg.candidates import Candidates
 from shapepose_fg.detections import Detections
 from shapepose_fg.observations import Observations
-from shapepose_fg.proposals import Proposals, match_best_first
+from shapepose_fg.proposals import Proposals
 from shapepose_fg.skeleton import Skeleton
 
 
@@ -70,12 +71,9 @@ def associate(
     for _ in range(config.passes):
         chosen = _choose(nearness, _owned(chosen, len(detections)), detections, skeleton, config)
     seen = chosen >= 0
-    observations = Observations(
-        xy=np.where(seen[..., None], detections.xy[chosen] if len(detections) > 0 else 0.0, 0.0),
-        confidence=np.where(seen, detections.confidence[chosen] if len(detections) > 0 else 0.0, 0.0),
-        initial=places,
-    )
-    return observations, int((~real).sum())
+    xy, confidence = np.zeros((*seen.shape, 2)), np.zeros(seen.shape)
+    xy[seen], confidence[seen] = detections.xy[chosen[seen]], detections.confidence[chosen[seen]]
+    return Observations(xy, confidence, initial=places), int((~real).sum())
 
 
 @dataclass(frozen=True)

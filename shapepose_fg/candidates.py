@@ -28,9 +28,12 @@ class CandidateConfig:
     min_votes: int = 3
     """The paper's three points: fewer make a *weak* candidate, which cannot anchor a person. With two cameras
     there is one pair only, so what counts is min(min_votes, pairs of views)."""
+    min_view_fraction: float = 1 / 6
+    """Where there are very many views, chance crossings of rays have three votes, too: a strong candidate must
+    have those of all pairs of this fraction of the views (30 cameras: 5 views, 10 votes; 18 and fewer: 3)."""
 
     def __post_init__(self) -> None:
-        for name in ("gate_m", "min_angle_deg", "vote_radius_m", "min_votes"):
+        for name in ("gate_m", "min_angle_deg", "vote_radius_m", "min_votes", "min_view_fraction"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
 
@@ -122,8 +125,20 @@ def vote(points: PairPoints, detections: Detections, views: int, config: Candida
     support = _support(np.repeat(cluster, 2), points.pair.ravel(), detections)
     confidence = np.bincount(support[:, 0], detections.confidence[support[:, 1]], count)
     score = confidence / np.bincount(support[:, 0], minlength=count)
-    needed = min(config.min_votes, views * (views - 1) // 2)
-    return Candidates(xyz, joint, score, votes, votes >= needed, support)
+    strong = votes >= _needed_votes(views, config)
+    # A detection that made a strong candidate is explained: what it makes with others' is a crossing of rays.
+    explained = np.zeros(len(detections), dtype=bool)
+    explained[support[strong[support[:, 0]], 1]] = True
+    keep = strong | ~(np.bincount(support[:, 0], explained[support[:, 1]], count) > 0)
+    support = support[keep[support[:, 0]]]
+    support[:, 0] = (np.cumsum(keep) - 1)[support[:, 0]]
+    return Candidates(xyz[keep], joint[keep], score[keep], votes[keep], strong[keep], support)
+
+
+def _needed_votes(views: int, config: CandidateConfig) -> int:
+    """Votes that make a candidate strong: `min_votes`, fewer if there are no such many pairs, more if very many."""
+    seen_by = int(views * config.min_view_fraction)
+    return min(max(config.min_votes, seen_by * (seen_by - 1) // 2), views * (views - 1) // 2)
 
 
 def _support(cluster: NDArray[np.intp], detection: NDArray[np.intp], detections: Detections) -> NDArray[np.intp]:

@@ -88,6 +88,8 @@ class PersonGraph:
             sigmas_px[self._joint, self._view] / np.sqrt(config.weight_2d),
             robust_kernel(kernel),
         )
+        self.values = gtsam.Values()
+        """The last solution, for `gtsam.Marginals` and for graphs that this one is added to."""
         self._active = np.ones(len(self._projections), dtype=bool)
         self._has_prior = np.zeros(len(xy), dtype=bool)
         self._added: list[tuple[gtsam.NonlinearFactor, NDArray[np.intp]]] = []
@@ -140,11 +142,11 @@ class PersonGraph:
         for key, point in zip(self.keys[present].tolist(), initial[present], strict=True):
             values.insert(key, point)
         if not present.any():
+            self.values = values
             return initial.copy()
         self._rest(present)
         optimizer = gtsam.LevenbergMarquardtOptimizer(self.graph, values, self._parameters)
         self.values = optimizer.optimize()
-        """The solution, for `gtsam.Marginals` and for graphs that this one is added to."""
         joints = np.full(initial.shape, np.nan)
         joints[present] = [self.values.atPoint3(key) for key in self.keys[present].tolist()]
         return joints
@@ -161,6 +163,8 @@ class PersonGraph:
     def covariance(self) -> NDArray[np.float64]:
         """Marginal covariance (J, 3, 3) in m² of each joint at the last solution; NaN where it was not solved."""
         result = np.full((len(self.keys), 3, 3), np.nan)
+        if self.values.empty():
+            return result
         marginals = gtsam.Marginals(self.graph, self.values)
         for joint, key in enumerate(self.keys.tolist()):
             if self.values.exists(key):

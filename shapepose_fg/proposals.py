@@ -4,13 +4,14 @@ Stage I (d) and the first half of (e) of the paper (section 3.1, "Human Proposal
 """
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.candidates import Candidates
 from shapepose_fg.detections import Detections
+from shapepose_fg.growth import GrowthConfig, Links, grow, link
 from shapepose_fg.skeleton import Skeleton
 
 
@@ -32,25 +33,19 @@ class ProposalConfig:
     min_own_views: int = 2
     """Views in which an anchor needs a detection of its own, not one that made a better anchor: where rays to
     different people's hips cross, there is a candidate but nobody's."""
-    doubt: float = 0.2
-    """Affinity below which a view speaks against a limb: unrelated pairs are mostly 0, true ones above 0.4."""
-    view_weight: float = 0.5
-    """What a view that supports a candidate counts, times its confidence, beside the affinities of its limbs:
-    where these leave a choice, a point that five views agree on is a joint, and a crossing of two rays is not."""
-    max_limb_m: float = 0.75
-    """No limb is longer: the trunk of a tall adult, hip to neck, is about 0.65 m."""
-    sweeps: int = 2
-    """How often the joints are chosen again once all their neighbours are known."""
     min_grown_parts: float = 0.4
     """Least fraction of the core joints that must have a strong candidate linked to the hip: one whose upper body
     alone shows has 0.6. On simulated people in close motion real ones have over 0.47, and three of four phantoms,
     whose joints belong to others, have less than 0.4."""
 
+    growth: GrowthConfig = field(default_factory=GrowthConfig)
+    """How a person is grown from the hip."""
+
     def __post_init__(self) -> None:
-        for name in ("box_horizontal_m", "box_vertical_m", "separation_m", "max_limb_m"):
+        for name in ("box_horizontal_m", "box_vertical_m", "separation_m"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        for name in ("min_parts", "min_confidence", "min_grown_parts", "doubt"):
+        for name in ("min_parts", "min_confidence", "min_grown_parts"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
 
@@ -70,16 +65,6 @@ class Proposals:
         return len(self.candidate)
 
 
-@dataclass(frozen=True)
-class Links:
-    """Limbs between 3D candidates, as the part affinities of all views support them."""
-
-    ends: NDArray[np.intp]
-    """(L, 2) two candidates, joined by a limb of the skeleton, first joint of the limb first."""
-    score: NDArray[np.float64]
-    """(L,) sum over the views that see both of (affinity - doubt): positive when the views agree."""
-
-
 def propose(
     candidates: Candidates,
     detections: Detections,
@@ -93,7 +78,7 @@ def propose(
     `up` is the (3,) unit vector that points up. Two people do not share a candidate.
     """
     dropped: Counter[str] = Counter()
-    links = link(candidates, detections, config)
+    links = link(candidates, detections, config.growth)
     hips = np.flatnonzero(candidates.strong & (candidates.joint == skeleton.root))
     none = np.zeros(0, dtype=np.intp)
     anchors = _anchors(hips, none, candidates, skeleton, up, detections, config, dropped)
@@ -138,14 +123,14 @@ def _linked(
     dropped: Counter[str],
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """The anchors that enough strong joints are linked to, and what they chose; counts the others in `dropped`."""
-    chosen = grow(anchors, candidates, links, skeleton, config)
+    chosen = grow(anchors, candidates, links, skeleton, config.growth)
     core = chosen[:, skeleton.core]
     linked = ((core >= 0) & candidates.strong[core]).mean(axis=1) >= config.min_grown_parts
     if linked.all():
         return anchors, chosen
     dropped["too few joints linked to the hip"] += int((~linked).sum())
     # What the dropped had taken goes back to those whom it belongs to.
-    return anchors[linked], grow(anchors[linked], candidates, links, skeleton, config)
+    return anchors[linked], grow(anchors[linked], candidates, links, skeleton, config.growth)
 
 
 def _anchors(
@@ -221,121 +206,3 @@ def _box_score(
     np.maximum.at(best, (hip, candidates.joint[candidate]), candidates.score[candidate])
     core = best[:, skeleton.core]
     return (core > 0).mean(axis=1), core.sum(axis=1) / np.maximum((core > 0).sum(axis=1), 1)
-
-
-def link(candidates: Candidates, detections: Detections, config: ProposalConfig) -> Links:
-    """Sum the part affinities of all views between the detections that support two candidates."""
-    owner, detection = candidates.support.T
-    by_detection = np.argsort(detection, kind="stable")
-    owners, counts = owner[by_detection], np.bincount(detection, minlength=len(detections))
-    start = np.cumsum(counts) - counts
-    head, tail = detections.pairs.T
-    # Each affinity speaks for every pair of candidates that its two detections support.
-    repeat = counts[head] * counts[tail]
-    which = np.repeat(np.arange(len(head)), repeat)
-    step = np.arange(len(which)) - np.repeat(np.cumsum(repeat) - repeat, repeat)
-    first = owners[start[head][which] + step // np.maximum(counts[tail][which], 1)]
-    second = owners[start[tail][which] + step % np.maximum(counts[tail][which], 1)]
-    key, inverse = np.unique(first * len(candidates) + second, return_inverse=True)
-    ends = np.stack(np.divmod(key, max(len(candidates), 1)), axis=1)
-    total = np.bincount(inverse, detections.affinity[which], len(key))
-    sees = np.zeros((len(candidates), int(detections.view.max(initial=0)) + 1), dtype=bool)
-    sees[owner, detections.view[detection]] = True
-    shared = (sees[ends[:, 0]] & sees[ends[:, 1]]).sum(axis=1)
-    length = np.linalg.norm(candidates.xyz[ends[:, 0]] - candidates.xyz[ends[:, 1]], axis=1)
-    plausible = length < config.max_limb_m
-    return Links(ends[plausible], (total - config.doubt * shared)[plausible])
-
-
-def grow(
-    anchors: NDArray[np.intp],
-    candidates: Candidates,
-    links: Links,
-    skeleton: Skeleton,
-    config: ProposalConfig,
-) -> NDArray[np.intp]:
-    """Choose a candidate per person and joint: (P, J), -1 where none is linked to the person.
-
-    First outwards from the hip, level by level of the skeleton's tree, then `sweeps` times all joints at once,
-    each with the sum of the links to all its chosen neighbours.
-    """
-    people, joints = len(anchors), len(skeleton)
-    chosen = np.full((people, joints), -1, dtype=np.intp)
-    chosen[:, skeleton.root] = anchors
-    evidence = config.view_weight * np.bincount(
-        candidates.support[:, 0], candidates.score[candidates.support[:, 0]], len(candidates)
-    )
-    both_ways = np.concatenate([links.ends, links.ends[:, ::-1]])
-    score = np.concatenate([links.score, links.score])
-    parent = np.array(skeleton.parents)
-    downward = parent[candidates.joint[both_ways[:, 1]]] == candidates.joint[both_ways[:, 0]]
-    down, down_score = both_ways[downward], score[downward]
-    depth = np.zeros(joints, dtype=int)
-    for level, members in enumerate(skeleton.tree_levels):
-        depth[members] = level
-    for level in range(1, len(skeleton.tree_levels)):
-        here = depth[candidates.joint[down[:, 1]]] == level
-        support = _support(chosen, down[here], down_score[here], len(candidates))
-        _choose(chosen, support, evidence, candidates, np.flatnonzero(depth == level))
-    others = np.setdiff1d(np.arange(joints), [skeleton.root])
-    for _ in range(config.sweeps):
-        support = _support(chosen, both_ways, score, len(candidates))
-        _choose(chosen, support, evidence, candidates, others)
-    return chosen
-
-
-def _support(
-    chosen: NDArray[np.intp], ends: NDArray[np.intp], score: NDArray[np.float64], count: int
-) -> NDArray[np.float64]:
-    """(P, C) sum of the links from each person's chosen candidates to every candidate."""
-    has = np.zeros((len(chosen), count + 1), dtype=bool)
-    np.put_along_axis(has, chosen, True, axis=1)  # -1 marks the spare last column
-    person, edge = np.nonzero(has[:, ends[:, 0]])
-    key = person * count + ends[edge, 1]
-    return np.bincount(key, score[edge], len(chosen) * count).reshape(len(chosen), count).astype(float)
-
-
-def _choose(
-    chosen: NDArray[np.intp],
-    support: NDArray[np.float64],
-    evidence: NDArray[np.float64],
-    candidates: Candidates,
-    joints: NDArray[np.intp],
-) -> None:
-    """Set `chosen` of these joints to the best supported candidates, one candidate serving one person."""
-    person, candidate = np.nonzero(support > 0)
-    of_these = np.isin(candidates.joint[candidate], joints)
-    person, candidate = person[of_these], candidate[of_these]
-    score = support[person, candidate] + evidence[candidate]
-    slot = person * chosen.shape[1] + candidates.joint[candidate]
-    picked = match_best_first(slot, candidate, score)
-    chosen[:, joints] = -1
-    chosen.reshape(-1)[slot[picked]] = candidate[picked]
-
-
-def match_best_first(
-    left: NDArray[np.intp], right: NDArray[np.intp], score: NDArray[np.float64]
-) -> NDArray[np.intp]:
-    """Greedy one-to-one matching of edges (left, right) by falling score; returns indices of picked edges.
-
-    Edges that are the best of both their ends would be picked before any rival, so all of them are picked in a
-    round; a few rounds give the same matching as one edge at a time.
-    """
-    rank = np.empty(len(score), dtype=np.intp)
-    rank[np.argsort(-score, kind="stable")] = np.arange(len(score))
-    live = np.arange(len(score))
-    picked = []
-    ends = max(left.max(initial=-1), right.max(initial=-1)) + 1
-    while len(live) > 0:
-        best_left = np.full(ends, len(score))
-        best_right = np.full(ends, len(score))
-        np.minimum.at(best_left, left[live], rank[live])
-        np.minimum.at(best_right, right[live], rank[live])
-        wins = live[(best_left[left[live]] == rank[live]) & (best_right[right[live]] == rank[live])]
-        picked.append(wins)
-        used_left = np.zeros(ends, dtype=bool)
-        used_right = np.zeros(ends, dtype=bool)
-        used_left[left[wins]] = True
-        used_right[right[wins]] = True
-        live = live[~used_left[left[live]] & ~used_right[right[live]]]
-    return np.concatenate(picked) if picked else live

@@ -197,7 +197,6 @@ def test_noise_of_a_detector_changes_no_owner(five_cameras, two_people, seen_exa
     assert np.all(seen.xy == noisy.xy[owners], axis=-1).mean() > 0.99
 
 
-@pytest.mark.xfail(strict=True, raises=ValueError, reason="a frame without any detection makes xy (0, 25, 5, 1)")
 def test_nobody_has_no_observations(five_cameras):
     empty = Detections.empty()
     seen = observe(empty, five_cameras, np.zeros((0, 25, 3)))

@@ -1,0 +1,32 @@
+"""Who gets what: greedy one-to-one matching of whole arrays."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def match_best_first(
+    left: NDArray[np.intp], right: NDArray[np.intp], score: NDArray[np.float64]
+) -> NDArray[np.intp]:
+    """Greedy one-to-one matching of edges (left, right) by falling score; returns indices of picked edges.
+
+    Edges that are the best of both their ends would be picked before any rival, so all of them are picked in a
+    round; a few rounds give the same matching as one edge at a time.
+    """
+    rank = np.empty(len(score), dtype=np.intp)
+    rank[np.argsort(-score, kind="stable")] = np.arange(len(score))
+    live = np.arange(len(score))
+    picked = []
+    ends = max(left.max(initial=-1), right.max(initial=-1)) + 1
+    while len(live) > 0:
+        best_left = np.full(ends, len(score))
+        best_right = np.full(ends, len(score))
+        np.minimum.at(best_left, left[live], rank[live])
+        np.minimum.at(best_right, right[live], rank[live])
+        wins = live[(best_left[left[live]] == rank[live]) & (best_right[right[live]] == rank[live])]
+        picked.append(wins)
+        used_left = np.zeros(ends, dtype=bool)
+        used_right = np.zeros(ends, dtype=bool)
+        used_left[left[wins]] = True
+        used_right[right[wins]] = True
+        live = live[~used_left[left[live]] & ~used_right[right[live]]]
+    return np.concatenate(picked) if picked else live
