@@ -145,8 +145,12 @@ def _covariances(demo: Demo) -> Table:
     calibration = covariance_calibration(error, people.covariance[matches.row])
     table = _table("Is the truth where the covariances say?")
     for level, share in calibration.coverage.items():
-        table.add_row(f"inside the {100 * level:.0f} % ellipsoid", _percent(share), f"true: {100 * level:.0f} %")
-    table.add_row("mean NEES", f"{calibration.mean_nees:.2f}", "true: 3; larger: too sure of gross errors")
+        table.add_row(
+            f"inside the {100 * level:.0f} % ellipsoid",
+            _percent(share),
+            f"should be {100 * level:.0f} %; more is cautious",
+        )
+    table.add_row("mean NEES", f"{calibration.mean_nees:.2f}", "should be 3; more is too sure")
     return table
 
 
