@@ -136,7 +136,7 @@ def vote(points: PairPoints, detections: Detections, views: int, config: Candida
 
 
 def _needed_votes(views: int, config: CandidateConfig) -> int:
-    """Votes that make a candidate strong: `min_votes`, fewer if there are no such many pairs, more if very many."""
+    """Votes that make a candidate strong: `min_votes`, fewer if pairs are fewer, more if there are very many."""
     seen_by = int(views * config.min_view_fraction)
     return min(max(config.min_votes, seen_by * (seen_by - 1) // 2), views * (views - 1) // 2)
 
