@@ -125,9 +125,7 @@ def robust(base: noiseModel.Base, kernel: Kernel | None) -> noiseModel.Base:
     return base if kernel is None else noiseModel.Robust.Create(kernel, base)
 
 
-def isotropic_models(
-    dimension: int, sigmas: ArrayLike, kernel: Kernel | None = None
-) -> list[noiseModel.Base]:
+def isotropic_models(dimension: int, sigmas: ArrayLike, kernel: Kernel | None = None) -> list[noiseModel.Base]:
     """One isotropic noise model for each of `sigmas` (D,): `isotropic` for an array."""
     values = np.asarray(sigmas, dtype=np.float64)
     if values.ndim != 1 or not np.all((values > 0) & np.isfinite(values)):

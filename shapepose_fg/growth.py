@@ -83,13 +83,14 @@ def grow(
     """Choose a candidate per person and joint: (P, J), -1 where none is linked to the person.
 
     First outwards from the hip, level by level of the skeleton's tree, then `sweeps` times all joints at once,
-    each with the sum of the links to all its chosen neighbours.
+    each with the sum of the links to all its chosen neighbours; last, beyond joints that nobody saw.
     """
     people, joints = len(anchors), len(skeleton)
     chosen = np.full((people, joints), -1, dtype=np.intp)
     chosen[:, skeleton.root] = anchors
-    evidence = config.view_weight * np.bincount(
-        candidates.support[:, 0], candidates.score[candidates.support[:, 0]], len(candidates)
+    supported = candidates.support[:, 0]
+    evidence = np.asarray(
+        config.view_weight * np.bincount(supported, candidates.score[supported], len(candidates)), dtype=np.float64
     )
     both_ways = np.concatenate([links.ends, links.ends[:, ::-1]])
     score = np.concatenate([links.score, links.score])
@@ -136,8 +137,10 @@ def _bridge(
         ancestor, bones = _nearest_known(chosen, skeleton)
         start = candidates.xyz[np.take_along_axis(chosen, ancestor, axis=1)]
         distance = np.linalg.norm(start[:, candidates.joint] - candidates.xyz, axis=-1)
-        nearness = 1.0 - distance / (config.bridge_m * bones[:, candidates.joint])
-        score = np.where(empty & loose & (nearness > 0), nearness + evidence, score)
+        gap = bones[:, candidates.joint]
+        nearness = 1.0 - distance / (config.bridge_m * gap)
+        # Without a gap the affinities had their say, and said no.
+        score = np.where(empty & loose & (gap > 1) & (nearness > 0), nearness + evidence, score)
     person, candidate = np.nonzero(score > 0)
     slot = person * chosen.shape[1] + candidates.joint[candidate]
     picked = match_best_first(slot, candidate, score[person, candidate])
