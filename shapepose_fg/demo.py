@@ -177,7 +177,7 @@ def _table(title: str) -> Table:
 
 
 def _percent(share: float) -> str:
-    return f"{100 * share:.1f} %" if np.isfinite(share) else "-"
+    return f"{100 * share:.2f} %" if np.isfinite(share) else "-"
 
 
 def _mm(errors: np.ndarray) -> str:
