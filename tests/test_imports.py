@@ -12,10 +12,11 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 LEVELS = (
-    "factors errors camera skeleton",
+    "factors errors camera skeleton assignment",
     "files provenance rendering body",
     "detections reconstruction",
     "candidates observations person_graph",
+    "growth",
     "proposals",
     "association refine",
     "pipeline",

@@ -6,19 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from shapepose_fg.assignment import match_best_first
 from shapepose_fg.association import AssociationConfig, associate
 from shapepose_fg.camera import Rig
 from shapepose_fg.candidates import CandidateConfig, Candidates, triangulate_pairs, vote
 from shapepose_fg.detections import Detections
-from shapepose_fg.proposals import (
-    Links,
-    ProposalConfig,
-    Proposals,
-    grow,
-    link,
-    match_best_first,
-    propose,
-)
+from shapepose_fg.growth import GrowthConfig, Links, grow, link
+from shapepose_fg.proposals import ProposalConfig, Proposals, propose
 from shapepose_fg.simulation.scene import ring_of_cameras
 from shapepose_fg.skeleton import BODY_25
 
@@ -109,12 +103,12 @@ def test_links_are_the_sums_of_affinity_less_doubt_over_the_views_that_see_both(
     A, B, C, D = range(4)
     support = [[A, 0], [A, 1], [A, 2], [B, 3], [B, 4], [B, 5], [C, 6], [C, 7], [D, 4]]
     candidates = made([NECK, HIP, HIP, HIP], support=support)
-    links = link(candidates, detections, ProposalConfig(doubt=0.2))
+    links = link(candidates, detections, GrowthConfig(doubt=0.2))
     found = {tuple(ends): score for ends, score in zip(links.ends.tolist(), links.score.tolist(), strict=True)}
     assert found == pytest.approx({(A, B): 1.1, (A, C): -0.3, (A, D): 0.6})
     far = replace(candidates, xyz=np.array([[0, 0, 0], [0, 0, 0.8], [0, 0, 0.5], [0, 0, 0.5]]))
-    assert [A, B] not in link(far, detections, ProposalConfig(max_limb_m=0.75)).ends.tolist()
-    assert [A, C] in link(far, detections, ProposalConfig(max_limb_m=0.75)).ends.tolist()
+    assert [A, B] not in link(far, detections, GrowthConfig(max_limb_m=0.75)).ends.tolist()
+    assert [A, C] in link(far, detections, GrowthConfig(max_limb_m=0.75)).ends.tolist()
 
 
 def arms(wrist_links: list[float]) -> tuple[Candidates, Links]:
@@ -126,7 +120,7 @@ def arms(wrist_links: list[float]) -> tuple[Candidates, Links]:
 
 
 def grown(candidates: Candidates, links: Links) -> NDArray[np.intp]:
-    return grow(np.array([0, 4]), candidates, links, BODY_25, ProposalConfig())
+    return grow(np.array([0, 4]), candidates, links, BODY_25, GrowthConfig())
 
 
 def test_each_person_grows_along_its_own_links():
@@ -181,6 +175,43 @@ def test_an_embrace_is_two_people(five_cameras, two_people, seen_exactly):
     assert sorted(own) == [0, 1]
     # A cluster is dragged by points where rays of both cross, at most by about its radius of 12 cm.
     assert np.median(distance[[0, 1], own]) < 0.02 and distance[[0, 1], own].max() < 0.15
+
+
+@pytest.mark.parametrize(
+    ("unseen", "beyond"), [("LKnee", "LAnkle"), ("RElbow", "RWrist"), ("RShoulder", "RWrist")]
+)
+def test_a_limb_goes_on_beyond_a_joint_that_nobody_saw(five_cameras, two_people, seen_exactly, unseen, beyond):
+    detections = without(seen_exactly(five_cameras, two_people), BODY_25.index(unseen))
+    proposals, candidates = find(detections, five_cameras)
+    far = BODY_25.index(beyond)
+    found = candidates.xyz[proposals.candidate[:, far]]
+    distance = np.linalg.norm(found[:, None] - two_people[None, :, far], axis=-1)
+    assert (proposals.candidate[:, far] >= 0).all() and (distance.min(axis=0) < 0.005).all()
+    hips = candidates.xyz[proposals.candidate[:, HIP]]
+    own = np.linalg.norm(hips[:, None] - two_people[None, :, HIP], axis=-1).argmin(axis=1)
+    assert (distance.argmin(axis=1) == own).all(), "each got the own one"
+    assert (proposals.candidate[:, BODY_25.index(unseen)] == -1).all()
+
+
+def test_a_hidden_forearm_does_not_hide_the_person(five_cameras, two_people, seen_exactly):
+    detections = without(seen_exactly(five_cameras, two_people[:1]), ELBOW, WRIST)
+    assert len(find(detections, five_cameras)[0]) == 1
+    assert len(find(detections, five_cameras, min_parts=0.9)[0]) == 0, "the paper's 90 % would"
+
+
+def without(detections: Detections, *joints: int) -> Detections:
+    """The same detections, of some joints none."""
+    keep = ~np.isin(detections.joint, joints)
+    place = np.cumsum(keep) - 1
+    both = keep[detections.pairs].all(axis=1)
+    return Detections(
+        detections.view[keep],
+        detections.joint[keep],
+        detections.xy[keep],
+        detections.confidence[keep],
+        place[detections.pairs[both]],
+        detections.affinity[both],
+    )
 
 
 def test_a_person_whom_the_detector_doubts_is_dropped_with_a_reason(five_cameras, two_people, seen_exactly):
