@@ -60,9 +60,7 @@ def associate(
     both. Proposals that are left with hardly any joint seen by two views are dropped, and what they took is given
     out anew; the second value is their number.
     """
-    places = np.full((len(proposals), len(skeleton), 3), np.nan)
-    known = proposals.candidate >= 0
-    places[known] = candidates.xyz[proposals.candidate[known]]
+    places = proposals.places
     nearness = _nearness(places, detections, rig, skeleton, config)
     chosen = _choose(nearness, _by_support(proposals, candidates, len(detections)), detections, skeleton, config)
     seen_twice = ((chosen >= 0).sum(axis=2) >= 2)[:, skeleton.core].mean(axis=1)

@@ -4,7 +4,7 @@ Stage I (d) and the first half of (e) of the paper (section 3.1, "Human Proposal
 """
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,8 @@ class ProposalConfig:
     separation_m: float = 0.2
     """Non-maximum suppression: of two anchors closer than this the better one stays. A pelvis is about 20 cm
     deep and 30 cm wide: the middles of two are not closer even when people hug."""
+    hip_width_m: float = 0.4
+    """Two hips of one person are not farther apart: their middle is a root where no two views saw one."""
     min_own_views: int = 2
     """Views in which an anchor needs a detection of its own, not one that made a better anchor: where rays to
     different people's hips cross, there is a candidate but nobody's."""
@@ -44,7 +46,7 @@ class ProposalConfig:
     """How a person is grown from the hip."""
 
     def __post_init__(self) -> None:
-        for name in ("box_horizontal_m", "box_vertical_m", "separation_m"):
+        for name in ("box_horizontal_m", "box_vertical_m", "separation_m", "hip_width_m"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
         for name in ("min_parts", "min_confidence", "min_grown_parts"):
@@ -58,6 +60,9 @@ class Proposals:
 
     candidate: NDArray[np.intp]
     """(P, J) index of the 3D candidate of each joint, -1 where there is none."""
+    places: NDArray[np.float64]
+    """(P, J, 3) where the joints are thought to be, metres: the candidates, and the middle of the hips as the root
+    of a person whose root no two views saw; NaN elsewhere."""
     score: NDArray[np.float64]
     """(P,) mean confidence of the box's best candidates."""
     dropped: dict[str, int]
@@ -76,85 +81,134 @@ def propose(
 ) -> Proposals:
     """Find the people of a frame: anchors at the root joint, their boxes checked, their joints grown.
 
-    Strong root candidates come first (the paper's hips); weak ones anchor only what the strong ones leave over.
-    `up` is the (3,) unit vector that points up. Two people do not share a candidate.
+    Strong root candidates come first (the paper's hips). What they leave over may be people whose root few views
+    saw: weak root candidates anchor them, and in the end the middles between two hips. `up` is the (3,) unit
+    vector that points up. Two people do not share a candidate.
     """
-    dropped: Counter[str] = Counter()
-    links = link(candidates, detections, config.growth)
-    hips = np.flatnonzero(candidates.strong & (candidates.joint == skeleton.root))
-    none = np.zeros(0, dtype=np.intp)
-    anchors = _anchors(hips, none, candidates, skeleton, up, detections, config, dropped)
-    anchors, chosen = _linked(anchors, candidates, links, skeleton, config, dropped)
-    more = _unclaimed_anchors(anchors, chosen, candidates, links, skeleton, up, detections, config)
-    if len(more) > 0:
-        everyone = np.concatenate([anchors, more])
-        anchors, chosen = _linked(everyone, candidates, links, skeleton, config, dropped)
-    score = _box_score(anchors, candidates, skeleton, up, config)[1]
-    return Proposals(chosen, score, dict(dropped))
+    search = _Search(
+        candidates, link(candidates, detections, config.growth), detections, skeleton, up, config, Counter()
+    )
+    roots = candidates.joint == skeleton.root
+    anchors = search.anchors(np.flatnonzero(roots & candidates.strong), np.zeros(0, dtype=np.intp))
+    anchors, chosen = search.linked(anchors)
+    for last_resort in (False, True):
+        free = search.unclaimed(chosen)
+        if free is None:
+            break
+        if last_resort:
+            search = search.with_middles(free)
+            free = np.append(free, np.ones(len(search.candidates) - len(free), dtype=bool))
+        more = search.among(free).people(anchors)
+        if len(more) > 0:
+            anchors, chosen = search.linked(np.concatenate([anchors, more]))
+    places = np.full((*chosen.shape, 3), np.nan)
+    places[chosen >= 0] = search.candidates.xyz[chosen[chosen >= 0]]
+    score = search.boxes(anchors)[1]
+    return Proposals(np.where(chosen < len(candidates), chosen, -1), places, score, dict(search.dropped))
 
 
-def _unclaimed_anchors(
-    anchors: NDArray[np.intp],
-    chosen: NDArray[np.intp],
-    candidates: Candidates,
-    links: Links,
-    skeleton: Skeleton,
-    up: NDArray[np.float64],
-    detections: Detections,
-    config: ProposalConfig,
-) -> NDArray[np.intp]:
-    """Weak root candidates that explain strong joints which nobody claims: people whose hip too few views saw."""
-    free = np.ones(len(candidates), dtype=bool)
-    free[chosen[chosen >= 0]] = False
-    left = np.unique(candidates.joint[free & candidates.strong & np.isin(candidates.joint, skeleton.core)])
-    if len(left) < config.min_grown_parts * len(skeleton.core):
-        return np.zeros(0, dtype=np.intp)
-    both_free = free[links.ends].all(axis=1)
-    unclaimed = Links(links.ends[both_free], links.score[both_free])
-    hips = np.flatnonzero(free & (candidates.joint == skeleton.root))
-    more = _anchors(hips, anchors, candidates, skeleton, up, detections, config, Counter())
-    return _linked(more, candidates, unclaimed, skeleton, config, Counter())[0]
+@dataclass(frozen=True)
+class _Search:
+    """The search for people in one frame."""
 
+    candidates: Candidates
+    links: Links
+    detections: Detections
+    skeleton: Skeleton
+    up: NDArray[np.float64]
+    config: ProposalConfig
+    dropped: Counter[str]
 
-def _linked(
-    anchors: NDArray[np.intp],
-    candidates: Candidates,
-    links: Links,
-    skeleton: Skeleton,
-    config: ProposalConfig,
-    dropped: Counter[str],
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """The anchors that enough strong joints are linked to, and what they chose; counts the others in `dropped`."""
-    chosen = grow(anchors, candidates, links, skeleton, config.growth)
-    core = chosen[:, skeleton.core]
-    linked = ((core >= 0) & candidates.strong[core]).mean(axis=1) >= config.min_grown_parts
-    if linked.all():
-        return anchors, chosen
-    dropped["too few joints linked to the hip"] += int((~linked).sum())
-    # What the dropped had taken goes back to those whom it belongs to.
-    return anchors[linked], grow(anchors[linked], candidates, links, skeleton, config.growth)
+    def anchors(self, roots: NDArray[np.intp], taken: NDArray[np.intp]) -> NDArray[np.intp]:
+        """The root candidates `roots` whose box holds enough confident parts and that stand apart, best first."""
+        parts, score = self.boxes(roots)
+        enough = parts >= self.config.min_parts
+        confident = score >= self.config.min_confidence
+        anchors = roots[enough & confident]
+        kept = _apart(anchors, taken, self.candidates, self.detections, self.config)
+        self.dropped["too few parts in the box"] += int((~enough).sum())
+        self.dropped["low confidence"] += int((enough & ~confident).sum())
+        self.dropped["hip seen as a better one's"] += len(anchors) - len(kept)
+        return kept
 
+    def boxes(self, roots: NDArray[np.intp]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Fraction (H,) of the core parts in the box around each root, and mean confidence (H,) of the best."""
+        candidates, config = self.candidates, self.config
+        offset = candidates.xyz[None] - candidates.xyz[roots, None]
+        height = offset @ self.up
+        horizontal = np.linalg.norm(offset - height[..., None] * self.up, axis=-1)
+        in_box = (horizontal < config.box_horizontal_m) & (np.abs(height) < config.box_vertical_m)
+        best = np.zeros((len(roots), len(self.skeleton)))
+        root, candidate = np.nonzero(in_box)
+        np.maximum.at(best, (root, candidates.joint[candidate]), candidates.score[candidate])
+        core = best[:, self.skeleton.core]
+        return (core > 0).mean(axis=1), core.sum(axis=1) / np.maximum((core > 0).sum(axis=1), 1)
 
-def _anchors(
-    hips: NDArray[np.intp],
-    taken: NDArray[np.intp],
-    candidates: Candidates,
-    skeleton: Skeleton,
-    up: NDArray[np.float64],
-    detections: Detections,
-    config: ProposalConfig,
-    dropped: Counter[str],
-) -> NDArray[np.intp]:
-    """The root candidates of `hips` whose box holds enough confident parts and that stand apart, best first."""
-    parts, score = _box_score(hips, candidates, skeleton, up, config)
-    enough = parts >= config.min_parts
-    confident = score >= config.min_confidence
-    anchors = hips[enough & confident]
-    kept = _apart(anchors, taken, candidates, detections, config)
-    dropped["too few parts in the box"] += int((~enough).sum())
-    dropped["low confidence"] += int((enough & ~confident).sum())
-    dropped["hip seen as a better one's"] += len(anchors) - len(kept)
-    return kept
+    def linked(self, anchors: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """The anchors that enough strong joints are linked to, and what each chose (P, J)."""
+        chosen = grow(anchors, self.candidates, self.links, self.skeleton, self.config.growth)
+        core = chosen[:, self.skeleton.core]
+        linked = ((core >= 0) & self.candidates.strong[core]).mean(axis=1) >= self.config.min_grown_parts
+        if linked.all():
+            return anchors, chosen
+        self.dropped["too few joints linked to the hip"] += int((~linked).sum())
+        # What the dropped had taken goes back to those whom it belongs to.
+        again = grow(anchors[linked], self.candidates, self.links, self.skeleton, self.config.growth)
+        return anchors[linked], again
+
+    def unclaimed(self, chosen: NDArray[np.intp]) -> NDArray[np.bool_] | None:
+        """(C,) the candidates that nobody chose, if there are strong ones of enough joints to be a person.
+
+        A candidate needs detections of its own in `min_own_views`: others made what somebody chose.
+        """
+        owner, detection = self.candidates.support.T
+        used = np.zeros(len(self.detections), dtype=bool)
+        used[detection[np.isin(owner, chosen[chosen >= 0])]] = True
+        free = np.bincount(owner, ~used[detection], len(self.candidates)) >= self.config.min_own_views
+        strong = free & self.candidates.strong & np.isin(self.candidates.joint, self.skeleton.core)
+        enough = len(np.unique(self.candidates.joint[strong])) >= self.config.min_grown_parts * len(
+            self.skeleton.core
+        )
+        return free if enough else None
+
+    def among(self, free: NDArray[np.bool_]) -> "_Search":
+        """The same search among some candidates only; what it drops is not counted."""
+        both = free[self.links.ends].all(axis=1)
+        links = Links(self.links.ends[both], self.links.score[both])
+        hidden = replace(self.candidates, joint=np.where(free, self.candidates.joint, -1))
+        return replace(self, candidates=hidden, links=links, dropped=Counter())
+
+    def people(self, taken: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Anchors, strong or weak, of people beside those `taken`."""
+        roots = np.flatnonzero(self.candidates.joint == self.skeleton.root)
+        return self.linked(self.anchors(roots, taken))[0]
+
+    def with_middles(self, free: NDArray[np.bool_]) -> "_Search":
+        """Add root candidates where nobody saw one: in the middle of two free hips, linked to both."""
+        candidates, count = self.candidates, len(self.candidates)
+        right, left = self.skeleton.hips
+        first, second = (np.flatnonzero(free & (candidates.joint == hip)) for hip in (right, left))
+        first, second = (index.ravel() for index in np.meshgrid(first, second, indexing="ij"))
+        width = np.linalg.norm(candidates.xyz[first] - candidates.xyz[second], axis=1)
+        fits = (width < self.config.hip_width_m) & (candidates.strong[first] | candidates.strong[second])
+        first, second = first[fits], second[fits]
+        middle = count + np.arange(len(first))
+        owner, detection = candidates.support.T
+        from_first = [
+            np.stack([np.full((owner == f).sum(), m), detection[owner == f]], axis=1)
+            for m, f in zip(middle.tolist(), first.tolist(), strict=True)
+        ]
+        more = Candidates(
+            np.concatenate([candidates.xyz, (candidates.xyz[first] + candidates.xyz[second]) / 2]),
+            np.append(candidates.joint, np.full(len(first), self.skeleton.root)),
+            np.append(candidates.score, (candidates.score[first] + candidates.score[second]) / 2),
+            np.append(candidates.votes, np.minimum(candidates.votes[first], candidates.votes[second])),
+            np.append(candidates.strong, np.zeros(len(first), dtype=bool)),
+            np.concatenate([candidates.support, *from_first]),
+        )
+        ends = np.stack([np.tile(middle, 2), np.concatenate([first, second])], axis=1)
+        links = Links(np.concatenate([self.links.ends, ends]), np.append(self.links.score, np.ones(len(ends))))
+        return replace(self, candidates=more, links=links)
 
 
 def _apart(
@@ -189,22 +243,3 @@ def _apart(
         open_ &= distance[best] >= config.separation_m
         open_[best] = False
     return both[np.array(kept[len(taken) :], dtype=np.intp)]
-
-
-def _box_score(
-    hips: NDArray[np.intp],
-    candidates: Candidates,
-    skeleton: Skeleton,
-    up: NDArray[np.float64],
-    config: ProposalConfig,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Fraction of the core parts (H,) in the box around each hip, and mean confidence (H,) of the best of each."""
-    offset = candidates.xyz[None] - candidates.xyz[hips, None]
-    height = offset @ up
-    horizontal = np.linalg.norm(offset - height[..., None] * up, axis=-1)
-    in_box = (horizontal < config.box_horizontal_m) & (np.abs(height) < config.box_vertical_m)
-    best = np.zeros((len(hips), len(skeleton)))
-    hip, candidate = np.nonzero(in_box)
-    np.maximum.at(best, (hip, candidates.joint[candidate]), candidates.score[candidate])
-    core = best[:, skeleton.core]
-    return (core > 0).mean(axis=1), core.sum(axis=1) / np.maximum((core > 0).sum(axis=1), 1)

@@ -38,6 +38,12 @@ class Skeleton:
         """The joint that anchors a person."""
         return self.parents.index(-1)
 
+    @property
+    def hips(self) -> tuple[int, int]:
+        """The two joints beside the root that mirror each other, right first."""
+        beside = [j for j in range(len(self)) if self.parents[j] == self.root and self.mirror[j] != j]
+        return beside[0], beside[1]
+
     @cached_property
     def tree_levels(self) -> tuple[NDArray[np.intp], ...]:
         """Joints by their distance from the root: level 0 is the root alone, level 1 its children, ..."""

@@ -199,9 +199,26 @@ def test_a_hidden_forearm_does_not_hide_the_person(five_cameras, two_people, see
     assert len(find(detections, five_cameras, min_parts=0.9)[0]) == 0, "the paper's 90 % would"
 
 
+def test_a_person_whose_hip_nobody_saw_is_anchored_between_the_hips(five_cameras, two_people, seen_exactly):
+    xy, _ = five_cameras.project(two_people[1, HIP])
+    everything = seen_exactly(five_cameras, two_people)
+    of_second = np.linalg.norm(everything.xy - xy[everything.view], axis=1) < 1e-6
+    for views in (0, 1, 2):
+        hidden = of_second & (everything.joint == HIP) & (everything.view >= views)
+        proposals, candidates = find(thinned(everything, ~hidden), five_cameras)
+        assert len(proposals) == 2, f"MidHip seen by {views} views"
+        places = proposals.places[np.linalg.norm(proposals.places[:, HIP] - two_people[1, HIP], axis=1).argmin()]
+        np.testing.assert_allclose(places, two_people[1], atol=0.01)
+        assert candidates.joint[proposals.candidate[proposals.candidate >= 0]].shape == (50 - (views < 2),)
+
+
 def without(detections: Detections, *joints: int) -> Detections:
     """The same detections, of some joints none."""
-    keep = ~np.isin(detections.joint, joints)
+    return thinned(detections, ~np.isin(detections.joint, joints))
+
+
+def thinned(detections: Detections, keep: NDArray[np.bool_]) -> Detections:
+    """The detections of the mask `keep`, and the pairs between them."""
     place = np.cumsum(keep) - 1
     both = keep[detections.pairs].all(axis=1)
     return Detections(
