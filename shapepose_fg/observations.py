@@ -38,6 +38,10 @@ class Observations:
         """(P, J, V) whether there is an observation."""
         return self.confidence > 0
 
+    def rows(self, index: NDArray[np.intp]) -> "Observations":
+        """Some of the people."""
+        return Observations(self.xy[index], self.confidence[index], self.initial[index])
+
     @classmethod
     def concatenate(cls, parts: Sequence["Observations"]) -> "Observations":
         """The people of several frames, one after the other."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import determined
-from shapepose_fg.body.fitter import BodyFit, BodyFitter, JointTargets
+from shapepose_fg.body.fitter import BodyFit, BodyFitter, FitStatus, JointTargets
 from shapepose_fg.camera import Rig
 from shapepose_fg.observations import (
     Evidence,
@@ -31,7 +31,9 @@ class RefineConfig:
     """How the alternation runs."""
 
     alternations: int = 3
-    """N of Algorithm 1: how often the body is fitted and the joints are solved."""
+    """N of Algorithm 1: how often the body is fitted and the joints are solved, at the most."""
+    settled_m: float = 0.002
+    """A person whose joints all moved less in a round is done: most are after one or two."""
     max_sigma_m: float = 0.5
     """A joint whose views leave it less certain than this in some direction is not determined by them."""
     disagreement: float = 4.0
@@ -42,7 +44,7 @@ class RefineConfig:
     """Fewer joints than this determined by the views are not a person that can be placed in space."""
 
     def __post_init__(self) -> None:
-        for name in ("alternations", "max_sigma_m", "disagreement", "min_joints"):
+        for name in ("alternations", "settled_m", "max_sigma_m", "disagreement", "min_joints"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
 
@@ -86,23 +88,35 @@ def refine(
     sigmas = observation_sigmas(observations, observations.initial, rig, observation_config)
     X = triangulate(observations, rig, sigmas, observation_config)
     graphs = _graphs(observations, sigmas, rig, observation_config, graph_config, person, frame, extra_factors)
-    fit: BodyFit | None = None
+    inlier, confidence = np.zeros(sigmas.shape, dtype=bool), np.zeros(X.shape[:2])
     enough = np.zeros(len(X), dtype=bool)
+    fit = BodyFit.failed(np.full(len(X), FitStatus.TOO_FEW_JOINTS), X.shape[1])
+    moving = np.arange(len(X))
     for n in range(config.alternations):
-        evidence = weigh(observations, sigmas, X, rig, observation_config)
+        observed, sigma, start = observations.rows(moving), sigmas[moving], X[moving]
+        evidence = weigh(observed, sigma, start, rig, observation_config)
         if n == 0:
             enough = _placed(evidence, config).sum(axis=1) >= config.min_joints
-        fit = fitter.fit(_targets(evidence, enough), fit)  # the Theta step
-        wrong = _disagree(evidence, fit, config)
+        body = fitter.fit(_targets(evidence, enough[moving]), fit.rows(moving))  # the Theta step
+        fitted = evidence.target
+        wrong = _disagree(evidence, body, config)
         if wrong.any():
-            there = np.where(wrong[..., None], fit.prior_xyz, X)
-            evidence = weigh(observations, sigmas, there, rig, observation_config)
-        confidence = mean_confidence(observations, evidence.inlier)
-        X = _solve(graphs, evidence, _placed(evidence, config), fit, confidence, graph_config)
-    assert fit is not None
+            there = np.where(wrong[..., None], body.prior_xyz, start)
+            evidence = weigh(observed, sigma, there, rig, observation_config)
+        confidence[moving] = mean_confidence(observed, evidence.inlier)
+        pulled = _pulled(evidence, body, confidence[moving], config, graph_config)
+        X[moving] = _solve([graphs[row] for row in moving], evidence, pulled, body, config)
+        inlier[moving], fit = evidence.inlier, fit.with_rows(moving, body)
+        # Settled: the body was fitted to where the joints are now, and pulled joints stay where they were.
+        before = np.where((pulled | wrong)[..., None], start, fitted)
+        shift = np.linalg.norm(X[moving] - before, axis=-1)
+        unknown = np.isnan(X[moving]).any(axis=-1)
+        moving = moving[~((shift < config.settled_m) | unknown).all(axis=1)]
+        if len(moving) == 0:
+            break
     covariance = np.stack([graph.covariance() for graph in graphs]) if graphs else np.zeros((*X.shape, 3))
     status = np.where(fit.ok, Status.OK, np.where(enough, Status.BODY_UNDETERMINED, Status.TOO_FEW_VIEWS))
-    return Refined(X, covariance, mean_confidence(observations, evidence.inlier), evidence.inlier, fit, status)
+    return Refined(X, covariance, confidence, inlier, fit, status)
 
 
 def _graphs(
@@ -161,17 +175,29 @@ def _targets(evidence: Evidence, enough: NDArray[np.bool_]) -> JointTargets:
     return JointTargets(np.nan_to_num(evidence.target), information)
 
 
+def _pulled(
+    evidence: Evidence,
+    fit: BodyFit,
+    confidence: NDArray[np.float64],
+    config: RefineConfig,
+    graph_config: PersonGraphConfig,
+) -> NDArray[np.bool_]:
+    """(P, J) which joints the body pulls: delta of Eq. 4, and joints that their views do not determine.
+
+    The latter need the body however sure their one view is.
+    """
+    return ((confidence < graph_config.rho_3d) | ~_placed(evidence, config)) & fit.ok[:, None]
+
+
 def _solve(
     graphs: list[PersonGraph],
     evidence: Evidence,
-    placed: NDArray[np.bool_],
+    pulled: NDArray[np.bool_],
     fit: BodyFit,
-    confidence: NDArray[np.float64],
-    config: PersonGraphConfig,
+    config: RefineConfig,
 ) -> NDArray[np.float64]:
     """The X step for every person: (P, J, 3)."""
-    # Eq. 4; and a joint that its views do not determine needs the body, however sure the one view is.
-    pulled = ((confidence < config.rho_3d) | ~placed) & fit.ok[:, None]
+    placed = _placed(evidence, config)
     solved = placed | pulled
     start = np.where(placed[..., None], evidence.points, np.where(pulled[..., None], fit.prior_xyz, np.nan))
     X = np.full(evidence.points.shape, np.nan)

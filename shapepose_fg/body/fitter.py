@@ -1,6 +1,6 @@
 """From 3D joints to bodies: what a fitter is given, what it gives back, and what it may be replaced by."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import StrEnum
 from typing import Protocol
 
@@ -80,6 +80,19 @@ class BodyFit:
     def ok(self) -> NDArray[np.bool_]:
         """(B,) which rows hold a body."""
         return self.status == FitStatus.OK
+
+    def rows(self, index: NDArray[np.intp]) -> "BodyFit":
+        """The rows `index` (R,)."""
+        return BodyFit(**{field.name: getattr(self, field.name)[index] for field in fields(self)})
+
+    def with_rows(self, index: NDArray[np.intp], other: "BodyFit") -> "BodyFit":
+        """The same, with the rows `index` (R,) from `other`."""
+        changed = {}
+        for field in fields(self):
+            values = getattr(self, field.name).copy()
+            values[index] = getattr(other, field.name)
+            changed[field.name] = values
+        return BodyFit(**changed)
 
     @classmethod
     def failed(cls, status: NDArray[np.str_], num_joints: int) -> "BodyFit":
