@@ -129,7 +129,7 @@ def vote(points: PairPoints, detections: Detections, views: int, config: Candida
     # A detection that made a strong candidate is explained: what it makes with others' is a crossing of rays.
     explained = np.zeros(len(detections), dtype=bool)
     explained[support[strong[support[:, 0]], 1]] = True
-    keep = strong | ~(np.bincount(support[:, 0], explained[support[:, 1]], count) > 0)
+    keep = strong | (np.bincount(support[:, 0], ~explained[support[:, 1]], count) > 0)
     support = support[keep[support[:, 0]]]
     support[:, 0] = (np.cumsum(keep) - 1)[support[:, 0]]
     return Candidates(xyz[keep], joint[keep], score[keep], votes[keep], strong[keep], support)

@@ -33,7 +33,7 @@ class RefineConfig:
     alternations: int = 3
     """N of Algorithm 1: how often the body is fitted and the joints are solved, at the most."""
     settled_m: float = 0.002
-    """A person whose joints all moved less in a round is done: most are after one or two."""
+    """A person whose joints all moved less in a round is done: most are after one or two. 0: nobody is."""
     max_sigma_m: float = 0.5
     """A joint whose views leave it less certain than this in some direction is not determined by them."""
     disagreement: float = 4.0
@@ -44,9 +44,11 @@ class RefineConfig:
     """Fewer joints than this determined by the views are not a person that can be placed in space."""
 
     def __post_init__(self) -> None:
-        for name in ("alternations", "settled_m", "max_sigma_m", "disagreement", "min_joints"):
+        for name in ("alternations", "max_sigma_m", "disagreement", "min_joints"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        if self.settled_m < 0:
+            raise ValueError(f"settled_m must not be negative, got {self.settled_m}")
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,7 @@ def refine(
     is counted twice and the covariances stay honest.
     """
     sigmas = observation_sigmas(observations, observations.initial, rig, observation_config)
-    X = triangulate(observations, rig, sigmas, observation_config)
+    X = triangulate(observations, rig, sigmas, observation_config).copy()
     graphs = _graphs(observations, sigmas, rig, observation_config, graph_config, person, frame, extra_factors)
     inlier, confidence = np.zeros(sigmas.shape, dtype=bool), np.zeros(X.shape[:2])
     enough = np.zeros(len(X), dtype=bool)
