@@ -87,15 +87,23 @@ def built_in_scene(
     return Scene(rig, body, _on_the_floor(body, motion, builds), fps)
 
 
-def ring_of_cameras(count: int, rng: np.random.Generator, *, image_size: tuple[int, int] = (1280, 720)) -> Rig:
+def ring_of_cameras(
+    count: int,
+    rng: np.random.Generator,
+    *,
+    image_size: tuple[int, int] = (1280, 720),
+    distance_m: tuple[float, float] = (3.1, 3.6),
+    height_m: tuple[float, float] = (2.0, 2.5),
+) -> Rig:
     """Cameras on the walls around the room, 3 to 3.6 m from its middle and 1.9 to 2.7 m high, looking inward.
 
+    `distance_m` and `height_m` are what they are drawn from; every second one is 0.3 m lower.
     1280 x 720 px and a focal length near 900 px by default: a field of view of 71 by 44 degrees.
     """
     cameras = []
     angles = 2 * np.pi * (np.arange(count) + rng.uniform(-0.18, 0.18, count)) / count + 0.35
     for index, angle in enumerate(angles):
-        distance, height = rng.uniform(3.1, 3.6), rng.uniform(2.0, 2.5) + (0.2, -0.1)[index % 2]
+        distance, height = rng.uniform(*distance_m), rng.uniform(*height_m) + (0.2, -0.1)[index % 2]
         eye = np.array([distance * np.cos(angle), distance * np.sin(angle), height])
         target = np.array([*rng.uniform(-0.15, 0.15, 2), 0.85])
         focal = rng.uniform(860.0, 940.0)
