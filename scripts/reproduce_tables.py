@@ -10,22 +10,27 @@ import os
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from shapepose_fg.body.baseline import LevenbergMarquardtFitter
 from shapepose_fg.body.model import BodyModel, BodyParameters
+from shapepose_fg.camera import Rig
 from shapepose_fg.evaluation.alternation import BeforeRefinement, alternation_errors, before_refinement
 from shapepose_fg.evaluation.matching import match_people
 from shapepose_fg.evaluation.metrics import JointMetrics, covariance_calibration, joint_metrics
 from shapepose_fg.evaluation.shelf import LIMB_NAMES, ShelfScore, evaluate_shelf, read_shelf_ground_truth
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
-from shapepose_fg.pipeline import PipelineConfig, reconstruct
+from shapepose_fg.observations import Observations, observation_sigmas, triangulate, weigh
+from shapepose_fg.pipeline import PipelineConfig, find_people, reconstruct
 from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.refine import disagreement, joint_targets
 from shapepose_fg.simulation import built_in_scene, simulate
 
 ROOT = Path(__file__).parents[1]
@@ -111,6 +116,7 @@ def main() -> None:
     if shelf.is_dir():
         steps = shelf_steps(shelf)
         tables |= {"shelf": lambda: shelf_table(steps), "shelf limbs": lambda: limb_table(steps)}
+        tables |= {"contradictions": lambda: contradiction_table(shelf), "sigma": lambda: sigma_table(shelf)}
     else:
         print(f"(no Shelf recording in {shelf}: its tables are left out)\n")
     for name, table in tables.items():
@@ -229,6 +235,74 @@ def limb_table(steps: dict[str, ShelfScore]) -> list[str]:
             cells = " | ".join(f"{a} of {b}" for a, b in zip(right, count, strict=True))
             rows.append(f"| {limb} | {cells} | {count.sum() - right.sum()} |")
     return ["| limbs that are right | actor 1 | actor 2 | actor 3 | lost |", _rule(5), *rows]
+
+
+def contradiction_table(folder: Path) -> list[str]:
+    """How often the views put a joint where the rest of the body cannot have it, by how many views agree."""
+    rig, observations, sigmas, points = shelf_observations(folder)
+    evidence = weigh(observations, sigmas, points, rig, CONFIG.observations)
+    fit = LevenbergMarquardtFitter(config=CONFIG.body).fit(
+        joint_targets(evidence, np.ones(len(points), dtype=bool)), None
+    )
+    apart, views = disagreement(evidence, fit), evidence.inlier.sum(axis=-1)
+    rows = []
+    for count in range(2, len(rig) + 1):
+        here = apart[views == count]
+        over = 100 * (here > CONFIG.refine.disagreement).mean()
+        rows.append(
+            f"| {count} | {len(here)} | {np.median(here):.2f} | {np.percentile(here, 99):.1f} | {over:.2f} |"
+        )
+    limit = f"over {CONFIG.refine.disagreement:g}, %"
+    return [f"| views that agree | joints | median, sigma | 99 %, sigma | {limit} |", _rule(5), *rows]
+
+
+def sigma_table(folder: Path) -> list[str]:
+    """Error of a detection by confidence: each view against where at least three others see the joint."""
+    rig, observations, sigmas, points = shelf_observations(folder)
+    config = replace(CONFIG.observations, rho_2d_m=0.3, kernel="geman_mcclure")
+    error, known, confidence, modelled = [], [], [], []
+    for view in range(len(rig)):
+        others = sigmas.copy()
+        others[:, :, view] = 0.0
+        unseen = replace(observations, confidence=np.where(others > 0, observations.confidence, 0.0))
+        place = points
+        for _ in range(6):
+            place = weigh(unseen, others, place, rig, config).target
+        evidence = weigh(unseen, others, place, rig, config)
+        usable = (evidence.inlier.sum(axis=-1) >= 3) & observations.seen[:, :, view]
+        xy, depth = rig.project(place)
+        metres = (depth[view] / rig.focal_px[view])[usable]
+        offset = (xy[view] - observations.xy[:, :, view])[usable] * metres[:, None]
+        R = rig.cTw[view, :, :3]
+        spread = (R @ np.linalg.inv(evidence.information[usable]) @ R.T)[:, :2, :2]
+        error.append(np.linalg.norm(offset, axis=1))
+        known.append(np.trace(spread, axis1=1, axis2=2) / 2)
+        confidence.append(observations.confidence[:, :, view][usable])
+        modelled.append(sigmas[:, :, view][usable] * metres)
+    error, known, confidence, modelled = map(np.concatenate, (error, known, confidence, modelled))
+    rows = []
+    for low, high in pairwise((0.05, 0.2, 0.4, 0.6, 0.7, 0.8, 0.9, 1.01)):
+        here = (confidence >= low) & (confidence < high)
+        # The median length of a two-dimensional Gaussian is 1.177 sigma; the others' own spread is taken out.
+        sigma = np.sqrt(max((np.median(error[here]) / 1.1774) ** 2 - np.median(known[here]), 0.0))
+        tail = np.percentile(error[here], 90) / np.median(error[here])
+        rows.append(
+            f"| {low:g} to {min(high, 1.0):g} | {here.sum()} | {1e3 * sigma:.0f} | "
+            f"{1e3 * np.median(modelled[here]):.0f} | {tail:.2f} |"
+        )
+    head = "| confidence | detections | sigma, mm | sigma that we give it, mm | 90 % / 50 % (Gaussian: 1.82) |"
+    return [head, _rule(5), *rows]
+
+
+@cache
+def shelf_observations(folder: Path) -> tuple[Rig, Observations, NDArray[np.float64], NDArray[np.float64]]:
+    """Everybody on Shelf after stage I: rig, observations, their sigmas (P, J, V) and X_0 (P, J, 3)."""
+    rig = read_rig(folder / "calibration.json")
+    detections = read_detections(folder, rig)
+    found = [find_people(detections[t], rig, detections.skeleton, CONFIG) for t in range(len(detections))]
+    observations = Observations.concatenate(found)
+    sigmas = observation_sigmas(observations, observations.initial, rig, CONFIG.observations)
+    return rig, observations, sigmas, triangulate(observations, rig, sigmas, CONFIG.observations)
 
 
 def body_joints(people: Reconstruction) -> NDArray[np.float64]:

@@ -99,9 +99,9 @@ def refine(
         evidence = weigh(observed, sigma, start, rig, observation_config)
         if n == 0:
             enough = _placed(evidence, config).sum(axis=1) >= config.min_joints
-        body = fitter.fit(_targets(evidence, enough[moving]), fit.rows(moving))  # the Theta step
+        body = fitter.fit(joint_targets(evidence, enough[moving]), fit.rows(moving))  # the Theta step
         fitted = evidence.target
-        wrong = _disagree(evidence, body, config)
+        wrong = disagreement(evidence, body) > config.disagreement
         if wrong.any():
             there = np.where(wrong[..., None], body.prior_xyz, start)
             evidence = weigh(observed, sigma, there, rig, observation_config)
@@ -156,11 +156,11 @@ def _placed(evidence: Evidence, config: RefineConfig) -> NDArray[np.bool_]:
     return determined(information, max_sigma_m=config.max_sigma_m).reshape(evidence.points.shape[:2])
 
 
-def _disagree(evidence: Evidence, fit: BodyFit, config: RefineConfig) -> NDArray[np.bool_]:
-    """(P, J) whether a joint's views put it where the rest of the body cannot have it.
+def disagreement(evidence: Evidence, fit: BodyFit) -> NDArray[np.float64]:
+    """How far (P, J) each joint's views put it from where the rest of the body puts it, in standard deviations.
 
     The distance between the two, measured against the sum of their covariances; where the views leave a
-    direction open, they cannot disagree in it.
+    direction open, they cannot disagree in it. 0 for people without a body.
     """
     apart = np.nan_to_num(evidence.target - fit.prior_xyz)
     body = np.where(fit.ok[:, None, None, None], fit.prior_covariance, np.eye(3))
@@ -168,11 +168,11 @@ def _disagree(evidence: Evidence, fit: BodyFit, config: RefineConfig) -> NDArray
     information = evidence.information
     weight = information @ np.linalg.inv(np.eye(3) + body @ information)
     squared = np.einsum("...i,...ij,...j->...", apart, weight, apart)
-    return fit.ok[:, None] & (squared > config.disagreement**2)
+    return np.where(fit.ok[:, None], np.sqrt(np.maximum(squared, 0.0)), 0.0)
 
 
-def _targets(evidence: Evidence, enough: NDArray[np.bool_]) -> JointTargets:
-    """All joints with what the views say of them; nothing for people who are not determined."""
+def joint_targets(evidence: Evidence, enough: NDArray[np.bool_]) -> JointTargets:
+    """What the body is fitted to: what the views say of all joints, of people whom they determine (`enough`)."""
     information = np.where(enough[:, None, None, None], evidence.information, 0.0)
     return JointTargets(np.nan_to_num(evidence.target), information)
 
