@@ -249,9 +249,8 @@ def contradiction_table(folder: Path) -> list[str]:
     for count in range(2, len(rig) + 1):
         here = apart[views == count]
         over = 100 * (here > CONFIG.refine.disagreement).mean()
-        rows.append(
-            f"| {count} | {len(here)} | {np.median(here):.2f} | {np.percentile(here, 99):.1f} | {over:.2f} |"
-        )
+        typical = f"{np.median(here):.2f} | {np.percentile(here, 99):.1f}"
+        rows.append(f"| {count} | {len(here)} | {typical} | {over:.2f} |")
     limit = f"over {CONFIG.refine.disagreement:g}, %"
     return [f"| views that agree | joints | median, sigma | 99 %, sigma | {limit} |", _rule(5), *rows]
 
