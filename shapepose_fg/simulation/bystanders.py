@@ -66,7 +66,7 @@ def walking_clips(mocap: Mocap, *, without: frozenset[str]) -> list[int]:
 def endless(clip: Clip, frames: int, start: int = 0) -> Clip:
     """`clip` from frame `start` for `frames` frames, again from its beginning where it ends, by a crossfade."""
     seam = min(max(2, round(_SEAM_S * clip.fps)), len(clip) // 3)
-    share = (np.arange(seam) + 1.0) / (seam + 1.0)
+    share: Array = np.linspace(0.0, 1.0, seam + 2)[1:-1]
     share = share**2 * (3 - 2 * share)
     head, tail = clip.between(0, seam), clip.between(len(clip) - seam, len(clip))
     rotations, pelvis = clip.rotations[:-seam].copy(), clip.pelvis[:-seam].copy()
@@ -132,7 +132,7 @@ def _cycle(walk: Performance) -> tuple[Performance, float]:
     # A shorter loop shows its seam more often: prefer the longer of two that close equally well.
     begin, end = np.unravel_index(np.argmin(gap - 0.002 * (last[None] - first[:, None])), gap.shape)
     begin, end = int(first[begin]), int(last[end])
-    share = (np.arange(seam) + 1.0) / (seam + 1.0)
+    share: Array = np.linspace(0.0, 1.0, seam + 2)[1:-1]
     rotations, joints = walk.rotations[begin:end].copy(), walk.joints[begin:end].copy()
     rotations[-seam:] = blend(rotations[-seam:], walk.rotations[begin - seam : begin], share)
     length = float(walk.joints[end, 0, 0] - walk.joints[begin, 0, 0])

@@ -71,7 +71,7 @@ class Clip:
             return replace(self, fps=fps)
         time = np.arange(int(np.floor((len(self) - 1) * fps / self.fps + 1e-9)) + 1) * self.fps / fps
         low = np.minimum(time.astype(int), len(self) - 2)
-        share = time - low
+        share = np.asarray(time - low, dtype=np.float64)
         rotations = blend(self.rotations[low], self.rotations[low + 1], share)
         pelvis = self.pelvis[low] + share[:, None] * (self.pelvis[low + 1] - self.pelvis[low])
         return replace(self, rotations=rotations, pelvis=pelvis, fps=fps)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from shapepose_fg.body.model import BodyModel
 from shapepose_fg.simulation.bystanders import stand, standing_clips, walk_along, walking_clips
 from shapepose_fg.simulation.crossing import way_through
+from shapepose_fg.simulation.holding import hold_hands
 from shapepose_fg.simulation.mocap import Clip, Figure, Mocap, Performance, perform, together
 from shapepose_fg.simulation.motion import Motion
 from shapepose_fg.simulation.scene import Scene, ring_of_cameras
@@ -304,6 +305,7 @@ def _place_pair(
     legs = np.mean([Figure(body, shape).leg_m for shape in betas])
     scale = float(legs / np.mean([clip.leg_m for clip in pair]))
     two = [perform(body, shape, clip, scale=scale) for shape, clip in zip(betas, pair, strict=True)]
+    two = hold_hands(two[0], two[1], pair[0].fps)
     steps = np.concatenate([one.joints[:, 0, :2] for one in two])
     middle = (steps.min(axis=0) + steps.max(axis=0)) / 2
     two = [one.moved(-middle) for one in two]
