@@ -14,6 +14,15 @@ from shapepose_fg.camera import Camera
 
 NEAR_M = 0.05
 """Faces with a corner nearer than this are dropped, metres: nothing is clipped."""
+_FAR_M = 100.0
+"""Faces beyond this are not drawn by OpenCV, metres."""
+_NUMBER = np.float32(2.0**-20)
+"""What a vertex counts as colour: OpenCV takes colours of 0 to 1, and float32 holds these exactly."""
+_FLAT = (
+    cv2.TriangleRasterizeSettings()
+    .setShadingType(cv2.RASTERIZE_SHADING_FLAT)
+    .setCullingMode(cv2.RASTERIZE_CULLING_CW)
+)
 _CHUNK_PIXELS = 2_000_000
 """Pixels tested at once: bounds the memory that large triangles take."""
 
@@ -72,6 +81,48 @@ def render_depth(
     safe = np.where(depth > NEAR_M, depth, np.nan)
     pixels = points[:, :2] / safe[:, None] @ camera.K[:2, :2].T + camera.K[:2, 2]
     return rasterise(pixels, depth, faces, camera.image_size, cull_back=cull_back)
+
+
+def first_surface_at(
+    points_world: NDArray[np.floating],
+    faces: NDArray[np.integer],
+    camera: Camera,
+    column: NDArray[np.intp],
+    row: NDArray[np.intp],
+) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+    """Depth and vertex, each of the shape of `column` and `row`, of the first surface on the rays of some pixels.
+
+    The vertex is the first corner of the face that is met. inf and -1 where nothing is. The same picture as
+    `render_depth` with `cull_back` makes, by OpenCV and in half the time. At most 2**20 points.
+    """
+    width, height = camera.image_size
+    cTw = camera.cTw.astype(np.float32)
+    points = np.asarray(points_world, dtype=np.float32) @ cTw[:, :3].T + cTw[:, 3]
+    near = points[:, 2] <= NEAR_M
+    if near.any():  # OpenCV draws a face that reaches behind the camera all over the image
+        faces = faces[~near[faces].any(axis=1)]
+    if len(faces) == 0:
+        return np.full(row.shape, np.inf, dtype=np.float32), np.full(row.shape, -1, dtype=np.intp)
+    number = np.zeros((len(points), 3), dtype=np.float32)
+    number[:, 0] = np.arange(len(points), dtype=np.float32) * _NUMBER
+    colour = np.full((height, width, 3), -1.0, dtype=np.float32)
+    depth = np.full((height, width), _FAR_M, dtype=np.float32)
+    cv2.triangleRasterize(
+        _as_opengl(points, camera), faces, number, colour, depth, np.eye(4), 1.0, NEAR_M, _FAR_M, _FLAT
+    )
+    met = colour[row, column, 0]
+    vertex = np.where(met >= 0, np.rint(met / _NUMBER), -1).astype(np.intp)
+    return np.where(met >= 0, depth[row, column], np.float32(np.inf)), vertex
+
+
+def _as_opengl(points: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:
+    """Points (N, 3) of camera coordinates where a camera of 1 radian of height, y up, z back, sees them alike."""
+    (width, height), K = camera.image_size, camera.K
+    focal = height / 2 / np.tan(0.5)
+    # OpenCV's pixels have their centres at halves there; a shear moves the principal point to the middle.
+    x = (K[0, 0] * points[:, 0] + K[0, 1] * points[:, 1] + (K[0, 2] + 0.5 - width / 2) * points[:, 2]) / focal
+    y = (K[1, 1] * points[:, 1] + (K[1, 2] + 0.5 - height / 2) * points[:, 2]) / focal
+    return np.stack([x, -y, -points[:, 2]], axis=1).astype(np.float32)
 
 
 def rasterise(

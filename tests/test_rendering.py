@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 
 from shapepose_fg.camera import Camera
-from shapepose_fg.rendering import look_at, rasterise, render_depth, render_shaded, scaled, vertex_normals, zoom
+from shapepose_fg.rendering import (
+    first_surface_at,
+    look_at,
+    rasterise,
+    render_depth,
+    render_shaded,
+    scaled,
+    vertex_normals,
+    zoom,
+)
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -148,3 +157,28 @@ def test_normals_and_shading_of_a_sphere(camera: Camera):
     # The side towards the light is brighter; right in the image is +y in the world here.
     row = rgb[60, :, 0][inside[60]]
     assert row[-len(row) // 4] > 1.1 * row[len(row) // 4]
+
+
+def test_the_fast_way_meets_the_same_surfaces(camera: Camera):
+    """Two spheres, one through the other, from outside, from near and from inside, by a camera with skew."""
+    ball, faces = sphere(40)
+    points = np.concatenate([ball, 0.6 * ball + (0.5, 0.7, 0.2)])
+    mesh = np.concatenate([faces, faces + len(ball)])
+    width, height = camera.image_size
+    row, column = np.mgrid[:height, :width]
+    hits = []
+    for eye, target in (((4.0, 1, 0.5), (0, 0, 0)), ((1.0, 0.1, 1), (0.5, 0.7, 0.2)), ((0, 0, 0.1), (3.0, 1, 0))):
+        shifted = np.array([[200.0, 3.0, 70.0], [0, 180.0, 66.0], [0, 0, 1]])
+        seen_from = Camera("c", shifted, look_at(np.array(eye), np.array(target), UP), camera.image_size)
+        exact = render_depth(points, mesh, seen_from, cull_back=True)
+        depth, vertex = first_surface_at(points, mesh.astype(np.int32), seen_from, column, row)
+        hit = exact.face >= 0
+        hits.append(hit.mean())
+        assert np.mean((vertex >= 0) != hit) < 1e-3  # pixel centres on an edge, to float32
+        both = (vertex >= 0) & hit
+        assert np.mean(vertex[both] != mesh[exact.face[both], 0]) < 2e-3
+        assert np.quantile(np.abs(depth[both] - exact.depth[both]), 0.999) < 1e-4
+        assert np.isinf(depth[vertex < 0]).all()
+    assert min(hits) > 0.3  # also from inside the first ball, whose backs are not drawn
+    nothing = first_surface_at(points[:0], mesh[:0].astype(np.int32), camera, column, row)
+    assert np.isinf(nothing[0]).all() and (nothing[1] == -1).all()

@@ -5,7 +5,7 @@ blend shapes (where the file has any), linear blend skinning.
 The model's own frame: metres, y up, facing +z, T-pose.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
 from pathlib import Path
 
@@ -113,17 +113,21 @@ class BodyModel:
         """What the file held, in float64."""
         return self._arrays
 
-    def vertices(self, parameters: BodyParameters) -> Tensor:
-        """(B, Nv, 3) the skinned mesh, metres. The only thing here whose cost grows with the mesh."""
+    def vertices(self, parameters: BodyParameters, only: NDArray[np.intp] | None = None) -> Tensor:
+        """(B, Nv, 3) the skinned mesh, metres; or (B, M, 3), the vertices `only` (M,) of it.
+
+        The only thing here whose cost grows with the mesh.
+        """
+        mesh = self._mesh if only is None else self._mesh.part(only)
         _, rotations = self._rotations(parameters)
-        shaped = self._mesh.template + (parameters.betas @ self._mesh.shapes).unflatten(-1, (-1, 3))
-        if self._mesh.pose_blend is not None:
-            shaped = shaped + (self._pose_feature(parameters) @ self._mesh.pose_blend).unflatten(-1, (-1, 3))
-        rest = self._mesh.rest_joints + (parameters.betas @ self._mesh.rest_joint_shapes).unflatten(-1, (-1, 3))
+        shaped = mesh.template + (parameters.betas @ mesh.shapes).unflatten(-1, (-1, 3))
+        if mesh.pose_blend is not None:
+            shaped = shaped + (self._pose_feature(parameters) @ mesh.pose_blend).unflatten(-1, (-1, 3))
+        rest = mesh.rest_joints + (parameters.betas @ mesh.rest_joint_shapes).unflatten(-1, (-1, 3))
         posed = self._joints.positions(rotations, parameters.betas, parameters.transl, None)
         shift = posed - (rotations @ rest[..., None]).squeeze(-1)
         transforms = torch.cat((rotations, shift[..., None]), -1).flatten(2)  # (B, 24, 12)
-        blended = (self._mesh.weights @ transforms).unflatten(-1, (3, 4))
+        blended = (mesh.weights @ transforms).unflatten(-1, (3, 4))
         return (blended[..., :3] @ shaped[..., None]).squeeze(-1) + blended[..., 3]
 
     def joints(self, parameters: BodyParameters) -> Tensor:
@@ -204,6 +208,18 @@ class _Mesh:
     """(10, 24 * 3) metres per unit of each beta."""
     weights: Tensor
     """(Nv, 24) skinning weights."""
+
+    def part(self, vertices: NDArray[np.intp]) -> "_Mesh":
+        """What some of the vertices need."""
+        rows = torch.from_numpy(vertices)
+        blend = self.pose_blend
+        return replace(
+            self,
+            template=self.template[rows],
+            shapes=self.shapes.unflatten(1, (-1, 3))[:, rows].flatten(1),
+            pose_blend=None if blend is None else blend.unflatten(1, (-1, 3))[:, rows].flatten(1),
+            weights=self.weights[rows],
+        )
 
 
 @cache

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections, Recording
 from shapepose_fg.simulation.scene import Scene
-from shapepose_fg.simulation.visibility import Visibility, VisibilityConfig, coarsen, see
+from shapepose_fg.simulation.visibility import Skin, Visibility, VisibilityConfig, see
 from shapepose_fg.skeleton import BODY_25
 
 _LIMBS = np.array(BODY_25.limbs)
@@ -88,11 +88,11 @@ def simulate(scene: Scene, config: DetectorConfig | None = None, seed: int = 0) 
     Each frame has its own generator, so that a frame does not depend on those before it.
     """
     config = DetectorConfig() if config is None else config
-    kept, faces = coarsen(scene.standing, scene.body.faces, config.visibility.cell_m)
+    skin = Skin.of(scene.body, config.visibility.cell_m)
     frames = []
     for frame in range(len(scene)):
         joints = scene.truth_at(frame)
-        seen = see(scene.rig, joints, scene.vertices_at(frame)[:, kept], faces, config.visibility)
+        seen = see(scene.rig, joints, scene.vertices_at(frame, skin.vertices), skin, config.visibility)
         frames.append(detect(scene.rig, joints, seen, config, np.random.default_rng([seed, frame])))
     return Recording(BODY_25, frames)
 

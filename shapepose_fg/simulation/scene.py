@@ -48,12 +48,14 @@ class Scene:
         """(P, 25, 3) true BODY_25 keypoints of one frame."""
         return self.keypoints[frame]
 
-    def vertices_at(self, frame: int) -> NDArray[np.float32]:
-        """(P, Nv, 3) the true surfaces of one frame."""
+    def vertices_at(self, frame: int, only: NDArray[np.intp] | None = None) -> NDArray[np.float32]:
+        """(P, Nv, 3) the true surfaces of one frame; or (P, M, 3), the vertices `only` (M,) of them."""
         if self.people == 0:
-            return np.zeros((0, self.body.num_vertices, 3), dtype=np.float32)
+            count = self.body.num_vertices if only is None else len(only)
+            return np.zeros((0, count, 3), dtype=np.float32)
+        parameters = _parameters(self.body, self.motion, slice(frame, frame + 1))
         with torch.no_grad():
-            return self.body.vertices(_parameters(self.body, self.motion, slice(frame, frame + 1))).numpy()
+            return self.body.vertices(parameters, only).numpy()
 
     @cached_property
     def standing(self) -> NDArray[np.float32]:

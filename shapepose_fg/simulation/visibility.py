@@ -1,105 +1,156 @@
-"""Which joints a camera sees: the posed surfaces' depth buffer around each joint."""
+"""Which joints a camera sees: the first of the posed surfaces on the rays to each joint, and whose skin it is."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.body.model import BodyModel
 from shapepose_fg.camera import Rig
-from shapepose_fg.rendering import render_depth, scaled
+from shapepose_fg.rendering import first_surface_at, scaled
+from shapepose_fg.skeleton import SMPL_24
 
-_OFFSETS = np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (0.7, 0.7), (-0.7, 0.7), (0.7, -0.7), (-0.7, -0.7)])
-"""Rays around a joint, in units of the probe's radius."""
-_TRUNK = [1, 2, 5, 8, 9, 12]
-"""Neck, shoulders and hips in BODY_25."""
-_OTHERS_M = 0.02
-"""Another person's surface hides a joint when it is nearer by more than this: skin on skin does not."""
+NOBODY, ITSELF, BORDER = -1, -2, -3
+"""What `Visibility.hidden_by` says where no other person is in front."""
+
+_BONES = (
+    "head neck+left_collar+right_collar right_shoulder+right_collar right_elbow right_wrist "
+    "left_shoulder+left_collar left_elbow left_wrist pelvis right_hip right_knee right_ankle left_hip left_knee "
+    "left_ankle head head head head left_foot left_foot left_ankle right_foot right_foot right_ankle"
+).split()
+"""The own bones of each joint of BODY_25: SMPL's that begin there; face, toes and heels have their nearest. A
+collar has next to no skin: it counts as the shoulder's own, so that the chest is adjacent to the shoulder."""
+_FACE = [0, 15, 16, 17, 18]
+"""Nose, eyes and ears in BODY_25: they lie on the skin, not inside a limb."""
+
+_RAYS = np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (0.7, 0.7), (-0.7, 0.7), (0.7, -0.7), (-0.7, -0.7)])
+"""Where rays go around a joint, in units of the probe's radius."""
 
 
 @dataclass(frozen=True)
 class VisibilityConfig:
-    """How the depth buffer is read."""
+    """How the depth buffer is drawn and read."""
 
     image_scale: float = 0.25
     """The buffer's resolution, as a share of the image's."""
-    own_depth_m: float = 0.15
-    """A joint lies at most this far under the skin that shows it; deeper, its own body hides it."""
-    trunk_depth_m: float = 0.22
-    """The same for hips, shoulders and neck: from the side they lie deeper in the body."""
-    probe_m: float = 0.035
-    """Radius around a joint in which rays are sent."""
-    cell_m: float = 0.03
+    cell_m: float = 0.04
     """Vertices of the surface this near to each other are one; 0 keeps all."""
+    probe_m: float = 0.03
+    """Radius around a joint in which rays are sent; 0 leaves the ray to the joint itself."""
+    front_m: float = 0.02
+    """A surface is in front of a joint when it is nearer by more than this: skin on skin hides nothing."""
+    face_depth_m: float = 0.08
+    """The head itself hides nose, eyes and ears that are deeper under its first surface: on its other side."""
 
 
 @dataclass(frozen=True)
 class Visibility:
-    """How much of each joint each view sees."""
+    """How much of each joint each view sees, and what hides it."""
 
     seen: NDArray[np.float64]
     """(V, P, J) share of the rays to a joint that arrive, 0 to 1; 0 outside the image."""
     in_image: NDArray[np.bool_]
     """(V, P, J) whether the joint projects into the image."""
     hidden_by: NDArray[np.intp]
-    """(V, P, J) the other person in front of the joint; -1 where there is none, or its own body hides it."""
+    """(V, P, J) NOBODY (-1) where at least half of the rays arrive; else what stops most of the others: a
+    person's index, or ITSELF (-2), its own body; BORDER (-3) outside the image."""
+
+
+@dataclass(frozen=True)
+class Skin:
+    """The surface that is drawn for every person, and which joints each part of it shows."""
+
+    vertices: NDArray[np.intp]
+    """(M,) vertices of the body's mesh that are in use."""
+    faces: NDArray[np.int32]
+    """(G, 3) triangles over those."""
+    shows: NDArray[np.bool_]
+    """(M, J) whether a vertex is skinned to the joint's own bone or one next to it: by half its weight or more."""
+
+    @classmethod
+    def of(cls, body: BodyModel, cell_m: float) -> "Skin":
+        """The surface of `body`, with vertices merged that are within a cube of `cell_m` in the mean T-pose."""
+        vertices, faces, cell = coarsen(body.arrays.template, body.faces, cell_m)
+        shown = body.arrays.weights @ _bones_near(body.parents).T
+        mean = np.stack([np.bincount(cell, share) for share in shown.T], axis=1) / np.bincount(cell)[:, None]
+        return cls(vertices, faces.astype(np.int32), mean >= 0.5)
+
+    @cached_property
+    def _shows_or_none(self) -> NDArray[np.bool_]:
+        """(M + 1, J) `shows`, and a last row for vertex -1, which is none."""
+        return np.concatenate([self.shows, np.zeros((1, self.shows.shape[1]), dtype=bool)])
 
 
 def see(
     rig: Rig,
     joints: NDArray[np.float64],
-    vertices: NDArray[np.floating],
-    faces: NDArray[np.integer],
+    surfaces: NDArray[np.floating],
+    skin: Skin,
     config: VisibilityConfig,
 ) -> Visibility:
-    """See BODY_25 `joints` (P, 25, 3) of people whose surfaces are `vertices` (P, Nv, 3), `faces` (F, 3).
+    """See BODY_25 `joints` (P, 25, 3) of people whose `surfaces` are (P, M, 3), the vertices of `skin`.
 
-    A ray arrives when the first surface on it is the joint's own body within `own_depth_m`, or nothing
-    nearer than the joint (a joint at the edge of its own silhouette).
+    A ray arrives when the first surface on it is skinned to the joint's own bones or adjacent ones of the
+    same person, or when no surface is nearer than the joint (a toe at the edge of its silhouette).
     """
-    people, count = joints.shape[:2]
-    shape = (len(rig), people, count)
-    seen, hidden_by = np.zeros(shape), np.full(shape, -1, dtype=np.intp)
+    people, size = len(joints), surfaces.shape[1]
     xy, depth = rig.project(joints)
-    size = rig.image_sizes[:, None, None, :]
-    in_image = np.all((xy >= 0) & (xy <= size - 1), axis=-1)  # NaN behind the camera compares false
-    mesh = (faces[None] + np.arange(people)[:, None, None] * vertices.shape[1]).reshape(-1, 3)
-    points = vertices.reshape(-1, 3)
-    own = np.arange(people)[:, None, None]
-    under_skin = np.full((count, 1), config.own_depth_m)
-    under_skin[_TRUNK] = config.trunk_depth_m
-    for view, camera in enumerate(rig.cameras):
-        if not in_image[view].any():
-            continue
-        small = scaled(camera, config.image_scale)
-        surface = render_depth(points, mesh, small, cull_back=True)
-        ratio = np.array(small.image_size) / camera.image_size
+    in_image = np.all((xy >= 0) & (xy <= rig.image_sizes[:, None, None] - 1), axis=-1)  # NaN compares false
+    rays = _RAYS if config.probe_m > 0 else _RAYS[:1]
+    met_depth = np.full((*depth.shape, len(rays)), np.inf)
+    met = np.full(met_depth.shape, -1, dtype=np.intp)
+    faces = (skin.faces[None] + np.arange(people, dtype=np.int32)[:, None, None] * size).reshape(-1, 3)
+    points = surfaces.reshape(-1, 3)
+    for view in np.flatnonzero(in_image.any(axis=(1, 2))):
+        camera = scaled(rig.cameras[view], config.image_scale)
         radius = config.probe_m * rig.focal_px[view] / depth[view]
-        with np.errstate(invalid="ignore"):
-            probes = (xy[view][:, :, None] + radius[..., None, None] * _OFFSETS + 0.5) * ratio - 0.5
-            pixel = np.rint(probes)
-        pixel = np.clip(np.nan_to_num(pixel), 0, np.array(small.image_size) - 1).astype(np.intp)
-        face = surface.face[pixel[..., 1], pixel[..., 0]]
-        person = np.where(face >= 0, face // len(faces), -1)
-        gap = depth[view][..., None] - surface.depth[pixel[..., 1], pixel[..., 0]]  # -inf where nothing is
-        hidden = gap > np.where(person == own, under_skin, _OTHERS_M)
-        seen[view] = np.where(in_image[view], 1.0 - hidden.mean(axis=-1), 0.0)
-        others = hidden & (person != own)
-        # The nearest ray that another person stops names who is in front: rays are ordered from the centre.
-        first = np.take_along_axis(person, others.argmax(axis=-1)[..., None], axis=-1)[..., 0]
-        hidden_by[view] = np.where(others.any(axis=-1) & in_image[view], first, -1)
-    return Visibility(seen, in_image, hidden_by)
+        ratio = np.array(camera.image_size) / rig.image_sizes[view]
+        pixels = (xy[view][..., None, :] + radius[..., None, None] * rays + 0.5) * ratio - 0.5
+        last = np.array(camera.image_size) - 1
+        column, row = np.clip(np.rint(np.nan_to_num(pixels)), 0, last).astype(np.intp).transpose(3, 0, 1, 2)
+        met_depth[view], met[view] = first_surface_at(points, faces, camera, column, row)
+    own = np.arange(people)[:, None, None]
+    owner, place = np.divmod(met, max(size, 1))  # nothing met: owner -1
+    shows = skin._shows_or_none[np.where(owner == own, place, -1), np.arange(joints.shape[1])[:, None]]
+    gap = depth[..., None] - met_depth  # -inf where nothing is met
+    deep = np.full((joints.shape[1], 1), np.inf)
+    deep[_FACE] = config.face_depth_m
+    stopped = (gap > config.front_m) & (~shows | (gap > deep))
+    seen = np.where(in_image, 1.0 - stopped.mean(axis=-1), 0.0)
+    hider = _commonest(np.where(owner == own, ITSELF, owner), stopped)
+    hidden_by = np.where(seen >= 0.5, NOBODY, hider)
+    return Visibility(seen, in_image, np.where(in_image, hidden_by, BORDER))
+
+
+def _commonest(who: NDArray[np.intp], counts: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """The value of `who` (..., R) that comes most often among those that count; of equals, the first."""
+    votes = ((who[..., :, None] == who[..., None, :]) & counts[..., None, :]).sum(axis=-1)
+    best = np.where(counts, votes, 0).argmax(axis=-1)
+    return np.take_along_axis(who, best[..., None], axis=-1)[..., 0]
+
+
+def _bones_near(parents: tuple[int, ...]) -> NDArray[np.float64]:
+    """(25, 24) 1 where a bone is a joint's own, or the parent or child of one."""
+    adjacent = np.eye(len(parents))
+    child, parent = np.arange(1, len(parents)), np.array(parents[1:])
+    adjacent[child, parent] = adjacent[parent, child] = 1
+    own = np.array([[name in names.split("+") for name in SMPL_24] for names in _BONES], dtype=np.float64)
+    return np.minimum(own @ adjacent, 1.0)
 
 
 def coarsen(
     vertices: NDArray[np.floating], faces: NDArray[np.integer], cell_m: float
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
     """Fewer triangles over some of the vertices (N, 3): one vertex per cube of `cell_m`.
 
-    Returns the indices (M,) of the vertices that stay, and faces (G, 3) over those. A cube keeps the vertex
-    nearest to its vertices' mean; triangles that collapse or come twice go.
+    Returns the indices (M,) of the vertices that stay, faces (G, 3) over those, and the cube (N,) of each
+    vertex, from 0 to M - 1. A cube keeps the vertex nearest to its vertices' mean; triangles that collapse
+    or come twice go.
     """
     if cell_m <= 0:
-        return np.arange(len(vertices)), np.asarray(faces, dtype=np.intp)
+        every = np.arange(len(vertices))
+        return every, np.asarray(faces, dtype=np.intp), every
     cells = np.floor((vertices - vertices.min(axis=0)) / cell_m).astype(np.int64)
     _, cell = np.unique(cells, axis=0, return_inverse=True)
     cell = cell.ravel()
@@ -110,6 +161,6 @@ def coarsen(
     small = cell[faces]
     distinct = (small[:, 0] != small[:, 1]) & (small[:, 1] != small[:, 2]) & (small[:, 2] != small[:, 0])
     small = small[distinct]
-    # Turn each triangle to begin with its smallest index, so that copies are equal and keep their winding.
+    # Turn each triangle to begin with its smallest index: copies are equal and keep their winding.
     turn = (small.argmin(axis=1)[:, None] + np.arange(3)) % 3
-    return chosen, np.unique(np.take_along_axis(small, turn, axis=1), axis=0)
+    return chosen, np.unique(np.take_along_axis(small, turn, axis=1), axis=0), cell
