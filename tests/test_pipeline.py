@@ -1,0 +1,174 @@
+"""The whole way: what goes in as 2D candidates comes out as people."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+import torch
+
+from factors import isotropic
+from shapepose_fg.detections import Detections, Recording
+from shapepose_fg.evaluation.metrics import joint_metrics
+from shapepose_fg.evaluation.shelf import evaluate_shelf, read_shelf_ground_truth
+from shapepose_fg.io.calibration import read_rig
+from shapepose_fg.io.detections import read_detections
+from shapepose_fg.pipeline import PipelineConfig, find_people, reconstruct
+from shapepose_fg.proposals import ProposalConfig
+from shapepose_fg.reconstruction import Reconstruction, Status
+from shapepose_fg.simulation import built_in_scene, simulate
+from shapepose_fg.simulation.scene import Scene
+from shapepose_fg.skeleton import BODY_25
+
+WRISTS = [BODY_25.index("RWrist"), BODY_25.index("LWrist")]
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """Four people in close motion before six cameras: two thirds of a second."""
+    return built_in_scene(seed=0, frames=16)
+
+
+@pytest.fixture(scope="module")
+def recording(scene) -> Recording:
+    return simulate(scene, seed=0)
+
+
+@pytest.fixture(scope="module")
+def people(scene, recording) -> Reconstruction:
+    return reconstruct(recording, scene.rig)
+
+
+def assert_same(one: Reconstruction, other: Reconstruction) -> None:
+    """Rows do not influence each other; batches round differently, well under a millimetre."""
+    np.testing.assert_array_equal(one.frame, other.frame)
+    np.testing.assert_array_equal(one.status, other.status)
+    np.testing.assert_allclose(one.joints, other.joints, atol=5e-4)
+    np.testing.assert_allclose(one.betas, other.betas, atol=0.05)
+
+
+def test_everybody_is_found_once_and_where_they_are(scene, people):
+    found = joint_metrics(people, scene.keypoints)
+    assert found.people_found == found.people_true == 64
+    assert found.people_duplicated == found.people_invented == 0
+    assert found.precision >= 0.98 and found.recall >= 0.98 and found.mpjpe_mm <= 30
+    assert set(people.status) == {Status.OK}
+    assert np.isfinite(people.joints).all() and np.isfinite(people.covariance).all()
+    assert (np.linalg.eigvalsh(people.covariance) > 0).all()
+
+
+def test_the_bodies_are_where_the_joints_are(scene, people):
+    body = scene.body
+    from shapepose_fg.body.model import BodyParameters
+
+    columns = (people.betas, people.global_orient, people.body_pose, people.transl)
+    fitted = body.keypoints(BodyParameters(*(torch.from_numpy(c).to(body.dtype) for c in columns))).numpy()
+    distance = np.linalg.norm(fitted - people.joints, axis=-1)
+    assert np.median(distance) < 0.02, "the model error that the fit allows for"
+
+
+def test_the_run_says_how_it_came_about(recording, people):
+    run = people.run
+    assert run["frames"] == [0, 16]
+    assert run["people"]["found"] == len(people) == run["people"]["status"]["ok"]
+    assert run["configuration"]["person_graph"]["rho_3d"] == PipelineConfig().person_graph.rho_3d
+    assert set(run["seconds"]) >= {"triangulate", "vote", "propose", "associate", "refine"}
+    assert run["versions"]["gtsam"].startswith("4.")
+
+
+def test_frames_stand_alone_and_batches_do_not_matter(scene, recording, people):
+    part = reconstruct(recording, scene.rig, frames=range(5, 9))
+    rows = people.rows((people.frame >= 5) & (people.frame < 9))
+    assert_same(part, rows)
+    assert part.run["frames"] == [5, 9]
+    assert_same(reconstruct(recording, scene.rig, PipelineConfig(batch_frames=3), frames=range(5, 9)), rows)
+
+
+def test_the_same_input_gives_the_same_bytes(scene, recording):
+    one, other = (reconstruct(recording, scene.rig, frames=range(3)) for _ in range(2))
+    for name in Reconstruction.ROWS:
+        assert getattr(one, name).tobytes() == getattr(other, name).tobytes(), name
+
+
+def test_progress_counts_frames_and_torch_gets_its_threads_back(scene, recording):
+    before, seen = torch.get_num_threads(), []
+    reconstruct(
+        recording,
+        scene.rig,
+        PipelineConfig(batch_frames=4),
+        frames=range(10),
+        progress=lambda *done: seen.append(done),
+    )
+    assert seen == [(4, 10), (8, 10), (10, 10)]
+    assert torch.get_num_threads() == before
+
+
+@pytest.mark.parametrize("frames", [range(0, 17), range(-1, 3), range(0, 8, 2)])
+def test_frames_that_are_not_there_are_refused(scene, recording, frames):
+    with pytest.raises(ValueError, match="within 0:16"):
+        reconstruct(recording, scene.rig, frames=frames)
+
+
+@pytest.mark.filterwarnings("error")
+def test_nobody_and_nothing_are_empty_results(scene):
+    nobody = reconstruct(Recording(BODY_25, [Detections.empty()] * 3), scene.rig)
+    assert len(nobody) == 0 and nobody.run["people"]["found"] == 0
+    assert len(reconstruct(Recording(BODY_25, []), scene.rig)) == 0
+
+
+def test_an_empty_frame_and_a_blind_view_harm_no_other(scene, recording, people):
+    blind = recording[1]
+    keep = blind.view != 2
+    place = np.cumsum(keep) - 1
+    both = keep[blind.pairs].all(axis=1)
+    blind = Detections(
+        blind.view[keep],
+        blind.joint[keep],
+        blind.xy[keep],
+        blind.confidence[keep],
+        place[blind.pairs[both]],
+        blind.affinity[both],
+    )
+    frames = [recording[0], Detections.empty(), blind, recording[3]]
+    result = reconstruct(Recording(BODY_25, frames), scene.rig)
+    assert np.bincount(result.frame, minlength=4).tolist() == [4, 0, 4, 4]
+    assert_same(result.at(0), people.at(0))
+    without_view = joint_metrics([result.joints[result.frame == 2]], scene.keypoints[1:2])
+    assert without_view.people_found == 4 and without_view.mpjpe_mm < 40
+
+
+def test_one_person_before_two_cameras():
+    scene = built_in_scene(seed=0, people=1, cameras=2, frames=6)
+    found = joint_metrics(reconstruct(simulate(scene, seed=0), scene.rig), scene.keypoints)
+    assert found.people_found == 6 and found.people_invented == 0
+    # Two views, one baseline: no third to vote an error down.
+    assert found.mpjpe_mm < 60
+
+
+def test_factors_of_one_s_own_reach_every_person(scene, recording):
+    def hands_apart(graph):
+        right, left = graph.keys[WRISTS].tolist()
+        yield gtsam.RangeFactor3(right, left, 0.5, isotropic(1, 1e-4))
+
+    result = reconstruct(recording, scene.rig, frames=range(1), extra_factors=hands_apart)
+    apart = np.linalg.norm(result.joints[:, WRISTS[0]] - result.joints[:, WRISTS[1]], axis=-1)
+    np.testing.assert_allclose(apart, 0.5, atol=0.005)
+
+
+def test_settings_reach_their_steps(scene, recording):
+    strict = PipelineConfig(proposals=ProposalConfig(min_confidence=1.0))
+    assert len(find_people(recording[0], scene.rig, BODY_25, strict)) == 0
+    with pytest.raises(ValueError, match="batch_frames must be positive"):
+        replace(strict, batch_frames=0)
+
+
+def test_shelf_is_as_good_as_promised(shared_data):
+    """Every frame by itself, annotated frames only; the figures are those that the project promises."""
+    shelf = shared_data / "shelf"
+    rig = read_rig(shelf / "calibration.json")
+    detections = read_detections(shelf, rig)
+    truth = read_shelf_ground_truth(shelf / "gt_dev.txt")
+    parts = [reconstruct(detections, rig, frames=r) for r in (range(0, 101), range(216, 231), range(270, 285))]
+    score = evaluate_shelf(Reconstruction.concatenate(parts).with_run(frames=[0, 301]), truth)
+    assert score.people_found == score.people
+    assert score.pcp_average >= 96.4 and (score.pcp >= 92.5).all()
