@@ -12,7 +12,7 @@ from shapepose_fg.detections import Detections
 from shapepose_fg.errors import InputError
 from shapepose_fg.skeleton import Skeleton
 
-_MARGIN = 0.25
+MARGIN = 0.25
 """How far outside the picture a detector may place a joint, as a part of the picture's size."""
 
 
@@ -127,7 +127,7 @@ def assemble(views: Sequence[ViewCandidates], rig: Rig, skeleton: Skeleton) -> D
 def _undistorted(view: ViewCandidates, camera: Camera) -> ViewCandidates:
     """`view` with the pixels of a camera without distortion, its points checked against the picture."""
     size = np.array(camera.image_size, dtype=np.float64)
-    outside = np.any((view.xy < -_MARGIN * size) | (view.xy > (1 + _MARGIN) * size), axis=1)
+    outside = np.any((view.xy < -MARGIN * size) | (view.xy > (1 + MARGIN) * size), axis=1)
     if outside.any():
         row = int(np.argmax(outside))
         x, y = view.xy[row]

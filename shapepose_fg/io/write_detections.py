@@ -1,0 +1,160 @@
+"""2D detections written for other systems: 4D Association's text with its calibration, and OpenPose's JSON.
+
+Both hold the pixels that the real lens gives: a rig with distortion distorts them again.
+"""
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.camera import Camera, Rig
+from shapepose_fg.detections import Detections, DetectionSequence
+from shapepose_fg.errors import InputError
+from shapepose_fg.files import write_atomically
+from shapepose_fg.io.detection_table import MARGIN
+from shapepose_fg.skeleton import BODY_25
+
+SMALLEST_PERSON = 3
+"""Groups of fewer joints are nobody, as in OpenPose's default settings."""
+_BODY_25 = 4
+"""The number of BODY_25 among the format's skeletons."""
+_LIMBS = np.array(BODY_25.limbs)
+_LIMB_OF = np.full((len(BODY_25), len(BODY_25)), -1, dtype=np.intp)
+_LIMB_OF[tuple(_LIMBS.T)] = np.arange(len(_LIMBS))
+
+
+def write_association(recording: DetectionSequence, rig: Rig, folder: str | Path) -> None:
+    """Write calibration.json and detection/<camera>.txt into `folder`, as 4D Association reads them.
+
+    Positions have seven decimals (parts of the picture), scores and affinities six. What lies a quarter of
+    the picture or more outside it is left out: readers refuse it. ValueError where the skeleton is not
+    BODY_25, there is no frame, or the world's z does not point up, as the format wants it.
+    """
+    _check(recording)
+    if rig.up != "z":
+        raise ValueError(
+            f"the format has z up, this rig {rig.up}: turn the world before writing, and the truth with it"
+        )
+    folder = Path(folder)
+    calibration = {camera.name: _calibration(camera) for camera in rig.cameras}
+    _write(folder / "calibration.json", json.dumps(calibration, indent=1, allow_nan=False))
+    texts = [[f"{_BODY_25} {len(recording)}"] for _ in rig.cameras]
+    for frame in range(len(recording)):
+        found = recording[frame]
+        for view, camera in enumerate(rig.cameras):
+            texts[view] += _frame_lines(found, view, camera)
+    for camera, lines in zip(rig.cameras, texts, strict=True):
+        _write(folder / "detection" / f"{camera.name}.txt", "\n".join(lines) + "\n")
+
+
+def write_openpose(recording: DetectionSequence, rig: Rig, folder: str | Path) -> None:
+    """Write <camera>/<camera>_000000000000_keypoints.json and so on into `folder`: people, as OpenPose does.
+
+    Candidates are grouped by `group_people`; those that belong to nobody are not in such files. Positions
+    have three decimals, pixels. ValueError where the skeleton is not BODY_25 or there is no frame;
+    InputError where the folder of a camera already holds frames.
+    """
+    _check(recording)
+    folders = [Path(folder) / camera.name for camera in rig.cameras]
+    for each in folders:
+        each.mkdir(parents=True, exist_ok=True)
+        if next(each.glob("*_keypoints.json"), None) is not None:
+            raise InputError(f"{each}: there are frames already, which would mix with the new; delete it first")
+    for frame in range(len(recording)):
+        found = recording[frame]
+        people = [members for members in group_people(found) if len(members) >= SMALLEST_PERSON]
+        for view, (camera, each) in enumerate(zip(rig.cameras, folders, strict=True)):
+            mine = [members for members in people if found.view[members[0]] == view]
+            # Thousands of small files: written plainly, the reader notices one that is missing or cut.
+            file = each / f"{camera.name}_{frame:012d}_keypoints.json"
+            file.write_text(json.dumps(_frame_object(found, mine, camera), allow_nan=False))
+
+
+def group_people(found: Detections) -> list[NDArray[np.intp]]:
+    """Candidates grouped into people, greedily: the rows (N,) of each group, single candidates included.
+
+    As OpenPose does, by the affinities alone: pairs in falling order; a pair joins its two groups unless
+    both have a candidate of one kind of joint, so that nobody gets two left knees.
+    """
+    group = list(range(len(found)))
+    members = [[row] for row in group]
+    kinds = [1 << joint for joint in found.joint.tolist()]
+    for first, second in found.pairs[np.argsort(-found.affinity, kind="stable")].tolist():
+        one, other = group[first], group[second]
+        if one == other or kinds[one] & kinds[other]:
+            continue
+        members[one] += members[other]
+        kinds[one] |= kinds[other]
+        for row in members[other]:
+            group[row] = one
+    return [np.array(members[one], dtype=np.intp) for one in sorted(set(group))]
+
+
+def _check(recording: DetectionSequence) -> None:
+    """Refuse what the formats have no words for."""
+    if recording.skeleton.joints != BODY_25.joints:
+        raise ValueError(f"only BODY_25 can be written, not {recording.skeleton.name}")
+    if len(recording) == 0:
+        raise ValueError("there is no frame to write: these formats have at least one")
+
+
+def _calibration(camera: Camera) -> dict[str, list[float] | list[int]]:
+    """A camera in 4D Association's calibration; distortion under the key that the format's readers know."""
+    entry: dict[str, list[float] | list[int]] = {"K": camera.K.ravel().tolist(), "RT": camera.cTw.ravel().tolist()}
+    entry["imgSize"] = list(camera.image_size)
+    if camera.distortion.any():
+        entry["distCoeff"] = camera.distortion.tolist()
+    return entry
+
+
+def _frame_lines(found: Detections, view: int, camera: Camera) -> Iterable[str]:
+    """The lines of one frame of one camera: candidates joint by joint, then affinities limb by limb."""
+    size = np.array(camera.image_size, dtype=np.float64)
+    rows = np.flatnonzero(found.view == view)
+    xy = camera.distort(found.xy[rows])
+    near = np.all((xy > -MARGIN * size) & (xy < (1 + MARGIN) * size), axis=1)
+    rows, xy = rows[near], xy[near]
+    order = np.argsort(found.joint[rows], kind="stable")
+    rows, (x, y) = rows[order], (xy[order] / (size - 1)).T
+    counts = np.bincount(found.joint[rows], minlength=len(BODY_25))
+    ends = np.cumsum(counts)
+    for n, end in zip(counts.tolist(), ends.tolist(), strict=True):
+        yield str(n)
+        if n > 0:
+            block = slice(end - n, end)
+            yield from (_numbers(x[block], 7), _numbers(y[block], 7), _numbers(found.confidence[rows[block]], 6))
+    place = np.full(len(found), -1, dtype=np.intp)
+    place[rows] = np.arange(len(rows)) - (ends - counts)[found.joint[rows]]
+    first, second = found.pairs.T
+    kept = (place[first] >= 0) & (place[second] >= 0)
+    first, second, affinity = first[kept], second[kept], found.affinity[kept]
+    limb = _LIMB_OF[found.joint[first], found.joint[second]]
+    for index, (a, b) in enumerate(BODY_25.limbs):
+        scores = np.zeros((counts[a], counts[b]))
+        mine = limb == index
+        scores[place[first[mine]], place[second[mine]]] = affinity[mine]
+        if scores.size > 0:
+            yield from (_numbers(row, 6) for row in scores)
+
+
+def _numbers(values: NDArray[np.float64], decimals: int) -> str:
+    """Numbers in a line; zeros short, for they are most of an affinity matrix."""
+    return " ".join("0" if value == 0 else f"{value:.{decimals}f}" for value in values.tolist())
+
+
+def _frame_object(found: Detections, people: list[NDArray[np.intp]], camera: Camera) -> dict[str, object]:
+    """One frame of one camera as OpenPose writes it; a joint that a person lacks is 0 0 0."""
+    listed = []
+    for members in people:
+        keypoints = np.zeros((len(BODY_25), 3))
+        keypoints[found.joint[members], :2] = camera.distort(found.xy[members]).round(3)
+        keypoints[found.joint[members], 2] = found.confidence[members].round(6)
+        listed.append({"person_id": [-1], "pose_keypoints_2d": keypoints.ravel().tolist()})
+    return {"version": 1.3, "people": listed}
+
+
+def _write(path: Path, text: str) -> None:
+    write_atomically(path, lambda stream: stream.write(text.encode()))
