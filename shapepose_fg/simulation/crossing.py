@@ -35,11 +35,11 @@ def way_through(
     *,
     fps: float,
     speed_mps: float,
-    distance_m: float,
+    distance_m: Array,
     half_room_m: float,
     tries: int = 4,
 ) -> Way:
-    """A way from wall to wall and back, past `others` (T, K, 2) at `distance_m` or a little more.
+    """A way from wall to wall and back, past points `others` (T, K, 2) at `distance_m` (K,) or a little more.
 
     Of several tries the one that keeps its distance best, then the one that comes closest.
     """
@@ -47,16 +47,16 @@ def way_through(
     return max(ways, key=lambda way: _worth(way, others, distance_m))
 
 
-def _worth(way: Way, others: Array, distance_m: float) -> float:
+def _worth(way: Way, others: Array, distance_m: Array) -> float:
     """How good a way is: first that nobody is bumped into, then that it is close."""
     if others.shape[1] == 0 or len(way.xy) == 0:
         return 0.0
-    nearest = np.linalg.norm(others - way.xy[:, None], axis=-1).min(axis=1)
-    return 100.0 * min(float(nearest.min()) - distance_m, 0.0) + float((nearest < 2 * distance_m).mean())
+    room = (np.linalg.norm(others - way.xy[:, None], axis=-1) - distance_m).min(axis=1)
+    return 30.0 * float(np.minimum(room, 0.0).mean()) + min(float(room.min()), 0.0) + float((room < 0.4).mean())
 
 
 def _walk(
-    others: Array, frames: int, rng: np.random.Generator, fps: float, speed: float, distance: float, half: float
+    others: Array, frames: int, rng: np.random.Generator, fps: float, speed: float, distance: Array, half: float
 ) -> Way:
     """One try: at each decision the turn and pace whose next two seconds are best (dynamic window)."""
     hold = max(1, round(_DECISION_S * fps))

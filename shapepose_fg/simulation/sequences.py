@@ -5,6 +5,7 @@ in the room comes from other subjects. Room of 4 x 4 m, world z up, floor at z =
 """
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Literal
@@ -29,6 +30,14 @@ TAKES: dict[str, range] = {"tune": range(1, 8), "report": range(9, 16)}
 """Numbers of the takes of each split."""
 _TORSO = (0, 6, 9, 12)
 """Pelvis, spine and neck: what nobody else may come into."""
+_TORSO_M = 0.2
+"""How near to these another's joint may come."""
+_MIDDLES, _LIMBS = (0, 9), (18, 19, 20, 21, 22, 23, 4, 5)
+"""Pelvis and chest; elbows, wrists, hands, knees."""
+_TRIED = 30
+"""Placements of somebody that are looked at closely."""
+_ARM_M = 0.3
+"""Who walks keeps this far from others' limbs."""
 
 
 @dataclass(frozen=True)
@@ -176,11 +185,11 @@ class _Room:
         self.performed.append(performance)
         self.names.append(name)
 
-    def points(self) -> Array:
-        """(T, 2 P, 2) pelvises and chests over the floor."""
+    def points(self, joints: tuple[int, ...] = _MIDDLES) -> Array:
+        """(T, P x joints, 2) where SMPL's `joints` of everybody are over the floor."""
         if len(self.performed) == 0:
             return np.zeros((self.frames, 0, 2))
-        return np.concatenate([p.joints[:, [0, 9], :2] for p in self.performed], axis=1)
+        return np.concatenate([p.joints[:, list(joints), :2] for p in self.performed], axis=1)
 
 
 def _compose(
@@ -277,13 +286,14 @@ def _segment(
     for index in _drawn(walks, config.walking, rng):
         clip, speed = mocap.clip(index), 0.0
         speed = float(np.linalg.norm(clip.pelvis[-1] - clip.pelvis[0]) / len(clip) * clip.fps)
+        middles, limbs = room.points(_MIDDLES), room.points(_LIMBS)
         way = way_through(
-            room.points(),
+            np.concatenate([middles, limbs], axis=1),
             frames,
             rng,
             fps=fps,
             speed_mps=min(speed, 1.35),
-            distance_m=config.close_m,
+            distance_m=np.repeat([config.close_m, _ARM_M], [middles.shape[1], limbs.shape[1]]),
             half_room_m=config.half_room_m,
         )
         start = rng.uniform()
@@ -309,16 +319,15 @@ def _place_pair(
     steps = np.concatenate([one.joints[:, 0, :2] for one in two])
     middle = (steps.min(axis=0) + steps.max(axis=0)) / 2
     two = [one.moved(-middle) for one in two]
-    if config.pairs == 1:
-        turn = rng.uniform(-np.pi, np.pi)
-        options = [(turn, rng.uniform(-0.3, 0.3, 2))]
-    else:
-        along = _long_axis(steps - middle)
-        sides = np.array([[0.0, -0.6], [0.0, 0.6]])[number]
-        options = [
-            (rng.choice([0.0, np.pi]) - along + rng.normal(0.0, 0.25), sides + rng.normal(0.0, 0.25, 2))
-            for _ in range(60 if number > 0 else 1)
-        ]
+    alone = config.pairs == 1
+    along, side = _long_axis(steps - middle), 0.0 if alone else (-0.6, 0.6)[number]
+    options = [
+        (
+            rng.uniform(-np.pi, np.pi) if alone else rng.choice([0.0, np.pi]) - along + rng.normal(0.0, 0.25),
+            np.array([0.0, side]) + rng.normal(0.0, 0.2, 2),
+        )
+        for _ in range(60)
+    ]
     others = room.points()
     worth = []
     for turn, shift in options:
@@ -328,9 +337,12 @@ def _place_pair(
         nearest = float(gaps.min()) if gaps.size > 0 else config.close_m
         # Close, but not closer than allowed, and inside the room.
         worth.append(-20 * max(config.close_m - nearest, 0.0) - max(nearest - config.close_m, 0.0) - 10 * outside)
-    turn, shift = options[int(np.argmax(worth))]
-    for one, clip in zip(two, pair, strict=True):
-        room.add(one.moved(shift, turn), clip.name)
+    placed = (
+        [one.moved(options[index][1], float(options[index][0])) for one in two]
+        for index in np.argsort(worth)[::-1][:_TRIED]
+    )
+    for one, clip in zip(_roomiest(room, placed, config), pair, strict=True):
+        room.add(one, clip.name)
 
 
 def _place_standing(
@@ -351,26 +363,32 @@ def _place_standing(
     nearest = np.linalg.norm(others[None, ::3] - spots[:, None, None], axis=-1)
     nearest = nearest.min(axis=(1, 2)) if nearest.size > 0 else np.full(150, config.close_m)
     short = np.maximum(config.close_m + 0.1 - nearest, 0.0)
-    order = np.argsort(20 * short + np.maximum(nearest - config.close_m, 0.0))[:14]
-    best: tuple[float, Performance] | None = None
-    for option in order:
-        towards = others.mean(axis=(0, 1)) - spots[option] if others.size > 0 else np.array([1.0, 0.0])
-        turn = np.arctan2(towards[1], towards[0]) - np.arctan2(faces[1], faces[0]) + noise[option]
-        moved = one.moved(spots[option], float(turn))
-        free = min([_gap(moved, other, config) for other in room.performed], default=1.0)
-        if best is None or free > best[0]:
-            best = (free, moved)
+    order = np.argsort(20 * short + np.maximum(nearest - config.close_m, 0.0))[:_TRIED]
+    towards = others.mean(axis=(0, 1)) - spots if others.size > 0 else np.tile([1.0, 0.0], (len(spots), 1))
+    turns = np.arctan2(towards[:, 1], towards[:, 0]) - np.arctan2(faces[1], faces[0]) + noise
+    placed = ([one.moved(spots[index], float(turns[index]))] for index in order)
+    room.add(_roomiest(room, placed, config)[0], clip.name)
+
+
+def _roomiest(room: _Room, options: Iterable[list[Performance]], config: SequenceConfig) -> list[Performance]:
+    """The first of the ways to place people that leaves everybody room enough, else the one that leaves most."""
+    best, most = [], -np.inf
+    for placed in options:
+        free = min((_gap(one, other, config) for one in placed for other in room.performed), default=0.0)
+        reach = max(np.abs(one.joints[:, 0, :2]).max(initial=0.0) for one in placed)
+        free = min(free, config.half_room_m - float(reach))
+        if free > most:
+            best, most = placed, free
         if free >= 0.0:
             break
-    assert best is not None
-    room.add(best[1], clip.name)
+    return best
 
 
 def _gap(one: Performance, other: Performance, config: SequenceConfig) -> float:
     """How much room two people leave each other beyond what is asked for, metres; negative where too little."""
-    a, b = one.joints[::4], other.joints[::4]
+    a, b = one.joints[::5], other.joints[::5]
     limbs = np.linalg.norm(a[:, :, None] - b[:, None], axis=-1).min(initial=9.0) - config.limbs_m
-    trunks = clearance_m(a, b).min(initial=9.0) - 0.2
+    trunks = clearance_m(a, b).min(initial=9.0) - _TORSO_M
     hips = np.linalg.norm((a - b)[:, 0, :2], axis=-1).min(initial=9.0) - config.close_m
     return float(min(limbs, trunks, hips))
 
