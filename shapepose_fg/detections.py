@@ -38,6 +38,19 @@ class Detections:
     def __len__(self) -> int:
         return len(self.view)
 
+    def only(self, keep: NDArray[np.bool_]) -> "Detections":
+        """The candidates of the mask `keep` (D,), and the affinities between them."""
+        place = np.cumsum(keep) - 1
+        both = keep[self.pairs].all(axis=1)
+        return Detections(
+            self.view[keep],
+            self.joint[keep],
+            self.xy[keep],
+            self.confidence[keep],
+            place[self.pairs[both]],
+            self.affinity[both],
+        )
+
     @classmethod
     def empty(cls) -> "Detections":
         """A frame in which no view saw anything."""

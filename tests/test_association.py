@@ -51,19 +51,6 @@ def assert_each_has_its_own(seen: Observations, detections: Detections, owners: 
     np.testing.assert_array_equal(seen.confidence, np.where(there, detections.confidence[owners], 0.0))
 
 
-def keep(detections: Detections, mask: NDArray[np.bool_]) -> Detections:
-    place = np.cumsum(mask) - 1
-    both = mask[detections.pairs].all(axis=1)
-    return Detections(
-        detections.view[mask],
-        detections.joint[mask],
-        detections.xy[mask],
-        detections.confidence[mask],
-        place[detections.pairs[both]],
-        detections.affinity[both],
-    )
-
-
 def add(detections: Detections, view, joint, xy, confidence: float) -> Detections:
     """More candidates, with no affinity to anything."""
     return Detections(
@@ -109,7 +96,7 @@ def test_a_missing_view_and_a_view_without_people(five_cameras, two_people, seen
     exact = seen_exactly(five_cameras, two_people)
     xy, _ = five_cameras.project(two_people)
     first = np.linalg.norm(exact.xy - xy[exact.view, 0, exact.joint], axis=1) < 1e-6
-    detections = keep(exact, (exact.view != 3) & ~(first & (exact.view == 1)))
+    detections = exact.only((exact.view != 3) & ~(first & (exact.view == 1)))
     seen = observe(detections, five_cameras, two_people)
     assert_each_has_its_own(seen, detections, owners_of(detections, five_cameras, two_people))
     assert not seen.seen[:, :, 3].any() and not seen.seen[0, :, 1].any() and seen.seen[1, :, 1].all()
@@ -130,7 +117,7 @@ def test_a_joint_that_few_views_see_is_observed_all_the_same(five_cameras, two_p
     """Two views are one pair of rays, which is no cluster; one view is no pair. Both must reach stage II."""
     joint = BODY_25.index(joint)
     exact = seen_exactly(five_cameras, two_people)
-    detections = keep(exact, (exact.joint != joint) | (exact.view < views))
+    detections = exact.only((exact.joint != joint) | (exact.view < views))
     seen = observe(detections, five_cameras, two_people)
     assert seen.seen[:, joint].sum(axis=-1).tolist() == [views, views]
     owners = owners_of(detections, five_cameras, two_people)
@@ -143,7 +130,7 @@ def test_a_joint_that_few_views_see_is_observed_all_the_same(five_cameras, two_p
 def test_a_lone_candidate_without_affinity_is_not_taken(five_cameras, two_people, seen_exactly):
     """A wrist that one view reports and no limb supports is anybody's."""
     exact = seen_exactly(five_cameras, two_people)
-    detections = keep(exact, exact.joint != WRIST)
+    detections = exact.only(exact.joint != WRIST)
     xy, _ = five_cameras.project(two_people[0])
     detections = add(detections, [2], [WRIST], [xy[2, WRIST]], 0.9)
     seen = observe(detections, five_cameras, two_people)
@@ -170,7 +157,7 @@ def test_where_two_people_overlap_one_detection_serves_both(five_cameras, two_pe
     assert len(rows) == 2 and np.linalg.norm(np.diff(exact.xy[rows], axis=0)) < 1e-6
     stays, goes = rows
     joined = replace(exact, pairs=np.where(exact.pairs == goes, stays, exact.pairs))
-    detections = keep(joined, np.arange(len(exact)) != goes)
+    detections = joined.only(np.arange(len(exact)) != goes)
     seen = observe(detections, five_cameras, people)
     assert seen.seen.all()
     np.testing.assert_array_equal(seen.xy[0, KNEE, 0], seen.xy[1, KNEE, 0])
@@ -184,7 +171,7 @@ def test_close_people_who_do_not_overlap_share_nothing(five_cameras, two_people,
     people[1, :, 2] += 0.08
     exact = seen_exactly(five_cameras, people)
     owners = owners_of(exact, five_cameras, people)
-    detections = keep(exact, np.arange(len(exact)) != owners[1, KNEE, 0])
+    detections = exact.only(np.arange(len(exact)) != owners[1, KNEE, 0])
     seen = observe(detections, five_cameras, people)
     assert_each_has_its_own(seen, detections, owners_of(detections, five_cameras, people))
     assert seen.seen[0, KNEE, 0] and not seen.seen[1, KNEE, 0]

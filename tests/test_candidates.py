@@ -90,16 +90,7 @@ def test_three_votes_but_two_cameras_have_one(five_cameras, two_people, seen_exa
     assert vote(points, detections, 2, config).strong.all()
     three = Rig(five_cameras.cameras[:3], "z")
     some = seen_exactly(three, two_people[:1])
-    keep = some.view < 2
-    index = np.cumsum(keep) - 1
-    of_two = Detections(
-        some.view[keep],
-        some.joint[keep],
-        some.xy[keep],
-        some.confidence[keep],
-        index[some.pairs[keep[some.pairs].all(axis=1)]],
-        some.affinity[keep[some.pairs].all(axis=1)],
-    )
+    of_two = some.only(some.view < 2)
     weak = vote(triangulate_pairs(of_two, three, config), of_two, 3, config)
     assert len(weak) == 25 and not weak.strong.any(), "seen by two of three cameras: kept, but weak"
 

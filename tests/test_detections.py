@@ -52,3 +52,20 @@ def test_a_recording_is_its_frames_in_order():
     assert len(recording) == 2 and recording.skeleton is BODY_25
     assert recording[1] is frames[1]
     assert [len(frame) for frame in recording] == [0, 3]
+
+
+def test_only_some_candidates_keep_the_affinities_between_them():
+    pairs = np.array([[0, 1], [1, 2], [2, 3]])
+    whole = Detections(
+        np.zeros(4, dtype=int),
+        np.arange(4),
+        np.arange(8.0).reshape(4, 2),
+        np.full(4, 0.5),
+        pairs,
+        np.array([0.1, 0.2, 0.3]),
+    )
+    some = whole.only(np.array([True, False, True, True]))
+    np.testing.assert_array_equal(some.joint, [0, 2, 3])
+    np.testing.assert_array_equal(some.xy, [[0, 1], [4, 5], [6, 7]])
+    np.testing.assert_array_equal(some.pairs, [[1, 2]])
+    np.testing.assert_array_equal(some.affinity, [0.3])

@@ -117,18 +117,7 @@ def test_nobody_and_nothing_are_empty_results(scene):
 
 
 def test_an_empty_frame_and_a_blind_view_harm_no_other(scene, recording, people):
-    blind = recording[1]
-    keep = blind.view != 2
-    place = np.cumsum(keep) - 1
-    both = keep[blind.pairs].all(axis=1)
-    blind = Detections(
-        blind.view[keep],
-        blind.joint[keep],
-        blind.xy[keep],
-        blind.confidence[keep],
-        place[blind.pairs[both]],
-        blind.affinity[both],
-    )
+    blind = recording[1].only(recording[1].view != 2)
     frames = [recording[0], Detections.empty(), blind, recording[3]]
     result = reconstruct(Recording(BODY_25, frames), scene.rig)
     assert np.bincount(result.frame, minlength=4).tolist() == [4, 0, 4, 4]

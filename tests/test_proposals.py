@@ -205,7 +205,7 @@ def test_a_person_whose_hip_nobody_saw_is_anchored_between_the_hips(five_cameras
     of_second = np.linalg.norm(everything.xy - xy[everything.view], axis=1) < 1e-6
     for views in (0, 1, 2):
         hidden = of_second & (everything.joint == HIP) & (everything.view >= views)
-        proposals, candidates = find(thinned(everything, ~hidden), five_cameras)
+        proposals, candidates = find(everything.only(~hidden), five_cameras)
         assert len(proposals) == 2, f"MidHip seen by {views} views"
         places = proposals.places[np.linalg.norm(proposals.places[:, HIP] - two_people[1, HIP], axis=1).argmin()]
         np.testing.assert_allclose(places, two_people[1], atol=0.01)
@@ -214,21 +214,7 @@ def test_a_person_whose_hip_nobody_saw_is_anchored_between_the_hips(five_cameras
 
 def without(detections: Detections, *joints: int) -> Detections:
     """The same detections, of some joints none."""
-    return thinned(detections, ~np.isin(detections.joint, joints))
-
-
-def thinned(detections: Detections, keep: NDArray[np.bool_]) -> Detections:
-    """The detections of the mask `keep`, and the pairs between them."""
-    place = np.cumsum(keep) - 1
-    both = keep[detections.pairs].all(axis=1)
-    return Detections(
-        detections.view[keep],
-        detections.joint[keep],
-        detections.xy[keep],
-        detections.confidence[keep],
-        place[detections.pairs[both]],
-        detections.affinity[both],
-    )
+    return detections.only(~np.isin(detections.joint, joints))
 
 
 def test_a_person_whom_the_detector_doubts_is_dropped_with_a_reason(five_cameras, two_people, seen_exactly):
