@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from shapepose_fg.io.calibration import Unit
     from shapepose_fg.pipeline import PipelineConfig
     from shapepose_fg.reconstruction import Reconstruction
+    from shapepose_fg.simulated import Format
 
 # Everything else is imported inside the commands: `--help` must not wait for torch.
 
@@ -142,6 +144,59 @@ def demo(
     print()
     for line in result.save(output):
         print(line)
+
+
+@app.command()
+def simulate(
+    name: Annotated[str, typer.Argument(help="demo, or an interaction sequence: salsa, crossing or crowd.")],
+    output: Annotated[Path, typer.Option(help="Folder for cameras, detections and truth.")],
+    split: Annotated[str, typer.Option(help="Takes of a sequence: tune, to choose settings by; report.")] = "tune",
+    frames: Annotated[
+        str | None, typer.Option(metavar="A:B", help="Frames A to B-1; either may be left out.")
+    ] = None,
+    cameras: Annotated[int, typer.Option(help="Cameras around the room, 2 to 12.")] = 6,
+    people: Annotated[int | None, typer.Option(help="People in demo, 0 to 12; a sequence has its own.")] = None,
+    seed: Annotated[int, typer.Option(help="Fixes the detector's errors, and the people of demo.")] = 0,
+    mocap: Annotated[Path | None, typer.Option(help="Recorded motions (.npz) that sequences are made of.")] = None,
+    format: Annotated[str, typer.Option(help="Detections as association (4D Association) or openpose.")] = (
+        "association"
+    ),
+) -> None:
+    """Simulate a recording with known truth: cameras, 2D detections, and people.npz to compare with."""
+    if format not in ("association", "openpose"):
+        raise InputError(f"--format {format}: must be association or openpose")
+    if seed < 0:
+        raise InputError(f"--seed {seed}: must be 0 or more")
+    _prepare(output)
+    from shapepose_fg.simulated import cut, named_scene, write_simulated
+    from shapepose_fg.simulation import DetectorConfig
+    from shapepose_fg.simulation import simulate as run_detector
+
+    last = re.search(r":\s*(\d{1,6})\s*$", frames or "")
+    scene = named_scene(
+        name,
+        split=split,
+        cameras=cameras,
+        people=people,
+        frames=int(last[1]) if last is not None else 0,
+        seed=seed,
+        mocap=mocap,
+    )
+    span = _frame_range(frames, len(scene))
+    start = time.perf_counter()
+    with _progress("simulating") as progress:
+        detections = run_detector(cut(scene, span), DetectorConfig(), seed, progress=progress)
+    seconds = time.perf_counter() - start
+    about = {"name": name, "seed": seed, "first_frame": span.start, "detector": asdict(DetectorConfig())}
+    about |= {} if name == "demo" else {"split": split}
+    written = write_simulated(cut(scene, span), detections, output, cast("Format", format), **about)
+    print(
+        f"{len(span)} frames of {scene.people} people before {cameras} cameras,"
+        f" {1e3 * seconds / len(span):.0f} ms a frame"
+    )
+    for what, path in written.items():
+        print(f"{what:<12}{path}")
+    print(f"try: shapepose-fg reconstruct --calibration {written['cameras']} --detections {written['detections']}")
 
 
 @app.command("config")

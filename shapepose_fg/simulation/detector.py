@@ -5,6 +5,7 @@ hidden one that is still reported to three times that; confidence falls with bot
 joint merge, as non-maximum suppression does; and a hidden joint may be found on whoever hides it.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -82,10 +83,17 @@ class _Found:
         return _Found(**{name: np.concatenate([value, vars(other)[name]]) for name, value in vars(self).items()})
 
 
-def simulate(scene: Scene, config: DetectorConfig | None = None, seed: int = 0) -> Recording:
+def simulate(
+    scene: Scene,
+    config: DetectorConfig | None = None,
+    seed: int = 0,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> Recording:
     """Detect everybody in every frame of `scene`; the same seed gives the same candidates.
 
-    Each frame has its own generator, so that a frame does not depend on those before it.
+    Each frame has its own generator, so that a frame does not depend on those before it. `progress` is told
+    the frames that are done, and all.
     """
     config = DetectorConfig() if config is None else config
     skin = Skin.of(scene.body, config.visibility.cell_m)
@@ -94,6 +102,8 @@ def simulate(scene: Scene, config: DetectorConfig | None = None, seed: int = 0) 
         joints = scene.truth_at(frame)
         seen = see(scene.rig, joints, scene.vertices_at(frame, skin.vertices), skin, config.visibility)
         frames.append(detect(scene.rig, joints, seen, config, np.random.default_rng([seed, frame])))
+        if progress is not None:
+            progress(len(frames), len(scene))
     return Recording(BODY_25, frames)
 
 
