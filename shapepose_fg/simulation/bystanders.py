@@ -6,16 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.model import BodyModel
-from shapepose_fg.simulation.mocap import (
-    Clip,
-    Figure,
-    Mocap,
-    Performance,
-    about_z,
-    blend,
-    grounded,
-    perform,
-)
+from shapepose_fg.simulation.mocap import Clip, Mocap, blend
+from shapepose_fg.simulation.performance import Figure, Performance, about_z, grounded, perform
 
 Array = NDArray[np.float64]
 

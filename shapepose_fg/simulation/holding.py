@@ -7,13 +7,12 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.simulation.mocap import Performance
+from shapepose_fg.simulation.performance import Performance
 
 Array = NDArray[np.float64]
 
 _ARMS = ((13, 16, 18, 20, 22), (14, 17, 19, 21, 23))
 """Collar, shoulder, elbow, wrist, hand: left, right."""
-_PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
 _HELD_M, _FREE_M = 0.17, 0.27
 """Hands nearer than the first are held, farther than the second they are not: the recordings' limbs and those of
 drawn bodies leave 10 to 20 cm between hands that touched."""
@@ -71,8 +70,8 @@ def _reach(person: Performance, steps: Array) -> Performance:
         upper, fore = swing @ upper, swing @ bend @ fore
         rotations[:, shoulder] = np.swapaxes(girdle, -1, -2) @ upper
         rotations[:, elbow] = np.swapaxes(upper, -1, -2) @ fore
-        for joint, turned in ((elbow, upper), (wrist, fore), (hand, fore @ rotations[:, wrist])):
-            parent = _PARENTS[joint]
+        bones = ((shoulder, elbow, upper), (elbow, wrist, fore), (wrist, hand, fore @ rotations[:, wrist]))
+        for parent, joint, turned in bones:
             joints[:, joint] = joints[:, parent] + turned @ (person.rest[joint] - person.rest[parent])
     return replace(person, rotations=rotations, joints=joints)
 

@@ -12,7 +12,8 @@ from shapepose_fg.body.model import BodyModel
 from shapepose_fg.errors import InputError
 from shapepose_fg.simulation.bystanders import endless, stand, walk_along
 from shapepose_fg.simulation.holding import hold_hands
-from shapepose_fg.simulation.mocap import Clip, Figure, Mocap, Performance, Placement, perform, together
+from shapepose_fg.simulation.mocap import Clip, Mocap
+from shapepose_fg.simulation.performance import Figure, Performance, Placement, perform, together
 from shapepose_fg.simulation.scene import Scene, _parameters, keypoints_of, ring_of_cameras
 from shapepose_fg.simulation.shoulder import shoulder_rhythm
 

@@ -8,15 +8,14 @@ from numpy.typing import NDArray
 
 from shapepose_fg.body.model import BodyModel
 from shapepose_fg.simulation.mocap import Mocap
+from shapepose_fg.simulation.room import SequenceConfig, clearance_m
 from shapepose_fg.simulation.scene import Scene
 from shapepose_fg.simulation.sequences import (
     DANCERS,
     SEQUENCES,
     TAKES,
     Sequence,
-    SequenceConfig,
     Split,
-    clearance_m,
     random_scene,
     salsa_takes,
     sequence,
