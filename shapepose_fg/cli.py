@@ -168,7 +168,7 @@ def simulate(
     if seed < 0:
         raise InputError(f"--seed {seed}: must be 0 or more")
     _prepare(output)
-    from shapepose_fg.simulated import cut, named_scene, write_simulated
+    from shapepose_fg.simulated import check_output, cut, named_scene, write_simulated
     from shapepose_fg.simulation import DetectorConfig
     from shapepose_fg.simulation import simulate as run_detector
 
@@ -183,6 +183,7 @@ def simulate(
         mocap=mocap,
     )
     span = _frame_range(frames, len(scene))
+    check_output(scene, output, cast("Format", format))
     start = time.perf_counter()
     with _progress("simulating") as progress:
         detections = run_detector(cut(scene, span), DetectorConfig(), seed, progress=progress)

@@ -7,7 +7,7 @@ from typing import Any, Literal, get_args
 from shapepose_fg.detections import DetectionSequence
 from shapepose_fg.errors import InputError
 from shapepose_fg.io.calibration import write_rig
-from shapepose_fg.io.write_detections import write_association, write_openpose
+from shapepose_fg.io.write_detections import refuse_leftovers, write_association, write_openpose
 from shapepose_fg.provenance import versions
 from shapepose_fg.simulation import Scene, built_in_scene
 from shapepose_fg.simulation.mocap import Mocap
@@ -21,6 +21,8 @@ Format = Literal["association", "openpose"]
 NAMES = ("demo", *SEQUENCES)
 """The built-in scene, and the interaction sequences that are made of recorded motions."""
 
+_OPENPOSE = "openpose"
+"""The folder of OpenPose's folders."""
 _MOCAP = Path("data") / "cmu_mocap" / "cmu_smpl24.npz"
 """Where the recorded motions are inside the folder of real recordings."""
 
@@ -65,6 +67,12 @@ def cut(scene: Scene, span: range) -> Scene:
     return Scene(scene.rig, scene.body, part, scene.fps)
 
 
+def check_output(scene: Scene, folder: Path, format: Format) -> None:
+    """InputError where `write_simulated` could not write into `folder`: before the work, not after."""
+    if format == "openpose":
+        refuse_leftovers(scene.rig, folder / _OPENPOSE)
+
+
 def write_simulated(
     scene: Scene, detections: DetectionSequence, folder: Path, format: Format, **run: Any
 ) -> dict[str, Path]:
@@ -79,7 +87,7 @@ def write_simulated(
         write_association(detections, scene.rig, folder)
         place = folder / "detection"
     else:
-        place = folder / "openpose"
+        place = folder / _OPENPOSE
         write_openpose(detections, scene.rig, place)
     about = {"fps": scene.fps, "frames": len(scene), "people": scene.people, "cameras": len(scene.rig), **run}
     truth_of(scene).with_run(simulated=about, versions=versions()).save(folder / "truth")

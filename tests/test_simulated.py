@@ -97,6 +97,14 @@ def test_errors_are_one_sentence(tmp_path: Path, monkeypatch, capsys, arguments,
     assert not (tmp_path / "out" / "truth").exists()
 
 
+def test_frames_of_an_earlier_run_are_not_mixed_with_new_ones(tmp_path: Path, capsys):
+    options = ["simulate", "demo", "--people", "1", "--cameras", "2", "--format", "openpose", "--output"]
+    assert run(*options, str(tmp_path), "--frames", ":2") == 0
+    assert run(*options, str(tmp_path), "--frames", ":1") == 2
+    assert "would mix" in capsys.readouterr().err
+    assert len(list(tmp_path.glob("openpose/cam0/*.json"))) == 2
+
+
 def test_a_sequence_of_recorded_motions(shared_data: Path, tmp_path: Path, monkeypatch):
     monkeypatch.setenv("SHAPEPOSE_DATA", str(shared_data.parent))
     options = ["simulate", "salsa", "--split", "tune", "--frames", "100:102", "--cameras", "3"]

@@ -58,11 +58,10 @@ def write_openpose(recording: DetectionSequence, rig: Rig, folder: str | Path) -
     InputError where the folder of a camera already holds frames.
     """
     _check(recording)
+    refuse_leftovers(rig, folder)
     folders = [Path(folder) / camera.name for camera in rig.cameras]
     for each in folders:
         each.mkdir(parents=True, exist_ok=True)
-        if next(each.glob("*_keypoints.json"), None) is not None:
-            raise InputError(f"{each}: there are frames already, which would mix with the new; delete it first")
     for frame in range(len(recording)):
         found = recording[frame]
         people = [members for members in group_people(found) if len(members) >= SMALLEST_PERSON]
@@ -71,6 +70,14 @@ def write_openpose(recording: DetectionSequence, rig: Rig, folder: str | Path) -
             # Thousands of small files: written plainly, the reader notices one that is missing or cut.
             file = each / f"{camera.name}_{frame:012d}_keypoints.json"
             file.write_text(json.dumps(_frame_object(found, mine, camera), allow_nan=False))
+
+
+def refuse_leftovers(rig: Rig, folder: str | Path) -> None:
+    """InputError where `write_openpose` would mix its frames with others, to be known before long work."""
+    for camera in rig.cameras:
+        place = Path(folder) / camera.name
+        if next(place.glob("*_keypoints.json"), None) is not None:
+            raise InputError(f"{place}: there are frames already, which would mix with the new; delete it first")
 
 
 def group_people(found: Detections) -> list[NDArray[np.intp]]:
