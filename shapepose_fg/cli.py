@@ -7,7 +7,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
@@ -188,7 +187,7 @@ def simulate(
     with _progress("simulating") as progress:
         detections = run_detector(cut(scene, span), DetectorConfig(), seed, progress=progress)
     seconds = time.perf_counter() - start
-    about = {"name": name, "seed": seed, "first_frame": span.start, "detector": asdict(DetectorConfig())}
+    about = {"name": name, "seed": seed, "first_frame": span.start, "detector": DetectorConfig().as_dict()}
     about |= {} if name == "demo" else {"split": split}
     written = write_simulated(cut(scene, span), detections, output, cast("Format", format), **about)
     print(

@@ -353,7 +353,7 @@ def test_the_alternation_helps_on_the_built_in_scene():
     from shapepose_fg.simulation import DetectorConfig, built_in_scene, simulate
 
     scene = built_in_scene(frames=12)
-    detections = simulate(scene, DetectorConfig(miss_seen=0.3, miss_hidden=0.8))  # many joints in two views
+    detections = simulate(scene, DetectorConfig(misses=3.0))  # many joints in two views
     seen = Observations.concatenate(
         [seen_of(scene.rig, detections[n], scene.truth_at(n), within_m=0.3) for n in range(len(scene))]
     )

@@ -1,66 +1,115 @@
-"""A detector that errs: from where people truly are to 2D joint candidates and part affinities.
+"""A detector that errs as a real one does: from where people truly are to 2D joint candidates and part affinities.
 
-The numbers are reasoned from how OpenPose behaves: a visible joint is placed to about 1.5 cm on the body, a
-hidden one that is still reported to three times that; confidence falls with both; close candidates of one
-joint merge, as non-maximum suppression does; and a hidden joint may be found on whoever hides it.
+What it draws from was measured on real detections (`detector_statistics.py`, `scripts/measure_detector.py`,
+docs/simulation.md). A joint has a lasting quality: at the low end it is missed, above that its quality is its
+confidence, and its error has the size that errors of this confidence have.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections, Recording
+from shapepose_fg.simulation.affinities import affinities
+from shapepose_fg.simulation.detector_statistics import JOINT_GROUP, DetectorStatistics, measured
+from shapepose_fg.simulation.facing import seen_from_the_front
+from shapepose_fg.simulation.memory import FalseCandidates, Ghosts, LastingNoise
 from shapepose_fg.simulation.scene import Scene
 from shapepose_fg.simulation.visibility import Skin, Visibility, VisibilityConfig, see
 from shapepose_fg.skeleton import BODY_25
 
-_LIMBS = np.array(BODY_25.limbs)
+_MIRROR = np.array(BODY_25.mirror)
+_MIRROR_APART_M = 0.12
+"""Left and right are swapped only where they are this far from each other in the image."""
+_LARGEST_ERROR_M = 0.25
+"""Errors were measured up to here; what is farther is a miss and a false candidate."""
+
+_HIDDEN, _SEEN = 0.3, 0.7
+"""Joints of which less, or more, is seen were measured as hidden, or visible; in between, in between."""
+_NEAR_M = 0.5
+"""False candidates nearer than this to somebody's joint were counted as that person's."""
 
 
 @dataclass(frozen=True)
 class DetectorConfig:
-    """How the detector errs. `seen` below is the share of a joint that is visible, 0 to 1."""
+    """How much the detector errs: 1 is as measured, 0 not at all, 2 twice as much."""
 
-    sigma_seen_m: float = 0.015
-    """Standard deviation of each image coordinate of a visible joint, as a length on the person."""
-    sigma_hidden_m: float = 0.045
-    """The same for a joint that is hidden and still reported; geometric in between."""
-    sigma_floor_px: float = 0.7
-    """What the grid of the heat maps adds, however small a person is."""
-    quality_spread: float = 0.35
-    """How much a joint's own sigma varies about these (of its logarithm); confidence follows it."""
-    miss_seen: float = 0.03
-    """Share of the visible joints that are not reported."""
-    miss_hidden: float = 0.5
-    """The same for hidden ones; linear in between."""
-    capture: float = 0.3
-    """Share of the reported joints hidden by another person that are found on that person's same joint."""
-    merge_px: float = 8.0
-    """Candidates of one joint and view this near to each other are one: the more confident stays."""
-    false_per_view: float = 2.0
-    """Mean count of false candidates in a view, Poisson: half of them on people, half anywhere."""
-    spurious_far: float = 0.01
+    noise: float = 1.0
+    """Size of the errors of position."""
+    misses: float = 1.0
+    """Share of the joints that are not reported, up to all of them."""
+    doubt: float = 1.0
+    """How far confidences, and affinities of right pairs, are below 1."""
+    false_candidates: float = 1.0
+    """Number of candidates that are nobody's."""
+    swaps: float = 1.0
+    """Share of the joints that are called by their mirror's name."""
+    captures: float = 1.0
+    """Share of the missed joints behind another person whose neighbours are joined to that person's joint."""
+    merging: float = 1.0
+    """Distance at which two people's same joints become one candidate."""
+    wrong_affinities: float = 1.0
     """Share of the wrong pairs that get an affinity."""
-    spurious_near: float = 0.15
-    """The same for wrong pairs that are as near as a limb is long."""
+    statistics: DetectorStatistics = field(default_factory=measured, repr=False)
+    """What is meant by "as measured"."""
     visibility: VisibilityConfig = field(default_factory=VisibilityConfig)
     """How the depth buffer is read."""
 
     def __post_init__(self) -> None:
-        for name in ("miss_seen", "miss_hidden", "capture", "spurious_far", "spurious_near"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name} must be a share from 0 to 1, got {getattr(self, name)}")
-        for name in ("sigma_seen_m", "sigma_hidden_m", "sigma_floor_px", "quality_spread", "merge_px"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
+        for name in _KNOBS:
+            if not 0 <= getattr(self, name) < np.inf:
+                raise ValueError(f"{name} must be 0 (none), 1 (as measured) or more, got {getattr(self, name)}")
+        for name in ("doubt", "captures", "wrong_affinities"):
+            if getattr(self, name) > 1:
+                raise ValueError(f"{name} must not be more than 1 (as measured), got {getattr(self, name)}")
 
     @classmethod
     def perfect(cls) -> "DetectorConfig":
-        """Reports every joint in the image exactly where it is, and nothing else."""
-        return cls(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        """Reports every joint in the image exactly where it is, with confidence 1, and nothing else."""
+        return cls(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The settings as plain values, for a record of a run; the statistics are told by their provenance."""
+        knobs = {name: getattr(self, name) for name in _KNOBS}
+        return knobs | {"statistics": self.statistics.provenance, "visibility": asdict(self.visibility)}
+
+
+_KNOBS = "noise misses doubt false_candidates swaps captures merging wrong_affinities".split()
+
+
+def simulate(
+    scene: Scene,
+    config: DetectorConfig | None = None,
+    seed: int = 0,
+    *,
+    frames: Sequence[int] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Recording:
+    """Detect everybody in `scene`; the same seed gives the same bytes.
+
+    `frames` picks rising frame numbers, all by default. Errors last over time, so the detector runs through the
+    frames before and between them too (without looking): every frame comes out as it does in the whole recording.
+    A scene that is cut starts afresh, with errors as they are at any time. `progress` is told the frames that are
+    done, and all.
+    """
+    config = DetectorConfig() if config is None else config
+    frames = range(len(scene)) if frames is None else frames
+    skin = Skin.of(scene.body, config.visibility.cell_m)
+    detector = Detector(scene.rig, scene.people, scene.fps, config, seed)
+    found = []
+    for frame in frames:
+        joints = scene.truth_at(frame)
+        seen = see(scene.rig, joints, scene.vertices_at(frame, skin.vertices), skin, config.visibility)
+        detector.skip_to(frame)
+        found.append(detector.detect(joints, seen))
+        if progress is not None:
+            progress(len(found), len(frames))
+    return Recording(BODY_25, found)
 
 
 @dataclass(frozen=True)
@@ -72,9 +121,9 @@ class _Found:
     xy: NDArray[np.float64]
     confidence: NDArray[np.float64]
     owner: NDArray[np.bool_]
-    """(D, P) whose joint a candidate is; nobody's where it is false, two people's where two have merged."""
-    seen: NDArray[np.float64]
-    """(D,) share that was visible."""
+    """(D, P) whose joint a candidate is; nobody's where it is false, two people's where two are one."""
+    reach_px: NDArray[np.float64]
+    """(D,) nearer than this to a better candidate of the same joint it is not seen as one of its own."""
 
     def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> "_Found":
         return _Found(**{name: value[index] for name, value in vars(self).items()})
@@ -83,158 +132,199 @@ class _Found:
         return _Found(**{name: np.concatenate([value, vars(other)[name]]) for name, value in vars(self).items()})
 
 
-def simulate(
-    scene: Scene,
-    config: DetectorConfig | None = None,
-    seed: int = 0,
-    *,
-    progress: Callable[[int, int], None] | None = None,
-) -> Recording:
-    """Detect everybody in every frame of `scene`; the same seed gives the same candidates.
+class Detector:
+    """A detector that looks at one recording, frame after frame; its errors last."""
 
-    Each frame has its own generator, so that a frame does not depend on those before it. `progress` is told
-    the frames that are done, and all.
-    """
-    config = DetectorConfig() if config is None else config
-    skin = Skin.of(scene.body, config.visibility.cell_m)
-    frames = []
-    for frame in range(len(scene)):
-        joints = scene.truth_at(frame)
-        seen = see(scene.rig, joints, scene.vertices_at(frame, skin.vertices), skin, config.visibility)
-        frames.append(detect(scene.rig, joints, seen, config, np.random.default_rng([seed, frame])))
-        if progress is not None:
-            progress(len(frames), len(scene))
-    return Recording(BODY_25, frames)
+    def __init__(self, rig: Rig, people: int, fps: float, config: DetectorConfig, seed: int = 0) -> None:
+        """Look at `people` people with the cameras of `rig`, `fps` frames a second."""
+        self._rig, self._config, self._seed = rig, config, seed
+        self._noise = LastingNoise(len(rig), people, fps, config.statistics, seed)
+        self._false = FalseCandidates(len(rig), people, fps, config.statistics, config.false_candidates, seed)
+        self._frame = 0
 
+    def skip_to(self, frame: int) -> None:
+        """Let time pass until `frame` is the next one; ValueError if it has passed."""
+        if frame < self._frame:
+            raise ValueError(f"frames must come in order: frame {frame} asked for, {self._frame} is next")
+        while self._frame < frame:
+            self._noise.next(self._frame)
+            self._false.next(self._frame)
+            self._frame += 1
 
-def detect(
-    rig: Rig,
-    joints: NDArray[np.float64],
-    visibility: Visibility,
-    config: DetectorConfig,
-    rng: np.random.Generator,
-) -> Detections:
-    """What the detector says of one frame with BODY_25 `joints` (P, 25, 3), of which `visibility` is known."""
-    found = _report(rig, joints, visibility, config, rng)
-    found = _merge(found.join(_invent(rig, found, config, rng)), config.merge_px)
-    found = found.take(rng.permutation(len(found.view)))
-    pairs, affinity = _affinities(found, config, rng)
-    return Detections(found.view, found.joint, found.xy, found.confidence, pairs, affinity)
+    def detect(self, joints: NDArray[np.float64], visibility: Visibility) -> Detections:
+        """The candidates of the next frame: BODY_25 `joints` (P, 25, 3), of which `visibility` is known."""
+        config, rig = self._config, self._rig
+        noise, ghosts = self._noise.next(self._frame), self._false.next(self._frame)
+        rng = np.random.default_rng([self._seed, self._frame, 2])
+        self._frame += 1
+        true_xy, depth = rig.project(joints)
+        found, captors = _report(rig, joints, true_xy, depth, visibility, config, noise)
+        found = _merge(found.join(_invent(rig, ghosts, true_xy, depth, config)))
+        found = found.take(rng.permutation(len(found.view)))
+        pairs, affinity = affinities(
+            found.view, found.joint, found.xy, found.confidence, found.owner, true_xy, captors, config.statistics,
+            doubt=config.doubt, wrong=config.wrong_affinities, rng=rng,
+        )  # fmt: skip
+        return Detections(found.view, found.joint, found.xy, found.confidence, pairs, affinity)
 
 
 def _report(
     rig: Rig,
     joints: NDArray[np.float64],
+    true_xy: NDArray[np.float64],
+    depth: NDArray[np.float64],
     visibility: Visibility,
     config: DetectorConfig,
-    rng: np.random.Generator,
-) -> _Found:
-    """The joints of people that are reported, each with its error."""
-    missed = rng.random(visibility.seen.shape) < _between(config.miss_hidden, config.miss_seen, visibility.seen)
-    view, person, joint = np.nonzero(visibility.in_image & ~missed)
-    seen = visibility.seen[view, person, joint]
-    front = visibility.hidden_by[view, person, joint]
-    captured = (front >= 0) & (seen < 0.5) & (rng.random(len(view)) < config.capture)
-    at = np.where(captured, front, person)
-    seen = np.where(captured, 0.5, seen)
-    true_xy, depth = rig.project(joints)
-    captured &= np.isfinite(true_xy[view, at, joint, 0])  # the other's joint is before the camera
-    at = np.where(captured, at, person)
-    # The length on the person, as pixels; quality multiplies it and has a mean square of 1.
-    hidden, visible = np.log(np.maximum([config.sigma_hidden_m, config.sigma_seen_m], 1e-12))
-    log_sigma_m = _between(hidden, visible, seen)
-    spread = rng.normal(0.0, 1.0, len(view)) * config.quality_spread
-    quality = np.exp(spread - config.quality_spread**2)
-    sigma_px = np.hypot(np.exp(log_sigma_m) * rig.focal_px[view] / depth[view, at, joint], config.sigma_floor_px)
-    error = rng.normal(0.0, 1.0, (len(view), 2)) * (sigma_px * quality)[:, None]
-    xy = true_xy[view, at, joint] + error
-    confidence = _confidence(seen, spread, error, sigma_px, rng)
+    noise: NDArray[np.float64],
+) -> tuple[_Found, NDArray[np.intp]]:
+    """The joints of people that are reported, each with its error; and who captured the others (`_capture`)."""
+    table = config.statistics
+    seen = seen_from_the_front(visibility.seen, joints, rig.centres, table.facing)
+    seen = np.clip((seen - _HIDDEN) / (_SEEN - _HIDDEN), 0.0, 1.0)
+    hidden_as = np.where(visibility.hidden_by >= 0, 2, 1)
+    quality = ndtr(noise[LastingNoise.CONFIDENCE])
+    miss = config.misses * _between(table.miss[JOINT_GROUP, hidden_as], table.miss[JOINT_GROUP, 0], seen)
+    miss = np.clip(miss, 0.0, 1.0)
+    reported = visibility.in_image & (quality >= miss)
+    view, person, joint = np.nonzero(reported)
+    seen, hidden_as, group = seen[reported], hidden_as[reported], JOINT_GROUP[joint]
+    rank = (quality[reported] - miss[reported]) / (1.0 - miss[reported])
+    rows = _between(table.confidence[group, hidden_as].T, table.confidence[group, 0].T, seen).T
+    confidence = table.quantile(rows, rank)
+    px_a_metre = rig.focal_px[view] / depth[reported]
+    error = _errors(
+        confidence, seen, hidden_as, group, px_a_metre, config, noise[:2, reported], noise[3, reported]
+    )
     owner = np.zeros((len(view), len(joints)), dtype=bool)
     owner[np.arange(len(view)), person] = True
-    owner[np.arange(len(view)), at] = True
-    inside = np.all((xy >= 0) & (xy <= rig.image_sizes[view] - 1), axis=1)
-    return _Found(view, joint, xy, confidence, owner, seen).take(inside)
-
-
-def _confidence(
-    seen: NDArray[np.float64],
-    spread: NDArray[np.float64],
-    error: NDArray[np.float64],
-    sigma_px: NDArray[np.float64],
-    rng: np.random.Generator,
-) -> NDArray[np.float64]:
-    """About 0.8 where visible and 0.3 where hidden, lower for a joint of poor quality and a large error."""
-    size = np.linalg.norm(error, axis=1) / np.maximum(sigma_px, 1e-9)
-    value = _between(0.33, 0.8, seen) - 0.12 * spread - 0.05 * (size - 1.25) + rng.normal(0.0, 0.05, len(seen))
-    return np.clip(value, _between(0.08, 0.35, seen), _between(0.55, 0.97, seen))
-
-
-def _invent(rig: Rig, found: _Found, config: DetectorConfig, rng: np.random.Generator) -> _Found:
-    """False candidates: anywhere in the image, or of another joint than the one that is there."""
-    view = np.repeat(np.arange(len(rig)), rng.poisson(config.false_per_view, len(rig)))
-    count = len(view)
-    xy = rng.random((count, 2)) * (rig.image_sizes[view] - 1)
-    if len(found.view):
-        # A reported candidate of the same view, if that view has any: candidates come sorted by view.
-        first, last = np.searchsorted(found.view, view), np.searchsorted(found.view, view, side="right")
-        chosen = np.minimum(first + (rng.random(count) * (last - first)).astype(np.intp), len(found.view) - 1)
-        near = (rng.random(count) < 0.5) & (last > first)
-        xy = np.where(near[:, None], found.xy[chosen] + rng.normal(0.0, 12.0, (count, 2)), xy)
-        xy = np.clip(xy, 0.0, rig.image_sizes[view] - 1)
-    return _Found(
+    captors = _capture(reported, true_xy, depth / rig.focal_px[:, None, None], visibility, config, noise)
+    swapped = ndtr(noise[LastingNoise.SWAP, reported]) < config.swaps * table.swap
+    gap_px = np.linalg.norm(true_xy[view, person, joint] - true_xy[view, person, _MIRROR[joint]], axis=-1)
+    swapped &= gap_px > _MIRROR_APART_M * px_a_metre
+    owner[swapped] = False
+    found = _Found(
         view=view,
-        joint=rng.integers(0, len(BODY_25), count),
-        xy=xy,
-        confidence=np.clip(rng.gamma(2.0, 0.1, count) + 0.05, 0.05, 0.6),
-        owner=np.zeros((count, found.owner.shape[1]), dtype=bool),
-        seen=np.zeros(count),
+        joint=np.where(swapped, _MIRROR[joint], joint),
+        xy=true_xy[reported] + error,
+        confidence=1.0 - config.doubt * (1.0 - confidence),
+        owner=owner,
+        reach_px=_reach_px(ndtr(noise[LastingNoise.SCALE, reported]), rig.image_sizes[view, 1], config),
     )
+    inside = np.all((found.xy >= 0) & (found.xy <= rig.image_sizes[view] - 1), axis=1)
+    return found.take(inside), captors
 
 
-def _merge(found: _Found, merge_px: float) -> _Found:
+def _errors(
+    confidence: NDArray[np.float64],
+    seen: NDArray[np.float64],
+    hidden_as: NDArray[np.intp],
+    group: NDArray[np.intp],
+    px_a_metre: NDArray[np.float64],
+    config: DetectorConfig,
+    normal: NDArray[np.float64],
+    scale: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Errors (D, 2) px of reported joints, from lasting normal draws `normal` (2, D) and `scale` (D,)."""
+    table = config.statistics
+    floor_m = table.floor_px / table.size_px_a_metre
+    # What the grid adds is part of the measured sigma; people of other sizes get it anew.
+    own_m = np.sqrt(np.maximum(table.sigma_m**2 - floor_m**2, (0.3 * table.sigma_m) ** 2))
+    log_sigma = np.stack([np.interp(confidence, table.knots, np.log(row)) for row in own_m])
+    tail = np.stack([np.interp(confidence, table.knots, row) for row in table.tail])
+    which = hidden_as, np.arange(len(confidence))
+    sigma_px = np.hypot(np.exp(_between(log_sigma[which], log_sigma[0], seen)) * px_a_metre, table.floor_px)
+    sigma_px = sigma_px * np.exp(_between(tail[which], tail[0], seen) * scale)
+    error = normal.T * sigma_px[:, None] * table.joint_scale[group]
+    length = np.linalg.norm(error, axis=1)
+    limit = _LARGEST_ERROR_M * px_a_metre / np.maximum(length, 1e-9)
+    return config.noise * error * np.minimum(limit, 1.0)[:, None]
+
+
+def _capture(
+    reported: NDArray[np.bool_],
+    true_xy: NDArray[np.float64],
+    metres_a_px: NDArray[np.float64],
+    visibility: Visibility,
+    config: DetectorConfig,
+    noise: NDArray[np.float64],
+) -> NDArray[np.intp]:
+    """Whose candidate stands for a joint that is missed behind another person: (2, V, P, 25).
+
+    The first is the person in front whose candidate the hidden joint's neighbours are joined to, the second one
+    whose candidate they are not joined to; -1 where there is none.
+    """
+    table = config.statistics
+    view, person, joint = np.nonzero((visibility.hidden_by >= 0) & visibility.in_image & ~reported)
+    front = visibility.hidden_by[view, person, joint]
+    gap_px = np.linalg.norm(true_xy[view, person, joint] - true_xy[view, front, joint], axis=-1)
+    gap_m = np.nan_to_num(gap_px, nan=np.inf) * metres_a_px[view, person, joint]
+    kind = np.searchsorted(table.capture_gap_m, gap_m, side="right") - 1
+    taken = ndtr(noise[LastingNoise.CAPTURE, view, person, joint]) < config.captures * table.capture[kind]
+    captors = np.full((2, *reported.shape), -1)
+    captors[np.where(taken, 0, 1), view, person, joint] = front
+    return captors
+
+
+def _invent(
+    rig: Rig, ghosts: Ghosts, true_xy: NDArray[np.float64], depth: NDArray[np.float64], config: DetectorConfig
+) -> _Found:
+    """False candidates, where they are now."""
+    table = config.statistics
+    near = ghosts.person >= 0
+    size = rig.image_sizes[ghosts.view]
+    xy = ghosts.offset * (size - 1)
+    at = ghosts.view[near], ghosts.person[near], ghosts.anchor[near]
+    xy[near] = true_xy[at] + ghosts.offset[near] * (rig.focal_px[at[0]] / depth[at])[:, None]
+    there = np.all((xy >= 0) & (xy <= size - 1), axis=1)  # NaN behind a camera compares false
+    # The others stay in the background: a person before it covers them.
+    gap_px = np.linalg.norm(true_xy[ghosts.view] - xy[:, None, None], axis=-1)
+    gap_m = (gap_px * depth[ghosts.view]).min(axis=(1, 2), initial=np.inf, where=np.isfinite(gap_px))
+    there &= near | (gap_m > _NEAR_M * rig.focal_px[ghosts.view])
+    quantiles = np.where(near[:, None], table.false_near_confidence, table.false_far_confidence)
+    found = _Found(
+        view=ghosts.view,
+        joint=ghosts.joint,
+        xy=xy,
+        confidence=table.quantile(quantiles, ghosts.rank),
+        owner=np.zeros((len(xy), true_xy.shape[1]), dtype=bool),
+        reach_px=_reach_px(ghosts.rank, size[:, 1], config),
+    )
+    return found.take(there)
+
+
+def _reach_px(
+    probability: NDArray[np.float64], height_px: NDArray[np.float64], config: DetectorConfig
+) -> NDArray[np.float64]:
+    """How near (D,) to a better one of its joint a candidate is lost: logistic, in proportion to the image."""
+    table = config.statistics
+    drawn = np.clip(probability, 1e-6, 1 - 1e-6)
+    reach = table.merge_px + table.merge_width_px * np.log(drawn / (1 - drawn))
+    return config.merging * np.maximum(reach, 0.0) * height_px / table.merge_height_px
+
+
+def _merge(found: _Found) -> _Found:
     """Keep of near candidates of one joint and view the most confident, which then belongs to all of them."""
-    if merge_px <= 0 or len(found.view) == 0:
+    if len(found.view) == 0 or found.reach_px.max() <= 0:
         return found
-    found = found.take(np.argsort(-found.confidence, kind="stable"))
     label = found.view * len(BODY_25) + found.joint
-    x, y = found.xy.T
-    better = (label[:, None] == label) & np.tri(len(label), k=-1, dtype=bool)
-    better &= np.square(x[:, None] - x) + np.square(y[:, None] - y) < merge_px**2
-    lost = better.any(axis=1)
+    order = np.lexsort((-found.confidence, label))
+    found, label = found.take(order), label[order]
+    winner = np.full(len(label), -1)
+    # Candidates of one label stand together, the best first: compare each with those one place before, two, ...
+    for step in range(1, int(np.bincount(label).max())):
+        better, worse = np.arange(len(label) - step), np.arange(step, len(label))
+        near = np.linalg.norm(found.xy[better] - found.xy[worse], axis=1) < found.reach_px[worse]
+        near &= label[better] == label[worse]
+        winner[worse[near]] = better[near]
+    lost = winner >= 0
     owner = found.owner.copy()
-    np.logical_or.at(owner, better[lost].argmax(axis=1), found.owner[lost])
+    for index in np.flatnonzero(lost)[::-1]:  # few; the worst first, so that theirs is handed up
+        owner[winner[index]] |= owner[index]
     return _Found(**{**vars(found), "owner": owner}).take(~lost)
 
 
-def _affinities(
-    found: _Found, config: DetectorConfig, rng: np.random.Generator
-) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Pairs (E, 2) that a limb may join, and their affinity (E,): high inside a person, else mostly none."""
-    first, second = np.nonzero(
-        (found.view[:, None] == found.view[None]) & _JOINED[found.joint[:, None], found.joint[None]]
-    )
-    right = (found.owner[first] & found.owner[second]).any(axis=1)
-    evidence = 0.5 * (found.seen[first] + found.seen[second])
-    strong = rng.uniform(0.6, 0.95, len(first)) * _between(0.5, 1.0, evidence)
-    # Wrong pairs as near as the right pairs of the same limb and view lie on a common image region.
-    length = np.linalg.norm(found.xy[first] - found.xy[second], axis=1)
-    limb = (found.view[first] * len(BODY_25) + found.joint[first]) * len(BODY_25) + found.joint[second]
-    group = np.unique(limb, return_inverse=True)[1]
-    longest = np.zeros(group.max(initial=-1) + 1)
-    np.maximum.at(longest, group[right], length[right])
-    share = np.where(length < longest[group], config.spurious_near, config.spurious_far)
-    spurious = (rng.random(len(first)) < share) * rng.uniform(0.05, 0.5, len(first))
-    affinity = np.where(right, strong, spurious)
-    listed = affinity > 0
-    return np.stack([first, second], axis=1)[listed], affinity[listed]
-
-
 def _between(
-    hidden: float | np.floating, visible: float | np.floating, seen: NDArray[np.float64]
+    hidden: NDArray[np.float64], visible: NDArray[np.float64], seen: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """From the value of a hidden joint to that of a visible one."""
+    """From the value of a hidden joint to that of a visible one, by the share that is seen."""
     return hidden + (visible - hidden) * seen
-
-
-_JOINED = np.zeros((len(BODY_25), len(BODY_25)), dtype=bool)
-_JOINED[_LIMBS[:, 0], _LIMBS[:, 1]] = True

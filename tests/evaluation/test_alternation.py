@@ -48,7 +48,7 @@ def test_refuses_another_recording():
 def test_stage_two_helps_whom_the_views_see_badly():
     """What the project promises; misses are frequent here, so that few frames hold enough doubtful joints."""
     scene = built_in_scene(1000, frames=10)
-    detections = simulate(scene, DetectorConfig(miss_seen=0.25, miss_hidden=0.8), seed=1000)
+    detections = simulate(scene, DetectorConfig(misses=3.0), seed=1000)
     before, people = before_refinement(detections, scene.rig), reconstruct(detections, scene.rig)
     # Row by row the same people: most joints hardly move.
     assert before.joints.shape == people.joints.shape

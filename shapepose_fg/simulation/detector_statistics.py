@@ -1,0 +1,186 @@
+"""How a real detector errs, as tables: what `scripts/measure_detector.py` found on the Shelf recording."""
+
+import json
+from dataclasses import dataclass, fields, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.skeleton import BODY_25
+
+_FILE = Path(__file__).parent / "data" / "detector.json"
+_MIRROR = np.array(BODY_25.mirror)
+
+JOINT_GROUP = np.unique(np.minimum(np.arange(25), _MIRROR), return_inverse=True)[1]
+"""(25,) the row of each joint in tables by joint: left and right share one, G = 14 rows."""
+_LIMBS = np.array(BODY_25.limbs)
+_LIMB_NAMES = [min(tuple(limb), tuple(_MIRROR[limb].tolist())) for limb in _LIMBS.tolist()]
+LIMB_GROUP = np.array([sorted(set(_LIMB_NAMES)).index(name) for name in _LIMB_NAMES])
+"""(26,) the same for limbs, 14 rows."""
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class DetectorStatistics:
+    """Tables by joint (G rows), state (visible, hidden by itself, hidden by another) and quantile (K levels)."""
+
+    levels: Array
+    """(K,) probabilities at which quantiles are given, 0 to 1."""
+    miss: Array
+    """(G, 3) share of the joints that are not reported."""
+    confidence: Array
+    """(G, 3, K) quantiles of the confidence of those that are."""
+    knots: Array
+    """(N,) confidences at which sigma and tail are given."""
+    sigma_m: Array
+    """(3, N) sigma of each image coordinate, as a length on a person of median size, from the error's median."""
+    tail: Array
+    """(3, N) standard deviation of the logarithm of a sigma that changes: it makes tails heavier than Gaussian."""
+    joint_scale: Array
+    """(G, 2) what sigma is multiplied with along x and y of the image."""
+    floor_px: float
+    """What the detector's grid adds at any size, part of `sigma_m`, pixels."""
+    size_px_a_metre: float
+    """The median size."""
+    facing: Array
+    """(5, 2) cosines between which nose, eyes and ears come into sight (see `facing.py`)."""
+    error_memory: Array
+    """(2, 2) share and time constant in seconds of a fast and a slow part of the errors; the rest is white."""
+    confidence_memory: Array
+    """(2, 2) the same of confidences and misses."""
+    error_correlation: Array
+    """(25, 25) between the errors of a person's joints in one view."""
+    confidence_correlation: Array
+    """(25, 25) between their confidences."""
+    swap: float
+    """Share of the joints apart from their mirror that are reported as the mirror."""
+    capture_gap_m: Array
+    """(B,) distances from a hidden joint to the same joint of whoever hides it."""
+    capture: Array
+    """(B,) share of the missed ones that are found there."""
+    merge_px: float
+    """Distance at which two people's same joints are found as one in half the cases, at `merge_height_px`."""
+    merge_width_px: float
+    """How softly."""
+    merge_height_px: float
+    """Height of the images in which that was measured."""
+    false_near: float
+    """False candidates near a person, for each person and view."""
+    false_far: float
+    """False candidates elsewhere, in each view."""
+    false_mirrored: float
+    """Share of those near a person that lie on the mirrored joint."""
+    false_near_m: Array
+    """(K,) quantiles of the distance of the others to the next joint."""
+    false_joints: Array
+    """(G,) which joints they claim to be."""
+    false_near_confidence: Array
+    """(K,)"""
+    false_far_confidence: Array
+    """(K,)"""
+    false_memory: Array
+    """(2, 2) as `error_memory`: how long false candidates stay."""
+    affinity_right: Array
+    """(14, K) quantiles of the affinity of right pairs, by limb."""
+    affinity_right_confidence: Array
+    """(14, K) quantiles of the lower of their confidences."""
+    affinity_correlation: float
+    """Between the ranks of the two."""
+    detours: Array
+    """(B,) lower edges of classes of wrong pairs: how far the wrong end is off, in limb lengths."""
+    affinity_wrong_share: Array
+    """(B,) share of the pairs of two people that get an affinity."""
+    affinity_wrong: Array
+    """(B, K) and which."""
+    affinity_nobody_share: Array
+    """(B,) the same for pairs with a false candidate."""
+    affinity_nobody: Array
+    """(B, K)"""
+    provenance: str = "not known"
+    """Where they come from."""
+
+    @classmethod
+    def read(cls, path: Path) -> "DetectorStatistics":
+        """From the file that `scripts/measure_detector.py --update` writes."""
+        content = json.loads(path.read_text(encoding="utf-8"))
+        found = cls.of(content["measured"], content["drawn"])
+        return replace(found, provenance=content["provenance"]["recording"])
+
+    @classmethod
+    def of(cls, measured: dict[str, Any], drawn: dict[str, Any]) -> "DetectorStatistics":
+        """From what was measured, and what is drawn instead so that the same is measured in a simulation."""
+        flat = _flat(measured) | drawn
+        values: dict[str, Any] = {
+            field.name: flat[_KEYS.get(field.name, field.name)]
+            for field in fields(cls)
+            if field.name != "provenance"
+        }
+        for name, value in values.items():
+            values[name] = np.array(value, dtype=np.float64) if isinstance(value, list) else float(value)
+        return cls(**values)
+
+    def quantile(self, table: Array, probability: Array) -> Array:
+        """Values (...,) at `probability` (...,) of quantile tables (..., K)."""
+        at = np.clip(np.searchsorted(self.levels, probability, side="right") - 1, 0, len(self.levels) - 2)
+        low, high = self.levels[at], self.levels[at + 1]
+        part = np.clip((probability - low) / (high - low), 0.0, 1.0)
+        first = np.take_along_axis(table, at[..., None], axis=-1)[..., 0]
+        second = np.take_along_axis(table, at[..., None] + 1, axis=-1)[..., 0]
+        return first + (second - first) * part
+
+    def probability(self, table: Array, value: Array) -> Array:
+        """The inverse of `quantile`: how probable less than `value` (...,) is, tables (..., K)."""
+        at = np.clip((value[..., None] >= table).sum(axis=-1) - 1, 0, len(self.levels) - 2)
+        low = np.take_along_axis(table, at[..., None], axis=-1)[..., 0]
+        high = np.take_along_axis(table, at[..., None] + 1, axis=-1)[..., 0]
+        part = np.clip((value - low) / np.maximum(high - low, 1e-9), 0.0, 1.0)
+        return self.levels[at] + (self.levels[at + 1] - self.levels[at]) * part
+
+
+@cache
+def measured() -> DetectorStatistics:
+    """The shipped file, read once."""
+    return DetectorStatistics.read(_FILE)
+
+
+_KEYS = {
+    "error_memory": "memory.error",
+    "confidence_memory": "memory.confidence",
+    "error_correlation": "joint_correlation.error",
+    "confidence_correlation": "joint_correlation.confidence",
+    "swap": "swap.instead",
+    "capture_gap_m": "capture.gap_m",
+    "capture": "capture.share",
+    "merge_px": "merge.half_px",
+    "merge_width_px": "merge.width_px",
+    "merge_height_px": "merge.image_height_px",
+    "false_near": "false.near_per_person",
+    "false_far": "false.far_per_view",
+    "false_mirrored": "false.mirrored",
+    "false_near_m": "false.near_m",
+    "false_joints": "false.joints",
+    "false_near_confidence": "false.near_confidence",
+    "false_far_confidence": "false.far_confidence",
+    "false_memory": "false.memory",
+    "affinity_right": "affinity.right",
+    "affinity_right_confidence": "affinity.right_confidence",
+    "affinity_correlation": "affinity.correlation",
+    "detours": "affinity.detours",
+    "affinity_wrong_share": "affinity.wrong_share",
+    "affinity_wrong": "affinity.wrong",
+    "affinity_nobody_share": "affinity.nobody_share",
+    "affinity_nobody": "affinity.nobody",
+}
+"""Where fields stand in the file, if not under their own name."""
+
+
+def _flat(value: dict[str, Any]) -> dict[str, Any]:
+    """Nested keys joined by dots."""
+    inner = {
+        f"{key}.{name}": v for key, part in value.items() if isinstance(part, dict) for name, v in part.items()
+    }
+    return value | inner

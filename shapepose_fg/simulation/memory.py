@@ -1,0 +1,141 @@
+"""Errors that last: what a detector gets wrong in one frame it gets wrong in the next.
+
+Everything here is stationary and runs frame by frame from the first one; each frame has its own generator, made of
+the seed and the frame's number, so that skipping frames leaves the later ones as they are.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.simulation.detector_statistics import JOINT_GROUP, DetectorStatistics
+from shapepose_fg.skeleton import BODY_25
+
+Array = NDArray[np.float64]
+
+_MIRROR = np.array(BODY_25.mirror)
+_PAIRED = np.flatnonzero(np.arange(25) != _MIRROR)
+_MIRRORED_SIGMA_M = 0.03
+
+
+class LastingNoise:
+    """Six standard normal processes for every view, person and joint.
+
+    Each is the sum of a fast and a slow AR(1) process and of white noise.
+    """
+
+    ERROR_X, ERROR_Y, CONFIDENCE, SCALE, SWAP, CAPTURE = range(6)
+
+    def __init__(self, views: int, people: int, fps: float, statistics: DetectorStatistics, seed: int) -> None:
+        self._seed = seed
+        self._shape = (6, 3, views, people, 25)
+        memory = np.stack([statistics.error_memory] * 2 + [statistics.confidence_memory] * 4)
+        share, seconds = memory[..., 0], memory[..., 1]
+        self._keep = np.exp(-1.0 / (fps * seconds))[..., None, None, None]
+        self._amplitude = np.sqrt(share)[..., None, None, None]
+        self._white = np.sqrt(np.maximum(1.0 - share.sum(axis=1), 0.0))[:, None, None, None]
+        self._mix = [
+            np.linalg.cholesky(c).T for c in (statistics.error_correlation, statistics.confidence_correlation)
+        ]
+        self._state: Array | None = None
+
+    def next(self, frame: int) -> Array:
+        """(6, V, P, 25) for `frame`; to be called for every frame, in order."""
+        fresh = np.random.default_rng([self._seed, frame, 0]).standard_normal(self._shape)
+        fresh[:2] = fresh[:2] @ self._mix[0]
+        fresh[2] = fresh[2] @ self._mix[1]
+        new = fresh[:, :2]
+        if self._state is None:
+            self._state = new
+        else:
+            self._state = self._keep * self._state + np.sqrt(1.0 - self._keep**2) * new
+        return (self._amplitude * self._state).sum(axis=1) + self._white * fresh[:, 2]
+
+
+@dataclass(frozen=True)
+class Ghosts:
+    """False candidates that are there now: F of them."""
+
+    view: NDArray[np.intp]
+    person: NDArray[np.intp]
+    """Whom it goes with, or -1."""
+    anchor: NDArray[np.intp]
+    """The joint that it keeps its distance to."""
+    joint: NDArray[np.intp]
+    """What it claims to be."""
+    offset: Array
+    """(F, 2) from the anchor in metres, or a place as a share of the image."""
+    rank: Array
+    """(F,) probability of a lower confidence."""
+    stays: Array
+    """(F,) probability to be there in the next frame."""
+
+    def take(self, index: NDArray) -> "Ghosts":
+        return Ghosts(**{name: value[index] for name, value in vars(self).items()})
+
+    def join(self, other: "Ghosts") -> "Ghosts":
+        return Ghosts(**{name: np.concatenate([value, vars(other)[name]]) for name, value in vars(self).items()})
+
+
+class FalseCandidates:
+    """Candidates of nobody: some go along with a person, some stay where they are; some flicker, some last."""
+
+    def __init__(
+        self, views: int, people: int, fps: float, statistics: DetectorStatistics, rate: float, seed: int
+    ) -> None:
+        self._views, self._people, self._statistics, self._seed = views, people, statistics, seed
+        near, far = statistics.false_near * people * views * rate, statistics.false_far * views * rate
+        share, seconds = statistics.false_memory.T
+        self._stays = np.append(np.exp(-1.0 / (fps * seconds)), 0.0)
+        # Of those that are there at any time: born as often as they go.
+        self._present = np.append(share, max(1.0 - share.sum(), 0.0))[:, None] * np.array([near, far])
+        self._ghosts: Ghosts | None = None
+
+    def next(self, frame: int) -> Ghosts:
+        """Those of `frame`; to be called for every frame, in order."""
+        rng = np.random.default_rng([self._seed, frame, 1])
+        if self._ghosts is None:
+            self._ghosts = self._born(rng, self._present)
+        else:
+            staying = self._ghosts.take(rng.random(len(self._ghosts.view)) < self._ghosts.stays)
+            self._ghosts = staying.join(self._born(rng, self._present * (1.0 - self._stays)[:, None]))
+        return self._ghosts
+
+    def _born(self, rng: np.random.Generator, rate: Array) -> Ghosts:
+        """Poisson counts of `rate` (3, 2): by how long they stay, near people and far from them."""
+        kind = np.repeat(np.arange(6), rng.poisson(rate).ravel())
+        stays, far = self._stays[kind // 2], kind % 2 == 1
+        count = len(kind)
+        mirrored = ~far & (rng.random(count) < self._statistics.false_mirrored)
+        anchor = np.where(mirrored, rng.choice(_PAIRED, count), rng.integers(0, 25, count))
+        other = rng.choice(25, count, p=_joint_shares(self._statistics))
+        distance = self._statistics.quantile(
+            np.broadcast_to(self._statistics.false_near_m, (count, len(self._statistics.levels))),
+            rng.random(count),
+        )
+        angle = rng.uniform(0.0, 2 * np.pi, count)
+        around = distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        offset = np.where(mirrored[:, None], rng.normal(0.0, _MIRRORED_SIGMA_M, (count, 2)), around)
+        return Ghosts(
+            view=rng.integers(0, self._views, count),
+            person=np.where(far, -1, rng.integers(0, max(self._people, 1), count)),
+            anchor=anchor,
+            joint=np.where(mirrored, _MIRROR[anchor], other),
+            offset=np.where(far[:, None], rng.random((count, 2)), offset),
+            rank=rng.random(count),
+            stays=stays,
+        )
+
+
+def _joint_shares(statistics: DetectorStatistics) -> Array:
+    """(25,) how often a false candidate claims to be each joint: a group's share over its members."""
+    share = statistics.false_joints[JOINT_GROUP] / np.bincount(JOINT_GROUP)[JOINT_GROUP]
+    return share / share.sum()
+
+
+def _root(correlation: Array) -> Array:
+    """What independent rows (..., 25) are multiplied with from the right to correlate so; rounding is forgiven."""
+    values, vectors = np.linalg.eigh(correlation)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    return (root / np.linalg.norm(root, axis=1, keepdims=True)).T
