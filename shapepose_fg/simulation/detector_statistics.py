@@ -113,11 +113,10 @@ class DetectorStatistics:
     @classmethod
     def of(cls, measured: dict[str, Any], drawn: dict[str, Any]) -> "DetectorStatistics":
         """From what was measured, and what is drawn instead so that the same is measured in a simulation."""
-        flat = _flat(measured) | drawn
+        flat = _flat(measured)
+        names = [field.name for field in fields(cls) if field.name != "provenance"]
         values: dict[str, Any] = {
-            field.name: flat[_KEYS.get(field.name, field.name)]
-            for field in fields(cls)
-            if field.name != "provenance"
+            name: drawn[name] if name in drawn else flat[_KEYS.get(name, name)] for name in names
         }
         for name, value in values.items():
             values[name] = np.array(value, dtype=np.float64) if isinstance(value, list) else float(value)

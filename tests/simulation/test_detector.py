@@ -3,6 +3,7 @@
 import json
 from dataclasses import fields, replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from shapepose_fg.camera import Camera, Rig
 from shapepose_fg.detections import Detections
 from shapepose_fg.rendering import look_at
-from shapepose_fg.simulation import DetectorConfig, Scene, built_in_scene, simulate
+from shapepose_fg.simulation import DetectorConfig, Scene, built_in_scene, detector_statistics, simulate
 from shapepose_fg.simulation.detector import Detector
 from shapepose_fg.simulation.detector_statistics import JOINT_GROUP, LIMB_GROUP, DetectorStatistics, measured
 from shapepose_fg.simulation.facing import FACE, facing
@@ -341,3 +342,15 @@ def test_the_shipped_statistics_are_whole():
     probability = np.array([0.03, 0.3, 0.97])
     rows = np.broadcast_to(table.confidence[0, 0], (3, len(table.levels)))
     np.testing.assert_allclose(table.probability(rows, table.quantile(rows, probability)), probability, atol=1e-9)
+
+
+def test_what_is_drawn_takes_the_place_of_what_was_measured():
+    content = json.loads((Path(detector_statistics.__file__).parent / "data" / "detector.json").read_text())
+    drawn = DetectorStatistics.of(content["measured"], {"swap": 0.5, "miss": np.full((14, 3), 0.25).tolist()})
+    assert drawn.swap == 0.5 and (drawn.miss == 0.25).all()
+    plain = DetectorStatistics.of(content["measured"], {})
+    assert plain.swap == content["measured"]["swap"]["instead"] and plain.merge_px == measured().merge_px
+    names = {field.name for field in fields(measured())}
+    assert set(content["drawn"]) <= names
+    for name, value in content["drawn"].items():
+        np.testing.assert_array_equal(getattr(measured(), name), value)
