@@ -1,8 +1,8 @@
 """How hard the named sequences are: python scripts/measure_difficulty.py [--update] [--stride 10] [--split tune].
 
-The detector sees every frame, because its errors last; every `--stride`-th frame is reconstructed, by itself, at
-the default settings. Needs the recorded motions (`--data FOLDER`, or SHAPEPOSE_DATA). `--update` writes the table
-between its marks in docs/simulation.md. About eight minutes.
+Every `--stride`-th frame is reconstructed, by itself, at the default settings. Needs the recorded motions
+(`--data FOLDER`, or SHAPEPOSE_DATA). `--update` writes the table between its marks in docs/simulation.md. About five
+minutes.
 """
 
 import argparse
@@ -58,10 +58,8 @@ def main() -> None:
 
 def row(scene: Sequence, name: str, split: Split, stride: int) -> str:
     """One sequence, scored."""
-    detections = simulate(scene, seed=0)
-    frames = range(0, len(scene), stride)
-    some = Recording(detections.skeleton, [detections[t] for t in frames])
-    truth = scene.keypoints[frames.start :: stride]
+    some = simulate(scene, seed=0, frames=range(0, len(scene), stride))
+    truth = scene.keypoints[::stride]
     m = joint_metrics(reconstruct(some, scene.rig, PipelineConfig()), truth)
     hips = views_that_see_the_hip(some, scene, truth)
     shares = " | ".join(f"{100 * share:.1f}" for share in (m.precision, m.recall, m.f1))

@@ -60,18 +60,23 @@ def associate(
     both. Proposals that are left with hardly any joint seen by two views are dropped, and what they took is given
     out anew; the second value is their number.
     """
-    places = proposals.places
-    nearness = _nearness(places, detections, rig, skeleton, config)
-    chosen = _choose(nearness, _by_support(proposals, candidates, len(detections)), detections, skeleton, config)
-    seen_twice = ((chosen >= 0).sum(axis=2) >= 2)[:, skeleton.core].mean(axis=1)
-    real = seen_twice >= config.min_observed_parts
-    places, chosen, nearness = places[real], chosen[real], nearness.of(real)
-    for _ in range(config.passes):
-        chosen = _choose(nearness, _owned(chosen, len(detections)), detections, skeleton, config)
+    nearness = _nearness(proposals.places, detections, rig, skeleton, config)
+    owns = _by_support(proposals, candidates, len(detections))
+    real = np.ones(len(proposals), dtype=bool)
+    rounds = 1 + config.passes
+    while rounds > 0:
+        chosen = _choose(nearness, owns, detections, skeleton, config)
+        seen_twice = ((chosen >= 0).sum(axis=2) >= 2)[:, skeleton.core].mean(axis=1)
+        keep = seen_twice >= config.min_observed_parts
+        real[np.flatnonzero(real)[~keep]] = False
+        nearness, chosen = nearness.of(keep), chosen[keep]
+        owns = _owned(chosen, len(detections))
+        # What the dropped had is given out anew.
+        rounds = rounds - 1 if keep.all() else config.passes
     seen = chosen >= 0
     xy, confidence = np.zeros((*seen.shape, 2)), np.zeros(seen.shape)
     xy[seen], confidence[seen] = detections.xy[chosen[seen]], detections.confidence[chosen[seen]]
-    return Observations(xy, confidence, initial=places), int((~real).sum())
+    return Observations(xy, confidence, initial=proposals.places[real]), int((~real).sum())
 
 
 @dataclass(frozen=True)

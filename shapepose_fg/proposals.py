@@ -34,6 +34,10 @@ class ProposalConfig:
     deep and 30 cm wide: the middles of two are not closer even when people hug."""
     hip_width_m: float = 0.4
     """Two hips of one person are not farther apart: their middle is a root where no two views saw one."""
+    split_m: float = 0.4
+    """Two anchors nearer than this, with hardly a joint that both have, are one person's trunk and legs."""
+    split_shared: int = 2
+    """Core joints that the two may both have."""
     min_own_views: int = 2
     """Views in which an anchor needs a detection of its own, not one that made a better anchor: where rays to
     different people's hips cross, there is a candidate but nobody's."""
@@ -46,7 +50,7 @@ class ProposalConfig:
     """How a person is grown from the hip."""
 
     def __post_init__(self) -> None:
-        for name in ("box_horizontal_m", "box_vertical_m", "separation_m", "hip_width_m"):
+        for name in ("box_horizontal_m", "box_vertical_m", "separation_m", "hip_width_m", "split_m"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
         for name in ("min_parts", "min_confidence", "min_grown_parts"):
@@ -148,13 +152,28 @@ class _Search:
         """The anchors that enough strong joints are linked to, and what each chose (P, J)."""
         chosen = grow(anchors, self.candidates, self.links, self.skeleton, self.config.growth)
         core = chosen[:, self.skeleton.core]
-        linked = ((core >= 0) & self.candidates.strong[core]).mean(axis=1) >= self.config.min_grown_parts
-        if linked.all():
+        strong = (core >= 0) & self.candidates.strong[core]
+        linked = strong.mean(axis=1) >= self.config.min_grown_parts
+        half = linked & self._halves(anchors, strong & linked[:, None])
+        if linked.all() and not half.any():
             return anchors, chosen
         self.dropped["too few joints linked to the hip"] += int((~linked).sum())
+        self.dropped["the other half of a person"] += int(half.sum())
         # What the dropped had taken goes back to those whom it belongs to.
-        again = grow(anchors[linked], self.candidates, self.links, self.skeleton, self.config.growth)
-        return anchors[linked], again
+        kept = anchors[linked & ~half]
+        return kept, grow(kept, self.candidates, self.links, self.skeleton, self.config.growth)
+
+    def _halves(self, anchors: NDArray[np.intp], strong: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """(P,) who has what somebody beside them lacks, and nearly nothing else: legs without trunk and arms, say.
+
+        `strong` (P, K) tells who has a strong candidate for which core joint. Two real people have both.
+        """
+        hips = self.candidates.xyz[anchors]
+        near = np.linalg.norm(hips[:, None] - hips[None], axis=-1) < self.config.split_m
+        count = strong.sum(axis=1)
+        shared = strong.astype(np.intp) @ strong.T
+        less = (count[:, None] < count) | ((count[:, None] == count) & np.tri(len(count), k=-1, dtype=bool))
+        return (near & less & (shared <= self.config.split_shared)).any(axis=1)
 
     def unclaimed(self, chosen: NDArray[np.intp]) -> NDArray[np.bool_] | None:
         """(C,) the candidates that nobody chose, if there are strong ones of enough joints to be a person.

@@ -126,6 +126,17 @@ def test_an_empty_frame_and_a_blind_view_harm_no_other(scene, recording, people)
     assert without_view.people_found == 4 and without_view.mpjpe_mm < 40
 
 
+@pytest.mark.parametrize(("seed", "frame"), [(0, 34), (1003, 8), (1004, 3)])
+def test_nobody_is_cut_in_two_and_nobody_invented(seed, frame):
+    """Frames where rays to different hips cross near somebody: that hip took the legs, or odds and ends."""
+    scene = built_in_scene(seed=seed)
+    seen = simulate(scene, seed=seed, frames=range(frame, frame + 1))[0]
+    people = find_people(seen, scene.rig, BODY_25, PipelineConfig())
+    apart = np.linalg.norm(people.initial[:, None] - scene.keypoints[frame][None], axis=-1)
+    assert len(people) == 4
+    assert sorted(np.nanmedian(apart, axis=-1).argmin(axis=1)) == [0, 1, 2, 3]
+
+
 def test_one_person_before_two_cameras():
     scene = built_in_scene(seed=0, people=1, cameras=2, frames=6)
     found = joint_metrics(reconstruct(simulate(scene, seed=0), scene.rig), scene.keypoints)
