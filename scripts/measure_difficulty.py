@@ -1,8 +1,8 @@
 """How hard the named sequences are: python scripts/measure_difficulty.py [--update] [--stride 10] [--split tune].
 
 Every `--stride`-th frame is reconstructed, by itself, at the default settings. Needs the recorded motions
-(`--data FOLDER`, or SHAPEPOSE_DATA). `--update` writes the table between its marks in docs/simulation.md. About five
-minutes.
+(`--data FOLDER`, or SHAPEPOSE_DATA). `--update` writes the table between its marks in docs/simulation.md. Takes
+about five minutes.
 """
 
 import argparse

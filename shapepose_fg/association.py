@@ -63,6 +63,7 @@ def associate(
     nearness = _nearness(proposals.places, detections, rig, skeleton, config)
     owns = _by_support(proposals, candidates, len(detections))
     real = np.ones(len(proposals), dtype=bool)
+    chosen = np.full((*proposals.candidate.shape, len(rig)), -1, dtype=np.intp)
     rounds = 1 + config.passes
     while rounds > 0:
         chosen = _choose(nearness, owns, detections, skeleton, config)
