@@ -1,8 +1,8 @@
-"""How hard the named sequences are: python scripts/measure_difficulty.py [--update] [--stride 10] [--split tune].
+"""How hard the named sequences are: python scripts/measure_difficulty.py [--update] [--stride 20] [--split tune].
 
 Every `--stride`-th frame is reconstructed, by itself, at the default settings. Needs the recorded motions
 (`--data FOLDER`, or SHAPEPOSE_DATA). `--update` writes the table between its marks in docs/simulation.md. Takes
-about five minutes.
+about three minutes.
 """
 
 import argparse
@@ -33,7 +33,7 @@ def main() -> None:
     parser.add_argument(
         "--data", type=Path, default=Path(os.environ.get("SHAPEPOSE_DATA", ROOT.parent / "shared"))
     )
-    parser.add_argument("--stride", type=int, default=10, help="reconstruct every so-many-th frame")
+    parser.add_argument("--stride", type=int, default=20, help="reconstruct every so-many-th frame")
     parser.add_argument("--frames", type=int, help="shorten the sequences")
     parser.add_argument("--split", choices=("tune", "report"), action="append", help="both by default")
     parser.add_argument("--update", action="store_true", help="write the table into docs/simulation.md")
