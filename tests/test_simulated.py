@@ -83,7 +83,7 @@ def test_any_number_of_people_and_cameras(tmp_path: Path, people: int, cameras: 
         (["demo", "--frames", "5:2"], "0 <= A < B"),
         (["demo", "--format", "coco"], "--format coco: must be association or openpose"),
         (["salsa", "--split", "train"], "--split train: must be tune or report"),
-        (["salsa", "--people", "2"], "salsa has 4 people; leave it out"),
+        (["salsa", "--people", "2"], "salsa has 8 people; leave it out"),
         (["salsa"], "give their file with --mocap"),
         (["crowd", "--mocap", "nowhere.npz"], "nowhere.npz: there is no such file"),
     ],
@@ -109,7 +109,7 @@ def test_a_sequence_of_recorded_motions(shared_data: Path, tmp_path: Path, monke
     monkeypatch.setenv("SHAPEPOSE_DATA", str(shared_data.parent))
     options = ["simulate", "salsa", "--split", "tune", "--frames", "100:102", "--cameras", "3"]
     assert run(*options, "--output", str(tmp_path)) == 0
-    assert len(Reconstruction.load(tmp_path / "truth")) == 8
+    assert len(Reconstruction.load(tmp_path / "truth")) == 2 * 8
     about = json.loads((tmp_path / "truth" / "run.json").read_text())["simulated"]
     assert about["split"] == "tune" and about["frames"] == 2 and about["fps"] == 30
     assert len(read_detections(tmp_path, read_rig(tmp_path / "rig.json"))[1]) > 100

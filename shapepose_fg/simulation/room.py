@@ -57,6 +57,8 @@ class SequenceConfig:
     """Range of the cameras' distances from the middle."""
     camera_height_m: tuple[float, float] = (2.0, 2.5)
     """Range of the cameras' heights; every second one is 0.3 m lower."""
+    focal_px: tuple[float, float] = (860.0, 940.0)
+    """Range of the cameras' focal lengths."""
     image_size: tuple[int, int] = (1280, 720)
     """Pixels."""
     seed: int = 0

@@ -96,10 +96,11 @@ def ring_of_cameras(
     image_size: tuple[int, int] = (1280, 720),
     distance_m: tuple[float, float] = (3.1, 3.6),
     height_m: tuple[float, float] = (2.0, 2.5),
+    focal_px: tuple[float, float] = (860.0, 940.0),
 ) -> Rig:
     """Cameras on the walls around the room, 3 to 3.6 m from its middle and 1.9 to 2.7 m high, looking inward.
 
-    `distance_m` and `height_m` are what they are drawn from; every second one is 0.3 m lower.
+    `distance_m`, `height_m` and `focal_px` are what they are drawn from; every second one is 0.3 m lower.
     1280 x 720 px and a focal length near 900 px by default: a field of view of 71 by 44 degrees.
     """
     cameras = []
@@ -108,7 +109,7 @@ def ring_of_cameras(
         distance, height = rng.uniform(*distance_m), rng.uniform(*height_m) + (0.2, -0.1)[index % 2]
         eye = np.array([distance * np.cos(angle), distance * np.sin(angle), height])
         target = np.array([*rng.uniform(-0.15, 0.15, 2), 0.85])
-        focal = rng.uniform(860.0, 940.0)
+        focal = rng.uniform(*focal_px)
         centre = np.array(image_size) / 2 + rng.uniform(-8.0, 8.0, 2)
         K = np.array([[focal, 0.0, centre[0]], [0.0, focal, centre[1]], [0.0, 0.0, 1.0]])
         cameras.append(Camera(f"cam{index}", K, look_at(eye, target, UP), image_size))
