@@ -21,7 +21,7 @@ LEVELS = (
     "association refine",
     "pipeline",
     "io evaluation simulation viewer",
-    "demo simulated",
+    "demo simulated training",
     "cli",
 )
 """Each level imports only from those before it; a package may import its own modules too."""
