@@ -160,16 +160,22 @@ def simulate(
     format: Annotated[str, typer.Option(help="Detections as association (4D Association) or openpose.")] = (
         "association"
     ),
+    workers: Annotated[
+        int | None, typer.Option(help="Processes that look at the frames; by default one a core. No byte changes.")
+    ] = None,
 ) -> None:
     """Simulate a recording with known truth: cameras, 2D detections, and people.npz to compare with."""
     if format not in ("association", "openpose"):
         raise InputError(f"--format {format}: must be association or openpose")
     if seed < 0:
         raise InputError(f"--seed {seed}: must be 0 or more")
+    if workers is not None and not 1 <= workers <= 64:
+        raise InputError(f"--workers {workers}: must be 1 to 64; leave it out for one a core")
     _prepare(output)
     from shapepose_fg.simulated import check_output, cut, named_scene, write_simulated
     from shapepose_fg.simulation import DetectorConfig
     from shapepose_fg.simulation import simulate as run_detector
+    from shapepose_fg.simulation.lookout import suitable_workers
 
     last = re.search(r":\s*(\d{1,6})\s*$", frames or "")
     scene = named_scene(
@@ -183,9 +189,10 @@ def simulate(
     )
     span = _frame_range(frames, len(scene))
     check_output(scene, output, cast("Format", format))
+    workers = suitable_workers(len(span)) if workers is None else workers
     start = time.perf_counter()
     with _progress("simulating") as progress:
-        detections = run_detector(cut(scene, span), DetectorConfig(), seed, progress=progress)
+        detections = run_detector(cut(scene, span), DetectorConfig(), seed, workers=workers, progress=progress)
     seconds = time.perf_counter() - start
     about = {"name": name, "seed": seed, "first_frame": span.start, "detector": DetectorConfig().as_dict()}
     about |= {} if name == "demo" else {"split": split}

@@ -12,6 +12,7 @@ import numpy as np
 from shapepose_fg.association import AssociationConfig, associate
 from shapepose_fg.body.baseline import PlainFitterConfig
 from shapepose_fg.body.fitter import BodyFitter
+from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.camera import Rig
 from shapepose_fg.candidates import CandidateConfig, triangulate_pairs, vote
 from shapepose_fg.detections import Detections, DetectionSequence
@@ -82,7 +83,7 @@ def reconstruct(
     with run.stage("load"):
         fitter = _default_fitter(config) if fitter is None else fitter
     parts = []
-    with _torch_threads(config.threads):
+    with torch_threads(config.threads):
         for start in range(0, len(frames), config.batch_frames):
             batch = frames[start : start + config.batch_frames]
             parts.append(_reconstruct_batch(detections, rig, config, batch, fitter, extra_factors, run))
@@ -166,19 +167,6 @@ def _default_fitter(config: PipelineConfig) -> BodyFitter:
     from shapepose_fg.body.baseline import LevenbergMarquardtFitter
 
     return LevenbergMarquardtFitter(config=config.body)
-
-
-@contextmanager
-def _torch_threads(count: int) -> Iterator[None]:
-    """Give torch `count` threads, and back what it had."""
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 class _Run:

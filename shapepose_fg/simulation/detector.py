@@ -6,6 +6,7 @@ confidence, and its error has the size that errors of this confidence have.
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -13,14 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections, Recording
 from shapepose_fg.simulation.affinities import affinities
 from shapepose_fg.simulation.detector_statistics import JOINT_GROUP, DetectorStatistics, measured
 from shapepose_fg.simulation.facing import seen_from_the_front
+from shapepose_fg.simulation.lookout import Lookout
 from shapepose_fg.simulation.memory import FalseCandidates, Ghosts, LastingNoise
 from shapepose_fg.simulation.scene import Scene
-from shapepose_fg.simulation.visibility import Skin, Visibility, VisibilityConfig, see
+from shapepose_fg.simulation.visibility import Skin, Visibility, VisibilityConfig
 from shapepose_fg.skeleton import BODY_25
 
 _MIRROR = np.array(BODY_25.mirror)
@@ -88,27 +91,30 @@ def simulate(
     seed: int = 0,
     *,
     frames: Sequence[int] | None = None,
+    workers: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> Recording:
     """Detect everybody in `scene`; the same seed gives the same bytes.
 
     `frames` picks rising frame numbers, all by default. Errors last over time, so the detector runs through the
     frames before and between them too (without looking): every frame comes out as it does in the whole recording.
-    A scene that is cut starts afresh, with errors as they are at any time. `progress` is told the frames that are
-    done, and all.
+    A scene that is cut starts afresh, with errors as they are at any time. `workers` processes find out what is
+    visible, which is most of the work (1: this one does it); they change no byte. `progress` is told the frames
+    that are done, and all.
     """
     config = DetectorConfig() if config is None else config
     frames = range(len(scene)) if frames is None else frames
     skin = Skin.of(scene.body, config.visibility.cell_m)
     detector = Detector(scene.rig, scene.people, scene.fps, config, seed)
+    people = ((scene.truth_at(frame), scene.vertices_at(frame, skin.vertices)) for frame in frames)
     found = []
-    for frame in frames:
-        joints = scene.truth_at(frame)
-        seen = see(scene.rig, joints, scene.vertices_at(frame, skin.vertices), skin, config.visibility)
-        detector.skip_to(frame)
-        found.append(detector.detect(joints, seen))
-        if progress is not None:
-            progress(len(found), len(frames))
+    watched = Lookout(scene.rig, skin, config.visibility).watch(people, min(workers, max(len(frames), 1)))
+    with torch_threads(1), closing(watched):
+        for frame, seen in zip(frames, watched, strict=True):
+            detector.skip_to(frame)
+            found.append(detector.detect(scene.truth_at(frame), seen))
+            if progress is not None:
+                progress(len(found), len(frames))
     return Recording(BODY_25, found)
 
 

@@ -2,15 +2,17 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from shapepose_fg.body.model import BodyModel, BodyParameters
 from shapepose_fg.camera import Camera, Rig
 from shapepose_fg.rendering import look_at
 from shapepose_fg.simulation.motion import Build, Motion, close_motion
+
+if TYPE_CHECKING:  # torch comes with it: processes that only look at people do without
+    from shapepose_fg.body.model import BodyModel, BodyParameters
 
 UP = np.array([0.0, 0.0, 1.0])
 _FEET = (19, 20, 21, 22, 23, 24)
@@ -23,7 +25,7 @@ class Scene:
 
     rig: Rig
     """The cameras."""
-    body: BodyModel
+    body: "BodyModel"
     """The model whose parameters `motion` holds."""
     motion: Motion
     """P people in T frames."""
@@ -53,6 +55,8 @@ class Scene:
         if self.people == 0:
             count = self.body.num_vertices if only is None else len(only)
             return np.zeros((0, count, 3), dtype=np.float32)
+        import torch
+
         parameters = _parameters(self.body, self.motion, slice(frame, frame + 1))
         with torch.no_grad():
             return self.body.vertices(parameters, only).numpy()
@@ -60,6 +64,10 @@ class Scene:
     @cached_property
     def standing(self) -> NDArray[np.float32]:
         """(Nv, 3) the mean body in its T-pose, y up."""
+        import torch
+
+        from shapepose_fg.body.model import BodyParameters
+
         with torch.no_grad():
             return self.body.vertices(BodyParameters.zeros(1, self.body.dtype))[0].numpy()
 
@@ -71,7 +79,7 @@ def built_in_scene(
     cameras: int = 6,
     frames: int = 60,
     fps: float = 25.0,
-    body: BodyModel | None = None,
+    body: "BodyModel | None" = None,
 ) -> Scene:
     """Close motion in a room of 4 x 4 m: two dance, one walks through, one waves and crouches.
 
@@ -80,7 +88,10 @@ def built_in_scene(
     """
     if people < 0 or frames < 0 or cameras < 2:
         raise ValueError(f"need people >= 0, frames >= 0, cameras >= 2; got {people}, {frames}, {cameras}")
-    body = BodyModel.default() if body is None else body
+    if body is None:
+        from shapepose_fg.body.model import BodyModel
+
+        body = BodyModel.default()
     rng = np.random.default_rng(seed)
     rig = ring_of_cameras(cameras, rng)
     betas = np.clip(rng.normal(0.0, 1.0, (people, body.num_betas)), -1.8, 1.8)
@@ -116,10 +127,12 @@ def ring_of_cameras(
     return Rig(tuple(cameras), up="z")
 
 
-def builds_of(body: BodyModel, betas: NDArray[np.float64]) -> list[Build]:
+def builds_of(body: "BodyModel", betas: NDArray[np.float64]) -> list[Build]:
     """The measures of P shapes `betas` (P, 10) that motions are made to."""
     if len(betas) == 0:
         return []
+    import torch
+
     standing = Motion(betas, *(np.zeros((1, len(betas), *shape)) for shape in ((3,), (23, 3), (3,))))
     parameters = _parameters(body, standing, slice(0, 1))
     with torch.no_grad():
@@ -128,17 +141,19 @@ def builds_of(body: BodyModel, betas: NDArray[np.float64]) -> list[Build]:
     return [Build(rest, float(floor)) for rest, floor in zip(joints, floors, strict=True)]
 
 
-def keypoints_of(body: BodyModel, motion: Motion) -> NDArray[np.float64]:
+def keypoints_of(body: "BodyModel", motion: Motion) -> NDArray[np.float64]:
     """BODY_25 keypoints (T, P, 25, 3) of a motion."""
     frames, people = motion.transl.shape[:2]
     if frames * people == 0:
         return np.zeros((frames, people, 25, 3))
+    import torch
+
     with torch.no_grad():
         points = body.keypoints(_parameters(body, motion, slice(0, frames))).numpy()
     return points.astype(np.float64).reshape(frames, people, -1, 3)
 
 
-def _on_the_floor(body: BodyModel, motion: Motion, builds: list[Build]) -> Motion:
+def _on_the_floor(body: "BodyModel", motion: Motion, builds: list[Build]) -> Motion:
     """Shift everybody up or down so that in each frame the lowest toe or heel is as high as in standing."""
     frames, people = motion.transl.shape[:2]
     if frames * people == 0:
@@ -151,8 +166,12 @@ def _on_the_floor(body: BodyModel, motion: Motion, builds: list[Build]) -> Motio
     return Motion(motion.betas, motion.global_orient, motion.body_pose, transl)
 
 
-def _parameters(body: BodyModel, motion: Motion, frames: slice) -> BodyParameters:
+def _parameters(body: "BodyModel", motion: Motion, frames: slice) -> "BodyParameters":
     """The bodies of some frames, frame by frame, as one batch."""
+    import torch
+
+    from shapepose_fg.body.model import BodyParameters
+
     count = len(range(*frames.indices(len(motion.transl))))
     tensors = {
         "betas": np.tile(motion.betas, (count, 1)),

@@ -2,14 +2,17 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.body.model import BodyModel
 from shapepose_fg.camera import Rig
 from shapepose_fg.rendering import first_surface_at, scaled
 from shapepose_fg.skeleton import SMPL_24
+
+if TYPE_CHECKING:
+    from shapepose_fg.body.model import BodyModel
 
 NOBODY, ITSELF, BORDER = -1, -2, -3
 """What `Visibility.hidden_by` says where no other person is in front."""
@@ -69,7 +72,7 @@ class Skin:
     """(M, J) whether a vertex is skinned to the joint's own bone or one next to it: by half its weight or more."""
 
     @classmethod
-    def of(cls, body: BodyModel, cell_m: float) -> "Skin":
+    def of(cls, body: "BodyModel", cell_m: float) -> "Skin":
         """The surface of `body`, with vertices merged that are within a cube of `cell_m` in the mean T-pose."""
         vertices, faces, cell = coarsen(body.arrays.template, body.faces, cell_m)
         shown = body.arrays.weights @ _bones_near(body.parents).T
