@@ -121,6 +121,7 @@ LIGHT = {
     "readers": "from shapepose_fg import InputError, Reconstruction, read_detections, read_rig, write_rig",
     "stage I": "import shapepose_fg.association",
     "stage II": "import shapepose_fg.refine",
+    "processes that look": "import shapepose_fg.simulation.lookout",
     "help": (
         "from shapepose_fg.cli import main\n"
         "sys.argv = ['shapepose-fg', '--help']\n"
