@@ -13,12 +13,13 @@ ROOT = Path(__file__).parents[1]
 
 LEVELS = (
     "factors errors camera skeleton assignment",
-    "files provenance rendering body",
+    "files provenance rendering",
+    "body",
     "detections reconstruction",
     "candidates observations person_graph",
     "growth",
     "proposals",
-    "association refine",
+    "association detector_offsets refine",
     "pipeline",
     "io evaluation simulation viewer",
     "demo simulated training",

@@ -11,6 +11,7 @@ from shapepose_fg.body.alignment import RestAlignment
 from shapepose_fg.body.energy import BodyEnergy, Linearisation, WhitenedTargets, robust_weight
 from shapepose_fg.body.evidence import Evidence, EvidenceConfig, weigh
 from shapepose_fg.body.fitter import BodyFit, FitStatus, JointTargets
+from shapepose_fg.body.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.leave_one_out import JointPosterior, joint_posterior
 from shapepose_fg.body.model import BodyModel
 from shapepose_fg.body.pose_prior import PosePrior
@@ -64,9 +65,14 @@ class LevenbergMarquardtFitter:
         model = BodyModel.default() if model is None else model
         prior = PosePrior.default() if pose_prior is None else pose_prior
         self.config = PlainFitterConfig() if config is None else config
+        self.model, self._prior = model, prior
         self._align = RestAlignment(model, prior)
         self._energy = BodyEnergy(model.to(torch.float32), prior)
         self._mean_angles = prior.mean[self._energy.angles]
+
+    def with_keypoint_offsets(self, offsets: KeypointOffsets) -> "LevenbergMarquardtFitter":
+        """The same fitter for a detector that puts its joints `offsets` away from the body's."""
+        return LevenbergMarquardtFitter(self.model.with_keypoint_offsets(offsets), self._prior, self.config)
 
     @torch.no_grad()
     def fit(self, targets: JointTargets, initial: BodyFit | None = None) -> BodyFit:

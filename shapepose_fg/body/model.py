@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from shapepose_fg.body.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.rotation import exp_so3
 from shapepose_fg.body.skinned_points import SkinnedPoints, contract
 from shapepose_fg.body.smpl_file import NUM_BETAS, SMPL_PARENTS, SmplArrays, read_smpl_file
@@ -72,12 +73,16 @@ class BodyModel:
     num_betas: int = NUM_BETAS
     """Shape components in use."""
 
-    def __init__(self, arrays: SmplArrays, dtype: torch.dtype = torch.float32):
+    def __init__(
+        self, arrays: SmplArrays, dtype: torch.dtype = torch.float32, offsets: KeypointOffsets | None = None
+    ):
         """From checked arrays; most callers want `default` or `load`."""
         self._arrays = arrays
         self.dtype = dtype
         """Floating point type of parameters and results."""
-        self._keypoints = _keypoint_points(arrays).to(dtype)
+        self.keypoint_offsets = KeypointOffsets.identity() if offsets is None else offsets
+        """Where the detector's joints lie against the body's; in `keypoints`, not in `vertices` and `joints`."""
+        self._keypoints = _moved(_keypoint_points(arrays), self.keypoint_offsets).to(dtype)
         self._joints = _joint_points(arrays).to(dtype)
 
     @classmethod
@@ -96,7 +101,11 @@ class BodyModel:
 
     def to(self, dtype: torch.dtype) -> "BodyModel":
         """The same model computing in another floating point type."""
-        return self if dtype == self.dtype else BodyModel(self._arrays, dtype)
+        return self if dtype == self.dtype else BodyModel(self._arrays, dtype, self.keypoint_offsets)
+
+    def with_keypoint_offsets(self, offsets: KeypointOffsets) -> "BodyModel":
+        """The same body with its keypoints where a detector puts them; takes the place of offsets it has."""
+        return BodyModel(self._arrays, self.dtype, offsets)
 
     @property
     def faces(self) -> NDArray[np.int64]:
@@ -152,6 +161,10 @@ class BodyModel:
         return self._keypoints.positions_with_jacobian(
             rotations, parameters.betas, parameters.transl, local, self._blend_feature(local)
         )
+
+    def bone_rotations(self, parameters: BodyParameters) -> Tensor:
+        """(B, 24, 3, 3) world from bone: in the T-pose every bone's frame is the model's own."""
+        return self._rotations(parameters)[1]
 
     def _rotations(self, parameters: BodyParameters) -> tuple[Tensor, Tensor]:
         """Local and world rotations of the joints, (B, 24, 3, 3) each."""
@@ -254,6 +267,13 @@ def _keypoint_points(arrays: SmplArrays) -> SkinnedPoints:
     moments = np.einsum("kv,vj,vxn->kjxn", regressor, weights, np.concatenate(components, -1), optimize=True)
     return contract(moments, regressor @ weights, _rest_joints(arrays), SMPL_PARENTS, regressor.sum(1),
                     arrays.pose_blend is not None)  # fmt: skip
+
+
+def _moved(points: SkinnedPoints, offsets: KeypointOffsets) -> SkinnedPoints:
+    """Points that ride a constant offset away on one bone each: x_k + R_b o_k, so d_kb + o_k."""
+    moved = points.offsets.clone()
+    moved[torch.arange(len(moved)), :, torch.from_numpy(offsets.bones)] += torch.from_numpy(offsets.xyz_m)
+    return replace(points, offsets=moved)
 
 
 def _joint_points(arrays: SmplArrays) -> SkinnedPoints:

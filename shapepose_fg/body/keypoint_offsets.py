@@ -1,0 +1,155 @@
+"""Where a detector puts its joints on the body, against where the body model has them.
+
+A detector's hips are not SMPL's hips: how people annotate a joint differs from model to model. The difference is
+nearly constant in the frame of the bone that the joint rides on, so it is one vector per joint.
+"""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.errors import InputError
+from shapepose_fg.files import read_json, write_atomically
+from shapepose_fg.skeleton import BODY_25, SMPL_24
+
+_FORMAT = "shapepose-fg keypoint offsets 1"
+_RIDES_ON = {
+    "Nose REye LEye REar LEar": "head",
+    "Neck": "spine3",
+    "MidHip RHip LHip": "pelvis",
+    "RShoulder": "right_collar",
+    "LShoulder": "left_collar",
+    "RElbow": "right_shoulder",
+    "LElbow": "left_shoulder",
+    "RWrist": "right_elbow",
+    "LWrist": "left_elbow",
+    "RKnee": "right_hip",
+    "LKnee": "left_hip",
+    "RAnkle": "right_knee",
+    "LAnkle": "left_knee",
+    "RBigToe RSmallToe RHeel": "right_ankle",
+    "LBigToe LSmallToe LHeel": "left_ankle",
+}
+"""A bone has the name of the SMPL joint that it turns about: a wrist rides on the fore-arm, so on the elbow.
+Each is a bone whose turn the keypoints show; a hand's is not among them."""
+_BONE_OF = {joint: bone for joints, bone in _RIDES_ON.items() for joint in joints.split()}
+RIDES_ON = np.array([SMPL_24.index(_BONE_OF[joint]) for joint in BODY_25.joints])
+"""(25,) index in `SMPL_24` of the bone that each joint of BODY_25 rides on."""
+LARGEST_M = 0.2
+"""No detector puts a joint farther from the body's: a longer offset is a mistake, in unit or in data."""
+
+
+@dataclass(frozen=True)
+class KeypointOffsets:
+    """How far a detector's joints lie from the body's, in the frames of its bones.
+
+    In the T-pose every bone's frame is the body's own: x to its left, y up, z to its front.
+    """
+
+    xyz_m: NDArray[np.float64]
+    """(25, 3) added to each keypoint in the frame of its bone, metres."""
+    sigma_m: NDArray[np.float64]
+    """(25,) how surely each is known, root mean square over the axes, metres."""
+    count: NDArray[np.intp]
+    """(25,) how many observed joints each was learnt from; 0 where nothing was."""
+    bones: NDArray[np.intp]
+    """(25,) index in `SMPL_24` of the bone that each joint rides on."""
+
+    def __post_init__(self) -> None:
+        kinds = {"xyz_m": (np.float64, (25, 3)), "sigma_m": (np.float64, (25,))}
+        kinds |= {"count": (np.intp, (25,)), "bones": (np.intp, (25,))}
+        for name, (kind, shape) in kinds.items():
+            value = np.asarray(getattr(self, name))
+            if value.shape != shape:
+                raise ValueError(f"{name} must be {shape}, got {value.shape}")
+            if not np.isfinite(value).all():
+                raise ValueError(f"{name} must be finite numbers")
+            object.__setattr__(self, name, value.astype(kind))
+        if np.linalg.norm(self.xyz_m, axis=1).max() > LARGEST_M:
+            raise ValueError(f"xyz_m must be metres, none longer than {LARGEST_M}: it was learnt from nonsense")
+        if (self.sigma_m < 0).any() or (self.count < 0).any():
+            raise ValueError("sigma_m and count must not be negative")
+        if (self.bones < 0).any() or (self.bones >= len(SMPL_24)).any():
+            raise ValueError(f"bones must be indices of SMPL's {len(SMPL_24)} joints")
+
+    @classmethod
+    def identity(cls) -> "KeypointOffsets":
+        """The detector's joints are the body's."""
+        return cls(np.zeros((25, 3)), np.zeros(25), np.zeros(25, dtype=np.intp), RIDES_ON)
+
+    @classmethod
+    def symmetric(cls, metres: Mapping[str, Sequence[float]]) -> "KeypointOffsets":
+        """Offsets by the joint's name, (x, y, z) metres; the mirror joint gets the mirrored one.
+
+        `symmetric({"LHip": (0.035, 0.02, 0.0)})` has both hips farther out and higher. ValueError for an unknown
+        joint, for both sides of a pair, and for a joint in the middle that would not stay there.
+        """
+        xyz = np.zeros((25, 3))
+        given = [BODY_25.index(name) for name in metres]
+        for joint, offset in zip(given, metres.values(), strict=True):
+            mirror = BODY_25.mirror[joint]
+            if mirror != joint and mirror in given:
+                raise ValueError(f"give {BODY_25.joints[joint]} or {BODY_25.joints[mirror]}, not both")
+            if mirror == joint and offset[0] != 0:
+                raise ValueError(f"{BODY_25.joints[joint]} is in the middle: its x must be 0, got {offset[0]}")
+            xyz[mirror] = np.array(offset) * (-1.0, 1.0, 1.0)
+            xyz[joint] = offset
+        return cls(xyz, np.zeros(25), np.zeros(25, dtype=np.intp), RIDES_ON)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, for run.json and `save`: an entry per joint, millimetres to 3 digits."""
+        joints = {
+            name: {
+                "bone": SMPL_24[self.bones[joint]],
+                "xyz_mm": [round(1e3 * float(value), 3) for value in self.xyz_m[joint]],
+                "sigma_mm": round(1e3 * float(self.sigma_m[joint]), 3),
+                "count": int(self.count[joint]),
+            }
+            for joint, name in enumerate(BODY_25.joints)
+        }
+        return {"format": _FORMAT, "joints": joints}
+
+    def save(self, path: str | Path) -> None:
+        """Write as JSON, whole or not at all."""
+        text = json.dumps(self.as_dict(), indent=1, allow_nan=False) + "\n"
+        write_atomically(Path(path), lambda stream: stream.write(text.encode()))
+
+    @classmethod
+    def load(cls, path: str | Path) -> "KeypointOffsets":
+        """Read what `save` wrote, or the run.json of a reconstruction; InputError on anything else."""
+        path = Path(path)
+        content = read_json(path)
+        if isinstance(content, dict) and isinstance(content.get("keypoint_offsets"), dict):
+            content = content["keypoint_offsets"]
+        if not isinstance(content, dict) or content.get("format") != _FORMAT:
+            raise InputError(
+                f"{path}: holds no keypoint offsets; give a run.json that does, or what KeypointOffsets.save wrote"
+            )
+        try:
+            return cls._from_joints(content["joints"])
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+            raise InputError(f"{path}: {reason}; restore the file, or learn the offsets anew") from None
+
+    @classmethod
+    def _from_joints(cls, joints: Mapping[str, Mapping[str, Any]]) -> "KeypointOffsets":
+        rows = [joints[name] for name in BODY_25.joints]
+        return cls(
+            np.array([[_number(value) for value in row["xyz_mm"]] for row in rows]) / 1e3,
+            np.array([_number(row["sigma_mm"]) for row in rows]) / 1e3,
+            np.array([int(_number(row["count"])) for row in rows]),
+            np.array([SMPL_24.index(row["bone"]) for row in rows]),
+        )
+
+
+def _number(value: object) -> float:
+    """A finite JSON number as float; ValueError for anything else."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError(f"{value!r} is not a number")
+    return float(value)
