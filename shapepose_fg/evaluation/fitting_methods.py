@@ -1,0 +1,128 @@
+"""The fitters that are compared, each with the means to cut it short, and how fast they are."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.body.baseline import LevenbergMarquardtFitter, PlainFitterConfig
+from shapepose_fg.body.closed_form import ClosedFormStart
+from shapepose_fg.body.evidence import Evidence
+from shapepose_fg.body.fitter import BodyFit, BodyFitter, JointTargets
+from shapepose_fg.body.gradient_descent import GradientDescentConfig, GradientDescentFitter
+from shapepose_fg.body.model import BodyModel
+from shapepose_fg.body.pose_prior import PosePrior
+from shapepose_fg.evaluation.fitting import batches, fit_in_batches
+
+Array = NDArray[np.float64]
+
+PLAIN_STEPS = 100
+"""Steps of the plain optimiser that learned descent is compared with, as in the paper."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """One row of the tables."""
+
+    name: str
+    """For tables and figures."""
+    make: Callable[[int | None], BodyFitter]
+    """The fitter, with so many steps at the most; with None as it is used."""
+    steps: tuple[int, ...] = ()
+    """Numbers of steps at which error and time are measured; none for a method without steps."""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """What a method has reached after how long."""
+
+    ms: Array
+    """(M,) milliseconds a fit, in batches."""
+    error_mm: Array
+    """(M,) mean error of all joints."""
+
+    def time_to(self, error_mm: float) -> float:
+        """Milliseconds until the error was this low for the first time; infinite if it never was."""
+        reached = self.error_mm <= error_mm
+        return float(self.ms[reached].min()) if reached.any() else float("inf")
+
+
+class ClosedFormFitter(LevenbergMarquardtFitter):
+    """`ClosedFormStart` as it is, or as the start of Levenberg-Marquardt's `steps`; implements `BodyFitter`."""
+
+    def __init__(self, model: BodyModel | None = None, pose_prior: PosePrior | None = None, steps: int | None = 0):
+        plain = PlainFitterConfig()
+        steps = plain.max_iterations if steps is None else steps
+        super().__init__(model, pose_prior, PlainFitterConfig(max_iterations=max(steps, 1), unfinished=np.inf))
+        self._steps = steps
+        prior = PosePrior.default() if pose_prior is None else pose_prior
+        self._closed_form = ClosedFormStart(self._energy.model, prior)
+
+    def _start(
+        self, evidence: Evidence, rows: NDArray[np.intp], centre: Array, warm: NDArray[np.bool_],
+        initial: BodyFit | None,
+    ) -> Array:  # fmt: skip
+        import torch
+
+        start = super()._start(evidence, rows, centre, warm, initial)
+        xyz = torch.from_numpy(evidence.xyz[rows] - centre[:, None]).float()
+        body = self._closed_form(xyz, torch.from_numpy(evidence.variance_m2[rows]).float())
+        pose = body.body_pose.flatten(1)[:, torch.from_numpy(self._energy.angles)]
+        found = torch.cat((body.betas, body.global_orient, pose, body.transl), 1).double().numpy()
+        return np.where(warm[:, None], start, found)
+
+    def _solve(self, free, targets, warm):
+        return free if self._steps == 0 else super()._solve(free, targets, warm)
+
+
+def plain_methods() -> tuple[Method, ...]:
+    """The methods that learn nothing but the prior: same start, energy, prior and batching."""
+    return (
+        Method("closed form alone", lambda steps: ClosedFormFitter()),
+        Method(
+            f"gradient descent, {PLAIN_STEPS} steps",
+            lambda steps: GradientDescentFitter(
+                config=GradientDescentConfig(max_iterations=PLAIN_STEPS if steps is None else steps)
+            ),
+            (5, 10, 15, 20, 30, 40, 60, 80, PLAIN_STEPS),
+        ),
+        Method("Levenberg-Marquardt, converged", _levenberg_marquardt, (1, 2, 3, 4, 5, 6, 8, 10, 15, 40)),
+    )
+
+
+def _levenberg_marquardt(steps: int | None) -> BodyFitter:
+    if steps is None:
+        return LevenbergMarquardtFitter()
+    return LevenbergMarquardtFitter(config=PlainFitterConfig(max_iterations=steps, unfinished=np.inf))
+
+
+def milliseconds(fitter: BodyFitter, targets: JointTargets, batch: int, repeats: int) -> Array:
+    """(repeats,) milliseconds a fit in batches of `batch` different rows, after one batch to warm up."""
+    parts = [part for part in batches(targets, batch) if len(part) == batch]
+    if len(parts) == 0:
+        raise ValueError(f"{len(targets)} rows do not fill a batch of {batch}: give more, or a smaller batch")
+    fitter.fit(parts[-1])
+    seconds = []
+    for repeat in range(repeats):
+        part = parts[repeat % len(parts)]
+        start = time.perf_counter()
+        fitter.fit(part)
+        seconds.append(time.perf_counter() - start)
+    return 1e3 * np.array(seconds) / batch
+
+
+def curve(method: Method, targets: JointTargets, truth: Array, batch: int = 64) -> Curve:
+    """Error of all joints against `truth` (N, 25, 3) and time, for each of the method's numbers of steps.
+
+    The time is the median over the batches. Every number of steps is a run of its own from the start: what comes
+    before and after the steps is in it.
+    """
+    ms, error = [], []
+    for steps in method.steps if len(method.steps) > 0 else (None,):
+        fitter = method.make(steps)
+        ms.append(np.median(milliseconds(fitter, targets, batch, max(5, len(targets) // batch))))
+        joints = fit_in_batches(fitter, targets, batch).joints
+        error.append(1e3 * np.nanmean(np.linalg.norm(joints - truth, axis=-1)))
+    return Curve(np.array(ms), np.array(error))
