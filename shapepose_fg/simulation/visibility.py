@@ -121,9 +121,10 @@ def see(
     deep[_FACE] = config.face_depth_m
     stopped = (gap > config.front_m) & (~shows | (gap > deep))
     seen = np.where(in_image, 1.0 - stopped.mean(axis=-1), 0.0)
-    hider = _commonest(np.where(owner == own, ITSELF, owner), stopped)
-    hidden_by = np.where(seen >= 0.5, NOBODY, hider)
-    return Visibility(seen, in_image, np.where(in_image, hidden_by, BORDER))
+    hidden_by = np.where(in_image, NOBODY, BORDER)
+    hidden = in_image & (seen < 0.5)
+    hidden_by[hidden] = _commonest(np.where(owner == own, ITSELF, owner)[hidden], stopped[hidden])
+    return Visibility(seen, in_image, hidden_by)
 
 
 def _commonest(who: NDArray[np.intp], counts: NDArray[np.bool_]) -> NDArray[np.intp]:
