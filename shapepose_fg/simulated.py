@@ -40,7 +40,7 @@ def named_scene(
     """The scene called `name`; InputError, one sentence, where an option is wrong or the motions are not there.
 
     `people` and `seed` are the built-in scene's, which has 60 frames, or `frames` if that is more. A sequence
-    is what it is.
+    is what it is; where only its first `frames` are wanted (0: all) the later segments are not made.
     """
     if name not in NAMES:
         raise InputError(f"{name}: there is no such scene; give one of {' '.join(NAMES)}")
@@ -57,7 +57,8 @@ def named_scene(
         raise InputError(
             f"--people {people}: {name} has {SEQUENCES[name].people} people; leave it out, or take demo"
         )
-    return sequence(name, split, Mocap.load(_motions(mocap)), cameras=cameras)  # type: ignore[arg-type]
+    until = frames if frames > 0 else None
+    return sequence(name, split, Mocap.load(_motions(mocap)), cameras=cameras, until=until)  # type: ignore[arg-type]
 
 
 def cut(scene: Scene, span: range) -> Scene:

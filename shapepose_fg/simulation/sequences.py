@@ -66,13 +66,15 @@ def sequence(
     body: BodyModel | None = None,
     cameras: int = 6,
     frames: int | None = None,
+    until: int | None = None,
     fps: float = 30.0,
     config: SequenceConfig | None = None,
 ) -> Sequence:
     """Interaction sequence `name` of `SEQUENCES` from the takes of `split`, before `cameras` cameras.
 
-    `config` takes the place of the named one's; `frames` of its length. ValueError for an unknown name or
-    split, or recordings without a take of that split.
+    `config` takes the place of the named one's; `frames` of its length. With `until` no segment
+    is made that begins at that frame or later: what there is of the recording is as in the whole one. ValueError
+    for an unknown name or split, or recordings without a take of that split.
     """
     if name not in SEQUENCES or split not in TAKES:
         raise ValueError(
@@ -83,7 +85,7 @@ def sequence(
     if len(takes) == 0:
         raise ValueError(f"these recordings hold no salsa take of split {split!r}: give the whole file")
     rng = np.random.default_rng([config.seed, list(TAKES).index(split)])
-    return _compose(mocap, takes, config, rng, body, cameras, frames, fps, (name, split))
+    return _compose(mocap, takes, config, rng, body, cameras, frames, fps, (name, split), until)
 
 
 def random_scene(
@@ -122,6 +124,7 @@ def _compose(
     frames: int | None,
     fps: float,
     label: tuple[str, str],
+    until: int | None = None,
 ) -> Sequence:
     """Segments one after the other until there are frames enough."""
     body = BodyModel.default() if body is None else body
@@ -140,7 +143,7 @@ def _compose(
     clips: list[tuple[str, ...]] = []
     cuts: list[int] = []
     done = 0
-    while done < frames:
+    while done < (frames if until is None else min(until, frames)):
         room = _segment(mocap, body, betas, config, rng, fps, frames - done, stretches)
         parts.append(together(betas, room.performed, room.frames))
         clips.append(tuple(room.names))
