@@ -75,7 +75,9 @@ class Sample:
 
     expected: dict[str, NDArray]
     """Joints that other views place in an image: frame, person (row), track, view, joint, seen, hidden_by (row or
-    -1), hit, residual_m (2), spread_m (of the prediction, one sigma per axis), confidence, mirror_m."""
+    -1), buried (share of the person's joints that others hide there), hit, residual_m (2), spread_m (of the
+    prediction, one sigma per axis), confidence, mirror_m, swapped (found under the mirror's name), double_m and
+    double_confidence (of that candidate, from the joint's own, where both are there)."""
     candidates: dict[str, NDArray]
     """All candidates: frame, view, joint, confidence, owner (row or -1), stranger, and how near the
     person's joints are: nearest_m (the same joint), mirrored_m (its mirror), any_joint_m."""
@@ -266,13 +268,21 @@ def _expected(number: int, part: tuple, found: Detections, rig: Rig, people: Peo
     row = rows[person]
     # The candidates of the mirrored joint that lie where this joint is, nearer than to its own place.
     swapped = np.zeros(len(which), dtype=bool)
+    double_m, double_confidence = np.full((2, len(which)), np.nan)
     labels = found.joint[mine]
     for index in np.flatnonzero((mirror != joint) & (apart > 0.12)):
         p, j, m = person[index], joint[index], mirror[index]
         other = mine[labels == m]
         gap = np.linalg.norm(found.xy[other] - at[p, j], axis=-1) * scale[p, j]
         home = np.linalg.norm(found.xy[other] - at[p, m], axis=-1) * scale[p, j]
-        swapped[index] = bool(((gap < 0.06) & (gap < 0.4 * home)).any())
+        there = (gap < 0.06) & (gap < 0.4 * home)
+        swapped[index] = bool(there.any())
+        if there.any() and found_it[index]:
+            twice = other[there][gap[there].argmin()]
+            own = found.xy[mine[which[index]]]
+            double_m[index] = np.linalg.norm(found.xy[twice] - own) * scale[p, j]
+            double_confidence[index] = found.confidence[twice]
+    behind = (people.visibility.hidden_by[view] >= 0) & (people.visibility.seen[view] < 0.5)
     return {
         "frame": np.full(len(which), number),
         "person": row,
@@ -281,12 +291,15 @@ def _expected(number: int, part: tuple, found: Detections, rig: Rig, people: Peo
         "joint": joint,
         "seen": people.visibility.seen[view, row, joint],
         "hidden_by": people.visibility.hidden_by[view, row, joint],
+        "buried": behind.mean(axis=-1)[row],
         "hit": found_it,
         "residual_m": residual,
         "spread_m": spread_m[person, joint],
         "confidence": confidence,
         "mirror_m": np.where(mirror != joint, apart, np.nan),
         "swapped": swapped,
+        "double_m": double_m,
+        "double_confidence": double_confidence,
         "px_a_metre": 1.0 / scale[person, joint],
     }
 

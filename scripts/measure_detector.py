@@ -11,30 +11,36 @@ import argparse
 import json
 import os
 import re
+from collections.abc import Iterable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from detector_sample import MIRROR, NEAR_M, RAMP, People, Sample, find, take_sample, twin
+from detector_misses import FREE, miss_tables, tetrachoric
+from detector_sample import MIRROR, NEAR_M, RAMP, People, Sample, find, pool, take_sample, twin
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import ndtri
 
 from shapepose_fg.camera import Rig
-from shapepose_fg.detections import DetectionSequence
+from shapepose_fg.detections import DetectionSequence, Recording
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.pipeline import PipelineConfig
-from shapepose_fg.simulation import DetectorConfig, simulate
+from shapepose_fg.simulation import DetectorConfig
+from shapepose_fg.simulation.detector import Detector
 from shapepose_fg.simulation.detector_statistics import DetectorStatistics
 from shapepose_fg.simulation.scene import Scene
+from shapepose_fg.simulation.visibility import Skin, Visibility, VisibilityConfig, see
 from shapepose_fg.skeleton import BODY_25
 
 ROOT = Path(__file__).parents[1]
 OUTPUT = ROOT / "shapepose_fg" / "simulation" / "data" / "detector.json"
 CONFIG = PipelineConfig()
+SEEDS = 3
+"""Simulated recordings in each round of calibration."""
 FPS = 25.0
 """Of the Shelf recording."""
 SEEN, HIDDEN = 0.7, 0.3
@@ -69,14 +75,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, help="folder with data/shelf/ (default SHAPEPOSE_DATA, ../shared)")
     parser.add_argument("--rounds", type=int, default=4, help="rounds of calibration (default 4)")
+    parser.add_argument("--afresh", action="store_true", help="begin with what was measured, not with the file's")
     parser.add_argument("--update", action="store_true", help=f"write {OUTPUT.relative_to(ROOT)}")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     detections, rig, people = shelf_people(shelf_folder(arguments.data))
     sample = take_sample(detections, rig, people, CONFIG)
     measured = statistics(sample, rig, FPS)
-    provenance = PROVENANCE | {"joints judged": len(sample.expected["hit"]), "rounds": arguments.rounds}
-    drawn = calibrate(measured, twin(people, rig, FPS), arguments.rounds)
+    provenance = PROVENANCE | {
+        "joints judged": len(sample.expected["hit"]),
+        "rounds": arguments.rounds,
+        "recordings a round": SEEDS,
+    }
+    begin = {} if arguments.afresh else json.loads(OUTPUT.read_text(encoding="utf-8"))["drawn"]
+    drawn = calibrate(measured, twin(people, rig, FPS), arguments.rounds, begin)
     text = pretty({"provenance": provenance, "measured": measured, "drawn": drawn})
     print(text)
     if arguments.update:
@@ -105,28 +117,49 @@ def shelf_people(folder: Path) -> tuple[DetectionSequence, Rig, People]:
     return detections, rig, find(detections, rig, CONFIG)
 
 
-def calibrate(measured: dict[str, Any], scene: Scene, rounds: int) -> dict[str, Any]:
+def calibrate(measured: dict[str, Any], scene: Scene, rounds: int, begin: dict[str, Any]) -> dict[str, Any]:
     """What must be drawn so that this script measures in a simulated recording what it measured in the real one.
 
     Bodies and predictions are not quite right, and so a part of what is measured is the measurement's own error.
     The simulated recording shows the same poses before the same cameras; each round moves what is drawn by what
-    is measured too much or too little.
+    is measured too much or too little. `begin` is what was drawn before, empty to begin with what was measured.
     """
     flat = flatten(measured)
-    drawn = {name: np.array(flat[key], dtype=float) for name, (key, _) in ADJUSTED.items()}
+    drawn = {name: np.array(begin.get(name, flat[key]), dtype=float) for name, (key, _) in ADJUSTED.items()}
+    looks = watch(scene)
     for index in range(rounds):
-        gain = 0.7 / (1.0 + 0.4 * index)  # each recording has its own chances: later ones are averaged
+        gain = 0.8 / (1.0 + 0.5 * index)  # recordings have their own chances: later ones are averaged
         plain = {name: value.tolist() for name, value in drawn.items()}
         config = DetectorConfig(statistics=DetectorStatistics.of(measured, plain))
-        found = flatten(measure(simulate(scene, config, seed=index), scene.rig))
+        seeds = range(SEEDS * index, SEEDS * (index + 1))
+        found = flatten(statistics(pool(simulated(scene, looks, config, seeds)), scene.rig, FPS))
         for name, (key, way) in ADJUSTED.items():
             drawn[name] = _moved(drawn[name], np.array(flat[key]), np.array(found[key]), way, gain)
     return {name: _rounded(value, 4) for name, value in drawn.items()}
 
 
-def measure(detections: DetectionSequence, rig: Rig) -> dict[str, Any]:
-    """Everything, from candidates to statistics."""
-    return statistics(take_sample(detections, rig, find(detections, rig, CONFIG), CONFIG), rig, FPS)
+Looks = list[tuple[NDArray[np.float64], Visibility]]
+"""True joints (P, 25, 3) and what is seen of them, frame by frame: the same for every seed."""
+
+
+def watch(scene: Scene) -> Looks:
+    """Everybody in `scene`, and who is visible."""
+    config = VisibilityConfig()
+    skin = Skin.of(scene.body, config.cell_m)
+    joints = [scene.truth_at(frame) for frame in range(len(scene))]
+    surfaces = (scene.vertices_at(frame, skin.vertices) for frame in range(len(scene)))
+    pairs = zip(joints, surfaces, strict=True)
+    return [(at, see(scene.rig, at, surface, skin, config)) for at, surface in pairs]
+
+
+def simulated(scene: Scene, looks: Looks, config: DetectorConfig, seeds: Iterable[int]) -> list[Sample]:
+    """Recordings of one scene with several seeds, each measured like the real one."""
+    samples = []
+    for seed in seeds:
+        detector = Detector(scene.rig, scene.people, scene.fps, config, seed)
+        recording = Recording(BODY_25, [detector.detect(*look) for look in looks])
+        samples.append(take_sample(recording, scene.rig, find(recording, scene.rig, CONFIG), CONFIG))
+    return samples
 
 
 def flatten(nested: dict[str, Any]) -> dict[str, Any]:
@@ -137,6 +170,9 @@ def flatten(nested: dict[str, Any]) -> dict[str, Any]:
 
 ADJUSTED = {
     "miss": ("miss", "odds by state"),
+    "buried": ("buried", "probit"),
+    "lost": ("lost", "nested ratio"),
+    "lost_memory": ("memory.lost", "memory"),
     "confidence": ("confidence", "quantiles by state"),
     "sigma_m": ("sigma_m", "ratio by state"),
     "tail": ("tail", "visible"),
@@ -144,12 +180,14 @@ ADJUSTED = {
     "error_memory": ("memory.error", "memory"),
     "confidence_memory": ("memory.confidence", "memory"),
     "swap": ("swap.instead", "ratio"),
+    "double": ("swap.besides", "ratio"),
+    "merge_px": ("merge.half_px", "ratio"),
     "capture": ("capture.share", "odds"),
-    "false_near": ("false.near_per_person", "ratio"),
+    "false_near": ("false.others_per_person", "ratio"),
     "false_far": ("false.far_per_view", "ratio"),
     "false_near_m": ("false.near_m", "one ratio"),
-    "false_mirrored": ("false.mirrored", "odds"),
     "affinity_right": ("affinity.right", "quantiles"),
+    "affinity_wrong": ("affinity.wrong", "quantiles together"),
     "affinity_wrong_share": ("affinity.wrong_share", "odds"),
     "affinity_nobody_share": ("affinity.nobody_share", "odds"),
 }
@@ -163,11 +201,14 @@ def _moved(drawn: NDArray, wanted: NDArray, found: NDArray, way: str, gain: floa
     if way.startswith("odds"):
         step = _logit(wanted) - _logit(found)
         if way == "odds by state":  # by joint where visible, of all joints together where hidden
-            step[:, 1:] = np.median(step[:, 1:], axis=0)
+            step[:, 1:] = np.mean(step[:, 1:], axis=0)
         moved = 1 / (1 + np.exp(-(_logit(drawn) + np.clip(gain * step, -0.7, 0.7))))
         return np.where(wanted > 0, moved, 0.0)
     if way.endswith("ratio"):
         ratio = np.median(wanted / found) if way == "one ratio" else wanted / np.maximum(found, 1e-9)
+        if way == "nested ratio":  # the second is a part of the first, and rarer
+            drawn = drawn * np.clip(ratio, 0.6, 1.6) ** gain
+            return np.array([drawn[0], min(drawn[1], 0.8 * drawn[0])])
         moved = drawn * np.clip(ratio, 0.6, 1.6) ** gain
         return np.minimum(moved, 1.6 * wanted) if way == "one ratio" else moved
     if way == "ratio by state":
@@ -179,10 +220,14 @@ def _moved(drawn: NDArray, wanted: NDArray, found: NDArray, way: str, gain: floa
         return np.vstack(
             [np.clip(drawn[:1] + gain * np.clip(wanted - found, -0.3, 0.3)[:1], 0.05, 1.0), drawn[1:]]
         )
+    if way == "probit":
+        return np.maximum.accumulate(drawn + gain * np.clip(wanted - found, -0.5, 0.5))
     if way.startswith("quantiles"):
         step = np.clip(gain * (wanted - found), -0.1, 0.1)
         if way == "quantiles by state":
             step[:, 1:] = np.median(step[:, 1:], axis=0)
+        if way == "quantiles together":
+            step[:] = np.median(step, axis=0)
         return np.clip(np.maximum.accumulate(drawn + step, axis=-1), wanted[..., :1], wanted[..., -1:])
     curve = _curve(drawn) * np.clip(_curve(wanted) / np.maximum(_curve(found), 1e-3), 0.7, 1.5) ** gain
     moved = np.array(_memory(np.minimum(curve, 0.99), LAGS, FPS))
@@ -216,15 +261,16 @@ def statistics(sample: Sample, rig: Rig, fps: float) -> dict[str, Any]:
     return {
         "states": ["visible", "hidden by itself", "hidden by another person"],
         "levels": LEVELS.tolist(),
+        **miss_tables(expected, state, GROUP[expected["joint"]], len(GROUPS)),
         **confidence,
         **errors,
         "facing": RAMP.tolist(),
         "memory": _memories(expected, state, errors, fps),
         "joint_correlation": _joint_correlation(expected, state, errors, rig),
-        "swap": _swaps(expected),
+        "swap": swaps(expected),
         "capture": _capture(sample.captured),
-        "merge": _merging(sample, rig),
-        "false": _false(sample, rig, fps),
+        "merge": merging(sample, rig),
+        "false": false_candidates(sample, rig, fps),
         "affinity": _affinity(sample.pairs),
     }
 
@@ -236,20 +282,17 @@ def joint_states(expected: dict[str, NDArray]) -> NDArray[np.intp]:
 
 
 def _confidence_tables(expected: dict[str, NDArray], state: NDArray) -> dict[str, Any]:
-    """Miss rate (G, 3) and quantiles of the confidence (G, 3, K): a rare case leans on all joints together."""
-    miss, quantiles = np.zeros((len(GROUPS), 3)), np.zeros((len(GROUPS), 3, len(LEVELS)))
+    """Quantiles of the confidence (G, 3, K): a rare case leans on all joints together."""
+    quantiles = np.zeros((len(GROUPS), 3, len(LEVELS)))
     for s in range(3):
         of_all = state == s
-        pooled_miss = 1 - expected["hit"][of_all].mean()
         pooled = np.quantile(expected["confidence"][of_all & expected["hit"]], LEVELS)
         for g in range(len(GROUPS)):
-            those = of_all & (GROUP[expected["joint"]] == g)
-            hits = those & expected["hit"]
-            count, found = those.sum(), hits.sum()
-            miss[g, s] = ((count - found) + PRIOR * pooled_miss) / (count + PRIOR)
+            hits = of_all & (GROUP[expected["joint"]] == g) & expected["hit"]
+            found = hits.sum()
             own = np.quantile(expected["confidence"][hits], LEVELS) if found > 0 else pooled
             quantiles[g, s] = (found * own + PRIOR * pooled) / (found + PRIOR)
-    return {"miss": _rounded(miss), "confidence": _rounded(quantiles)}
+    return {"confidence": _rounded(quantiles)}
 
 
 def _errors(expected: dict[str, NDArray], state: NDArray) -> dict[str, Any]:
@@ -359,8 +402,8 @@ def _memory(values: NDArray, lags: NDArray, fps: float) -> list[list[float]]:
     )
     a, b, fast, slow = found.x
     return [
-        [round(float(a), 3), round(float(np.exp(fast)), 3)],
-        [round(float(b), 3), round(float(np.exp(slow)), 3)],
+        [round(float(np.clip(share, 0.0, 1.0)), 3), round(float(min(np.exp(log_s), LONGEST_S)), 3)]
+        for share, log_s in ((a, fast), (b, slow))
     ]
 
 
@@ -396,7 +439,13 @@ def _memories(expected: dict[str, NDArray], state: NDArray, errors: dict[str, An
     z = whitened(expected, state, errors)
     error = np.mean([autocorrelation(z[:, axis], expected, LAGS) for axis in range(2)], axis=0)
     score = autocorrelation(normal_scores(expected, state), expected, LAGS)
-    return {"error": _memory(error, LAGS, fps), "confidence": _memory(score, LAGS, fps)}
+    found = autocorrelation(hits_about_mean(expected, state), expected, LAGS)
+    lost = tetrachoric(found, 1 - float(expected["hit"][state == 0].mean()))
+    return {
+        "error": _memory(error, LAGS, fps),
+        "confidence": _memory(score, LAGS, fps),
+        "lost": _memory(lost, LAGS, fps),
+    }
 
 
 def _joint_correlation(
@@ -423,13 +472,18 @@ def _joint_correlation(
         return C / np.sqrt(np.outer(np.diag(C), np.diag(C)))
 
     of_errors = (correlation(z[:, 0]) + correlation(z[:, 1])) / 2
+    free = (state == 0) & (expected["buried"] < FREE)
+    found = correlation(np.where(free, hits_about_mean(expected, state), np.nan))
+    of_misses = tetrachoric(found, 1 - float(expected["hit"][free].mean()))
+    np.fill_diagonal(of_misses, 1.0)
     return {
+        "lost": _rounded(of_misses, 2),
         "error": _rounded(of_errors, 2),
         "confidence": _rounded(correlation(normal_scores(expected, state)), 2),
     }
 
 
-def _swaps(expected: dict[str, NDArray]) -> dict[str, Any]:
+def swaps(expected: dict[str, NDArray]) -> dict[str, Any]:
     """Share of joints, apart from their mirror, that are found under the mirrored name, instead or besides."""
     apart = np.nan_to_num(expected["mirror_m"]) > MIRROR_APART_M
     visible = apart & (expected["seen"] > 0.5)
@@ -438,6 +492,9 @@ def _swaps(expected: dict[str, NDArray]) -> dict[str, Any]:
     return {
         "instead": round(float(instead[visible].mean()), 5),
         "besides": round(float(besides[visible].mean()), 5),
+        # Of two coordinates, half of the distances are below 1.1774 sigma.
+        "double_m": round(float(np.median(expected["double_m"][besides & visible])) / 1.1774, 4),
+        "double_confidence": _rounded(np.quantile(expected["double_confidence"][besides & visible], LEVELS)),
     }
 
 
@@ -449,7 +506,7 @@ def _capture(captured: dict[str, NDArray]) -> dict[str, Any]:
     return {"gap_m": edges.tolist(), "share": _rounded(np.array(share))}
 
 
-def _merging(sample: Sample, rig: Rig) -> dict[str, Any]:
+def merging(sample: Sample, rig: Rig) -> dict[str, Any]:
     """Distance in pixels at which two people's same joints, both visible, are found as two in half the cases."""
     pairs = sample.neighbours
     edges = np.arange(0, 121, 10)
@@ -473,7 +530,7 @@ def _merging(sample: Sample, rig: Rig) -> dict[str, Any]:
     }
 
 
-def _false(sample: Sample, rig: Rig, fps: float) -> dict[str, Any]:
+def false_candidates(sample: Sample, rig: Rig, fps: float) -> dict[str, Any]:
     """Candidates of nobody, parts of people nobody reconstructed left out."""
     c = sample.candidates
     nobody = (c["owner"] < 0) & ~c["stranger"]
@@ -482,16 +539,17 @@ def _false(sample: Sample, rig: Rig, fps: float) -> dict[str, Any]:
     frames = c["frame"].max() + 1
     person_views = sample.people_in_views
     mirrored = near & (c["mirrored_m"] < 0.1) & (MIRROR[c["joint"]] != c["joint"])
-    groups = np.bincount(GROUP[c["joint"][nobody]], minlength=len(GROUPS)) / max(nobody.sum(), 1)
+    others = nobody & ~mirrored
+    groups = np.bincount(GROUP[c["joint"][others]], minlength=len(GROUPS)) / max(others.sum(), 1)
     lags = np.array([1, 2, 3, 5, 10])
     still_there = _persistence(c, nobody, lags)
     return {
         "near_per_person": round(float(near.sum() / person_views), 4),
         "far_per_view": round(float(far.sum() / (frames * len(rig))), 4),
-        "mirrored": round(float(mirrored.sum() / max(near.sum(), 1)), 3),
-        "near_m": _rounded(np.quantile(c["any_joint_m"][near & ~mirrored], LEVELS)),
+        "others_per_person": round(float((near & others).sum() / person_views), 4),
+        "near_m": _rounded(np.quantile(c["any_joint_m"][near & others], LEVELS)),
         "joints": _rounded(groups),
-        "near_confidence": _rounded(np.quantile(c["confidence"][near], LEVELS)),
+        "near_confidence": _rounded(np.quantile(c["confidence"][near & others], LEVELS)),
         "far_confidence": _rounded(np.quantile(c["confidence"][far], LEVELS)),
         "lags": lags.tolist(),
         "still_there": _rounded(still_there),

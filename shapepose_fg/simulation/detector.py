@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 
 from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.camera import Rig
@@ -34,6 +34,8 @@ _LARGEST_ERROR_M = 0.25
 
 _HIDDEN, _SEEN = 0.3, 0.7
 """Joints of which less, or more, is seen were measured as hidden, or visible; in between, in between."""
+_HALF_LOST, _WHOLLY_LOST = 1.96, 2.80
+"""Of joints of which one in 40 is missed, half and four fifths are when the probit is so much higher."""
 _NEAR_M = 0.5
 """False candidates nearer than this to somebody's joint were counted as that person's."""
 
@@ -164,7 +166,7 @@ class Detector:
         rng = np.random.default_rng([self._seed, self._frame, 2])
         self._frame += 1
         true_xy, depth = rig.project(joints)
-        found, captors = _report(rig, joints, true_xy, depth, visibility, config, noise)
+        found, captors = _report(rig, joints, true_xy, depth, visibility, config, noise, rng)
         found = _merge(found.join(_invent(rig, ghosts, true_xy, depth, config)))
         found = found.take(rng.permutation(len(found.view)))
         pairs, affinity = affinities(
@@ -182,16 +184,18 @@ def _report(
     visibility: Visibility,
     config: DetectorConfig,
     noise: NDArray[np.float64],
+    rng: np.random.Generator,
 ) -> tuple[_Found, NDArray[np.intp]]:
     """The joints of people that are reported, each with its error; and who captured the others (`_capture`)."""
     table = config.statistics
     seen = seen_from_the_front(visibility.seen, joints, rig.centres, table.facing)
     seen = np.clip((seen - _HIDDEN) / (_SEEN - _HIDDEN), 0.0, 1.0)
     hidden_as = np.where(visibility.hidden_by >= 0, 2, 1)
-    quality = ndtr(noise[LastingNoise.CONFIDENCE])
-    miss = config.misses * _between(table.miss[JOINT_GROUP, hidden_as], table.miss[JOINT_GROUP, 0], seen)
-    miss = np.clip(miss, 0.0, 1.0)
-    reported = visibility.in_image & (quality >= miss)
+    worse = _worse(visibility, seen, table, noise)
+    quality = ndtr(noise[LastingNoise.CONFIDENCE] - worse)
+    miss = ndtri(_between(table.miss[JOINT_GROUP, hidden_as], table.miss[JOINT_GROUP, 0], seen))
+    miss = ndtr(ndtri(np.minimum(config.misses * ndtr(miss + worse), 1.0)) - worse)
+    reported = visibility.in_image & (quality >= miss) & (miss < 1)
     view, person, joint = np.nonzero(reported)
     seen, hidden_as, group = seen[reported], hidden_as[reported], JOINT_GROUP[joint]
     rank = (quality[reported] - miss[reported]) / (1.0 - miss[reported])
@@ -204,9 +208,10 @@ def _report(
     owner = np.zeros((len(view), len(joints)), dtype=bool)
     owner[np.arange(len(view)), person] = True
     captors = _capture(reported, true_xy, depth / rig.focal_px[:, None, None], visibility, config, noise)
-    swapped = ndtr(noise[LastingNoise.SWAP, reported]) < config.swaps * table.swap
     gap_px = np.linalg.norm(true_xy[view, person, joint] - true_xy[view, person, _MIRROR[joint]], axis=-1)
-    swapped &= gap_px > _MIRROR_APART_M * px_a_metre
+    apart = gap_px > _MIRROR_APART_M * px_a_metre
+    swap_rank = np.where(apart, ndtr(noise[LastingNoise.SWAP, reported]), 1.0)
+    swapped = swap_rank < config.swaps * table.swap
     owner[swapped] = False
     found = _Found(
         view=view,
@@ -216,8 +221,50 @@ def _report(
         owner=owner,
         reach_px=_reach_px(ndtr(noise[LastingNoise.SCALE, reported]), rig.image_sizes[view, 1], config),
     )
-    inside = np.all((found.xy >= 0) & (found.xy <= rig.image_sizes[view] - 1), axis=1)
+    found = found.join(_doubles(found, swap_rank, px_a_metre, config, rng))
+    inside = np.all((found.xy >= 0) & (found.xy <= rig.image_sizes[found.view] - 1), axis=1)
     return found.take(inside), captors
+
+
+def _doubles(
+    found: _Found,
+    swap_rank: NDArray[np.float64],
+    px_a_metre: NDArray[np.float64],
+    config: DetectorConfig,
+    rng: np.random.Generator,
+) -> _Found:
+    """False candidates under the mirror's name of joints that are found under their own."""
+    table = config.statistics
+    low, high = config.swaps * table.swap, config.swaps * (table.swap + table.double)
+    those = (swap_rank >= low) & (swap_rank < high)
+    first = found.take(those)
+    rank = (swap_rank[those] - low) / max(high - low, 1e-9)
+    shift_px = rng.normal(0.0, table.double_m, first.xy.shape) * px_a_metre[those, None]
+    return _Found(
+        view=first.view,
+        joint=_MIRROR[first.joint],
+        xy=first.xy + shift_px,
+        confidence=table.quantile(np.broadcast_to(table.double_confidence, (len(rank), len(table.levels))), rank),
+        owner=np.zeros_like(first.owner),
+        reach_px=np.zeros(len(rank)),
+    )
+
+
+def _worse(
+    visibility: Visibility, seen: NDArray[np.float64], table: DetectorStatistics, noise: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """How much worse than others (V, P, 25) joints are found, of people who are buried behind others, or lost.
+
+    As a standard normal (probit). What its own body hides is no worse off when others hide the rest.
+    """
+    behind = visibility.hidden_by >= 0
+    share = (behind & (visibility.seen < 0.5)).mean(axis=-1, keepdims=True)
+    buried = np.interp(share, table.buried_share, table.buried) * np.where(behind, 1.0, seen)
+    if table.lost[1] <= 0:
+        return buried
+    half, wholly = -ndtri(table.lost)
+    slope = (_WHOLLY_LOST - _HALF_LOST) / (wholly - half)
+    return buried + np.maximum(_HALF_LOST + slope * (noise[LastingNoise.LOST] - half), 0.0)
 
 
 def _errors(

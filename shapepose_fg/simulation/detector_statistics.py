@@ -31,7 +31,17 @@ class DetectorStatistics:
     levels: Array
     """(K,) probabilities at which quantiles are given, 0 to 1."""
     miss: Array
-    """(G, 3) share of the joints that are not reported."""
+    """(G, 3) share of the joints that are not reported, of people who stand free and are not lost."""
+    buried_share: Array
+    """(B,) shares of a person's joints in a view that other people hide."""
+    buried: Array
+    """(B,) what they add to a miss and take from a confidence, as a standard normal (probit)."""
+    lost: Array
+    """(2,) share of the people in a view of whom half, or four fifths, is missed though nobody stands before them."""
+    lost_memory: Array
+    """(2, 2) as `error_memory`: how long that lasts."""
+    lost_correlation: Array
+    """(25, 25) between a person's joints."""
     confidence: Array
     """(G, 3, K) quantiles of the confidence of those that are."""
     knots: Array
@@ -58,6 +68,12 @@ class DetectorStatistics:
     """(25, 25) between their confidences."""
     swap: float
     """Share of the joints apart from their mirror that are reported as the mirror."""
+    double: float
+    """Share of them that are reported under both names."""
+    double_m: float
+    """Sigma of each coordinate of the distance between the two."""
+    double_confidence: Array
+    """(K,) of the one with the wrong name."""
     capture_gap_m: Array
     """(B,) distances from a hidden joint to the same joint of whoever hides it."""
     capture: Array
@@ -69,13 +85,11 @@ class DetectorStatistics:
     merge_height_px: float
     """Height of the images in which that was measured."""
     false_near: float
-    """False candidates near a person, for each person and view."""
+    """False candidates near a person, for each person and view; joints under both names are none of them."""
     false_far: float
     """False candidates elsewhere, in each view."""
-    false_mirrored: float
-    """Share of those near a person that lie on the mirrored joint."""
     false_near_m: Array
-    """(K,) quantiles of the distance of the others to the next joint."""
+    """(K,) quantiles of the distance of those near a person to the next joint."""
     false_joints: Array
     """(G,) which joints they claim to be."""
     false_near_confidence: Array
@@ -151,15 +165,19 @@ _KEYS = {
     "confidence_memory": "memory.confidence",
     "error_correlation": "joint_correlation.error",
     "confidence_correlation": "joint_correlation.confidence",
+    "lost_memory": "memory.lost",
+    "lost_correlation": "joint_correlation.lost",
     "swap": "swap.instead",
+    "double": "swap.besides",
+    "double_m": "swap.double_m",
+    "double_confidence": "swap.double_confidence",
     "capture_gap_m": "capture.gap_m",
     "capture": "capture.share",
     "merge_px": "merge.half_px",
     "merge_width_px": "merge.width_px",
     "merge_height_px": "merge.image_height_px",
-    "false_near": "false.near_per_person",
+    "false_near": "false.others_per_person",
     "false_far": "false.far_per_view",
-    "false_mirrored": "false.mirrored",
     "false_near_m": "false.near_m",
     "false_joints": "false.joints",
     "false_near_confidence": "false.near_confidence",

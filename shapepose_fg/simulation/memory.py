@@ -10,41 +10,42 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.simulation.detector_statistics import JOINT_GROUP, DetectorStatistics
-from shapepose_fg.skeleton import BODY_25
 
 Array = NDArray[np.float64]
 
-_MIRROR = np.array(BODY_25.mirror)
-_PAIRED = np.flatnonzero(np.arange(25) != _MIRROR)
-_MIRRORED_SIGMA_M = 0.03
-
 
 class LastingNoise:
-    """Six standard normal processes for every view, person and joint.
+    """Seven standard normal processes for every view, person and joint.
 
     Each is the sum of a fast and a slow AR(1) process and of white noise.
     """
 
-    ERROR_X, ERROR_Y, CONFIDENCE, SCALE, SWAP, CAPTURE = range(6)
+    ERROR_X, ERROR_Y, CONFIDENCE, SCALE, SWAP, CAPTURE, LOST = range(7)
 
     def __init__(self, views: int, people: int, fps: float, statistics: DetectorStatistics, seed: int) -> None:
         self._seed = seed
-        self._shape = (6, 3, views, people, 25)
-        memory = np.stack([statistics.error_memory] * 2 + [statistics.confidence_memory] * 4)
+        self._shape = (7, 3, views, people, 25)
+        memory = np.stack(
+            [statistics.error_memory] * 2 + [statistics.confidence_memory] * 4 + [statistics.lost_memory]
+        )
         share, seconds = memory[..., 0], memory[..., 1]
         self._keep = np.exp(-1.0 / (fps * seconds))[..., None, None, None]
         self._amplitude = np.sqrt(share)[..., None, None, None]
         self._white = np.sqrt(np.maximum(1.0 - share.sum(axis=1), 0.0))[:, None, None, None]
         self._mix = [
-            np.linalg.cholesky(c).T for c in (statistics.error_correlation, statistics.confidence_correlation)
-        ]
+            _root(c)
+            for c in (
+                statistics.error_correlation, statistics.confidence_correlation, statistics.lost_correlation
+            )
+        ]  # fmt: skip
         self._state: Array | None = None
 
     def next(self, frame: int) -> Array:
-        """(6, V, P, 25) for `frame`; to be called for every frame, in order."""
+        """(7, V, P, 25) for `frame`; to be called for every frame, in order."""
         fresh = np.random.default_rng([self._seed, frame, 0]).standard_normal(self._shape)
         fresh[:2] = fresh[:2] @ self._mix[0]
-        fresh[2] = fresh[2] @ self._mix[1]
+        fresh[self.CONFIDENCE] = fresh[self.CONFIDENCE] @ self._mix[1]
+        fresh[self.LOST] = fresh[self.LOST] @ self._mix[2]
         new = fresh[:, :2]
         if self._state is None:
             self._state = new
@@ -107,22 +108,18 @@ class FalseCandidates:
         kind = np.repeat(np.arange(6), rng.poisson(rate).ravel())
         stays, far = self._stays[kind // 2], kind % 2 == 1
         count = len(kind)
-        mirrored = ~far & (rng.random(count) < self._statistics.false_mirrored)
-        anchor = np.where(mirrored, rng.choice(_PAIRED, count), rng.integers(0, 25, count))
-        other = rng.choice(25, count, p=_joint_shares(self._statistics))
         distance = self._statistics.quantile(
             np.broadcast_to(self._statistics.false_near_m, (count, len(self._statistics.levels))),
             rng.random(count),
         )
         angle = rng.uniform(0.0, 2 * np.pi, count)
         around = distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        offset = np.where(mirrored[:, None], rng.normal(0.0, _MIRRORED_SIGMA_M, (count, 2)), around)
         return Ghosts(
             view=rng.integers(0, self._views, count),
             person=np.where(far, -1, rng.integers(0, max(self._people, 1), count)),
-            anchor=anchor,
-            joint=np.where(mirrored, _MIRROR[anchor], other),
-            offset=np.where(far[:, None], rng.random((count, 2)), offset),
+            anchor=rng.integers(0, 25, count),
+            joint=rng.choice(25, count, p=_joint_shares(self._statistics)),
+            offset=np.where(far[:, None], rng.random((count, 2)), around),
             rank=rng.random(count),
             stays=stays,
         )

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.special import ndtr, ndtri
 
 from shapepose_fg.camera import Camera, Rig
 from shapepose_fg.detections import Detections
@@ -23,7 +24,9 @@ MIRROR = np.array(BODY_25.mirror)
 BODY = np.setdiff1d(np.arange(25), FACE)
 """Joints that do not depend on which way a face looks."""
 _, Y, Z = np.eye(3)
-PLAIN = DetectorConfig(false_candidates=0.0, merging=0.0, swaps=0.0, captures=0.0)
+KEPT = replace(measured(), lost=np.zeros(2))
+"""Nobody is lost as a whole."""
+PLAIN = DetectorConfig(false_candidates=0.0, merging=0.0, swaps=0.0, captures=0.0, statistics=KEPT)
 """Errors and misses only."""
 
 
@@ -61,8 +64,8 @@ def looks(rig: Rig, joints: np.ndarray, seen: Visibility, config: DetectorConfig
 
 
 def drawing(**tables: object) -> DetectorStatistics:
-    """The measured statistics with other tables."""
-    return replace(measured(), **tables)  # type: ignore[arg-type]
+    """The measured statistics with other tables, and nobody lost as a whole."""
+    return replace(KEPT, **tables)  # type: ignore[arg-type]
 
 
 def test_without_noise_the_candidates_are_the_truth(scene: Scene):
@@ -181,7 +184,7 @@ def test_errors_last_as_long_as_measured():
 
 def test_joints_are_swapped_with_their_mirror_as_often_as_configured():
     rig, joints = crowd(12)
-    config = replace(DetectorConfig.perfect(), swaps=1.0, statistics=drawing(swap=0.1))
+    config = replace(DetectorConfig.perfect(), swaps=1.0, statistics=drawing(swap=0.1, double=0.0))
     wrong = total = 0
     xy, depth = rig.project(joints)
     apart = np.linalg.norm(xy - xy[:, :, MIRROR], axis=-1) * depth / 900.0 > 0.12
@@ -193,6 +196,61 @@ def test_joints_are_swapped_with_their_mirror_as_often_as_configured():
         assert np.abs(there[off]).max() < 1e-6
         wrong, total = wrong + off.sum(), total + apart.sum()
     assert abs(wrong / total - 0.1) < 5 * np.sqrt(0.1 * 0.9 / total)
+
+
+def test_joints_are_found_under_both_names_as_often_as_configured():
+    rig, joints = crowd(12)
+    table = drawing(swap=0.0, double=0.1, double_m=0.02)
+    config = replace(DetectorConfig.perfect(), swaps=1.0, statistics=table)
+    xy, depth = rig.project(joints)
+    apart = np.linalg.norm(xy - xy[:, :, MIRROR], axis=-1) * depth / 900.0 > 0.12
+    extra, gaps = 0, []
+    for found in looks(rig, joints, everything_seen(rig, 12), config, 20):
+        error, _ = nearest(found, rig, joints)
+        twice = np.linalg.norm(error, axis=1) > 1e-6
+        assert len(found) == 2 * 12 * 25 + twice.sum()  # nothing is missing
+        offset, person = nearest(replace(found, joint=MIRROR[found.joint]), rig, joints)
+        metres_a_px = depth[found.view, person, MIRROR[found.joint]] / 900.0
+        gaps.append(np.linalg.norm(offset, axis=1)[twice] * metres_a_px[twice])
+        extra += twice.sum()
+    total = 20 * apart.sum()
+    assert abs(extra / total - 0.1) < 5 * np.sqrt(0.1 * 0.9 / total)
+    assert np.isclose(np.median(np.concatenate(gaps)), 0.02 * 1.1774, rtol=0.15)  # some 600 lengths: 5 % each way
+
+
+@pytest.mark.parametrize(("seen", "hidden_by"), [(1.0, -1), (0.0, 0)])
+def test_whom_others_hide_is_missed_as_a_whole(seen: float, hidden_by: int):
+    """Joint 4 of every person, seen or hidden by another, where others hide nobody else, or 14 further joints."""
+    rig, joints = crowd(12)
+    table = drawing(miss=np.full((14, 3), 0.2), buried_share=np.array([0.04, 0.6]), buried=np.array([0.0, 1.5]))
+    shares = []
+    for count in (0, 14):
+        visibility = everything_seen(rig, 12)
+        visibility.seen[..., 10 : 10 + count], visibility.hidden_by[..., 10 : 10 + count] = 0.0, 0
+        visibility.seen[..., 4], visibility.hidden_by[..., 4] = seen, hidden_by
+        frames = looks(rig, joints, visibility, replace(PLAIN, statistics=table), 40)
+        shares.append(1 - sum((found.joint == 4).sum() for found in frames) / (40 * 24))
+    hidden = (14 + (hidden_by >= 0)) / 25
+    buried = np.interp(hidden, table.buried_share, table.buried)
+    for share, expected in zip(shares, (0.2, ndtr(ndtri(0.2) + buried)), strict=True):
+        assert abs(share - expected) < 4 * np.sqrt(expected * (1 - expected) / 960)
+
+
+def test_people_are_lost_as_wholes():
+    rig, joints = crowd(12)
+    table = drawing(
+        miss=np.full((14, 3), 0.025), lost=np.array([0.2, 0.1]), lost_correlation=np.full((25, 25), 1.0)
+    )
+    missed = []
+    for found in looks(rig, joints, everything_seen(rig, 12), replace(PLAIN, noise=0.0, statistics=table), 40):
+        count = np.zeros((2, 12))
+        np.add.at(count, (found.view, nearest(found, rig, joints)[1]), 1)
+        missed.append(1 - count.ravel() / 25)
+    missed = np.concatenate(missed)
+    # 960 people in views: four standard errors, and as much again since single joints are missed by chance too.
+    assert abs((missed > 0.5).mean() - 0.2) < 0.1
+    assert abs((missed > 0.8).mean() - 0.1) < 0.08
+    assert np.median(missed) <= 0.04 + 1e-9  # one joint
 
 
 @pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
@@ -334,7 +392,9 @@ def test_the_shipped_statistics_are_whole():
         assert (np.diff(getattr(table, name), axis=-1) >= 0).all(), name
     for name in ("miss", "capture", "affinity_wrong_share", "affinity_nobody_share"):
         assert ((getattr(table, name) >= 0) & (getattr(table, name) <= 1)).all(), name
-    for memory in (table.error_memory, table.confidence_memory, table.false_memory):
+    assert (np.diff(table.buried) >= 0).all() and (np.diff(table.buried_share) > 0).all()
+    assert 0 <= table.lost[1] < table.lost[0] < 1
+    for memory in (table.error_memory, table.confidence_memory, table.false_memory, table.lost_memory):
         assert memory[:, 0].sum() <= 1 and (memory[:, 1] > 0).all()
     # What everybody knows of detectors: surer is nearer, hidden is missed more.
     assert (np.diff(table.sigma_m[0, ::2]) < 0).all()
@@ -349,7 +409,7 @@ def test_what_is_drawn_takes_the_place_of_what_was_measured():
     drawn = DetectorStatistics.of(content["measured"], {"swap": 0.5, "miss": np.full((14, 3), 0.25).tolist()})
     assert drawn.swap == 0.5 and (drawn.miss == 0.25).all()
     plain = DetectorStatistics.of(content["measured"], {})
-    assert plain.swap == content["measured"]["swap"]["instead"] and plain.merge_px == measured().merge_px
+    assert plain.swap == content["measured"]["swap"]["instead"] and plain.floor_px == measured().floor_px
     names = {field.name for field in fields(measured())}
     assert set(content["drawn"]) <= names
     for name, value in content["drawn"].items():

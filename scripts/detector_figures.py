@@ -1,47 +1,45 @@
-"""The simulated detector beside the real one: python scripts/draw_detector.py [--update].
+"""The simulated detector beside the real one, for `reproduce_simulation.py`: a table of distances, and figures.
 
-Both are measured alike (`detector_sample.py`): the Shelf recording, and three simulated recordings of the same
-poses before the same cameras, with seeds on which nothing was calibrated. Prints a table of distances; `--update`
-writes it into docs/simulation.md, and the figures into docs/images. Takes two minutes.
+Both are measured alike (`detector_sample.py`): the Shelf recording, and simulated recordings of the same poses
+before the same cameras, with seeds on which nothing was calibrated.
 """
 
-import argparse
-import re
 from collections.abc import Callable
+from functools import cached_property
 from pathlib import Path
 
 import matplotlib
 import numpy as np
-import torch
-from detector_sample import Sample, find, pool, take_sample, twin
+from detector_misses import is_lost
+from detector_sample import Sample, pool, take_sample, twin
 from measure_detector import (
     CONFIG,
     FPS,
     GROUP,
     GROUPS,
-    ROOT,
     autocorrelation,
-    flatten,
+    false_candidates,
     hits_about_mean,
     joint_states,
+    merging,
     normal_scores,
-    shelf_folder,
     shelf_people,
+    simulated,
     statistics,
+    swaps,
+    watch,
     whitened,
 )
 from numpy.typing import NDArray
 
-from shapepose_fg.simulation import simulate
+from shapepose_fg.simulation import DetectorConfig
 from shapepose_fg.skeleton import BODY_25
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 
-IMAGES = ROOT / "docs" / "images"
-DOCUMENT = ROOT / "docs" / "simulation.md"
-SEEDS = (100, 101, 102)
+UNSEEN = (100, 101, 102, 103, 104, 105)
 """Of the simulated recordings, which are taken together; calibration used 0 and up."""
 COLOURS = {"real": "black", "simulated": "#d95f02"}
 STATES = ("visible", "hidden by itself", "hidden by another")
@@ -55,8 +53,13 @@ class Measured:
         self.sample = sample
         self.expected = sample.expected
         self.state = joint_states(sample.expected)
-        self.statistics = statistics(sample, rig, FPS)
+        self.rig = rig
         self.length_mm = 1e3 * np.linalg.norm(sample.expected["residual_m"], axis=1)
+
+    @cached_property
+    def statistics(self) -> dict:
+        """As the simulated detector draws from them."""
+        return statistics(self.sample, self.rig, FPS)
 
     def confidences(self, state: int) -> NDArray:
         """Of the joints found in this state."""
@@ -92,6 +95,17 @@ class Measured:
         label = (c["frame"] * views + c["view"]) * 25 + c["joint"]
         return np.bincount(label[ours], minlength=frames * views * 25)
 
+    def missed(self, state: int, least: float = 0.0, most: float = 1.0) -> float:
+        """Share of the joints missed in this state, where others hide so much of the person, %."""
+        buried = self.expected["buried"]
+        return 100 * float(
+            1 - self.expected["hit"][(self.state == state) & (buried >= least) & (buried <= most)].mean()
+        )
+
+    def lost(self) -> float:
+        """Share of the people in views of whom half is missed though nobody hides them, %."""
+        return 100 * float(is_lost(self.expected, self.state)[1][0])
+
     def captured(self) -> float:
         """Share of the joints missed behind another person that are found on that person, %."""
         return 100 * float(self.sample.captured["taken"].mean())
@@ -108,50 +122,45 @@ class Measured:
         return pairs["affinity"][those]
 
 
-def main() -> None:
-    """Measure both, compare, draw."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, help="folder with data/shelf/ (default SHAPEPOSE_DATA, ../shared)")
-    parser.add_argument("--update", action="store_true", help="write figures and table into docs/")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    detections, rig, people = shelf_people(shelf_folder(arguments.data))
+def tables_and_figures(shelf: Path, images: Path | None) -> list[str]:
+    """Measure the recording in the folder `shelf` and its simulation, compare; draw into `images` if given."""
+    detections, rig, people = shelf_people(shelf)
     scene = twin(people, rig, FPS)
-    recordings = [simulate(scene, seed=seed) for seed in SEEDS]
-    samples = [take_sample(each, rig, find(each, rig, CONFIG), CONFIG) for each in recordings]
+    samples = simulated(scene, watch(scene), DetectorConfig(), UNSEEN)
     both = {
         "real": Measured(take_sample(detections, rig, people, CONFIG), rig),
         "simulated": Measured(pool(samples), rig),
     }
-    text = "\n".join(table(both))
-    print(text)
-    if arguments.update:
-        draw("detector_joints.png", both, [confidences, errors, misses])
-        draw("detector_time.png", both, [memories, counts, tails])
-        draw("detector_affinities.png", both, [right_pairs, wrong_pairs, wrong_shares])
-        old = DOCUMENT.read_text(encoding="utf-8")
-        marked = re.compile(r"(<!-- detector -->\n).*?(<!-- end -->)", re.DOTALL)
-        DOCUMENT.write_text(marked.sub(lambda found: f"{found[1]}\n{text}\n\n{found[2]}", old), encoding="utf-8")
+    if images is not None:
+        draw(images / "detector_joints.png", both, [confidences, errors, misses])
+        draw(images / "detector_time.png", both, [memories, counts, tails])
+        draw(images / "detector_affinities.png", both, [right_pairs, wrong_pairs, wrong_shares])
+    return table(both, [Measured(sample, rig) for sample in samples])
 
 
-def table(both: dict[str, Measured]) -> list[str]:
-    """Real, simulated, and their distance, as Markdown."""
+def table(both: dict[str, Measured], each: list[Measured]) -> list[str]:
+    """Real, simulated (together, and `each` by itself), and their distance, as Markdown."""
     real, simulated = both.values()
     rows = []
 
     def distribution(name: str, of: Callable[[Measured], NDArray], unit: str = "", digits: int = 2) -> None:
         a, b = of(real), of(simulated)
         cells = [" / ".join(f"{q:.{digits}f}" for q in np.quantile(x, [0.1, 0.5, 0.9])) for x in (a, b)]
-        rows.append(f"| {name}{unit} | {cells[0]} | {cells[1]} | KS {kolmogorov_smirnov(a, b):.3f} |")
+        rows.append(f"| {name}{unit} | {cells[0]} | {cells[1]} | KS {kolmogorov_smirnov(a, b):.3f} | |")
 
     def number(name: str, of: Callable[[Measured], float], digits: int = 1) -> None:
         a, b = of(real), of(simulated)
-        rows.append(f"| {name} | {a:.{digits}f} | {b:.{digits}f} | {b - a:+.{digits}f} |")
+        spread = np.std([of(one) for one in each], ddof=1)
+        rows.append(f"| {name} | {a:.{digits}f} | {b:.{digits}f} | {b - a:+.{digits}f} | {spread:.{digits}f} |")
 
     for state, name in enumerate(STATES):
         distribution(f"confidence, {name}", lambda m, s=state: m.confidences(s))
     for state, name in enumerate(STATES):
-        number(f"missed, {name}, %", lambda m, s=state: 100 * float(1 - m.expected["hit"][m.state == s].mean()))
+        number(f"missed, {name}, %", lambda m, s=state: m.missed(s))
+    number("missed, visible, others hide half the person or more, %", lambda m: m.missed(0, 0.5))
+    number("missed, hidden by another who hides a third or less, %", lambda m: m.missed(2, 0.0, 0.33))
+    number("missed, hidden by another who hides half or more, %", lambda m: m.missed(2, 0.5))
+    number("people in views half missed though nobody hides them, %", Measured.lost)
     distribution("residual, visible", Measured.errors, ", mm", 0)
     for low, high in ((0.15, 0.4), (0.4, 0.6), (0.6, 0.75), (0.75, 0.85), (0.85, 1.0)):
         distribution(
@@ -161,18 +170,17 @@ def table(both: dict[str, Measured]) -> list[str]:
         cells = [" / ".join(f"{m.memories()[name][lag - 1]:.2f}" for lag in (1, 5, 25)) for m in (real, simulated)]
         gap = np.abs(real.memories()[name] - simulated.memories()[name]).mean()
         rows.append(
-            f"| autocorrelation after 1 / 5 / 25 frames, {name} | {cells[0]} | {cells[1]} | mean {gap:.3f} |"
+            f"| autocorrelation after 1 / 5 / 25 frames, {name} | {cells[0]} | {cells[1]} | mean {gap:.3f} | |"
         )
-    flat = [flatten(m.statistics) for m in (real, simulated)]
     rows.append(_distance_of_counts(real, simulated))
-    for key, name, factor, digits in NUMBERS:
-        a, b = (factor * f[key] for f in flat)
-        rows.append(f"| {name} | {a:.{digits}f} | {b:.{digits}f} | {b - a:+.{digits}f} |")
+    for name, digits, of in NUMBERS:
+        number(name, of, digits)
     number("captured, of those missed behind another, %", Measured.captured)
     distribution("affinity of right pairs", lambda m: m.affinities(True))
     distribution("affinity of wrong pairs that have one", lambda m: m.affinities(False))
     number("wrong pairs that have one, %", Measured.wrong_listed)
-    return ["| 10 / 50 / 90 % quantiles, or a number | real | simulated | distance |", "|---|---|---|---|", *rows]
+    head = "| 10 / 50 / 90 % quantiles, or a number | real | simulated | distance | seed to seed |"
+    return [head, "|---" * 5 + "|", *rows]
 
 
 def kolmogorov_smirnov(a: NDArray, b: NDArray) -> float:
@@ -182,13 +190,18 @@ def kolmogorov_smirnov(a: NDArray, b: NDArray) -> float:
     return float(np.abs(below[0] - below[1]).max())
 
 
-NUMBERS = (
-    ("false.near_per_person", "false candidates, a person and view", 1, 2),
-    ("false.far_per_view", "false candidates far from people, a view", 1, 2),
-    ("swap.instead", "found only under the mirror's name, %", 100, 2),
-    ("swap.besides", "also found under the mirror's name, %", 100, 2),
-    ("merge.half_px", "two people's joints are one below, px", 1, 1),
+def _false(m: Measured, which: str) -> float:
+    return false_candidates(m.sample, m.rig, FPS)[which]
+
+
+NUMBERS: tuple[tuple[str, int, Callable[[Measured], float]], ...] = (
+    ("false candidates, a person and view", 2, lambda m: _false(m, "near_per_person")),
+    ("false candidates far from people, a view", 2, lambda m: _false(m, "far_per_view")),
+    ("found only under the mirror's name, %", 2, lambda m: 100 * swaps(m.expected)["instead"]),
+    ("also found under the mirror's name, %", 2, lambda m: 100 * swaps(m.expected)["besides"]),
+    ("two people's joints are one below, px", 1, lambda m: merging(m.sample, m.rig)["half_px"]),
 )
+"""Name, digits, and how it is measured."""
 
 
 def _distance_of_counts(real: Measured, simulated: Measured) -> str:
@@ -196,16 +209,16 @@ def _distance_of_counts(real: Measured, simulated: Measured) -> str:
     shares = [np.bincount(np.minimum(x, 5), minlength=6) / len(x) for x in (a, b)]
     distance = 0.5 * np.abs(shares[0] - shares[1]).sum()
     means = f"{a.mean():.2f} | {b.mean():.2f}"
-    return f"| candidates of a joint in a view, mean | {means} | total variation {distance:.3f} |"
+    return f"| candidates of a joint in a view, mean | {means} | total variation {distance:.3f} | |"
 
 
-def draw(name: str, both: dict[str, Measured], panels: list[Callable[[Axes, dict[str, Measured]], None]]) -> None:
-    """A row of panels as docs/images/`name`."""
+def draw(path: Path, both: dict[str, Measured], panels: list[Callable[[Axes, dict[str, Measured]], None]]) -> None:
+    """A row of panels as an image."""
     figure, axes = plt.subplots(1, len(panels), figsize=(4.2 * len(panels), 3.6), layout="constrained")
     for axis, panel in zip(axes, panels, strict=True):
         panel(axis, both)
         axis.grid(alpha=0.3)
-    figure.savefig(IMAGES / name, dpi=100)
+    figure.savefig(path, dpi=100)
     plt.close(figure)
 
 
@@ -316,7 +329,3 @@ def wrong_shares(axis: Axes, both: dict[str, Measured]) -> None:
         xlabel="distance from the right end, limb lengths", ylabel="share with an affinity", title="Wrong pairs"
     )
     axis.legend(fontsize=7)
-
-
-if __name__ == "__main__":
-    main()
