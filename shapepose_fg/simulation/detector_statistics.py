@@ -37,7 +37,7 @@ class DetectorStatistics:
     buried: Array
     """(B,) what they add to a miss and take from a confidence, as a standard normal (probit)."""
     lost: Array
-    """(2,) share of the people in a view of whom half, or four fifths, is missed though nobody stands before them."""
+    """(2,) share of the people in a view of whom half, or four fifths, is missed though nobody hides them."""
     lost_memory: Array
     """(2, 2) as `error_memory`: how long that lasts."""
     lost_correlation: Array
