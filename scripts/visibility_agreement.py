@@ -30,23 +30,19 @@ def table() -> list[str]:
     """Shares of joints and views, and how often buffers of coarser bodies differ, as Markdown."""
     scenes = [(built_in_scene(seed), range(3 * seed, 60, 6)) for seed in (0, 1)]
     exact = np.stack([view.hidden_by for each in scenes for view in look(*each, EXACT)[0]])
-    shares = " / ".join(
-        f"{100 * share.mean():.1f}"
-        for share in (exact == NOBODY, exact == ITSELF, exact >= 0, exact == BORDER)
-    )  # fmt: skip
+    states = exact == NOBODY, exact == ITSELF, exact >= 0, exact == BORDER
+    shares = " / ".join(f"{100 * state.mean():.1f}" for state in states)
     rows = [
-        f"| of {exact.size:,} joints and views | |",
-        "|---|---|",
-        f"| visible / hidden by the body itself / by others / outside | {shares} % |",
+        f"{exact.size:,} joints and views: visible / hidden by the body itself / by others / outside {shares} %.",
+        "",
+        "| cells | visible or not differs, % | who hides differs, % | visible, % | a frame, ms |",
+        "|---" * 5 + "|",
     ]
     for cell_m in (0.02, 0.03, 0.04, 0.05):
         found = [look(*each, VisibilityConfig(cell_m=cell_m)) for each in scenes]
         quick = np.stack([view.hidden_by for views, _ in found for view in views])
-        visible, who = np.mean((quick == NOBODY) != (exact == NOBODY)), np.mean(quick != exact)
-        default = ", the default" if cell_m == VisibilityConfig().cell_m else ""
-        rows.append(
-            f"| cells of {100 * cell_m:.0f} cm{default}: visible or not, who hides differs; visible; one frame "
-            f"| {100 * visible:.1f} %, {100 * who:.1f} %; {100 * np.mean(quick == NOBODY):.1f} %; "
-            f"{np.mean([ms for _, ms in found]):.0f} ms |"
-        )
+        parts = np.mean((quick == NOBODY) != (exact == NOBODY)), np.mean(quick != exact), np.mean(quick == NOBODY)
+        cells = " | ".join(f"{100 * part:.1f}" for part in parts)
+        default = " (default)" if cell_m == VisibilityConfig().cell_m else ""
+        rows.append(f"| {100 * cell_m:.0f} cm{default} | {cells} | {np.mean([ms for _, ms in found]):.0f} |")
     return rows
