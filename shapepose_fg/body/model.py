@@ -8,6 +8,7 @@ The model's own frame: metres, y up, facing +z, T-pose.
 from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,7 +19,8 @@ from shapepose_fg.body.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.rotation import exp_so3
 from shapepose_fg.body.skinned_points import SkinnedPoints, contract
 from shapepose_fg.body.smpl_file import NUM_BETAS, SMPL_PARENTS, SmplArrays, read_smpl_file
-from shapepose_fg.skeleton import SMPL_24
+from shapepose_fg.body.target_skeletons import slots
+from shapepose_fg.skeleton import BODY_25, SMPL_24
 
 _DEFAULT_FILE = Path(__file__).parent / "data" / "open_body.npz"
 _SHAPES = {"betas": (NUM_BETAS,), "global_orient": (3,), "body_pose": (23, 3), "transl": (3,)}
@@ -63,7 +65,8 @@ class BodyParameters:
 class BodyModel:
     """A body model in SMPL's file format, ready to pose batches of bodies.
 
-    Keypoints are the 25 of BODY_25, as a detector would place them on the posed body.
+    Keypoints are the 25 of BODY_25, as a detector would place them on the posed body, or those that
+    `with_keypoints` chose.
     """
 
     joint_names: tuple[str, ...] = SMPL_24
@@ -74,7 +77,11 @@ class BodyModel:
     """Shape components in use."""
 
     def __init__(
-        self, arrays: SmplArrays, dtype: torch.dtype = torch.float32, offsets: KeypointOffsets | None = None
+        self,
+        arrays: SmplArrays,
+        dtype: torch.dtype = torch.float32,
+        offsets: KeypointOffsets | None = None,
+        keypoint_names: tuple[str, ...] = BODY_25.joints,
     ):
         """From checked arrays; most callers want `default` or `load`."""
         self._arrays = arrays
@@ -82,8 +89,14 @@ class BodyModel:
         """Floating point type of parameters and results."""
         self.keypoint_offsets = KeypointOffsets.identity() if offsets is None else offsets
         """Where the detector's joints lie against the body's; in `keypoints`, not in `vertices` and `joints`."""
-        self._keypoints = _moved(_keypoint_points(arrays), self.keypoint_offsets).to(dtype)
+        self.keypoint_names = keypoint_names
+        """(K,) names of the keypoints, some of `BODY_POINTS`."""
+        body_25 = _moved(_keypoint_points(arrays), self.keypoint_offsets).to(dtype)
         self._joints = _joint_points(arrays).to(dtype)
+        self.points = body_25.joined(_head_top(arrays).to(dtype)).joined(self._joints)
+        """All `BODY_POINTS`: BODY_25's keypoints, the top of the head, the 24 joints."""
+        self.keypoint_points = self.points.part(list(slots(keypoint_names)))
+        """The keypoints (K)."""
 
     @classmethod
     def default(cls) -> "BodyModel":
@@ -101,11 +114,19 @@ class BodyModel:
 
     def to(self, dtype: torch.dtype) -> "BodyModel":
         """The same model computing in another floating point type."""
-        return self if dtype == self.dtype else BodyModel(self._arrays, dtype, self.keypoint_offsets)
+        return self if dtype == self.dtype else self._with(dtype=dtype)
 
     def with_keypoint_offsets(self, offsets: KeypointOffsets) -> "BodyModel":
         """The same body with its keypoints where a detector puts them; takes the place of offsets it has."""
-        return BodyModel(self._arrays, self.dtype, offsets)
+        return self._with(offsets=offsets)
+
+    def with_keypoints(self, names: tuple[str, ...]) -> "BodyModel":
+        """The same body with other keypoints: a skeleton of `TARGET_SKELETONS`, or any of `BODY_POINTS`."""
+        return self._with(keypoint_names=names)
+
+    def _with(self, **changed: Any) -> "BodyModel":
+        kept = {"dtype": self.dtype, "offsets": self.keypoint_offsets, "keypoint_names": self.keypoint_names}
+        return BodyModel(self._arrays, **(kept | changed))
 
     @property
     def faces(self) -> NDArray[np.int64]:
@@ -145,22 +166,38 @@ class BodyModel:
         return self._joints.positions(rotations, parameters.betas, parameters.transl, None)
 
     def keypoints(self, parameters: BodyParameters) -> Tensor:
-        """(B, 25, 3) BODY_25 keypoints, metres: keypoint regressor x vertices, without the mesh."""
+        """(B, K, 3) keypoints, metres: keypoint regressor x vertices, without the mesh."""
         local, rotations = self._rotations(parameters)
         feature = self._blend_feature(local)
-        return self._keypoints.positions(rotations, parameters.betas, parameters.transl, feature)
+        return self.keypoint_points.positions(rotations, parameters.betas, parameters.transl, feature)
 
     @torch.no_grad()
     def keypoints_with_jacobian(self, parameters: BodyParameters) -> tuple[Tensor, Tensor]:
-        """BODY_25 keypoints (B, 25, 3) and their analytic Jacobian (B, 25, 3, 85); carries no autograd graph.
+        """Keypoints (B, K, 3) and their analytic Jacobian (B, K, 3, 85); carries no autograd graph.
 
         Columns: betas 10, global_orient 3, body_pose 23 x 3, transl 3. A rotation's columns are its right tangent
         `R <- R exp(delta)`, the rotation being the joint's own, relative to its parent.
         """
         local, rotations = self._rotations(parameters)
-        return self._keypoints.positions_with_jacobian(
+        return self.keypoint_points.positions_with_jacobian(
             rotations, parameters.betas, parameters.transl, local, self._blend_feature(local)
         )
+
+    @property
+    def offsets_of_keypoints(self) -> tuple[Tensor, Tensor] | None:
+        """What the keypoint offsets add to each keypoint (K, 3) and on which bone (K,); None where nothing."""
+        if not self.keypoint_offsets.xyz_m.any():
+            return None
+        xyz = torch.zeros(len(self.points.root), 3, dtype=self.dtype)
+        bones = torch.zeros(len(xyz), dtype=torch.long)
+        xyz[: len(BODY_25)] = torch.from_numpy(self.keypoint_offsets.xyz_m).to(self.dtype)
+        bones[: len(BODY_25)] = torch.from_numpy(self.keypoint_offsets.bones)
+        chosen = list(slots(self.keypoint_names))
+        return xyz[chosen], bones[chosen]
+
+    def rest_pelvis(self, betas: Tensor) -> Tensor:
+        """(B, 3) the pelvis of bodies (B, 10) in the T-pose, metres: what `global_orient` turns about."""
+        return self._joints.root[0] + betas @ self._joints.root_shape[:, 0]
 
     def bone_rotations(self, parameters: BodyParameters) -> Tensor:
         """(B, 24, 3, 3) world from bone: in the T-pose every bone's frame is the model's own."""
@@ -174,14 +211,11 @@ class BodyModel:
                 "convert one of them with .to(dtype)"
             )
         local = exp_so3(torch.cat((parameters.global_orient[:, None], parameters.body_pose), 1))
-        levels = [local[:, :1]]
-        for joints, parents_in_level in _TREE_LEVELS:
-            levels.append(levels[-1][:, parents_in_level] @ local[:, joints])
-        return local, torch.cat(levels, 1)[:, _FROM_LEVEL_ORDER]
+        return local, accumulate(local)
 
     def _blend_feature(self, local: Tensor) -> Tensor | None:
         """(B, 207) R - I of the joints but the pelvis; None for a model that has no use for it."""
-        if self._keypoints.offsets_pose is None:
+        if self.keypoint_points.offsets_pose is None:
             return None
         return (local[:, 1:] - torch.eye(3, dtype=local.dtype)).flatten(1)
 
@@ -252,6 +286,14 @@ def _tree_levels() -> tuple[list[tuple[list[int], list[int]]], list[int]]:
 _TREE_LEVELS, _FROM_LEVEL_ORDER = _tree_levels()
 
 
+def accumulate(local: Tensor) -> Tensor:
+    """World rotations of SMPL's bones from those relative to their parents; (B, 24, 3, 3) both."""
+    levels = [local[:, :1]]
+    for joints, parents_in_level in _TREE_LEVELS:
+        levels.append(levels[-1][:, parents_in_level] @ local[:, joints])
+    return torch.cat(levels, 1)[:, _FROM_LEVEL_ORDER]
+
+
 def _rest_joints(arrays: SmplArrays) -> NDArray[np.float64]:
     """(24, 3, 11) rest positions of the joints: mean shape, then per unit of each beta."""
     components = np.concatenate((arrays.template[..., None], arrays.shapes), -1)
@@ -274,6 +316,13 @@ def _moved(points: SkinnedPoints, offsets: KeypointOffsets) -> SkinnedPoints:
     moved = points.offsets.clone()
     moved[torch.arange(len(moved)), :, torch.from_numpy(offsets.bones)] += torch.from_numpy(offsets.xyz_m)
     return replace(points, offsets=moved)
+
+
+def _head_top(arrays: SmplArrays) -> SkinnedPoints:
+    """The top of the head: the highest vertex of the T-pose."""
+    top = np.zeros((1, len(arrays.template)))
+    top[0, np.argmax(arrays.template[:, 1])] = 1
+    return _keypoint_points(replace(arrays, keypoint_regressor=top))
 
 
 def _joint_points(arrays: SmplArrays) -> SkinnedPoints:

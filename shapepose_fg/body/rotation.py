@@ -92,3 +92,23 @@ def right_jacobian_inverse(axis_angle: Tensor) -> Tensor:
     factor = torch.where(small, series, (1 - half / half.tan()) / safe)  # (1 - t/2 cot(t/2)) / t^2
     cross = hat(axis_angle)
     return torch.eye(3, dtype=axis_angle.dtype) + 0.5 * cross + factor * (cross @ cross)
+
+
+def six_d(R: Tensor) -> Tensor:
+    """The first two columns of rotation matrices, a continuous form for networks; (..., 3, 3) -> (..., 6).
+
+    Zhou et al., "On the Continuity of Rotation Representations in Neural Networks", CVPR 2019.
+    """
+    return R[..., :2].transpose(-1, -2).flatten(-2)
+
+
+def from_six_d(columns: Tensor) -> Tensor:
+    """Rotation matrices from two columns that need be neither unit nor orthogonal; (..., 6) -> (..., 3, 3).
+
+    Gram-Schmidt; parallel or zero columns have no rotation and give NaN.
+    """
+    first, second = columns[..., :3], columns[..., 3:]
+    x = first / torch.linalg.vector_norm(first, dim=-1, keepdim=True)
+    across = second - (x * second).sum(-1, keepdim=True) * x
+    y = across / torch.linalg.vector_norm(across, dim=-1, keepdim=True)
+    return torch.stack((x, y, torch.linalg.cross(x, y)), -1)

@@ -48,6 +48,35 @@ class SkinnedPoints:
         converted = {name: value.to(dtype) for name, value in vars(self).items() if value is not None}
         return replace(self, **converted)
 
+    def part(self, rows: list[int]) -> "SkinnedPoints":
+        """Some of the points."""
+        pose = self.offsets_pose
+        return replace(
+            self,
+            offsets=self.offsets[rows],
+            offsets_shape=self.offsets_shape[:, rows],
+            offsets_pose=None if pose is None else pose[:, rows],
+            root=self.root[rows],
+            root_shape=self.root_shape[:, rows],
+            translation=self.translation[rows],
+        )
+
+    def joined(self, other: "SkinnedPoints") -> "SkinnedPoints":
+        """These points, then those of `other`, of the same body; points without pose blend shapes have zeros."""
+        poses = [points.offsets_pose for points in (self, other)]
+        if any(pose is not None for pose in poses):
+            shapes = [(207, *points.offsets.shape) for points in (self, other)]
+            poses = [torch.zeros(s) if p is None else p for s, p in zip(shapes, poses, strict=True)]
+        return replace(
+            self,
+            offsets=torch.cat((self.offsets, other.offsets)),
+            offsets_shape=torch.cat((self.offsets_shape, other.offsets_shape), 1),
+            offsets_pose=None if poses[0] is None or poses[1] is None else torch.cat((poses[0], poses[1]), 1),
+            root=torch.cat((self.root, other.root)),
+            root_shape=torch.cat((self.root_shape, other.root_shape), 1),
+            translation=torch.cat((self.translation, other.translation)),
+        )
+
     def positions(self, rotations: Tensor, betas: Tensor, transl: Tensor, pose_feature: Tensor | None) -> Tensor:
         """(B, K, 3) world positions from world rotations (B, 24, 3, 3), betas (B, 10) and transl (B, 3)."""
         terms = self._terms(rotations, self._offsets(betas, pose_feature))
@@ -73,6 +102,40 @@ class SkinnedPoints:
                 self._add_pose_blend(jacobian[part], rotations[part], local[part])
         jacobian[..., -3:] = self.translation[:, None, None] * torch.eye(3, dtype=betas.dtype)
         return position, jacobian
+
+    def positions_with_arms(
+        self, rotations: Tensor, betas: Tensor, transl: Tensor, pose_feature: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Positions (B, K, 3), and lever arms (B, K, 3, 24) from each joint to what of the point it turns.
+
+        The arms are all that `pull_back` needs: gradients at a third of the Jacobian's price.
+        """
+        arms = self._terms(rotations, self._offsets(betas, pose_feature)) @ self.subtree
+        return arms[..., 0] + self._anchor(betas, transl), arms
+
+    def pull_back(self, forces: Tensor, arms: Tensor, rotations: Tensor, local: Tensor) -> Tensor:
+        """J^T f (B, 85) of `forces` f (B, K, 3) on the points, with the columns of `positions_with_jacobian`.
+
+        Turning joint j moves what hangs on it: its gradient is the torque sum_k p_kj x f_k, in the joint's frame.
+        """
+        px, py, pz = arms.unbind(2)
+        fx, fy, fz = forces[..., None].unbind(2)
+        torque = torch.stack(((py * fz - pz * fy), (pz * fx - px * fz), (px * fy - py * fx)), 1).sum(2)
+        turns = (rotations * torque.permute(0, 2, 1)[..., None]).sum(2)  # (B, 24, 3), R_j^T torque
+        # The forces in the frame of every bone: (B, K, 3 y, 24 j).
+        columns = rotations.permute(0, 2, 3, 1).flatten(2)  # (B, 3 x, y j)
+        turned = (forces @ columns).flatten(1)
+        shape = turned @ self.offsets_shape.flatten(1).T + forces.flatten(1) @ self.root_shape.flatten(1).T
+        if self.offsets_pose is not None:
+            by_entry = (turned @ self.offsets_pose.flatten(1).T).view(-1, NUM_BONES - 1, 3, 3)
+            # d(L exp(delta)) = L hat(delta): <G, L hat(delta)> is delta times the axial part of L^T G.
+            axial = local[:, 1:].mT @ by_entry
+            turns = torch.cat((turns[:, :1], turns[:, 1:] + torch.stack((
+                axial[..., 2, 1] - axial[..., 1, 2],
+                axial[..., 0, 2] - axial[..., 2, 0],
+                axial[..., 1, 0] - axial[..., 0, 1]), -1)), 1)  # fmt: skip
+        shift = (self.translation[:, None] * forces).sum(1)
+        return torch.cat((shape, turns.flatten(1), shift), 1)
 
     def _offsets(self, betas: Tensor, pose_feature: Tensor | None) -> Tensor:
         """(B, K, 3, 24) d_kj of these bodies."""

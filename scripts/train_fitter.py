@@ -1,0 +1,132 @@
+"""Train the learned fitter's update network: python scripts/train_fitter.py cmu_smpl24.npz [--resume].
+
+Learns from the training subjects of recorded motions (CMU's .npz or a folder of AMASS files), watches the
+validation subjects, never sees the test subjects. Writes a checkpoint every few minutes, from which `--resume` goes
+on to the bit, a log (one JSON line for each validation), and at the end the weights with their card. About an hour
+on one core.
+"""
+
+import json
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import typer
+from rich.progress import Progress, TimeRemainingColumn
+
+from shapepose_fg.body.descent import LearnedDescent, gradient_scale
+from shapepose_fg.body.model import BodyModel
+from shapepose_fg.body.network import UpdateNetwork, num_weights
+from shapepose_fg.body.person_frame import PersonFrame
+from shapepose_fg.body.target_skeletons import BODY_POINTS
+from shapepose_fg.body.weights import FitterWeights, fingerprint
+from shapepose_fg.errors import InputError
+from shapepose_fg.provenance import versions
+from shapepose_fg.training.checkpoint import load_checkpoint, save_checkpoint
+from shapepose_fg.training.motions import Motions, load_motions
+from shapepose_fg.training.split import TEST_SUBJECTS, VALIDATION_SUBJECTS
+from shapepose_fg.training.train import PeopleSource, Trainer, TrainingConfig, body_points, prepared
+
+VALIDATION_PEOPLE = 2048
+ACKNOWLEDGEMENT = (
+    "The data used in this project was obtained from mocap.cs.cmu.edu. "
+    "The database was created with funding from NSF EIA-0196217."
+)
+
+
+def main(
+    motions: Annotated[Path, typer.Argument(help="cmu_smpl24.npz, or a folder of AMASS .npz files.")],
+    output: Annotated[Path, typer.Option(help="Where the weights go.")] = Path("fitter.safetensors"),
+    body: Annotated[Path | None, typer.Option(help="SMPL file to train for; the open body without.")] = None,
+    iterations: Annotated[int, typer.Option(min=1, help="Batches in all.")] = TrainingConfig.iterations,
+    batch: Annotated[int, typer.Option(min=1, help="People in each.")] = TrainingConfig.batch,
+    seed: Annotated[int, typer.Option(help="Of everything that is drawn.")] = 0,
+    threads: Annotated[int, typer.Option(min=1, help="CPU threads.")] = 1,
+    validate_every: Annotated[int, typer.Option(min=1, help="Iterations between validations.")] = 500,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint beside the output.")] = False,
+) -> None:
+    """Train, validate, write."""
+    torch.set_num_threads(threads)
+    config = replace(TrainingConfig(), iterations=iterations, batch=batch, seed=seed)
+    model = BodyModel.default() if body is None else BodyModel.load(body)
+    recorded = load_motions(motions)
+    train = recorded.of("train")
+    frame = PersonFrame.of(model, train.poses, train.weight)
+    trainer = _trainer(recorded, model, frame, config)
+    checkpoint, log = output.with_suffix(".checkpoint"), output.with_suffix(".log")
+    if resume:
+        load_checkpoint(trainer, checkpoint)
+    elif checkpoint.exists():
+        raise InputError(f"{checkpoint}: there is a run already; go on with --resume, or remove it")
+    validation = _people_to_validate(recorded, model, frame, config)
+    columns = (*Progress.get_default_columns()[:-1], TimeRemainingColumn())
+    with Progress(*columns) as progress:
+        bar = progress.add_task("training", total=iterations, completed=trainer.iteration)
+        for errors in trainer.run(iterations - trainer.iteration):
+            progress.update(bar, advance=1, description=f"joints {errors[-1]:.0f} mm")
+            if trainer.iteration % validate_every == 0 or trainer.iteration == iterations:
+                line = {"iteration": trainer.iteration, "time": round(time.time())}
+                line |= {"validation_mm": [round(error, 2) for error in validation(trainer.averaged)]}
+                with log.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(line) + "\n")
+                save_checkpoint(trainer, checkpoint)
+    card = _card(trainer, recorded, motions, validation(trainer.averaged))
+    trainer.averaged.requires_grad_(False)
+    FitterWeights(trainer.averaged.eval().cpu(), frame, fingerprint(model), card).save(output)
+    print(f"{output}: {output.stat().st_size / 1e6:.1f} MB, {num_weights(trainer.averaged)} weights")
+
+
+def _trainer(recorded: Motions, model: BodyModel, frame: PersonFrame, config: TrainingConfig) -> Trainer:
+    """A run that has not begun; the network lives on a GPU where there is one, the bodies on the CPU."""
+    torch.manual_seed(config.seed)
+    network = UpdateNetwork(config.network)
+    network.gradient_scale.copy_(gradient_scale(model.points, tuple(range(25))))
+    network.to("cuda" if torch.cuda.is_available() else "cpu")
+    return Trainer(PeopleSource(recorded.of("train"), model, frame, config), frame, network, config)
+
+
+def _people_to_validate(recorded: Motions, model: BodyModel, frame: PersonFrame, config: TrainingConfig):
+    """A function: the mean joint error in mm after each step of a network, on the same people each time."""
+    still = replace(config, shake_rad=0.0, exchange=0.0)
+    source = PeopleSource(recorded.of("validation"), model, frame, still)
+    generator = torch.Generator().manual_seed(1)
+    people = source.draw(VALIDATION_PEOPLE, generator)
+    targets, start, _, true_points = prepared(people, frame, still, generator)
+    everything = tuple(range(len(BODY_POINTS)))
+
+    @torch.no_grad()
+    def errors(network: UpdateNetwork) -> list[float]:
+        network.eval()
+        descent = LearnedDescent(model.points, everything, network, config.kernel_scale)
+        distances = [body_points(model, state) - true_points for state in descent.unroll(start, targets)]
+        return [1000 * float(torch.linalg.vector_norm(distance, dim=-1).mean()) for distance in distances]
+
+    return errors
+
+
+def _card(trainer: Trainer, recorded: Motions, motions: Path, errors: list[float]) -> dict[str, str]:
+    """What a reader of the weights wants to know."""
+    train = recorded.of("train")
+    commit = subprocess.run(
+        ["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=False
+    )
+    return {
+        "data": f"{motions.name}: {len(train)} frames of {len(set(train.subject.tolist()))} subjects for training",
+        "not seen": f"validation subjects {' '.join(VALIDATION_SUBJECTS)}, test subjects {' '.join(TEST_SUBJECTS)}",
+        "command": " ".join(["python", "scripts/train_fitter.py", motions.name, *sys.argv[2:]]),
+        "settings": json.dumps({"iterations": trainer.config.iterations, "batch": trainer.config.batch}),
+        "validation": "mean joint error after each step, mm: " + ", ".join(f"{error:.1f}" for error in errors),
+        "acknowledgement": ACKNOWLEDGEMENT,
+        "made with": json.dumps(versions()) + " " + commit.stdout.strip(),
+    }
+
+
+if __name__ == "__main__":
+    try:
+        typer.run(main)
+    except InputError as error:
+        sys.exit(str(error))

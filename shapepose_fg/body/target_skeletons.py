@@ -1,0 +1,42 @@
+"""Which points of a body a detector's joints are: one list of all, and the skeletons as parts of it."""
+
+from shapepose_fg.skeleton import BODY_25, SMPL_24
+
+HEAD_TOP = "Head"
+"""HALPE's top of the head."""
+
+BODY_POINTS: tuple[str, ...] = (*BODY_25.joints, HEAD_TOP, *SMPL_24)
+"""(K,) every point that a body can be fitted to: BODY_25's, HALPE's top of the head, SMPL's own joints."""
+
+_LIMB_JOINTS = "LShoulder RShoulder LElbow RElbow LWrist RWrist LHip RHip LKnee RKnee LAnkle RAnkle".split()
+_COCO_17 = ("Nose", "LEye", "REye", "LEar", "REar", *_LIMB_JOINTS)
+_HALPE_FEET = "LBigToe RBigToe LSmallToe RSmallToe LHeel RHeel".split()
+
+TARGET_SKELETONS: dict[str, tuple[str, ...]] = {
+    "BODY_25": BODY_25.joints,
+    "COCO_17": _COCO_17,
+    "HALPE_26": (*_COCO_17, HEAD_TOP, "Neck", "MidHip", *_HALPE_FEET),
+    "SMPL_24": SMPL_24,
+}
+"""Names of the joints of each skeleton, in its own order, as `BODY_POINTS` calls them."""
+
+
+def _mirrored(name: str) -> str:
+    """The same point on the other side of the body."""
+    if name in SMPL_24:
+        side, _, part = name.partition("_")
+        swap = {"left": "right", "right": "left"}
+        return f"{swap[side]}_{part}" if side in swap else name
+    return BODY_25.joints[BODY_25.mirror[BODY_25.index(name)]] if name in BODY_25.joints else name
+
+
+MIRROR: tuple[int, ...] = tuple(BODY_POINTS.index(_mirrored(name)) for name in BODY_POINTS)
+"""(K,) the same point on the other side of the body; one in the middle is its own mirror."""
+
+
+def slots(names: tuple[str, ...]) -> tuple[int, ...]:
+    """Places of points among `BODY_POINTS`; ValueError naming what is not there."""
+    unknown = [name for name in names if name not in BODY_POINTS]
+    if unknown:
+        raise ValueError(f"a body has no {' '.join(unknown)}; it has {' '.join(BODY_POINTS)}")
+    return tuple(BODY_POINTS.index(name) for name in names)
