@@ -2,7 +2,8 @@
 
 Reconstructs the Shelf recording (or another one, or the built-in scene where there is no recording) in the
 batches that the pipeline makes, and prints the median over the batches, the mean over all frames, where stage
-II's time goes, and ratios of settings against each other. Run it on a machine that does nothing else.
+II's time goes, and ratios of settings against each other; with --simulate NAME, how fast a recording is simulated
+instead, with one worker and with two. Run it on a machine that does nothing else.
 """
 
 import argparse
@@ -26,7 +27,8 @@ from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.provenance import versions
-from shapepose_fg.simulation import built_in_scene, simulate
+from shapepose_fg.simulated import NAMES, cut, named_scene
+from shapepose_fg.simulation import Scene, built_in_scene, simulate
 
 STAGES = ("read", "triangulate", "vote", "propose", "associate", "refine")
 PARTS = {
@@ -101,10 +103,17 @@ def main() -> None:
     parser.add_argument("--frames", type=int, help="the first frames only (default: all)")
     parser.add_argument("--threads", type=int, default=PipelineConfig().threads, help="threads of torch")
     parser.add_argument("--rounds", type=int, default=3, help="how often settings are compared; 0: not at all")
+    parser.add_argument(
+        "--simulate", metavar="NAME", choices=NAMES, help="time the simulator on this scene instead"
+    )
     arguments = parser.parse_args()
 
     console = Console()
     config = replace(PipelineConfig(), threads=arguments.threads)
+    if arguments.simulate is not None:
+        console.print(_machine(config), highlight=False)
+        console.print(_simulation_table(arguments.simulate, arguments.frames or 600))
+        return
     recording = _scene() if arguments.scene or arguments.data is None else _read(arguments.data)
     count = len(recording.detections)
     frames = range(count if arguments.frames is None else min(arguments.frames, count))
@@ -166,6 +175,28 @@ def ratios(
             people = reconstruct(recording.detections, recording.rig, other, frames=frames, fitter=fitter)
             best[name] = min(best[name], sum(people.run["seconds"].values()))
     return {name: spent / best[here] for name, spent in best.items()}
+
+
+def simulation_speed(scene: Scene, workers: int) -> tuple[float, float]:
+    """Frames a second, and CPU milliseconds a frame of all processes together (where the system counts them)."""
+    before, start = os.times(), time.perf_counter()
+    simulate(scene, workers=workers)
+    seconds, after = time.perf_counter() - start, os.times()
+    return len(scene) / seconds, 1e3 * (sum(after[:4]) - sum(before[:4])) / len(scene)
+
+
+def _simulation_table(name: str, frames: int) -> Table:
+    """The first frames of a scene, with one worker and with two."""
+    whole = named_scene(name, frames=frames)
+    scene = cut(whole, range(min(frames, len(whole))))
+    title = f"simulate {name}: {len(scene)} frames, {len(scene.rig)} cameras, {scene.people} people"
+    table = Table(title=title, title_justify="left")
+    for column in ("workers", "frames a second", "CPU ms a frame", "ratio"):
+        table.add_column(column, justify="right")
+    alone = simulation_speed(scene, 1)
+    for workers, (speed, cpu_ms) in ((1, alone), (2, simulation_speed(scene, 2))):
+        table.add_row(str(workers), f"{speed:.1f}", f"{cpu_ms:.1f}", f"{speed / alone[0]:.2f}")
+    return table
 
 
 def _default_data() -> Path | None:

@@ -115,7 +115,7 @@ def first_surface_at(
 
 
 def _as_opengl(points: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:
-    """Where a camera of 1 radian of height, y up, z back, sees alike what are (3, N) in camera coordinates: (N, 3)."""
+    """(N, 3) of points (3, N) in camera coordinates, where a camera of 1 radian, y up, z back, sees them alike."""
     (width, height), K = camera.image_size, camera.K
     focal = height / 2 / np.tan(0.5)
     # OpenCV's pixels have their centres at halves there; a shear moves the principal point to the middle.

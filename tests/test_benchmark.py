@@ -71,3 +71,11 @@ def test_median_and_mean_of_unequal_batches(benchmark):
     timing = benchmark.Timing(np.array([2, 2, 1]), 0, seconds)
     assert timing.median_ms("vote") == pytest.approx(20.0)  # of 10, 20 and 30 ms a frame
     assert timing.mean_ms("vote") == pytest.approx(18.0)  # 90 ms over 5 frames
+
+
+def test_prints_how_fast_it_simulates(benchmark, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["benchmark.py", "--simulate", "demo", "--frames", "4"])
+    benchmark.main()
+    rows = [line.split() for line in capsys.readouterr().out.splitlines() if "│" in line]
+    assert [row[1] for row in rows] == ["1", "2"]  # workers
+    assert rows[0][-2] == "1.00" and all(float(cell) > 0 for row in rows for cell in row[3::2] if cell != "│")
