@@ -1,9 +1,9 @@
 """The energy of a body given joint targets, and its Gauss-Newton linearisation, batched over rows.
 
-    E(Theta) = sum_i rho(|S_i (x_i(Theta) - z_i)|²) + |betas|² + |theta - mean|²_P
+    E(Theta) = sum_i rho(|S_i (x_i(Theta) - z_i)|²) + |betas|² - 2 log p(theta) + constant
 
-with S_iᵀ S_i the information of target z_i, rho a robust kernel, P the pose prior's precision: SMPLify (Bogo et
-al. 2016) for 3D joints. There is no factor 1/2, so that the inverse of the Hessian below is a covariance.
+with S_iᵀ S_i the information of target z_i, rho a robust kernel, p the pose prior, a Gaussian mixture: SMPLify
+(Bogo et al. 2016) for 3D joints. There is no factor 1/2, so that the inverse of the Hessian below is a covariance.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from shapepose_fg.body.model import BodyModel, BodyParameters
-from shapepose_fg.body.pose_prior import PosePrior
+from shapepose_fg.body.pose_energy import PoseEnergy
+from shapepose_fg.body.pose_prior import NUM_ANGLES, PosePrior
 from shapepose_fg.body.rotation import exp_so3, log_so3, right_jacobian
 
 VISIBLE_M_PER_RAD = 1e-3
@@ -80,7 +81,7 @@ class BodyEnergy:
 
     It holds betas, root orientation, angles, translation. The angles are the axis-angles of joints that some
     keypoint can see. The others (hands) have no evidence: the prior's marginal over the visible angles accounts
-    for them exactly, and `complete` fills them in with their regression.
+    for them exactly, and `complete` fills them in with what it expects of them.
     """
 
     def __init__(self, model: BodyModel, prior: PosePrior):
@@ -91,12 +92,9 @@ class BodyEnergy:
         self.num_angles = len(self.angles)
         self.num_free = 10 + 3 + self.num_angles + 3
         self._angle_slice = slice(13, 13 + self.num_angles)
-        hidden = np.setdiff1d(np.arange(69), self.angles)
-        self._hidden = torch.from_numpy(hidden)
+        self._hidden = torch.from_numpy(np.setdiff1d(np.arange(NUM_ANGLES), self.angles))
         self._visible = torch.from_numpy(self.angles)
-        self._regression = self._tensor(prior.regression(self.angles, hidden))
-        self._mean = self._tensor(prior.mean)
-        self._precision = self._tensor(prior.marginal_precision(self.angles))
+        self._pose = PoseEnergy(prior, self.angles, self.dtype)
         # From free parameters to the model's 85 columns: identity, but right Jacobians for the angles.
         spread = torch.zeros(10 + 72 + 3, self.num_free, dtype=self.dtype)
         spread[:13, :13] = torch.eye(13)
@@ -107,25 +105,19 @@ class BodyEnergy:
         place = torch.arange(len(visible))
         self._block_rows = (13 + 3 * joint[:, None] + within)[:, :, None]
         self._block_columns = (13 + 3 * place[:, None] + within)[:, None, :]
-        self._prior_hessian = torch.zeros(self.num_free, self.num_free, dtype=self.dtype)
-        self._prior_hessian[:10, :10] = torch.eye(10)
-        self._prior_hessian[self._angle_slice, self._angle_slice] = self._precision
-
-    def _tensor(self, array: np.ndarray) -> Tensor:
-        return torch.from_numpy(np.ascontiguousarray(array)).to(self.dtype)
 
     def complete(self, free: Tensor) -> BodyParameters:
         """The body (B rows) of free parameters (B, P); invisible joints are where the prior expects them."""
         angles = free[:, self._angle_slice]
-        pose = self._mean.repeat(len(free), 1)
+        pose = free.new_empty(len(free), NUM_ANGLES)
         pose[:, self._visible] = angles
-        pose[:, self._hidden] += (angles - self._mean[self._visible]) @ self._regression.T
+        pose[:, self._hidden] = self._pose.hidden(angles)
         return BodyParameters(free[:, :10], free[:, 10:13], pose.unflatten(1, (23, 3)), free[:, -3:])
 
     def retract(self, free: Tensor, step: Tensor) -> Tensor:
         """Move by a step (B, P): the orientation by R exp(step), all else by addition.
 
-        Angles are added to as vectors, for in them the pose prior is exactly quadratic.
+        Angles are added to as vectors, for in them the pose prior's components are exactly quadratic.
         """
         moved = free + step
         moved[:, 10:13] = log_so3(exp_so3(free[:, 10:13]) @ exp_so3(step[:, 10:13]))
@@ -139,12 +131,24 @@ class BodyEnergy:
         spread[:, self._block_rows, self._block_columns] = blocks
         return xyz, jacobian.flatten(1, 2) @ spread
 
-    def linearise(self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor) -> Linearisation:
-        """Energy, gradient and Hessian at free parameters (B, P), with the kernel's scale (B, 1)."""
-        return self.linearise_at(free, *self.keypoints_with_jacobian(free), targets, kernel_scale)
+    def linearise(
+        self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor, anchor: Tensor | None = None
+    ) -> Linearisation:
+        """Energy, gradient and Hessian at free parameters (B, P), with the kernel's scale (B, 1).
+
+        With an `anchor` (B, P), shape and pose are held around it instead of where the priors expect them, as
+        tightly as the priors hold there: for a body that something else than the priors has guessed.
+        """
+        return self.linearise_at(free, *self.keypoints_with_jacobian(free), targets, kernel_scale, anchor)
 
     def linearise_at(
-        self, free: Tensor, xyz: Tensor, jacobian: Tensor, targets: WhitenedTargets, kernel_scale: Tensor
+        self,
+        free: Tensor,
+        xyz: Tensor,
+        jacobian: Tensor,
+        targets: WhitenedTargets,
+        kernel_scale: Tensor,
+        anchor: Tensor | None = None,
     ) -> Linearisation:
         """The same where keypoints `xyz` and their `jacobian` are known already."""
         residual = (targets.root @ (xyz - targets.xyz)[..., None]).squeeze(-1)
@@ -153,17 +157,22 @@ class BodyEnergy:
         root = weight[..., None] * targets.root
         rows = (root @ jacobian.unflatten(1, xyz.shape[1:])).flatten(1, 2)
         gradient = (rows.mT @ (weight * residual).flatten(1)[..., None]).squeeze(-1)
-        hessian = rows.mT @ rows + self._prior_hessian
-        prior = self._add_priors(free, gradient)
+        hessian = rows.mT @ rows
+        prior = self._add_priors(free, gradient, hessian, anchor)
         return Linearisation(squared, prior, gradient, hessian)
 
-    def _add_priors(self, free: Tensor, gradient: Tensor) -> Tensor:
-        """Add the gradients of shape and pose prior in place; returns their energy (B,)."""
-        betas, error = free[:, :10], free[:, self._angle_slice] - self._mean[self._visible]
-        pull = error @ self._precision
+    def _add_priors(self, free: Tensor, gradient: Tensor, hessian: Tensor, anchor: Tensor | None) -> Tensor:
+        """Add the gradients and Hessians of shape and pose prior in place; returns their energy (B,)."""
+        if anchor is None:
+            betas, pose = free[:, :10], self._pose(free[:, self._angle_slice])
+        else:
+            betas = free[:, :10] - anchor[:, :10]
+            pose = self._pose.around(anchor[:, self._angle_slice], free[:, self._angle_slice])
         gradient[:, :10] += betas
-        gradient[:, self._angle_slice] += pull
-        return betas.square().sum(-1) + (pull * error).sum(-1)
+        gradient[:, self._angle_slice] += pose.gradient
+        torch.diagonal(hessian, dim1=-2, dim2=-1)[:, :10] += 1
+        hessian[:, self._angle_slice, self._angle_slice] += pose.hessian
+        return betas.square().sum(-1) + pose.energy
 
 
 def visible_joints(model: BodyModel, prior: PosePrior) -> np.ndarray:

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from scipy.stats import multivariate_normal
 
 from shapepose_fg.body.alignment import RestAlignment
 from shapepose_fg.body.energy import (
@@ -14,6 +15,7 @@ from shapepose_fg.body.energy import (
 from shapepose_fg.body.evidence import EvidenceConfig, spread_m, weigh
 from shapepose_fg.body.fitter import JointTargets
 from shapepose_fg.body.model import BodyModel, BodyParameters
+from shapepose_fg.body.pose_energy import PoseEnergy
 from shapepose_fg.body.pose_prior import PosePrior
 from shapepose_fg.skeleton import BODY_25, SMPL_24
 
@@ -28,6 +30,16 @@ def model() -> BodyModel:
 @pytest.fixture(scope="module")
 def energy(model) -> BodyEnergy:
     return BodyEnergy(model, PosePrior.default())
+
+
+@pytest.fixture(scope="module")
+def apart() -> PosePrior:
+    """Three broad components with hands that go with the arms, unlike the default's."""
+    rng = np.random.default_rng(0)
+    A = 0.3 * rng.normal(size=(3, 69, 69)) / np.sqrt(69)
+    covariances = 0.2 * np.eye(69) + A @ A.swapaxes(1, 2)
+    free = np.full(69, np.inf)
+    return PosePrior(np.array([0.5, 0.3, 0.2]), rng.normal(0, 0.1, (3, 69)), covariances, -free, free, "test")
 
 
 @pytest.fixture
@@ -86,8 +98,9 @@ def test_hessian_is_information_and_priors(energy, free, targets):
     J = jacobian.unflatten(1, (25, 3))
     expected = torch.einsum("bkip,bkij,bkjq->bpq", J, information, J)
     expected[:, :10, :10] += torch.eye(10)
-    precision = torch.from_numpy(PosePrior.default().marginal_precision(energy.angles))
-    expected[:, 13:-3, 13:-3] += precision
+    expected[:, 13:-3, 13:-3] += PoseEnergy(PosePrior.default(), energy.angles, torch.float64)(
+        free[:, 13:-3]
+    ).hessian
     torch.testing.assert_close(energy.linearise(free, targets, wide).hessian, expected)
 
 
@@ -106,22 +119,49 @@ def test_hands_are_invisible_and_limbs_are_not(model):
     assert {"left_hip", "right_knee", "left_ankle", "right_shoulder", "left_elbow", "neck", "spine2"} <= names
 
 
-def test_invisible_joints_follow_the_prior(model):
-    rng = np.random.default_rng(0)
-    default, A = (
-        PosePrior.default(),
-        rng.normal(size=(69, 69)),
-    )  # hands that go with the arms, unlike the default's
-    prior = PosePrior(default.mean, default.covariance + 1e-3 * A @ A.T, default.lower, default.upper, "test")
-    energy = BodyEnergy(model, prior)
-    free = torch.from_numpy(rng.normal(size=(ROWS, energy.num_free)) * 0.3)
+def test_invisible_joints_are_where_the_prior_expects_them(model, apart):
+    energy = BodyEnergy(model, apart)
+    free = torch.from_numpy(np.random.default_rng(0).normal(size=(ROWS, energy.num_free)) * 0.3)
     pose = energy.complete(free).body_pose.reshape(ROWS, 69).numpy()
     hidden = np.setdiff1d(np.arange(69), energy.angles)
     assert len(hidden) > 0
     np.testing.assert_allclose(pose[:, energy.angles], free[:, 13:-3])
-    # The most probable hidden angles given the others leave the prior's energy no slope there.
-    slope = (pose - prior.mean) @ prior.precision
-    np.testing.assert_allclose(slope[:, hidden], 0, atol=1e-8)
+    for row, angles in enumerate(free[:, 13:-3].numpy()):
+        expected, total = 0, 0
+        for w, mean, S in zip(apart.weights, apart.means, apart.covariances, strict=True):
+            seen = S[np.ix_(energy.angles, energy.angles)]
+            share = w * multivariate_normal(mean[energy.angles], seen).pdf(angles)
+            pull = np.linalg.solve(seen, angles - mean[energy.angles])
+            expected = expected + share * (mean[hidden] + S[np.ix_(hidden, energy.angles)] @ pull)
+            total += share
+        np.testing.assert_allclose(pose[row, hidden], expected / total, atol=1e-9)
+
+
+def test_pose_energy_is_the_density_of_the_visible_angles(energy, apart):
+    rng = np.random.default_rng(0)
+    pose = PoseEnergy(apart, energy.angles, torch.float64)
+    angles = torch.from_numpy(rng.normal(0, 0.4, (6, energy.num_angles))).requires_grad_()
+    pull = pose(angles)
+    seen = (slice(None), energy.angles[:, None], energy.angles)
+    parts = zip(apart.weights, apart.means[:, energy.angles], apart.covariances[seen], strict=True)
+    log_density = np.log(sum(w * multivariate_normal(mean, S).pdf(angles.detach()) for w, mean, S in parts))
+    shift = pull.energy.detach().numpy() + 2 * log_density
+    np.testing.assert_allclose(shift, shift[0])  # equal up to a constant
+    assert pull.energy.min() >= 0
+    (slope,) = torch.autograd.grad(pull.energy.sum(), angles)
+    torch.testing.assert_close(pull.gradient.detach(), slope / 2)
+    assert torch.linalg.eigvalsh(pull.hessian)[:, 0].min() > 0
+
+
+def test_pose_energy_of_one_gaussian_is_its_squared_distance(energy, apart):
+    S, mean = apart.covariances[:1], apart.means[:1]
+    free = np.full(69, np.inf)
+    pose = PoseEnergy(PosePrior(np.ones(1), mean, S, -free, free, "test"), energy.angles, torch.float64)
+    error = np.random.default_rng(0).normal(0, 0.4, (4, energy.num_angles))
+    pull = pose(torch.from_numpy(mean[:, energy.angles] + error))
+    P = np.linalg.inv(S[0][np.ix_(energy.angles, energy.angles)])
+    np.testing.assert_allclose(pull.energy, np.einsum("bi,ij,bj->b", error, P, error))
+    np.testing.assert_allclose(pull.hessian, np.broadcast_to(P, (4, *P.shape)))
 
 
 def test_orientation_moves_on_the_sphere_of_rotations(energy, free):
