@@ -1,11 +1,14 @@
-"""Which joints of a recording are known well enough to learn the detector's habits from."""
+"""Which joints of a recording are known well enough to learn the detector's habits from, and who uses them."""
 
 from dataclasses import dataclass, field
+from typing import Protocol, Self, runtime_checkable
 
 import numpy as np
 
 from factors import determined
-from shapepose_fg.body.fitter import JointTargets
+from shapepose_fg.body.fitter import BodyFitter, JointTargets
+from shapepose_fg.body.keypoint_offsets import KeypointOffsets
+from shapepose_fg.body.model import BodyModel
 from shapepose_fg.body.offset_estimation import OffsetPrior
 from shapepose_fg.camera import Rig
 from shapepose_fg.observations import ObservationConfig, Observations, observation_sigmas, triangulate, weigh
@@ -18,7 +21,7 @@ class OffsetConfig:
     source: str = "recording"
     """"recording": learnt from the recording itself; "none": there is none; else a file that holds offsets:
     the run.json of another recording by the same detector, or what `KeypointOffsets.save` wrote."""
-    frames: int = 60
+    frames: int = 30
     """Frames, spread over the whole recording, that offsets are learnt from."""
     min_views: int = 3
     """Views that must agree on a joint for it to be learnt from: two that agree may both be wrong."""
@@ -37,6 +40,18 @@ class OffsetConfig:
             raise ValueError(f"min_confidence must be between 0 and 1, got {self.min_confidence}")
         if self.source == "":
             raise ValueError('source must be "recording", "none" or a file, got nothing')
+
+
+@runtime_checkable
+class AdjustableFitter(BodyFitter, Protocol):
+    """A body fitter that can be told where its detector puts the joints."""
+
+    model: BodyModel
+    """The body that it fits."""
+
+    def with_keypoint_offsets(self, offsets: KeypointOffsets) -> Self:
+        """The same fitter, its joints moved by `offsets`."""
+        ...
 
 
 def spread_frames(length: int, count: int) -> list[int]:

@@ -10,19 +10,22 @@ from typing import Any
 import numpy as np
 
 from shapepose_fg.association import AssociationConfig, associate
-from shapepose_fg.body.baseline import PlainFitterConfig
+from shapepose_fg.body.baseline import LevenbergMarquardtFitter, PlainFitterConfig
 from shapepose_fg.body.fitter import BodyFitter
+from shapepose_fg.body.keypoint_offsets import KeypointOffsets
+from shapepose_fg.body.offset_estimation import learn_offsets
 from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.camera import Rig
 from shapepose_fg.candidates import CandidateConfig, triangulate_pairs, vote
 from shapepose_fg.detections import Detections, DetectionSequence
+from shapepose_fg.detector_offsets import AdjustableFitter, OffsetConfig, confident_targets, spread_frames
 from shapepose_fg.observations import ObservationConfig, Observations
 from shapepose_fg.person_graph import PersonGraphConfig
 from shapepose_fg.proposals import ProposalConfig, propose
 from shapepose_fg.provenance import versions
 from shapepose_fg.reconstruction import Reconstruction
 from shapepose_fg.refine import ExtraFactors, RefineConfig, Refined, refine
-from shapepose_fg.skeleton import Skeleton
+from shapepose_fg.skeleton import BODY_25, Skeleton
 
 Progress = Callable[[int, int], None]
 """Called with the number of frames that are done and the number of all."""
@@ -44,6 +47,8 @@ class PipelineConfig:
     """Stage II: the factor graph of a person."""
     body: PlainFitterConfig = field(default_factory=PlainFitterConfig)
     """Stage II: how bodies are fitted."""
+    offsets: OffsetConfig = field(default_factory=OffsetConfig)
+    """Stage II: where the detector puts its joints on the body."""
     refine: RefineConfig = field(default_factory=RefineConfig)
     """Stage II: the alternation."""
     batch_frames: int = 64
@@ -73,7 +78,9 @@ def reconstruct(
     `frames` picks frames of the recording (all of them by default). `fitter` replaces the body fitter, and
     `extra_factors` adds factors of your own to every person's graph. In the result a person's number counts the
     people of a frame; it is not an identity over time. `run` of the result holds the configuration, versions,
-    seconds per stage, and how many people were found and dropped, with reasons.
+    seconds per stage, how many people were found and dropped, with reasons, and where the detector's joints lie
+    on the body. That is learnt from frames of the whole recording, whatever `frames` picks, so that a frame comes
+    out the same alone and among others; a fitter of your own takes part if it is an `AdjustableFitter`.
     """
     config = PipelineConfig() if config is None else config
     frames = range(len(detections)) if frames is None else frames
@@ -82,15 +89,44 @@ def reconstruct(
     run = _Run()
     with run.stage("load"):
         fitter = _default_fitter(config) if fitter is None else fitter
+    found: dict[int, Observations] = {}
     parts = []
     with torch_threads(config.threads):
+        offsets = _offsets(detections, rig, config, frames, fitter, found, run)
+        if isinstance(fitter, AdjustableFitter) and offsets is not None:
+            fitter = fitter.with_keypoint_offsets(offsets)
         for start in range(0, len(frames), config.batch_frames):
             batch = frames[start : start + config.batch_frames]
-            parts.append(_reconstruct_batch(detections, rig, config, batch, fitter, extra_factors, run))
+            parts.append(_reconstruct_batch(detections, rig, config, batch, fitter, extra_factors, found, run))
             if progress is not None:
                 progress(start + len(batch), len(frames))
     people = Reconstruction.concatenate(parts) if parts else Reconstruction.empty(detections.skeleton.joints)
-    return replace(people, run=run.summary(config, frames, people))
+    summary = run.summary(config, frames, people)
+    return replace(people, run=summary | {"keypoint_offsets": None if offsets is None else offsets.as_dict()})
+
+
+def estimate_offsets(
+    detections: DetectionSequence,
+    rig: Rig,
+    config: PipelineConfig | None = None,
+    *,
+    fitter: AdjustableFitter | None = None,
+) -> KeypointOffsets:
+    """Where the detector of a recording puts its joints on the body, learnt without any truth.
+
+    From frames spread over the recording and joints that at least three views see well; what `reconstruct` does
+    by itself. `fitter` says on which body, by default the shipped one. `config.offsets.source` is not looked at.
+    """
+    config = PipelineConfig() if config is None else config
+    fitter = _default_fitter(config) if fitter is None else fitter
+    config = replace(config, offsets=replace(config.offsets, source="recording"))
+    with torch_threads(config.threads):
+        offsets = _offsets(detections, rig, config, range(0), fitter, {}, _Run())
+    if offsets is None:
+        raise ValueError(
+            f"offsets are known for {BODY_25.name} only, these are joints of {detections.skeleton.name}"
+        )
+    return offsets
 
 
 def find_people(
@@ -118,20 +154,20 @@ def _reconstruct_batch(
     frames: range,
     fitter: BodyFitter,
     extra_factors: ExtraFactors | None,
+    found: dict[int, Observations],
     run: "_Run",
 ) -> Reconstruction:
-    """Stage I frame by frame, then stage II for all people of these frames together."""
-    found = []
-    for index in frames:
-        with run.stage("read"):
-            seen = detections[index]
-        found.append(find_people(seen, rig, detections.skeleton, config, run))
-    counts = np.array([len(observations) for observations in found])
+    """Stage I frame by frame, then stage II for all people of these frames together.
+
+    Frames whose people are `found` already are not looked at again.
+    """
+    parts = [found.pop(t) if t in found else _look(detections, t, rig, config, run) for t in frames]
+    counts = np.array([len(observations) for observations in parts])
     frame = np.repeat(np.array(frames), counts)
     person = np.arange(len(frame)) - np.repeat(np.cumsum(counts) - counts, counts)
     with run.stage("refine"):
         refined = refine(
-            Observations.concatenate(found),
+            Observations.concatenate(parts),
             rig,
             fitter,
             config.observations,
@@ -142,6 +178,47 @@ def _reconstruct_batch(
             extra_factors=extra_factors,
         )
     return _rows(refined, frame, person, detections.skeleton)
+
+
+def _look(
+    detections: DetectionSequence, frame: int, rig: Rig, config: PipelineConfig, run: "_Run"
+) -> Observations:
+    """Read a frame, and stage I."""
+    with run.stage("read"):
+        seen = detections[frame]
+    return find_people(seen, rig, detections.skeleton, config, run)
+
+
+def _offsets(
+    detections: DetectionSequence,
+    rig: Rig,
+    config: PipelineConfig,
+    frames: range,
+    fitter: BodyFitter,
+    found: dict[int, Observations],
+    run: "_Run",
+) -> KeypointOffsets | None:
+    """Where the detector puts its joints; None where nobody asks. Fills `found` with people of `frames`."""
+    source = config.offsets.source
+    if source == "none":
+        return None
+    if not isinstance(fitter, AdjustableFitter) or detections.skeleton != BODY_25:
+        if source == "recording":
+            return None
+        raise ValueError(f"offsets of {source} need a fitter with `with_keypoint_offsets` and joints of BODY_25")
+    if source != "recording":
+        return KeypointOffsets.load(source)
+    spread = spread_frames(len(detections), config.offsets.frames)
+    for frame in spread:
+        if frame in frames:
+            found[frame] = _look(detections, frame, rig, config, run)
+    with run.stage("offsets"):
+        # What was found elsewhere is not this run's: neither its stages nor what it dropped.
+        people = [found[t] if t in frames else _look(detections, t, rig, config, _Run()) for t in spread]
+        if len(people) == 0:
+            return KeypointOffsets.identity()
+        targets = confident_targets(Observations.concatenate(people), rig, config.observations, config.offsets)
+        return learn_offsets(targets, fitter.model, config=config.body, prior=config.offsets.prior)
 
 
 def _rows(refined: Refined, frame: np.ndarray, person: np.ndarray, skeleton: Skeleton) -> Reconstruction:
@@ -162,10 +239,8 @@ def _rows(refined: Refined, frame: np.ndarray, person: np.ndarray, skeleton: Ske
     )
 
 
-def _default_fitter(config: PipelineConfig) -> BodyFitter:
-    """The plain optimiser on the shipped body; torch is loaded here and not before."""
-    from shapepose_fg.body.baseline import LevenbergMarquardtFitter
-
+def _default_fitter(config: PipelineConfig) -> LevenbergMarquardtFitter:
+    """The plain optimiser on the shipped body."""
     return LevenbergMarquardtFitter(config=config.body)
 
 

@@ -9,6 +9,7 @@ import torch
 
 from factors import isotropic
 from shapepose_fg.detections import Detections, Recording
+from shapepose_fg.detector_offsets import OffsetConfig
 from shapepose_fg.evaluation.metrics import joint_metrics
 from shapepose_fg.evaluation.shelf import evaluate_shelf, read_shelf_ground_truth
 from shapepose_fg.io.calibration import read_rig
@@ -116,12 +117,14 @@ def test_nobody_and_nothing_are_empty_results(scene):
     assert len(reconstruct(Recording(BODY_25, []), scene.rig)) == 0
 
 
-def test_an_empty_frame_and_a_blind_view_harm_no_other(scene, recording, people):
+def test_an_empty_frame_and_a_blind_view_harm_no_other(scene, recording):
     blind = recording[1].only(recording[1].view != 2)
     frames = [recording[0], Detections.empty(), blind, recording[3]]
-    result = reconstruct(Recording(BODY_25, frames), scene.rig)
+    # What is learnt of the detector is learnt from all frames, so it is left out here.
+    config = PipelineConfig(offsets=OffsetConfig(source="none"))
+    result = reconstruct(Recording(BODY_25, frames), scene.rig, config)
     assert np.bincount(result.frame, minlength=4).tolist() == [4, 0, 4, 4]
-    assert_same(result.at(0), people.at(0))
+    assert_same(result.at(0), reconstruct(recording, scene.rig, config, frames=range(1)))
     without_view = joint_metrics([result.joints[result.frame == 2]], scene.keypoints[1:2])
     assert without_view.people_found == 4 and without_view.mpjpe_mm < 40
 

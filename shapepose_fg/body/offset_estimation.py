@@ -12,7 +12,7 @@ bounded by one draw from the prior only, so it goes first. What pose and shape c
 alike, turning a limb) is not mistaken for an offset; the prior Q keeps that at zero.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -45,11 +45,12 @@ class OffsetPrior:
     pose_widening: float = 3.0
     """The pose prior is this many times as wide while offsets are learnt: a prior is never quite right about how
     poses vary, and what it has wrong would look like an offset, the same in hundreds of rows."""
-    rows_per_draw: float = 8.0
+    rows_per_draw: float = 4.0
     """How many rows say as much as one that is independent: a detector's error lasts over frames, and people come
     back."""
-    rounds: int = 3
-    """How often bodies are fitted and offsets are solved."""
+    rounds: int = 1
+    """How often bodies are fitted and offsets are solved. As bodies are eliminated and not held, the first
+    solution is nearly the last: more rounds change what the body predicts by 0.2 mm."""
 
     def __post_init__(self) -> None:
         for name in ("sigma_m", "asymmetry_sigma_m"):
@@ -74,7 +75,7 @@ def learn_offsets(
     """
     pose_prior = PosePrior.default() if pose_prior is None else pose_prior
     prior = OffsetPrior() if prior is None else prior
-    wide = pose_prior.widened(prior.pose_widening)
+    wide = replace(pose_prior, covariance=prior.pose_widening**2 * pose_prior.covariance)
     config = PlainFitterConfig() if config is None else config
     precision = np.linalg.inv(_prior_covariance(prior))
     model, fit = model.with_keypoint_offsets(_made(np.zeros(75), precision, np.zeros(25))), None
@@ -163,12 +164,14 @@ def _eliminate(
     crossed = (by_offset.mT @ by_body.unflatten(1, xyz.shape[1:])).flatten(1, 2)
     both = torch.cat([crossed, -prior_hessian], dim=1)  # (R, 75 + P, P): second derivatives with the body
     gradient = torch.cat([-(by_offset.mT @ residual[..., None]).flatten(1), -prior_gradient], dim=1)
-    solved = torch.linalg.solve(here.hessian, torch.cat([both.mT, here.gradient[..., None]], dim=-1))
-    hessian = -(both @ solved[..., :-1]).sum(dim=0)
+    factor = torch.linalg.cholesky(here.hessian)
+    right = torch.cat([both.mT, here.gradient[..., None]], dim=-1)
+    half = torch.linalg.solve_triangular(factor, right, upper=False).flatten(0, 1)  # all rows' in one matrix
+    hessian = -(half[:, :-1].mT @ half[:, :-1])
     hessian[:75, :75] += torch.block_diag(*(by_offset.mT @ by_offset).sum(dim=0))
     hessian[75:, 75:] += prior_hessian.sum(dim=0)
-    gradient = gradient - (both @ solved[..., -1:]).squeeze(-1)
-    return hessian.numpy(), gradient.sum(dim=0).numpy(), prior_hessian.sum(dim=0).numpy()
+    gradient = gradient.sum(dim=0) - half[:, :-1].mT @ half[:, -1]
+    return hessian.numpy(), gradient.numpy(), prior_hessian.sum(dim=0).numpy()
 
 
 def _prior_covariance(prior: OffsetPrior) -> Array:
