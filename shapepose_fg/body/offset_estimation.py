@@ -12,7 +12,7 @@ bounded by one draw from the prior only, so it goes first. What pose and shape c
 alike, turning a limb) is not mistaken for an offset; the prior Q keeps that at zero.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -75,7 +75,7 @@ def learn_offsets(
     """
     pose_prior = PosePrior.default() if pose_prior is None else pose_prior
     prior = OffsetPrior() if prior is None else prior
-    wide = replace(pose_prior, covariance=prior.pose_widening**2 * pose_prior.covariance)
+    wide = pose_prior.widened(prior.pose_widening)
     config = PlainFitterConfig() if config is None else config
     precision = np.linalg.inv(_prior_covariance(prior))
     model, fit = model.with_keypoint_offsets(_made(np.zeros(75), precision, np.zeros(25))), None
