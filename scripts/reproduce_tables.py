@@ -1,8 +1,10 @@
 """The figures of README.md and docs/evaluation.md, as Markdown: python scripts/reproduce_tables.py [--update].
 
 Scenes come from fixed seeds. The Shelf tables need the recording (`--data FOLDER`, or SHAPEPOSE_DATA) and are
-left out without it. `--update` writes every table between its marks `<!-- NAME -->` and `<!-- end -->` in the
-two files. Takes about two minutes.
+left out without it; so are those of body fitters (`fitter_comparison.py`) without the recorded motions.
+`--only shelf` prints the tables whose names begin so. `--update` writes every table between its marks
+`<!-- NAME -->` and `<!-- end -->` in the two files, and the figure into docs/images. Takes about two minutes, and
+ten more for the fitters.
 """
 
 import argparse
@@ -14,6 +16,7 @@ from functools import cache, cached_property
 from itertools import pairwise
 from pathlib import Path
 
+import fitter_comparison
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -101,7 +104,7 @@ def main() -> None:
     parser.add_argument(
         "--data", type=Path, default=Path(os.environ.get("SHAPEPOSE_DATA", ROOT.parent / "shared"))
     )
-    parser.add_argument("--only", nargs="*", help="names of tables")
+    parser.add_argument("--only", nargs="*", help="names of tables, or their first words")
     parser.add_argument("--update", action="store_true", help="write the tables into the documents")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
@@ -119,8 +122,10 @@ def main() -> None:
         tables |= {"contradictions": lambda: contradiction_table(shelf), "sigma": lambda: sigma_table(shelf)}
     else:
         print(f"(no Shelf recording in {shelf}: its tables are left out)\n")
+    images = ROOT / "docs" / "images" if arguments.update else None
+    tables |= fitter_comparison.tables(arguments.data, images)
     for name, table in tables.items():
-        if arguments.only is None or name in arguments.only:
+        if arguments.only is None or any(f"{name} ".startswith(f"{only} ") for only in arguments.only):
             text = "\n".join(table())
             print(f"{name}\n\n{text}\n", flush=True)
             if arguments.update:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from shapepose_fg.body.baseline import LevenbergMarquardtFitter, PlainFitterConfig
 from shapepose_fg.body.energy import WhitenedTargets
+from shapepose_fg.body.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model import BodyModel
 from shapepose_fg.body.pose_prior import PosePrior
 
@@ -51,6 +52,10 @@ class GradientDescentFitter(LevenbergMarquardtFitter):
         self._descent = config
         self._steps = torch.full((self._energy.num_free,), config.step_rad)
         self._steps[:10], self._steps[-3:] = config.step_beta, config.step_m
+
+    def with_keypoint_offsets(self, offsets: KeypointOffsets) -> "GradientDescentFitter":
+        """The same fitter for a detector that puts its joints `offsets` away from the body's."""
+        return GradientDescentFitter(self.model.with_keypoint_offsets(offsets), self._prior, self._descent)
 
     def _solve(self, free: Tensor, targets: WhitenedTargets, warm: NDArray[np.bool_]) -> Tensor:
         """All steps of Adam (Kingma and Ba 2015) from `free` (B, P); returns (B, P)."""

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.body.fitter import BodyFit, BodyFitter, JointTargets
+from shapepose_fg.body.fitter import BodyFit, JointTargets
 from shapepose_fg.body.model import BodyModel, BodyParameters
 from shapepose_fg.evaluation.metrics import CovarianceCalibration, covariance_calibration
 from shapepose_fg.skeleton import BODY_25
@@ -163,10 +163,9 @@ def draw_missing(count: int, share: float, rng: np.random.Generator) -> NDArray[
     return missing | (rng.random(missing.shape) < each_way / (len(BODY_25) - each_way))
 
 
-def fit_in_batches(fitter: BodyFitter, targets: JointTargets, batch: int) -> BodyFit:
-    """All rows, `batch` of them at a time."""
-    parts = [fitter.fit(part) for part in batches(targets, batch)]
-    return BodyFit(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(BodyFit)})
+def concatenated(fits: list[BodyFit]) -> BodyFit:
+    """The rows of all, in order."""
+    return BodyFit(**{f.name: np.concatenate([getattr(fit, f.name) for fit in fits]) for f in fields(BodyFit)})
 
 
 def batches(targets: JointTargets, size: int) -> list[JointTargets]:

@@ -12,9 +12,10 @@ from shapepose_fg.body.closed_form import ClosedFormStart
 from shapepose_fg.body.evidence import Evidence
 from shapepose_fg.body.fitter import BodyFit, BodyFitter, JointTargets
 from shapepose_fg.body.gradient_descent import GradientDescentConfig, GradientDescentFitter
+from shapepose_fg.body.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model import BodyModel
 from shapepose_fg.body.pose_prior import PosePrior
-from shapepose_fg.evaluation.fitting import batches, fit_in_batches
+from shapepose_fg.evaluation.fitting import batches, concatenated
 
 Array = NDArray[np.float64]
 
@@ -57,8 +58,11 @@ class ClosedFormFitter(LevenbergMarquardtFitter):
         steps = plain.max_iterations if steps is None else steps
         super().__init__(model, pose_prior, PlainFitterConfig(max_iterations=max(steps, 1), unfinished=np.inf))
         self._steps = steps
-        prior = PosePrior.default() if pose_prior is None else pose_prior
-        self._closed_form = ClosedFormStart(self._energy.model, prior)
+        self._closed_form = ClosedFormStart(self._energy.model, self._prior)
+
+    def with_keypoint_offsets(self, offsets: KeypointOffsets) -> "ClosedFormFitter":
+        """The same fitter for a detector that puts its joints `offsets` away from the body's."""
+        return ClosedFormFitter(self.model.with_keypoint_offsets(offsets), self._prior, self._steps)
 
     def _start(
         self, evidence: Evidence, rows: NDArray[np.intp], centre: Array, warm: NDArray[np.bool_],
@@ -92,25 +96,53 @@ def plain_methods() -> tuple[Method, ...]:
     )
 
 
+def learned_methods() -> tuple[Method, ...]:
+    """The learned fitter; none as long as there is none."""
+    return ()
+
+
 def _levenberg_marquardt(steps: int | None) -> BodyFitter:
     if steps is None:
         return LevenbergMarquardtFitter()
     return LevenbergMarquardtFitter(config=PlainFitterConfig(max_iterations=steps, unfinished=np.inf))
 
 
-def milliseconds(fitter: BodyFitter, targets: JointTargets, batch: int, repeats: int) -> Array:
-    """(repeats,) milliseconds a fit in batches of `batch` different rows, after one batch to warm up."""
-    parts = [part for part in batches(targets, batch) if len(part) == batch]
-    if len(parts) == 0:
+def timed_fit(fitter: BodyFitter, targets: JointTargets, batch: int, rounds: int = 1) -> tuple[BodyFit, Array]:
+    """All rows, `batch` at a time, and (R,) milliseconds a fit of every full batch, `rounds` times over.
+
+    The time is the processor's, which other work on the machine does not stretch much: with one thread it is what
+    a clock shows on a machine that does nothing else. The first batch is fitted once more before, to warm up.
+    """
+    parts = batches(targets, batch)
+    if len(parts[0]) < batch:
         raise ValueError(f"{len(targets)} rows do not fill a batch of {batch}: give more, or a smaller batch")
-    fitter.fit(parts[-1])
-    seconds = []
-    for repeat in range(repeats):
-        part = parts[repeat % len(parts)]
-        start = time.perf_counter()
+    fitter.fit(parts[0])
+    fits, ms = [], []
+    for part in parts * rounds:
+        start = time.process_time()
+        fits.append(fitter.fit(part))
+        if len(part) == batch:
+            ms.append(1e3 * (time.process_time() - start) / batch)
+    return concatenated(fits[: len(parts)]), np.array(ms)
+
+
+def fits_per_second(fitter: BodyFitter, targets: JointTargets, batch: int, threads: int) -> float:
+    """By the clock on the wall, the best of three batches; for a machine that does nothing else."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        part = batches(targets, batch)[0]
         fitter.fit(part)
-        seconds.append(time.perf_counter() - start)
-    return 1e3 * np.array(seconds) / batch
+        seconds = []
+        for _ in range(3):
+            start = time.perf_counter()
+            fitter.fit(part)
+            seconds.append(time.perf_counter() - start)
+    finally:
+        torch.set_num_threads(before)
+    return len(part) / min(seconds)
 
 
 def curve(method: Method, targets: JointTargets, truth: Array, batch: int = 64) -> Curve:
@@ -121,8 +153,7 @@ def curve(method: Method, targets: JointTargets, truth: Array, batch: int = 64) 
     """
     ms, error = [], []
     for steps in method.steps if len(method.steps) > 0 else (None,):
-        fitter = method.make(steps)
-        ms.append(np.median(milliseconds(fitter, targets, batch, max(5, len(targets) // batch))))
-        joints = fit_in_batches(fitter, targets, batch).joints
-        error.append(1e3 * np.nanmean(np.linalg.norm(joints - truth, axis=-1)))
+        fit, times = timed_fit(method.make(steps), targets, batch)
+        ms.append(np.median(times))
+        error.append(1e3 * np.nanmean(np.linalg.norm(fit.joints - truth, axis=-1)))
     return Curve(np.array(ms), np.array(error))
