@@ -1,6 +1,6 @@
 """A recording's detections set beside where its other views and its bodies expect them.
 
-For `measure_detector.py` and `draw_detector.py`, which treat real and simulated recordings alike: each view is
+For `measure_detector.py` and `detector_figures.py`, which treat real and simulated recordings alike: each view is
 judged by the others, and nothing here knows an annotation or the truth of a simulation.
 """
 
