@@ -296,7 +296,7 @@ def alternation_table(motions: Path, shelf: Path) -> list[str]:
     """The whole pipeline with each fitter, on the same detections."""
     config = PipelineConfig()
     fitters = {"Levenberg-Marquardt": LevenbergMarquardtFitter(config=config.body)}
-    fitters |= {method.name: method.make(None) for method in learned_methods()}
+    fitters |= {method.name: method.make(None) for method in learned_methods()[1:]}
     rows = []
     if shelf.is_dir():
         truth, rig = read_shelf_ground_truth(shelf / "gt_dev.txt"), read_rig(shelf / "calibration.json")

@@ -65,14 +65,10 @@ class GradientDescentFitter(LevenbergMarquardtFitter):
         for n in range(config.max_iterations):
             done = n / config.max_iterations
             widening = annealing * max(0.0, 1 - 5 * done)
-            gradient = self._gradient(free, targets, config.kernel_scale * 2.0**widening)
+            gradient = self._energy.gradient(free, targets, config.kernel_scale * 2.0**widening)
             first = _MOMENTUM * first + (1 - _MOMENTUM) * gradient
             second = _MEMORY * second + (1 - _MEMORY) * gradient.square()
             scale = math.sqrt(1 - _MEMORY ** (n + 1)) / (1 - _MOMENTUM ** (n + 1))
             length = 0.5 * (1 + math.cos(math.pi * done)) * scale * self._steps
             free = self._energy.retract(free, -length * first / (second.sqrt() + _TINY))
         return free
-
-    def _gradient(self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor) -> Tensor:
-        """(B, P) half the energy's gradient."""
-        return self._energy.linearise(free, targets, kernel_scale).gradient

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,8 +97,22 @@ def plain_methods() -> tuple[Method, ...]:
 
 
 def learned_methods() -> tuple[Method, ...]:
-    """The learned fitter; none as long as there is none."""
-    return ()
+    """The learned fitter: its steps alone, and with its polish; none where it has no weights."""
+    try:
+        from shapepose_fg.body.learned import LearnedFitter, LearnedFitterConfig
+
+        LearnedFitter()
+    except (ImportError, FileNotFoundError):
+        return ()
+
+    def polished(steps: int | None) -> BodyFitter:
+        config = LearnedFitterConfig()
+        return LearnedFitter(config=config if steps is None else replace(config, polish_steps=steps))
+
+    return (
+        Method("learned, network alone", lambda steps: polished(0)),
+        Method("learned", polished, (0, 1, 2, 3)),
+    )
 
 
 def _levenberg_marquardt(steps: int | None) -> BodyFitter:
