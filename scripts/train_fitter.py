@@ -1,9 +1,9 @@
 """Train the learned fitter's update network: python scripts/train_fitter.py cmu_smpl24.npz [--resume].
 
 Learns from the training subjects of recorded motions (CMU's .npz or a folder of AMASS files), watches the
-validation subjects, never sees the test subjects. Writes a checkpoint every few minutes, from which `--resume` goes
-on to the bit, a log (one JSON line for each validation), and at the end the weights with their card. About an hour
-on one core.
+validation subjects, never sees the test subjects. Writes a checkpoint every few minutes, from which `--resume`
+goes on to the bit, a log (one JSON line for each validation), and at the end the weights with their card. About
+an hour on one core.
 """
 
 import json
@@ -116,7 +116,7 @@ def _card(trainer: Trainer, recorded: Motions, motions: Path, errors: list[float
     )
     return {
         "data": f"{motions.name}: {len(train)} frames of {len(set(train.subject.tolist()))} subjects for training",
-        "not seen": f"validation subjects {' '.join(VALIDATION_SUBJECTS)}, test subjects {' '.join(TEST_SUBJECTS)}",
+        "not seen": f"subjects {' '.join(VALIDATION_SUBJECTS)} (validation), {' '.join(TEST_SUBJECTS)} (test)",
         "command": " ".join(["python", "scripts/train_fitter.py", motions.name, *sys.argv[2:]]),
         "settings": json.dumps({"iterations": trainer.config.iterations, "batch": trainer.config.batch}),
         "validation": "mean joint error after each step, mm: " + ", ".join(f"{error:.1f}" for error in errors),

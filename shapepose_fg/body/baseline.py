@@ -8,15 +8,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from shapepose_fg.body.alignment import RestAlignment
-from shapepose_fg.body.energy import BodyEnergy, Linearisation, WhitenedTargets, robust_weight
+from shapepose_fg.body.beliefs import fill
+from shapepose_fg.body.energy import BodyEnergy, Held, Linearisation, WhitenedTargets
 from shapepose_fg.body.evidence import Evidence, EvidenceConfig, weigh
 from shapepose_fg.body.fitter import BodyFit, FitStatus, JointTargets
 from shapepose_fg.body.keypoint_offsets import KeypointOffsets
-from shapepose_fg.body.leave_one_out import JointPosterior, joint_posterior
 from shapepose_fg.body.model import BodyModel
 from shapepose_fg.body.pose_prior import PosePrior
 from shapepose_fg.body.rotation import log_so3
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.body.shared_shape import check_groups, pooled_betas
 
 Array = NDArray[np.float64]
 
@@ -75,12 +75,14 @@ class LevenbergMarquardtFitter:
         return LevenbergMarquardtFitter(self.model.with_keypoint_offsets(offsets), self._prior, self.config)
 
     @torch.no_grad()
-    def fit(self, targets: JointTargets, initial: BodyFit | None = None) -> BodyFit:
-        """Fit a body to every row of `targets` (BODY_25 joints); see `BodyFit` for what comes back.
+    def fit(
+        self, targets: JointTargets, initial: BodyFit | None = None, groups: NDArray[np.intp] | None = None
+    ) -> BodyFit:
+        """Fit a body to every row of `targets`; see `BodyFit` for what comes back.
 
         OK rows of `initial` (as many rows as targets) are warm starts: no closed form, no annealing.
         """
-        _check(targets, initial)
+        _check(targets, initial, len(self.model.keypoint_names))
         evidence = weigh(targets, self.config.evidence)
         fit = BodyFit.failed(evidence.status, targets.xyz.shape[1])
         rows = np.flatnonzero(evidence.status == FitStatus.OK)
@@ -91,7 +93,17 @@ class LevenbergMarquardtFitter:
         weighted = WhitenedTargets(_single(evidence.xyz[rows] - centre[:, None]), _single(evidence.root[rows]))
         warm = np.zeros(len(rows), dtype=bool) if initial is None else initial.ok[rows]
         start = _single(self._start(evidence, rows, centre, warm, initial))
-        return self._finish(fit, rows, self._solve(start, weighted, warm), weighted, centre)
+        free, held = self._solve(start, weighted, warm), None
+        if groups is not None:
+            own, priors = check_groups(groups, len(targets))[rows], Held.by_priors()
+            here = self._energy.linearise(free, weighted, torch.tensor(self.config.kernel_scale))
+            betas = pooled_betas(free, here.hessian, own, priors)
+            held = priors.at_shape(betas)
+            free = self._solve(torch.cat((betas, free[:, 10:]), 1), weighted, np.ones(len(rows), dtype=bool), held)
+        fill(fit, rows, self._energy, free, weighted, centre, kernel_scale=self.config.kernel_scale,
+             model_sigma_m=self.config.evidence.model_sigma_m, unfinished=self.config.unfinished,
+             held=held)  # fmt: skip
+        return fit
 
     def _start(
         self, evidence: Evidence, rows: NDArray[np.intp], centre: Array, warm: NDArray[np.bool_],
@@ -109,19 +121,21 @@ class LevenbergMarquardtFitter:
             start[warm] = np.concatenate([betas, orient, angles, transl - centre[warm]], axis=1)
         return start
 
-    def _solve(self, free: Tensor, targets: WhitenedTargets, warm: NDArray[np.bool_]) -> Tensor:
+    def _solve(
+        self, free: Tensor, targets: WhitenedTargets, warm: NDArray[np.bool_], held: Held | None = None
+    ) -> Tensor:
         """Minimise from `free` (B, P); rows leave the batch as they finish. Returns (B, P)."""
         config, energy = self.config, self._energy
         result, rows = free.clone(), torch.arange(len(free))
         widening = torch.where(torch.from_numpy(warm), 0, config.anneal_steps)[:, None]
         damping = torch.full((len(free),), _DAMPING_START)
-        here = energy.linearise(free, targets, config.kernel_scale * 2.0**widening)
+        here = energy.linearise(free, targets, config.kernel_scale * 2.0**widening, held)
         for _ in range(config.max_iterations):
             step, promised = _damped_step(here, damping)
             trial = energy.retract(free, step)
             scale, annealed = config.kernel_scale * 2.0**widening, widening[:, 0] == 0
             widening = (widening - 1).clamp_min(0)
-            there = energy.linearise(trial, targets, config.kernel_scale * 2.0**widening)
+            there = energy.linearise(trial, targets, config.kernel_scale * 2.0**widening, held)
             gain = here.energy(scale) - there.energy(scale)
             better = gain > 0  # a step into NaN is not
             here, free = here.replaced(better, there), torch.where(better[:, None], trial, free)
@@ -133,52 +147,16 @@ class LevenbergMarquardtFitter:
             result[rows[~going]] = free[~going]
             rows, free, damping, widening = rows[going], free[going], damping[going], widening[going]
             here, targets = here[going], targets[going]
+            held = None if held is None else held[going]
             if len(rows) == 0:
                 break
         result[rows] = free
         return result
 
-    def _beliefs(
-        self, free: Tensor, targets: WhitenedTargets
-    ) -> tuple[Tensor, JointPosterior, Tensor, NDArray[np.bool_]]:
-        """Joints (R, K, 3) at `free`, how surely they are known, residuals in metres, which rows are done."""
-        energy, scale = self._energy, torch.tensor(self.config.kernel_scale)
-        xyz, jacobian = energy.keypoints_with_jacobian(free)
-        here = energy.linearise_at(free, xyz, jacobian, targets, scale)
-        factor, _ = torch.linalg.cholesky_ex(here.hessian.double())
-        right = torch.cat((jacobian.mT, here.gradient[..., None]), -1).double()
-        half = torch.linalg.solve_triangular(factor, right, upper=False)
-        left = half[..., -1].square().sum(-1)  # what a Newton step would still gain
-        root = robust_weight(here.squared, scale).sqrt()[..., None, None] * targets.root
-        posterior = joint_posterior(xyz.double(), half[..., :-1], (xyz - targets.xyz).double(), root.double())
-        information = targets.root.square().sum(dim=(-1, -2)).sum(-1) / 3
-        residual_m = (here.squared.sum(-1) / information).sqrt()
-        return xyz, posterior, residual_m, (left < self.config.unfinished).numpy()  # NaN is not
 
-    def _finish(
-        self, fit: BodyFit, rows: NDArray[np.intp], free: Tensor, targets: WhitenedTargets, centre: Array
-    ) -> BodyFit:
-        """Fill `fit`'s `rows` with the bodies `free` (R, P) and what is known about their joints."""
-        xyz, posterior, residual_m, done = self._beliefs(free, targets)
-        body = self._energy.complete(free)
-        fit.status[rows[~done]] = FitStatus.NOT_CONVERGED
-        rows, origin = rows[done], centre[done]
-        fit.betas[rows] = _double(body.betas)[done]
-        fit.global_orient[rows] = _double(body.global_orient)[done]
-        fit.body_pose[rows] = _double(body.body_pose)[done]
-        fit.transl[rows] = _double(body.transl)[done] + origin
-        fit.joints[rows] = _double(xyz)[done] + origin[:, None]
-        fit.covariance[rows] = _double(posterior.covariance)[done]
-        fit.prior_xyz[rows] = _double(posterior.left_out_xyz)[done] + origin[:, None]
-        model_error = self.config.evidence.model_sigma_m**2 * np.eye(3)
-        fit.prior_covariance[rows] = _double(posterior.left_out_covariance)[done] + model_error
-        fit.residual_m[rows] = _double(residual_m)[done]
-        return fit
-
-
-def _check(targets: JointTargets, initial: BodyFit | None) -> None:
-    if targets.xyz.shape[1] != len(BODY_25):
-        raise ValueError(f"targets must be the {len(BODY_25)} joints of BODY_25, got {targets.xyz.shape[1]}")
+def _check(targets: JointTargets, initial: BodyFit | None, count: int) -> None:
+    if targets.xyz.shape[1] != count:
+        raise ValueError(f"targets must be the {count} keypoints of the body, got {targets.xyz.shape[1]}")
     if initial is not None and len(initial) != len(targets):
         raise ValueError(f"initial must have one row per target: {len(targets)}, got {len(initial)}")
 

@@ -17,6 +17,8 @@ from shapepose_fg.body.pose_energy import PoseEnergy
 from shapepose_fg.body.pose_prior import NUM_ANGLES, PosePrior
 from shapepose_fg.body.rotation import exp_so3, log_so3, right_jacobian
 
+SETTLED = 1e6
+"""Precision of a beta that other rows of the same person have settled."""
 VISIBLE_M_PER_RAD = 1e-3
 """A joint whose rotation moves no keypoint faster than this is invisible: a radian would move 1 mm."""
 
@@ -32,6 +34,30 @@ class WhitenedTargets:
 
     def __getitem__(self, rows: Tensor) -> "WhitenedTargets":
         return WhitenedTargets(self.xyz[rows], self.root[rows])
+
+
+@dataclass(frozen=True)
+class Held:
+    """Around what shape and pose are held."""
+
+    betas: Tensor
+    """(B, 10) shape, or one for all (10,)."""
+    stiffness: Tensor
+    """(B, 1) precision of each beta, or one for all (1,)."""
+    angles: Tensor | None = None
+    """(B, A) free angles, held as tightly as the pose prior holds there; None: where it expects them."""
+
+    @classmethod
+    def by_priors(cls) -> "Held":
+        """By nothing else than the priors."""
+        return cls(torch.zeros(10), torch.ones(1))
+
+    def __getitem__(self, rows: Tensor) -> "Held":
+        return Held(self.betas[rows], self.stiffness[rows], None if self.angles is None else self.angles[rows])
+
+    def at_shape(self, betas: Tensor) -> "Held":
+        """The same, but with shapes (B, 10) that are settled: next to immovable."""
+        return Held(betas, torch.full((len(betas), 1), SETTLED), self.angles)
 
 
 @dataclass(frozen=True)
@@ -132,14 +158,13 @@ class BodyEnergy:
         return xyz, jacobian.flatten(1, 2) @ spread
 
     def linearise(
-        self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor, anchor: Tensor | None = None
+        self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor, held: "Held | None" = None
     ) -> Linearisation:
         """Energy, gradient and Hessian at free parameters (B, P), with the kernel's scale (B, 1).
 
-        With an `anchor` (B, P), shape and pose are held around it instead of where the priors expect them, as
-        tightly as the priors hold there: for a body that something else than the priors has guessed.
+        What is `held` stays around there instead of where the priors expect it.
         """
-        return self.linearise_at(free, *self.keypoints_with_jacobian(free), targets, kernel_scale, anchor)
+        return self.linearise_at(free, *self.keypoints_with_jacobian(free), targets, kernel_scale, held)
 
     def linearise_at(
         self,
@@ -148,7 +173,7 @@ class BodyEnergy:
         jacobian: Tensor,
         targets: WhitenedTargets,
         kernel_scale: Tensor,
-        anchor: Tensor | None = None,
+        held: "Held | None" = None,
     ) -> Linearisation:
         """The same where keypoints `xyz` and their `jacobian` are known already."""
         residual = (targets.root @ (xyz - targets.xyz)[..., None]).squeeze(-1)
@@ -158,7 +183,7 @@ class BodyEnergy:
         rows = (root @ jacobian.unflatten(1, xyz.shape[1:])).flatten(1, 2)
         gradient = (rows.mT @ (weight * residual).flatten(1)[..., None]).squeeze(-1)
         hessian = rows.mT @ rows
-        prior = self._add_priors(free, gradient, hessian, anchor)
+        prior = self._add_priors(free, gradient, hessian, held)
         return Linearisation(squared, prior, gradient, hessian)
 
     def gradient(self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor) -> Tensor:
@@ -180,18 +205,17 @@ class BodyEnergy:
         by_angles = turned + self._pose(angles).gradient
         return torch.cat((by_betas, by_column[:, 10:13], by_angles, by_column[:, -3:]), 1)
 
-    def _add_priors(self, free: Tensor, gradient: Tensor, hessian: Tensor, anchor: Tensor | None) -> Tensor:
+    def _add_priors(self, free: Tensor, gradient: Tensor, hessian: Tensor, held: "Held | None") -> Tensor:
         """Add the gradients and Hessians of shape and pose prior in place; returns their energy (B,)."""
-        if anchor is None:
-            betas, pose = free[:, :10], self._pose(free[:, self._angle_slice])
-        else:
-            betas = free[:, :10] - anchor[:, :10]
-            pose = self._pose.around(anchor[:, self._angle_slice], free[:, self._angle_slice])
-        gradient[:, :10] += betas
+        angles = free[:, self._angle_slice]
+        held = Held.by_priors() if held is None else held
+        away = free[:, :10] - held.betas
+        pose = self._pose(angles) if held.angles is None else self._pose.around(held.angles, angles)
+        gradient[:, :10] += held.stiffness * away
         gradient[:, self._angle_slice] += pose.gradient
-        torch.diagonal(hessian, dim1=-2, dim2=-1)[:, :10] += 1
+        torch.diagonal(hessian, dim1=-2, dim2=-1)[:, :10] += held.stiffness
         hessian[:, self._angle_slice, self._angle_slice] += pose.hessian
-        return betas.square().sum(-1) + pose.energy
+        return (held.stiffness * away.square()).sum(-1) + pose.energy
 
 
 def visible_joints(model: BodyModel, prior: PosePrior) -> np.ndarray:

@@ -115,9 +115,12 @@ class BodyFit:
 class BodyFitter(Protocol):
     """Anything that turns joints into bodies: plain optimisation here, a learned fitter elsewhere."""
 
-    def fit(self, targets: JointTargets, initial: BodyFit | None = None) -> BodyFit:
-        """Fit a body to every row of `targets`; rows do not influence each other.
+    def fit(
+        self, targets: JointTargets, initial: BodyFit | None = None, groups: NDArray[np.intp] | None = None
+    ) -> BodyFit:
+        """Fit a body to every row of `targets`.
 
-        `initial` has one row per target; its OK rows are where the fit starts, the others start afresh.
+        `initial` has one row per target; its OK rows are where the fit may start. `groups` (B,) are whole numbers:
+        rows with the same number are one person and get one shape. Otherwise rows do not influence each other.
         """
         ...

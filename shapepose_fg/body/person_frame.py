@@ -30,7 +30,7 @@ class PersonFrame:
 
     @classmethod
     def of(cls, model: BodyModel, poses: NDArray[np.floating], weight: NDArray[np.floating]) -> "PersonFrame":
-        """The frame of a body that takes `poses` (N, 24, 3), axis-angle, with weights (N,); roots are not looked at."""
+        """The frame of a body that takes `poses` (N, 24, 3), axis-angle, root first, with weights (N,)."""
         model = model.to(torch.float64)
         angles, share = poses[:, 1:].reshape(len(poses), 69).astype(np.float64), weight / weight.sum()
         mean = share @ angles

@@ -222,7 +222,7 @@ def test_misuse_is_told(fitter, joints):
         JointTargets(joints[0], np.zeros((25, 3, 3)))
     with pytest.raises(ValueError, match="information must be"):
         JointTargets(joints, np.zeros((1, 25, 3)))
-    with pytest.raises(ValueError, match="25 joints of BODY_25"):
+    with pytest.raises(ValueError, match="25 keypoints of the body"):
         fitter.fit(make_targets(joints[:, :18], 0.01))
     with pytest.raises(ValueError, match="one row per target"):
         fitter.fit(make_targets(joints, 0.01), initial=fitter.fit(make_targets(joints[:2], 0.01)))
