@@ -132,14 +132,15 @@ class KeypointOffsets:
                 f"{path}: holds no keypoint offsets; give a run.json that does, or what KeypointOffsets.save wrote"
             )
         try:
-            return cls._from_joints(content["joints"])
+            return cls.from_dict(content)
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
             raise InputError(f"{path}: {reason}; restore the file, or learn the offsets anew") from None
 
     @classmethod
-    def _from_joints(cls, joints: Mapping[str, Mapping[str, Any]]) -> "KeypointOffsets":
-        rows = [joints[name] for name in BODY_25.joints]
+    def from_dict(cls, content: Mapping[str, Any]) -> "KeypointOffsets":
+        """What `as_dict` gave; KeyError, TypeError or ValueError for anything else. Files: `load`."""
+        rows = [content["joints"][name] for name in BODY_25.joints]
         return cls(
             np.array([[_number(value) for value in row["xyz_mm"]] for row in rows]) / 1e3,
             np.array([_number(row["sigma_mm"]) for row in rows]) / 1e3,

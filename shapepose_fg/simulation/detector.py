@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
+from shapepose_fg.body.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections, Recording
@@ -60,6 +61,8 @@ class DetectorConfig:
     """Distance at which two people's same joints become one candidate."""
     wrong_affinities: float = 1.0
     """Share of the wrong pairs that get an affinity."""
+    offsets: KeypointOffsets | None = None
+    """Where it puts its joints, if not where the body has its keypoints: every detector has its own skeleton."""
     statistics: DetectorStatistics = field(default_factory=measured, repr=False)
     """What is meant by "as measured"."""
     visibility: VisibilityConfig = field(default_factory=VisibilityConfig)
@@ -81,6 +84,7 @@ class DetectorConfig:
     def as_dict(self) -> dict[str, Any]:
         """The settings as plain values, for a record of a run; the statistics are told by their provenance."""
         knobs = {name: getattr(self, name) for name in _KNOBS}
+        knobs |= {"offsets": None if self.offsets is None else self.offsets.as_dict()}
         return knobs | {"statistics": self.statistics.provenance, "visibility": asdict(self.visibility)}
 
 
@@ -105,6 +109,7 @@ def simulate(
     that are done, and all.
     """
     config = DetectorConfig() if config is None else config
+    scene = scene if config.offsets is None else scene.with_keypoint_offsets(config.offsets)
     frames = range(len(scene)) if frames is None else frames
     skin = Skin.of(scene.body, config.visibility.cell_m)
     detector = Detector(scene.rig, scene.people, scene.fps, config, seed)

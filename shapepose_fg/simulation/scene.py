@@ -1,12 +1,13 @@
 """People with known truth before calibrated cameras: the built-in scene of `demo` and the tests."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.body.keypoint_offsets import KeypointOffsets
 from shapepose_fg.camera import Camera, Rig
 from shapepose_fg.rendering import look_at
 from shapepose_fg.simulation.motion import Build, Motion, close_motion
@@ -45,6 +46,10 @@ class Scene:
     def keypoints(self) -> NDArray[np.float64]:
         """(T, P, 25, 3) true BODY_25 keypoints."""
         return keypoints_of(self.body, self.motion)
+
+    def with_keypoint_offsets(self, offsets: KeypointOffsets) -> Self:
+        """The same people, their true keypoints where a detector with these offsets puts them."""
+        return replace(self, body=self.body.with_keypoint_offsets(offsets))
 
     def truth_at(self, frame: int) -> NDArray[np.float64]:
         """(P, 25, 3) true BODY_25 keypoints of one frame."""
