@@ -100,9 +100,9 @@ class LevenbergMarquardtFitter:
             betas = pooled_betas(free, here.hessian, own, priors)
             held = priors.at_shape(betas)
             free = self._solve(torch.cat((betas, free[:, 10:]), 1), weighted, np.ones(len(rows), dtype=bool), held)
-        fill(fit, rows, self._energy, free, weighted, centre, kernel_scale=self.config.kernel_scale,
-             model_sigma_m=self.config.evidence.model_sigma_m, unfinished=self.config.unfinished,
-             held=held)  # fmt: skip
+        body = self._energy.evaluate(free, weighted, torch.tensor(self.config.kernel_scale), held)
+        fill(fit, rows, self._energy, body, weighted, centre, kernel_scale=self.config.kernel_scale,
+             model_sigma_m=self.config.evidence.model_sigma_m, unfinished=self.config.unfinished)  # fmt: skip
         return fit
 
     def _start(

@@ -5,7 +5,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from shapepose_fg.body.energy import BodyEnergy, Held, WhitenedTargets, robust_weight
+from shapepose_fg.body.energy import BodyEnergy, Evaluated, WhitenedTargets, robust_weight
 from shapepose_fg.body.fitter import BodyFit, FitStatus
 from shapepose_fg.body.leave_one_out import joint_posterior
 
@@ -16,25 +16,22 @@ def fill(
     fit: BodyFit,
     rows: NDArray[np.intp],
     energy: BodyEnergy,
-    free: Tensor,
+    body: Evaluated,
     targets: WhitenedTargets,
     centre: Array,
     *,
     kernel_scale: float,
     model_sigma_m: float,
     unfinished: float,
-    held: Held | None = None,
 ) -> None:
-    """Fill `fit`'s `rows` (R,) with the bodies `free` (R, P) and what is known about their joints (Laplace).
+    """Fill `fit`'s `rows` (R,) with the `body` of each and what is known about their joints (Laplace).
 
     `centre` (R, 3) is each row's origin. Rows whose energy a Newton step would lower by more than `unfinished`,
-    or that are not finite, become NOT_CONVERGED. `held` as in `BodyEnergy.linearise`.
+    or that are not finite, become NOT_CONVERGED.
     """
-    scale = torch.tensor(kernel_scale)
-    xyz, jacobian = energy.keypoints_with_jacobian(free)
-    here = energy.linearise_at(free, xyz, jacobian, targets, scale, held)
+    scale, xyz, here = torch.tensor(kernel_scale), body.xyz, body.here
     factor, _ = torch.linalg.cholesky_ex(here.hessian.double())
-    right = torch.cat((jacobian.mT, here.gradient[..., None]), -1).double()
+    right = torch.cat((body.jacobian.mT, here.gradient[..., None]), -1).double()
     half = torch.linalg.solve_triangular(factor, right, upper=False)
     left = half[..., -1].square().sum(-1)  # what a Newton step would still gain
     root = robust_weight(here.squared, scale).sqrt()[..., None, None] * targets.root
@@ -42,13 +39,13 @@ def fill(
     information = targets.root.square().sum(dim=(-1, -2)).sum(-1) / 3
     residual_m = (here.squared.sum(-1) / information).sqrt()
 
-    body, done = energy.complete(free), (left < unfinished).numpy()  # NaN is not
+    whole, done = energy.complete(body.free), (left < unfinished).numpy()  # NaN is not
     fit.status[rows[~done]] = FitStatus.NOT_CONVERGED
     rows, origin = rows[done], centre[done]
-    fit.betas[rows] = _double(body.betas)[done]
-    fit.global_orient[rows] = _double(body.global_orient)[done]
-    fit.body_pose[rows] = _double(body.body_pose)[done]
-    fit.transl[rows] = _double(body.transl)[done] + origin
+    fit.betas[rows] = _double(whole.betas)[done]
+    fit.global_orient[rows] = _double(whole.global_orient)[done]
+    fit.body_pose[rows] = _double(whole.body_pose)[done]
+    fit.transl[rows] = _double(whole.transl)[done] + origin
     fit.joints[rows] = _double(xyz)[done] + origin[:, None]
     fit.covariance[rows] = _double(posterior.covariance)[done]
     fit.prior_xyz[rows] = _double(posterior.left_out_xyz)[done] + origin[:, None]

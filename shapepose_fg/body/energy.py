@@ -102,6 +102,32 @@ def robust_weight(squared: Tensor, scale: Tensor) -> Tensor:
     return (c2 / (c2 + squared)).square()
 
 
+@dataclass(frozen=True)
+class Evaluated:
+    """Bodies, their keypoints and the energy around them."""
+
+    free: Tensor
+    """(B, P) free parameters."""
+    xyz: Tensor
+    """(B, K, 3) keypoints, metres."""
+    jacobian: Tensor
+    """(B, 3 K, P) of the keypoints by the free parameters."""
+    here: Linearisation
+    """The energy."""
+
+    def replaced(self, where: Tensor, other: "Evaluated") -> "Evaluated":
+        """The same, but with the rows `where` (B,) taken from another."""
+        if bool(where.all()):
+            return other
+        rows, three = where[:, None], where[:, None, None]
+        return Evaluated(
+            torch.where(rows, other.free, self.free),
+            torch.where(three, other.xyz, self.xyz),
+            torch.where(three, other.jacobian, self.jacobian),
+            self.here.replaced(where, other.here),
+        )
+
+
 class BodyEnergy:
     """Evaluates the energy over the *free* parameters of a row, a vector (P,).
 
@@ -156,6 +182,14 @@ class BodyEnergy:
         blocks = right_jacobian(free[:, self._angle_slice].unflatten(1, (-1, 3)))
         spread[:, self._block_rows, self._block_columns] = blocks
         return xyz, jacobian.flatten(1, 2) @ spread
+
+    def evaluate(
+        self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor, held: "Held | None" = None
+    ) -> Evaluated:
+        """What `linearise` gives, with keypoints and Jacobian."""
+        xyz, jacobian = self.keypoints_with_jacobian(free)
+        here = self.linearise_at(free, xyz, jacobian, targets, kernel_scale, held)
+        return Evaluated(free, xyz, jacobian, here)
 
     def linearise(
         self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor, held: "Held | None" = None

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from shapepose_fg.body.beliefs import fill
 from shapepose_fg.body.descent import BodyState, DescentTargets, LearnedDescent
-from shapepose_fg.body.energy import BodyEnergy, Held, WhitenedTargets
+from shapepose_fg.body.energy import BodyEnergy, Evaluated, Held, WhitenedTargets
 from shapepose_fg.body.evidence import EvidenceConfig, weigh
 from shapepose_fg.body.fitter import BodyFit, FitStatus, JointTargets
 from shapepose_fg.body.keypoint_offsets import KeypointOffsets
@@ -100,14 +100,13 @@ class LearnedFitter:
         weighted = WhitenedTargets(_single(evidence.xyz[rows] - centre[:, None]), _single(evidence.root[rows]))
         arrived = self._descend(weighted, _single(evidence.variance_m2[rows]))
         held = Held(arrived[:, :10], torch.ones(len(rows), 1), arrived[:, 13:-3])
-        free, hessian = self._polish(arrived, weighted, held)
+        body = self._polish(arrived, weighted, held)
         if groups is not None:
-            betas = pooled_betas(free, hessian, check_groups(groups, len(targets))[rows], held)
-            held = held.at_shape(betas)
-            free, _ = self._polish(torch.cat((betas, free[:, 10:]), 1), weighted, held)
-        fill(fit, rows, self._energy, free, weighted, centre, kernel_scale=self.config.kernel_scale,
-             model_sigma_m=self.config.evidence.model_sigma_m, unfinished=self.config.unfinished,
-             held=held)  # fmt: skip
+            own = check_groups(groups, len(targets))[rows]
+            betas = pooled_betas(body.free, body.here.hessian, own, held)
+            body = self._polish(torch.cat((betas, body.free[:, 10:]), 1), weighted, held.at_shape(betas))
+        fill(fit, rows, self._energy, body, weighted, centre, kernel_scale=self.config.kernel_scale,
+             model_sigma_m=self.config.evidence.model_sigma_m, unfinished=self.config.unfinished)  # fmt: skip
         return fit
 
     def _descend(self, targets: WhitenedTargets, variance: Tensor) -> Tensor:
@@ -134,21 +133,17 @@ class LearnedFitter:
         transl = (rotation @ (pelvis + state.transl)[..., None]).squeeze(-1) + origin - pelvis
         return torch.cat((state.betas, orient, angles, transl), 1)
 
-    def _polish(self, free: Tensor, targets: WhitenedTargets, held: Held) -> tuple[Tensor, Tensor]:
-        """Gauss-Newton steps from `free` (R, P), and the Hessian (R, P, P) where they end.
-
-        A step that does not lower a row's energy is not taken.
-        """
+    def _polish(self, free: Tensor, targets: WhitenedTargets, held: Held) -> Evaluated:
+        """Gauss-Newton steps from `free` (R, P); one that does not lower a row's energy is not taken."""
         scale = torch.tensor(self.config.kernel_scale)
-        here = self._energy.linearise(free, targets, scale, held)
+        body = self._energy.evaluate(free, targets, scale, held)
         for _ in range(self.config.polish_steps):
-            factor, _ = torch.linalg.cholesky_ex(here.hessian)
-            step = -torch.cholesky_solve(here.gradient[..., None], factor).squeeze(-1)
-            trial = self._energy.retract(free, step)
-            there = self._energy.linearise(trial, targets, scale, held)
-            better = there.energy(scale) < here.energy(scale)  # a step into NaN is not
-            here, free = here.replaced(better, there), torch.where(better[:, None], trial, free)
-        return free, here.hessian
+            factor, _ = torch.linalg.cholesky_ex(body.here.hessian)
+            step = -torch.cholesky_solve(body.here.gradient[..., None], factor).squeeze(-1)
+            trial = self._energy.evaluate(self._energy.retract(body.free, step), targets, scale, held)
+            better = trial.here.energy(scale) < body.here.energy(scale)  # a step into NaN is not
+            body = body.replaced(better, trial)
+        return body
 
 
 def _single(array: Array) -> Tensor:
