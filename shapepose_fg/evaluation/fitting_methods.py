@@ -97,13 +97,8 @@ def plain_methods() -> tuple[Method, ...]:
 
 
 def learned_methods() -> tuple[Method, ...]:
-    """The learned fitter: its steps alone, and with its polish; none where it has no weights."""
-    try:
-        from shapepose_fg.body.learned import LearnedFitter, LearnedFitterConfig
-
-        LearnedFitter()
-    except (ImportError, FileNotFoundError):
-        return ()
+    """The learned fitter: its steps alone, and with its polish; InputError where its weights are not there."""
+    from shapepose_fg.body.learned import LearnedFitter, LearnedFitterConfig
 
     def polished(steps: int | None) -> BodyFitter:
         config = LearnedFitterConfig()
