@@ -24,6 +24,7 @@ _STAGES = {
     "vote": "points to 3D joint candidates",
     "propose": "candidates to people",
     "associate": "people to their 2D observations",
+    "offsets": "where the detector puts joints on the body",
     "refine": "bodies and factor graphs, covariances",
 }
 """The stages that are worth a line, and what each does."""
