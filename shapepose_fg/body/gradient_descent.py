@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from shapepose_fg.body.baseline import LevenbergMarquardtFitter, PlainFitterConfig
-from shapepose_fg.body.energy import WhitenedTargets
+from shapepose_fg.body.energy import Held, WhitenedTargets
 from shapepose_fg.body.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model import BodyModel
 from shapepose_fg.body.pose_prior import PosePrior
@@ -57,18 +57,22 @@ class GradientDescentFitter(LevenbergMarquardtFitter):
         """The same fitter for a detector that puts its joints `offsets` away from the body's."""
         return GradientDescentFitter(self.model.with_keypoint_offsets(offsets), self._prior, self._descent)
 
-    def _solve(self, free: Tensor, targets: WhitenedTargets, warm: NDArray[np.bool_]) -> Tensor:
+    def _solve(
+        self, free: Tensor, targets: WhitenedTargets, warm: NDArray[np.bool_], held: Held | None = None
+    ) -> Tensor:
         """All steps of Adam (Kingma and Ba 2015) from `free` (B, P); returns (B, P)."""
-        config = self._descent
+        config, steps = self._descent, self._steps.repeat(len(free), 1)
+        if held is not None:
+            steps[:, :10] /= held.stiffness  # Adam would jump as far however stiff
         first, second = torch.zeros_like(free), torch.zeros_like(free)
         annealing = torch.where(torch.from_numpy(warm), 0, config.anneal_steps)[:, None]
         for n in range(config.max_iterations):
             done = n / config.max_iterations
             widening = annealing * max(0.0, 1 - 5 * done)
-            gradient = self._energy.gradient(free, targets, config.kernel_scale * 2.0**widening)
+            gradient = self._energy.gradient(free, targets, config.kernel_scale * 2.0**widening, held)
             first = _MOMENTUM * first + (1 - _MOMENTUM) * gradient
             second = _MEMORY * second + (1 - _MEMORY) * gradient.square()
             scale = math.sqrt(1 - _MEMORY ** (n + 1)) / (1 - _MOMENTUM ** (n + 1))
-            length = 0.5 * (1 + math.cos(math.pi * done)) * scale * self._steps
+            length = 0.5 * (1 + math.cos(math.pi * done)) * scale * steps
             free = self._energy.retract(free, -length * first / (second.sqrt() + _TINY))
         return free

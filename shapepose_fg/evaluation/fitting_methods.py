@@ -77,8 +77,8 @@ class ClosedFormFitter(LevenbergMarquardtFitter):
         found = torch.cat((body.betas, body.global_orient, pose, body.transl), 1).double().numpy()
         return np.where(warm[:, None], start, found)
 
-    def _solve(self, free, targets, warm):
-        return free if self._steps == 0 else super()._solve(free, targets, warm)
+    def _solve(self, free, targets, warm, held=None):
+        return free if self._steps == 0 else super()._solve(free, targets, warm, held)
 
 
 def plain_methods() -> tuple[Method, ...]:

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from shapepose_fg.body.baseline import LevenbergMarquardtFitter
-from shapepose_fg.body.energy import BodyEnergy, WhitenedTargets
+from shapepose_fg.body.energy import BodyEnergy, Held, WhitenedTargets
 from shapepose_fg.body.fitter import FitStatus, JointTargets
 from shapepose_fg.body.gradient_descent import GradientDescentConfig, GradientDescentFitter
 from shapepose_fg.body.model import BodyModel, BodyParameters
@@ -29,8 +29,10 @@ def test_the_gradient_alone_is_that_of_the_linearisation(tiny_model):
 
     free, root = 0.3 * draw(6, energy.num_free), draw(6, 25, 3, 3)
     seen, scale = WhitenedTargets(draw(6, 25, 3), root @ root.mT), torch.full((6, 1), 3.0, dtype=torch.float64)
-    expected = energy.linearise(free, seen, scale).gradient
-    torch.testing.assert_close(energy.gradient(free, seen, scale), expected, atol=1e-9, rtol=1e-9)
+    settled = Held(draw(6, 10), draw(6, 1).exp(), draw(6, energy.num_angles))
+    for held in (None, settled):
+        expected = energy.linearise(free, seen, scale, held).gradient
+        torch.testing.assert_close(energy.gradient(free, seen, scale, held), expected, atol=1e-9, rtol=1e-9)
 
 
 def test_steps_lead_to_the_optimum(targets):
@@ -53,3 +55,10 @@ def test_targets_are_judged_as_for_every_fitter(targets):
     )
     assert fit.status[:3].tolist() == [FitStatus.TOO_FEW_JOINTS, FitStatus.INVALID_TARGETS, FitStatus.OK]
     assert np.isfinite(fit.body_pose).all()
+
+
+def test_rows_of_one_person_share_a_shape(targets):
+    fit = GradientDescentFitter().fit(targets, groups=np.repeat(np.arange(12), 2))
+    assert fit.ok.all()
+    np.testing.assert_allclose(fit.betas[::2], fit.betas[1::2], atol=0.01)  # next to immovable
+    assert np.ptp(fit.betas[:, 0]) > 0.5
