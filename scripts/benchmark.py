@@ -19,8 +19,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from shapepose_fg.body.baseline import LevenbergMarquardtFitter
 from shapepose_fg.body.fitter import BodyFit, BodyFitter, JointTargets
+from shapepose_fg.body.fitters import make_fitter
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import DetectionSequence
 from shapepose_fg.io.calibration import read_rig
@@ -63,10 +63,12 @@ class TimedFitter:
     seconds: float = 0.0
     """Time since the last reset."""
 
-    def fit(self, targets: JointTargets, initial: BodyFit | None = None) -> BodyFit:
+    def fit(
+        self, targets: JointTargets, initial: BodyFit | None = None, groups: np.ndarray | None = None
+    ) -> BodyFit:
         """Fit, and look at the clock before and after."""
         start = time.perf_counter()
-        result = self.fitter.fit(targets, initial)
+        result = self.fitter.fit(targets, initial, groups)
         self.seconds += time.perf_counter() - start
         return result
 
@@ -118,7 +120,7 @@ def main() -> None:
     count = len(recording.detections)
     frames = range(count if arguments.frames is None else min(arguments.frames, count))
     console.print(_machine(config), highlight=False)
-    fitter = TimedFitter(LevenbergMarquardtFitter(config=config.body))
+    fitter = TimedFitter(make_fitter(config.body))
     reconstruct(recording.detections, recording.rig, config, frames=frames[:8], fitter=fitter)  # warm-up
     timing = measure(recording, config, frames, fitter)
     console.print(_stage_table(recording, timing, stage_two(recording, config, frames, fitter)))

@@ -95,7 +95,7 @@ class Sample:
 def find(detections: DetectionSequence, rig: Rig, config: PipelineConfig) -> People:
     """Everybody in the recording, with bodies."""
     parts, frames, joints, fits = [], [], [], []
-    fitter = LevenbergMarquardtFitter(config=config.body)
+    fitter = LevenbergMarquardtFitter(config=config.body.plain)
     for start in range(0, len(detections), BATCH):
         numbers = range(start, min(start + BATCH, len(detections)))
         found = [find_people(detections[t], rig, BODY_25, config) for t in numbers]

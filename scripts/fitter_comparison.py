@@ -214,15 +214,20 @@ def draw_curves(comparison: Comparison, path: Path) -> None:
         for (name, each), colour in zip(curves.items(), COLOURS, strict=False):
             axis.plot(each.ms, each.error_mm, marker="." if len(each.ms) > 1 else "D", color=colour, label=name)
         axis.set(xscale="log", yscale="log", title=setting.name, xlabel=f"milliseconds a fit, {BATCH} at a time")
-        ticks = [5, 7, 10, 15, 20, 30, 50, 100, 200, 400]
-        low, high = axis.get_ylim()
-        axis.set_yticks([t for t in ticks if low <= t <= high], [str(t) for t in ticks if low <= t <= high])
+        _plain_ticks(axis.yaxis, axis.get_ylim(), (5, 7, 10, 15, 20, 30, 50, 100, 200, 400))
+        _plain_ticks(axis.xaxis, axis.get_xlim(), (0.2, 0.5, 1, 2, 5, 10, 20, 50))
         axis.minorticks_off()
         axis.grid(alpha=0.3)
     axes[0].set(ylabel="mean error of all joints, mm")
     axes[0].legend(fontsize=7)
     figure.savefig(path, dpi=100)
     plt.close(figure)
+
+
+def _plain_ticks(axis, limits: tuple[float, float], values: tuple[float, ...]) -> None:
+    """Numbers as one writes them, not powers of ten."""
+    inside = [value for value in values if limits[0] <= value <= limits[1]]
+    axis.set_ticks(inside, [f"{value:g}" for value in inside])
 
 
 def speed_table(comparison: Comparison) -> list[str]:
@@ -296,7 +301,7 @@ def sigma_table(comparison: Comparison) -> list[str]:
 def alternation_table(motions: Path, shelf: Path) -> list[str]:
     """The whole pipeline with each fitter, on the same detections."""
     config = PipelineConfig()
-    fitters = {"Levenberg-Marquardt": LevenbergMarquardtFitter(config=config.body)}
+    fitters = {"Levenberg-Marquardt": LevenbergMarquardtFitter(config=config.body.plain)}
     fitters |= {method.name: method.make(None) for method in _learned()[1:]}
     rows = []
     if shelf.is_dir():

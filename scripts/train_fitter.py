@@ -26,6 +26,7 @@ from shapepose_fg.body.target_skeletons import BODY_POINTS
 from shapepose_fg.body.weights import FitterWeights, fingerprint
 from shapepose_fg.errors import InputError
 from shapepose_fg.provenance import versions
+from shapepose_fg.training.calibration import calibrated
 from shapepose_fg.training.checkpoint import load_checkpoint, save_checkpoint
 from shapepose_fg.training.motions import Motions, load_motions
 from shapepose_fg.training.split import TEST_SUBJECTS, VALIDATION_SUBJECTS
@@ -75,8 +76,10 @@ def main(
                     file.write(json.dumps(line) + "\n")
                 save_checkpoint(trainer, checkpoint)
     card = _card(trainer, recorded, motions, validation(trainer.averaged))
-    trainer.averaged.requires_grad_(False)
-    FitterWeights(trainer.averaged.eval().cpu(), frame, fingerprint(model), card).save(output)
+    network = trainer.averaged.requires_grad_(False).eval().cpu()
+    still = replace(config, shake_rad=0.0, exchange=0.0)
+    unseen = PeopleSource(recorded.of("validation"), model, frame, still)
+    calibrated(FitterWeights(network, frame, fingerprint(model), card=card), unseen, model).save(output)
     print(f"{output}: {output.stat().st_size / 1e6:.1f} MB, {num_weights(trainer.averaged)} weights")
 
 

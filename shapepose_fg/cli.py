@@ -100,7 +100,9 @@ def reconstruct(
             recording, rig, settings, frames=span, fitter=_fitter(body, settings), progress=progress
         )
     seconds = time.perf_counter() - start
-    inputs = [path for path in (calibration, *recording.sources, config, body) if path is not None]
+    source = settings.offsets.source
+    offsets = None if source in ("recording", "none") else Path(source)
+    inputs = [path for path in (calibration, *recording.sources, config, body, offsets) if path is not None]
     people.with_run(inputs=checksums(inputs)).save(output)
     _print(_summary(people, span, len(rig), seconds, output))
 
@@ -257,10 +259,10 @@ def _fitter(body: Path | None, settings: "PipelineConfig") -> "BodyFitter | None
     """The body fitter with the model of the file `body`; without one, the pipeline takes its own."""
     if body is None:
         return None
-    from shapepose_fg.body.baseline import LevenbergMarquardtFitter
+    from shapepose_fg.body.fitters import make_fitter
     from shapepose_fg.body.model import BodyModel
 
-    return LevenbergMarquardtFitter(BodyModel.load(body), config=settings.body)
+    return make_fitter(settings.body, BodyModel.load(body))
 
 
 @contextmanager

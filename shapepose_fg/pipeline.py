@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from shapepose_fg.association import AssociationConfig, associate
-from shapepose_fg.body.baseline import LevenbergMarquardtFitter, PlainFitterConfig
 from shapepose_fg.body.fitter import BodyFitter
+from shapepose_fg.body.fitters import BodyConfig, make_fitter
 from shapepose_fg.body.keypoint_offsets import KeypointOffsets
+from shapepose_fg.body.model import BodyModel
 from shapepose_fg.body.offset_estimation import learn_offsets
 from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.camera import Rig
@@ -45,7 +46,7 @@ class PipelineConfig:
     """How far a 2D observation is trusted."""
     person_graph: PersonGraphConfig = field(default_factory=PersonGraphConfig)
     """Stage II: the factor graph of a person."""
-    body: PlainFitterConfig = field(default_factory=PlainFitterConfig)
+    body: BodyConfig = field(default_factory=BodyConfig)
     """Stage II: how bodies are fitted."""
     offsets: OffsetConfig = field(default_factory=OffsetConfig)
     """Stage II: where the detector puts its joints on the body."""
@@ -88,7 +89,8 @@ def reconstruct(
         raise ValueError(f"frames must be a range of step 1 within 0:{len(detections)}, got {frames}")
     run = _Run()
     with run.stage("load"):
-        fitter = _default_fitter(config) if fitter is None else fitter
+        if fitter is None:
+            fitter = make_fitter(config.body, BodyModel.default().with_keypoints(detections.skeleton.joints))
     found: dict[int, Observations] = {}
     parts = []
     with torch_threads(config.threads):
@@ -118,7 +120,7 @@ def estimate_offsets(
     by itself. `fitter` says on which body, by default the shipped one. `config.offsets.source` is not looked at.
     """
     config = PipelineConfig() if config is None else config
-    fitter = _default_fitter(config) if fitter is None else fitter
+    fitter = make_fitter(config.body) if fitter is None else fitter
     config = replace(config, offsets=replace(config.offsets, source="recording"))
     with torch_threads(config.threads):
         offsets = _offsets(detections, rig, config, range(0), fitter, {}, _Run())
@@ -218,7 +220,7 @@ def _offsets(
         if len(people) == 0:
             return KeypointOffsets.identity()
         targets = confident_targets(Observations.concatenate(people), rig, config.observations, config.offsets)
-        return learn_offsets(targets, fitter.model, config=config.body, prior=config.offsets.prior)
+        return learn_offsets(targets, fitter.model, config=config.body.plain, prior=config.offsets.prior)
 
 
 def _rows(refined: Refined, frame: np.ndarray, person: np.ndarray, skeleton: Skeleton) -> Reconstruction:
@@ -237,11 +239,6 @@ def _rows(refined: Refined, frame: np.ndarray, person: np.ndarray, skeleton: Ske
         status=refined.status,
         **body,
     )
-
-
-def _default_fitter(config: PipelineConfig) -> LevenbergMarquardtFitter:
-    """The plain optimiser on the shipped body."""
-    return LevenbergMarquardtFitter(config=config.body)
 
 
 class _Run:

@@ -114,7 +114,7 @@ def test_factors_know_gtsam_and_numpy_only():
 def test_torch_is_imported_for_bodies_only():
     users = {room(name) for name, tree in LIBRARY.items() if "torch" in imported_on_import(tree)}
     # The scene's people are bodies; everybody else imports torch in the function that needs it, or not at all.
-    assert users <= {"body", "simulation"}
+    assert users <= {"body", "simulation", "training"}
 
 
 LIGHT = {

@@ -31,7 +31,9 @@ class FakeFitter:
         self.initials: list[BodyFit | None] = []
         self.fits: list[BodyFit] = []
 
-    def fit(self, targets: JointTargets, initial: BodyFit | None = None) -> BodyFit:
+    def fit(
+        self, targets: JointTargets, initial: BodyFit | None = None, groups: NDArray[np.intp] | None = None
+    ) -> BodyFit:
         self.targets.append(targets)
         self.initials.append(initial)
         ok = targets.information.any(axis=(1, 2, 3)) & (not self.fails)

@@ -23,11 +23,13 @@ def fill(
     kernel_scale: float,
     model_sigma_m: float,
     unfinished: float,
+    spread: Tensor | None = None,
 ) -> None:
     """Fill `fit`'s `rows` (R,) with the `body` of each and what is known about their joints (Laplace).
 
     `centre` (R, 3) is each row's origin. Rows whose energy a Newton step would lower by more than `unfinished`,
-    or that are not finite, become NOT_CONVERGED.
+    or that are not finite, become NOT_CONVERGED. `spread` (K,) multiplies the variance of what the body says of
+    joints without help of their own targets.
     """
     scale, xyz, here = torch.tensor(kernel_scale), body.xyz, body.here
     factor, _ = torch.linalg.cholesky_ex(here.hessian.double())
@@ -36,6 +38,9 @@ def fill(
     left = half[..., -1].square().sum(-1)  # what a Newton step would still gain
     root = robust_weight(here.squared, scale).sqrt()[..., None, None] * targets.root
     posterior = joint_posterior(xyz.double(), half[..., :-1], (xyz - targets.xyz).double(), root.double())
+    unseen = (targets.root == 0).all(-1).all(-1)[..., None, None]
+    wider = torch.ones(1) if spread is None else spread.double()[:, None, None]
+    covariance = torch.where(unseen, wider * posterior.covariance, posterior.covariance)
     information = targets.root.square().sum(dim=(-1, -2)).sum(-1) / 3
     residual_m = (here.squared.sum(-1) / information).sqrt()
 
@@ -47,10 +52,10 @@ def fill(
     fit.body_pose[rows] = _double(whole.body_pose)[done]
     fit.transl[rows] = _double(whole.transl)[done] + origin
     fit.joints[rows] = _double(xyz)[done] + origin[:, None]
-    fit.covariance[rows] = _double(posterior.covariance)[done]
+    fit.covariance[rows] = _double(covariance)[done]
     fit.prior_xyz[rows] = _double(posterior.left_out_xyz)[done] + origin[:, None]
     model_error = model_sigma_m**2 * np.eye(3)
-    fit.prior_covariance[rows] = _double(posterior.left_out_covariance)[done] + model_error
+    fit.prior_covariance[rows] = _double(wider * posterior.left_out_covariance)[done] + model_error
     fit.residual_m[rows] = _double(residual_m)[done]
 
 

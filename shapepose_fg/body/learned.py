@@ -106,7 +106,8 @@ class LearnedFitter:
             betas = pooled_betas(body.free, body.here.hessian, own, held)
             body = self._polish(torch.cat((betas, body.free[:, 10:]), 1), weighted, held.at_shape(betas))
         fill(fit, rows, self._energy, body, weighted, centre, kernel_scale=self.config.kernel_scale,
-             model_sigma_m=self.config.evidence.model_sigma_m, unfinished=self.config.unfinished)  # fmt: skip
+             model_sigma_m=self.config.evidence.model_sigma_m, unfinished=self.config.unfinished,
+             spread=self.weights.spread[list(self._slots)])  # fmt: skip
         return fit
 
     def _descend(self, targets: WhitenedTargets, variance: Tensor) -> Tensor:

@@ -15,11 +15,12 @@ from torch import Tensor
 from shapepose_fg.body.model import BodyModel
 from shapepose_fg.body.network import NetworkConfig, UpdateNetwork
 from shapepose_fg.body.person_frame import PersonFrame
+from shapepose_fg.body.target_skeletons import BODY_POINTS
 from shapepose_fg.errors import InputError
 
 _DEFAULT = Path(__file__).parent / "data" / "fitter.safetensors"
 _FORMAT = "shapepose-fg fitter 1"
-_FRAME = "frame."
+_FRAME, _SPREAD = "frame.", "spread"
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +33,8 @@ class FitterWeights:
     """Mean body and mean pose from which it starts."""
     body: str
     """Fingerprint of the body model it was trained on (see `fingerprint`)."""
+    spread: Tensor = field(default_factory=lambda: torch.ones(len(BODY_POINTS)))
+    """(K,) by which the variance of each of `BODY_POINTS` is multiplied where it has no target: calibrated."""
     card: dict[str, str] = field(default_factory=dict)
     """What it was trained on, by which command, and its errors."""
 
@@ -60,6 +63,7 @@ class FitterWeights:
             raise InputError(f"{path}: the weights hold NaN or infinity; train or fetch them again")
         try:
             network = UpdateNetwork(NetworkConfig(**json.loads(about["network"])))
+            spread = tensors.pop(_SPREAD)
             network.load_state_dict({k: v for k, v in tensors.items() if not k.startswith(_FRAME)})
             frame = PersonFrame(**{k.removeprefix(_FRAME): v for k, v in tensors.items() if k.startswith(_FRAME)})
             body, card = about["body"], json.loads(about["card"])
@@ -69,11 +73,12 @@ class FitterWeights:
                 f"{path}: weights of another version of the fitter ({why}); train them anew"
             ) from error
         network.requires_grad_(False)
-        return cls(network.eval(), frame, body, card)
+        return cls(network.eval(), frame, body, spread, card)
 
     def save(self, path: Path) -> None:
         """Write a safetensors file."""
         tensors: dict[str, Tensor] = dict(self.network.state_dict())
+        tensors[_SPREAD] = self.spread
         tensors |= {_FRAME + name: value for name, value in vars(self.frame).items()}
         tensors = {name: value.contiguous() for name, value in tensors.items()}
         about = {
