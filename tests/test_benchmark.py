@@ -32,7 +32,7 @@ def five_frames(benchmark, monkeypatch):
 
 def test_times_of_batches_add_up(benchmark, five_frames):
     config = replace(PipelineConfig(), batch_frames=2)
-    fitter = benchmark.TimedFitter(benchmark.LevenbergMarquardtFitter())
+    fitter = benchmark.TimedFitter(benchmark.make_fitter())
     timing = benchmark.measure(benchmark._scene(), config, range(5), fitter)
     assert timing.frames.tolist() == [2, 2, 1]
     assert timing.people == 20
@@ -44,7 +44,7 @@ def test_times_of_batches_add_up(benchmark, five_frames):
 
 
 def test_stage_two_is_taken_apart_by_functions_that_exist(benchmark, five_frames):
-    fitter = benchmark.TimedFitter(benchmark.LevenbergMarquardtFitter())
+    fitter = benchmark.TimedFitter(benchmark.make_fitter())
     shares = benchmark.stage_two(benchmark._scene(), PipelineConfig(), range(2), fitter)
     assert set(shares) == {*benchmark.PARTS, "the rest"}
     assert all(share > 0 for share in shares.values()), shares
