@@ -317,10 +317,13 @@ def test_false_candidates_stay_a_while():
 
 def test_affinities_are_as_measured():
     rig, joints = crowd(12)
-    table = measured()
+    # People who stand free are found with higher confidences than those on whom affinities were measured: here
+    # the affinities of right pairs do not go with them.
+    table = drawing(affinity_correlation=0.0)
+    config = replace(PLAIN, noise=0.0, statistics=table)
     right = {group: [] for group in range(14)}
     wrong = []
-    for found in looks(rig, joints, everything_seen(rig, 12), replace(PLAIN, noise=0.0), 20):
+    for found in looks(rig, joints, everything_seen(rig, 12), config, 20):
         _, person = nearest(found, rig, joints)
         score = np.zeros((len(found), len(found)))
         score[tuple(found.pairs.T)] = found.affinity
@@ -332,10 +335,24 @@ def test_affinities_are_as_measured():
             right[LIMB_GROUP[limb]].append(scores[same_view & same])
             wrong.append(scores[same_view & ~same])
     for group, parts in right.items():
-        # Confidences here are not quite those of the pairs on which the affinities were measured.
-        assert abs(np.median(np.concatenate(parts)) - np.median(table.affinity_right[group])) < 0.12
+        # 300 draws or more that spread by 0.2: medians to 0.015, four of which are 0.06.
+        assert abs(np.median(np.concatenate(parts)) - np.median(table.affinity_right[group])) < 0.06
     share = (np.concatenate(wrong) > 0).mean()
     assert 0 < share < 0.1  # neighbours are a metre apart, limbs up to 0.8 m
+
+
+def test_surer_joints_have_higher_affinities():
+    rig, joints = crowd(12)
+    lower, affinity = [], []
+    for found in looks(rig, joints, everything_seen(rig, 12), replace(PLAIN, noise=0.0), 5):
+        _, person = nearest(found, rig, joints)
+        first, second = found.pairs.T
+        same = person[first] == person[second]
+        lower.append(np.minimum(found.confidence[first], found.confidence[second])[same])
+        affinity.append(found.affinity[same])
+    ranks = [np.argsort(np.argsort(np.concatenate(parts))) for parts in (lower, affinity)]
+    # As measured within limbs (0.73); limbs differ, which takes some of it away.
+    assert np.corrcoef(ranks)[0, 1] > 0.5
 
 
 def test_faces_are_not_found_from_behind():
