@@ -68,16 +68,20 @@ class LearnedDescent:
         slots: tuple[int, ...],
         network: UpdateNetwork,
         kernel_scale: float,
+        others: SkinnedPoints | None = None,
         offsets: tuple[Tensor, Tensor] | None = None,
     ):
         """`points` are the targets' (K), `slots` (K,) their places among `BODY_POINTS`.
 
+        `others`: the rest of the body's points (50 - K), in order, to be given where there are any.
         `offsets`: what a detector's keypoint offsets add to the points (K, 3), in the frames of which bones (K,).
         """
+        rest = tuple(sorted(set(range(len(BODY_POINTS))) - set(slots)))
+        if len(rest) != (0 if others is None else len(others.root)):
+            raise ValueError(f"others must be the {len(rest)} points of the body that are not among the targets")
         self._gradient_scale = network.gradient_scale.cpu()
-        self.points, self.network, self._offsets = points, network, offsets
-        self._slots = torch.tensor(slots)
-        self._everything = slots == tuple(range(len(BODY_POINTS)))
+        self.points, self.network, self._others, self._offsets = points, network, others, offsets
+        self._slots, self._rest = torch.tensor(slots), torch.tensor(rest, dtype=torch.long)
         self._kernel_scale = torch.tensor(kernel_scale)
 
     def unroll(self, state: BodyState, targets: DescentTargets, steps: int | None = None) -> Iterator[BodyState]:
@@ -104,10 +108,13 @@ class LearnedDescent:
         shrunk = shrunk / (1 + torch.linalg.vector_norm(shrunk, dim=-1, keepdim=True) / _FAR_M)
         if self._offsets is not None:  # the network knows the body's own points
             xyz = xyz - (rotations[:, self._offsets[1]] @ self._offsets[0][..., None]).squeeze(-1)
-        seen = torch.cat((xyz + shrunk, 5 * shrunk, trust[..., None]), -1)
+        seen = xyz.new_zeros(len(xyz), len(BODY_POINTS), 7)
+        seen[:, self._slots] = torch.cat((xyz + shrunk, 5 * shrunk, trust[..., None]), -1)
+        if self._others is not None:  # as those whose targets are missing
+            seen[:, self._rest, :3] = self._others.positions(rotations, state.betas, state.transl, feature)
         return torch.cat(
             (
-                self._spread(seen).flatten(1),
+                seen.flatten(1),
                 state.betas / 3,
                 six_d(state.local[:, :NUM_ROTATIONS]).flatten(1),
                 state.transl,
@@ -115,14 +122,6 @@ class LearnedDescent:
             ),
             1,
         )
-
-    def _spread(self, values: Tensor) -> Tensor:
-        """Values of the targets (B, K, n) in their places among all body points; zero elsewhere."""
-        if self._everything:
-            return values
-        spread = values.new_zeros(len(values), len(BODY_POINTS), values.shape[-1])
-        spread[:, self._slots] = values
-        return spread
 
 
 def _moved(state: BodyState, change: Tensor) -> BodyState:

@@ -18,7 +18,8 @@ from shapepose_fg.body.model import BodyModel
 from shapepose_fg.body.pose_prior import PosePrior
 from shapepose_fg.body.rotation import log_so3
 from shapepose_fg.body.shared_shape import check_groups, pooled_betas
-from shapepose_fg.body.target_skeletons import slots
+from shapepose_fg.body.skinned_points import SkinnedPoints
+from shapepose_fg.body.target_skeletons import BODY_POINTS, slots
 from shapepose_fg.body.weights import FitterWeights
 
 Array = NDArray[np.float64]
@@ -72,7 +73,7 @@ class LearnedFitter:
         self._slots = slots(model.keypoint_names)
         self._descent = LearnedDescent(
             self._model.keypoint_points, self._slots, self.weights.network, self.config.kernel_scale,
-            offsets=self._model.offsets_of_keypoints,
+            others=_other_points(self._model, self._slots), offsets=self._model.offsets_of_keypoints,
         )  # fmt: skip
 
     def with_keypoint_offsets(self, offsets: KeypointOffsets) -> "LearnedFitter":
@@ -146,6 +147,13 @@ class LearnedFitter:
             better = trial.here.energy(scale) < body.here.energy(scale)  # a step into NaN is not
             body = body.replaced(better, trial)
         return body
+
+
+def _other_points(model: BodyModel, targets: tuple[int, ...]) -> SkinnedPoints | None:
+    """The body's own points at the places (K,) where there are no `targets`; None where there are no such."""
+    rest = [place for place in range(len(BODY_POINTS)) if place not in targets]
+    body = model.with_keypoint_offsets(KeypointOffsets.identity()) if model.keypoint_offsets.xyz_m.any() else model
+    return body.points.part(rest) if rest else None
 
 
 def _single(array: Array) -> Tensor:
