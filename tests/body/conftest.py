@@ -6,6 +6,7 @@ import torch
 
 from shapepose_fg.body.model import BodyModel, BodyParameters
 from shapepose_fg.body.smpl_file import SMPL_PARENTS
+from shapepose_fg.body.weights import FitterWeights
 
 NUM_VERTICES = 60
 
@@ -59,3 +60,20 @@ def tiny_file(request, tmp_path):
 @pytest.fixture
 def tiny_model(tiny_file) -> BodyModel:
     return BodyModel.load(tiny_file).to(torch.float64)
+
+
+@pytest.fixture(params=["the shipped body", "tiny with pose blend shapes", "tiny without"])
+def any_body(request, tmp_path) -> BodyModel:
+    """A body in double precision."""
+    if request.param == "the shipped body":
+        return BodyModel.default().to(torch.float64)
+    arrays = make_smpl_arrays()
+    arrays["posedirs"] *= request.param == "tiny with pose blend shapes"
+    np.savez(tmp_path / "tiny.npz", **arrays)
+    return BodyModel.load(tmp_path / "tiny.npz").to(torch.float64)
+
+
+@pytest.fixture(scope="session")
+def shipped_weights() -> FitterWeights:
+    """The learned fitter's weights that come with the package."""
+    return FitterWeights.default()

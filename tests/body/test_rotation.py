@@ -5,7 +5,15 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.body.rotation import exp_so3, hat, log_so3, right_jacobian, right_jacobian_inverse
+from shapepose_fg.body.rotation import (
+    exp_so3,
+    from_six_d,
+    hat,
+    log_so3,
+    right_jacobian,
+    right_jacobian_inverse,
+    six_d,
+)
 
 ANGLES = (0.0, 1e-12, 1e-7, 1e-4, 0.0999, 0.1001, 1.0, 3.0, np.pi - 1e-4, np.pi - 1e-9)
 
@@ -70,3 +78,33 @@ def test_batch_dimensions(shape):
     for function in (hat, exp_so3, right_jacobian, right_jacobian_inverse):
         assert function(vectors).shape == (*shape, 3)
     assert log_so3(exp_so3(vectors)).shape == shape
+
+
+def test_six_numbers_are_the_first_two_columns_and_give_the_rotation_back():
+    R = exp_so3(axis_angles())
+    columns = six_d(R)
+    np.testing.assert_array_equal(columns[..., :3].numpy(), R[..., 0].numpy())
+    np.testing.assert_array_equal(columns[..., 3:].numpy(), R[..., 1].numpy())
+    np.testing.assert_allclose(from_six_d(columns).numpy(), R.numpy(), atol=1e-14)
+
+
+def test_any_two_columns_become_a_rotation_with_the_first_ones_direction():
+    columns = torch.from_numpy(np.random.default_rng(0).normal(0, 3, (200, 6)))
+    R = from_six_d(columns)
+    np.testing.assert_allclose((R.mT @ R).numpy(), np.tile(np.eye(3), (200, 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(torch.linalg.det(R).numpy(), 1, atol=1e-12)
+    first, second = columns[:, :3].numpy(), columns[:, 3:].numpy()
+    np.testing.assert_allclose(R[..., 0], first / np.linalg.norm(first, axis=1, keepdims=True), atol=1e-15)
+    # The second column is spanned by both and leans to its own side: nothing of it along the third.
+    np.testing.assert_allclose((R[..., 2].numpy() * second).sum(1), 0, atol=1e-12)
+    assert ((R[..., 1].numpy() * second).sum(1) > 0).all()
+
+
+def test_columns_without_a_rotation_are_nan_and_not_some_rotation():
+    columns = torch.tensor([[0.0, 0, 0, 0, 1, 0], [1.0, 0, 0, 0, 0, 0], [1.0, 0, 0, 2, 0, 0]])
+    assert torch.isnan(from_six_d(columns)).any(-1).any(-1).all()
+
+
+def test_six_numbers_are_differentiable():
+    columns = six_d(exp_so3(axis_angles()[:20])).requires_grad_()
+    assert torch.autograd.gradcheck(from_six_d, (columns,))
