@@ -100,7 +100,8 @@ def learned_methods() -> tuple[Method, ...]:
 
     def polished(steps: int | None) -> BodyFitter:
         config = LearnedFitterConfig()
-        return LearnedFitter(config=config if steps is None else replace(config, polish_steps=steps))
+        short = replace(config, polish_steps=steps or 0, unfinished=np.inf)  # no row is given up
+        return LearnedFitter(config=config if steps is None else short)
 
     return (
         Method("learned, network alone", lambda steps: polished(0)),
