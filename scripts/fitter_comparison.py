@@ -218,7 +218,7 @@ def draw_curves(comparison: Comparison, path: Path) -> None:
         for (name, each), colour in zip(curves.items(), COLOURS, strict=False):
             axis.plot(each.ms, each.error_mm, marker="." if len(each.ms) > 1 else "D", color=colour, label=name)
         axis.set(xscale="log", yscale="log", title=setting.name, xlabel=f"milliseconds a fit, {BATCH} at a time")
-        _plain_ticks(axis.yaxis, axis.get_ylim(), (5, 7, 10, 15, 20, 30, 50, 100, 200, 400))
+        _plain_ticks(axis.yaxis, axis.get_ylim(), (3, 5, 7, 10, 15, 20, 30, 40, 50, 70, 100, 200))
         _plain_ticks(axis.xaxis, axis.get_xlim(), (0.2, 0.5, 1, 2, 5, 10, 20, 50))
         axis.minorticks_off()
         axis.grid(alpha=0.3)
