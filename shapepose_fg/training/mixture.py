@@ -89,7 +89,9 @@ def fit_mixture(
     if config.components > 1:
         one = _seeded(rows, known, count, one, config.components // 2, rng)
     for _ in range(config.iterations):
-        share = _responsibilities(rows, groups, one) * count[:, None]
+        share = count[:, None]  # a single component is its own mirror image
+        if config.components > 1:
+            share = share * _responsibilities(rows, groups, one)
         one = _maximise(rows, groups, share, one, config.shrink)
     if config.components == 1:
         return one

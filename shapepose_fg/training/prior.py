@@ -4,8 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.pose_prior import NUM_ANGLES, PosePrior
+from shapepose_fg.simulation.shoulder import COLLARS, SHOULDERS
 from shapepose_fg.skeleton import SMPL_24
 from shapepose_fg.training.mixture import Mirror, Mixture, MixtureConfig, fit_mixture
 from shapepose_fg.training.motions import Motions, mirror_joints
@@ -13,10 +15,10 @@ from shapepose_fg.training.motions import Motions, mirror_joints
 Array = NDArray[np.float64]
 
 _NAMES = SMPL_24[1:]
-# Not recorded, so from anatomy, (x, y, z) in rad. Collars of the motions follow the arms (scapulohumeral rhythm);
-# around that they rise and sweep by 5 degrees, about their own axis hardly. Fingers as one block: bent or spread.
-_PLAY_RAD = {"collar": (0.05, 0.08, 0.08)}
-_HAND_SIGMA_RAD = 0.2
+# Not recorded, so from anatomy, (x, y, z) in rad. The shoulder girdle follows the arm at about one degree in three
+# (scapulohumeral rhythm): the clavicle rises up to 0.5 rad and moves to the front or back by 0.35, rarely. About
+# its own axis it hardly turns. Fingers as one block: the hand is bent or spread by 0.2 rad.
+_ASSUMED_SIGMA_RAD = {"collar": (0.06, 0.12, 0.15), "hand": (0.2, 0.2, 0.2)}
 # Play past straight; SMPL's knee flexes about +x, the left elbow about -y, the right about +y.
 _STRAIGHT_RAD = 0.12
 _FLEXION = {"left_knee": (0, 1), "right_knee": (0, 1), "left_elbow": (1, -1), "right_elbow": (1, 1)}
@@ -26,8 +28,10 @@ _FLEXION = {"left_knee": (0, 1), "right_knee": (0, 1), "left_elbow": (1, -1), "r
 class PriorConfig:
     """Settings of `learn_pose_prior`."""
 
-    mixture: MixtureConfig = MixtureConfig()  # noqa: RUF009 - frozen
-    """How many components, how they are fitted."""
+    mixture: MixtureConfig = MixtureConfig(components=1)  # noqa: RUF009 - frozen
+    """How many components, how they are fitted. 8 are likelier on validation subjects by 3 nats a frame, but fits
+    get caught in the wrong one: with 20 mm of noise and 30 % of the joints missing they are 0.9 mm worse on the
+    joints that are seen, no better on those missing, and surer of them than they may be."""
     slack_rad: float = 0.08
     """Sigma added (in squares) to every angle: the play between a recording's skeleton and another body.
 
@@ -40,16 +44,16 @@ class PriorConfig:
 def learn_pose_prior(motions: Motions, config: PriorConfig, provenance: str) -> PosePrior:
     """The mixture of the poses and their mirror images, with play and limits; the same for the same input."""
     motions = motions.rows(np.arange(0, len(motions), config.every))
-    fitted = joints_of("hand", other=True)  # hands are zero everywhere: no place in a mixture
-    angles = angles_of(fitted)
-    observed = motions.observed[:, 1:].copy()
-    observed[:, joints_of("collar")] = True  # the rhythm's
-    weight = motions.weight * config.every
+    fitted = [joint for joint in range(len(_NAMES)) if not _NAMES[joint].endswith(tuple(_ASSUMED_SIGMA_RAD))]
     mixture = fit_mixture(
-        _angles(motions)[:, angles], np.repeat(observed[:, fitted], 3, axis=1), weight,
-        _mirror(fitted), config.mixture, np.random.default_rng(0),
-    )  # fmt: skip
-    return _with_anatomy(mixture, angles, config.slack_rad, provenance)
+        _angles(motions)[:, angles_of(fitted)],
+        np.repeat(motions.observed[:, 1:][:, fitted], 3, axis=1),
+        motions.weight * config.every,
+        _mirror(fitted),
+        config.mixture,
+        np.random.default_rng(0),
+    )
+    return _with_anatomy(mixture, angles_of(fitted), config.slack_rad, provenance)
 
 
 def log_likelihood(prior: PosePrior, motions: Motions) -> Array:
@@ -75,18 +79,18 @@ def expected_angles(prior: PosePrior, poses: Array, asked: NDArray[np.intp]) -> 
     return np.einsum("nk,knm->nm", share, guesses)
 
 
-def joints_of(part: str, *, other: bool = False) -> list[int]:
-    """Rows of `body_pose` whose joint's name ends with `part`; with `other`, the rest."""
-    return [index for index, name in enumerate(_NAMES) if name.endswith(part) != other]
-
-
 def angles_of(joints: list[int]) -> NDArray[np.intp]:
     """Places of the joints' three angles each among the 69."""
     return (np.array(joints, dtype=np.intp)[:, None] * 3 + np.arange(3)).ravel()
 
 
 def _angles(motions: Motions) -> Array:
-    return motions.poses[:, 1:].reshape(len(motions), NUM_ANGLES).astype(np.float64)
+    """Angles (N, 69) as they were recorded: collars stay as in the T-pose, the shoulder turns for both."""
+    poses = motions.poses.astype(np.float64)
+    for collar, shoulder in zip(COLLARS, SHOULDERS, strict=True):
+        both = Rotation.from_rotvec(poses[:, collar]) * Rotation.from_rotvec(poses[:, shoulder])
+        poses[:, collar], poses[:, shoulder] = 0.0, both.as_rotvec()
+    return poses[:, 1:].reshape(len(motions), NUM_ANGLES)
 
 
 def _mirror(joints: list[int]) -> Mirror:
@@ -100,11 +104,11 @@ def _with_anatomy(mixture: Mixture, angles: NDArray[np.intp], slack_rad: float, 
     means, covariances = np.zeros((K, NUM_ANGLES)), np.zeros((K, NUM_ANGLES, NUM_ANGLES))
     means[:, angles] = mixture.means
     covariances[:, angles[:, None], angles] = mixture.covariances + slack_rad**2 * np.eye(len(angles))
-    for part, play in _PLAY_RAD.items():
-        places = angles_of(joints_of(part))
-        covariances[:, places, places] += np.tile(np.square(play), len(places) // 3)
-    hands = angles_of(joints_of("hand"))
-    covariances[:, hands, hands] = _HAND_SIGMA_RAD**2
+    for joint, name in enumerate(_NAMES):
+        for part, sigma in _ASSUMED_SIGMA_RAD.items():
+            if name.endswith(part):
+                place = angles_of([joint])
+                covariances[:, place, place] = np.square(sigma)
     lower, upper = np.full(NUM_ANGLES, -np.inf), np.full(NUM_ANGLES, np.inf)
     for name, (axis, direction) in _FLEXION.items():
         angle = 3 * _NAMES.index(name) + axis

@@ -135,7 +135,8 @@ def test_other_files_are_refused(tmp_path):
 
 def test_predicts_hidden_joints_of_people_it_never_saw(prior, shared_data):
     motions = load_motions(shared_data / "cmu_mocap" / "cmu_smpl24.npz").of("test")
-    poses = motions.poses[::30, 1:].reshape(-1, 69).astype(float)
+    motions = motions.rows(~np.isin(motions.subject, ["60", "61"]))  # salsa would be three frames in four
+    poses = motions.poses[::10, 1:].reshape(-1, 69).astype(float)
     for joint, gain in (("left_knee", 0.75), ("right_elbow", 0.9)):
         asked = np.array([angle(joint, axis) for axis in range(3)])
         guess = expected_angles(prior, poses, asked)
