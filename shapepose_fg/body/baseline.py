@@ -83,6 +83,7 @@ class LevenbergMarquardtFitter:
         OK rows of `initial` (as many rows as targets) are warm starts: no closed form, no annealing.
         """
         _check(targets, initial, len(self.model.keypoint_names))
+        groups = None if groups is None else check_groups(groups, len(targets))
         evidence = weigh(targets, self.config.evidence)
         fit = BodyFit.failed(evidence.status, targets.xyz.shape[1])
         rows = np.flatnonzero(evidence.status == FitStatus.OK)
@@ -95,9 +96,9 @@ class LevenbergMarquardtFitter:
         start = _single(self._start(evidence, rows, centre, warm, initial))
         free, held = self._solve(start, weighted, warm), None
         if groups is not None:
-            own, priors = check_groups(groups, len(targets))[rows], Held.by_priors()
+            priors = Held.by_priors()
             here = self._energy.linearise(free, weighted, torch.tensor(self.config.kernel_scale))
-            betas = pooled_betas(free, here.hessian, own, priors)
+            betas = pooled_betas(free, here.hessian, groups[rows], priors)
             held = priors.at_shape(betas)
             free = self._solve(torch.cat((betas, free[:, 10:]), 1), weighted, np.ones(len(rows), dtype=bool), held)
         body = self._energy.evaluate(free, weighted, torch.tensor(self.config.kernel_scale), held)

@@ -92,6 +92,7 @@ class LearnedFitter:
         count = len(self._slots)
         if targets.xyz.shape[1] != count:
             raise ValueError(f"targets must be the {count} keypoints of the body, got {targets.xyz.shape[1]}")
+        groups = None if groups is None else check_groups(groups, len(targets))
         evidence = weigh(targets, self.config.evidence)
         fit = BodyFit.failed(evidence.status, count)
         rows = np.flatnonzero(evidence.status == FitStatus.OK)
@@ -104,8 +105,7 @@ class LearnedFitter:
         held = Held(arrived[:, :10], torch.ones(len(rows), 1), arrived[:, 13:-3])
         body = self._polish(arrived, weighted, held)
         if groups is not None:
-            own = check_groups(groups, len(targets))[rows]
-            betas = pooled_betas(body.free, body.here.hessian, own, held)
+            betas = pooled_betas(body.free, body.here.hessian, groups[rows], held)
             body = self._polish(torch.cat((betas, body.free[:, 10:]), 1), weighted, held.at_shape(betas))
         fill(fit, rows, self._energy, body, weighted, centre, kernel_scale=self.config.kernel_scale,
              model_sigma_m=self.config.evidence.model_sigma_m, unfinished=self.config.unfinished,

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from shapepose_fg.body.model import BodyModel, BodyParameters, accumulate
 from shapepose_fg.body.rotation import exp_so3
+from shapepose_fg.body.target_skeletons import BODY_POINTS
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,17 @@ class PersonFrame:
     """(24, 3, 3) the mean pose's local rotations; the root's is the identity."""
     transl: Tensor
     """(3,) which puts the pelvis at the origin, metres."""
+
+    def __post_init__(self) -> None:
+        K = len(BODY_POINTS)
+        for name, shape in {
+            "rest_xyz": (K, 3),
+            "rest_variance": (K,),
+            "local": (24, 3, 3),
+            "transl": (3,),
+        }.items():
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"{name} must be {shape}, got {tuple(getattr(self, name).shape)}")
 
     @classmethod
     def of(cls, model: BodyModel, poses: NDArray[np.floating], weight: NDArray[np.floating]) -> "PersonFrame":

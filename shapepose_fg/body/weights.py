@@ -38,6 +38,10 @@ class FitterWeights:
     card: dict[str, str] = field(default_factory=dict)
     """What it was trained on, by which command, and its errors."""
 
+    def __post_init__(self) -> None:
+        if self.spread.shape != (len(BODY_POINTS),):
+            raise ValueError(f"spread must be ({len(BODY_POINTS)},), got {tuple(self.spread.shape)}")
+
     @staticmethod
     def default() -> "FitterWeights":
         """The weights that ship with the package (read once)."""
@@ -66,14 +70,13 @@ class FitterWeights:
             spread = tensors.pop(_SPREAD)
             network.load_state_dict({k: v for k, v in tensors.items() if not k.startswith(_FRAME)})
             frame = PersonFrame(**{k.removeprefix(_FRAME): v for k, v in tensors.items() if k.startswith(_FRAME)})
-            body, card = about["body"], json.loads(about["card"])
+            network.requires_grad_(False)
+            return cls(network.eval(), frame, about["body"], spread, json.loads(about["card"]))
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             why = str(error).splitlines()[0]
             raise InputError(
                 f"{path}: weights of another version of the fitter ({why}); train them anew"
             ) from error
-        network.requires_grad_(False)
-        return cls(network.eval(), frame, body, spread, card)
 
     def save(self, path: Path) -> None:
         """Write a safetensors file."""

@@ -1,0 +1,274 @@
+"""The learned fitter with the weights that ship: errors, independence, groups, offsets, bad input.
+
+Bounds on errors leave room for other weights: they say that the fitter works, `docs/evaluation.md` how well.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from shapepose_fg.body.fitter import BodyFit, FitStatus, JointTargets
+from shapepose_fg.body.keypoint_offsets import KeypointOffsets
+from shapepose_fg.body.learned import LearnedFitter, LearnedFitterConfig
+from shapepose_fg.body.model import BodyModel, BodyParameters
+from shapepose_fg.body.pose_prior import PosePrior
+from shapepose_fg.body.target_skeletons import BODY_POINTS, TARGET_SKELETONS
+from shapepose_fg.skeleton import BODY_25
+
+COUNT = 32
+WRIST, ELBOW = BODY_25.index("RWrist"), BODY_25.index("RElbow")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """Small matrices in several threads wait for each other where other work runs on the same cores."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def draw_bodies(count: int, rows_each: int = 1) -> BodyParameters:
+    """`count` people of `rows_each` poses from the prior, standing in a z-up world, any heading."""
+    rng = np.random.default_rng(0)
+    rows = count * rows_each
+    heading = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi, (rows, 1)))
+    orient = (heading * Rotation.from_rotvec([np.pi / 2, 0, 0])).as_rotvec()
+    betas = np.repeat(np.clip(rng.normal(size=(count, 10)), -2, 2), rows_each, axis=0)
+    poses, transl = PosePrior.default().sample(rng, rows), rng.uniform(-3, 3, (rows, 3))
+    return BodyParameters(*map(torch.from_numpy, (betas, orient, poses, transl)))
+
+
+def known_to(xyz: np.ndarray, sigma_m: float) -> JointTargets:
+    return JointTargets(xyz.copy(), np.broadcast_to(np.eye(3) / sigma_m**2, (*xyz.shape, 3)).copy())
+
+
+def distance_mm(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return 1000 * np.linalg.norm(a - b, axis=-1)
+
+
+@pytest.fixture(scope="module")
+def fitter(shipped_weights) -> LearnedFitter:
+    return LearnedFitter(weights=shipped_weights)
+
+
+@pytest.fixture(scope="module")
+def joints() -> np.ndarray:
+    """(COUNT, 25, 3) true joints."""
+    return BodyModel.default().to(torch.float64).keypoints(draw_bodies(COUNT)).numpy()
+
+
+@pytest.fixture(scope="module")
+def uneven(joints) -> JointTargets:
+    """Noisy targets, surer along some directions than along others, forearms missing from every third row."""
+    rng = np.random.default_rng(1)
+    A = 0.02 * rng.normal(size=(*joints.shape, 3))
+    information = np.linalg.inv(0.01**2 * np.eye(3) + A @ A.swapaxes(-1, -2))
+    information[::3, [ELBOW, WRIST]] = 0
+    return JointTargets(joints + rng.normal(0, 0.01, joints.shape), information)
+
+
+@pytest.fixture(scope="module")
+def fit(fitter, uneven) -> BodyFit:
+    return fitter.fit(uneven)
+
+
+def test_clean_joints_come_back(fitter, joints):
+    fit = fitter.fit(known_to(joints, 0.005))
+    assert fit.ok.all()
+    # 6.3 mm with weights that were a third trained; a tenth of the prior's poses are wilder than any recorded.
+    assert distance_mm(fit.joints, joints).mean() < 8
+    assert np.median(distance_mm(fit.joints, joints)) < 6
+
+
+@pytest.mark.parametrize("name", ["COCO_17", "HALPE_26", "SMPL_24"])
+def test_clean_joints_of_other_skeletons_come_back(shipped_weights, name):
+    model = BodyModel.default().with_keypoints(TARGET_SKELETONS[name])
+    truth = model.to(torch.float64).keypoints(draw_bodies(COUNT)).numpy()
+    fit = LearnedFitter(model, weights=shipped_weights).fit(known_to(truth, 0.005))
+    assert fit.ok.all() and fit.joints.shape == truth.shape
+    # COCO has neither feet nor neck, SMPL has a spine and hands that no prior bends far: a little more room.
+    assert distance_mm(fit.joints, truth).mean() < 12
+
+
+def test_noise_is_averaged_out(fitter, joints):
+    noise = np.random.default_rng(1).normal(0, 0.02, joints.shape)
+    fit = fitter.fit(known_to(joints + noise, 0.02))
+    # 20 mm an axis is 32 mm in length; 25 joints hang together in fewer than 75 ways.
+    assert distance_mm(fit.joints, joints).mean() < 0.8 * distance_mm(noise, 0).mean()
+
+
+def test_the_polish_pays_and_needs_the_network(fitter, shipped_weights, joints):
+    unpolished = LearnedFitter(weights=shipped_weights, config=LearnedFitterConfig(polish_steps=0))
+    targets = known_to(joints, 0.005)
+    rough = unpolished.fit(targets)
+    rough_mm = distance_mm(rough.joints, joints)[rough.ok].mean()
+    assert distance_mm(fitter.fit(targets).joints, joints).mean() < 0.8 * rough_mm
+    assert rough_mm < 40  # a mean pose put on the joints is 110 mm off
+
+
+def test_parameters_are_the_body_that_has_the_joints(fit):
+    parameters = BodyParameters(*map(torch.from_numpy, (fit.betas, fit.global_orient, fit.body_pose, fit.transl)))
+    keypoints = BodyModel.default().to(torch.float64).keypoints(parameters).numpy()
+    assert fit.ok.all()
+    assert distance_mm(fit.joints, keypoints).max() < 0.01  # single precision
+
+
+def test_a_world_turned_and_moved_has_the_same_bodies_turned_and_moved(fitter, uneven, fit):
+    R, t = Rotation.random(random_state=0).as_matrix(), np.array([20.0, -7.0, 3.0])
+    moved = fitter.fit(JointTargets(uneven.xyz @ R.T + t, R @ uneven.information @ R.T))
+    # Single precision within a metre of each person, 1e-6 m, times a condition of 100 at most.
+    np.testing.assert_allclose(moved.joints, fit.joints @ R.T + t, atol=1e-4)
+    np.testing.assert_allclose(moved.prior_xyz, fit.prior_xyz @ R.T + t, atol=1e-4)
+    np.testing.assert_allclose(moved.betas, fit.betas, atol=1e-3)
+    np.testing.assert_allclose(moved.body_pose, fit.body_pose, atol=1e-3)
+    np.testing.assert_allclose(moved.covariance, R @ fit.covariance @ R.T, atol=1e-5)
+
+
+def test_a_row_alone_is_the_row_of_a_batch(fitter, uneven, fit):
+    for row in (0, 7):
+        alone = fitter.fit(JointTargets(uneven.xyz[[row]], uneven.information[[row]]))
+        np.testing.assert_allclose(alone.joints[0], fit.joints[row], atol=1e-4)  # products in another order
+        np.testing.assert_allclose(alone.betas[0], fit.betas[row], atol=1e-3)
+
+
+def test_where_a_fit_starts_does_not_matter(fitter, uneven, fit):
+    np.testing.assert_array_equal(fitter.fit(uneven, initial=fit).joints, fit.joints)
+
+
+@pytest.mark.parametrize("anything", [np.nan, np.inf, 1e6])
+def test_the_place_of_a_missing_joint_is_not_looked_at(fitter, uneven, fit, anything):
+    xyz = uneven.xyz.copy()
+    xyz[::3, [ELBOW, WRIST]] = anything
+    np.testing.assert_array_equal(fitter.fit(JointTargets(xyz, uneven.information)).joints, fit.joints)
+
+
+def test_missing_joints_are_filled_in_and_known_to_be_guesses(fit, joints):
+    length = np.linalg.norm((fit.joints - joints)[::3, WRIST], axis=-1)
+    assert np.median(length) < 0.3  # a guess, but on the right side: an arm is 0.55 m
+    sigma = np.sqrt(np.trace(fit.covariance, axis1=-2, axis2=-1) / 3)[::3]
+    assert (sigma[:, WRIST] > 3 * sigma[:, BODY_25.index("LWrist")]).all()
+    assert np.linalg.eigvalsh(fit.covariance).min() > 0
+    assert np.linalg.eigvalsh(fit.prior_covariance).min() > 0
+
+
+def test_beliefs_about_missing_joints_are_as_wide_as_the_weights_say(shipped_weights, uneven):
+    one, four = (replace(shipped_weights, spread=torch.full((len(BODY_POINTS),), s)) for s in (1.0, 4.0))
+    narrow, wide = (LearnedFitter(weights=weights).fit(uneven) for weights in (one, four))
+    hidden = ~uneven.information.any(axis=(-1, -2))
+    np.testing.assert_allclose(wide.covariance[hidden], 4 * narrow.covariance[hidden], rtol=1e-9)
+    np.testing.assert_array_equal(wide.covariance[~hidden], narrow.covariance[~hidden])
+    model_error = 0.02**2 * np.eye(3)  # is no belief about the body
+    expected = 4 * (narrow.prior_covariance - model_error) + model_error
+    np.testing.assert_allclose(wide.prior_covariance, expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_array_equal(wide.joints, narrow.joints)
+
+
+def test_bad_rows_get_a_status_and_leave_the_others_alone(fitter, joints):
+    targets = known_to(joints[:8], 0.01)
+    good = fitter.fit(targets)
+    xyz, information = targets.xyz.copy(), targets.information.copy()
+    information[0] = 0  # all missing
+    xyz[1, 3, 1] = np.nan
+    information[2, 5, 0, 0] = np.nan
+    information[3, 5] *= -1
+    xyz[4] = xyz[4, :1]  # collapsed: all joints in one point
+    xyz[5] = xyz[5, :1] + np.linspace(0, 1, 25)[:, None] * [0.2, 0.3, 1.0]  # all on a line
+    information[6, 3:] = 0
+    fit = fitter.fit(JointTargets(xyz, information))
+    few, invalid = FitStatus.TOO_FEW_JOINTS, FitStatus.INVALID_TARGETS
+    assert fit.status.tolist() == [few, invalid, invalid, invalid, few, few, few, FitStatus.OK]
+    for values in (fit.betas, fit.global_orient, fit.body_pose, fit.transl):
+        assert not values[:7].any() and np.isfinite(values).all()
+    assert np.isnan(fit.joints[:7]).all() and np.isnan(fit.residual_m[:7]).all()
+    np.testing.assert_allclose(fit.joints[7], good.joints[7], atol=1e-4)
+
+
+@pytest.mark.parametrize("scale", [0.2, 100.0, 1e6])
+def test_what_is_no_person_never_becomes_nan(fitter, joints, scale):
+    fit = fitter.fit(known_to(joints[:4] * scale, 0.01))
+    assert set(fit.status) <= {FitStatus.OK, FitStatus.NOT_CONVERGED, FitStatus.TOO_FEW_JOINTS}
+    for values in (fit.betas, fit.global_orient, fit.body_pose, fit.transl, fit.joints[fit.ok]):
+        assert np.isfinite(values).all()
+    clean = fitter.fit(known_to(joints[:4], 0.01)).residual_m
+    assert (fit.residual_m[fit.ok] > 3 * clean.max()).all()  # it says that it does not fit
+
+
+def test_a_network_gone_wild_is_not_converged_and_not_nan(shipped_weights, joints):
+    network = type(shipped_weights.network)(shipped_weights.network.config)
+    network.load_state_dict(shipped_weights.network.state_dict())
+    with torch.no_grad():
+        network.leave.bias += 1e30
+    fit = LearnedFitter(weights=replace(shipped_weights, network=network.eval())).fit(known_to(joints[:3], 0.01))
+    assert fit.status.tolist() == [FitStatus.NOT_CONVERGED] * 3
+    assert not fit.body_pose.any() and np.isnan(fit.joints).all()
+
+
+def test_no_rows_give_no_bodies(fitter):
+    fit = fitter.fit(JointTargets(np.zeros((0, 25, 3)), np.zeros((0, 25, 3, 3))))
+    assert len(fit) == 0 and fit.joints.shape == (0, 25, 3)
+
+
+def test_rows_of_one_person_share_a_shape_that_is_nearer_to_the_true_one(fitter):
+    people, rows = 8, 6
+    bodies = draw_bodies(people, rows)
+    truth = BodyModel.default().to(torch.float64).keypoints(bodies).numpy()
+    targets = known_to(truth + np.random.default_rng(1).normal(0, 0.01, truth.shape), 0.01)
+    alone = fitter.fit(targets)
+    order = np.random.default_rng(2).permutation(people * rows)  # rows of a person need not lie together
+    shuffled = JointTargets(targets.xyz[order], targets.information[order])
+    together = fitter.fit(shuffled, groups=order // rows * 7 - 3).rows(np.argsort(order))
+    shapes = together.betas.reshape(people, rows, 10)
+    ok = (alone.ok & together.ok).reshape(people, rows)
+    assert ok.mean() > 0.9
+    spread = np.array([np.ptp(shapes[p][ok[p]], axis=0).max() for p in range(people)])
+    # Held by a precision of 1e6, against some hundreds of what a row's joints say; alone they differ by ones.
+    assert spread.max() < 1e-3
+    error = [np.linalg.norm(f.betas - bodies.betas.numpy(), axis=1)[ok.ravel()].mean() for f in (alone, together)]
+    # 2.6 and 2.1: joints tell little of girth; those directions stay near zero, as they must.
+    assert error[1] < 0.9 * error[0]
+
+
+def test_groups_are_checked_even_where_nothing_can_be_fitted(fitter, joints):
+    nothing = JointTargets(joints[:3], np.zeros((3, 25, 3, 3)))
+    for groups in (np.zeros(2, dtype=int), np.zeros(3), np.zeros((3, 1), dtype=int)):
+        with pytest.raises(ValueError, match="groups must be 3 whole numbers"):
+            fitter.fit(nothing, groups=groups)
+
+
+def test_a_person_with_bad_rows_keeps_the_shape_of_the_good_ones(fitter, joints):
+    targets = known_to(joints[:4], 0.01)
+    information = targets.information.copy()
+    information[1] = 0
+    fit = fitter.fit(JointTargets(targets.xyz, information), groups=np.array([0, 0, 0, 1]))
+    assert fit.status.tolist() == [FitStatus.OK, FitStatus.TOO_FEW_JOINTS, FitStatus.OK, FitStatus.OK]
+    np.testing.assert_allclose(fit.betas[0], fit.betas[2], atol=1e-3)
+
+
+def test_a_detector_that_puts_joints_elsewhere_is_followed(fitter, shipped_weights, joints):
+    offsets = KeypointOffsets.symmetric({"LHip": (0.05, 0.06, 0.0), "LAnkle": (0.0, 0.0, -0.05)})
+    elsewhere = fitter.with_keypoint_offsets(offsets)
+    truth = elsewhere.model.to(torch.float64).keypoints(draw_bodies(COUNT)).numpy()
+    hip = BODY_25.index("LHip")
+    assert distance_mm(truth[:, hip], joints[:, hip]) == pytest.approx(1000 * np.hypot(0.05, 0.06), abs=0.01)
+    targets = known_to(truth, 0.005)
+    informed, naive = elsewhere.fit(targets), fitter.fit(targets)
+    assert distance_mm(informed.joints, truth).mean() < 8
+    assert (
+        distance_mm(informed.joints, truth)[:, hip].mean() < 0.5 * distance_mm(naive.joints, truth)[:, hip].mean()
+    )
+    body = fitter.model.to(torch.float64).keypoints(
+        BodyParameters(*map(torch.from_numpy, (informed.betas, informed.global_orient, informed.body_pose,
+                                               informed.transl)))
+    ).numpy()  # fmt: skip
+    assert distance_mm(body, joints).mean() < 8  # the body itself is where it was
+
+
+def test_misuse_is_refused(fitter, joints):
+    with pytest.raises(ValueError, match="the 25 keypoints of the body, got 17"):
+        fitter.fit(known_to(joints[:, :17], 0.01))
+    with pytest.raises(ValueError, match="kernel_scale and unfinished must be positive"):
+        LearnedFitterConfig(polish_steps=-1)
