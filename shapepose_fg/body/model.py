@@ -97,6 +97,7 @@ class BodyModel:
         """All `BODY_POINTS`: BODY_25's keypoints, the top of the head, the 24 joints."""
         self.keypoint_points = self.points.part(list(slots(keypoint_names)))
         """The keypoints (K)."""
+        self._last_part: tuple[bytes, _Mesh] | None = None
 
     @classmethod
     def default(cls) -> "BodyModel":
@@ -148,7 +149,7 @@ class BodyModel:
 
         The only thing here whose cost grows with the mesh.
         """
-        mesh = self._mesh if only is None else self._mesh.part(only)
+        mesh = self._mesh if only is None else self._part_of_mesh(only)
         _, rotations = self._rotations(parameters)
         shaped = mesh.template + (parameters.betas @ mesh.shapes).unflatten(-1, (-1, 3))
         if mesh.pose_blend is not None:
@@ -222,6 +223,13 @@ class BodyModel:
     def _pose_feature(self, parameters: BodyParameters) -> Tensor:
         return (exp_so3(parameters.body_pose) - torch.eye(3, dtype=self.dtype)).flatten(1)
 
+    def _part_of_mesh(self, only: NDArray[np.intp]) -> "_Mesh":
+        """What some of the vertices need; the last part is kept, for it is asked for frame after frame."""
+        key = only.tobytes()
+        if self._last_part is None or self._last_part[0] != key:
+            self._last_part = (key, self._mesh.part(only))
+        return self._last_part[1]
+
     @cached_property
     def _mesh(self) -> "_Mesh":
         """The big arrays, made when somebody first asks for vertices."""
@@ -284,14 +292,16 @@ def _tree_levels() -> tuple[list[tuple[list[int], list[int]]], list[int]]:
 
 
 _TREE_LEVELS, _FROM_LEVEL_ORDER = _tree_levels()
+_LEVEL_INDICES = [(torch.tensor(joints), torch.tensor(parents)) for joints, parents in _TREE_LEVELS]
+_FROM_LEVEL_INDEX = torch.tensor(_FROM_LEVEL_ORDER)
 
 
 def accumulate(local: Tensor) -> Tensor:
     """World rotations of SMPL's bones from those relative to their parents; (B, 24, 3, 3) both."""
     levels = [local[:, :1]]
-    for joints, parents_in_level in _TREE_LEVELS:
-        levels.append(levels[-1][:, parents_in_level] @ local[:, joints])
-    return torch.cat(levels, 1)[:, _FROM_LEVEL_ORDER]
+    for joints, parents_in_level in _LEVEL_INDICES:  # tensors: lists would be converted each time
+        levels.append(levels[-1].index_select(1, parents_in_level) @ local.index_select(1, joints))
+    return torch.cat(levels, 1).index_select(1, _FROM_LEVEL_INDEX)
 
 
 def _rest_joints(arrays: SmplArrays) -> NDArray[np.float64]:
