@@ -44,7 +44,7 @@ def main(
     output: Annotated[Path, typer.Option(help="Where the weights go.")] = Path("fitter.safetensors"),
     body: Annotated[Path | None, typer.Option(help="SMPL file to train for; the open body without.")] = None,
     iterations: Annotated[int, typer.Option(min=1, help="Batches in all.")] = TrainingConfig.iterations,
-    batch: Annotated[int, typer.Option(min=1, help="People in each.")] = TrainingConfig.batch,
+    batch: Annotated[int, typer.Option(min=16, help="People in each.")] = TrainingConfig.batch,
     seed: Annotated[int, typer.Option(help="Of everything that is drawn.")] = 0,
     threads: Annotated[int, typer.Option(min=1, help="CPU threads.")] = 1,
     validate_every: Annotated[int, typer.Option(min=1, help="Iterations between validations.")] = 500,
@@ -55,6 +55,11 @@ def main(
     config = replace(TrainingConfig(), iterations=iterations, batch=batch, seed=seed)
     model = BodyModel.default() if body is None else BodyModel.load(body)
     recorded = load_motions(motions)
+    for split in ("train", "validation"):
+        if len(recorded.of(split)) == 0:
+            raise InputError(
+                f"{motions}: no {split} subjects in it; add motions of more people (see training/split)"
+            )
     train = recorded.of("train")
     frame = PersonFrame.of(model, train.poses, train.weight)
     trainer = _trainer(recorded, model, frame, config)

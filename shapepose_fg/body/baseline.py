@@ -7,16 +7,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from shapepose_fg.body.alignment import RestAlignment
 from shapepose_fg.body.beliefs import fill
 from shapepose_fg.body.energy import BodyEnergy, Held, Linearisation, WhitenedTargets
 from shapepose_fg.body.evidence import Evidence, EvidenceConfig, weigh
 from shapepose_fg.body.fitter import BodyFit, FitStatus, JointTargets
 from shapepose_fg.body.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model import BodyModel
+from shapepose_fg.body.person_frame import PersonFrame
 from shapepose_fg.body.pose_prior import PosePrior
 from shapepose_fg.body.rotation import log_so3
 from shapepose_fg.body.shared_shape import check_groups, pooled_betas
+from shapepose_fg.body.target_skeletons import slots
 
 Array = NDArray[np.float64]
 
@@ -66,7 +67,8 @@ class LevenbergMarquardtFitter:
         prior = PosePrior.default() if pose_prior is None else pose_prior
         self.config = PlainFitterConfig() if config is None else config
         self.model, self._prior = model, prior
-        self._align = RestAlignment(model, prior)
+        self._frame = PersonFrame.of_angles(model, prior.mean, prior.covariance)
+        self._slots = slots(model.keypoint_names)
         self._energy = BodyEnergy(model.to(torch.float32), prior)
         self._mean_angles = prior.mean[self._energy.angles]
 
@@ -74,7 +76,7 @@ class LevenbergMarquardtFitter:
         """The same fitter for a detector that puts its joints `offsets` away from the body's."""
         return LevenbergMarquardtFitter(self.model.with_keypoint_offsets(offsets), self._prior, self.config)
 
-    @torch.no_grad()
+    @torch.inference_mode()
     def fit(
         self, targets: JointTargets, initial: BodyFit | None = None, groups: NDArray[np.intp] | None = None
     ) -> BodyFit:
@@ -111,8 +113,9 @@ class LevenbergMarquardtFitter:
         initial: BodyFit | None,
     ) -> Array:  # fmt: skip
         """Free parameters (R, P) to start from, with `centre` (R, 3) as origin."""
-        rotation, transl = self._align(evidence.xyz[rows] - centre[:, None], evidence.variance_m2[rows])
-        orient = log_so3(torch.from_numpy(rotation)).numpy()
+        xyz = torch.from_numpy(evidence.xyz[rows] - centre[:, None])
+        rotation, pelvis = self._frame.place(xyz, torch.from_numpy(evidence.variance_m2[rows]), self._slots)
+        orient, transl = log_so3(rotation).numpy(), (pelvis + self._frame.transl).numpy()
         angles = np.broadcast_to(self._mean_angles, (len(rows), len(self._mean_angles)))
         start = np.concatenate([np.zeros((len(rows), 10)), orient, angles, transl], axis=1)
         if initial is not None and warm.any():

@@ -6,7 +6,7 @@ the kinematic tree, each to where the joints that hang on it are seen,
     W = argmax tr(Wᵀ M),   M = sum_k w_k (z_k - p) a_kᵀ + W_parent R_mean / (2 s²),
 
 with a_k the arm of joint k from the pivot in the T-pose, z_k its target, p the pivot's place, w_k an inverse
-variance, and s the pose prior's sigma of that rotation: Kabsch's alignment with the mean pose as one more witness,
+variance, and s the pose prior's sigma of that rotation: Kabsch with the mean pose as one more witness,
 so that a single direction turns a bone without twisting it, and a limb that nobody sees hangs as it does on
 average. Elbows and knees are hinges, bent as the triangle of their limb says. Good to some centimetres: a start
 for other fitters, and what they must beat.
@@ -18,11 +18,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from shapepose_fg.body.alignment import RestAlignment
 from shapepose_fg.body.bone_lengths import BoneLengths
 from shapepose_fg.body.model import BodyModel, BodyParameters
+from shapepose_fg.body.person_frame import PersonFrame
 from shapepose_fg.body.pose_prior import PosePrior
 from shapepose_fg.body.rotation import exp_so3, log_so3
+from shapepose_fg.body.target_skeletons import slots
 from shapepose_fg.skeleton import BODY_25, SMPL_24
 
 _SPINE = ("spine1", "spine2", "spine3")
@@ -76,7 +77,7 @@ class ClosedFormStart:
 
     def __init__(self, model: BodyModel, prior: PosePrior):
         self.model, self.dtype = model, model.dtype
-        self._align = RestAlignment(model, prior)
+        self._frame = PersonFrame.of_angles(model, prior.mean, prior.covariance)
         self._lengths = BoneLengths(model, prior)
         self._rest, self._rest_shapes = (part.to(self.dtype) for part in _rest_points(model))
         self._mean = exp_so3(torch.from_numpy(prior.mean).view(23, 3)).to(self.dtype)
@@ -92,9 +93,8 @@ class ClosedFormStart:
         figure = _Figure(
             xyz, 1 / variance_m2, (self._rest.flatten() + betas @ self._rest_shapes).unflatten(1, (-1, 3))
         )
-        rotation, transl = self._align(xyz.double().numpy(), variance_m2.double().numpy())
-        root = torch.from_numpy(rotation).to(self.dtype)
-        pelvis = self._rest[_POINTS["pelvis"]] + torch.from_numpy(transl).to(self.dtype)
+        rotation, pelvis = self._frame.place(xyz.double(), variance_m2.double(), slots(BODY_25.joints))
+        root, pelvis = rotation.to(self.dtype), pelvis.to(self.dtype)
         local = self._mean.repeat(len(xyz), 1, 1, 1)
         root, chest = self._turn_trunk(figure, local, root, pelvis)
         self._turn_head(figure, local, chest)

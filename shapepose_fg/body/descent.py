@@ -17,6 +17,7 @@ from shapepose_fg.body.model import accumulate
 from shapepose_fg.body.network import NUM_ROTATIONS, UpdateNetwork
 from shapepose_fg.body.rotation import from_six_d, six_d
 from shapepose_fg.body.skinned_points import SkinnedPoints
+from shapepose_fg.body.small_matrices import inverse_3x3
 from shapepose_fg.body.target_skeletons import BODY_POINTS
 
 _REACH_M = 0.1
@@ -138,14 +139,6 @@ def _believed(information: Tensor) -> tuple[Tensor, Tensor]:
     believed = information @ inverse_3x3(information + eye / _REACH_M**2)
     share = information @ inverse_3x3(information + eye / _TRUST_M**2)
     return believed, torch.diagonal(share, dim1=-2, dim2=-1).mean(-1)
-
-
-def inverse_3x3(matrix: Tensor) -> Tensor:
-    """Inverses of many 3x3 matrices by cross products of their rows; LAPACK takes them one at a time."""
-    a, b, c = matrix.unbind(-2)
-    columns = torch.stack((torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)), -1)
-    determinant = (a * columns[..., 0]).sum(-1)
-    return columns / determinant[..., None, None]
 
 
 def gradient_scale(points: SkinnedPoints, slots: tuple[int, ...]) -> Tensor:

@@ -80,7 +80,7 @@ class LearnedFitter:
         """The same fitter for a detector that puts its joints so far from the body's."""
         return LearnedFitter(self.model.with_keypoint_offsets(offsets), self._prior, self.config, self.weights)
 
-    @torch.no_grad()
+    @torch.inference_mode()
     def fit(
         self, targets: JointTargets, initial: BodyFit | None = None, groups: NDArray[np.intp] | None = None
     ) -> BodyFit:

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from shapepose_fg.body.small_matrices import inverse_3x3
+
 
 @dataclass(frozen=True)
 class JointPosterior:
@@ -49,7 +51,7 @@ def joint_posterior(xyz: Tensor, half: Tensor, residual: Tensor, root: Tensor) -
     A = blocks @ blocks.mT
     AS = A @ root
     remainder = torch.eye(3, dtype=A.dtype) - _symmetric(root @ AS)
-    C = A + _symmetric(AS @ _inverse(remainder) @ AS.mT)
+    C = A + _symmetric(AS @ inverse_3x3(remainder) @ AS.mT)
     pull = root @ (root @ residual[..., None])
     sag = torch.diagonal(A, dim1=-2, dim2=-1).sum(-1) / (2 * LIMB_M)
     curvature = sag.square()[..., None, None] * torch.eye(3, dtype=A.dtype)
@@ -58,11 +60,3 @@ def joint_posterior(xyz: Tensor, half: Tensor, residual: Tensor, root: Tensor) -
 
 def _symmetric(matrix: Tensor) -> Tensor:
     return (matrix + matrix.mT) / 2
-
-
-def _inverse(matrix: Tensor) -> Tensor:
-    """Inverses of many 3x3 matrices by cross products of their rows; LAPACK takes them one at a time."""
-    a, b, c = matrix.unbind(-2)
-    columns = torch.stack((torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)), -1)
-    determinant = (a * columns[..., 0]).sum(-1)
-    return columns / determinant[..., None, None]

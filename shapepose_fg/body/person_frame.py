@@ -1,4 +1,4 @@
-"""The person's own frame: where learned descent starts, and in which it works."""
+"""The person's own frame, in closed form: where fits start, and in which learned descent works."""
 
 from dataclasses import dataclass
 
@@ -42,11 +42,18 @@ class PersonFrame:
 
     @classmethod
     def of(cls, model: BodyModel, poses: NDArray[np.floating], weight: NDArray[np.floating]) -> "PersonFrame":
-        """The frame of a body that takes `poses` (N, 24, 3), axis-angle, root first, with weights (N,)."""
-        model = model.to(torch.float64)
+        """The frame of a body that takes `poses` (N, 24, 3), axis-angle, root first, weighing (N,); float32."""
         angles, share = poses[:, 1:].reshape(len(poses), 69).astype(np.float64), weight / weight.sum()
         mean = share @ angles
-        covariance = torch.from_numpy((angles - mean).T @ ((angles - mean) * share[:, None]))
+        frame = cls.of_angles(model, mean, (angles - mean).T @ ((angles - mean) * share[:, None]))
+        return cls(frame.rest_xyz.float(), frame.rest_variance.float(), frame.local.float(), frame.transl.float())
+
+    @classmethod
+    def of_angles(
+        cls, model: BodyModel, mean: NDArray[np.float64], covariance: NDArray[np.float64]
+    ) -> "PersonFrame":
+        """The frame of a body whose 69 joint angles have this mean (69,) and covariance (69, 69), rad; float64."""
+        model = model.to(torch.float64)
         pose = torch.from_numpy(mean).view(1, 23, 3)
         zero = torch.zeros(1, 3, dtype=torch.float64)
         pelvis = model.joints(BodyParameters(torch.zeros(1, 10, dtype=torch.float64), zero, pose, zero))[0, 0]
@@ -56,8 +63,9 @@ class PersonFrame:
             accumulate(local), torch.zeros(1, 10, dtype=torch.float64), zero, local, feature
         )
         by_shape, by_pose = jacobian[0, ..., :10], jacobian[0, ..., 13:-3]
-        variance = by_shape.square().sum(-1) + torch.einsum("kxi,ij,kxj->kx", by_pose, covariance, by_pose)
-        return cls((xyz[0] - pelvis).float(), variance.mean(-1).float(), local[0].float(), -pelvis.float())
+        spread = by_pose @ torch.from_numpy(covariance)
+        variance = by_shape.square().sum(-1) + (spread * by_pose).sum(-1)
+        return cls(xyz[0] - pelvis, variance.mean(-1), local[0], -pelvis)
 
     def place(self, xyz: Tensor, variance: Tensor, slots: tuple[int, ...]) -> tuple[Tensor, Tensor]:
         """World from person: rotations (B, 3, 3), and where the pelvis is (B, 3).
@@ -69,14 +77,15 @@ class PersonFrame:
         slots: (J,) places of the targets among `BODY_POINTS`.
         """
         rows = list(slots)
-        weight = 1 / (self.rest_variance[rows] + variance)
+        rest_xyz, rest_variance = self.rest_xyz[rows].to(xyz.dtype), self.rest_variance[rows].to(xyz.dtype)
+        weight = 1 / (rest_variance + variance)
         weight = weight / weight.sum(1, keepdim=True)
-        rest_centre = weight @ self.rest_xyz[rows]
+        rest_centre = weight @ rest_xyz
         target_centre = (weight[:, None] @ xyz)[:, 0]
-        rest = self.rest_xyz[rows] - rest_centre[:, None]
+        rest = rest_xyz - rest_centre[:, None]
         moment = (weight[..., None] * (xyz - target_centre[:, None])).mT @ rest
         U, _, Vt = torch.linalg.svd(moment.double())
         sign = torch.det(U @ Vt).sign()
         U = torch.cat((U[..., :2], U[..., 2:] * sign[:, None, None]), -1)  # a rotation, not a mirror image
-        rotation = (U @ Vt).float()
+        rotation = (U @ Vt).to(xyz.dtype)
         return rotation, target_centre - (rotation @ rest_centre[..., None]).squeeze(-1)

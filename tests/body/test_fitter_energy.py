@@ -4,7 +4,6 @@ import torch
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
-from shapepose_fg.body.alignment import RestAlignment
 from shapepose_fg.body.energy import (
     BodyEnergy,
     WhitenedTargets,
@@ -16,6 +15,7 @@ from shapepose_fg.body.evidence import EvidenceConfig, spread_m, weigh
 from shapepose_fg.body.fitter import JointTargets
 from shapepose_fg.body.model import BodyModel, BodyParameters
 from shapepose_fg.body.pose_energy import PoseEnergy
+from shapepose_fg.body.person_frame import PersonFrame
 from shapepose_fg.body.pose_prior import PosePrior
 from shapepose_fg.skeleton import BODY_25, SMPL_24
 
@@ -186,9 +186,11 @@ def test_alignment_of_the_mean_pose_is_exact(model, seen):
     }[seen]
     variance = np.full((4, 25), np.inf)
     variance[:, [BODY_25.index(name) for name in names]] = 1e-4
-    R, t = RestAlignment(model, prior)(np.where(np.isinf(variance)[..., None], 0.0, xyz), variance)
+    frame = PersonFrame.of_angles(model, prior.mean, prior.covariance)
+    targets = torch.from_numpy(np.where(np.isinf(variance)[..., None], 0.0, xyz))
+    R, pelvis = frame.place(targets, torch.from_numpy(variance), tuple(range(25)))
     np.testing.assert_allclose(R, rotation.as_matrix(), atol=1e-9)
-    np.testing.assert_allclose(t, transl, atol=1e-9)
+    np.testing.assert_allclose(pelvis + frame.transl, transl, atol=1e-9)
 
 
 def test_model_error_is_added_to_covariances_and_rays_stay_rays():
