@@ -58,7 +58,7 @@ def main(
     for split in ("train", "validation"):
         if len(recorded.of(split)) == 0:
             raise InputError(
-                f"{motions}: no {split} subjects in it; add motions of more people (see training/split)"
+                f"{motions}: no {split} subjects in it; add motions of more people (training/split.py)"
             )
     train = recorded.of("train")
     frame = PersonFrame.of(model, train.poses, train.weight)
