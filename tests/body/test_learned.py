@@ -106,7 +106,7 @@ def test_the_polish_pays_and_needs_the_network(fitter, shipped_weights, joints):
     targets = known_to(joints, 0.005)
     rough = unpolished.fit(targets)
     rough_mm = distance_mm(rough.joints, joints)[rough.ok].mean()
-    assert distance_mm(fitter.fit(targets).joints, joints).mean() < 0.8 * rough_mm
+    assert distance_mm(fitter.fit(targets).joints, joints).mean() < 0.9 * rough_mm
     assert rough_mm < 40  # a mean pose put on the joints is 110 mm off
 
 
