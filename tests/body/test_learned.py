@@ -267,6 +267,15 @@ def test_a_detector_that_puts_joints_elsewhere_is_followed(fitter, shipped_weigh
     assert distance_mm(body, joints).mean() < 8  # the body itself is where it was
 
 
+def test_offsets_of_joints_that_a_skeleton_lacks_change_nothing(shipped_weights):
+    model = BodyModel.default().with_keypoints(TARGET_SKELETONS["COCO_17"])
+    plain = LearnedFitter(model, weights=shipped_weights)
+    targets = known_to(model.to(torch.float64).keypoints(draw_bodies(4)).numpy(), 0.01)
+    offsets = KeypointOffsets.symmetric({"Neck": (0.0, 0.15, 0.0), "LBigToe": (0.1, 0.0, 0.1)})
+    moved = plain.with_keypoint_offsets(offsets).fit(targets)
+    np.testing.assert_array_equal(moved.joints, plain.fit(targets).joints)
+
+
 def test_misuse_is_refused(fitter, joints):
     with pytest.raises(ValueError, match="the 25 keypoints of the body, got 17"):
         fitter.fit(known_to(joints[:, :17], 0.01))
