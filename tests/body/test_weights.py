@@ -141,7 +141,7 @@ def test_weights_belong_to_one_body(weights, tiny_body, file):
 
 
 def test_the_fitter_is_the_one_that_is_asked_for(weights, file, tiny_body, shipped_weights):
-    assert isinstance(make_fitter(), LevenbergMarquardtFitter)
+    assert isinstance(make_fitter(model=tiny_body), LevenbergMarquardtFitter)  # whatever the default: it works
     assert isinstance(make_fitter(BodyConfig(method="plain"), tiny_body), LevenbergMarquardtFitter)
     learned = make_fitter(BodyConfig(method="learned"))
     assert isinstance(learned, LearnedFitter) and learned.weights is shipped_weights
