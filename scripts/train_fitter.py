@@ -7,7 +7,6 @@ an hour on one core.
 """
 
 import json
-import subprocess
 import sys
 import time
 from dataclasses import replace
@@ -118,18 +117,15 @@ def _people_to_validate(recorded: Motions, model: BodyModel, frame: PersonFrame,
 
 def _card(trainer: Trainer, recorded: Motions, motions: Path, errors: list[float]) -> dict[str, str]:
     """What a reader of the weights wants to know."""
-    train = recorded.of("train")
-    commit = subprocess.run(
-        ["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=False
-    )
+    train, config = recorded.of("train"), trainer.config
     return {
         "data": f"{motions.name}: {len(train)} frames of {len(set(train.subject.tolist()))} subjects for training",
         "not seen": f"subjects {' '.join(VALIDATION_SUBJECTS)} (validation), {' '.join(TEST_SUBJECTS)} (test)",
-        "command": " ".join(["python", "scripts/train_fitter.py", motions.name, *sys.argv[2:]]),
-        "settings": json.dumps({"iterations": trainer.config.iterations, "batch": trainer.config.batch}),
+        "command": f"python scripts/train_fitter.py {motions.name} --iterations {config.iterations}"
+        f" --batch {config.batch} --seed {config.seed}",
         "validation": "mean joint error after each step, mm: " + ", ".join(f"{error:.1f}" for error in errors),
         "acknowledgement": ACKNOWLEDGEMENT,
-        "made with": json.dumps(versions()) + " " + commit.stdout.strip(),
+        "made with": json.dumps(versions()),
     }
 
 

@@ -16,7 +16,7 @@ Method = Literal["auto", "learned", "plain"]
 class BodyConfig:
     """How bodies are fitted."""
 
-    method: str = "plain"
+    method: str = "auto"
     """"learned": learned gradient descent; "plain": Levenberg-Marquardt; "auto": learned where the weights are for
     the body at hand, plain on any other body."""
     weights: str = ""
