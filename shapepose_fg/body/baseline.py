@@ -16,7 +16,7 @@ from shapepose_fg.body.model import BodyModel
 from shapepose_fg.body.person_frame import PersonFrame
 from shapepose_fg.body.pose_prior import PosePrior
 from shapepose_fg.body.rotation import log_so3
-from shapepose_fg.body.shared_shape import check_groups, pooled_betas
+from shapepose_fg.body.shared_shape import check_groups, pooled_betas, shared
 from shapepose_fg.body.target_skeletons import slots
 
 Array = NDArray[np.float64]
@@ -101,7 +101,7 @@ class LevenbergMarquardtFitter:
             priors = Held.by_priors()
             here = self._energy.linearise(free, weighted, torch.tensor(self.config.kernel_scale))
             betas = pooled_betas(free, here.hessian, groups[rows], priors)
-            held = priors.at_shape(betas)
+            held = priors.at_shape(betas, shared(groups[rows]))
             free = self._solve(torch.cat((betas, free[:, 10:]), 1), weighted, np.ones(len(rows), dtype=bool), held)
         body = self._energy.evaluate(free, weighted, torch.tensor(self.config.kernel_scale), held)
         fill(fit, rows, self._energy, body, weighted, centre, kernel_scale=self.config.kernel_scale,

@@ -55,9 +55,10 @@ class Held:
     def __getitem__(self, rows: Tensor) -> "Held":
         return Held(self.betas[rows], self.stiffness[rows], None if self.angles is None else self.angles[rows])
 
-    def at_shape(self, betas: Tensor) -> "Held":
-        """The same, but with shapes (B, 10) that are settled: next to immovable."""
-        return Held(betas, torch.full((len(betas), 1), SETTLED), self.angles)
+    def at_shape(self, betas: Tensor, settled: Tensor) -> "Held":
+        """The same, but next to immovable at shapes `betas` (B, 10) in the rows that are `settled` (B,)."""
+        rows = settled[:, None]
+        return Held(torch.where(rows, betas, self.betas), torch.where(rows, SETTLED, self.stiffness), self.angles)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from shapepose_fg.body.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model import BodyModel
 from shapepose_fg.body.pose_prior import PosePrior
 from shapepose_fg.body.rotation import log_so3
-from shapepose_fg.body.shared_shape import check_groups, pooled_betas
+from shapepose_fg.body.shared_shape import check_groups, pooled_betas, shared
 from shapepose_fg.body.skinned_points import SkinnedPoints
 from shapepose_fg.body.target_skeletons import BODY_POINTS, slots
 from shapepose_fg.body.weights import FitterWeights
@@ -106,7 +106,8 @@ class LearnedFitter:
         body = self._polish(arrived, weighted, held)
         if groups is not None:
             betas = pooled_betas(body.free, body.here.hessian, groups[rows], held)
-            body = self._polish(torch.cat((betas, body.free[:, 10:]), 1), weighted, held.at_shape(betas))
+            held = held.at_shape(betas, shared(groups[rows]))
+            body = self._polish(torch.cat((betas, body.free[:, 10:]), 1), weighted, held)
         fill(fit, rows, self._energy, body, weighted, centre, kernel_scale=self.config.kernel_scale,
              model_sigma_m=self.config.evidence.model_sigma_m, unfinished=self.config.unfinished,
              spread=self.weights.spread[list(self._slots)])  # fmt: skip

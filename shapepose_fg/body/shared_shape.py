@@ -41,6 +41,12 @@ def pooled_betas(free: Tensor, hessian: Tensor, groups: NDArray[np.intp], held: 
     return torch.where((count[index] > 1)[:, None], betas, free[:, :10])
 
 
+def shared(groups: NDArray[np.intp]) -> Tensor:
+    """(B,) which rows are not alone in their group."""
+    _, place, size = np.unique(groups, return_inverse=True, return_counts=True)
+    return torch.from_numpy(size[place] > 1)
+
+
 def check_groups(groups: NDArray[np.intp], rows: int) -> NDArray[np.intp]:
     """`groups` if it is one whole number a row; ValueError otherwise."""
     groups = np.asarray(groups)

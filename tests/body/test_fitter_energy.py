@@ -14,8 +14,8 @@ from shapepose_fg.body.energy import (
 from shapepose_fg.body.evidence import EvidenceConfig, spread_m, weigh
 from shapepose_fg.body.fitter import JointTargets
 from shapepose_fg.body.model import BodyModel, BodyParameters
-from shapepose_fg.body.pose_energy import PoseEnergy
 from shapepose_fg.body.person_frame import PersonFrame
+from shapepose_fg.body.pose_energy import PoseEnergy
 from shapepose_fg.body.pose_prior import PosePrior
 from shapepose_fg.skeleton import BODY_25, SMPL_24
 

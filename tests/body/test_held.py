@@ -72,7 +72,7 @@ def test_where_it_is_held_it_is_not_pulled(energy, free):
 
 def test_settled_shapes_stay_and_poses_go_on(energy, targets, free, held):
     betas = draw(ROWS, 10, seed=5)
-    settled = held.at_shape(betas)
+    settled = held.at_shape(betas, torch.ones(len(betas), dtype=torch.bool))
     assert settled.angles is held.angles
     start = torch.cat((betas, free[:, 10:]), 1)
     here = energy.linearise(start, targets, SCALE, settled)
