@@ -8,6 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from shapepose_fg.body.baseline import LevenbergMarquardtFitter, PlainFitterConfig
 from shapepose_fg.body.beliefs import fill
 from shapepose_fg.body.descent import BodyState, DescentTargets, LearnedDescent
 from shapepose_fg.body.energy import BodyEnergy, Evaluated, Held, WhitenedTargets
@@ -39,7 +40,8 @@ class LearnedFitterConfig:
     well_seen_m: float = 0.05
     """Sigma of a joint, metres, from which on the network is not shown it."""
     unfinished: float = 30.0
-    """Rows whose energy a Newton step would still lower by more are NOT_CONVERGED."""
+    """Rows whose energy another step would still lower by more are left to the plain optimiser: some in a hundred
+    whose joints contradict each other, such as those of two people."""
 
     def __post_init__(self) -> None:
         if not (self.kernel_scale > 0 and self.unfinished > 0 and self.polish_steps >= 0):
@@ -49,7 +51,8 @@ class LearnedFitterConfig:
 class LearnedFitter:
     """Fits a body to 3D joints by learned gradient descent; implements `BodyFitter`.
 
-    Rows are independent, but for the shape of rows in one group. Computed in single precision around each row's
+    Rows are independent, but for the shape of rows in one group; one that a short polish does not settle is fitted
+    by the plain optimiser instead, with a shape of its own. Computed in single precision around each row's
     centre, covariances in double.
     """
 
@@ -70,6 +73,8 @@ class LearnedFitter:
         self._prior = prior
         self._model = model.to(torch.float32)
         self._energy = BodyEnergy(self._model, prior)
+        plain = PlainFitterConfig(evidence=self.config.evidence, kernel_scale=self.config.kernel_scale)
+        self._plain = LevenbergMarquardtFitter(model, prior, plain)
         self._slots = slots(model.keypoint_names)
         self._descent = LearnedDescent(
             self._model.keypoint_points, self._slots, self.weights.network, self.config.kernel_scale,
@@ -111,6 +116,10 @@ class LearnedFitter:
         fill(fit, rows, self._energy, body, weighted, centre, kernel_scale=self.config.kernel_scale,
              model_sigma_m=self.config.evidence.model_sigma_m, unfinished=self.config.unfinished,
              spread=self.weights.spread[list(self._slots)])  # fmt: skip
+        unsettled = rows[fit.status[rows] == FitStatus.NOT_CONVERGED]
+        if len(unsettled) > 0:
+            some = JointTargets(targets.xyz[unsettled], targets.information[unsettled])
+            fit = fit.with_rows(unsettled, self._plain.fit(some))
         return fit
 
     def _descend(self, targets: WhitenedTargets, variance: Tensor) -> Tensor:
