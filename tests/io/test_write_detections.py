@@ -137,7 +137,9 @@ def test_a_reader_that_is_not_ours_finds_the_same(rig: Rig, recording: Recording
 
 def test_what_lies_far_outside_the_picture_is_left_out(rig: Rig, recording: Recording, tmp_path: Path):
     xy = recording[0].xy.copy()
-    xy[recording[0].view == 1] = np.linspace((-330, 100), (1000, 100), np.sum(recording[0].view == 1))
+    rows = np.flatnonzero(recording[0].view == 1)
+    rows = rows[np.argsort(~np.isin(rows, recording[0].pairs))]  # those with affinities lie outside
+    xy[rows] = np.linspace((-330, 100), (1000, 100), len(rows))
     moved = Recording(BODY_25, [replace(recording[0], xy=xy)])
     write_association(moved, rig, tmp_path)
     back = read_detections(tmp_path, rig)[0]  # the reader refuses what is 25 % outside or more
