@@ -226,7 +226,8 @@ def _report(
         owner=owner,
         reach_px=_reach_px(ndtr(noise[LastingNoise.SCALE, reported]), rig.image_sizes[view, 1], config),
     )
-    found = found.join(_doubles(found, swap_rank, px_a_metre, config, rng))
+    in_sight = np.where(seen >= 0.5, swap_rank, 1.0)  # of which the share of doubles was measured
+    found = found.join(_doubles(found, in_sight, px_a_metre, config, rng))
     inside = np.all((found.xy >= 0) & (found.xy <= rig.image_sizes[found.view] - 1), axis=1)
     return found.take(inside), captors
 
