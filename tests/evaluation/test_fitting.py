@@ -195,5 +195,5 @@ def test_timing_needs_a_full_batch(noisy):
     with pytest.raises(ValueError, match="batch"):
         timed_fit(ClosedFormFitter(), noisy[0], 1000)
     threads = torch.get_num_threads()
-    assert fits_per_second(ClosedFormFitter(), noisy[0], 32, threads=2) > 0
+    assert fits_per_second(ClosedFormFitter(), noisy[0], 32, workers=2) > 0
     assert torch.get_num_threads() == threads
