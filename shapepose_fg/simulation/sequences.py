@@ -27,19 +27,26 @@ DANCERS = frozenset({"60", "61"})
 """Subjects of the salsa takes: nobody trains on them."""
 TAKES: dict[str, range] = {"tune": range(1, 8), "report": range(9, 16)}
 """Numbers of the takes of each split."""
-_HARD: dict[str, Any] = {
-    "camera_distance_m": (6.0, 6.5),
-    "camera_height_m": (1.0, 1.15),
-    "focal_px": (1550.0, 1690.0),
-}
-"""Cameras at the height of the hips, far away, with long lenses: rays to different people's same joints lie nearly
-in one plane and cross wherever somebody could stand. Chosen on the tune split, so that there is room to get better
-in (docs/simulation.md)."""
+_IMAGE_PX_A_M = 259.0
+"""Everybody is as large in the image, whatever the cameras' distance."""
+
+
+def _from_afar(distance_m: float) -> dict[str, Any]:
+    """Cameras at the height of the hips, far away, with long lenses.
+
+    Rays to different people's same joints lie nearly in one plane and cross wherever somebody could stand. From
+    farther away they are flatter still, but one person hides less of the room. Distances were chosen on the tune
+    split, for room to get better in and hips that are seen in 4.5 views or more (docs/simulation.md).
+    """
+    range_m = (distance_m, distance_m + 0.5)
+    focal_px = (_IMAGE_PX_A_M * range_m[0], _IMAGE_PX_A_M * range_m[1])
+    return {"camera_distance_m": range_m, "camera_height_m": (1.0, 1.15), "focal_px": focal_px}
+
 
 SEQUENCES: dict[str, SequenceConfig] = {
-    "salsa": SequenceConfig(pairs=1, standing=3, walking=3, seed=11, **_HARD),
-    "crossing": SequenceConfig(pairs=1, standing=1, walking=4, seed=23, **_HARD),
-    "crowd": SequenceConfig(pairs=2, standing=2, walking=2, seed=37, **_HARD),
+    "salsa": SequenceConfig(pairs=1, standing=3, walking=3, seed=11, **_from_afar(8.0)),
+    "crossing": SequenceConfig(pairs=1, standing=1, walking=4, seed=23, **_from_afar(10.0)),
+    "crowd": SequenceConfig(pairs=2, standing=2, walking=2, seed=37, **_from_afar(7.0)),
 }
 """A pair among three who stand and three who walk; mostly walkers, through and between; two pairs and others."""
 
