@@ -236,16 +236,16 @@ def _matched(drawn: NDArray, wanted: NDArray, found: NDArray, way: str, gain: fl
     By value and not by level: at the low end may be people mostly hidden, whom no drawn quantile moves, and values
     that move together stay in order. Rare rows are moved together, by the mean over their quantiles.
     """
-    shown, aim, gain = found, wanted, np.full(drawn.shape, gain)
+    shown, aim, share = found, wanted, np.full(drawn.shape, gain)
     if way == "quantiles by state":  # by joint where visible, of all joints together where hidden
         shown, aim = found.copy(), wanted.copy()
         shown[:, 1:], aim[:, 1:] = found[:, 1:].mean(axis=0), wanted[:, 1:].mean(axis=0)
-        gain[:, 1:] = 0.8  # well known, but slow to follow: how much others hide moves them too
+        share[:, 1:] = 0.8  # well known, but slow to follow: how much others hide moves them too
     if way == "quantiles together":
         shown, aim = (np.broadcast_to(table.mean(axis=0), table.shape) for table in (found, wanted))
     rows = [part.reshape(-1, part.shape[-1]) for part in (drawn, shown, aim)]
     step = np.stack([np.interp(at, x, y - x) for at, x, y in zip(*rows, strict=True)]).reshape(drawn.shape)
-    moved = np.maximum.accumulate(drawn + np.clip(gain * step, -0.1, 0.1), axis=-1)
+    moved = np.maximum.accumulate(drawn + np.clip(share * step, -0.1, 0.1), axis=-1)
     return np.clip(moved, wanted.min(axis=0)[..., :1], wanted.max(axis=0)[..., -1:])
 
 
