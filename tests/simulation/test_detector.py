@@ -216,6 +216,9 @@ def test_joints_are_found_under_both_names_as_often_as_configured():
     total = 20 * apart.sum()
     assert abs(extra / total - 0.1) < 5 * np.sqrt(0.1 * 0.9 / total)
     assert np.isclose(np.median(np.concatenate(gaps)), 0.02 * 1.1774, rtol=0.15)  # some 600 lengths: 5 % each way
+    # The share was measured on joints of which half or more is seen: the others are found once.
+    hidden = looks(rig, joints, everything_seen(rig, 12, 0.4), config, 5)
+    assert [len(found) for found in hidden] == [2 * 12 * 25] * 5
 
 
 @pytest.mark.parametrize(("seen", "hidden_by"), [(1.0, -1), (0.0, 0)])
