@@ -23,8 +23,8 @@ People = tuple[NDArray[np.float64], NDArray[np.float32]]
 
 _AHEAD = 4
 """Frames a worker that are under way: enough that none waits, and memory stays bounded."""
-_FRAMES_WORTH_A_WORKER = 60
-"""To start a process takes about as long as to look at this many."""
+_FRAMES_WORTH_A_WORKER = 100
+"""A recording must have this many for each worker, or starting them takes longer than it saves."""
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 

@@ -100,7 +100,7 @@ def test_no_workers_are_refused(lookout: Lookout, scene: Scene, workers: int):
 
 def test_workers_pay_for_long_recordings_only(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(8), raising=False)
-    assert [suitable_workers(frames) for frames in (0, 1, 60, 300, 3000)] == [1, 1, 1, 5, 8]
+    assert [suitable_workers(frames) for frames in (0, 1, 60, 300, 3000)] == [1, 1, 1, 3, 8]
 
 
 def test_what_workers_inherit_is_put_back(monkeypatch: pytest.MonkeyPatch):
