@@ -21,7 +21,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from shapepose_fg.body.baseline import LevenbergMarquardtFitter
+from shapepose_fg.body.fitters import make_fitter
+from shapepose_fg.body.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model import BodyModel, BodyParameters
 from shapepose_fg.camera import Rig
 from shapepose_fg.evaluation.alternation import BeforeRefinement, alternation_errors, before_refinement
@@ -246,7 +247,7 @@ def contradiction_table(folder: Path) -> list[str]:
     """How often the views put a joint where the rest of the body cannot have it, by how many views agree."""
     rig, observations, sigmas, points = shelf_observations(folder)
     evidence = weigh(observations, sigmas, points, rig, CONFIG.observations)
-    fit = LevenbergMarquardtFitter(config=CONFIG.body).fit(
+    fit = make_fitter(CONFIG.body).fit(
         joint_targets(evidence, np.ones(len(points), dtype=bool)), None
     )
     apart, views = disagreement(evidence, fit), evidence.inlier.sum(axis=-1)
@@ -311,7 +312,9 @@ def shelf_observations(folder: Path) -> tuple[Rig, Observations, NDArray[np.floa
 
 def body_joints(people: Reconstruction) -> NDArray[np.float64]:
     """(N, 25, 3) the joints of the fitted bodies; NaN where there is no body."""
-    body = BodyModel.default()
+    body, offsets = BodyModel.default(), people.run["keypoint_offsets"]
+    if offsets is not None:
+        body = body.with_keypoint_offsets(KeypointOffsets.from_dict(offsets))
     columns = (people.betas, people.global_orient, people.body_pose, people.transl)
     with torch.no_grad():
         return (
