@@ -61,7 +61,7 @@ CURVE_BODIES = 512
 BATCH, LARGE_BATCH = 64, 128
 ALONE = 12
 """How many single fits are timed."""
-STRIDE = 40
+STRIDE = 20
 """Every so-many-th frame of the simulated sequences is reconstructed."""
 COLOURS = ("black", "#7570b3", "#1b9e77", "#d95f02", "#e7298a")
 
