@@ -247,9 +247,7 @@ def contradiction_table(folder: Path) -> list[str]:
     """How often the views put a joint where the rest of the body cannot have it, by how many views agree."""
     rig, observations, sigmas, points = shelf_observations(folder)
     evidence = weigh(observations, sigmas, points, rig, CONFIG.observations)
-    fit = make_fitter(CONFIG.body).fit(
-        joint_targets(evidence, np.ones(len(points), dtype=bool)), None
-    )
+    fit = make_fitter(CONFIG.body).fit(joint_targets(evidence, np.ones(len(points), dtype=bool)), None)
     apart, views = disagreement(evidence, fit), evidence.inlier.sum(axis=-1)
     rows = []
     for count in range(2, len(rig) + 1):
