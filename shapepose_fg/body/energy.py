@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from shapepose_fg.body.model import BodyModel, BodyParameters, accumulate
-from shapepose_fg.body.pose_energy import PoseEnergy
+from shapepose_fg.body.pose_energy import PoseEnergy, PosePull
 from shapepose_fg.body.pose_prior import NUM_ANGLES, PosePrior
 from shapepose_fg.body.rotation import exp_so3, log_so3, right_jacobian
 
@@ -235,25 +235,29 @@ class BodyEnergy:
         weight = robust_weight(residual.square().sum(-1), kernel_scale)[..., None]
         forces = (targets.root @ (weight * residual)[..., None]).squeeze(-1)
         by_column = points.pull_back(forces, arms, rotations, local)
-        angles, held = free[:, self._angle_slice], Held.by_priors() if held is None else held
-        pose = self._pose(angles) if held.angles is None else self._pose.around(held.angles, angles)
+        angles = free[:, self._angle_slice]
+        stiffness, away, pose = self._pulls(free, held)
         torques = by_column[:, 13 + self._visible].unflatten(1, (-1, 3))
         turned = (right_jacobian(angles.unflatten(1, (-1, 3))).mT @ torques[..., None]).flatten(1)
-        by_betas = by_column[:, :10] + held.stiffness * (free[:, :10] - held.betas)
+        by_betas = by_column[:, :10] + stiffness * away
         by_angles = turned + pose.gradient
         return torch.cat((by_betas, by_column[:, 10:13], by_angles, by_column[:, -3:]), 1)
 
     def _add_priors(self, free: Tensor, gradient: Tensor, hessian: Tensor, held: "Held | None") -> Tensor:
         """Add the gradients and Hessians of shape and pose prior in place; returns their energy (B,)."""
+        stiffness, away, pose = self._pulls(free, held)
+        gradient[:, :10] += stiffness * away
+        gradient[:, self._angle_slice] += pose.gradient
+        torch.diagonal(hessian, dim1=-2, dim2=-1)[:, :10] += stiffness
+        hessian[:, self._angle_slice, self._angle_slice] += pose.hessian
+        return (stiffness * away.square()).sum(-1) + pose.energy
+
+    def _pulls(self, free: Tensor, held: "Held | None") -> tuple[Tensor, Tensor, PosePull]:
+        """How stiffly betas are held, how far away they are, and what pulls the angles."""
         angles = free[:, self._angle_slice]
         held = Held.by_priors() if held is None else held
-        away = free[:, :10] - held.betas
         pose = self._pose(angles) if held.angles is None else self._pose.around(held.angles, angles)
-        gradient[:, :10] += held.stiffness * away
-        gradient[:, self._angle_slice] += pose.gradient
-        torch.diagonal(hessian, dim1=-2, dim2=-1)[:, :10] += held.stiffness
-        hessian[:, self._angle_slice, self._angle_slice] += pose.hessian
-        return (held.stiffness * away.square()).sum(-1) + pose.energy
+        return held.stiffness, free[:, :10] - held.betas, pose
 
 
 def visible_joints(model: BodyModel, prior: PosePrior) -> np.ndarray:

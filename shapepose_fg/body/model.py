@@ -82,8 +82,12 @@ class BodyModel:
         dtype: torch.dtype = torch.float32,
         offsets: KeypointOffsets | None = None,
         keypoint_names: tuple[str, ...] = BODY_25.joints,
+        contracted: SkinnedPoints | None = None,
     ):
-        """From checked arrays; most callers want `default` or `load`."""
+        """From checked arrays; most callers want `default` or `load`.
+
+        `contracted` is what another model made of the same arrays (`_contract`): it costs more than all else here.
+        """
         self._arrays = arrays
         self.dtype = dtype
         """Floating point type of parameters and results."""
@@ -91,12 +95,12 @@ class BodyModel:
         """Where the detector's joints lie against the body's; in `keypoints`, not in `vertices` and `joints`."""
         self.keypoint_names = keypoint_names
         """(K,) names of the keypoints, some of `BODY_POINTS`."""
-        body_25 = _moved(_keypoint_points(arrays), self.keypoint_offsets).to(dtype)
-        self._joints = _joint_points(arrays).to(dtype)
-        self.points = body_25.joined(_head_top(arrays).to(dtype)).joined(self._joints)
+        self._contracted = _contract(arrays) if contracted is None else contracted
+        self.points = _moved(self._contracted, self.keypoint_offsets).to(dtype)
         """All `BODY_POINTS`: BODY_25's keypoints, the top of the head, the 24 joints."""
         self.keypoint_points = self.points.part(list(slots(keypoint_names)))
         """The keypoints (K)."""
+        self._joints = self.points.part(list(slots(SMPL_24)))
         self._last_part: tuple[bytes, _Mesh] | None = None
 
     @classmethod
@@ -127,7 +131,7 @@ class BodyModel:
 
     def _with(self, **changed: Any) -> "BodyModel":
         kept = {"dtype": self.dtype, "offsets": self.keypoint_offsets, "keypoint_names": self.keypoint_names}
-        return BodyModel(self._arrays, **(kept | changed))
+        return BodyModel(self._arrays, **(kept | changed), contracted=self._contracted)
 
     @property
     def faces(self) -> NDArray[np.int64]:
@@ -321,10 +325,15 @@ def _keypoint_points(arrays: SmplArrays) -> SkinnedPoints:
                     arrays.pose_blend is not None)  # fmt: skip
 
 
+def _contract(arrays: SmplArrays) -> SkinnedPoints:
+    """All `BODY_POINTS` of a mesh, float64, where the body itself has them."""
+    return _keypoint_points(arrays).joined(_head_top(arrays)).joined(_joint_points(arrays))
+
+
 def _moved(points: SkinnedPoints, offsets: KeypointOffsets) -> SkinnedPoints:
-    """Points that ride a constant offset away on one bone each: x_k + R_b o_k, so d_kb + o_k."""
+    """`BODY_POINTS`, BODY_25's a constant offset away on one bone each: x_k + R_b o_k, so d_kb + o_k."""
     moved = points.offsets.clone()
-    moved[torch.arange(len(moved)), :, torch.from_numpy(offsets.bones)] += torch.from_numpy(offsets.xyz_m)
+    moved[torch.arange(len(offsets.bones)), :, torch.from_numpy(offsets.bones)] += torch.from_numpy(offsets.xyz_m)
     return replace(points, offsets=moved)
 
 

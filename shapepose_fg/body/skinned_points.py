@@ -66,7 +66,8 @@ class SkinnedPoints:
         poses = [points.offsets_pose for points in (self, other)]
         if any(pose is not None for pose in poses):
             shapes = [(207, *points.offsets.shape) for points in (self, other)]
-            poses = [torch.zeros(s) if p is None else p for s, p in zip(shapes, poses, strict=True)]
+            empty = self.offsets.dtype
+            poses = [torch.zeros(s, dtype=empty) if p is None else p for s, p in zip(shapes, poses, strict=True)]
         return replace(
             self,
             offsets=torch.cat((self.offsets, other.offsets)),

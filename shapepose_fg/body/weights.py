@@ -55,12 +55,7 @@ class FitterWeights:
     @classmethod
     def load(cls, path: Path) -> "FitterWeights":
         """Read a safetensors file; InputError naming it where it cannot be used."""
-        try:
-            with safe_open(path, framework="pt") as file:
-                about = file.metadata() or {}
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        except (OSError, SafetensorError) as error:
-            raise InputError(f"{path}: not readable as safetensors ({error}); train or fetch it again") from error
+        about, tensors = read_tensors(path, "train or fetch it again")
         if about.get("format") != _FORMAT:
             raise InputError(f"{path}: not weights of the learned fitter; make them with scripts/train_fitter.py")
         if not all(bool(torch.isfinite(tensor).all()) for tensor in tensors.values()):
@@ -99,6 +94,15 @@ class FitterWeights:
                 "these weights of the learned fitter were trained on another body model: train some on yours with"
                 " scripts/train_fitter.py --body, or choose the plain fitter"
             )
+
+
+def read_tensors(path: Path, cure: str) -> tuple[dict[str, str], dict[str, Tensor]]:
+    """Texts and tensors of a safetensors file; InputError with the `cure` where it cannot be read."""
+    try:
+        with safe_open(path, framework="pt") as file:
+            return file.metadata() or {}, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (OSError, SafetensorError) as error:
+        raise InputError(f"{path}: not readable as safetensors ({error}); {cure}") from error
 
 
 def fingerprint(model: BodyModel) -> str:

@@ -5,10 +5,10 @@ from dataclasses import asdict
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from shapepose_fg.body.weights import read_tensors
 from shapepose_fg.errors import InputError
 from shapepose_fg.training.train import Trainer
 
@@ -29,12 +29,7 @@ def save_checkpoint(trainer: Trainer, path: Path) -> None:
 
 def load_checkpoint(trainer: Trainer, path: Path) -> None:
     """Continue from `path`; InputError where it is not a checkpoint of a run with the same settings."""
-    try:
-        with safe_open(path, framework="pt") as file:
-            about = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (OSError, SafetensorError) as error:
-        raise InputError(f"{path}: not readable as safetensors ({error}); start the training afresh") from error
+    about, tensors = read_tensors(path, "start the training afresh")
     if about.get("format") != _FORMAT or about.get("config") != _config(trainer):
         raise InputError(f"{path}: a checkpoint of other settings; give those, or start the training afresh")
     trainer.network.load_state_dict(_under("network.", tensors))

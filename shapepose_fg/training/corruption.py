@@ -129,7 +129,7 @@ def _kept(xyz: Tensor, draw: _Draw, config: CorruptionConfig) -> Tensor:
 
 
 def _isotropic(xyz: Tensor, draw: _Draw, clean: float) -> tuple[Tensor, Tensor]:
-    """The same noise along every axis, 2 to 50 mm, unlike from joint to joint."""
+    """The same noise along every axis, 2 to 40 mm before they are made unlike from joint to joint."""
     B, K = xyz.shape[:2]
     base = torch.exp(torch.log(torch.tensor(0.002)) + draw.uniform(B, 1) * torch.log(torch.tensor(20.0)))
     base = base * (draw.uniform(B, 1) >= clean)

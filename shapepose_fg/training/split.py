@@ -12,7 +12,7 @@ TEST_SUBJECTS = ("60", "61", "02", "08", "16", "43", "94", "139")
 """CMU subjects for reported figures only: salsa (both partners), sports and chores, walks, runs and jumps, a bar,
 Indian dance, getting up."""
 VALIDATION_SUBJECTS = ("06", "12", "127", "140")
-"""CMU subjects by whom settings are chosen: basketball, tai chi, runs and ducks, getting up from the floor."""
+"""CMU subjects by whom settings are chosen: basketball, walks, runs and ducks, getting up from the floor."""
 UNKNOWN_SUBJECT = "?"
 """A recording that does not say whose it is: to be learnt from, never a part of what is reported."""
 
