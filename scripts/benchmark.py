@@ -19,23 +19,23 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from shapepose_fg.body.fitter import BodyFit, BodyFitter, JointTargets
-from shapepose_fg.body.fitters import make_fitter
+from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
+from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import DetectionSequence
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.provenance import versions
-from shapepose_fg.simulated import NAMES, cut, named_scene
 from shapepose_fg.simulation import Scene, built_in_scene, simulate
+from shapepose_fg.simulation.files import NAMES, cut, named_scene
 
 STAGES = ("read", "triangulate", "vote", "propose", "associate", "refine")
 PARTS = {
-    "graphs built": ("refine.py", "_graphs"),
-    "graphs solved": ("refine.py", "_solve"),
+    "graphs built": ("alternation.py", "_graphs"),
+    "graphs solved": ("alternation.py", "_solve"),
     "covariances": ("person_graph.py", "covariance"),
-    "gates and weights": ("observations.py", "weigh"),
+    "gates and weights": ("linearisation.py", "weigh"),
 }
 """Parts of stage II beside the body fits, and the function whose time is taken for each."""
 
@@ -155,7 +155,7 @@ def stage_two(
     spent: dict[tuple[str, str], float] = {}
     for (file, _, function), row in vars(pstats.Stats(profile))["stats"].items():
         spent[Path(file).name, function] = row[3]
-    whole = spent["refine.py", "refine"] - spent[Path(__file__).name, "fit"]
+    whole = spent["alternation.py", "refine"] - spent[Path(__file__).name, "fit"]
     shares = {part: spent.get(where, 0.0) / whole for part, where in PARTS.items()}
     return shares | {"the rest": 1.0 - sum(shares.values())}
 

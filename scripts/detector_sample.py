@@ -12,15 +12,16 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.assignment import match_best_first
-from shapepose_fg.body.baseline import LevenbergMarquardtFitter
-from shapepose_fg.body.fitter import BodyFit
-from shapepose_fg.body.model import BodyModel
+from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter
+from shapepose_fg.body.fitting.fitter import BodyFit
+from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections, DetectionSequence
-from shapepose_fg.observations import Observations, observation_sigmas, triangulate, weigh
+from shapepose_fg.estimation.alternation import refine
+from shapepose_fg.estimation.linearisation import observation_sigmas, triangulate, weigh
+from shapepose_fg.observations import Observations
 from shapepose_fg.pipeline import PipelineConfig, find_people
-from shapepose_fg.refine import refine
+from shapepose_fg.proposal.assignment import match_best_first
 from shapepose_fg.simulation.facing import seen_from_the_front
 from shapepose_fg.simulation.motion import Motion
 from shapepose_fg.simulation.scene import Scene

@@ -14,15 +14,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.body.baseline import LevenbergMarquardtFitter
-from shapepose_fg.body.fitter import JointTargets
-from shapepose_fg.body.keypoint_offsets import KeypointOffsets
-from shapepose_fg.body.model import BodyModel
-from shapepose_fg.body.offset_estimation import learn_offsets
+from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter
+from shapepose_fg.body.fitting.fitter import JointTargets
+from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
+from shapepose_fg.body.offsets.estimation import learn_offsets
 from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import DetectionSequence
-from shapepose_fg.detector_offsets import confident_targets, spread_frames
+from shapepose_fg.estimation.detector_offsets import confident_targets, spread_frames
 from shapepose_fg.evaluation.matching import match_people
 from shapepose_fg.evaluation.metrics import joint_metrics
 from shapepose_fg.io.calibration import read_rig

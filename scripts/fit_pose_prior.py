@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.body.model import BodyModel
-from shapepose_fg.body.pose_prior import PosePrior
+from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.skeleton import SMPL_24
 from shapepose_fg.training.mixture import MixtureConfig
 from shapepose_fg.training.motions import Motions, load_motions

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.body.baseline import LevenbergMarquardtFitter
-from shapepose_fg.body.fitter import BodyFit, BodyFitter, JointTargets
-from shapepose_fg.body.model import BodyModel
+from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter
+from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
+from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import DetectionSequence
 from shapepose_fg.errors import InputError

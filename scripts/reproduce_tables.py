@@ -21,20 +21,21 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from shapepose_fg.body.fitters import make_fitter
-from shapepose_fg.body.keypoint_offsets import KeypointOffsets
-from shapepose_fg.body.model import BodyModel, BodyParameters
+from shapepose_fg.body.fitting.fitters import make_fitter
+from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
+from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.camera import Rig
+from shapepose_fg.estimation.alternation import disagreement, joint_targets
+from shapepose_fg.estimation.linearisation import observation_sigmas, triangulate, weigh
 from shapepose_fg.evaluation.alternation import BeforeRefinement, alternation_errors, before_refinement
 from shapepose_fg.evaluation.matching import match_people
 from shapepose_fg.evaluation.metrics import JointMetrics, covariance_calibration, joint_metrics
 from shapepose_fg.evaluation.shelf import LIMB_NAMES, ShelfScore, evaluate_shelf, read_shelf_ground_truth
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
-from shapepose_fg.observations import Observations, observation_sigmas, triangulate, weigh
+from shapepose_fg.observations import Observations
 from shapepose_fg.pipeline import PipelineConfig, find_people, reconstruct
 from shapepose_fg.reconstruction import Reconstruction
-from shapepose_fg.refine import disagreement, joint_targets
 from shapepose_fg.simulation import built_in_scene, simulate
 
 ROOT = Path(__file__).parents[1]

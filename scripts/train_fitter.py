@@ -17,12 +17,12 @@ import torch
 import typer
 from rich.progress import Progress, TimeRemainingColumn
 
-from shapepose_fg.body.descent import LearnedDescent, gradient_scale
-from shapepose_fg.body.model import BodyModel
-from shapepose_fg.body.network import UpdateNetwork, num_weights
-from shapepose_fg.body.person_frame import PersonFrame
-from shapepose_fg.body.target_skeletons import BODY_POINTS
-from shapepose_fg.body.weights import FitterWeights, fingerprint
+from shapepose_fg.body.fitting.descent import LearnedDescent, gradient_scale
+from shapepose_fg.body.fitting.network import UpdateNetwork, num_weights
+from shapepose_fg.body.fitting.person_frame import PersonFrame
+from shapepose_fg.body.fitting.weights import FitterWeights, fingerprint
+from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.errors import InputError
 from shapepose_fg.provenance import versions
 from shapepose_fg.training.calibration import calibrated

@@ -17,12 +17,12 @@ from shapepose_fg.errors import InputError
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from shapepose_fg.body.fitter import BodyFitter
+    from shapepose_fg.body.fitting.fitter import BodyFitter
     from shapepose_fg.camera import Axis
     from shapepose_fg.io.calibration import Unit
     from shapepose_fg.pipeline import PipelineConfig
     from shapepose_fg.reconstruction import Reconstruction
-    from shapepose_fg.simulated import Format
+    from shapepose_fg.simulation.files import Format
 
 # Everything else is imported inside the commands: `--help` must not wait for torch.
 
@@ -174,9 +174,9 @@ def simulate(
     if workers is not None and not 1 <= workers <= 64:
         raise InputError(f"--workers {workers}: must be 1 to 64; leave it out for one a core")
     _prepare(output)
-    from shapepose_fg.simulated import check_output, cut, named_scene, write_simulated
     from shapepose_fg.simulation import DetectorConfig
     from shapepose_fg.simulation import simulate as run_detector
+    from shapepose_fg.simulation.files import check_output, cut, named_scene, write_simulated
     from shapepose_fg.simulation.lookout import suitable_workers
 
     last = re.search(r":\s*(\d{1,6})\s*$", frames or "")
@@ -259,8 +259,8 @@ def _fitter(body: Path | None, settings: "PipelineConfig") -> "BodyFitter | None
     """The body fitter with the model of the file `body`; without one, the pipeline takes its own."""
     if body is None:
         return None
-    from shapepose_fg.body.fitters import make_fitter
-    from shapepose_fg.body.model import BodyModel
+    from shapepose_fg.body.fitting.fitters import make_fitter
+    from shapepose_fg.body.model.body_model import BodyModel
 
     return make_fitter(settings.body, BodyModel.load(body))
 

@@ -9,23 +9,29 @@ from typing import Any
 
 import numpy as np
 
-from shapepose_fg.association import AssociationConfig, associate
-from shapepose_fg.body.fitter import BodyFitter
-from shapepose_fg.body.fitters import BodyConfig, make_fitter
-from shapepose_fg.body.keypoint_offsets import KeypointOffsets
-from shapepose_fg.body.model import BodyModel
-from shapepose_fg.body.offset_estimation import learn_offsets
+from shapepose_fg.body.fitting.fitter import BodyFitter
+from shapepose_fg.body.fitting.fitters import BodyConfig, make_fitter
+from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
+from shapepose_fg.body.offsets.estimation import learn_offsets
 from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.camera import Rig
-from shapepose_fg.candidates import CandidateConfig, triangulate_pairs, vote
 from shapepose_fg.detections import Detections, DetectionSequence
-from shapepose_fg.detector_offsets import AdjustableFitter, OffsetConfig, confident_targets, spread_frames
-from shapepose_fg.observations import ObservationConfig, Observations
-from shapepose_fg.person_graph import PersonGraphConfig
-from shapepose_fg.proposals import ProposalConfig, propose
+from shapepose_fg.estimation.alternation import ExtraFactors, RefineConfig, Refined, refine
+from shapepose_fg.estimation.detector_offsets import (
+    AdjustableFitter,
+    OffsetConfig,
+    confident_targets,
+    spread_frames,
+)
+from shapepose_fg.estimation.linearisation import ObservationConfig
+from shapepose_fg.estimation.person_graph import PersonGraphConfig
+from shapepose_fg.observations import Observations
+from shapepose_fg.proposal.association import AssociationConfig, associate
+from shapepose_fg.proposal.candidates import CandidateConfig, triangulate_pairs, vote
+from shapepose_fg.proposal.proposals import ProposalConfig, propose
 from shapepose_fg.provenance import versions
 from shapepose_fg.reconstruction import Reconstruction
-from shapepose_fg.refine import ExtraFactors, RefineConfig, Refined, refine
 from shapepose_fg.skeleton import BODY_25, Skeleton
 
 Progress = Callable[[int, int], None]

@@ -9,13 +9,13 @@ import torch
 
 from factors import isotropic
 from shapepose_fg.detections import Detections, Recording
-from shapepose_fg.detector_offsets import OffsetConfig
+from shapepose_fg.estimation.detector_offsets import OffsetConfig
 from shapepose_fg.evaluation.metrics import joint_metrics
 from shapepose_fg.evaluation.shelf import evaluate_shelf, read_shelf_ground_truth
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.pipeline import PipelineConfig, find_people, reconstruct
-from shapepose_fg.proposals import ProposalConfig
+from shapepose_fg.proposal.proposals import ProposalConfig
 from shapepose_fg.reconstruction import Reconstruction, Status
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.scene import Scene
@@ -60,7 +60,7 @@ def test_everybody_is_found_once_and_where_they_are(scene, people):
 
 def test_the_bodies_are_where_the_joints_are(scene, people):
     body = scene.body
-    from shapepose_fg.body.model import BodyParameters
+    from shapepose_fg.body.model.body_model import BodyParameters
 
     columns = (people.betas, people.global_orient, people.body_pose, people.transl)
     fitted = body.keypoints(BodyParameters(*(torch.from_numpy(c).to(body.dtype) for c in columns))).numpy()

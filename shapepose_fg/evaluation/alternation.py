@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import DetectionSequence
+from shapepose_fg.estimation.linearisation import observation_sigmas, triangulate
 from shapepose_fg.evaluation.matching import match_people
-from shapepose_fg.observations import Observations, observation_sigmas, triangulate
+from shapepose_fg.observations import Observations
 from shapepose_fg.pipeline import PipelineConfig, find_people
 from shapepose_fg.reconstruction import Reconstruction
 

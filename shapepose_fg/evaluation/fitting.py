@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.body.fitter import BodyFit, JointTargets
-from shapepose_fg.body.model import BodyModel, BodyParameters
+from shapepose_fg.body.fitting.fitter import BodyFit, JointTargets
+from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.evaluation.metrics import CovarianceCalibration, covariance_calibration
 from shapepose_fg.skeleton import BODY_25
 

@@ -8,15 +8,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.body.baseline import LevenbergMarquardtFitter, PlainFitterConfig
-from shapepose_fg.body.closed_form import ClosedFormStart
-from shapepose_fg.body.evidence import Evidence
-from shapepose_fg.body.fitter import BodyFit, BodyFitter, JointTargets
-from shapepose_fg.body.gradient_descent import GradientDescentConfig, GradientDescentFitter
-from shapepose_fg.body.keypoint_offsets import KeypointOffsets
-from shapepose_fg.body.model import BodyModel
-from shapepose_fg.body.pose_prior import PosePrior
+from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter, PlainFitterConfig
+from shapepose_fg.body.fitting.evidence import Evidence
+from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
+from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
+from shapepose_fg.evaluation.closed_form import ClosedFormStart
 from shapepose_fg.evaluation.fitting import batches, concatenated
+from shapepose_fg.evaluation.gradient_descent import GradientDescentConfig, GradientDescentFitter
 
 Array = NDArray[np.float64]
 
@@ -97,7 +97,7 @@ def plain_methods() -> tuple[Method, ...]:
 
 def learned_methods() -> tuple[Method, ...]:
     """The learned fitter: its steps alone, and with its polish; InputError where its weights are not there."""
-    from shapepose_fg.body.learned import LearnedFitter, LearnedFitterConfig
+    from shapepose_fg.body.fitting.learned import LearnedFitter, LearnedFitterConfig
 
     def polished(steps: int | None) -> BodyFitter:
         config = LearnedFitterConfig()

@@ -6,13 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from shapepose_fg.body.baseline import LevenbergMarquardtFitter, PlainFitterConfig
-from shapepose_fg.body.energy import BodyEnergy, WhitenedTargets
-from shapepose_fg.body.evidence import weigh
-from shapepose_fg.body.fitter import BodyFit, JointTargets
-from shapepose_fg.body.model import BodyModel
-from shapepose_fg.body.pose_prior import PosePrior
-from shapepose_fg.body.rotation import right_jacobian
+from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter, PlainFitterConfig
+from shapepose_fg.body.fitting.energy import BodyEnergy, WhitenedTargets
+from shapepose_fg.body.fitting.evidence import weigh
+from shapepose_fg.body.fitting.fitter import BodyFit, JointTargets
+from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.body.model.rotation import right_jacobian
 
 Array = NDArray[np.float64]
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.body.model import BodyModel
+from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.simulation.mocap import Clip, Mocap, blend
 from shapepose_fg.simulation.performance import Figure, Performance, about_z, grounded, perform
 

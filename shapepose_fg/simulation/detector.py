@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
-from shapepose_fg.body.keypoint_offsets import KeypointOffsets
+from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections, Recording

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.body.smpl_file import SMPL_PARENTS
+from shapepose_fg.body.model.smpl_file import SMPL_PARENTS
 from shapepose_fg.errors import InputError
 
 Array = NDArray[np.float64]

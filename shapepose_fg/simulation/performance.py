@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d, minimum_filter1d
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.body.model import BodyModel
+from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.simulation.mocap import Clip
 from shapepose_fg.simulation.motion import Motion
 from shapepose_fg.simulation.shoulder import shoulder_rhythm

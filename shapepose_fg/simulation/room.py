@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.body.model import BodyModel
+from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.simulation.bystanders import stand, walk_along
 from shapepose_fg.simulation.crossing import way_through
 from shapepose_fg.simulation.holding import hold_hands

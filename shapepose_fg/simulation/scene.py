@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.body.keypoint_offsets import KeypointOffsets
+from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.camera import Camera, Rig
 from shapepose_fg.rendering import look_at
 from shapepose_fg.simulation.motion import Build, Motion, close_motion
 
 if TYPE_CHECKING:  # torch comes with it: processes that only look at people do without
-    from shapepose_fg.body.model import BodyModel, BodyParameters
+    from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 
 UP = np.array([0.0, 0.0, 1.0])
 _FEET = (19, 20, 21, 22, 23, 24)
@@ -71,7 +71,7 @@ class Scene:
         """(Nv, 3) the mean body in its T-pose, y up."""
         import torch
 
-        from shapepose_fg.body.model import BodyParameters
+        from shapepose_fg.body.model.body_model import BodyParameters
 
         with torch.no_grad():
             return self.body.vertices(BodyParameters.zeros(1, self.body.dtype))[0].numpy()
@@ -94,7 +94,7 @@ def built_in_scene(
     if people < 0 or frames < 0 or cameras < 2:
         raise ValueError(f"need people >= 0, frames >= 0, cameras >= 2; got {people}, {frames}, {cameras}")
     if body is None:
-        from shapepose_fg.body.model import BodyModel
+        from shapepose_fg.body.model.body_model import BodyModel
 
         body = BodyModel.default()
     rng = np.random.default_rng(seed)
@@ -175,7 +175,7 @@ def _parameters(body: "BodyModel", motion: Motion, frames: slice) -> "BodyParame
     """The bodies of some frames, frame by frame, as one batch."""
     import torch
 
-    from shapepose_fg.body.model import BodyParameters
+    from shapepose_fg.body.model.body_model import BodyParameters
 
     count = len(range(*frames.indices(len(motion.transl))))
     tensors = {

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.body.model import BodyModel
+from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.simulation.bystanders import standing_clips, walking_clips
 from shapepose_fg.simulation.mocap import Clip, Mocap
 from shapepose_fg.simulation.motion import Motion

@@ -12,7 +12,7 @@ from shapepose_fg.rendering import first_surface_at, scaled
 from shapepose_fg.skeleton import SMPL_24
 
 if TYPE_CHECKING:
-    from shapepose_fg.body.model import BodyModel
+    from shapepose_fg.body.model.body_model import BodyModel
 
 NOBODY, ITSELF, BORDER = -1, -2, -3
 """What `Visibility.hidden_by` says where no other person is in front."""

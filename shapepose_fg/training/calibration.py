@@ -7,11 +7,11 @@ import torch
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from shapepose_fg.body.fitter import JointTargets
-from shapepose_fg.body.learned import LearnedFitter
-from shapepose_fg.body.model import BodyModel
-from shapepose_fg.body.target_skeletons import BODY_POINTS, MIRROR, TARGET_SKELETONS, slots
-from shapepose_fg.body.weights import FitterWeights
+from shapepose_fg.body.fitting.fitter import JointTargets
+from shapepose_fg.body.fitting.learned import LearnedFitter
+from shapepose_fg.body.fitting.weights import FitterWeights
+from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.body.model.target_skeletons import BODY_POINTS, MIRROR, TARGET_SKELETONS, slots
 from shapepose_fg.training.corruption import corrupt
 from shapepose_fg.training.train import PeopleSource
 

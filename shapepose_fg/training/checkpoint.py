@@ -8,7 +8,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from shapepose_fg.body.weights import read_tensors
+from shapepose_fg.body.fitting.weights import read_tensors
 from shapepose_fg.errors import InputError
 from shapepose_fg.training.train import Trainer
 

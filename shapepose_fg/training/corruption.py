@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from shapepose_fg.body.small_matrices import inverse_3x3
-from shapepose_fg.body.target_skeletons import BODY_POINTS, MIRROR
+from shapepose_fg.body.model.small_matrices import inverse_3x3
+from shapepose_fg.body.model.target_skeletons import BODY_POINTS, MIRROR
 from shapepose_fg.simulation.detector_statistics import JOINT_GROUP, DetectorStatistics, measured
 from shapepose_fg.skeleton import BODY_25
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.body.pose_prior import NUM_ANGLES, PosePrior
+from shapepose_fg.body.fitting.pose_prior import NUM_ANGLES, PosePrior
 from shapepose_fg.simulation.shoulder import COLLARS, SHOULDERS
 from shapepose_fg.skeleton import SMPL_24
 from shapepose_fg.training.mixture import Mirror, Mixture, MixtureConfig, fit_mixture

@@ -6,13 +6,13 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from shapepose_fg.body.descent import BodyState, DescentTargets, LearnedDescent
-from shapepose_fg.body.model import BodyModel, accumulate
-from shapepose_fg.body.network import NUM_ROTATIONS, NetworkConfig, UpdateNetwork
-from shapepose_fg.body.person_frame import PersonFrame
-from shapepose_fg.body.rotation import exp_so3
-from shapepose_fg.body.small_matrices import inverse_3x3
-from shapepose_fg.body.target_skeletons import BODY_POINTS, TARGET_SKELETONS, slots
+from shapepose_fg.body.fitting.descent import BodyState, DescentTargets, LearnedDescent
+from shapepose_fg.body.fitting.network import NUM_ROTATIONS, NetworkConfig, UpdateNetwork
+from shapepose_fg.body.fitting.person_frame import PersonFrame
+from shapepose_fg.body.model.body_model import BodyModel, accumulate
+from shapepose_fg.body.model.rotation import exp_so3
+from shapepose_fg.body.model.small_matrices import inverse_3x3
+from shapepose_fg.body.model.target_skeletons import BODY_POINTS, TARGET_SKELETONS, slots
 from shapepose_fg.training.corruption import CorruptionConfig, corrupt
 from shapepose_fg.training.motions import Motions, mirror_joints
 

@@ -13,7 +13,7 @@ from shapepose_fg.skeleton import BODY_25
 from shapepose_fg.viewer.floor import Floor
 
 if TYPE_CHECKING:
-    from shapepose_fg.body.model import BodyModel
+    from shapepose_fg.body.model.body_model import BodyModel
 
 Array = NDArray[np.float64]
 
@@ -95,7 +95,7 @@ def _bodies(body: "BodyModel", *parameters: Array) -> Array:
     """Surfaces (P, Nv, 3) of P bodies from betas, global_orient, body_pose and transl."""
     import torch
 
-    from shapepose_fg.body.model import BodyParameters
+    from shapepose_fg.body.model.body_model import BodyParameters
 
     if len(parameters[0]) == 0:
         return np.zeros((0, body.num_vertices, 3))

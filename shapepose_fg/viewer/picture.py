@@ -16,7 +16,7 @@ from shapepose_fg.viewer.figures import Figures, Mesh, floor_under, framed, free
 from shapepose_fg.viewer.floor import Floor, floor_picture
 
 if TYPE_CHECKING:
-    from shapepose_fg.body.model import BodyModel
+    from shapepose_fg.body.model.body_model import BodyModel
 
 Array = NDArray[np.float64]
 
@@ -74,7 +74,7 @@ def demo_picture(
 
 
 def _default_body() -> "BodyModel":
-    from shapepose_fg.body.model import BodyModel
+    from shapepose_fg.body.model.body_model import BodyModel
 
     return BodyModel.default()
 

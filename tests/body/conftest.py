@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from shapepose_fg.body.model import BodyModel, BodyParameters
-from shapepose_fg.body.smpl_file import SMPL_PARENTS
-from shapepose_fg.body.weights import FitterWeights
+from shapepose_fg.body.fitting.weights import FitterWeights
+from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
+from shapepose_fg.body.model.smpl_file import SMPL_PARENTS
 
 NUM_VERTICES = 60
 

@@ -5,13 +5,19 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.body.descent import BodyState, DescentTargets, LearnedDescent, gradient_scale, inverse_3x3
-from shapepose_fg.body.model import BodyModel
-from shapepose_fg.body.network import NUM_PARAMETERS, NetworkConfig, UpdateNetwork
-from shapepose_fg.body.person_frame import PersonFrame
-from shapepose_fg.body.pose_prior import PosePrior
-from shapepose_fg.body.rotation import exp_so3
-from shapepose_fg.body.target_skeletons import BODY_POINTS, TARGET_SKELETONS, slots
+from shapepose_fg.body.fitting.descent import (
+    BodyState,
+    DescentTargets,
+    LearnedDescent,
+    gradient_scale,
+    inverse_3x3,
+)
+from shapepose_fg.body.fitting.network import NUM_PARAMETERS, NetworkConfig, UpdateNetwork
+from shapepose_fg.body.fitting.person_frame import PersonFrame
+from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.body.model.rotation import exp_so3
+from shapepose_fg.body.model.target_skeletons import BODY_POINTS, TARGET_SKELETONS, slots
 
 ALL = tuple(range(len(BODY_POINTS)))
 ROWS = 6

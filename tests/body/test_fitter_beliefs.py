@@ -3,11 +3,11 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.body.baseline import LevenbergMarquardtFitter
-from shapepose_fg.body.fitter import BodyFit, JointTargets
-from shapepose_fg.body.leave_one_out import LIMB_M, joint_posterior
-from shapepose_fg.body.model import BodyModel, BodyParameters
-from shapepose_fg.body.pose_prior import PosePrior
+from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter
+from shapepose_fg.body.fitting.fitter import BodyFit, JointTargets
+from shapepose_fg.body.fitting.leave_one_out import LIMB_M, joint_posterior
+from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.skeleton import BODY_25
 
 MODEL_SIGMA_M = 0.02

@@ -4,19 +4,19 @@ import torch
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
-from shapepose_fg.body.energy import (
+from shapepose_fg.body.fitting.energy import (
     BodyEnergy,
     WhitenedTargets,
     robust_cost,
     robust_weight,
     visible_joints,
 )
-from shapepose_fg.body.evidence import EvidenceConfig, spread_m, weigh
-from shapepose_fg.body.fitter import JointTargets
-from shapepose_fg.body.model import BodyModel, BodyParameters
-from shapepose_fg.body.person_frame import PersonFrame
-from shapepose_fg.body.pose_energy import PoseEnergy
-from shapepose_fg.body.pose_prior import PosePrior
+from shapepose_fg.body.fitting.evidence import EvidenceConfig, spread_m, weigh
+from shapepose_fg.body.fitting.fitter import JointTargets
+from shapepose_fg.body.fitting.person_frame import PersonFrame
+from shapepose_fg.body.fitting.pose_energy import PoseEnergy
+from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.skeleton import BODY_25, SMPL_24
 
 ROWS = 3

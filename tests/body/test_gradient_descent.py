@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 import torch
 
-from shapepose_fg.body.baseline import LevenbergMarquardtFitter
-from shapepose_fg.body.energy import BodyEnergy, Held, WhitenedTargets
-from shapepose_fg.body.fitter import FitStatus, JointTargets
-from shapepose_fg.body.gradient_descent import GradientDescentConfig, GradientDescentFitter
-from shapepose_fg.body.model import BodyModel, BodyParameters
-from shapepose_fg.body.pose_prior import PosePrior
+from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter
+from shapepose_fg.body.fitting.energy import BodyEnergy, Held, WhitenedTargets
+from shapepose_fg.body.fitting.fitter import FitStatus, JointTargets
+from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
+from shapepose_fg.evaluation.gradient_descent import GradientDescentConfig, GradientDescentFitter
 
 
 @pytest.fixture(scope="module")

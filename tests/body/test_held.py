@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from shapepose_fg.body.energy import SETTLED, BodyEnergy, Held, WhitenedTargets
-from shapepose_fg.body.model import BodyModel
-from shapepose_fg.body.pose_prior import PosePrior
+from shapepose_fg.body.fitting.energy import SETTLED, BodyEnergy, Held, WhitenedTargets
+from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.model.body_model import BodyModel
 
 ROWS = 3
 SCALE = torch.full((ROWS, 1), 6.0, dtype=torch.float64)

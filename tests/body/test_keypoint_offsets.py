@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from shapepose_fg.body.keypoint_offsets import RIDES_ON, KeypointOffsets
-from shapepose_fg.body.model import BodyModel, BodyParameters
-from shapepose_fg.body.rotation import exp_so3, log_so3
+from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
+from shapepose_fg.body.model.keypoint_offsets import RIDES_ON, KeypointOffsets
+from shapepose_fg.body.model.rotation import exp_so3, log_so3
 from shapepose_fg.errors import InputError
 from shapepose_fg.skeleton import BODY_25, SMPL_24
 

@@ -10,13 +10,13 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.body.baseline import LevenbergMarquardtFitter
-from shapepose_fg.body.fitter import BodyFit, FitStatus, JointTargets
-from shapepose_fg.body.keypoint_offsets import KeypointOffsets
-from shapepose_fg.body.learned import LearnedFitter, LearnedFitterConfig
-from shapepose_fg.body.model import BodyModel, BodyParameters
-from shapepose_fg.body.pose_prior import PosePrior
-from shapepose_fg.body.target_skeletons import BODY_POINTS, TARGET_SKELETONS
+from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter
+from shapepose_fg.body.fitting.fitter import BodyFit, FitStatus, JointTargets
+from shapepose_fg.body.fitting.learned import LearnedFitter, LearnedFitterConfig
+from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
+from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
+from shapepose_fg.body.model.target_skeletons import BODY_POINTS, TARGET_SKELETONS
 from shapepose_fg.skeleton import BODY_25
 
 COUNT = 32

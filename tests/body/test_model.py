@@ -5,9 +5,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.body.model import BodyModel, BodyParameters
-from shapepose_fg.body.rotation import exp_so3, log_so3
-from shapepose_fg.body.smpl_file import SMPL_PARENTS
+from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
+from shapepose_fg.body.model.rotation import exp_so3, log_so3
+from shapepose_fg.body.model.smpl_file import SMPL_PARENTS
 
 
 def smpl_by_hand(arrays, parameters, b):

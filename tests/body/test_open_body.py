@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-import shapepose_fg.body.model
-from shapepose_fg.body.model import BodyModel, BodyParameters
+import shapepose_fg.body.model.body_model
+from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.skeleton import BODY_25, SMPL_24
 
 
@@ -49,7 +49,7 @@ def winding(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 def test_it_is_read_once_and_small():
     assert BodyModel.default() is BodyModel.default()
     assert BodyModel.default().dtype == torch.float32
-    data = Path(shapepose_fg.body.model.__file__).parent / "data"
+    data = Path(shapepose_fg.body.model.body_model.__file__).parents[1] / "data"
     assert (data / "open_body.npz").stat().st_size < 4e6
     assert BodyModel.default().num_vertices < 14000
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from shapepose_fg.body.pose_prior import PosePrior
+from shapepose_fg.body.fitting.pose_prior import PosePrior
 from shapepose_fg.skeleton import SMPL_24
 from shapepose_fg.training.motions import load_motions
 from shapepose_fg.training.prior import expected_angles

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.body.rotation import (
+from shapepose_fg.body.model.rotation import (
     exp_so3,
     from_six_d,
     hat,

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from shapepose_fg.body.energy import Held
-from shapepose_fg.body.shared_shape import check_groups, pooled_betas
+from shapepose_fg.body.fitting.energy import Held
+from shapepose_fg.body.fitting.shared_shape import check_groups, pooled_betas
 
 BETAS, REST = 10, 6
 

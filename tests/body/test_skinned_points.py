@@ -3,9 +3,9 @@
 import numpy as np
 import torch
 
-from shapepose_fg.body.model import BodyModel, BodyParameters, accumulate
-from shapepose_fg.body.rotation import exp_so3
-from shapepose_fg.body.skinned_points import SkinnedPoints
+from shapepose_fg.body.model.body_model import BodyModel, BodyParameters, accumulate
+from shapepose_fg.body.model.rotation import exp_so3
+from shapepose_fg.body.model.skinned_points import SkinnedPoints
 
 Posed = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor | None]
 

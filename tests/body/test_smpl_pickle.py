@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import scipy.sparse
 
-from shapepose_fg.body.model import BodyModel
+from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.errors import InputError
 
 

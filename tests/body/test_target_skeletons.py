@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from shapepose_fg.body.keypoint_offsets import RIDES_ON, KeypointOffsets
-from shapepose_fg.body.model import BodyModel, BodyParameters
-from shapepose_fg.body.target_skeletons import BODY_POINTS, MIRROR, TARGET_SKELETONS, slots
+from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
+from shapepose_fg.body.model.keypoint_offsets import RIDES_ON, KeypointOffsets
+from shapepose_fg.body.model.target_skeletons import BODY_POINTS, MIRROR, TARGET_SKELETONS, slots
 from shapepose_fg.skeleton import BODY_25, SMPL_24
 
 

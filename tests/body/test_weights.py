@@ -9,15 +9,15 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from shapepose_fg.body.baseline import LevenbergMarquardtFitter
-from shapepose_fg.body.fitters import BodyConfig, make_fitter
-from shapepose_fg.body.learned import LearnedFitter
-from shapepose_fg.body.model import BodyModel
-from shapepose_fg.body.network import NetworkConfig, UpdateNetwork
-from shapepose_fg.body.person_frame import PersonFrame
-from shapepose_fg.body.pose_prior import PosePrior
-from shapepose_fg.body.target_skeletons import BODY_POINTS
-from shapepose_fg.body.weights import FitterWeights, fingerprint
+from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter
+from shapepose_fg.body.fitting.fitters import BodyConfig, make_fitter
+from shapepose_fg.body.fitting.learned import LearnedFitter
+from shapepose_fg.body.fitting.network import NetworkConfig, UpdateNetwork
+from shapepose_fg.body.fitting.person_frame import PersonFrame
+from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.fitting.weights import FitterWeights, fingerprint
+from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.errors import InputError
 
 

@@ -2,10 +2,9 @@ import numpy as np
 import pytest
 import torch
 
-from shapepose_fg.body.baseline import LevenbergMarquardtFitter
-from shapepose_fg.body.gradient_descent import GradientDescentFitter
-from shapepose_fg.body.model import BodyModel
-from shapepose_fg.body.pose_prior import PosePrior
+from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter
+from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.evaluation.fitting import (
     GROUPS,
     LIMBS,
@@ -28,6 +27,7 @@ from shapepose_fg.evaluation.fitting_methods import (
     timed_fit,
 )
 from shapepose_fg.evaluation.fitting_optimum import check_optimum
+from shapepose_fg.evaluation.gradient_descent import GradientDescentFitter
 from shapepose_fg.skeleton import BODY_25
 
 NOISY = SETTINGS[2]

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.body.model import BodyModel
+from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.errors import InputError
 from shapepose_fg.simulation.bystanders import endless, stand, walk_along
 from shapepose_fg.simulation.holding import hold_hands

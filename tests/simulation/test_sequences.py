@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from shapepose_fg.body.model import BodyModel
+from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.simulation.mocap import Mocap
 from shapepose_fg.simulation.room import SequenceConfig, clearance_m
 from shapepose_fg.simulation.scene import Scene

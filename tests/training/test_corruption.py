@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from shapepose_fg.body.model import BodyModel, BodyParameters
-from shapepose_fg.body.pose_prior import PosePrior
-from shapepose_fg.body.target_skeletons import BODY_POINTS, MIRROR, TARGET_SKELETONS, slots
+from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
+from shapepose_fg.body.model.target_skeletons import BODY_POINTS, MIRROR, TARGET_SKELETONS, slots
 from shapepose_fg.training.corruption import CorruptionConfig, corrupt
 
 COUNT, K = 400, len(BODY_POINTS)

@@ -7,14 +7,14 @@ import pytest
 import torch
 from scipy.stats import chi2
 
-from shapepose_fg.body.descent import LearnedDescent, gradient_scale
-from shapepose_fg.body.model import BodyModel
-from shapepose_fg.body.network import NetworkConfig, UpdateNetwork
-from shapepose_fg.body.person_frame import PersonFrame
-from shapepose_fg.body.pose_prior import PosePrior
-from shapepose_fg.body.rotation import exp_so3
-from shapepose_fg.body.target_skeletons import BODY_POINTS
-from shapepose_fg.body.weights import FitterWeights, fingerprint
+from shapepose_fg.body.fitting.descent import LearnedDescent, gradient_scale
+from shapepose_fg.body.fitting.network import NetworkConfig, UpdateNetwork
+from shapepose_fg.body.fitting.person_frame import PersonFrame
+from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.fitting.weights import FitterWeights, fingerprint
+from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.body.model.rotation import exp_so3
+from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.errors import InputError
 from shapepose_fg.training.calibration import INSIDE, _hidden_squared, calibrated
 from shapepose_fg.training.checkpoint import load_checkpoint, save_checkpoint

@@ -11,11 +11,11 @@ import pytest
 import torch
 from safetensors import safe_open
 
-from shapepose_fg.body.fitter import JointTargets
-from shapepose_fg.body.learned import LearnedFitter, LearnedFitterConfig
-from shapepose_fg.body.model import BodyModel, BodyParameters
-from shapepose_fg.body.pose_prior import PosePrior
-from shapepose_fg.body.weights import FitterWeights
+from shapepose_fg.body.fitting.fitter import JointTargets
+from shapepose_fg.body.fitting.learned import LearnedFitter, LearnedFitterConfig
+from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.fitting.weights import FitterWeights
+from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.errors import InputError
 from shapepose_fg.training.train import Trainer
 

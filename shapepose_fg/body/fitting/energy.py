@@ -1,0 +1,270 @@
+"""The energy of a body given joint targets, and its Gauss-Newton linearisation, batched over rows.
+
+    E(Theta) = sum_i rho(|S_i (x_i(Theta) - z_i)|²) + |betas|² - 2 log p(theta) + constant
+
+with S_iᵀ S_i the information of target z_i, rho a robust kernel, p the pose prior, a Gaussian mixture: SMPLify
+(Bogo et al. 2016) for 3D joints. There is no factor 1/2, so that the inverse of the Hessian below is a covariance.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from shapepose_fg.body.fitting.pose_energy import PoseEnergy, PosePull
+from shapepose_fg.body.fitting.pose_prior import NUM_ANGLES, PosePrior
+from shapepose_fg.body.model.body_model import BodyModel, BodyParameters, accumulate
+from shapepose_fg.body.model.rotation import exp_so3, log_so3, right_jacobian
+
+SETTLED = 1e6
+"""Precision of a beta that other rows of the same person have settled."""
+VISIBLE_M_PER_RAD = 1e-3
+"""A joint whose rotation moves no keypoint faster than this is invisible: a radian would move 1 mm."""
+
+
+@dataclass(frozen=True)
+class WhitenedTargets:
+    """Targets as the energy wants them: torch, one floating point type."""
+
+    xyz: Tensor
+    """(B, K, 3) metres, finite."""
+    root: Tensor
+    """(B, K, 3, 3) symmetric square root S_i of the information, 1/m."""
+
+    def __getitem__(self, rows: Tensor) -> "WhitenedTargets":
+        return WhitenedTargets(self.xyz[rows], self.root[rows])
+
+
+@dataclass(frozen=True)
+class Held:
+    """Around what shape and pose are held."""
+
+    betas: Tensor
+    """(B, 10) shape, or one for all (10,)."""
+    stiffness: Tensor
+    """(B, 1) precision of each beta, or one for all (1,)."""
+    angles: Tensor | None = None
+    """(B, A) free angles, held as tightly as the pose prior holds there; None: where it expects them."""
+
+    @classmethod
+    def by_priors(cls) -> "Held":
+        """By nothing else than the priors."""
+        return cls(torch.zeros(10), torch.ones(1))
+
+    def __getitem__(self, rows: Tensor) -> "Held":
+        return Held(self.betas[rows], self.stiffness[rows], None if self.angles is None else self.angles[rows])
+
+    def at_shape(self, betas: Tensor, settled: Tensor) -> "Held":
+        """The same, but next to immovable at shapes `betas` (B, 10) in the rows that are `settled` (B,)."""
+        rows = settled[:, None]
+        return Held(torch.where(rows, betas, self.betas), torch.where(rows, SETTLED, self.stiffness), self.angles)
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """The energy around a point: gradient and Hessian in the tangent of the free parameters."""
+
+    squared: Tensor
+    """(B, K) squared Mahalanobis distance of every joint to its target."""
+    prior: Tensor
+    """(B,) what betas and pose prior add to the energy."""
+    gradient: Tensor
+    """(B, P) half the gradient."""
+    hessian: Tensor
+    """(B, P, P) half the Gauss-Newton Hessian, robust weights included."""
+
+    def energy(self, kernel_scale: Tensor) -> Tensor:
+        """(B,) the energy with the kernel's scale (B, 1)."""
+        return robust_cost(self.squared, kernel_scale).sum(-1) + self.prior
+
+    def __getitem__(self, rows: Tensor) -> "Linearisation":
+        return Linearisation(*(value[rows] for value in vars(self).values()))
+
+    def replaced(self, where: Tensor, other: "Linearisation") -> "Linearisation":
+        """The same, but with the rows `where` (B,) taken from another."""
+        if bool(where.all()):
+            return other
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return Linearisation(
+            *(torch.where(where.view(-1, *(1,) * (mine.ndim - 1)), new, mine) for mine, new in pairs)
+        )
+
+
+def robust_cost(squared: Tensor, scale: Tensor) -> Tensor:
+    """Geman-McClure: c² s / (c² + s), which grows to c² and no further."""
+    c2 = scale.square()
+    return c2 * squared / (c2 + squared)
+
+
+def robust_weight(squared: Tensor, scale: Tensor) -> Tensor:
+    """Derivative of `robust_cost`: the weight of a joint in iterated least squares, 1 at its target."""
+    c2 = scale.square()
+    return (c2 / (c2 + squared)).square()
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """Bodies, their keypoints and the energy around them."""
+
+    free: Tensor
+    """(B, P) free parameters."""
+    xyz: Tensor
+    """(B, K, 3) keypoints, metres."""
+    jacobian: Tensor
+    """(B, 3 K, P) of the keypoints by the free parameters."""
+    here: Linearisation
+    """The energy."""
+
+    def replaced(self, where: Tensor, other: "Evaluated") -> "Evaluated":
+        """The same, but with the rows `where` (B,) taken from another."""
+        if bool(where.all()):
+            return other
+        rows, three = where[:, None], where[:, None, None]
+        return Evaluated(
+            torch.where(rows, other.free, self.free),
+            torch.where(three, other.xyz, self.xyz),
+            torch.where(three, other.jacobian, self.jacobian),
+            self.here.replaced(where, other.here),
+        )
+
+
+class BodyEnergy:
+    """Evaluates the energy over the *free* parameters of a row, a vector (P,).
+
+    It holds betas, root orientation, angles, translation. The angles are the axis-angles of joints that some
+    keypoint can see. The others (hands) have no evidence: the prior's marginal over the visible angles accounts
+    for them exactly, and `complete` fills them in with what it expects of them.
+    """
+
+    def __init__(self, model: BodyModel, prior: PosePrior):
+        self.model, self.dtype = model, model.dtype
+        visible = visible_joints(model, prior)
+        self.angles = (visible[:, None] * 3 + np.arange(3)).ravel()
+        """(A,) places of the visible angles among the 69."""
+        self.num_angles = len(self.angles)
+        self.num_free = 10 + 3 + self.num_angles + 3
+        self._angle_slice = slice(13, 13 + self.num_angles)
+        self._hidden = torch.from_numpy(np.setdiff1d(np.arange(NUM_ANGLES), self.angles))
+        self._visible = torch.from_numpy(self.angles)
+        self._pose = PoseEnergy(prior, self.angles, self.dtype)
+        # From free parameters to the model's 85 columns: identity, but right Jacobians for the angles.
+        spread = torch.zeros(10 + 72 + 3, self.num_free, dtype=self.dtype)
+        spread[:13, :13] = torch.eye(13)
+        spread[-3:, -3:] = torch.eye(3)
+        self._spread = spread
+        joint = torch.from_numpy(visible)
+        within = torch.arange(3)
+        place = torch.arange(len(visible))
+        self._block_rows = (13 + 3 * joint[:, None] + within)[:, :, None]
+        self._block_columns = (13 + 3 * place[:, None] + within)[:, None, :]
+
+    def complete(self, free: Tensor) -> BodyParameters:
+        """The body (B rows) of free parameters (B, P); invisible joints are where the prior expects them."""
+        angles = free[:, self._angle_slice]
+        pose = free.new_empty(len(free), NUM_ANGLES)
+        pose[:, self._visible] = angles
+        pose[:, self._hidden] = self._pose.hidden(angles)
+        return BodyParameters(free[:, :10], free[:, 10:13], pose.unflatten(1, (23, 3)), free[:, -3:])
+
+    def retract(self, free: Tensor, step: Tensor) -> Tensor:
+        """Move by a step (B, P): the orientation by R exp(step), all else by addition.
+
+        Angles are added to as vectors, for in them the pose prior's components are exactly quadratic.
+        """
+        moved = free + step
+        moved[:, 10:13] = log_so3(exp_so3(free[:, 10:13]) @ exp_so3(step[:, 10:13]))
+        return moved
+
+    def keypoints_with_jacobian(self, free: Tensor) -> tuple[Tensor, Tensor]:
+        """Keypoints (B, K, 3) and their Jacobian by the free parameters (B, 3 K, P)."""
+        xyz, jacobian = self.model.keypoints_with_jacobian(self.complete(free))
+        spread = self._spread.repeat(len(free), 1, 1)
+        blocks = right_jacobian(free[:, self._angle_slice].unflatten(1, (-1, 3)))
+        spread[:, self._block_rows, self._block_columns] = blocks
+        return xyz, jacobian.flatten(1, 2) @ spread
+
+    def evaluate(
+        self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor, held: "Held | None" = None
+    ) -> Evaluated:
+        """What `linearise` gives, with keypoints and Jacobian."""
+        xyz, jacobian = self.keypoints_with_jacobian(free)
+        here = self.linearise_at(free, xyz, jacobian, targets, kernel_scale, held)
+        return Evaluated(free, xyz, jacobian, here)
+
+    def linearise(
+        self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor, held: "Held | None" = None
+    ) -> Linearisation:
+        """Energy, gradient and Hessian at free parameters (B, P), with the kernel's scale (B, 1).
+
+        What is `held` stays around there instead of where the priors expect it.
+        """
+        return self.linearise_at(free, *self.keypoints_with_jacobian(free), targets, kernel_scale, held)
+
+    def linearise_at(
+        self,
+        free: Tensor,
+        xyz: Tensor,
+        jacobian: Tensor,
+        targets: WhitenedTargets,
+        kernel_scale: Tensor,
+        held: "Held | None" = None,
+    ) -> Linearisation:
+        """The same where keypoints `xyz` and their `jacobian` are known already."""
+        residual = (targets.root @ (xyz - targets.xyz)[..., None]).squeeze(-1)
+        squared = residual.square().sum(-1)
+        weight = robust_weight(squared, kernel_scale).sqrt()[..., None]
+        root = weight[..., None] * targets.root
+        rows = (root @ jacobian.unflatten(1, xyz.shape[1:])).flatten(1, 2)
+        gradient = (rows.mT @ (weight * residual).flatten(1)[..., None]).squeeze(-1)
+        hessian = rows.mT @ rows
+        prior = self._add_priors(free, gradient, hessian, held)
+        return Linearisation(squared, prior, gradient, hessian)
+
+    def gradient(
+        self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor, held: "Held | None" = None
+    ) -> Tensor:
+        """(B, P) half the gradient, as in `linearise` at 40 % of the cost, for optimisers that need no more."""
+        body, points = self.complete(free), self.model.keypoint_points
+        local = exp_so3(torch.cat((body.global_orient[:, None], body.body_pose), 1))
+        rotations = accumulate(local)
+        blend = (local[:, 1:] - torch.eye(3, dtype=self.dtype)).flatten(1)
+        feature = None if points.offsets_pose is None else blend
+        xyz, arms = points.positions_with_arms(rotations, body.betas, body.transl, feature)
+        residual = (targets.root @ (xyz - targets.xyz)[..., None]).squeeze(-1)
+        weight = robust_weight(residual.square().sum(-1), kernel_scale)[..., None]
+        forces = (targets.root @ (weight * residual)[..., None]).squeeze(-1)
+        by_column = points.pull_back(forces, arms, rotations, local)
+        angles = free[:, self._angle_slice]
+        stiffness, away, pose = self._pulls(free, held)
+        torques = by_column[:, 13 + self._visible].unflatten(1, (-1, 3))
+        turned = (right_jacobian(angles.unflatten(1, (-1, 3))).mT @ torques[..., None]).flatten(1)
+        by_betas = by_column[:, :10] + stiffness * away
+        by_angles = turned + pose.gradient
+        return torch.cat((by_betas, by_column[:, 10:13], by_angles, by_column[:, -3:]), 1)
+
+    def _add_priors(self, free: Tensor, gradient: Tensor, hessian: Tensor, held: "Held | None") -> Tensor:
+        """Add the gradients and Hessians of shape and pose prior in place; returns their energy (B,)."""
+        stiffness, away, pose = self._pulls(free, held)
+        gradient[:, :10] += stiffness * away
+        gradient[:, self._angle_slice] += pose.gradient
+        torch.diagonal(hessian, dim1=-2, dim2=-1)[:, :10] += stiffness
+        hessian[:, self._angle_slice, self._angle_slice] += pose.hessian
+        return (stiffness * away.square()).sum(-1) + pose.energy
+
+    def _pulls(self, free: Tensor, held: "Held | None") -> tuple[Tensor, Tensor, PosePull]:
+        """How stiffly betas are held, how far away they are, and what pulls the angles."""
+        angles = free[:, self._angle_slice]
+        held = Held.by_priors() if held is None else held
+        pose = self._pose(angles) if held.angles is None else self._pose.around(held.angles, angles)
+        return held.stiffness, free[:, :10] - held.betas, pose
+
+
+def visible_joints(model: BodyModel, prior: PosePrior) -> np.ndarray:
+    """Which of the 23 joints below the root move some keypoint, by the model's own Jacobian (indices)."""
+    poses = torch.from_numpy(prior.sample(np.random.default_rng(0), 8)).to(model.dtype)
+    still = poses.new_zeros(8, 3)
+    parameters = BodyParameters(poses.new_zeros(8, 10), still, poses, still)
+    _, jacobian = model.keypoints_with_jacobian(parameters)
+    speed = jacobian[..., 13:-3].unflatten(-1, (23, 3)).abs().amax(dim=(0, 1, 2, 4))
+    return np.flatnonzero(speed.numpy() > VISIBLE_M_PER_RAD)

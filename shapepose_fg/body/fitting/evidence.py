@@ -1,0 +1,98 @@
+"""Which joint targets can be believed, and how much: what every fitter does before it fits."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.body.fitting.fitter import FitStatus, JointTargets
+
+Array = NDArray[np.float64]
+
+_STATUS_TYPE = f"U{max(len(status) for status in FitStatus)}"
+_ROUNDING = 1e-4
+"""Asymmetry or negativity of information, relative, that passes for rounding: inverses of rays lose much."""
+
+
+@dataclass(frozen=True)
+class EvidenceConfig:
+    """When a row of targets is enough for a body, and how far detector and body differ."""
+
+    model_sigma_m: float = 0.02
+    """How far the detector's joints lie from the body's, metres: added to every target's covariance."""
+    min_joints: int = 4
+    """Joints with full information that a fit needs."""
+    seen_sigma_m: float = 0.3
+    """A joint counts as fully seen when its target's sigma is under this along every axis, metres."""
+    min_spread_m: float = 0.03
+    """Those joints must lie this far off a common line (root mean square), metres, or the body could spin."""
+
+    def __post_init__(self) -> None:
+        for name in ("model_sigma_m", "seen_sigma_m", "min_spread_m"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        if self.min_joints < 3:
+            raise ValueError(f"min_joints must be at least 3 to turn a body, got {self.min_joints}")
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Targets, judged: which rows can be fitted, and their information with the model's error in it."""
+
+    status: NDArray[np.str_]
+    """(B,) OK or why not."""
+    xyz: Array
+    """(B, K, 3) targets, zero where there is no information, metres."""
+    root: Array
+    """(B, K, 3, 3) symmetric square root of (information^-1 + sigma² I)^-1, 1/m."""
+    variance_m2: Array
+    """(B, K) mean variance over the axes of joints with full information, else infinite."""
+    centre: Array
+    """(B, 3) mean of the joints with full information, metres."""
+
+
+def weigh(targets: JointTargets, config: EvidenceConfig) -> Evidence:
+    """Judge the rows, and add the model's error to every target.
+
+    An eigenvalue l of the information becomes l / (1 + l sigma²), which is the inverse of 1 / l + sigma² and
+    holds for l = 0 too: a direction in which nothing was measured.
+    """
+    xyz, information, valid = _refuse_nonsense(targets)
+    values, vectors = np.linalg.eigh((information + information.swapaxes(-1, -2)) / 2)
+    tolerance = _ROUNDING * np.maximum(np.abs(values).max(axis=-1), 1.0)
+    asymmetry = np.abs(information - information.swapaxes(-1, -2)).max(axis=(-1, -2))
+    valid &= ((values[..., 0] > -tolerance) & (asymmetry <= tolerance)).all(axis=1)
+    values = np.maximum(values, 0.0)
+    full = values[..., 0] > 1 / config.seen_sigma_m**2
+    count = full.sum(axis=1)
+    centre = np.where(full[..., None], xyz, 0.0).sum(axis=1) / np.maximum(count, 1)[:, None]
+    spread = spread_m(xyz - centre[:, None], full)
+    status = np.full(len(xyz), FitStatus.OK, dtype=_STATUS_TYPE)
+    status[(count < config.min_joints) | (spread < config.min_spread_m)] = FitStatus.TOO_FEW_JOINTS
+    status[~valid] = FitStatus.INVALID_TARGETS
+    half = np.sqrt(values / (1 + values * config.model_sigma_m**2))
+    root = (vectors * half[..., None, :]) @ vectors.swapaxes(-1, -2)
+    variance = (1 / np.where(full[..., None], values, 1.0)).mean(axis=-1) + config.model_sigma_m**2
+    return Evidence(status, xyz, root, np.where(full, variance, np.inf), centre)
+
+
+def spread_m(centred: Array, used: NDArray[np.bool_]) -> Array:
+    """How far the joints `used` (B, K) lie off their best line: root mean square, metres (B,).
+
+    `centred` (B, K, 3) are their places with the mean taken away.
+    """
+    points = centred * used[..., None]
+    scatter = points.swapaxes(-1, -2) @ points / np.maximum(used.sum(axis=1), 1)[:, None, None]
+    return np.sqrt(np.maximum(np.linalg.eigvalsh(scatter)[:, :2].sum(axis=1), 0.0))
+
+
+def _refuse_nonsense(targets: JointTargets) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Targets and information with rows that are not finite set to zero, and which rows (B,) were finite.
+
+    The place of a joint without information may be anything, NaN too: nobody looks at it.
+    """
+    known = np.any(targets.information != 0, axis=(2, 3))  # NaN differs from 0
+    finite = np.isfinite(targets.information).all(axis=(1, 2, 3))
+    finite &= (np.isfinite(targets.xyz).all(axis=2) | ~known).all(axis=1)
+    xyz = np.where((known & finite[:, None])[..., None], targets.xyz, 0.0)
+    return xyz, np.where(finite[:, None, None, None], targets.information, 0.0), finite

@@ -1,0 +1,118 @@
+"""The trained weights of the learned fitter: what is in the file, and which body they are for."""
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, field
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from shapepose_fg.body.fitting.network import NetworkConfig, UpdateNetwork
+from shapepose_fg.body.fitting.person_frame import PersonFrame
+from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.body.model.target_skeletons import BODY_POINTS
+from shapepose_fg.errors import InputError
+
+_DEFAULT = Path(__file__).parents[1] / "data" / "fitter.safetensors"
+_FORMAT = "shapepose-fg fitter 1"
+_FRAME, _SPREAD = "frame.", "spread"
+
+
+@dataclass(frozen=True, eq=False)
+class FitterWeights:
+    """A trained update network and the frame in which it works."""
+
+    network: UpdateNetwork
+    """In evaluation mode."""
+    frame: PersonFrame
+    """Mean body and mean pose from which it starts."""
+    body: str
+    """Fingerprint of the body model it was trained on (see `fingerprint`)."""
+    spread: Tensor = field(default_factory=lambda: torch.ones(len(BODY_POINTS)))
+    """(K,) by which the variance of each of `BODY_POINTS` is multiplied where it has no target: calibrated."""
+    card: dict[str, str] = field(default_factory=dict)
+    """What it was trained on, by which command, and its errors."""
+
+    def __post_init__(self) -> None:
+        if self.spread.shape != (len(BODY_POINTS),):
+            raise ValueError(f"spread must be ({len(BODY_POINTS)},), got {tuple(self.spread.shape)}")
+
+    @staticmethod
+    def default() -> "FitterWeights":
+        """The weights that ship with the package (read once)."""
+        return _load_default()
+
+    @classmethod
+    def of(cls, source: "FitterWeights | Path") -> "FitterWeights":
+        """`source` itself, or read from a path."""
+        return source if isinstance(source, FitterWeights) else cls.load(source)
+
+    @classmethod
+    def load(cls, path: Path) -> "FitterWeights":
+        """Read a safetensors file; InputError naming it where it cannot be used."""
+        about, tensors = read_tensors(path, "train or fetch it again")
+        if about.get("format") != _FORMAT:
+            raise InputError(f"{path}: not weights of the learned fitter; make them with scripts/train_fitter.py")
+        if not all(bool(torch.isfinite(tensor).all()) for tensor in tensors.values()):
+            raise InputError(f"{path}: the weights hold NaN or infinity; train or fetch them again")
+        try:
+            network = UpdateNetwork(NetworkConfig(**json.loads(about["network"])))
+            spread = tensors.pop(_SPREAD)
+            network.load_state_dict({k: v for k, v in tensors.items() if not k.startswith(_FRAME)})
+            frame = PersonFrame(**{k.removeprefix(_FRAME): v for k, v in tensors.items() if k.startswith(_FRAME)})
+            network.requires_grad_(False)
+            return cls(network.eval(), frame, about["body"], spread, json.loads(about["card"]))
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            why = str(error).splitlines()[0]
+            raise InputError(
+                f"{path}: weights of another version of the fitter ({why}); train them anew"
+            ) from error
+
+    def save(self, path: Path) -> None:
+        """Write a safetensors file."""
+        tensors: dict[str, Tensor] = dict(self.network.state_dict())
+        tensors[_SPREAD] = self.spread
+        tensors |= {_FRAME + name: value for name, value in vars(self.frame).items()}
+        tensors = {name: value.contiguous() for name, value in tensors.items()}
+        about = {
+            "format": _FORMAT,
+            "network": json.dumps(asdict(self.network.config)),
+            "body": self.body,
+            "card": json.dumps(self.card),
+        }
+        save_file(tensors, path, metadata=about)
+
+    def check(self, model: BodyModel) -> None:
+        """InputError where `model` is not the body they were trained on: betas would mean other shapes."""
+        if fingerprint(model) != self.body:
+            raise InputError(
+                "these weights of the learned fitter were trained on another body model: train some on yours with"
+                " scripts/train_fitter.py --body, or choose the plain fitter"
+            )
+
+
+def read_tensors(path: Path, cure: str) -> tuple[dict[str, str], dict[str, Tensor]]:
+    """Texts and tensors of a safetensors file; InputError with the `cure` where it cannot be read."""
+    try:
+        with safe_open(path, framework="pt") as file:
+            return file.metadata() or {}, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (OSError, SafetensorError) as error:
+        raise InputError(f"{path}: not readable as safetensors ({error}); {cure}") from error
+
+
+def fingerprint(model: BodyModel) -> str:
+    """What tells body models apart: SHA-256 of template, shapes and joint regressor, rounded to float32."""
+    digest = hashlib.sha256()
+    for array in (model.arrays.template, model.arrays.shapes, model.arrays.joint_regressor):
+        digest.update(np.ascontiguousarray(array, dtype=np.float32).tobytes())
+    return digest.hexdigest()
+
+
+@cache
+def _load_default() -> FitterWeights:
+    return FitterWeights.load(_DEFAULT)

@@ -1,0 +1,201 @@
+"""Reads a body model in SMPL's file format, `.npz` or the official `.pkl`, and checks all of it."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.body.model.smpl_pickle import RefusedPickle, as_array, read_smpl_pickle
+from shapepose_fg.errors import InputError
+from shapepose_fg.skeleton import BODY_25
+
+NUM_BETAS = 10
+"""Shape components in use; a file may hold more."""
+SMPL_PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
+"""Parent of each of SMPL's 24 joints."""
+_NUM_KEYPOINTS = len(BODY_25)
+_SMPL_NUM_VERTICES = 6890
+_SMPL_VERTEX_KEYPOINTS = {
+    "Nose": 332, "REye": 6260, "LEye": 2800, "REar": 4071, "LEar": 583, "LBigToe": 3216, "LSmallToe": 3226,
+    "LHeel": 3387, "RBigToe": 6617, "RSmallToe": 6624, "RHeel": 6787,
+}  # fmt: skip
+"""Vertices of SMPL's own mesh that lie on keypoints."""
+_SMPL_JOINT_KEYPOINTS = {
+    "RShoulder": 17, "RElbow": 19, "RWrist": 21, "LShoulder": 16, "LElbow": 18, "LWrist": 20,
+    "RHip": 2, "RKnee": 5, "RAnkle": 8, "LHip": 1, "LKnee": 4, "LAnkle": 7,
+}  # fmt: skip
+"""SMPL joints that stand for keypoints."""
+
+
+@dataclass(frozen=True)
+class SmplArrays:
+    """A body model's arrays, checked, in float64."""
+
+    template: NDArray[np.float64]
+    """(Nv, 3) vertices of the mean body in T-pose, metres, y up, facing +z."""
+    shapes: NDArray[np.float64]
+    """(Nv, 3, 10) metres per unit of each beta."""
+    pose_blend: NDArray[np.float64] | None
+    """(Nv, 3, 207) metres per unit of each entry of R - I; None where the file has none or only zeros."""
+    joint_regressor: NDArray[np.float64]
+    """(24, Nv) joints from the shaped template."""
+    weights: NDArray[np.float64]
+    """(Nv, 24) skinning weights; rows sum to 1."""
+    keypoint_regressor: NDArray[np.float64]
+    """(25, Nv) BODY_25 keypoints from the posed vertices."""
+    faces: NDArray[np.int64]
+    """(F, 3) vertex indices of the triangles."""
+
+
+def read_smpl_file(path: Path, keypoint_regressor: NDArray[np.floating] | None = None) -> SmplArrays:
+    """The model in `path`; InputError naming the file, the key and the cure where it cannot be used."""
+    entries = _Entries(path, _read_entries(path))
+    template = entries.floats("v_template", (None, 3))
+    count = len(template)
+    entries.check_tree()
+    joint_regressor = entries.floats("J_regressor", (24, count))
+    if keypoint_regressor is not None:
+        keypoints = entries.checked("keypoint_regressor", keypoint_regressor, (_NUM_KEYPOINTS, count))
+    elif "keypoint_regressor" in entries:
+        keypoints = entries.floats("keypoint_regressor", (_NUM_KEYPOINTS, count))
+    elif count == _SMPL_NUM_VERTICES:
+        keypoints = _smpl_keypoint_regressor(joint_regressor)
+    else:
+        raise InputError(
+            f"{path}: no keypoint_regressor, and with {count} vertices this is not SMPL's own mesh: add the key, "
+            f"or pass keypoint_regressor= ({_NUM_KEYPOINTS}, {count}), the weights that make BODY_25 from vertices"
+        )
+    return SmplArrays(
+        template=template,
+        shapes=entries.shapes(count),
+        pose_blend=entries.pose_blend(count),
+        joint_regressor=joint_regressor,
+        weights=entries.weights(count),
+        keypoint_regressor=keypoints,
+        faces=entries.faces(count),
+    )
+
+
+def _read_entries(path: Path) -> dict[str, Any]:
+    """The file's arrays or stand-ins for them, by name."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give the body model's .npz or .pkl")
+    if path.suffix not in (".npz", ".pkl"):
+        raise InputError(f"{path}: a body model is read from .npz or .pkl; give one of those")
+    try:
+        if path.suffix == ".pkl":
+            return read_smpl_pickle(path)
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except RefusedPickle as error:
+        raise InputError(
+            f"{path}: refused, {error}: use the unchanged file from the model's site, or save its arrays as .npz"
+        ) from error
+    except Exception as error:  # a damaged pickle can raise anything at all
+        raise InputError(
+            f"{path}: cannot be read as a body model ({type(error).__name__}: {error}): fetch the file again"
+        ) from error
+
+
+class _Entries:
+    """The entries of one file, taken out one by one and checked."""
+
+    def __init__(self, path: Path, content: dict[str, Any]):
+        self.path, self.content = path, content
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.content
+
+    def array(self, name: str) -> NDArray[Any]:
+        """The array called `name`."""
+        if name not in self.content:
+            raise InputError(f"{self.path}: {name} is missing; a body model has {' '.join(_KEYS)}")
+        value = self.content[name]
+        try:
+            return value if isinstance(value, np.ndarray) else as_array(value)
+        except Exception as error:  # records of a damaged pickle can hold anything
+            raise InputError(f"{self.path}: {name} is not an array ({error}): fetch the file again") from error
+
+    def floats(self, name: str, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
+        """The float64 array called `name`, of that shape and finite."""
+        return self.checked(name, self.array(name), shape)
+
+    def checked(self, name: str, value: Any, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
+        """`value` as a finite float64 array of that shape; None stands for any length but 0."""
+        value = np.asarray(value)
+        fits = value.ndim == len(shape) and all(
+            n == m if n is not None else m > 0 for n, m in zip(shape, value.shape, strict=True)
+        )
+        if not fits or value.dtype.kind not in "fiub":
+            expected = ", ".join("Nv" if n is None else str(n) for n in shape)
+            raise InputError(
+                f"{self.path}: {name} must be numbers ({expected}), got {value.dtype} {value.shape}: "
+                "use a file of one and the same model"
+            )
+        if not np.all(np.isfinite(value)):
+            raise InputError(f"{self.path}: {name} holds NaN or infinity: fetch the file again")
+        return np.ascontiguousarray(value, dtype=np.float64)
+
+    def shapes(self, count: int) -> NDArray[np.float64]:
+        """The first 10 shape components."""
+        shapes = self.array("shapedirs")
+        if shapes.ndim != 3 or shapes.shape[2] < NUM_BETAS:
+            raise InputError(
+                f"{self.path}: shapedirs must be ({count}, 3, {NUM_BETAS} or more), got {shapes.shape}: "
+                f"use the file with {NUM_BETAS} shape components"
+            )
+        return self.checked("shapedirs", shapes[..., :NUM_BETAS], (count, 3, NUM_BETAS))
+
+    def pose_blend(self, count: int) -> NDArray[np.float64] | None:
+        """The pose blend shapes, or None for a model without."""
+        if "posedirs" not in self or not np.any(self.array("posedirs")):
+            return None
+        return self.floats("posedirs", (count, 3, 207))
+
+    def weights(self, count: int) -> NDArray[np.float64]:
+        """Skinning weights whose rows sum to 1 exactly."""
+        weights = self.floats("weights", (count, 24))
+        total = weights.sum(1, keepdims=True)
+        if np.any(weights < -1e-6) or np.any(np.abs(total - 1) > 1e-2):  # files round to some digits
+            raise InputError(f"{self.path}: weights must be >= 0 with rows that sum to 1: not this model's file")
+        return weights / total
+
+    def faces(self, count: int) -> NDArray[np.int64]:
+        """Triangles between existing vertices."""
+        faces = self.array("f")
+        if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
+            raise InputError(f"{self.path}: f must be whole numbers (F, 3), got {faces.dtype} {faces.shape}")
+        faces = faces.astype(np.int64)
+        if np.any(faces < 0) or np.any(faces >= count):
+            raise InputError(f"{self.path}: f names vertices outside 0..{count - 1}: fetch the file again")
+        return faces
+
+    def check_tree(self) -> None:
+        """Refuses any tree but SMPL's: fitters and priors speak of its 24 joints by number."""
+        table = self.array("kintree_table")
+        fits = table.shape == (2, 24) and table.dtype.kind in "iuf"
+        if fits:
+            parents = np.asarray(table[0], dtype=np.int64)
+            fits = np.array_equal(parents[1:], SMPL_PARENTS[1:]) and np.array_equal(table[1], np.arange(24))
+        if not fits:
+            raise InputError(
+                f"{self.path}: kintree_table is not the tree of SMPL's 24 joints (shape {table.shape}): "
+                "use a SMPL body; SMPL-H, SMPL-X and others are not read"
+            )
+
+
+_KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f")
+
+
+def _smpl_keypoint_regressor(joint_regressor: NDArray[np.float64]) -> NDArray[np.float64]:
+    """BODY_25 keypoints of SMPL's own mesh: its joints for the limbs, single vertices for face and feet."""
+    regressor = np.zeros((_NUM_KEYPOINTS, _SMPL_NUM_VERTICES))
+    for name, vertex in _SMPL_VERTEX_KEYPOINTS.items():
+        regressor[BODY_25.index(name), vertex] = 1
+    for name, joint in _SMPL_JOINT_KEYPOINTS.items():
+        regressor[BODY_25.index(name)] = joint_regressor[joint]
+    for middle, sides in {"Neck": ("RShoulder", "LShoulder"), "MidHip": ("RHip", "LHip")}.items():
+        regressor[BODY_25.index(middle)] = regressor[[BODY_25.index(side) for side in sides]].mean(0)
+    return regressor

@@ -1,0 +1,1 @@
+"""Where a detector puts its joints on the body, learnt without truth."""

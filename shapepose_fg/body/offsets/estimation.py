@@ -1,0 +1,185 @@
+"""Learning where a detector puts its joints on the body: from joints that the views know well, without any truth.
+
+Each row (a person in a frame) is explained by a body, and what no body explains, the same in all rows in the frame
+of the bone, is the offset. Around the fits the energy is quadratic; summed over the rows
+
+    E(o, c) = sum_i min_dtheta |r - J dtheta - R o|²_W + |theta + dtheta - mean - c|²_P  +  |o|²_Q + |c|²_P
+
+with r the residuals, R the bones' rotations, W the information of the joints, P the precision of the prior of
+shape and pose. `c` is the recording's own mean shape and pose: were it zero, a room full of tall people who stand
+would be as many independent reasons to call their stature and their straight knees the detector's habit. It is
+bounded by one draw from the prior only, so it goes first. What pose and shape can explain (moving all joints
+alike, turning a limb) is not mistaken for an offset; the prior Q keeps that at zero.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter, PlainFitterConfig
+from shapepose_fg.body.fitting.energy import BodyEnergy, WhitenedTargets, robust_weight
+from shapepose_fg.body.fitting.evidence import Evidence, weigh
+from shapepose_fg.body.fitting.fitter import BodyFit, JointTargets
+from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.body.model.keypoint_offsets import LARGEST_M, RIDES_ON, KeypointOffsets
+from shapepose_fg.skeleton import BODY_25
+
+Array = NDArray[np.floating]
+
+_CHUNK = 128
+"""Rows that are linearised at a time."""
+
+
+@dataclass(frozen=True)
+class OffsetPrior:
+    """What is believed of a detector's offsets before it is seen."""
+
+    sigma_m: float = 0.02
+    """How far joints lie from the body's, metres per axis: offsets are shrunk towards zero by this."""
+    asymmetry_sigma_m: float = 0.003
+    """How far left and right may differ from being mirror images, metres per axis."""
+    pose_widening: float = 3.0
+    """The pose prior is this many times as wide while offsets are learnt: a prior is never quite right about how
+    poses vary, and what it has wrong would look like an offset, the same in hundreds of rows."""
+    rows_per_draw: float = 4.0
+    """How many rows say as much as one that is independent: a detector's error lasts over frames, and people come
+    back."""
+    rounds: int = 1
+    """How often bodies are fitted and offsets are solved. As bodies are eliminated and not held, the first
+    solution is nearly the last: more rounds change what the body predicts by 0.2 mm."""
+
+    def __post_init__(self) -> None:
+        for name in ("sigma_m", "asymmetry_sigma_m"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        for name in ("pose_widening", "rows_per_draw", "rounds"):
+            if not getattr(self, name) >= 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+
+
+def learn_offsets(
+    targets: JointTargets,
+    model: BodyModel,
+    pose_prior: PosePrior | None = None,
+    config: PlainFitterConfig | None = None,
+    prior: OffsetPrior | None = None,
+) -> KeypointOffsets:
+    """The offsets of the detector that gave `targets` (BODY_25), rows with too few joints left out.
+
+    Give only joints that are known well: information zero for all others. Offsets that `model` has already are
+    replaced, not added to. With no row that a body fits, the offsets are zero and their sigma is the prior's.
+    """
+    pose_prior = PosePrior.default() if pose_prior is None else pose_prior
+    prior = OffsetPrior() if prior is None else prior
+    wide = pose_prior.widened(prior.pose_widening)
+    config = PlainFitterConfig() if config is None else config
+    precision = np.linalg.inv(_prior_covariance(prior))
+    model, fit = model.with_keypoint_offsets(_made(np.zeros(75), precision, np.zeros(25))), None
+    for _ in range(prior.rounds):
+        fit = LevenbergMarquardtFitter(model, wide, config).fit(targets, fit)
+        if not fit.ok.any():
+            break
+        energy = BodyEnergy(model.to(torch.float64), wide)
+        sums = _summed(energy, fit, weigh(targets, config.evidence), config.kernel_scale)
+        model = model.with_keypoint_offsets(_solve(sums, model.keypoint_offsets, precision, prior))
+    return model.keypoint_offsets
+
+
+@dataclass(frozen=True)
+class _Sums:
+    """What the rows together say of offsets and mean (75 + P), bodies eliminated."""
+
+    hessian: Array
+    """(75 + P, 75 + P)."""
+    gradient: Array
+    """(75 + P,)."""
+    prior: Array
+    """(P, P) Hessian of one row's prior of shape and pose, the mean over the rows."""
+    count: Array
+    """(25,) rows in which each joint took part."""
+
+
+def _summed(energy: BodyEnergy, fit: BodyFit, evidence: Evidence, kernel_scale: float) -> _Sums:
+    """The sums over the rows that have a body."""
+    rows = np.flatnonzero(fit.ok)
+    size = 75 + energy.num_free
+    hessian, gradient, prior = np.zeros((size, size)), np.zeros(size), np.zeros((size - 75, size - 75))
+    for start in range(0, len(rows), _CHUNK):
+        part = rows[start : start + _CHUNK]
+        centred = evidence.xyz[part] - evidence.centre[part, None]
+        seen = WhitenedTargets(torch.from_numpy(centred), torch.from_numpy(evidence.root[part]))
+        here = _eliminate(energy, _free(energy, fit.rows(part), evidence.centre[part]), seen, kernel_scale)
+        hessian, gradient, prior = hessian + here[0], gradient + here[1], prior + here[2] / len(rows)
+    count = (np.abs(evidence.root[rows]).max(axis=(-1, -2)) > 0).sum(axis=0)
+    return _Sums(hessian, gradient, prior, count)
+
+
+def _solve(sums: _Sums, offsets: KeypointOffsets, precision: Array, prior: OffsetPrior) -> KeypointOffsets:
+    """One Newton step in offsets and mean; the mean starts from zero, which is where the bodies were fitted."""
+    current = offsets.xyz_m.ravel()
+    hessian, gradient = sums.hessian / prior.rows_per_draw, sums.gradient / prior.rows_per_draw
+    hessian[:75, :75] += precision
+    gradient[:75] += precision @ current
+    # The root's place and turn have no prior, and no say in the sums either: any small number holds them at zero.
+    hessian[75:, 75:] += sums.prior + 1e-9 * np.eye(len(sums.prior))
+    return _made(current - np.linalg.solve(hessian, gradient)[:75], hessian, sums.count)
+
+
+def _made(xyz_m: Array, precision: Array, count: Array) -> KeypointOffsets:
+    """Offsets (75,) with the sigmas that the joint `precision` (75 + ..., 75 + ...) leaves them."""
+    variance = np.diagonal(np.linalg.inv(precision))[:75].reshape(25, 3).mean(axis=1)
+    xyz = xyz_m.reshape(25, 3)
+    length = np.linalg.norm(xyz, axis=1, keepdims=True)
+    inside = xyz * np.minimum(1.0, 0.999 * LARGEST_M / np.maximum(length, 1e-9))
+    return KeypointOffsets(inside, np.sqrt(variance), count.astype(np.intp), RIDES_ON)
+
+
+def _free(energy: BodyEnergy, fit: BodyFit, centre: Array) -> Tensor:
+    """Free parameters (R, P) of fitted bodies, with `centre` (R, 3) as origin."""
+    angles = fit.body_pose.reshape(len(fit), -1)[:, energy.angles]
+    return torch.from_numpy(np.concatenate([fit.betas, fit.global_orient, angles, fit.transl - centre], axis=1))
+
+
+def _eliminate(
+    energy: BodyEnergy, free: Tensor, targets: WhitenedTargets, kernel_scale: float
+) -> tuple[Array, Array, Array]:
+    """Sums over the rows (R, P) `free`, each row's body eliminated.
+
+    Returns Hessian and gradient by (offsets 75, mean of the free parameters P), and the prior's Hessian (P, P).
+    """
+    xyz, jacobian = energy.keypoints_with_jacobian(free)
+    scale = torch.tensor(kernel_scale, dtype=free.dtype)
+    here = energy.linearise_at(free, xyz, jacobian, targets, scale)
+    root = robust_weight(here.squared, scale).sqrt()[..., None, None] * targets.root
+    rotations = energy.model.bone_rotations(energy.complete(free))[:, torch.from_numpy(RIDES_ON)]
+    by_offset = root @ rotations  # (R, 25, 3, 3), whitened
+    residual = (root @ (targets.xyz - xyz)[..., None]).squeeze(-1)
+    by_body = (root @ jacobian.unflatten(1, xyz.shape[1:])).flatten(1, 2)  # (R, 75, P)
+    prior_hessian = here.hessian - by_body.mT @ by_body
+    prior_gradient = here.gradient + (by_body.mT @ residual.flatten(1)[..., None]).squeeze(-1)
+    crossed = (by_offset.mT @ by_body.unflatten(1, xyz.shape[1:])).flatten(1, 2)
+    both = torch.cat([crossed, -prior_hessian], dim=1)  # (R, 75 + P, P): second derivatives with the body
+    gradient = torch.cat([-(by_offset.mT @ residual[..., None]).flatten(1), -prior_gradient], dim=1)
+    factor = torch.linalg.cholesky(here.hessian)
+    right = torch.cat([both.mT, here.gradient[..., None]], dim=-1)
+    half = torch.linalg.solve_triangular(factor, right, upper=False).flatten(0, 1)  # all rows' in one matrix
+    hessian = -(half[:, :-1].mT @ half[:, :-1])
+    hessian[:75, :75] += torch.block_diag(*(by_offset.mT @ by_offset).sum(dim=0))
+    hessian[75:, 75:] += prior_hessian.sum(dim=0)
+    gradient = gradient.sum(dim=0) - half[:, :-1].mT @ half[:, -1]
+    return hessian.numpy(), gradient.numpy(), prior_hessian.sum(dim=0).numpy()
+
+
+def _prior_covariance(prior: OffsetPrior) -> Array:
+    """(75, 75) covariance of the offsets: what mirrored joints share, and what they do not."""
+    flip = np.diag([-1.0, 1.0, 1.0])
+    mirrored = np.zeros((75, 75))  # takes every offset to the mirrored one of its mirror joint
+    for joint, mirror in enumerate(BODY_25.mirror):
+        mirrored[3 * joint : 3 * joint + 3, 3 * mirror : 3 * mirror + 3] = flip
+    even, odd = (np.eye(75) + mirrored) / 2, (np.eye(75) - mirrored) / 2
+    # Projections onto what is symmetric and what is not.
+    return prior.sigma_m**2 * even + prior.asymmetry_sigma_m**2 * odd

@@ -1,0 +1,79 @@
+"""Which joints of a recording are known well enough to learn the detector's habits from, and who uses them."""
+
+from dataclasses import dataclass, field
+from typing import Protocol, Self, runtime_checkable
+
+import numpy as np
+
+from factors import determined
+from shapepose_fg.body.fitting.fitter import BodyFitter, JointTargets
+from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
+from shapepose_fg.body.offsets.estimation import OffsetPrior
+from shapepose_fg.camera import Rig
+from shapepose_fg.estimation.linearisation import ObservationConfig, observation_sigmas, triangulate, weigh
+from shapepose_fg.observations import Observations
+
+
+@dataclass(frozen=True)
+class OffsetConfig:
+    """Whether, and from what, the difference between the detector's joints and the body's is learnt."""
+
+    source: str = "recording"
+    """"recording": learnt from the recording itself; "none": there is none; else a file that holds offsets:
+    the run.json of another recording by the same detector, or what `KeypointOffsets.save` wrote."""
+    frames: int = 30
+    """Frames, spread over the whole recording, that offsets are learnt from."""
+    min_views: int = 3
+    """Views that must agree on a joint for it to be learnt from: two that agree may both be wrong."""
+    min_confidence: float = 0.4
+    """Confidence that a detection must have to count as one of these views."""
+    max_sigma_m: float = 0.03
+    """A joint whose views leave it less certain than this in some direction is not learnt from."""
+    prior: OffsetPrior = field(default_factory=OffsetPrior)
+    """What is believed before."""
+
+    def __post_init__(self) -> None:
+        for name in ("frames", "min_views", "max_sigma_m"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        if not 0 <= self.min_confidence <= 1:
+            raise ValueError(f"min_confidence must be between 0 and 1, got {self.min_confidence}")
+        if self.source == "":
+            raise ValueError('source must be "recording", "none" or a file, got nothing')
+
+
+@runtime_checkable
+class AdjustableFitter(BodyFitter, Protocol):
+    """A body fitter that can be told where its detector puts the joints."""
+
+    model: BodyModel
+    """The body that it fits."""
+
+    def with_keypoint_offsets(self, offsets: KeypointOffsets) -> Self:
+        """The same fitter, its joints moved by `offsets`."""
+        ...
+
+
+def spread_frames(length: int, count: int) -> list[int]:
+    """At most `count` frames spread evenly over a recording of `length` frames, rising."""
+    if length <= count:
+        return list(range(length))
+    return np.unique(np.linspace(0, length - 1, count).round().astype(int)).tolist()
+
+
+def confident_targets(
+    observations: Observations, rig: Rig, observation_config: ObservationConfig, config: OffsetConfig
+) -> JointTargets:
+    """Where the views alone put the joints that they know well, information zero for all others.
+
+    No body has a say in it: what was pulled towards the body's joint would hide the detector's own.
+    """
+    sigmas = observation_sigmas(observations, observations.initial, rig, observation_config)
+    points = triangulate(observations, rig, sigmas, observation_config)
+    evidence = weigh(observations, sigmas, points, rig, observation_config)
+    evidence = weigh(observations, sigmas, evidence.target, rig, observation_config)
+    sure = (evidence.inlier & (observations.confidence >= config.min_confidence)).sum(axis=-1) >= config.min_views
+    information = evidence.information.reshape(-1, 3, 3)
+    sure &= determined(information, max_sigma_m=config.max_sigma_m).reshape(sure.shape)
+    return JointTargets(np.nan_to_num(evidence.target), np.where(sure[..., None, None], evidence.information, 0.0))

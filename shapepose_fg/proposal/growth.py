@@ -1,0 +1,190 @@
+"""Which joints hang together: 3D candidates linked by part affinities, and people grown along them from the hip.
+
+Stage I (e) of the paper (section 3.1): the affinities tell whose joint a candidate in somebody's box is.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.detections import Detections
+from shapepose_fg.proposal.assignment import match_best_first
+from shapepose_fg.proposal.candidates import Candidates
+from shapepose_fg.skeleton import Skeleton
+
+
+@dataclass(frozen=True)
+class GrowthConfig:
+    """How candidates are linked, and a person is grown."""
+
+    doubt: float = 0.2
+    """Affinity below which a view speaks against a limb: unrelated pairs are mostly 0, true ones above 0.4."""
+    view_weight: float = 0.5
+    """What a view that supports a candidate counts, times its confidence, beside the affinities of its limbs:
+    where these leave a choice, a point that five views agree on is a joint, and a crossing of two rays is not."""
+    max_limb_m: float = 0.75
+    """No limb is longer: the trunk of a tall adult, hip to neck, is about 0.65 m."""
+    sweeps: int = 2
+    """How often the joints are chosen again once all their neighbours are known."""
+    bridge_m: float = 0.55
+    """Beyond a joint that nobody saw, the next is sought within this distance a bone of the last known one: from
+    hip to ankle of a tall adult it is 0.9 m."""
+
+    def __post_init__(self) -> None:
+        for name in ("max_limb_m", "bridge_m"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        if not 0 <= self.doubt <= 1:
+            raise ValueError(f"doubt must be between 0 and 1, got {self.doubt}")
+
+
+@dataclass(frozen=True)
+class Links:
+    """Limbs between 3D candidates, as the part affinities of all views support them."""
+
+    ends: NDArray[np.intp]
+    """(L, 2) two candidates, joined by a limb of the skeleton, first joint of the limb first."""
+    score: NDArray[np.float64]
+    """(L,) sum over the views that see both of (affinity - doubt): positive when the views agree."""
+
+
+def link(candidates: Candidates, detections: Detections, config: GrowthConfig) -> Links:
+    """Sum the part affinities of all views between the detections that support two candidates."""
+    owner, detection = candidates.support.T
+    by_detection = np.argsort(detection, kind="stable")
+    owners, counts = owner[by_detection], np.bincount(detection, minlength=len(detections))
+    start = np.cumsum(counts) - counts
+    head, tail = detections.pairs.T
+    # Each affinity speaks for every pair of candidates that its two detections support.
+    repeat = counts[head] * counts[tail]
+    which = np.repeat(np.arange(len(head)), repeat)
+    step = np.arange(len(which)) - np.repeat(np.cumsum(repeat) - repeat, repeat)
+    first = owners[start[head][which] + step // np.maximum(counts[tail][which], 1)]
+    second = owners[start[tail][which] + step % np.maximum(counts[tail][which], 1)]
+    key, inverse = np.unique(first * len(candidates) + second, return_inverse=True)
+    ends = np.stack(np.divmod(key, max(len(candidates), 1)), axis=1)
+    total = np.bincount(inverse, detections.affinity[which], len(key))
+    sees = np.zeros((len(candidates), int(detections.view.max(initial=0)) + 1), dtype=bool)
+    sees[owner, detections.view[detection]] = True
+    shared = (sees[ends[:, 0]] & sees[ends[:, 1]]).sum(axis=1)
+    length = np.linalg.norm(candidates.xyz[ends[:, 0]] - candidates.xyz[ends[:, 1]], axis=1)
+    plausible = length < config.max_limb_m
+    return Links(ends[plausible], (total - config.doubt * shared)[plausible])
+
+
+def grow(
+    anchors: NDArray[np.intp],
+    candidates: Candidates,
+    links: Links,
+    skeleton: Skeleton,
+    config: GrowthConfig,
+) -> NDArray[np.intp]:
+    """Choose a candidate per person and joint: (P, J), -1 where none is linked to the person.
+
+    First outwards from the hip, level by level of the skeleton's tree, then `sweeps` times all joints at once,
+    each with the sum of the links to all its chosen neighbours; last, beyond joints that nobody saw.
+    """
+    people, joints = len(anchors), len(skeleton)
+    chosen = np.full((people, joints), -1, dtype=np.intp)
+    chosen[:, skeleton.root] = anchors
+    supported = candidates.support[:, 0]
+    evidence = np.asarray(
+        config.view_weight * np.bincount(supported, candidates.score[supported], len(candidates)), dtype=np.float64
+    )
+    both_ways = np.concatenate([links.ends, links.ends[:, ::-1]])
+    score = np.concatenate([links.score, links.score])
+    parent = np.array(skeleton.parents)
+    downward = parent[candidates.joint[both_ways[:, 1]]] == candidates.joint[both_ways[:, 0]]
+    down, down_score = both_ways[downward], score[downward]
+    depth = np.zeros(joints, dtype=int)
+    for level, members in enumerate(skeleton.tree_levels):
+        depth[members] = level
+    for level in range(1, len(skeleton.tree_levels)):
+        here = depth[candidates.joint[down[:, 1]]] == level
+        support = _support(chosen, down[here], down_score[here], len(candidates))
+        _choose(chosen, support, evidence, candidates, np.flatnonzero(depth == level))
+    others = np.setdiff1d(np.arange(joints), [skeleton.root])
+    for _ in range(config.sweeps):
+        support = _support(chosen, both_ways, score, len(candidates))
+        _choose(chosen, support, evidence, candidates, others)
+    for _ in skeleton.tree_levels:
+        support = _support(chosen, both_ways, score, len(candidates))
+        if not _bridge(chosen, support, evidence, candidates, skeleton, config):
+            break
+    return chosen
+
+
+def _bridge(
+    chosen: NDArray[np.intp],
+    support: NDArray[np.float64],
+    evidence: NDArray[np.float64],
+    candidates: Candidates,
+    skeleton: Skeleton,
+    config: GrowthConfig,
+) -> bool:
+    """Fill empty joints of `chosen`: linked ones, and strong ones beyond a gap; says whether there were any.
+
+    A joint that one view saw, or none, has no candidate, and its children no link to the person. A strong
+    candidate that is linked to nobody belongs to the nearest person who lacks it.
+    """
+    empty = (chosen < 0)[:, candidates.joint]
+    free = np.ones(len(candidates), dtype=bool)
+    free[chosen[chosen >= 0]] = False
+    loose = free & candidates.strong & ~(support > 0).any(axis=0)
+    score = np.where(empty & free & (support > 0), support + evidence, 0.0)
+    if (empty & loose).any():
+        ancestor, bones = _nearest_known(chosen, skeleton)
+        start = candidates.xyz[np.take_along_axis(chosen, ancestor, axis=1)]
+        distance = np.linalg.norm(start[:, candidates.joint] - candidates.xyz, axis=-1)
+        gap = bones[:, candidates.joint]
+        nearness = 1.0 - distance / (config.bridge_m * gap)
+        # Without a gap the affinities had their say, and said no.
+        score = np.where(empty & loose & (gap > 1) & (nearness > 0), nearness + evidence, score)
+    person, candidate = np.nonzero(score > 0)
+    slot = person * chosen.shape[1] + candidates.joint[candidate]
+    picked = match_best_first(slot, candidate, score[person, candidate])
+    chosen.reshape(-1)[slot[picked]] = candidate[picked]
+    return len(picked) > 0
+
+
+def _nearest_known(chosen: NDArray[np.intp], skeleton: Skeleton) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """The nearest joint towards the root (P, J) that a person has, and how many bones away (P, J) it is."""
+    ancestor = np.full(chosen.shape, skeleton.root)
+    bones = np.ones(chosen.shape, dtype=np.intp)
+    parent = np.array(skeleton.parents)
+    for members in skeleton.tree_levels[1:]:
+        up = parent[members]
+        known = chosen[:, up] >= 0
+        ancestor[:, members] = np.where(known, up, ancestor[:, up])
+        bones[:, members] = np.where(known, 1, bones[:, up] + 1)
+    return ancestor, bones
+
+
+def _support(
+    chosen: NDArray[np.intp], ends: NDArray[np.intp], score: NDArray[np.float64], count: int
+) -> NDArray[np.float64]:
+    """(P, C) sum of the links from each person's chosen candidates to every candidate."""
+    has = np.zeros((len(chosen), count + 1), dtype=bool)
+    np.put_along_axis(has, chosen, True, axis=1)  # -1 marks the spare last column
+    person, edge = np.nonzero(has[:, ends[:, 0]])
+    key = person * count + ends[edge, 1]
+    return np.bincount(key, score[edge], len(chosen) * count).reshape(len(chosen), count).astype(float)
+
+
+def _choose(
+    chosen: NDArray[np.intp],
+    support: NDArray[np.float64],
+    evidence: NDArray[np.float64],
+    candidates: Candidates,
+    joints: NDArray[np.intp],
+) -> None:
+    """Set `chosen` of these joints to the best supported candidates, one candidate serving one person."""
+    person, candidate = np.nonzero(support > 0)
+    of_these = np.isin(candidates.joint[candidate], joints)
+    person, candidate = person[of_these], candidate[of_these]
+    score = support[person, candidate] + evidence[candidate]
+    slot = person * chosen.shape[1] + candidates.joint[candidate]
+    picked = match_best_first(slot, candidate, score)
+    chosen[:, joints] = -1
+    chosen.reshape(-1)[slot[picked]] = candidate[picked]
