@@ -1,4 +1,4 @@
-"""What the body says of a joint without that joint's own target: the contract of `BodyFit.prior_xyz`, every fitter."""
+"""Where the body puts a joint without its own target: the contract of `BodyFit.prior_xyz`, every fitter."""
 
 import numpy as np
 import pytest
@@ -231,7 +231,8 @@ def test_priors_are_calibrated_on_bodies_from_the_priors(people):
     assert 2.3 < squared.mean() < 3.6
     assert 1.9 < np.median(squared) < 2.8
     by_joint = np.median(squared, axis=0)
-    assert (by_joint > 1.3).all() and (by_joint < 4.0).all()
+    # Wrists are given twice the variance that these bodies, whose angles are Gaussian, would need.
+    assert (by_joint > 1.0).all() and (by_joint < 4.0).all()
 
 
 @pytest.mark.parametrize(

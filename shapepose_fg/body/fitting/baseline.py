@@ -21,6 +21,9 @@ from shapepose_fg.body.model.target_skeletons import slots
 
 Array = NDArray[np.float64]
 
+_SPREAD = {"RWrist": 2.0, "LWrist": 2.0}
+"""Multiplies the variance of joints without their own target. Elbows bend farther from their mean than a Gaussian
+says: without it, 85 % of the wrists of the validation subjects (training.split) lay in their 90 % ellipsoids."""
 _DAMPING_START, _DAMPING_MIN, _DAMPING_MAX = 1e-3, 1e-7, 1e7
 
 
@@ -73,7 +76,8 @@ class LevenbergMarquardtFitter:
         self._slots = slots(model.keypoint_names)
         self._energy = BodyEnergy(model.to(torch.float32), prior)
         self._mean_angles = prior.mean[self._energy.angles]
-        sets, spread = left_out_sets(self._energy, prior, self.config.left_out_sets), np.ones(len(self._slots))
+        sets = left_out_sets(self._energy, prior, self.config.left_out_sets)
+        spread = np.array([_SPREAD.get(name, 1.0) for name in model.keypoint_names])
         self._rows = RowFitter(self._energy, self, sets, self.config.evidence, self.config.unfinished, spread)
 
     def with_keypoint_offsets(self, offsets: KeypointOffsets) -> "LevenbergMarquardtFitter":

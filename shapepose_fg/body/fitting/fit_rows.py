@@ -100,8 +100,8 @@ class RowFitter:
                 targets = passes.targets(inside, evidence.root, index)
                 body, _ = self.fallback.first(targets, passes.variance(evidence.variance_m2, index), None)
                 part.put(unsettled, JointPosterior.of(body, passes.asked(index)))
-        fill(fit, rows, passes, self.energy, parts, evidence.root, evidence.centre,
-             model_sigma_m=self.evidence.model_sigma_m, unfinished=self.unfinished, spread=self.spread)  # fmt: skip
+        fill(fit, rows, passes, self.energy, parts, evidence, self.spread,
+             model_sigma_m=self.evidence.model_sigma_m, unfinished=self.unfinished)  # fmt: skip
 
     def _shapes(
         self, inside: Array, evidence: Evidence, passes: Passes, start: Tensor | None

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from shapepose_fg.body.fitting.energy import BodyEnergy, Evaluated, factored
+from shapepose_fg.body.fitting.evidence import Evidence
 from shapepose_fg.body.fitting.fitter import BodyFit, FitStatus
 from shapepose_fg.body.fitting.left_out import Passes
 
@@ -82,21 +83,21 @@ def fill(
     passes: Passes,
     energy: BodyEnergy,
     parts: list[JointPosterior],
-    root: Array,
-    centre: Array,
+    evidence: Evidence,
+    spread: Array,
     *,
     model_sigma_m: float,
     unfinished: float,
-    spread: Array,
 ) -> None:
     """Fill `fit`'s `rows` (R,) with what the passes found: those with all targets, and those without some, if any.
 
-    `root` (R, J, 3, 3) is that of the targets' information, `centre` (R, 3) each row's origin. Rows whose energy a
-    Newton step would lower by more than `unfinished`, or that are not finite, become NOT_CONVERGED. `spread` (J,)
-    multiplies the variance of what is said of a joint without a target.
+    `evidence` is that of the rows. Rows whose energy a Newton step would lower by more than `unfinished`, or that
+    are not finite, become NOT_CONVERGED. `spread` (J,) multiplies the variance of what is said of a joint without
+    its own target.
     """
+    root, centre = evidence.root, evidence.centre
     wider = spread[:, None, None]
-    unseen = ~root.any(axis=(-1, -2))[..., None, None]
+    unseen = np.all(root == 0, axis=(-1, -2))[..., None, None]
     found = parts[0]
     prior_xyz, prior_covariance = _left_out(passes, *parts)
     information = np.square(root).sum(axis=(1, 2, 3)) / 3

@@ -94,8 +94,8 @@ class SkinnedPoints:
     ) -> tuple[Tensor, Tensor]:
         """Positions (B, K, 3) and their Jacobian (B, K, 3, 85); `local` are the joints' own rotations.
 
-        Columns: betas 10, then 24 right tangents `R <- R exp(T delta)` of the local rotations, with T of `tangents`
-        (B, 24, 3, 3) or the identity, then transl 3.
+        Columns: betas 10, then 24 right tangents `R <- R exp(T delta)` of the local rotations, with T of
+        `tangents` (B, 24, 3, 3) or the identity, then transl 3.
         """
         axes = rotations if tangents is None else rotations @ tangents
         batch, count = len(betas), len(self.root)
