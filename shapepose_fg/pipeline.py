@@ -31,7 +31,7 @@ from shapepose_fg.proposal.association import AssociationConfig, associate
 from shapepose_fg.proposal.candidates import CandidateConfig, triangulate_pairs, vote
 from shapepose_fg.proposal.proposals import ProposalConfig, propose
 from shapepose_fg.provenance import versions
-from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.reconstruction import Known, Reconstruction
 from shapepose_fg.skeleton import BODY_25, Skeleton
 
 Progress = Callable[[int, int], None]
@@ -235,6 +235,8 @@ def _rows(refined: Refined, frame: np.ndarray, person: np.ndarray, skeleton: Ske
     body = {name: getattr(fit, name).copy() for name in ("betas", "global_orient", "body_pose", "transl")}
     for values in body.values():
         values[~fit.ok] = np.nan
+    known = np.where(refined.inlier.any(axis=-1), Known.SEEN, Known.BODY)
+    known = np.where(np.isfinite(refined.joints).all(axis=-1), known, Known.UNKNOWN)
     return Reconstruction(
         frame=frame,
         person=person,
@@ -242,6 +244,7 @@ def _rows(refined: Refined, frame: np.ndarray, person: np.ndarray, skeleton: Ske
         joints=refined.joints,
         covariance=refined.covariance,
         confidence=refined.confidence,
+        known=known,
         status=refined.status,
         **body,
     )
@@ -271,6 +274,7 @@ class _Run:
             "people": {
                 "found": len(people),
                 "status": dict(Counter(people.status.tolist())),
+                "joints": people.count_known(),
                 "dropped": {reason: count for reason, count in self.dropped.items() if count > 0},
             },
         }

@@ -13,11 +13,12 @@ ROOT = Path(__file__).parents[1]
 
 LEVELS = (
     "factors errors camera skeleton",
-    "files provenance rendering body.threads",
+    "files provenance rendering run_summary columns body.threads",
     "body.model",
     "body.fitting",
     "body.offsets",
-    "detections reconstruction observations",
+    "detections observations observation_table",
+    "reconstruction",
     "proposal",
     "estimation",
     "pipeline",
