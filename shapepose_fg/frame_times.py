@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ class FrameTimes:
     """Where the times come from: "assumed", "fps", "given", or the name of a file."""
 
     def __post_init__(self) -> None:
-        """Check that times are finite and rise from frame to frame; ValueError with the first frame that does not."""
+        """Check that times are finite and rise; ValueError naming the first frame that does not."""
         time_s = np.asarray(self.time_s, dtype=np.float64)
         if time_s.ndim not in (1, 2):
             raise ValueError(f"time_s must be (T,) or (T, V), got {time_s.shape}")
@@ -63,7 +64,9 @@ class FrameTimes:
         if len(self) != frames:
             raise ValueError(f"times are needed for each of the {frames} frames, got {len(self)}")
         if self.time_s.ndim == 2 and self.time_s.shape[1] != views:
-            raise ValueError(f"times must have a column for each of the {views} cameras, got {self.time_s.shape[1]}")
+            raise ValueError(
+                f"times must have a column for each of the {views} cameras, got {self.time_s.shape[1]}"
+            )
 
     def as_dict(self) -> dict[str, Any]:
         """What run.json says of the times: where they come from, and the median rate."""
@@ -87,4 +90,4 @@ def stretches(frames: range, cuts: Sequence[int]) -> list[range]:
     """`frames` from one cut to the next; cuts outside of them do not matter."""
     inside = [cut for cut in cuts if frames.start < cut < frames.stop]
     edges = [frames.start, *inside, frames.stop]
-    return [range(start, stop) for start, stop in zip(edges, edges[1:], strict=False) if stop > start]
+    return [range(start, stop) for start, stop in pairwise(edges) if stop > start]

@@ -9,9 +9,11 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.camera import Rig
 from shapepose_fg.columns import check_codes, checked, code_names, npz_bytes, read_npz
 from shapepose_fg.errors import InputError
 from shapepose_fg.files import write_atomically
+from shapepose_fg.observations import Observations
 from shapepose_fg.skeleton import BODY_25
 
 _CURE = "give the observations.npz of a reconstruction"
@@ -92,6 +94,44 @@ class ObservationTable:
         return len(self.frame)
 
     @classmethod
+    def of(
+        cls,
+        observations: Observations,
+        place: NDArray[np.integer],
+        joints: NDArray[np.float64],
+        gate: NDArray[np.uint8],
+        rig: Rig,
+        *,
+        frame: NDArray[np.integer],
+        person: NDArray[np.integer],
+        joint_names: Sequence[str],
+    ) -> "ObservationTable":
+        """The table of N solved rows: what they observed, and where their `joints` (N, J, 3) came to lie.
+
+        `place` (N, J, V) is each detection's place among those of its view (`place_in_view`), `gate` (N, J, V)
+        the codes of `Gate`; what was not seen is recorded as that, whatever is there, and what was not used
+        because the joint is not placed, or behind the camera, as that.
+        """
+        seen = observations.seen
+        projected, depth = (np.moveaxis(values, 0, 2) for values in rig.project(joints))
+        gate = np.where(seen, gate, Gate.NOT_SEEN)
+        free = seen & (gate != Gate.USED)
+        gate = np.where(free & ~(depth > 0), Gate.BEHIND_CAMERA, gate)
+        gate = np.where(free & np.isnan(joints).any(axis=-1, keepdims=True), Gate.NOT_PLACED, gate)
+        ahead = np.asarray(seen & (depth > 0))[..., None]
+        return cls(
+            frame=frame.astype(np.int64),
+            person=person.astype(np.int64),
+            joint_names=np.array(joint_names, dtype=str),
+            view_names=np.array(rig.names, dtype=str),
+            candidate=np.where(seen, place, -1).astype(np.int32),
+            xy=np.where(seen[..., None], observations.xy, np.nan).astype(np.float32),
+            confidence=np.where(seen, observations.confidence, 0.0).astype(np.float32),
+            residual_px=np.where(ahead, projected - observations.xy, np.nan).astype(np.float32),
+            gate=gate.astype(np.uint8),
+        )
+
+    @classmethod
     def empty(
         cls, joint_names: Sequence[str] = BODY_25.joints, view_names: Sequence[str] = ()
     ) -> "ObservationTable":
@@ -166,13 +206,15 @@ class ObservationTable:
             raise InputError(f"{file}: {error}; {_CURE}") from None
 
 
-def place_in_view(view: NDArray[np.integer]) -> NDArray[np.int32]:
-    """(D,) the place of each detection among those of its own view, in their order, from `view` (D,) of a frame.
+def place_in_view(candidate: NDArray[np.integer], view: NDArray[np.integer]) -> NDArray[np.int32]:
+    """Detections counted among those of their own view, from where they are counted over all views of a frame.
 
-    What `ObservationTable.candidate` holds, for detections that are counted over all views (`Detections`).
+    `candidate` of any shape holds rows of the frame's `Detections`, -1 for none (and stays so); `view` (D,) is
+    `Detections.view`.
     """
     order = np.argsort(view, kind="stable")
     first = np.searchsorted(view[order], view[order])
-    place = np.empty(len(view), dtype=np.int32)
+    # One more place, at the end: what -1 leads to.
+    place = np.full(len(view) + 1, -1, dtype=np.int32)
     place[order] = np.arange(len(view)) - first
-    return place
+    return place[candidate]

@@ -106,9 +106,58 @@ def test_bad_files(tmp_path, changed, sentence):
 
 
 def test_a_detection_s_place_among_those_of_its_view():
-    assert place_in_view(np.array([0, 0, 0, 1, 1, 4])).tolist() == [0, 1, 2, 0, 1, 0]
-    assert place_in_view(np.array([2, 0, 2, 1, 2, 0])).tolist() == [0, 0, 1, 0, 2, 1]
-    assert place_in_view(np.zeros(0, int)).tolist() == []
+    assert place_in_view(np.array([0, 1, 2, 3, 4, 5, -1]), np.array([0, 0, 0, 1, 1, 4])).tolist() == [
+        0, 1, 2, 0, 1, 0, -1,
+    ]  # fmt: skip
+    assert place_in_view(np.array([[4, 3], [-1, 0]]), np.array([2, 0, 2, 1, 2, 0])).tolist() == [[2, 0], [-1, 0]]
+    assert place_in_view(np.array([-1]), np.zeros(0, int)).tolist() == [-1]
+
+
+def test_the_table_of_solved_rows(five_cameras, two_people, seen_exactly):
+    """Detections without error, joints moved by hand: residuals are what the cameras say, reasons as they must."""
+    from shapepose_fg.observations import Observations
+
+    seen = seen_exactly(five_cameras, two_people)
+    candidate = np.full((2, 25, 5), -1)
+    for person in range(2):  # the first detection of a joint in a view is the one, the second the other
+        for joint in range(25):
+            for view in range(5):
+                rows = np.flatnonzero((seen.joint == joint) & (seen.view == view))
+                xy = five_cameras.project(two_people[person, joint][None])[0][view, 0]
+                candidate[person, joint, view] = rows[np.linalg.norm(seen.xy[rows] - xy, axis=1).argmin()]
+    candidate[0, 3, 2] = -1
+    observations = Observations.of(candidate, seen, two_people)
+    joints = two_people.copy()
+    joints[0, 4] += 0.1
+    joints[1, 5] = np.nan
+    away = five_cameras.centres[0] - joints[1, 6]
+    joints[1, 6] = joints[1, 6] + 1.5 * away  # beyond the first camera, and so behind it
+    gate = np.full((2, 25, 5), Gate.USED)
+    gate[0, 4, 1], gate[1, 5], gate[1, 6, 0] = Gate.TOO_FAR, Gate.TOO_FAR, Gate.TOO_FAR
+    solved = ObservationTable.of(
+        observations,
+        place_in_view(candidate, seen.view),
+        joints,
+        gate,
+        five_cameras,
+        frame=np.array([7, 7]),
+        person=np.array([0, 1]),
+        joint_names=[f"joint {index}" for index in range(25)],
+    )
+    assert solved.gate[0, 3, 2] == Gate.NOT_SEEN and solved.candidate[0, 3, 2] == -1
+    assert solved.gate[0, 4].tolist() == [1, 2, 1, 1, 1]
+    assert (solved.gate[1, 5] == Gate.NOT_PLACED).all() and np.isnan(solved.residual_px[1, 5]).all()
+    assert solved.gate[1, 6, 0] == Gate.BEHIND_CAMERA and np.isnan(solved.residual_px[1, 6, 0]).all()
+    still = np.ones((2, 25, 5), dtype=bool)
+    still[0, 3, 2] = still[0, 4] = still[1, 5] = still[1, 6] = False
+    np.testing.assert_allclose(solved.residual_px[still], 0, atol=1e-4)
+    moved = (five_cameras.project(joints[0, 4][None])[0] - five_cameras.project(two_people[0, 4][None])[0])[:, 0]
+    np.testing.assert_allclose(solved.residual_px[0, 4], moved, rtol=1e-4, atol=1e-4)
+    # The detection that the table names is the one at that place: a reader of the file finds it again.
+    for view in range(5):
+        own = np.flatnonzero(seen.view == view)
+        picked = solved.candidate[0, 10, view]
+        np.testing.assert_allclose(seen.xy[own[picked]], solved.xy[0, 10, view], rtol=1e-6)
 
 
 def test_every_gate_has_a_name_of_its_own():

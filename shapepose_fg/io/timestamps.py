@@ -62,7 +62,9 @@ def _table(path: Path) -> tuple[list[str], NDArray[np.float64], NDArray[np.intp]
             raise InputError(f"{path}: line {line} must hold {len(names)} numbers, got {len(words)}; {cure}")
         wrong = next((word for word in words if not _is_number(word)), None)
         if wrong is not None:
-            raise InputError(f"{path}: line {line} must hold numbers, got {wrong[:20]!r}; write seconds like 0.033")
+            raise InputError(
+                f"{path}: line {line} must hold numbers, got {wrong[:20]!r}; write seconds like 0.033"
+            )
         rows.append([float(word) for word in words])
         lines.append(line)
     return names, np.array(rows).reshape(len(rows), -1 if rows else len(names)), np.array(lines, dtype=np.intp)
@@ -99,7 +101,9 @@ def _lines_of_frames(
     odd = (numbers != np.round(numbers)) | (numbers < 0)
     if odd.any():
         row = int(np.argmax(odd))
-        raise InputError(f"{path}: line {lines[row]} must name a frame, 0 or more, got {numbers[row]:g}; correct it")
+        raise InputError(
+            f"{path}: line {lines[row]} must name a frame, 0 or more, got {numbers[row]:g}; correct it"
+        )
     found, first, count = np.unique(numbers, return_index=True, return_counts=True)
     if (count > 1).any():
         raise InputError(f"{path}: frame {found[np.argmax(count > 1)]:.0f} occurs twice; keep one line of it")
