@@ -24,9 +24,9 @@ class Observations:
     frame: NDArray[np.intp] = field(default=None)  # type: ignore[assignment]
     """(N,) frame of the row; 0 where it is not said."""
     time_s: NDArray[np.float64] = field(default=None)  # type: ignore[assignment]
-    """(N, V) when each view was exposed, seconds; equal in a row for cameras that are synchronised. 0 by default."""
+    """(N, V) when each view was exposed, seconds: equal in a row if cameras are synchronised. 0 by default."""
     candidate: NDArray[np.intp] = field(default=None)  # type: ignore[assignment]
-    """(N, J, V) which detection of the row's frame each observation is; -1 where there is none, or it is not said."""
+    """(N, J, V) which detection of the row's frame each observation is; -1 for none, or not said."""
 
     def __post_init__(self) -> None:
         shape = np.shape(self.confidence)

@@ -1,4 +1,4 @@
-"""Where people's joints are, how fast they move and how surely: a Kalman filter, batched over people and joints."""
+"""Where joints are, how fast they move and how surely: a Kalman filter, batched over people and joints."""
 
 from dataclasses import dataclass, replace
 

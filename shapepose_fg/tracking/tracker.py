@@ -21,7 +21,7 @@ from shapepose_fg.tracking.view_assignment import AssignmentConfig, assign
 
 Array = NDArray[np.float64]
 FindPeople = Callable[[Detections, Rig, bool], Observations]
-"""Stage I of one frame: detections and rig to people; with True, hips that two views saw are enough for a person."""
+"""Stage I of one frame: detections and rig to people; with True, hips that two views saw are enough."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class TrackingConfig:
     assignment: AssignmentConfig = field(default_factory=AssignmentConfig)
     """Which detections are a track's."""
     lost_m: float = 0.2
-    """A joint whose predicted place has a larger sigma is lost: it is sought around its neighbour on the skeleton."""
+    """A joint whose predicted place has a larger sigma is lost: it is sought around its parent on the skeleton."""
     trusted_m: float = 0.1
     """A joint with a smaller sigma is judged by the length of its bones."""
     follow_s: float = 0.25
