@@ -1,4 +1,4 @@
-"""A reconstruction over time, scored on stretches of the named sequences: python scripts/evaluate_time.py [options].
+"""A reconstruction over time, scored on stretches of the named sequences: python scripts/evaluate_time.py.
 
     python scripts/evaluate_time.py                                  # six stretches, split report
     python scripts/evaluate_time.py --split tune --only crowd --frames 0:100
@@ -49,6 +49,7 @@ COLUMNS = {
     "wrist": ("fast_wrist_error_mm", 1),
     "body": ("body_mpjpe_mm", 1),
     "b accel": ("body_acceleration_error", 1),
+    "twists": ("twist_jumps", 0),
     "stature": ("stature_spread_cm", 1),
     "50 %": ("seen_inside_50", 1),
     "95 %": ("seen_inside_95", 1),
@@ -56,7 +57,7 @@ COLUMNS = {
     "u 95 %": ("unseen_inside_95", 1),
     "ms": ("cpu_ms", 0),
 }
-"""Heading, figure and decimals. mm, m/s², cm; `u` are joints unseen for ten frames; ms are the processor's, a frame."""
+"""Heading, figure, decimals. mm, m/s², cm; `u`: joints unseen for ten frames; ms: the processor's, a frame."""
 
 
 def main() -> None:

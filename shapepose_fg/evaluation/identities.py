@@ -61,8 +61,8 @@ def identity_metrics(
     Measures and a Data Set for Multi-Target, Multi-Camera Tracking", 2016). Switches and fragmentations go by
     `matches`, which are made frame by frame.
     """
-    scored = np.flatnonzero((index >= 0) & np.isfinite(joints).all(axis=2).any(axis=1))
-    present = np.isfinite(truth).all(axis=3).any(axis=2)
+    scored = np.flatnonzero((index >= 0) & np.isfinite(joints.sum(axis=2)).any(axis=1))
+    present = np.isfinite(truth.sum(axis=3)).any(axis=2)
     names, number = np.unique(identity[scored], return_inverse=True)
     pairs = np.stack([index[scored], number], axis=1)
     if len(np.unique(pairs, axis=0)) < len(pairs):
@@ -92,9 +92,7 @@ NOBODY = np.iinfo(np.int64).min
 """Stands for no identity: any other number may be one."""
 
 
-def identity_table(
-    matches: Matches, identity: NDArray[np.integer], shape: tuple[int, int]
-) -> NDArray[np.int64]:
+def identity_table(matches: Matches, identity: NDArray[np.integer], shape: tuple[int, int]) -> NDArray[np.int64]:
     """(T, P) the identity with which each person is matched in each frame; `NOBODY` where with none."""
     table = np.full(shape, NOBODY)
     table[matches.frame, matches.person] = identity[matches.row]

@@ -1,4 +1,4 @@
-"""How good a reconstruction over time is against a known truth: joints, identities, motion, bodies, covariances."""
+"""How good a reconstruction over time is against a known truth: joints, identities, motion, covariances."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.model.body_model import BodyModel
-from shapepose_fg.evaluation.bodies import body_joints, statures
+from shapepose_fg.evaluation.bodies import TWIST_JUMP, body_joints, bone_rotations, statures, twists
 from shapepose_fg.evaluation.identities import IdentityMetrics, identity_metrics
 from shapepose_fg.evaluation.matching import match_people
 from shapepose_fg.evaluation.metrics import (
@@ -33,6 +33,24 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
+class MotionScore:
+    """How joints of matched rows move, against the truth: those of the result, or those of its bodies."""
+
+    mpjpe_mm: float
+    """Mean distance to the true joints, millimetres."""
+    acceleration_error: float
+    """Mean length of the difference between a joint's acceleration and the true one, m/s²."""
+    fast_wrist_error_mm: float
+    """Median error of the wrists whose truth is faster than 1.5 m/s, millimetres."""
+    fast_wrists: int
+    """How many those are."""
+    forearm_spread: float
+    """Standard deviation over mean of a forearm's length, the mean over identities and sides."""
+    limb_spread: float
+    """The same of all upper and lower arms and legs."""
+
+
+@dataclass(frozen=True)
 class TrackingScore:
     """What `score_tracks` found."""
 
@@ -42,24 +60,14 @@ class TrackingScore:
     """The same of the joints that were asked for apart, with the same matches; None where none were."""
     identities: IdentityMetrics | None
     """IDF1, switches, fragmentations, tracks; None where `person` is no identity."""
-    acceleration_error: float
-    """Mean length of the difference between a joint's acceleration and the true one, m/s²."""
-    fast_wrist_error_mm: float
-    """Median error of the wrists whose truth is faster than 1.5 m/s, millimetres."""
-    fast_wrists: int
-    """How many those are."""
-    body_mpjpe_mm: float
-    """Mean distance of the bodies' own joints to the true ones, millimetres."""
-    body_acceleration_error: float
-    """As `acceleration_error`, of the bodies' own joints."""
+    motion: MotionScore
+    """The motion of the joints."""
+    bodies: MotionScore
+    """The motion of the bodies' own joints."""
     stature_spread_m: float
     """Tallest minus smallest body of an identity, metres: the largest over the identities."""
-    forearm_spread: float
-    """Standard deviation over mean of a forearm's length, the mean over identities and sides."""
-    body_forearm_spread: float
-    """The same of the bodies' own joints."""
-    limb_spread: float
-    """Standard deviation over mean of the length of all upper and lower arms and legs, the mean over them."""
+    twist_jumps: int
+    """Bones of bodies that turn about their own axis by 20 degrees more from a frame to the next than in truth."""
     seen: CovarianceCalibration
     """Covariances of the joints of matched rows that are seen in that frame."""
     long_unseen: CovarianceCalibration
@@ -72,31 +80,25 @@ class TrackingScore:
 
     def as_dict(self) -> dict[str, Any]:
         """The figures under plain names, for tables and JSON; None where there is nothing to measure."""
-        who = self.identities
         figures = {
             "f1": 100 * self.joints.f1,
             "precision": 100 * self.joints.precision,
             "recall": 100 * self.joints.recall,
             "f1_some_joints": np.nan if self.some_joints is None else 100 * self.some_joints.f1,
-            "mpjpe_mm": self.joints.mpjpe_mm,
-            "idf1": np.nan if who is None else 100 * who.idf1,
-            "acceleration_error": self.acceleration_error,
-            "fast_wrist_error_mm": self.fast_wrist_error_mm,
-            "body_mpjpe_mm": self.body_mpjpe_mm,
-            "body_acceleration_error": self.body_acceleration_error,
+            "idf1": np.nan if self.identities is None else 100 * self.identities.idf1,
             "stature_spread_cm": 100 * self.stature_spread_m,
-            "forearm_spread": 100 * self.forearm_spread,
-            "body_forearm_spread": 100 * self.body_forearm_spread,
-            "limb_spread": 100 * self.limb_spread,
         }
+        for prefix, motion in {"": self.motion, "body_": self.bodies}.items():
+            figures |= {f"{prefix}{name}": value for name, value in vars(motion).items()}
         for name, calibration in {"seen": self.seen, "unseen": self.long_unseen}.items():
             figures |= {f"{name}_inside_{100 * level:.0f}": 100 * s for level, s in calibration.coverage.items()}
+        return {name: float(v) if np.isfinite(v) else None for name, v in figures.items()} | self._counts()
+
+    def _counts(self) -> dict[str, int]:
         counts = {"rows_of_nobody": self.rows_of_nobody, "people_missed": self.joints.people_missed}
-        counts |= {"fast_wrists": self.fast_wrists, "joints_long_unseen": len(self.long_unseen.nees)}
-        if who is not None:
-            counts |= {"tracks": who.tracks, "tracks_of_nobody": who.tracks_of_nobody}
-            counts |= {"switches": who.switches, "fragmentations": who.fragmentations}
-        return {name: float(v) if np.isfinite(v) else None for name, v in figures.items()} | counts
+        counts |= {"twist_jumps": self.twist_jumps, "joints_long_unseen": len(self.long_unseen.nees)}
+        names = ("tracks", "tracks_of_nobody", "switches", "fragmentations")
+        return counts if self.identities is None else counts | {n: getattr(self.identities, n) for n in names}
 
 
 def score_tracks(
@@ -118,43 +120,59 @@ def score_tracks(
     apart. `seen` (N, J) says which joints count as seen in their frame, by default those with a confidence.
     `model` is the body whose parameters `people` holds. ValueError for an identity with two rows in one frame.
     """
-    frames = _span(truth) if frames is None else np.asarray(frames, dtype=np.int64)
-    index = frame_index(people.frame, frames)
-    true = joints_by_frame(truth, frames)
-    matches = match_people(people.frame, people.joints, true, frames.tolist())
-    row = np.full(true.shape[:2], -1, dtype=np.intp)
-    row[matches.frame, matches.person] = matches.row
-    identity = people.person if identities else None
-    chains = Chains.of(row, frames, identity)
-    matched, person = people.rows(matches.row), matches.person if identity is None else identity[matches.row]
+    numbers = _span(truth) if frames is None else np.asarray(frames, dtype=np.int64)
+    true = joints_by_frame(truth, numbers)
+    matches = match_people(people.frame, people.joints, true, numbers.tolist())
+    chains = Chains.of(
+        matches, numbers, true.shape[1], people.person[matches.row] if identities else matches.person
+    )
+    found, index = people.rows(matches.row), frame_index(people.frame, numbers)
     seen = (people.confidence > 0 if seen is None else np.asarray(seen, dtype=bool))[matches.row]
-    unseen = frames_unseen(seen, matched.frame, person) >= LONG_UNSEEN
-    error = matched.joints - true[matches.frame, matches.person]
-    placed, bodies = chains.placed(people.joints), body_joints(matched, model)
-    bodies_placed = np.full(true.shape, np.nan)
-    bodies_placed[matches.frame, matches.person] = bodies
-    fast = fast_joint_errors(placed, true, frames, fps)
-    forearms = list(FOREARMS)
-    limbs, body_limbs = (_relative_spread(joints, person) for joints in (matched.joints, bodies))
+    unseen = frames_unseen(seen, found.frame, chains.identity) >= LONG_UNSEEN
+    error = found.joints - true[matches.frame, matches.person]
     chosen = None if some_joints is None else list(some_joints)
     return TrackingScore(
-        joints=metrics_of(matches, people.joints, true),
-        some_joints=None if chosen is None else metrics_of(matches, people.joints[:, chosen], true[:, :, chosen]),
-        identities=None
-        if identity is None
-        else identity_metrics(matches, index, identity, people.joints, true),
-        acceleration_error=_mean(acceleration_errors(placed, true, chains.consecutive, fps)),
+        metrics_of(matches, people.joints, true),
+        None if chosen is None else metrics_of(matches, people.joints[:, chosen], true[:, :, chosen]),
+        identity_metrics(matches, index, people.person, people.joints, true) if identities else None,
+        motion=_motion(found.joints, true, chains, fps),
+        bodies=_motion(body_joints(found, model), true, chains, fps),
+        stature_spread_m=_widest(statures(found.betas, model), chains.identity),
+        twist_jumps=_twist_jumps(found, truth, numbers, chains, model),
+        seen=covariance_calibration(error[seen], found.covariance[seen]),
+        long_unseen=covariance_calibration(error[unseen], found.covariance[unseen]),
+    )
+
+
+def _motion(joints: Array, truth: Array, chains: Chains, fps: float) -> MotionScore:
+    """Score `joints` (M, J, 3) of the matched rows, metres, against `truth` (T, P, J, 3)."""
+    placed = chains.placed(joints)
+    fast = fast_joint_errors(placed, truth, chains.frames, fps)
+    mean, sigma = spread_by_identity(limb_lengths(joints), chains.identity)
+    return MotionScore(
+        mpjpe_mm=1e3 * _mean(np.linalg.norm(placed - truth, axis=-1)),
+        acceleration_error=_mean(acceleration_errors(placed, truth, chains.consecutive, fps)),
         fast_wrist_error_mm=1e3 * float(np.median(fast)) if len(fast) > 0 else float("nan"),
         fast_wrists=len(fast),
-        body_mpjpe_mm=1e3 * _mean(np.linalg.norm(bodies_placed - true, axis=-1)),
-        body_acceleration_error=_mean(acceleration_errors(bodies_placed, true, chains.consecutive, fps)),
-        stature_spread_m=_widest(statures(matched.betas, model), person),
-        forearm_spread=_mean(limbs[:, forearms]),
-        body_forearm_spread=_mean(body_limbs[:, forearms]),
-        limb_spread=_mean(limbs),
-        seen=covariance_calibration(error[seen], matched.covariance[seen]),
-        long_unseen=covariance_calibration(error[unseen], matched.covariance[unseen]),
+        forearm_spread=_mean((sigma / mean)[:, list(FOREARMS)]),
+        limb_spread=_mean(sigma / mean),
     )
+
+
+def _twist_jumps(
+    found: Reconstruction,
+    truth: Reconstruction,
+    frames: NDArray[np.int64],
+    chains: Chains,
+    model: BodyModel | None,
+) -> int:
+    """Count of `TrackingScore.twist_jumps` of the matched rows `found`."""
+    index, person = frame_index(truth.frame, frames), np.unique(truth.person, return_inverse=True)[1]
+    rotations = np.full((*chains.consecutive.shape, 24, 3, 3), np.nan)
+    rotations[index[index >= 0], person[index >= 0]] = bone_rotations(truth, model)[index >= 0]
+    turned, true = twists(chains.placed(bone_rotations(found, model)), model), twists(rotations, model)
+    jumps = (np.abs(turned) > TWIST_JUMP) & (np.abs(turned - true) > TWIST_JUMP)
+    return int(jumps[chains.consecutive[1:]].sum())
 
 
 def joints_by_frame(people: Reconstruction, frames: NDArray[np.integer]) -> Array:
@@ -179,12 +197,6 @@ def frame_index(frame: NDArray[np.integer], frames: NDArray[np.integer]) -> NDAr
 def _span(truth: Reconstruction) -> NDArray[np.int64]:
     """All frame numbers from the first to the last."""
     return np.arange(truth.frame.min(), truth.frame.max() + 1) if len(truth) > 0 else np.zeros(0, dtype=np.int64)
-
-
-def _relative_spread(joints: Array, identity: NDArray[np.integer]) -> Array:
-    """(K, 8) standard deviation over mean of the lengths of limbs of each identity."""
-    mean, sigma = spread_by_identity(limb_lengths(joints), identity)
-    return sigma / mean
 
 
 def _widest(values: Array, identity: NDArray[np.integer]) -> float:

@@ -1,10 +1,12 @@
-"""How people move against how they truly move: accelerations, fast joints, lengths of limbs, joints long unseen."""
+"""How people move against the truth: accelerations, fast joints, lengths of limbs, joints long unseen."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.evaluation.identities import NOBODY
+from shapepose_fg.evaluation.matching import Matches
 from shapepose_fg.skeleton import BODY_25
 
 Array = NDArray[np.float64]
@@ -26,30 +28,32 @@ LONG_UNSEEN = 10
 
 @dataclass(frozen=True)
 class Chains:
-    """What was found of each true person, frame by frame: (T, P) in the order of the truth."""
+    """The M matched rows in the order of the truth: person by person, frame after frame."""
 
-    row: NDArray[np.intp]
-    """(T, P) row of the people that was matched; -1 where none was."""
+    matches: Matches
+    """Which rows are whom, when."""
+    frames: NDArray[np.int64]
+    """(T,) frame numbers of the truth."""
+    identity: NDArray[np.int64]
+    """(M,) what makes two rows one and the same: their identity, or the true person where there are none."""
     consecutive: NDArray[np.bool_]
-    """(T, P) whether frame t and the one before it are numbered consecutively, and both rows are one track."""
+    """(T, P) whether a row follows one of the frame number before, and both are of one identity."""
 
     @classmethod
     def of(
-        cls, row: NDArray[np.intp], frames: NDArray[np.integer], identity: NDArray[np.integer] | None
+        cls, matches: Matches, frames: NDArray[np.int64], people: int, identity: NDArray[np.integer]
     ) -> "Chains":
-        """From `row` (T, P), the numbers `frames` (T,), and `identity` (N,) of the rows, None to go by the truth."""
-        follows = np.zeros(row.shape, dtype=bool)
-        follows[1:] = (row[1:] >= 0) & (row[:-1] >= 0) & (np.diff(frames) == 1)[:, None]
-        if identity is not None and len(identity) > 0:
-            follows[1:] &= identity[row[1:]] == identity[row[:-1]]
-        return cls(row, follows)
+        """From the matches, the truth's frame numbers (T,), its people, the `identity` (M,) of matched rows."""
+        who = np.full((len(frames), people), NOBODY)
+        who[matches.frame, matches.person] = identity
+        follows = np.zeros(who.shape, dtype=bool)
+        follows[1:] = (who[1:] != NOBODY) & (who[1:] == who[:-1]) & (np.diff(frames) == 1)[:, None]
+        return cls(matches, frames, identity.astype(np.int64), follows)
 
-    def placed(self, values: NDArray) -> NDArray:
-        """(T, P, ...) `values` (N, ...) of the matched rows; NaN, or zero in another type, where there is none."""
-        empty = np.nan if values.dtype.kind == "f" else 0
-        table = np.full((*self.row.shape, *values.shape[1:]), empty, dtype=values.dtype)
-        found = self.row >= 0
-        table[found] = values[self.row[found]]
+    def placed(self, values: Array) -> Array:
+        """(T, P, ...) `values` (M, ...) of the matched rows; NaN where there is none."""
+        table = np.full((*self.consecutive.shape, *values.shape[1:]), np.nan)
+        table[self.matches.frame, self.matches.person] = values
         return table
 
 
@@ -82,7 +86,7 @@ def limb_lengths(joints: Array) -> Array:
 
 
 def spread_by_identity(values: Array, identity: NDArray[np.integer]) -> tuple[Array, Array]:
-    """Mean and standard deviation (K, ...) of `values` (N, ...) over the rows of each of K identities; NaN left out."""
+    """Mean and standard deviation (K, ...) of `values` (N, ...) over the rows of K identities; NaN left out."""
     names, number = np.unique(identity, return_inverse=True)
     known = np.isfinite(values)
     count, total, square = (np.zeros((len(names), *values.shape[1:])) for _ in range(3))
@@ -95,7 +99,7 @@ def spread_by_identity(values: Array, identity: NDArray[np.integer]) -> tuple[Ar
 
 
 def frames_unseen(seen: NDArray[np.bool_], frame: NDArray[np.integer], identity: NDArray[np.integer]) -> NDArray:
-    """(N, J) for how many frames up to this one, itself included, a joint of an identity has not been `seen` (N, J).
+    """(N, J) for how many frames, up to this one and with it, a joint of an identity has not been `seen` (N, J).
 
     The count begins anew where the identity has no row in the frame before.
     """
