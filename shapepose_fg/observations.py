@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.detections import Detections
+
 
 @dataclass(frozen=True)
 class Observations:
@@ -17,6 +19,9 @@ class Observations:
     """(P, J, V) w_ij of Eq. 1, the detector's score; 0 where the view did not see the joint."""
     initial: NDArray[np.float64]
     """(P, J, 3) X_0: where stage I puts the joints, metres; NaN where it does not know."""
+    candidate: NDArray[np.intp] | None = None
+    """(P, J, V) which detection of its frame each observation is, -1 where the view did not see the joint; None
+    where that is not known."""
 
     def __post_init__(self) -> None:
         shape = np.shape(self.confidence)
@@ -36,7 +41,18 @@ class Observations:
 
     def rows(self, index: NDArray[np.intp]) -> "Observations":
         """Some of the people."""
-        return Observations(self.xy[index], self.confidence[index], self.initial[index])
+        candidate = None if self.candidate is None else self.candidate[index]
+        return Observations(self.xy[index], self.confidence[index], self.initial[index], candidate)
+
+    @classmethod
+    def of(
+        cls, candidate: NDArray[np.intp], detections: Detections, initial: NDArray[np.float64]
+    ) -> "Observations":
+        """The detections `candidate` (P, J, V) of one frame, -1 for none, as observations."""
+        seen = candidate >= 0
+        xy, confidence = np.zeros((*seen.shape, 2)), np.zeros(seen.shape)
+        xy[seen], confidence[seen] = detections.xy[candidate[seen]], detections.confidence[candidate[seen]]
+        return cls(xy, confidence, initial, candidate)
 
     @classmethod
     def concatenate(cls, parts: Sequence["Observations"]) -> "Observations":
@@ -45,4 +61,5 @@ class Observations:
             np.concatenate([part.xy for part in parts]),
             np.concatenate([part.confidence for part in parts]),
             np.concatenate([part.initial for part in parts]),
+            np.concatenate([part.candidate for part in parts]) if all(p.candidate is not None for p in parts) else None,
         )
