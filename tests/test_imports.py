@@ -13,12 +13,14 @@ ROOT = Path(__file__).parents[1]
 
 LEVELS = (
     "factors errors camera skeleton",
-    "files provenance rendering body.threads",
+    "files provenance rendering run_summary columns body.threads",
     "body.model",
     "body.fitting",
     "body.offsets",
-    "detections reconstruction",
+    "detections frame_times",
     "observations",
+    "observation_table",
+    "reconstruction",
     "proposal",
     "estimation",
     "tracking",
