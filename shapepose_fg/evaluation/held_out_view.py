@@ -49,18 +49,6 @@ class WithoutView:
 
 
 @dataclass(frozen=True)
-class Candidates2D:
-    """What one view saw of the joints of N rows of a reconstruction that had this view."""
-
-    xy: Array
-    """(N, J, 2) the detection that was given to the joint, undistorted pixels; NaN where there is none."""
-    confidence: Array
-    """(N, J) the detector's score."""
-    used: NDArray[np.bool_]
-    """(N, J) whether the reconstruction used it; one that its gate refused counts only near the joint."""
-
-
-@dataclass(frozen=True)
 class HeldOut:
     """What `held_out` found for one view."""
 
@@ -81,50 +69,50 @@ def held_out(
     recording: DetectionSequence,
     rig: Rig,
     people: Reconstruction,
-    candidates: Callable[[int], Candidates2D],
     solve: Solve,
     config: ObservationConfig,
 ) -> list[HeldOut]:
     """Solve without each camera in turn, and compare with what that camera saw of the `people` of the whole run.
 
-    `candidates` says for a view what it saw of each row of `people`.
+    ValueError where `people` come without their observations.
     """
     found = []
     for view, camera in enumerate(rig.cameras):
         others = Rig(tuple(other for other in rig.cameras if other is not camera), rig.up)
-        without = solve(WithoutView(recording, view), others)
-        found.append(compare_view(camera, candidates(view), people, without, config))
+        found.append(compare_view(camera, view, people, solve(WithoutView(recording, view), others), config))
     return found
 
 
 def compare_view(
-    camera: Camera,
-    seen: Candidates2D,
-    people: Reconstruction,
-    without: Reconstruction,
-    config: ObservationConfig,
+    camera: Camera, view: int, people: Reconstruction, without: Reconstruction, config: ObservationConfig
 ) -> HeldOut:
-    """Compare what `camera` saw of `people` with the same people as they are `without` it.
+    """Compare what `camera`, which is `view`, saw of `people` with the same people as they are `without` it.
 
-    Rows are matched frame by frame (Hungarian, mean joint distance under 0.5 m).
+    Rows are matched frame by frame (Hungarian, mean joint distance under 0.5 m). Compared are detections that
+    were given to a joint, those that were not used as long as they are near it.
     """
-    used = np.isfinite(seen.xy).all(axis=-1) & (seen.used | _near(camera, seen.xy, people.joints))
+    table = people.observations
+    if table is None:
+        raise ValueError("people come without observations: give what `reconstruct` returns, or load its folder")
+    xy, confidence = (values[:, :, view].astype(np.float64) for values in (table.xy, table.confidence))
+    there = np.isfinite(xy).all(axis=-1) & (table.used[:, :, view] | _near(camera, xy, people.joints))
     frames = np.unique(people.frame)
-    joints = _by_row(people, frames)
+    row = _row_of(people, frames)
+    joints = np.where((row >= 0)[..., None, None], people.joints[np.maximum(row, 0)], np.nan)
     matches = match_people(without.frame, without.joints, joints, frames.tolist())
-    row = _row_of(people, frames)[matches.frame, matches.person]
-    pair, joint = np.nonzero(used[row] & np.isfinite(without.joints[matches.row]).all(axis=-1))
-    ours, theirs = row[pair], matches.row[pair]
+    matched = row[matches.frame, matches.person]
+    pair, joint = np.nonzero(there[matched] & np.isfinite(without.joints[matches.row]).all(axis=-1))
+    ours, theirs = matched[pair], matches.row[pair]
     squared = squared_distances(
         camera,
-        seen.xy[ours, joint],
-        seen.confidence[ours, joint],
+        xy[ours, joint],
+        confidence[ours, joint],
         without.joints[theirs, joint],
         without.covariance[theirs, joint],
         config,
     )
     known = np.isfinite(squared)
-    return HeldOut(camera.name, squared[known], int(used.sum()) - int(known.sum()))
+    return HeldOut(camera.name, squared[known], int(there.sum()) - int(known.sum()))
 
 
 def squared_distances(
@@ -175,9 +163,3 @@ def _row_of(people: Reconstruction, frames: NDArray[np.integer]) -> NDArray[np.i
     table = np.full((len(frames), int(rank.max(initial=-1)) + 1), -1)
     table[index, rank] = np.arange(len(index))
     return table
-
-
-def _by_row(people: Reconstruction, frames: NDArray[np.integer]) -> Array:
-    """(T, P, J, 3) joints in the order of `_row_of`; NaN where there are fewer people."""
-    row = _row_of(people, frames)
-    return np.where((row >= 0)[..., None, None], people.joints[np.maximum(row, 0)], np.nan)

@@ -54,13 +54,28 @@ def draw_skeletons(picture: Picture, camera: Camera, joints: NDArray[np.float64]
     drawn = picture.copy()
     for person in joints:
         xy, _ = camera.project(person)
-        known = np.isfinite(xy).all(axis=1)
+        known = np.isfinite(xy.sum(axis=1))
         for first, second in _BONES:
             if known[first] and known[second]:
                 cv2.line(drawn, _pixel(xy[first]), _pixel(xy[second]), _colour(second), width, cv2.LINE_AA)
         for joint in np.flatnonzero(known).tolist():
             cv2.circle(drawn, _pixel(xy[joint]), width + 1, (255, 255, 255), -1, cv2.LINE_AA)
     return drawn
+
+
+def cropped(
+    picture: Picture, camera: Camera, points: NDArray[np.floating], size: tuple[int, int], margin: float = 0.15
+) -> Picture:
+    """The part of the `picture` around `points` (K, 3), metres, with a margin, as a picture of `size` (W, H)."""
+    xy, _ = camera.project(np.asarray(points, dtype=np.float64))
+    xy = xy[np.isfinite(xy.sum(axis=1))]
+    if len(xy) == 0:
+        return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    middle = (xy.min(axis=0) + xy.max(axis=0)) / 2
+    half = (0.5 + margin) * np.ptp(xy, axis=0).max() / max(size) * np.array(size)
+    move = np.array(size) / (2 * half)
+    matrix = np.array([[move[0], 0, -move[0] * (middle - half)[0]], [0, move[1], -move[1] * (middle - half)[1]]])
+    return np.asarray(cv2.warpAffine(picture, matrix, size, flags=cv2.INTER_AREA), dtype=np.uint8)
 
 
 def _colour(joint: int) -> tuple[int, int, int]:

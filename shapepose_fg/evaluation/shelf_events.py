@@ -47,7 +47,8 @@ def pcp_interval(
 ) -> tuple[float, float]:
     """Ends of the interval that holds Avg PCP, per cent, in `level` of the draws of blocks, with replacement.
 
-    As many are drawn as there are. A block is up to `block_frames` consecutive annotated frames (block bootstrap: Künsch, 1989); seed fixed.
+    As many are drawn as there are. A block is up to `block_frames` consecutive annotated
+    frames (block bootstrap: Künsch, 1989); seed fixed.
     """
     block = blocks_of(matched.frame, block_frames)
     count = int(block.max()) + 1

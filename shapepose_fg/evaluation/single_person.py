@@ -87,15 +87,12 @@ def measure_single_person(
     model: BodyModel | None = None,
 ) -> SinglePerson:
     """Measure a reconstruction of the recording; the man is whoever is in the middle of the cameras."""
-    middle = rig.centres @ _floor(rig).T
-    place = np.nanmean(np.where(np.isfinite(people.joints), people.joints, np.nan), axis=1) @ _floor(rig).T
-    man = _one_a_frame(people, np.linalg.norm(place - middle.mean(axis=0), axis=1), MIDDLE_M)
-    his = people.rows(man)
+    his = people.rows(man_of(people, rig))
     lengths, body_lengths = limb_lengths(his.joints), limb_lengths(body_joints(his, model))
     up = his.joints @ rig.up_vector
     below = np.full(len(recording), np.nan)
     below[his.frame] = up[:, _RIGHT[1]] - up[:, _RIGHT[0]]
-    there = _one_a_frame(people, np.linalg.norm(place - BYSTANDER_M, axis=1), AROUND_M)
+    there = _one_a_frame(people, np.linalg.norm(_places(people, rig) - BYSTANDER_M, axis=1), AROUND_M)
     seen = bystander_seen(recording, rig)
     return SinglePerson(
         frames=len(recording),
@@ -109,6 +106,12 @@ def measure_single_person(
         bystander_seen=int(seen.sum()),
         bystander_found=int(seen[people.frame[there]].sum()),
     )
+
+
+def man_of(people: Reconstruction, rig: Rig) -> NDArray[np.intp]:
+    """(M,) the row of the man in each frame that has one, in the order of frames."""
+    middle = (rig.centres @ _floor(rig).T).mean(axis=0)
+    return _one_a_frame(people, np.linalg.norm(_places(people, rig) - middle, axis=1), MIDDLE_M)
 
 
 def bystander_seen(recording: DetectionSequence, rig: Rig) -> NDArray[np.bool_]:
@@ -147,6 +150,14 @@ def residual_to_nearest(
 def _floor(rig: Rig) -> Array:
     """(2, 3) the axes of the world that lie in the floor."""
     return np.eye(3)[np.abs(rig.up_vector) < 0.5]
+
+
+def _places(people: Reconstruction, rig: Rig) -> Array:
+    """(N, 2) where on the floor people are: the mean of their joints; infinite for one without any."""
+    known = np.isfinite(people.joints.sum(axis=2))[..., None]
+    count = known.sum(axis=1)
+    mean = np.where(known, people.joints, 0.0).sum(axis=1) / np.maximum(count, 1)
+    return np.where(count > 0, mean @ _floor(rig).T, np.inf)
 
 
 def _one_a_frame(people: Reconstruction, distance: Array, limit: float) -> NDArray[np.intp]:
