@@ -26,8 +26,8 @@ _ENOUGH = 50
 def calibrated(weights: FitterWeights, source: PeopleSource, model: BodyModel, count: int = 4096) -> FitterWeights:
     """The same weights with `spread` measured on `count` people of `source` for each skeleton.
 
-    What is claimed of a joint without its own target (`BodyFit.prior_covariance` less the model's error, whether or
-    not it has one) is widened or narrowed so that `INSIDE` of them are where it says. Left and right are taken
+    What is claimed of joints without their own target (`BodyFit.prior_covariance`, less the error of the model;
+    whether or not they have one) is widened or narrowed so that `INSIDE` of them are there. Left and right are taken
     together.
     """
     plain = replace(weights, spread=torch.ones(len(BODY_POINTS)))
