@@ -36,7 +36,7 @@ class SequenceConfig:
     """Steps of Levenberg-Marquardt, refused ones included."""
     tolerance: float = 0.05
     """A chain is done when a step lowers its energy by less than this a row, in squared standard deviations."""
-    segment_rows: int = 256
+    segment_rows: int = 320
     """Longer chains are cut, so that memory does not grow with them."""
     overlap_rows: int = 16
     """Rows that a cut-off segment has of its neighbours, on either side."""
