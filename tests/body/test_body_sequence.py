@@ -1,4 +1,4 @@
-"""Bodies over time, every fitter: one shape, smooth poses, joints, rows that nobody saw, shapes that are carried on."""
+"""Bodies over time, every fitter: one shape, smooth poses, joints, rows without targets, shapes carried on."""
 
 from dataclasses import replace
 

@@ -93,7 +93,7 @@ def test_chains_end_at_gaps_and_long_ones_are_cut_with_overlap():
     ]
     assert cut_segments(rows[:0], group, time_s, gap_s=1.0, length=6, overlap=2) == []
     time_s[11] = time_s[10]
-    with pytest.raises(ValueError, match="group 4 has two rows at 5.0 s: give one row a time"):
+    with pytest.raises(ValueError, match=r"group 4 has two rows at 5\.0 s: give one row a time"):
         cut_segments(rows, group, time_s, gap_s=1.0, length=6, overlap=2)
 
 
