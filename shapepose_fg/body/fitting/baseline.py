@@ -90,20 +90,14 @@ class LevenbergMarquardtFitter:
 
     @torch.inference_mode()
     def fit(
-        self,
-        targets: JointTargets,
-        initial: BodyFit | None = None,
-        groups: NDArray[np.intp] | None = None,
-        *,
-        left_out: bool = True,
+        self, targets: JointTargets, initial: BodyFit | None = None, groups: NDArray[np.intp] | None = None
     ) -> BodyFit:
         """Fit a body to every row of `targets`; see `BodyFit` for what comes back.
 
         OK rows of `initial` (as many rows as targets) are warm starts: no closed form, no annealing. Passes that
-        leave targets out start cold. Without `left_out` there are none of these, and `prior_xyz` and
-        `prior_covariance` are NaN.
+        leave targets out start cold.
         """
-        return self._rows.fit(targets, initial, groups, left_out)
+        return self._rows.fit(targets, initial, groups)
 
     @torch.inference_mode()
     def fit_sequence(

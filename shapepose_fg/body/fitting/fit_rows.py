@@ -11,7 +11,7 @@ from torch import Tensor
 from shapepose_fg.body.fitting.energy import BodyEnergy, Evaluated, Held, WhitenedTargets
 from shapepose_fg.body.fitting.evidence import Evidence, EvidenceConfig, weigh
 from shapepose_fg.body.fitting.fitter import BodyFit, FitStatus, JointTargets
-from shapepose_fg.body.fitting.left_out import Passes, plan_passes, whole_passes
+from shapepose_fg.body.fitting.left_out import Passes, plan_passes
 from shapepose_fg.body.fitting.posterior import JointPosterior, fill
 from shapepose_fg.body.fitting.shared_shape import check_groups, pooled_betas, shape_precision, shared
 
@@ -55,9 +55,7 @@ class RowFitter:
     fallback: Optimiser | None = None
     """What fits the passes that `optimiser` left unfinished."""
 
-    def fit(
-        self, targets: JointTargets, initial: BodyFit | None, groups: NDArray[np.intp] | None, left_out: bool
-    ) -> BodyFit:
+    def fit(self, targets: JointTargets, initial: BodyFit | None, groups: NDArray[np.intp] | None) -> BodyFit:
         """A body for every row; see `BodyFitter.fit`."""
         count = len(self.sets)
         if targets.xyz.shape[1] != count:
@@ -71,14 +69,8 @@ class RowFitter:
         if len(rows) > 0:
             start = None if initial is None else self._start(initial.rows(rows), evidence.centre[rows])
             usable = evidence.rows(rows)
-            passes = (
-                plan_passes(usable, self.sets, groups[rows], self.evidence)
-                if left_out
-                else whole_passes(groups[rows], count)
-            )
+            passes = plan_passes(usable, self.sets, groups[rows], self.evidence)
             self._fit_passes(fit, usable, rows, passes, start)
-            if not left_out:
-                fit.prior_xyz[rows], fit.prior_covariance[rows] = np.nan, np.nan
         return fit
 
     def starts(self, evidence: Evidence) -> tuple[Tensor, Held, NDArray[np.bool_]]:

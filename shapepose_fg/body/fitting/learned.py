@@ -104,20 +104,14 @@ class LearnedFitter:
 
     @torch.inference_mode()
     def fit(
-        self,
-        targets: JointTargets,
-        initial: BodyFit | None = None,
-        groups: NDArray[np.intp] | None = None,
-        *,
-        left_out: bool = True,
+        self, targets: JointTargets, initial: BodyFit | None = None, groups: NDArray[np.intp] | None = None
     ) -> BodyFit:
         """Fit a body to every row of `targets`; see `BodyFit` for what comes back.
 
         `initial` is not needed: a few steps from the closed form arrive where a warm start would, and two fits to
-        the same targets are the same fit. Without `left_out` a fit takes a fifth of the time, and `prior_xyz` and
-        `prior_covariance` are NaN.
+        the same targets are the same fit.
         """
-        return self._rows.fit(targets, None, groups, left_out)
+        return self._rows.fit(targets, None, groups)
 
     @torch.inference_mode()
     def fit_sequence(

@@ -70,13 +70,6 @@ class Passes:
         return np.where(self.without[index], np.inf, variance[self.row[index]])
 
 
-def whole_passes(groups: NDArray[np.intp], count: int) -> Passes:
-    """One pass for each row, with all targets of its `count` joints; rows of one group (R,) get one shape."""
-    row = np.arange(len(groups))
-    without, source = np.zeros((len(row), count), dtype=bool), np.repeat(row[:, None], count, axis=1)
-    return Passes(row, without, groups, np.ones(len(row), dtype=bool), source)
-
-
 def plan_passes(
     evidence: Evidence, sets: NDArray[np.intp], groups: NDArray[np.intp], config: EvidenceConfig
 ) -> Passes:
