@@ -17,15 +17,17 @@ from shapepose_fg.body.offsets.estimation import learn_offsets
 from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections, DetectionSequence
-from shapepose_fg.estimation.alternation import ExtraFactors, RefineConfig, Refined, refine
+from shapepose_fg.estimation.alternation import EstimatorConfig, RefineConfig
 from shapepose_fg.estimation.detector_offsets import (
     AdjustableFitter,
     OffsetConfig,
     confident_targets,
     spread_frames,
 )
+from shapepose_fg.estimation.estimator import Estimates, Estimator, ExtraFactors
 from shapepose_fg.estimation.linearisation import ObservationConfig
-from shapepose_fg.estimation.person_graph import PersonGraphConfig
+from shapepose_fg.estimation.motion_model import MotionConfig
+from shapepose_fg.estimation.window_graph import WindowGraphConfig
 from shapepose_fg.observations import Observations
 from shapepose_fg.proposal.association import AssociationConfig, associate
 from shapepose_fg.proposal.candidates import CandidateConfig, triangulate_pairs, vote
@@ -50,8 +52,10 @@ class PipelineConfig:
     """Stage I (e): people to their 2D observations."""
     observations: ObservationConfig = field(default_factory=ObservationConfig)
     """How far a 2D observation is trusted."""
-    person_graph: PersonGraphConfig = field(default_factory=PersonGraphConfig)
+    window_graph: WindowGraphConfig = field(default_factory=WindowGraphConfig)
     """Stage II: the factor graph of a person."""
+    motion: MotionConfig = field(default_factory=MotionConfig)
+    """Stage II: how frames hang together."""
     body: BodyConfig = field(default_factory=BodyConfig)
     """Stage II: how bodies are fitted."""
     offsets: OffsetConfig = field(default_factory=OffsetConfig)
@@ -174,18 +178,11 @@ def _reconstruct_batch(
     frame = np.repeat(np.array(frames), counts)
     person = np.arange(len(frame)) - np.repeat(np.cumsum(counts) - counts, counts)
     with run.stage("refine"):
-        refined = refine(
-            Observations.concatenate(parts),
-            rig,
-            fitter,
-            config.observations,
-            config.person_graph,
-            config.refine,
-            person=person,
-            frame=frame,
-            extra_factors=extra_factors,
-        )
-    return _rows(refined, frame, person, detections.skeleton)
+        # No tracker yet: every row is a track of its own.
+        rows = replace(Observations.concatenate(parts), track=np.arange(len(frame)), frame=frame)
+        settings = EstimatorConfig(config.observations, config.window_graph, config.refine, config.motion)
+        estimates = Estimator(rig, fitter, detections.skeleton.joints, settings).estimate(rows, extra_factors)
+    return _rows(estimates, frame, person, detections.skeleton)
 
 
 def _look(
@@ -229,7 +226,7 @@ def _offsets(
         return learn_offsets(targets, fitter.model, config=config.body.plain, prior=config.offsets.prior)
 
 
-def _rows(refined: Refined, frame: np.ndarray, person: np.ndarray, skeleton: Skeleton) -> Reconstruction:
+def _rows(refined: Estimates, frame: np.ndarray, person: np.ndarray, skeleton: Skeleton) -> Reconstruction:
     """The refined people as rows of the result; bodies that were not fitted are NaN there."""
     fit = refined.fit
     body = {name: getattr(fit, name).copy() for name in ("betas", "global_orient", "body_pose", "transl")}
