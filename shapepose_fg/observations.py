@@ -6,6 +6,8 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.detections import Detections
+
 
 @dataclass(frozen=True)
 class Observations:
@@ -22,7 +24,9 @@ class Observations:
     frame: NDArray[np.intp] = field(default=None)  # type: ignore[assignment]
     """(N,) frame of the row; 0 where it is not said."""
     time_s: NDArray[np.float64] = field(default=None)  # type: ignore[assignment]
-    """(N, V) when each view was exposed, seconds; equal in a row for cameras that are synchronised. 0 by default."""
+    """(N, V) when each view was exposed, seconds: equal in a row if cameras are synchronised. 0 by default."""
+    candidate: NDArray[np.intp] = field(default=None)  # type: ignore[assignment]
+    """(N, J, V) which detection of the row's frame each observation is; -1 for none, or not said."""
 
     def __post_init__(self) -> None:
         shape = np.shape(self.confidence)
@@ -36,6 +40,7 @@ class Observations:
             "track": np.arange(N, dtype=np.intp),
             "frame": np.zeros(N, dtype=np.intp),
             "time_s": np.zeros((N, V)),
+            "candidate": np.full(shape, -1, dtype=np.intp),
         }
         for name, default in defaults.items():
             if getattr(self, name) is None:
@@ -45,6 +50,16 @@ class Observations:
 
     def __len__(self) -> int:
         return len(self.confidence)
+
+    @classmethod
+    def of(
+        cls, candidate: NDArray[np.intp], detections: Detections, initial: NDArray[np.float64]
+    ) -> "Observations":
+        """The detections `candidate` (N, J, V) of one frame, -1 for none, as observations."""
+        seen = candidate >= 0
+        xy, confidence = np.zeros((*seen.shape, 2)), np.zeros(seen.shape)
+        xy[seen], confidence[seen] = detections.xy[candidate[seen]], detections.confidence[candidate[seen]]
+        return cls(xy, confidence, initial, candidate=candidate)
 
     @property
     def seen(self) -> NDArray[np.bool_]:

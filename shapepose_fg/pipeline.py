@@ -2,7 +2,7 @@
 
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
@@ -14,6 +14,7 @@ from shapepose_fg.body.fitting.fitters import BodyConfig, make_fitter
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.offsets.estimation import learn_offsets
+from shapepose_fg.body.shapes import SubjectShapes
 from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections, DetectionSequence
@@ -28,12 +29,14 @@ from shapepose_fg.estimation.estimator import Estimates, Estimator, ExtraFactors
 from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.estimation.motion_model import MotionConfig
 from shapepose_fg.estimation.window_graph import WindowGraphConfig
+from shapepose_fg.frame_times import FrameTimes, check_cuts
+from shapepose_fg.observation_table import Gate, ObservationTable, place_in_view
 from shapepose_fg.observations import Observations
 from shapepose_fg.proposal.association import AssociationConfig, associate
 from shapepose_fg.proposal.candidates import CandidateConfig, triangulate_pairs, vote
 from shapepose_fg.proposal.proposals import ProposalConfig, propose
 from shapepose_fg.provenance import versions
-from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.reconstruction import Known, Reconstruction
 from shapepose_fg.skeleton import BODY_25, Skeleton
 
 Progress = Callable[[int, int], None]
@@ -62,6 +65,8 @@ class PipelineConfig:
     """Stage II: where the detector puts its joints on the body."""
     refine: RefineConfig = field(default_factory=RefineConfig)
     """Stage II: the alternation."""
+    temporal: bool = True
+    """People over time: identities, motion, one shape a person. Without it every frame stands alone."""
     batch_frames: int = 64
     """Frames whose people are refined together: bodies are fitted fastest by the hundred."""
     threads: int = 1
@@ -82,6 +87,9 @@ def reconstruct(
     frames: range | None = None,
     fitter: BodyFitter | None = None,
     extra_factors: ExtraFactors | None = None,
+    times: FrameTimes | None = None,
+    cuts: Sequence[int] = (),
+    shapes: SubjectShapes | None = None,
     progress: Progress | None = None,
 ) -> Reconstruction:
     """Reconstruct the people of a recording, every frame by itself.
@@ -90,13 +98,19 @@ def reconstruct(
     `extra_factors` adds factors of your own to every person's graph. In the result a person's number counts the
     people of a frame; it is not an identity over time. `run` of the result holds the configuration, versions,
     seconds per stage, how many people were found and dropped, with reasons, and where the detector's joints lie
-    on the body. That is learnt from frames of the whole recording, whatever `frames` picks, so that a frame comes
-    out the same alone and among others; a fitter of your own takes part if it is an `AdjustableFitter`.
+    on the body. `times` says when the frames were taken; without it 30 frames a second are assumed, and run.json
+    says so. `cuts` are first frames of what follows a cut: nothing carries over to them. `shapes` are people known
+    from other recordings. Offsets are learnt from frames of the whole recording, whatever `frames` picks, so that
+    a frame comes out the same alone and among others; a fitter of your own takes part if it is an
+    `AdjustableFitter`.
     """
     config = PipelineConfig() if config is None else config
     frames = range(len(detections)) if frames is None else frames
     if frames.step != 1 or not 0 <= frames.start <= frames.stop <= len(detections):
         raise ValueError(f"frames must be a range of step 1 within 0:{len(detections)}, got {frames}")
+    times = FrameTimes.assumed(len(detections)) if times is None else times
+    times.check(len(detections), len(rig))
+    cuts = check_cuts(cuts, len(detections))
     run = _Run()
     with run.stage("load"):
         if fitter is None:
@@ -113,8 +127,9 @@ def reconstruct(
             if progress is not None:
                 progress(start + len(batch), len(frames))
     people = Reconstruction.concatenate(parts) if parts else Reconstruction.empty(detections.skeleton.joints)
-    summary = run.summary(config, frames, people)
-    return replace(people, run=summary | {"keypoint_offsets": None if offsets is None else offsets.as_dict()})
+    summary = run.summary(config, frames, people) | {"time": times.as_dict(), "cuts": list(cuts)}
+    summary |= {"keypoint_offsets": None if offsets is None else offsets.as_dict()}
+    return replace(people, time_s=times.frame_s[people.frame], run=summary)
 
 
 def estimate_offsets(
@@ -177,12 +192,29 @@ def _reconstruct_batch(
     counts = np.array([len(observations) for observations in parts])
     frame = np.repeat(np.array(frames), counts)
     person = np.arange(len(frame)) - np.repeat(np.cumsum(counts) - counts, counts)
+    observations = Observations.concatenate(parts)
     with run.stage("refine"):
         # No tracker yet: every row is a track of its own.
-        rows = replace(Observations.concatenate(parts), track=np.arange(len(frame)), frame=frame)
+        rows = replace(observations, track=np.arange(len(frame)), frame=frame)
         settings = EstimatorConfig(config.observations, config.window_graph, config.refine, config.motion)
-        estimates = Estimator(rig, fitter, detections.skeleton.joints, settings).estimate(rows, extra_factors)
-    return _rows(estimates, frame, person, detections.skeleton)
+        refined = Estimator(rig, fitter, detections.skeleton.joints, settings).estimate(rows, extra_factors)
+    people = _rows(refined, frame, person, detections.skeleton)
+    if observations.candidate is None:
+        return people
+    with run.stage("refine"):
+        starts = np.cumsum(counts)[:-1]
+        candidates = zip(frames, np.split(observations.candidate, starts), strict=True)
+        table = ObservationTable.of(
+            observations,
+            np.concatenate([place_in_view(candidate, detections[t].view) for t, candidate in candidates]),
+            refined.joints,
+            np.where(refined.inlier, Gate.USED, Gate.TOO_FAR),
+            rig,
+            frame=frame,
+            person=person,
+            joint_names=detections.skeleton.joints,
+        )
+    return replace(people, observations=table)
 
 
 def _look(
@@ -232,6 +264,8 @@ def _rows(refined: Estimates, frame: np.ndarray, person: np.ndarray, skeleton: S
     body = {name: getattr(fit, name).copy() for name in ("betas", "global_orient", "body_pose", "transl")}
     for values in body.values():
         values[~fit.ok] = np.nan
+    known = np.where(refined.inlier.any(axis=-1), Known.SEEN, Known.BODY)
+    known = np.where(np.isfinite(refined.joints).all(axis=-1), known, Known.UNKNOWN)
     return Reconstruction(
         frame=frame,
         person=person,
@@ -239,6 +273,7 @@ def _rows(refined: Estimates, frame: np.ndarray, person: np.ndarray, skeleton: S
         joints=refined.joints,
         covariance=refined.covariance,
         confidence=refined.confidence,
+        known=known,
         status=refined.status,
         **body,
     )
@@ -268,6 +303,7 @@ class _Run:
             "people": {
                 "found": len(people),
                 "status": dict(Counter(people.status.tolist())),
+                "joints": people.count_known(),
                 "dropped": {reason: count for reason, count in self.dropped.items() if count > 0},
             },
         }

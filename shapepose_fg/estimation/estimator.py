@@ -1,7 +1,7 @@
 """From whose 2D detections are whose to joints, velocities and bodies: stage II as one object."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -13,7 +13,7 @@ from shapepose_fg.camera import Rig, Views
 from shapepose_fg.estimation.alternation import EstimatorConfig, Solution, Window, alternate
 from shapepose_fg.estimation.linearisation import linearise, mean_confidence, observation_sigmas, triangulate
 from shapepose_fg.estimation.motion_model import MotionModel
-from shapepose_fg.estimation.outcome import Known, Problem, how_known, lasting_covariance, problems
+from shapepose_fg.estimation.outcome import Problem, how_known, lasting_covariance, problems
 from shapepose_fg.estimation.window_graph import WindowGraph
 from shapepose_fg.observations import Observations
 from shapepose_fg.reconstruction import Status
@@ -40,7 +40,7 @@ class Estimates:
     """(N, J, V) delta_ij of Eq. 2: which observations were kept."""
     residual_px: NDArray[np.float64]
     """(N, J, V, 2) projection of the joint minus observation; NaN where unseen or unknown."""
-    known: NDArray[np.int8]
+    known: NDArray[np.uint8]
     """(N, J) a `Known` each."""
     fit: BodyFit
     """Theta: the bodies, N rows."""
@@ -48,6 +48,20 @@ class Estimates:
     """(N,) a `Status` each."""
     problems: tuple[Problem, ...] = field(default=())
     """What went wrong, joint by joint; rows of these have the status `not solved`."""
+
+    def __len__(self) -> int:
+        return len(self.joints)
+
+    def rows(self, index: NDArray[np.intp]) -> "Estimates":
+        """Some of the rows."""
+        kept = {name: getattr(self, name)[index] for name in _COLUMNS}
+        place = {row: n for n, row in enumerate(np.asarray(index).tolist())}
+        problems = (replace(each, row=place[each.row]) for each in self.problems if each.row in place)
+        return Estimates(**kept, fit=self.fit.rows(index), problems=tuple(problems))
+
+
+_COLUMNS = "joints covariance velocity velocity_covariance confidence inlier residual_px known status".split()
+"""The arrays of `Estimates`."""
 
 
 class Estimator:
@@ -140,9 +154,7 @@ class Estimator:
         wrong = problems(observations, windows, solution, first, covariance)
         enough = np.where(solution.enough, Status.BODY_UNDETERMINED, Status.TOO_FEW_VIEWS)
         status = np.where(solution.fit.ok, Status.OK, enough)
-        failed = {(problem.track, problem.frame) for problem in wrong}
-        named = zip(observations.track.tolist(), observations.frame.tolist(), strict=True)
-        status[[pair in failed for pair in named]] = Status.NOT_SOLVED
+        status[[problem.row for problem in wrong]] = Status.NOT_SOLVED
         return Estimates(
             joints=X,
             covariance=covariance,
@@ -151,7 +163,7 @@ class Estimator:
             confidence=mean_confidence(observations, solution.inlier),
             inlier=solution.inlier,
             residual_px=final.residual_px,
-            known=how_known(solution, covariance, self.config.refine.max_sigma_m),
+            known=how_known(solution, covariance),
             fit=solution.fit,
             status=status,
             problems=wrong,

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +9,7 @@ from numpy.typing import NDArray
 from shapepose_fg.estimation.alternation import Solution, Window
 from shapepose_fg.estimation.linearisation import weakest_sigma
 from shapepose_fg.observations import Observations
+from shapepose_fg.reconstruction import Known
 
 RUNAWAY_M = 1.0
 """A joint with a factor of the user's own that ends this far from where its views first put it has run away."""
@@ -18,23 +18,12 @@ RUNAWAY_SIGMA = 20.0
 _HALF_M = 0.5
 
 
-class Known(IntEnum):
-    """How a joint is known."""
-
-    UNKNOWN = 0
-    """Not at all: NaN."""
-    SEEN = 1
-    """The views of its frame determine it."""
-    BODY = 2
-    """Inferred from the rest of the body."""
-    MOTION = 3
-    """Carried by motion: where it was seen before or after says more than the body does."""
-
-
 @dataclass(frozen=True)
 class Problem:
     """What went wrong with one joint of one person in one frame."""
 
+    row: int
+    """Row of the estimates."""
     track: int
     """Who."""
     frame: int
@@ -57,18 +46,18 @@ def lasting_covariance(solution: Solution, window: Window, white_share: float) -
     return result
 
 
-def how_known(
-    solution: Solution, covariance: NDArray[np.float64], max_sigma_m: float
-) -> NDArray[np.int8]:
-    """(N, J) a `Known` for each joint, `covariance` (N, J, 3, 3) being its own."""
-    placed = weakest_sigma(solution.views.information) <= max_sigma_m
+def how_known(solution: Solution, covariance: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """(N, J) a `Known` for each joint, `covariance` (N, J, 3, 3) being its own.
+
+    A joint that no view saw is carried by motion where it is known much better (half the variance) than the body
+    knows it.
+    """
     pulled = solution.body.known
     information = np.where(pulled[..., None, None], solution.body.information, np.eye(3))
     said = np.trace(np.linalg.inv(information), axis1=2, axis2=3)
-    better = np.trace(covariance, axis1=2, axis2=3) < 0.5 * said
-    code = np.where(pulled & ~better, Known.BODY, Known.MOTION)
-    code = np.where(placed, Known.SEEN, code)
-    return np.where(np.isfinite(solution.joints).all(axis=2), code, Known.UNKNOWN).astype(np.int8)
+    carried = ~pulled | (np.trace(covariance, axis1=2, axis2=3) < 0.5 * said)
+    code = np.where(solution.inlier.any(axis=2), Known.SEEN, np.where(carried, Known.MOTION, Known.BODY))
+    return np.where(np.isfinite(solution.joints).all(axis=2), code, Known.UNKNOWN).astype(np.uint8)
 
 
 def problems(
@@ -101,7 +90,7 @@ def problems(
     lost = finite & ~np.isfinite(covariance).all(axis=(2, 3)) & (reasons == "")
     reasons[lost] = "nothing determines it: its system is singular"
     return tuple(
-        Problem(int(observations.track[n]), int(observations.frame[n]), int(j), reasons[n, j])
+        Problem(int(n), int(observations.track[n]), int(observations.frame[n]), int(j), reasons[n, j])
         for n, j in np.argwhere(reasons != "")
     )
 
