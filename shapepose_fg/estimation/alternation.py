@@ -233,23 +233,21 @@ def _solve(
     placed = evidence.sigma_m <= config.refine.max_sigma_m
     known = placed | body.known
     start = np.where(placed[..., None], evidence.points, np.where(body.known[..., None], body.xyz, np.nan))
-    badly = evidence.sigma_m > config.motion.badly_seen_m
+    badly = evidence.sigma_m > config.motion.lost_m
     X = np.full(evidence.points.shape, np.nan)
     first = 0
     for window in windows:
         part = slice(first, first + len(window.rows))
         first = part.stop
-        inlier, initial = evidence.inlier[part], start[part]
-        offsets = None
+        inlier, initial, lost = evidence.inlier[part], start[part], None
         if window.graph.temporal:
             initial = np.where(known[part][..., None], initial, evidence.points[part])
             initial = interpolated(initial, window.graph.times_s)
-            offsets = badly[part].any(axis=0)
-            offsets[sorted(window.graph.touched)] = True
+            lost = near_in_time(badly[part], window.graph.times_s, config.motion.around_s)
         else:
             inlier = inlier & known[part][..., None]
         views = Message(evidence.target[part], evidence.information[part])
-        X[part] = window.graph.solve(inlier, views, body.rows(np.arange(part.start, part.stop)), initial, offsets)
+        X[part] = window.graph.solve(inlier, views, body.rows(np.arange(part.start, part.stop)), initial, lost)
     return X
 
 
@@ -262,3 +260,13 @@ def interpolated(points: NDArray[np.float64], times_s: NDArray[np.float64]) -> N
         for axis in range(3):
             result[:, joint, axis] = np.interp(times_s, times_s[there], points[there, joint, axis])
     return result
+
+
+def near_in_time(
+    marked: NDArray[np.bool_], times_s: NDArray[np.float64], within_s: float
+) -> NDArray[np.bool_]:
+    """(T, J) which frames are at most `within_s` from one that is `marked` (T, J)."""
+    first = np.searchsorted(times_s, times_s - within_s, side="left")
+    last = np.searchsorted(times_s, times_s + within_s, side="right")
+    count = np.concatenate([np.zeros((1, marked.shape[1]), dtype=int), np.cumsum(marked, axis=0)])
+    return count[last] > count[first]
