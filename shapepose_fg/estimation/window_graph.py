@@ -257,7 +257,8 @@ class WindowGraph:
     def _parameters(self) -> gtsam.LevenbergMarquardtParams:
         parameters = gtsam.LevenbergMarquardtParams()
         parameters.setMaxIterations(self.config.max_iterations)
-        parameters.setRelativeErrorTol(self.config.tolerance)
+        # Of hundreds of joints that hardly move any more, a few thousandths of a sigma.
+        parameters.setRelativeErrorTol(self.config.tolerance * (10.0 if self.temporal else 1.0))
         return parameters
 
     @property
@@ -337,19 +338,20 @@ class WindowGraph:
         return factors
 
     def _start(self, initial: NDArray[np.float64], offsets: NDArray[np.bool_]) -> gtsam.Values:
-        """`initial` (T, J, 3) with its velocities; offsets of views and body, `offsets` (2, T, J), are zero."""
+        """`initial` (T, J, 3) with its velocities; `offsets` (2, T, J) of views and body start as they ended."""
         values = gtsam.Values()
         insert = values.insert
         for key, point in zip(self.keys[self._present].tolist(), initial[self._present], strict=True):
             insert(key, point)
         if not self.temporal:
             return values
+        last = self.values
         speed = np.gradient(initial, self.times_s, axis=0)
         for key, velocity in zip(self.velocity_keys[self._present].tolist(), speed[self._present], strict=True):
-            insert(key, velocity)
+            insert(key, last.atPoint3(key) if last.exists(key) else velocity)
         zero = np.zeros(3)
         for key in self._offset_keys[offsets].tolist():
-            insert(key, zero)
+            insert(key, last.atPoint3(key) if last.exists(key) else zero)
         return values
 
     def _points(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
