@@ -72,7 +72,7 @@ def test_the_run_says_how_it_came_about(recording, people):
     run = people.run
     assert run["frames"] == [0, 16]
     assert run["people"]["found"] == len(people) == run["people"]["status"]["ok"]
-    assert run["configuration"]["person_graph"]["rho_3d"] == PipelineConfig().person_graph.rho_3d
+    assert run["configuration"]["window_graph"]["rho_3d"] == PipelineConfig().window_graph.rho_3d
     assert set(run["seconds"]) >= {"triangulate", "vote", "propose", "associate", "refine"}
     assert run["versions"]["gtsam"].startswith("4.")
 
@@ -149,8 +149,8 @@ def test_one_person_before_two_cameras():
 
 
 def test_factors_of_one_s_own_reach_every_person(scene, recording):
-    def hands_apart(graph):
-        right, left = graph.keys[WRISTS].tolist()
+    def hands_apart(window, keys):
+        right, left = keys[0, WRISTS].tolist()
         yield gtsam.RangeFactor3(right, left, 0.5, isotropic(1, 1e-4))
 
     result = reconstruct(recording, scene.rig, frames=range(1), extra_factors=hands_apart)
