@@ -117,7 +117,12 @@ def alternate(
     moving = list(windows)
     for n in range(config.refine.alternations):
         rows = np.concatenate([window.rows for window in moving]) if moving else np.zeros(0, dtype=np.intp)
-        observed, sigma, here, start = observations.rows(rows), sigmas[rows], views.rows(rows), solution.joints[rows]
+        observed, sigma, here, start = (
+            observations.rows(rows),
+            sigmas[rows],
+            views.rows(rows),
+            solution.joints[rows],
+        )
         evidence = linearise(observed, sigma, start, here, config.observations)
         if n == 0:
             placed = evidence.sigma_m <= config.refine.max_sigma_m
@@ -144,7 +149,9 @@ def alternate(
         before = np.where((said.known | wrong)[..., None], start, fitted)
         shift = np.linalg.norm(X_new - before, axis=-1)
         settled = ((shift < config.refine.settled_m) | np.isnan(X_new).any(axis=-1)).all(axis=1)
-        moving = [window for window, done in zip(moving, _by_window(settled, moving), strict=True) if not done.all()]
+        moving = [
+            window for window, done in zip(moving, _by_window(settled, moving), strict=True) if not done.all()
+        ]
         if len(moving) == 0:
             break
     return solution
@@ -183,7 +190,11 @@ def _by_window(values: NDArray, windows: Sequence[Window]) -> list[NDArray]:
 
 
 def _fit(
-    fitter: BodyFitter, targets: JointTargets, last: BodyFit, groups: NDArray[np.intp] | None, rows: NDArray[np.intp]
+    fitter: BodyFitter,
+    targets: JointTargets,
+    last: BodyFit,
+    groups: NDArray[np.intp] | None,
+    rows: NDArray[np.intp],
 ) -> BodyFit:
     """Fit some of the rows."""
     some = JointTargets(targets.xyz[rows], targets.information[rows])
@@ -209,9 +220,7 @@ def _message(
     targets = joint_targets(evidence, enough)
     for joints in sorted({each for window in windows for each in window.graph.coupled}, key=sorted):
         # Tied to each other, each would get the others' views twice: through the tie, and through the body.
-        tied = np.concatenate(
-            [np.full(len(w.rows), joints in w.graph.coupled) for w in windows]
-        )  # one flag a row
+        tied = np.concatenate([np.full(len(w.rows), joints in w.graph.coupled) for w in windows])  # one flag a row
         rows, columns = np.flatnonzero(tied), np.array(sorted(joints))
         information = targets.information.copy()
         information[:, columns] = 0.0
