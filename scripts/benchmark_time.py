@@ -2,8 +2,8 @@
 
 Reconstructs Shelf, a stretch of salsa (where the recordings are: `--data FOLDER`, or SHAPEPOSE_DATA) and the
 built-in scene with time and frame by frame, alternately in one run, and prints processor milliseconds a frame,
-their ratio and the clock's. Then a cheap recording (two people, four cameras) of rising lengths: time a frame must not
-grow, nor memory beyond the rows of the result. Run it on a machine that does nothing else.
+their ratio and the clock's. Then a cheap recording (two people, four cameras) of rising lengths: time a frame must
+not grow, nor memory beyond the rows of the result. Run it on a machine that does nothing else.
 """
 
 import argparse

@@ -116,7 +116,7 @@ def crowd(cameras: list[int], config: PipelineConfig) -> None:
         joints, who = found.joints, found.identities
         print(
             f"{count} cameras: {100 * joints.people_found / joints.people_true:.1f} % of people found,"
-            f" {100 * joints.people_invented / max(len(people), 1):.1f} % of {len(people)} rows nobody within 0.5 m,"
+            f" {100 * joints.people_invented / max(len(people), 1):.1f} % of {len(people)} rows nobody,"
             f" {joints.people_duplicated} doubles; F1 {100 * joints.f1:.1f} %, MPJPE {joints.mpjpe_mm:.1f} mm"
             + ("" if who is None else f", IDF1 {100 * who.idf1:.1f} %, {who.tracks} tracks"),
             flush=True,
