@@ -1,4 +1,4 @@
-"""Where a camera stands and what it sees: pinhole cameras in the world, and a rig of them."""
+"""Where a camera stands and what it sees: pinhole cameras in the world, a rig of them, and their views over time."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -8,6 +8,8 @@ from typing import Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from factors.pinhole import project_with_jacobian, to_pixels
 
 Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
 """A world axis, as a calibration names the direction that is up."""
@@ -91,7 +93,7 @@ class Camera:
         A point that is not in front of the camera (depth <= 0) gets NaN pixels.
         """
         points_camera = points_world @ self.cTw[:, :3].T + self.cTw[:, 3]
-        return _to_pixels(points_camera, self.K)
+        return to_pixels(points_camera, self.K)
 
     def undistort(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
         """Map measured pixels (N, 2) to the pixels of the same camera without distortion."""
@@ -175,7 +177,7 @@ class Rig:
         shape = points_world.shape[:-1]
         flat = points_world.reshape(-1, 3)
         points_camera = flat @ self.cTw[:, :, :3].transpose(0, 2, 1) + self.cTw[:, None, :, 3]
-        xy, depth = _to_pixels(points_camera, self.K)
+        xy, depth = to_pixels(points_camera, self.K[:, None])
         return xy.reshape(len(self), *shape, 2), depth.reshape(len(self), *shape)
 
     def normalise(self, view: NDArray[np.intp], xy: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -184,13 +186,54 @@ class Rig:
         return np.einsum("dij,dj->di", K_inverse[:, :2, :2], xy) + K_inverse[:, :2, 2]
 
 
-def _to_pixels(
-    points_camera: NDArray[np.float64], K: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Pixels and depths of points (..., 3) in camera coordinates; `K` is (3, 3) or (V, 3, 3)."""
-    depth = points_camera[..., 2]
-    safe = np.where(depth > 0, depth, np.nan)
-    normalised = points_camera[..., :2] / safe[..., None]
-    return normalised @ np.swapaxes(K[..., :2, :2], -1, -2) + K[..., None, :2, 2].reshape(
-        K.shape[:-2] + (1,) * (normalised.ndim - K.ndim + 1) + (2,)
-    ), depth
+@dataclass(frozen=True)
+class Views:
+    """The cameras of N rows (people, frames or both), each row with cameras of its own if they move."""
+
+    K: NDArray[np.float64]
+    """(V, 3, 3) intrinsic matrices of cameras that are the same for all rows, or (N, V, 3, 3), pixels."""
+    cTw: NDArray[np.float64]
+    """(V, 3, 4) camera from world of cameras that stand still, or (N, V, 3, 4), metres."""
+
+    def __post_init__(self) -> None:
+        K, cTw = np.asarray(self.K, dtype=np.float64), np.asarray(self.cTw, dtype=np.float64)
+        if K.shape[-2:] != (3, 3) or cTw.shape[-2:] != (3, 4) or K.ndim not in (3, 4) or cTw.ndim not in (3, 4):
+            raise ValueError(f"K must be ([N,] V, 3, 3) and cTw ([N,] V, 3, 4), got {K.shape} and {cTw.shape}")
+        if K.shape[-3] != cTw.shape[-3] or (K.ndim == cTw.ndim == 4 and len(K) != len(cTw)):
+            raise ValueError(f"K and cTw must be of the same rows and views, got {K.shape} and {cTw.shape}")
+        if not (np.isfinite(K).all() and np.isfinite(cTw).all()):
+            raise ValueError("K or cTw holds a value that is not finite")
+
+    @classmethod
+    def of(cls, rig: Rig) -> "Views":
+        """The cameras of a rig that stands still."""
+        return cls(rig.K, rig.cTw)
+
+    def __len__(self) -> int:
+        """V, the number of views."""
+        return self.K.shape[-3]
+
+    @property
+    def rows_known(self) -> int | None:
+        """N where cameras are given row by row; None where all rows have the same."""
+        lengths = [len(array) for array in (self.K, self.cTw) if array.ndim == 4]
+        return lengths[0] if lengths else None
+
+    @property
+    def focal_px(self) -> NDArray[np.float64]:
+        """(V,) or (N, V) mean of the two focal lengths, pixels."""
+        return (self.K[..., 0, 0] + self.K[..., 1, 1]) / 2
+
+    def rows(self, index: NDArray[np.intp]) -> "Views":
+        """The cameras of some of the rows."""
+        return Views(*(array[index] if array.ndim == 4 else array for array in (self.K, self.cTw)))
+
+    def project(
+        self, points: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Pixels (N, J, V, 2), depths (N, J, V) and derivatives (N, J, V, 2, 3) of `points` (N, J, 3), metres.
+
+        Undistorted pixels; they and the derivatives are NaN where the depth is not positive.
+        """
+        K, cTw = (array[:, None] if array.ndim == 4 else array for array in (self.K, self.cTw))
+        return project_with_jacobian(points[:, :, None], K, cTw)
