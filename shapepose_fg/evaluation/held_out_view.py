@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import projection_jacobians, sigma_px
+from factors import project_with_jacobian, sigma_px
 from shapepose_fg.camera import Camera, Rig
 from shapepose_fg.detections import Detections, DetectionSequence
 from shapepose_fg.estimation.linearisation import ObservationConfig
@@ -127,10 +127,7 @@ def squared_distances(
     (M,). NaN behind the camera.
     """
     count = len(points)
-    projected, depth = camera.project(points)
-    J = projection_jacobians(
-        points, np.broadcast_to(camera.K, (count, 3, 3)), np.broadcast_to(camera.cTw, (count, 3, 4))
-    )
+    projected, depth, J = project_with_jacobian(points, camera.K, camera.cTw)
     ahead = depth >= config.min_depth_m
     sigma = np.full(count, np.nan)
     sigma[ahead] = sigma_px(
