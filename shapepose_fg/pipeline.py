@@ -202,8 +202,6 @@ def _reconstruct_batch(
             extra_factors=extra_factors,
         )
     people = _rows(refined, frame, person, detections.skeleton)
-    if observations.candidate is None:
-        return people
     with run.stage("refine"):
         starts = np.cumsum(counts)[:-1]
         candidates = zip(frames, np.split(observations.candidate, starts), strict=True)
