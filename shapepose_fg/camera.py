@@ -150,7 +150,8 @@ class Camera:
 
     def _normalised(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
         """Normalised image coordinates (N, 2) of pixels (N, 2). Lenses bend these, so that K may have a skew,
-        which OpenCV's own functions pass over."""
+        which OpenCV's own functions pass over.
+        """
         inverse = np.linalg.inv(self.K)
         return np.ascontiguousarray(xy @ inverse[:2, :2].T + inverse[:2, 2])
 
@@ -163,7 +164,9 @@ def padded_distortion(coefficients: Sequence[float], lens: Lens = "perspective")
     """`coefficients` with zeros up to the next number that OpenCV takes; ValueError where there are too many."""
     for count in _COEFFICIENTS[lens]:
         if len(coefficients) <= count:
-            return np.concatenate([np.asarray(coefficients, dtype=np.float64), np.zeros(count - len(coefficients))])
+            return np.concatenate(
+                [np.asarray(coefficients, dtype=np.float64), np.zeros(count - len(coefficients))]
+            )
     most = _COEFFICIENTS[lens][-1]
     raise ValueError(f"a {lens} lens has at most {most} distortion coefficients, got {len(coefficients)}")
 
