@@ -306,9 +306,8 @@ def _summary(
         table.add_row("", f"{count} {status}", style="green" if status == "ok" else "yellow")
     for reason, count in people.run.get("people", {}).get("dropped", {}).items():
         table.add_row("", f"{count} dropped: {reason}", style="dim")
-    known = np.isfinite(people.joints).all(axis=2)
     if len(people) > 0:
-        table.add_row("joints", f"{100 * known.mean():.1f} % placed{_spread(people, known)}")
+        table.add_row("joints", _joints(people))
     # Loading torch and the body takes a second or two, once; it says nothing about the time of a frame.
     stages = {name: spent for name, spent in people.run.get("seconds", {}).items() if name != "load"}
     per_stage = "  ".join(f"{name} {1e3 * spent / len(span):.1f}" for name, spent in stages.items())
@@ -319,13 +318,18 @@ def _summary(
     return table
 
 
-def _spread(people: "Reconstruction", known: Any) -> str:
-    """The median standard deviation of the joints, as words."""
+def _joints(people: "Reconstruction") -> str:
+    """How the joints are known, as shares, and how sure they are, as words."""
     import numpy as np
 
-    variance = np.trace(people.covariance[known], axis1=-2, axis2=-1) / 3
+    count = people.count_known()
+    words = {"seen": "seen", "body": "inferred from the body", "motion": "carried by motion", "unknown": "unknown"}
+    total = max(sum(count.values()), 1)
+    shares = ", ".join(f"{100 * count[how] / total:.1f} % {word}" for how, word in words.items() if count[how] > 0)
+    variance = np.trace(people.covariance, axis1=-2, axis2=-1) / 3
     variance = variance[np.isfinite(variance) & (variance >= 0)]
-    return f", median sigma {1e3 * np.sqrt(np.median(variance)):.0f} mm" if len(variance) > 0 else ""
+    sigma = f"; median sigma {1e3 * np.sqrt(np.median(variance)):.0f} mm" if len(variance) > 0 else ""
+    return shares + sigma
 
 
 def _print(content: "RenderableType") -> None:

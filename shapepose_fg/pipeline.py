@@ -26,12 +26,13 @@ from shapepose_fg.estimation.detector_offsets import (
 )
 from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.estimation.person_graph import PersonGraphConfig
+from shapepose_fg.observation_table import Gate, ObservationTable, place_in_view
 from shapepose_fg.observations import Observations
 from shapepose_fg.proposal.association import AssociationConfig, associate
 from shapepose_fg.proposal.candidates import CandidateConfig, triangulate_pairs, vote
 from shapepose_fg.proposal.proposals import ProposalConfig, propose
 from shapepose_fg.provenance import versions
-from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.reconstruction import Known, Reconstruction
 from shapepose_fg.skeleton import BODY_25, Skeleton
 
 Progress = Callable[[int, int], None]
@@ -173,9 +174,10 @@ def _reconstruct_batch(
     counts = np.array([len(observations) for observations in parts])
     frame = np.repeat(np.array(frames), counts)
     person = np.arange(len(frame)) - np.repeat(np.cumsum(counts) - counts, counts)
+    observations = Observations.concatenate(parts)
     with run.stage("refine"):
         refined = refine(
-            Observations.concatenate(parts),
+            observations,
             rig,
             fitter,
             config.observations,
@@ -185,7 +187,23 @@ def _reconstruct_batch(
             frame=frame,
             extra_factors=extra_factors,
         )
-    return _rows(refined, frame, person, detections.skeleton)
+    people = _rows(refined, frame, person, detections.skeleton)
+    if observations.candidate is None:
+        return people
+    with run.stage("refine"):
+        starts = np.cumsum(counts)[:-1]
+        candidates = zip(frames, np.split(observations.candidate, starts), strict=True)
+        table = ObservationTable.of(
+            observations,
+            np.concatenate([place_in_view(candidate, detections[t].view) for t, candidate in candidates]),
+            refined.joints,
+            np.where(refined.inlier, Gate.USED, Gate.TOO_FAR),
+            rig,
+            frame=frame,
+            person=person,
+            joint_names=detections.skeleton.joints,
+        )
+    return replace(people, observations=table)
 
 
 def _look(
@@ -235,6 +253,8 @@ def _rows(refined: Refined, frame: np.ndarray, person: np.ndarray, skeleton: Ske
     body = {name: getattr(fit, name).copy() for name in ("betas", "global_orient", "body_pose", "transl")}
     for values in body.values():
         values[~fit.ok] = np.nan
+    known = np.where(refined.inlier.any(axis=-1), Known.SEEN, Known.BODY)
+    known = np.where(np.isfinite(refined.joints).all(axis=-1), known, Known.UNKNOWN)
     return Reconstruction(
         frame=frame,
         person=person,
@@ -242,6 +262,7 @@ def _rows(refined: Refined, frame: np.ndarray, person: np.ndarray, skeleton: Ske
         joints=refined.joints,
         covariance=refined.covariance,
         confidence=refined.confidence,
+        known=known,
         status=refined.status,
         **body,
     )
@@ -271,6 +292,7 @@ class _Run:
             "people": {
                 "found": len(people),
                 "status": dict(Counter(people.status.tolist())),
+                "joints": people.count_known(),
                 "dropped": {reason: count for reason, count in self.dropped.items() if count > 0},
             },
         }

@@ -1,20 +1,20 @@
 """What comes out: the people of every frame, as arrays with one row per person and frame."""
 
-import io
 import json
-import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
+from enum import IntEnum, StrEnum
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.columns import check_codes, checked, code_names, npz_bytes, read_npz
 from shapepose_fg.errors import InputError
 from shapepose_fg.files import read_json, write_atomically
+from shapepose_fg.observation_table import ObservationTable
+from shapepose_fg.run_summary import merged_run, plain
 from shapepose_fg.skeleton import BODY_25
 
 
@@ -27,6 +27,23 @@ class Status(StrEnum):
     """No joint is seen by two views, or too few are: nothing fixes the person in space."""
     BODY_UNDETERMINED = "body undetermined"
     """Joints are there, but too few of them to fit a body; what no view saw stays NaN."""
+
+
+class Known(IntEnum):
+    """How the position of one joint in one frame is known."""
+
+    UNKNOWN = 0
+    """The joint is not placed (NaN); or the file is older than this column."""
+    SEEN = 1
+    """At least one view's detection of the joint was used in this frame."""
+    BODY = 2
+    """No detection in this frame: inferred from the body, which other joints place."""
+    MOTION = 3
+    """Neither: carried by motion from the frames before and after."""
+
+
+_LATER: Any = None
+"""In place of a column that is not given: nothing is known of it."""
 
 
 @dataclass(frozen=True)
@@ -55,33 +72,53 @@ class Reconstruction:
     """(N, 3) translation of the body, metres."""
     status: NDArray[np.str_]
     """(N,) one of the values of `Status`."""
+    time_s: NDArray[np.float64] = _LATER
+    """(N,) when the row's frame was taken, seconds; NaN where unknown, as it is where the column is not given."""
+    velocity: NDArray[np.float64] = _LATER
+    """(N, J, 3) velocity of each joint in the world, m/s; NaN where unknown or not given."""
+    velocity_covariance: NDArray[np.float64] = _LATER
+    """(N, J, 3, 3) covariance of each joint's velocity, (m/s)²; NaN where unknown or not given."""
+    known: NDArray[np.uint8] = _LATER
+    """(N, J) how each joint is known: codes of `Known`; unknown where not given."""
     run: dict[str, Any] = field(default_factory=dict)
     """How this came about: configuration, versions, checksums, times (goes to run.json)."""
+    observations: ObservationTable | None = None
+    """What each row was solved from, row by row (goes to observations.npz); None where that is not recorded."""
 
     ROWS: ClassVar = (
-        "frame person joints covariance confidence betas global_orient body_pose transl status".split()
+        "frame person time_s joints covariance velocity velocity_covariance known confidence"
+        " betas global_orient body_pose transl status".split()
     )
     """The columns that have one entry per row."""
 
     def __post_init__(self) -> None:
-        """Check every shape, once."""
+        """Check every shape and type, once."""
         N, J = np.size(self.frame), np.size(self.joint_names)
-        shapes = {"frame": (N,), "person": (N,), "joint_names": (J,), "joints": (N, J, 3)}
-        shapes |= {"covariance": (N, J, 3, 3), "confidence": (N, J), "betas": (N, 10)}
-        shapes |= {"global_orient": (N, 3), "body_pose": (N, 23, 3), "transl": (N, 3), "status": (N,)}
+        shapes = {"frame": (N,), "person": (N,), "joint_names": (J,), "time_s": (N,), "joints": (N, J, 3)}
+        shapes |= {"covariance": (N, J, 3, 3), "velocity": (N, J, 3), "velocity_covariance": (N, J, 3, 3)}
+        shapes |= {"known": (N, J), "confidence": (N, J), "betas": (N, 10), "global_orient": (N, 3)}
+        shapes |= {"body_pose": (N, 23, 3), "transl": (N, 3), "status": (N,)}
         for name, shape in shapes.items():
-            kind, wanted = _KINDS.get(name, ("f", np.dtype(np.float64)))
-            value = np.asarray(getattr(self, name))
-            if value.shape != shape:
-                raise ValueError(f"{name} must be {shape}, got {value.shape}")
-            if value.dtype.kind not in kind and value.size > 0:
-                raise ValueError(f"{name} must hold {wanted} values, got {value.dtype}")
-            # Fixed-width text keeps its own width; everything else gets one type.
-            text = wanted.kind == "U"
-            object.__setattr__(self, name, value.astype(str if text else wanted, copy=False))
+            value, dtype = getattr(self, name), _TYPES.get(name, np.float64)
+            if value is None and name in _ADDED:
+                value = np.full(shape, Known.UNKNOWN if name == "known" else np.nan, dtype=dtype)
+            object.__setattr__(self, name, checked(name, value, shape, dtype))
+        check_codes("known", self.known, Known)
         unknown = set(np.unique(self.status).tolist()) - set(Status)
         if len(unknown) > 0:
             raise ValueError(f"status must be one of {[*map(str, Status)]}, got {sorted(unknown)}")
+        self._check_observations()
+
+    def _check_observations(self) -> None:
+        """ValueError where `observations` are of other rows."""
+        table = self.observations
+        if table is None:
+            return
+        for name in ("frame", "person", "joint_names"):
+            if not np.array_equal(getattr(table, name), getattr(self, name)):
+                raise ValueError(
+                    f"observations must have the same {name} as the people, row by row (see `relabelled`)"
+                )
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -106,7 +143,11 @@ class Reconstruction:
 
     @classmethod
     def concatenate(cls, parts: Sequence["Reconstruction"]) -> "Reconstruction":
-        """The rows of `parts`, one after the other; `run` is the first part's."""
+        """The rows of `parts`, one after the other.
+
+        `run` says what all parts together are (`merged_run`): ValueError where their configurations differ or
+        two of them cover the same frame. `observations` are kept where every part that has rows has them.
+        """
         if len(parts) == 0:
             return cls.empty()
         first = parts[0]
@@ -114,11 +155,18 @@ class Reconstruction:
             if not np.array_equal(part.joint_names, first.joint_names):
                 raise ValueError("parts must have the same joint_names")
         columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in cls.ROWS}
-        return replace(first, **columns)
+        filled = [part.observations for part in parts if len(part) > 0]
+        tables = [table for table in filled if table is not None]
+        together = ObservationTable.concatenate(tables) if 0 < len(tables) == len(filled) else None
+        # A part without rows and without a run has nothing to say of the whole.
+        runs = [part.run for part in parts if len(part) > 0 or len(part.run) > 0]
+        return replace(first, **columns, observations=together, run=merged_run(runs))
 
     def rows(self, index: NDArray) -> "Reconstruction":
         """The rows that `index` picks: a mask (N,) or row numbers."""
-        return replace(self, **{name: getattr(self, name)[index] for name in self.ROWS})
+        columns = {name: getattr(self, name)[index] for name in self.ROWS}
+        table = None if self.observations is None else self.observations.rows(index)
+        return replace(self, **columns, observations=table)
 
     def at(self, frame: int) -> "Reconstruction":
         """The people of one frame."""
@@ -128,72 +176,81 @@ class Reconstruction:
         """The same people, with more to say in run.json."""
         return replace(self, run=self.run | entries)
 
-    def save(self, folder: str | Path) -> None:
-        """Write people.npz and run.json into `folder`, each whole or not at all (docs/conventions.md).
+    def relabelled(self, person: NDArray[np.integer]) -> "Reconstruction":
+        """The same rows with other identities (N,), in `observations` too."""
+        table = None if self.observations is None else replace(self.observations, person=person)
+        return replace(self, person=person, observations=table)
 
-        A process killed on the way leaves each file as it was or as it shall be. OSError where `folder`
-        cannot be written.
+    def count_known(self) -> dict[str, int]:
+        """How many joints are known in each way, in words: what run.json says of them."""
+        count = np.bincount(self.known.ravel(), minlength=len(Known))
+        return {
+            kind.name.lower(): int(count[kind]) for kind in (Known.SEEN, Known.BODY, Known.MOTION, Known.UNKNOWN)
+        }
+
+    def save(self, folder: str | Path) -> None:
+        """Write people.npz, run.json and observations.npz into `folder`, each whole or not at all.
+
+        A process killed on the way leaves each file as it was or as it shall be (docs/conventions.md). Without
+        `observations`, those of an earlier result are removed. OSError where `folder` cannot be written.
         """
         folder = Path(folder)
         columns = {name: getattr(self, name) for name in (*self.ROWS, "joint_names")}
-        run = json.dumps(self.run, indent=2, allow_nan=False, default=_plain) + "\n"
-        people = io.BytesIO()
-        np.savez_compressed(people, **columns)
-        # Both are complete in memory before the first is touched.
-        write_atomically(folder / "people.npz", lambda stream: stream.write(people.getbuffer()))
-        write_atomically(folder / "run.json", lambda stream: stream.write(run.encode()))
+        run = json.dumps(self.run, indent=2, allow_nan=False, default=plain) + "\n"
+        # All are complete in memory before the first is touched.
+        files = {_PEOPLE: npz_bytes(columns | {"known_names": code_names(Known)}), _RUN: run.encode()}
+        if self.observations is not None:
+            files[_OBSERVATIONS] = self.observations.to_bytes()
+        for name, content in files.items():
+            write_atomically(folder / name, lambda stream, content=content: stream.write(content))
+        if self.observations is None:
+            (folder / _OBSERVATIONS).unlink(missing_ok=True)
 
     @classmethod
     def load(cls, path: str | Path) -> "Reconstruction":
         """Read what `save` wrote: its folder, or the people.npz in it. InputError on anything else.
 
-        `run` is empty where there is no run.json beside it.
+        `run` is empty where there is no run.json beside it, and `observations` are None where there is no
+        observations.npz. Columns that files of earlier versions lack are unknown.
         """
         path = Path(path)
-        file = path / "people.npz" if path.is_dir() else path
-        columns = _read_npz(file)
-        names = (*cls.ROWS, "joint_names")
-        for name in names:
+        file = path / _PEOPLE if path.is_dir() else path
+        columns = read_npz(file, "give the people.npz of a reconstruction, or run one first")
+        needed = [name for name in (*cls.ROWS, "joint_names") if name not in _ADDED]
+        for name in (*needed, "known_names") if "known" in columns else needed:
             if name not in columns:
-                raise InputError(f"{file}: column {name} is missing; give the people.npz of a reconstruction")
-        run_file = file.with_name("run.json")
+                raise InputError(f"{file}: column {name} is missing; {_CURE}")
+        if "known" in columns and not np.array_equal(columns["known_names"], code_names(Known)):
+            raise InputError(f"{file}: known_names are not those of this version; {_CURE}")
+        run_file = file.with_name(_RUN)
         run = read_json(run_file) if run_file.is_file() else {}
         if not isinstance(run, dict):
             raise InputError(f"{run_file}: must hold an object; restore it or delete it")
+        given: dict[str, Any] = {name: columns[name] for name in (*cls.ROWS, "joint_names") if name in columns}
         try:
-            return cls(**{name: columns[name] for name in names}, run=run)
+            people = cls(**given, run=run)
         except ValueError as error:
-            raise InputError(f"{file}: {error}; give the people.npz of a reconstruction") from None
+            raise InputError(f"{file}: {error}; {_CURE}") from None
+        table_file = file.with_name(_OBSERVATIONS)
+        if not table_file.is_file():
+            return people
+        try:
+            return replace(people, observations=ObservationTable.load(table_file))
+        except InputError:
+            raise
+        except ValueError as error:
+            raise InputError(f"{table_file}: {error}; delete it or run the reconstruction again") from None
 
 
-_KINDS = {
-    "frame": ("iu", np.dtype(np.int64)),
-    "person": ("iu", np.dtype(np.int64)),
-    "joint_names": ("U", np.dtype(np.str_)),
-    "status": ("U", np.dtype(np.str_)),
+_PEOPLE, _RUN, _OBSERVATIONS = "people.npz", "run.json", "observations.npz"
+_CURE = "give the people.npz of a reconstruction"
+_TYPES: dict[str, type] = {
+    "frame": np.int64,
+    "person": np.int64,
+    "joint_names": np.str_,
+    "status": np.str_,
+    "known": np.uint8,
 }
-"""NumPy kinds that a column may have, and the type that it is given; every other column is float64."""
-
-
-def _plain(value: object) -> object:
-    """What JSON can hold of `value`: arrays as lists, paths as text."""
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    if isinstance(value, Path):
-        return str(value)
-    raise TypeError(f"run must hold plain values, got {type(value).__name__}")
-
-
-def _read_npz(file: Path) -> dict[str, NDArray]:
-    """The arrays of an .npz file, none of them pickled."""
-    try:
-        with np.load(file, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except FileNotFoundError:
-        raise InputError(f"{file}: there is no such file; run a reconstruction first") from None
-    except (ValueError, TypeError, EOFError, KeyError, OSError, zlib.error, zipfile.BadZipFile) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(
-            f"{file}: cannot be read as an .npz file without pickled objects ({reason});"
-            " give the people.npz of a reconstruction"
-        ) from None
+"""The type of a column; every other column is float64."""
+_ADDED = frozenset({"time_s", "velocity", "velocity_covariance", "known"})
+"""Columns that files of version 0.1 lack."""

@@ -12,7 +12,7 @@ import pytest
 
 import shapepose_fg.pipeline
 from shapepose_fg.cli import main
-from shapepose_fg.reconstruction import Reconstruction, Status
+from shapepose_fg.reconstruction import Known, Reconstruction, Status
 from shapepose_fg.skeleton import BODY_25
 
 K = [1000.0, 0, 500, 0, 1000, 400, 0, 0, 1]
@@ -50,6 +50,7 @@ def pipeline(monkeypatch) -> dict:
             joints=np.ones((N, 25, 3)),
             covariance=np.tile(4e-4 * np.eye(3), (N, 25, 1, 1)),
             confidence=np.ones((N, 25)),
+            known=np.full((N, 25), Known.SEEN),
             betas=np.zeros((N, 10)),
             global_orient=np.zeros((N, 3)),
             body_pose=np.zeros((N, 23, 3)),
@@ -83,7 +84,7 @@ def test_reconstruct_writes_results_and_says_what_it_found(recording, pipeline, 
     for part in ("5 (0:5) of 2 cameras", "10 in all, 2.0 a frame (2 to 2)", "5 ok", "5 too few views"):
         assert part in words
     for part in (
-        "100.0 % placed, median sigma 20 mm",
+        "100.0 % seen; median sigma 20 mm",
         "5.0 ms a frame",
         "vote 5.0",
         "out/people.npz",

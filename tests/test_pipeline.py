@@ -16,7 +16,7 @@ from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.pipeline import PipelineConfig, find_people, reconstruct
 from shapepose_fg.proposal.proposals import ProposalConfig
-from shapepose_fg.reconstruction import Reconstruction, Status
+from shapepose_fg.reconstruction import Known, Reconstruction, Status
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.scene import Scene
 from shapepose_fg.skeleton import BODY_25
@@ -175,3 +175,23 @@ def test_shelf_is_as_good_as_promised(shared_data):
     score = evaluate_shelf(Reconstruction.concatenate(parts).with_run(frames=[0, 301]), truth)
     assert score.people_found == score.people
     assert score.pcp_average >= 96.4 and (score.pcp >= 92.5).all()
+
+
+def test_the_observations_are_what_the_joints_were_solved_from(scene, recording, people):
+    """Whoever reads observations.npz finds the detections, and projecting the joints gives the residuals."""
+    table = people.observations
+    assert table.used.mean() > 0.5
+    row, joint, view = np.argwhere(table.used)[1000].tolist()
+    seen = recording[int(people.frame[row])]
+    own = np.flatnonzero(seen.view == view)
+    detection = own[table.candidate[row, joint, view]]
+    assert seen.joint[detection] == joint
+    np.testing.assert_allclose(table.xy[row, joint, view], seen.xy[detection], rtol=1e-6)
+    projected, _ = scene.rig.project(people.joints)
+    residual = projected[view, row, joint] - seen.xy[detection]
+    np.testing.assert_allclose(table.residual_px[row, joint, view], residual, atol=1e-3)
+    assert np.median(np.linalg.norm(table.residual_px[table.used], axis=-1)) < 10
+    # Seen means that a detection was used; nobody is known by motion where every frame stands alone.
+    np.testing.assert_array_equal(people.known == Known.SEEN, table.used.any(axis=-1))
+    assert set(np.unique(people.known)) <= {Known.SEEN, Known.BODY}
+    assert people.run["people"]["joints"]["seen"] == (people.known == Known.SEEN).sum()

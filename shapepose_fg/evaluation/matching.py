@@ -88,10 +88,17 @@ def mean_distance(
     A joint that only the prediction lacks counts `missing_m`, one that the truth lacks counts nothing; infinite
     for a person without joints.
     """
-    distance = np.linalg.norm(predicted[:, None] - truth[None], axis=3)
-    known = np.isfinite(truth).all(axis=2)
-    distance = np.where(known, np.where(np.isfinite(distance), distance, missing_m), 0.0).sum(axis=2)
-    count = known.sum(axis=1)
+    return pair_distance(predicted[:, None], truth[None], missing_m)
+
+
+def pair_distance(
+    predicted: NDArray[np.float64], truth: NDArray[np.float64], missing_m: float = MAX_DISTANCE_M
+) -> NDArray[np.float64]:
+    """The `mean_distance` (...) of pairs that are named: `predicted` and `truth` (..., J, 3) broadcast."""
+    distance = np.linalg.norm(predicted - truth, axis=-1)
+    known = np.isfinite(truth).all(axis=-1)
+    distance = np.where(known, np.where(np.isfinite(distance), distance, missing_m), 0.0).sum(axis=-1)
+    count = known.sum(axis=-1)
     return np.where(count > 0, distance / np.maximum(count, 1), np.inf)
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 from scipy.special import gammaincinv
 
-from shapepose_fg.evaluation.matching import People, match_people
+from shapepose_fg.evaluation.matching import Matches, People, match_people
 
 CORRECT_M = 0.2
 """A joint is correct if it is at most this far from the true one (the protocol of Zhang et al.), metres."""
@@ -118,6 +118,20 @@ def joint_metrics(
     else:
         joints = np.asarray(predicted.joints, dtype=np.float64)
         matches = match_people(predicted.frame, joints, truth, frames)
+    return metrics_of(matches, joints, truth, correct_m=correct_m)
+
+
+def metrics_of(
+    matches: Matches,
+    joints: NDArray[np.float64],
+    truth: NDArray[np.float64],
+    *,
+    correct_m: float = CORRECT_M,
+) -> JointMetrics:
+    """The figures of people who are matched already: rows `joints` (N, J, 3), `truth` (T, P, J, 3), metres.
+
+    The joints may be some of those by which people were matched.
+    """
     true_known = np.isfinite(truth.sum(axis=3))
     distance = np.linalg.norm(joints[matches.row] - truth[matches.frame, matches.person], axis=2)
     both = np.isfinite(distance)

@@ -18,6 +18,7 @@ from shapepose_fg.evaluation.shelf_ground_truth import (
     read_shelf_ground_truth,
     shelf_joints,
 )
+from shapepose_fg.run_summary import covered_frames
 from shapepose_fg.skeleton import BODY_25
 
 __all__ = ["ShelfGroundTruth", "ShelfScore", "evaluate_shelf", "read_shelf_ground_truth", "shelf_joints"]
@@ -135,7 +136,7 @@ def evaluate_shelf(
     Each annotated person takes the prediction of its frame with the smallest mean joint distance; two may take
     the same one; a missing joint counts 0.5 m in that choice and makes its limbs wrong. A limb is right when
     the mean error of its two ends is at most half its annotated length. Without `frames`, a reconstruction
-    whose run says which frames it covered (`run["frames"]`, [start, stop]) is scored on those.
+    whose run says which frames it covered (`run["frames"]`, [start, stop] or several) is scored on those.
     InputError if no annotated frame is left to score.
     """
     actor = np.isin(ground_truth.actor, ACTORS)
@@ -193,14 +194,11 @@ def _limbs_right(distance: NDArray[np.float64], truth: NDArray[np.float64]) -> N
 
 def _frames_run(people: People) -> Iterable[int] | None:
     """The frames that the reconstruction says it covered, if it says so."""
-    run = getattr(people, "run", None) or {}
-    span = run.get("frames")
-    if span is None:
-        return None
     try:
-        return range(*(int(bound) for bound in span))
-    except (TypeError, ValueError):
-        raise InputError(f'run.json: "frames" must be [start, stop], got {span!r}; restore the file') from None
+        spans = covered_frames(getattr(people, "run", None) or {})
+    except ValueError as error:
+        raise InputError(f"run.json: {error}; restore the file") from None
+    return None if spans is None else [frame for span in spans for frame in span]
 
 
 def _covered(frame: NDArray[np.int64], frames: Iterable[int] | None) -> NDArray[np.bool_]:

@@ -71,13 +71,10 @@ def associate(
         keep = seen_twice >= config.min_observed_parts
         real[np.flatnonzero(real)[~keep]] = False
         nearness, chosen = nearness.of(keep), chosen[keep]
-        owns = _owned(chosen, len(detections))
+        owns = owned(chosen, len(detections))
         # What the dropped had is given out anew.
         rounds = rounds - 1 if keep.all() else config.passes
-    seen = chosen >= 0
-    xy, confidence = np.zeros((*seen.shape, 2)), np.zeros(seen.shape)
-    xy[seen], confidence[seen] = detections.xy[chosen[seen]], detections.confidence[chosen[seen]]
-    return Observations(xy, confidence, initial=proposals.places[real]), int((~real).sum())
+    return Observations.of(chosen, detections, proposals.places[real]), int((~real).sum())
 
 
 @dataclass(frozen=True)
@@ -141,19 +138,19 @@ def _choose(
     config: AssociationConfig,
 ) -> NDArray[np.intp]:
     """(P, J, V) detections for the people who are thought to own `owns` (P, D)."""
-    affinity, neighbours = _affinity(owns, detections, skeleton, nearness.views)
+    affinity, neighbours = mean_affinity(owns, detections, skeleton, nearness.views)
     # Where no neighbour is seen, the affinities say nothing: neither for nor against.
     spoken = np.where(neighbours > 0, affinity, config.least_affinity)
     score = np.exp(-0.5 * (nearness.distance_m / config.near_m) ** 2) + spoken
     likely = (nearness.distance_m < config.far_m) & (score >= 2 * config.least_affinity)
     likely |= nearness.reachable & (affinity >= config.least_affinity)
-    chosen = _match(likely, score, detections, (len(owns), len(skeleton), nearness.views))
+    chosen = match_views(likely, score, detections, (len(owns), len(skeleton), nearness.views))
     overlap = (nearness.distance_px < config.overlap_px) & (affinity >= config.least_affinity)
-    _share(chosen, overlap, nearness.distance_px, detections)
+    share_overlaps(chosen, overlap, nearness.distance_px, detections)
     return chosen
 
 
-def _owned(chosen: NDArray[np.intp], count: int) -> NDArray[np.bool_]:
+def owned(chosen: NDArray[np.intp], count: int) -> NDArray[np.bool_]:
     """(P, D) whether a detection is chosen for a person."""
     owns = np.zeros((len(chosen), count), dtype=bool)
     person, _, _ = np.nonzero(chosen >= 0)
@@ -171,7 +168,7 @@ def _by_support(proposals: Proposals, candidates: Candidates, count: int) -> NDA
     return owns
 
 
-def _affinity(
+def mean_affinity(
     owns: NDArray[np.bool_], detections: Detections, skeleton: Skeleton, views: int
 ) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
     """(P, D) mean affinity of each detection to what the person owns at its limbs' other ends, and the number."""
@@ -189,7 +186,7 @@ def _affinity(
     return total / np.maximum(neighbours, 1), neighbours
 
 
-def _match(
+def match_views(
     likely: NDArray[np.bool_],
     score: NDArray[np.float64],
     detections: Detections,
@@ -204,7 +201,7 @@ def _match(
     return chosen
 
 
-def _share(
+def share_overlaps(
     chosen: NDArray[np.intp],
     overlap: NDArray[np.bool_],
     distance_px: NDArray[np.float64],

@@ -14,8 +14,9 @@ from shapepose_fg.simulation import DetectorConfig, built_in_scene, simulate
 def one_person(joints: np.ndarray) -> Reconstruction:
     """A reconstruction of one person in frame 0 with `joints` (25, 3)."""
     nobody = Reconstruction.empty()
-    rows = {name: np.zeros((1, *getattr(nobody, name).shape[1:])) for name in Reconstruction.ROWS}
-    rows |= {"frame": np.zeros(1, int), "person": np.zeros(1, int), "status": np.array(["ok"])}
+    columns = {name: getattr(nobody, name) for name in Reconstruction.ROWS}
+    rows = {name: np.zeros((1, *column.shape[1:]), column.dtype) for name, column in columns.items()}
+    rows |= {"status": np.array(["ok"])}
     return replace(nobody, **rows | {"joints": joints[None]})
 
 

@@ -1,0 +1,65 @@
+"""Tables of arrays with one row each: shapes and types checked, `.npz` files read and written."""
+
+import io
+from collections.abc import Mapping
+from enum import IntEnum
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from shapepose_fg.errors import InputError
+
+_ALLOWED = {"i": "iu", "u": "iu", "f": "f", "U": "U"}
+"""Kinds of NumPy types that may stand for a column's own kind: whole numbers, real numbers, text."""
+
+
+def checked(name: str, value: object, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+    """`value` as an array of `shape` and `dtype`; ValueError naming the column where it is anything else.
+
+    Whole numbers of another size are converted, and so are real ones; real numbers are not cut to whole ones,
+    and a whole number that the column's type cannot hold is refused. Text keeps its own width.
+    """
+    array, wanted = np.asarray(value), np.dtype(dtype)
+    if array.shape != shape:
+        raise ValueError(f"{name} must be {shape}, got {array.shape}")
+    if array.dtype.kind not in _ALLOWED[wanted.kind] and array.size > 0:
+        raise ValueError(f"{name} must hold {wanted} values, got {array.dtype}")
+    if wanted.kind in "iu" and array.size > 0:
+        bounds = np.iinfo(cast(Any, wanted))
+        if array.min() < bounds.min or array.max() > bounds.max:
+            raise ValueError(f"{name} must hold {bounds.min} to {bounds.max}, got {array.min()} to {array.max()}")
+    return array.astype(str if wanted.kind == "U" else wanted, copy=False)
+
+
+def check_codes(name: str, codes: NDArray[np.uint8], kinds: type[IntEnum]) -> None:
+    """ValueError where a code of the column `name` is none of `kinds`, which count from 0."""
+    if codes.size > 0 and codes.max() >= len(kinds):
+        raise ValueError(f"{name} must hold codes below {len(kinds)}, got {codes.max()}")
+
+
+def code_names(kinds: type[IntEnum]) -> NDArray[np.str_]:
+    """(K,) what each code of `kinds` means, in words: the array that makes a file of codes readable."""
+    return np.array([kind.name.lower().replace("_", " ") for kind in kinds])
+
+
+def read_npz(file: Path, cure: str) -> dict[str, NDArray[Any]]:
+    """The arrays of an `.npz` file, none of them pickled; InputError with the `cure` where it cannot be read."""
+    try:
+        with np.load(file, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except FileNotFoundError:
+        raise InputError(f"{file}: there is no such file; {cure}") from None
+    except Exception as error:  # a damaged file fails inside zipfile, zlib and NumPy in a dozen ways
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(
+            f"{file}: cannot be read as an .npz file without pickled objects ({reason}); {cure}"
+        ) from None
+
+
+def npz_bytes(columns: Mapping[str, NDArray[Any]]) -> memoryview:
+    """The contents of a compressed `.npz` file."""
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **cast(Any, dict(columns)))
+    return stream.getbuffer()

@@ -1,0 +1,217 @@
+"""How good a reconstruction over time is against a known truth: joints, identities, motion, covariances."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.evaluation.bodies import TWIST_JUMP, body_joints, bone_rotations, statures, twists
+from shapepose_fg.evaluation.identities import IdentityMetrics, identity_metrics
+from shapepose_fg.evaluation.matching import match_people
+from shapepose_fg.evaluation.metrics import (
+    CovarianceCalibration,
+    JointMetrics,
+    covariance_calibration,
+    metrics_of,
+)
+from shapepose_fg.evaluation.trajectories import (
+    FOREARMS,
+    LONG_UNSEEN,
+    Chains,
+    acceleration_errors,
+    fast_joint_errors,
+    frames_unseen,
+    limb_lengths,
+    spread_by_identity,
+)
+from shapepose_fg.reconstruction import Reconstruction
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class MotionScore:
+    """How joints of matched rows move, against the truth: those of the result, or those of its bodies."""
+
+    mpjpe_mm: float
+    """Mean distance to the true joints, millimetres."""
+    acceleration_error: float
+    """Mean length of the difference between a joint's acceleration and the true one, m/s²."""
+    fast_wrist_error_mm: float
+    """Median error of the wrists whose truth is faster than 1.5 m/s, millimetres."""
+    fast_wrists: int
+    """How many those are."""
+    forearm_spread: float
+    """Standard deviation over mean of a forearm's length, the mean over identities and sides."""
+    limb_spread: float
+    """The same of all upper and lower arms and legs."""
+
+
+@dataclass(frozen=True)
+class TrackingScore:
+    """What `score_tracks` found."""
+
+    joints: JointMetrics
+    """Precision, recall, F1 at 0.2 m, MPJPE, people found twice or invented."""
+    some_joints: JointMetrics | None
+    """The same of the joints that were asked for apart, with the same matches; None where none were."""
+    identities: IdentityMetrics | None
+    """IDF1, switches, fragmentations, tracks; None where `person` is no identity."""
+    motion: MotionScore
+    """The motion of the joints."""
+    bodies: MotionScore
+    """The motion of the bodies' own joints."""
+    stature_spread_m: float
+    """Tallest minus smallest body of an identity, metres: the largest over the identities."""
+    twist_jumps: int
+    """Bones of bodies that turn about their own axis by 20 degrees more from a frame to the next than in truth."""
+    seen: CovarianceCalibration
+    """Covariances of the joints of matched rows that are seen in that frame."""
+    long_unseen: CovarianceCalibration
+    """Covariances of those that no view has seen in this frame and the nine before."""
+
+    @property
+    def rows_of_nobody(self) -> int:
+        """Rows that are matched with nobody: people found twice, and phantoms."""
+        return self.joints.people_duplicated + self.joints.people_invented
+
+    def as_dict(self) -> dict[str, Any]:
+        """The figures under plain names, for tables and JSON; None where there is nothing to measure."""
+        figures = {
+            "f1": 100 * self.joints.f1,
+            "precision": 100 * self.joints.precision,
+            "recall": 100 * self.joints.recall,
+            "f1_some_joints": np.nan if self.some_joints is None else 100 * self.some_joints.f1,
+            "idf1": np.nan if self.identities is None else 100 * self.identities.idf1,
+            "stature_spread_cm": 100 * self.stature_spread_m,
+        }
+        for prefix, motion in {"": self.motion, "body_": self.bodies}.items():
+            figures |= {f"{prefix}{name}": value for name, value in vars(motion).items()}
+        for name, calibration in {"seen": self.seen, "unseen": self.long_unseen}.items():
+            figures |= {f"{name}_inside_{100 * level:.0f}": 100 * s for level, s in calibration.coverage.items()}
+        return {name: float(v) if np.isfinite(v) else None for name, v in figures.items()} | self._counts()
+
+    def _counts(self) -> dict[str, int]:
+        counts = {"rows_of_nobody": self.rows_of_nobody, "people_missed": self.joints.people_missed}
+        counts |= {"twist_jumps": self.twist_jumps, "joints_long_unseen": len(self.long_unseen.nees)}
+        names = ("tracks", "tracks_of_nobody", "switches", "fragmentations")
+        return counts if self.identities is None else counts | {n: getattr(self.identities, n) for n in names}
+
+
+def score_tracks(
+    people: Reconstruction,
+    truth: Reconstruction,
+    fps: float,
+    *,
+    identities: bool = True,
+    frames: Sequence[int] | range | None = None,
+    some_joints: Sequence[int] | None = None,
+    seen: NDArray[np.bool_] | None = None,
+    model: BodyModel | None = None,
+) -> TrackingScore:
+    """Compare `people` with the `truth` of a recording of `fps` frames a second (`truth_of`, or any result).
+
+    `frames` are the frame numbers that are scored, by default those from the truth's first to its last. Without
+    `identities` the column `person` only counts the people of a frame; what asks for one and the same person then
+    goes by the person of the truth with whom a row is matched. `some_joints` are indices of joints to be scored
+    apart. `seen` (N, J) says which joints count as seen in their frame, by default those with a confidence.
+    `model` is the body whose parameters `people` holds. ValueError for an identity with two rows in one frame.
+    """
+    numbers = _span(truth) if frames is None else np.asarray(frames, dtype=np.int64)
+    true = joints_by_frame(truth, numbers)
+    matches = match_people(people.frame, people.joints, true, numbers.tolist())
+    chains = Chains.of(
+        matches, numbers, true.shape[1], people.person[matches.row] if identities else matches.person
+    )
+    found, index = people.rows(matches.row), frame_index(people.frame, numbers)
+    seen = (people.confidence > 0 if seen is None else np.asarray(seen, dtype=bool))[matches.row]
+    unseen = frames_unseen(seen, found.frame, chains.identity) >= LONG_UNSEEN
+    error = found.joints - true[matches.frame, matches.person]
+    chosen = None if some_joints is None else list(some_joints)
+    return TrackingScore(
+        metrics_of(matches, people.joints, true),
+        None if chosen is None else metrics_of(matches, people.joints[:, chosen], true[:, :, chosen]),
+        identity_metrics(matches, index, people.person, people.joints, true) if identities else None,
+        motion=_motion(found.joints, true, chains, fps),
+        bodies=_motion(body_joints(found, model), true, chains, fps),
+        stature_spread_m=_widest(statures(found.betas, model), chains.identity),
+        twist_jumps=_twist_jumps(found, truth, numbers, chains, model),
+        seen=covariance_calibration(error[seen], found.covariance[seen]),
+        long_unseen=covariance_calibration(error[unseen], found.covariance[unseen]),
+    )
+
+
+def _motion(joints: Array, truth: Array, chains: Chains, fps: float) -> MotionScore:
+    """Score `joints` (M, J, 3) of the matched rows, metres, against `truth` (T, P, J, 3)."""
+    placed = chains.placed(joints)
+    fast = fast_joint_errors(placed, truth, chains.frames, fps)
+    mean, sigma = spread_by_identity(limb_lengths(joints), chains.identity)
+    return MotionScore(
+        mpjpe_mm=1e3 * _mean(np.linalg.norm(placed - truth, axis=-1)),
+        acceleration_error=_mean(acceleration_errors(placed, truth, chains.consecutive, fps)),
+        fast_wrist_error_mm=1e3 * float(np.median(fast)) if len(fast) > 0 else float("nan"),
+        fast_wrists=len(fast),
+        forearm_spread=_mean((sigma / mean)[:, list(FOREARMS)]),
+        limb_spread=_mean(sigma / mean),
+    )
+
+
+def _twist_jumps(
+    found: Reconstruction,
+    truth: Reconstruction,
+    frames: NDArray[np.int64],
+    chains: Chains,
+    model: BodyModel | None,
+) -> int:
+    """Count of `TrackingScore.twist_jumps` of the matched rows `found`."""
+    index, person = frame_index(truth.frame, frames), np.unique(truth.person, return_inverse=True)[1]
+    rotations = np.full((*chains.consecutive.shape, 24, 3, 3), np.nan)
+    rotations[index[index >= 0], person[index >= 0]] = bone_rotations(truth, model)[index >= 0]
+    turned, true = twists(chains.placed(bone_rotations(found, model)), model), twists(rotations, model)
+    jumps = (np.abs(turned) > TWIST_JUMP) & (np.abs(turned - true) > TWIST_JUMP)
+    return int(jumps[chains.consecutive[1:]].sum())
+
+
+def joints_by_frame(people: Reconstruction, frames: NDArray[np.integer]) -> Array:
+    """(T, P, J, 3) joints of the P identities of `people`, in rising order, in `frames` (T,); NaN where absent."""
+    names, number = np.unique(people.person, return_inverse=True)
+    index = frame_index(people.frame, frames)
+    table = np.full((len(frames), len(names), *people.joints.shape[1:]), np.nan)
+    table[index[index >= 0], number[index >= 0]] = people.joints[index >= 0]
+    return table
+
+
+def frame_index(frame: NDArray[np.integer], frames: NDArray[np.integer]) -> NDArray[np.intp]:
+    """(N,) place of each row's frame in `frames` (T,), which rise; -1 for one that is not among them."""
+    if len(frames) == 0:
+        return np.full(len(frame), -1)
+    if (np.diff(frames) <= 0).any():
+        raise ValueError("frames must rise: give each frame number once, smallest first")
+    place = np.minimum(np.searchsorted(frames, frame), len(frames) - 1)
+    return np.where(frames[place] == frame, place, -1)
+
+
+def _span(truth: Reconstruction) -> NDArray[np.int64]:
+    """All frame numbers from the first to the last."""
+    return np.arange(truth.frame.min(), truth.frame.max() + 1) if len(truth) > 0 else np.zeros(0, dtype=np.int64)
+
+
+def _widest(values: Array, identity: NDArray[np.integer]) -> float:
+    """The largest over identities of largest minus smallest value; NaN where there is none."""
+    known = np.isfinite(values)
+    names, number = np.unique(identity[known], return_inverse=True)
+    if len(names) == 0:
+        return float("nan")
+    low, high = np.full(len(names), np.inf), np.full(len(names), -np.inf)
+    np.minimum.at(low, number, values[known])
+    np.maximum.at(high, number, values[known])
+    return float((high - low).max())
+
+
+def _mean(values: Array) -> float:
+    """Mean of what is known; NaN where nothing is."""
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if len(known) > 0 else float("nan")

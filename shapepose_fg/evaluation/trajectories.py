@@ -1,0 +1,115 @@
+"""How people move against the truth: accelerations, fast joints, lengths of limbs, joints long unseen."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.evaluation.identities import NOBODY
+from shapepose_fg.evaluation.matching import Matches
+from shapepose_fg.skeleton import BODY_25
+
+Array = NDArray[np.float64]
+
+LIMBS = (
+    *(("RShoulder", "RElbow"), ("RElbow", "RWrist"), ("LShoulder", "LElbow"), ("LElbow", "LWrist")),
+    *(("RHip", "RKnee"), ("RKnee", "RAnkle"), ("LHip", "LKnee"), ("LKnee", "LAnkle")),
+)
+"""Upper and lower arms and legs: what does not change its length."""
+LIMB_ENDS = tuple((BODY_25.index(first), BODY_25.index(second)) for first, second in LIMBS)
+FOREARMS = (1, 3)
+"""Which of `LIMBS` are forearms."""
+WRISTS = (BODY_25.index("RWrist"), BODY_25.index("LWrist"))
+FAST_M_S = 1.5
+"""A wrist faster than this is where a smoother that is too stiff shows, metres a second."""
+LONG_UNSEEN = 10
+"""A joint is long unseen when no view has seen it in this frame and the nine before it."""
+
+
+@dataclass(frozen=True)
+class Chains:
+    """The M matched rows in the order of the truth: person by person, frame after frame."""
+
+    matches: Matches
+    """Which rows are whom, when."""
+    frames: NDArray[np.int64]
+    """(T,) frame numbers of the truth."""
+    identity: NDArray[np.int64]
+    """(M,) what makes two rows one and the same: their identity, or the true person where there are none."""
+    consecutive: NDArray[np.bool_]
+    """(T, P) whether a row follows one of the frame number before, and both are of one identity."""
+
+    @classmethod
+    def of(
+        cls, matches: Matches, frames: NDArray[np.int64], people: int, identity: NDArray[np.integer]
+    ) -> "Chains":
+        """From the matches, the truth's frame numbers (T,), its people, the `identity` (M,) of matched rows."""
+        who = np.full((len(frames), people), NOBODY)
+        who[matches.frame, matches.person] = identity
+        follows = np.zeros(who.shape, dtype=bool)
+        follows[1:] = (who[1:] != NOBODY) & (who[1:] == who[:-1]) & (np.diff(frames) == 1)[:, None]
+        return cls(matches, frames, identity.astype(np.int64), follows)
+
+    def placed(self, values: Array) -> Array:
+        """(T, P, ...) `values` (M, ...) of the matched rows; NaN where there is none."""
+        table = np.full((*self.consecutive.shape, *values.shape[1:]), np.nan)
+        table[self.matches.frame, self.matches.person] = values
+        return table
+
+
+def acceleration_errors(placed: Array, truth: Array, consecutive: NDArray[np.bool_], fps: float) -> Array:
+    """(T - 2, P, J) length of the difference of accelerations, m/s²: of `placed` and `truth` (T, P, J, 3), metres.
+
+    The acceleration is the second difference over three consecutive frames; NaN where one of them is missing.
+    """
+    error = placed - truth
+    second = (error[2:] - 2 * error[1:-1] + error[:-2]) * fps**2
+    whole = consecutive[1:-1] & consecutive[2:]
+    return np.where(whole[..., None], np.linalg.norm(second, axis=-1), np.nan)
+
+
+def fast_joint_errors(
+    placed: Array, truth: Array, frames: NDArray[np.integer], fps: float, joints: tuple[int, ...] = WRISTS
+) -> Array:
+    """(M,) errors in metres of those `joints` whose truth is faster than 1.5 m/s (difference over two frames)."""
+    near, true = placed[1:-1, :, list(joints)], truth[:, :, list(joints)]
+    speed = np.linalg.norm(true[2:] - true[:-2], axis=-1) * fps / 2
+    fast = (speed > FAST_M_S) & (frames[2:] - frames[:-2] == 2)[:, None, None]
+    error = np.linalg.norm(near - true[1:-1], axis=-1)
+    return error[fast & np.isfinite(error)]
+
+
+def limb_lengths(joints: Array) -> Array:
+    """(N, 8) lengths of `LIMBS` in BODY_25's `joints` (N, 25, 3), metres."""
+    first, second = np.array(LIMB_ENDS).T
+    return np.linalg.norm(joints[:, first] - joints[:, second], axis=-1)
+
+
+def spread_by_identity(values: Array, identity: NDArray[np.integer]) -> tuple[Array, Array]:
+    """Mean and standard deviation (K, ...) of `values` (N, ...) over the rows of K identities; NaN left out."""
+    names, number = np.unique(identity, return_inverse=True)
+    known = np.isfinite(values)
+    count, total, square = (np.zeros((len(names), *values.shape[1:])) for _ in range(3))
+    np.add.at(count, number, known)
+    np.add.at(total, number, np.where(known, values, 0.0))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = total / count
+        np.add.at(square, number, np.where(known, (values - mean[number]) ** 2, 0.0))
+        return mean, np.sqrt(square / count)
+
+
+def frames_unseen(seen: NDArray[np.bool_], frame: NDArray[np.integer], identity: NDArray[np.integer]) -> NDArray:
+    """(N, J) for how many frames, up to this one and with it, a joint of an identity has not been `seen` (N, J).
+
+    The count begins anew where the identity has no row in the frame before.
+    """
+    order = np.lexsort((frame, identity))
+    seen, frame, identity = seen[order], frame[order], identity[order]
+    starts = np.ones(len(order), dtype=bool)
+    starts[1:] = (np.diff(frame) != 1) | (np.diff(identity) != 0)
+    place = np.arange(len(order))[:, None]
+    last = np.where(seen, place, np.where(starts[:, None], place - 1, -1))
+    count = place - np.maximum.accumulate(last, axis=0)
+    back = np.empty_like(count)
+    back[order] = count
+    return back

@@ -1,0 +1,93 @@
+"""When each frame of a recording was taken, and where the recording is cut."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+ASSUMED_FPS = 30.0
+"""Frames a second where nothing says how many."""
+
+
+@dataclass(frozen=True)
+class FrameTimes:
+    """The times of T frames; frame numbers count from 0 in the file, as in `Reconstruction.frame`."""
+
+    time_s: NDArray[np.float64]
+    """(T,) seconds; or (T, V), a column for each camera, where they are not synchronised."""
+    source: str = "given"
+    """Where the times come from: "assumed", "fps", "given", or the name of a file."""
+
+    def __post_init__(self) -> None:
+        """Check that times are finite and rise; ValueError naming the first frame that does not."""
+        time_s = np.asarray(self.time_s, dtype=np.float64)
+        if time_s.ndim not in (1, 2):
+            raise ValueError(f"time_s must be (T,) or (T, V), got {time_s.shape}")
+        object.__setattr__(self, "time_s", time_s)
+        finite = np.isfinite(time_s).reshape(len(time_s), -1).all(axis=1)
+        if not finite.all():
+            raise ValueError(f"time_s must be finite, at frame {int(np.argmin(finite))} it is not")
+        rising = (np.diff(time_s, axis=0) > 0).reshape(max(len(time_s) - 1, 0), -1).all(axis=1)
+        if not rising.all():
+            frame = int(np.argmin(rising)) + 1
+            raise ValueError(f"time_s must rise from frame to frame, at frame {frame} it does not")
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    @classmethod
+    def from_fps(cls, fps: float, frames: int) -> "FrameTimes":
+        """`frames` frames at `fps` frames a second, frame 0 at 0 s."""
+        if not (np.isfinite(fps) and fps > 0):
+            raise ValueError(f"fps must be a positive number of frames a second, got {fps}")
+        return cls(np.arange(frames) / fps, source="fps")
+
+    @classmethod
+    def assumed(cls, frames: int) -> "FrameTimes":
+        """`frames` frames at 30 a second, because nothing says how many; run.json says so."""
+        return cls(np.arange(frames) / ASSUMED_FPS, source="assumed")
+
+    @property
+    def frame_s(self) -> NDArray[np.float64]:
+        """(T,) the time of each frame: the mean over its cameras where each has its own."""
+        return self.time_s if self.time_s.ndim == 1 else self.time_s.mean(axis=1)
+
+    def of_views(self, views: int) -> NDArray[np.float64]:
+        """(T, V) the time of each frame in each of `views` cameras."""
+        return self.time_s if self.time_s.ndim == 2 else np.repeat(self.time_s[:, None], views, axis=1)
+
+    def check(self, frames: int, views: int) -> None:
+        """ValueError where these are not the times of a recording of `frames` frames and `views` cameras."""
+        if len(self) != frames:
+            raise ValueError(f"times are needed for each of the {frames} frames, got {len(self)}")
+        if self.time_s.ndim == 2 and self.time_s.shape[1] != views:
+            raise ValueError(
+                f"times must have a column for each of the {views} cameras, got {self.time_s.shape[1]}"
+            )
+
+    def as_dict(self) -> dict[str, Any]:
+        """What run.json says of the times: where they come from, and the median rate."""
+        rate = 1.0 / float(np.median(np.diff(self.frame_s))) if len(self) > 1 else None
+        return {"source": self.source, "fps": rate, "per_camera": self.time_s.ndim == 2}
+
+
+def check_cuts(cuts: Sequence[int], frames: int) -> tuple[int, ...]:
+    """`cuts` if they are frames 1 to `frames` - 1 in rising order; ValueError otherwise.
+
+    A cut is the first frame of what follows it: nothing carries over from the frame before.
+    """
+    numbers = np.asarray(cuts)
+    whole = numbers.ndim == 1 and (numbers.size == 0 or numbers.dtype.kind in "iu")
+    if not whole or (np.diff(numbers) <= 0).any() or ((numbers < 1) | (numbers >= frames)).any():
+        raise ValueError(f"cuts must be rising frame numbers between 1 and {frames - 1}, got {list(cuts)}")
+    return tuple(int(cut) for cut in numbers)
+
+
+def stretches(frames: range, cuts: Sequence[int]) -> list[range]:
+    """`frames` from one cut to the next; cuts outside of them do not matter."""
+    inside = [cut for cut in cuts if frames.start < cut < frames.stop]
+    edges = [frames.start, *inside, frames.stop]
+    return [range(start, stop) for start, stop in pairwise(edges) if stop > start]

@@ -1,0 +1,138 @@
+"""When frames were taken, from a text file: a line per frame, in seconds; one column, or one for each camera."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.camera import Rig
+from shapepose_fg.errors import InputError
+from shapepose_fg.files import read_text
+from shapepose_fg.frame_times import FrameTimes
+
+_FRAME, _TIME = "frame", "time_s"
+"""Columns with a meaning of their own; every other column is a camera's."""
+_LONGEST_STEP_S = 10.0
+"""Frames farther apart than this are no recording of motion: the file is in milliseconds or less."""
+_SAME_CLOCK_S = 1.0
+"""Cameras that took one frame farther apart than this do not share a clock."""
+
+
+def read_timestamps(path: str | Path, rig: Rig, frames: int) -> FrameTimes:
+    """The times of a recording of `frames` frames, from a text file (docs/conventions.md).
+
+    Numbers are apart by commas or spaces. Without a header each line is a time in seconds, frame 0 first. The
+    header names the columns: `time_s`, or the rig's cameras; and `frame`, if lines say which frame they are of.
+    InputError, one sentence that names file, line and cure.
+    """
+    path = Path(path)
+    names, numbers, lines = _table(path)
+    columns = _columns(path, names, rig)
+    if _FRAME in names:
+        picked = _lines_of_frames(path, numbers[:, names.index(_FRAME)], lines, frames)
+    elif len(numbers) != frames:
+        raise InputError(
+            f"{path}: must hold a time for each of the {frames} frames, got {len(numbers)}; add a column frame"
+            " where it is of more frames than the recording"
+        )
+    else:
+        picked = np.arange(frames)
+    time_s = numbers[picked][:, columns]
+    _refuse_falling(path, time_s, lines[picked])
+    _refuse_other_units(path, time_s)
+    return FrameTimes(time_s[:, 0] if len(columns) == 1 else time_s, source=str(path))
+
+
+def _table(path: Path) -> tuple[list[str], NDArray[np.float64], NDArray[np.intp]]:
+    """Names of the columns, the numbers (T, C), and the line of the file that each row is from."""
+    names: list[str] = []
+    rows, lines = [], []
+    for line, text in enumerate(read_text(path).splitlines(), start=1):
+        words = [word for word in re.split(r"[,\s]+", text.split("#")[0].strip()) if word]
+        if len(words) == 0:
+            continue
+        if len(names) == 0:
+            header = not _is_number(words[0])
+            names = words if header else [_TIME]
+            if header:
+                continue
+        if len(words) != len(names):
+            cure = "name the columns in a first line" if names == [_TIME] else "correct the line"
+            raise InputError(f"{path}: line {line} must hold {len(names)} numbers, got {len(words)}; {cure}")
+        wrong = next((word for word in words if not _is_number(word)), None)
+        if wrong is not None:
+            raise InputError(
+                f"{path}: line {line} must hold numbers, got {wrong[:20]!r}; write seconds like 0.033"
+            )
+        rows.append([float(word) for word in words])
+        lines.append(line)
+    return names, np.array(rows).reshape(len(rows), -1 if rows else len(names)), np.array(lines, dtype=np.intp)
+
+
+def _is_number(word: str) -> bool:
+    """Whether `word` is a finite number."""
+    try:
+        return bool(np.isfinite(float(word)))
+    except ValueError:
+        return False
+
+
+def _columns(path: Path, names: list[str], rig: Rig) -> list[int]:
+    """The columns that hold times: one for all cameras, or one for each in the rig's order."""
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(f"{path}: column {twice} occurs twice; give each its own name")
+    if _TIME in names:
+        return [names.index(_TIME)]
+    missing = [name for name in rig.names if name not in names]
+    if len(missing) > 0:
+        raise InputError(
+            f"{path}: no times of camera {missing[0]}, the columns are {' '.join(names)[:80]}; name a column"
+            f" {_TIME}, or one for each camera of the calibration"
+        )
+    return [names.index(name) for name in rig.names]
+
+
+def _lines_of_frames(
+    path: Path, numbers: NDArray[np.float64], lines: NDArray[np.intp], frames: int
+) -> NDArray[np.intp]:
+    """(T,) the row of each frame of the recording; frames that it does not have are passed over."""
+    odd = (numbers != np.round(numbers)) | (numbers < 0)
+    if odd.any():
+        row = int(np.argmax(odd))
+        raise InputError(
+            f"{path}: line {lines[row]} must name a frame, 0 or more, got {numbers[row]:g}; correct it"
+        )
+    found, first, count = np.unique(numbers, return_index=True, return_counts=True)
+    if (count > 1).any():
+        raise InputError(f"{path}: frame {found[np.argmax(count > 1)]:.0f} occurs twice; keep one line of it")
+    missing = np.setdiff1d(np.arange(frames), found)
+    if len(missing) > 0:
+        raise InputError(
+            f"{path}: no time of frame {missing[0]}, the recording has frames 0 to {frames - 1}; add its line"
+        )
+    return first[np.searchsorted(found, np.arange(frames))]
+
+
+def _refuse_falling(path: Path, time_s: NDArray[np.float64], lines: NDArray[np.intp]) -> None:
+    """InputError where a time is not later than that of the frame before."""
+    falls = (np.diff(time_s, axis=0) <= 0).any(axis=1)
+    if falls.any():
+        frame = int(np.argmax(falls)) + 1
+        raise InputError(
+            f"{path}: line {lines[frame]} must be later than the frame before; put frames in order of their times"
+        )
+
+
+def _refuse_other_units(path: Path, time_s: NDArray[np.float64]) -> None:
+    """InputError where the numbers can hardly be seconds of one clock."""
+    step = float(np.median(np.diff(time_s, axis=0))) if len(time_s) > 1 else 0.0
+    if step > _LONGEST_STEP_S:
+        raise InputError(f"{path}: frames would be {step:.0f} s apart; write seconds, not milliseconds")
+    apart = np.ptp(time_s, axis=1)
+    if (apart > _SAME_CLOCK_S).any():
+        frame = int(np.argmax(apart > _SAME_CLOCK_S))
+        raise InputError(
+            f"{path}: the cameras' times of frame {frame} are {apart[frame]:.3g} s apart; give times of one clock"
+        )

@@ -1,0 +1,220 @@
+"""What each row of a result was solved from: per joint and view the detection, its residual, and its gate."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.camera import Rig
+from shapepose_fg.columns import check_codes, checked, code_names, npz_bytes, read_npz
+from shapepose_fg.errors import InputError
+from shapepose_fg.files import write_atomically
+from shapepose_fg.observations import Observations
+from shapepose_fg.skeleton import BODY_25
+
+_CURE = "give the observations.npz of a reconstruction"
+
+
+class Gate(IntEnum):
+    """Whether a detection was used for a joint, and why not."""
+
+    NOT_SEEN = 0
+    """The view has no detection for this joint."""
+    USED = 1
+    """The detection is part of the solution."""
+    TOO_FAR = 2
+    """Farther than rho_2D from the projected joint (delta_ij = 0 in Eq. 2)."""
+    CONTRADICTS_BODY = 3
+    """Too far from where the rest of the body puts the joint."""
+    CONTRADICTS_MOTION = 4
+    """Too far from where the frames before and after put the joint."""
+    BEHIND_CAMERA = 5
+    """The joint is behind this camera, or nearer than `min_depth_m`."""
+    NOT_PLACED = 6
+    """The joint itself could not be placed: there is nothing to compare the detection with."""
+
+
+@dataclass(frozen=True)
+class ObservationTable:
+    """The detections of N rows (person and frame), J joints and V views; row i is row i of people.npz."""
+
+    frame: NDArray[np.int64]
+    """(N,) frame of each row."""
+    person: NDArray[np.int64]
+    """(N,) identity of the person of each row."""
+    joint_names: NDArray[np.str_]
+    """(J,) names of the joints."""
+    view_names: NDArray[np.str_]
+    """(V,) names of the cameras."""
+    candidate: NDArray[np.int32]
+    """(N, J, V) which detection: its place among all those of its view in this frame; -1 where there is none."""
+    xy: NDArray[np.float32]
+    """(N, J, V, 2) where the detection lies, undistorted pixels; NaN where there is none."""
+    confidence: NDArray[np.float32]
+    """(N, J, V) the detector's score, 0 to 1; 0 where there is none."""
+    residual_px: NDArray[np.float32]
+    """(N, J, V, 2) projected joint minus detection, pixels; NaN where there is none, or no joint to project."""
+    gate: NDArray[np.uint8]
+    """(N, J, V) codes of `Gate`."""
+
+    ROWS: ClassVar = "frame person candidate xy confidence residual_px gate".split()
+    """The columns that have one entry per row."""
+
+    def __post_init__(self) -> None:
+        """Check every shape and type, once; and that a detection is there or not in all columns alike."""
+        N, J, V = np.size(self.frame), np.size(self.joint_names), np.size(self.view_names)
+        columns = {"frame": ((N,), np.int64), "person": ((N,), np.int64)}
+        columns |= {"joint_names": ((J,), np.str_), "view_names": ((V,), np.str_)}
+        columns |= {"candidate": ((N, J, V), np.int32), "xy": ((N, J, V, 2), np.float32)}
+        columns |= {"confidence": ((N, J, V), np.float32), "residual_px": ((N, J, V, 2), np.float32)}
+        columns |= {"gate": ((N, J, V), np.uint8)}
+        for name, (shape, dtype) in columns.items():
+            object.__setattr__(self, name, checked(name, getattr(self, name), shape, dtype))
+        check_codes("gate", self.gate, Gate)
+        seen = self.gate != Gate.NOT_SEEN
+        wrong = {
+            "candidate": (self.candidate >= 0) != seen,
+            "xy": np.isfinite(self.xy).all(axis=-1) != seen,
+            # Not the other way round: a score may be too small for a float32.
+            "confidence": (self.confidence != 0) & ~seen,
+        }
+        for name, where in wrong.items():
+            if where.any():
+                row, joint, view = np.argwhere(where)[0].tolist()
+                raise ValueError(
+                    f"{name} and gate must agree on what was seen, at row {row}, {self.joint_names[joint]},"
+                    f" view {self.view_names[view]} they do not"
+                )
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    @classmethod
+    def of(
+        cls,
+        observations: Observations,
+        place: NDArray[np.integer],
+        joints: NDArray[np.float64],
+        gate: NDArray[np.uint8],
+        rig: Rig,
+        *,
+        frame: NDArray[np.integer],
+        person: NDArray[np.integer],
+        joint_names: Sequence[str],
+    ) -> "ObservationTable":
+        """The table of N solved rows: what they observed, and where their `joints` (N, J, 3) came to lie.
+
+        `place` (N, J, V) is each detection's place among those of its view (`place_in_view`), `gate` (N, J, V)
+        the codes of `Gate`; what was not seen is recorded as that, whatever is there, and what was not used
+        because the joint is not placed, or behind the camera, as that.
+        """
+        seen = observations.seen
+        projected, depth = (np.moveaxis(values, 0, 2) for values in rig.project(joints))
+        gate = np.where(seen, gate, Gate.NOT_SEEN)
+        free = seen & (gate != Gate.USED)
+        gate = np.where(free & ~(depth > 0), Gate.BEHIND_CAMERA, gate)
+        gate = np.where(free & np.isnan(joints).any(axis=-1, keepdims=True), Gate.NOT_PLACED, gate)
+        ahead = np.asarray(seen & (depth > 0))[..., None]
+        return cls(
+            frame=frame.astype(np.int64),
+            person=person.astype(np.int64),
+            joint_names=np.array(joint_names, dtype=str),
+            view_names=np.array(rig.names, dtype=str),
+            candidate=np.where(seen, place, -1).astype(np.int32),
+            xy=np.where(seen[..., None], observations.xy, np.nan).astype(np.float32),
+            confidence=np.where(seen, observations.confidence, 0.0).astype(np.float32),
+            residual_px=np.where(ahead, projected - observations.xy, np.nan).astype(np.float32),
+            gate=gate.astype(np.uint8),
+        )
+
+    @classmethod
+    def empty(
+        cls, joint_names: Sequence[str] = BODY_25.joints, view_names: Sequence[str] = ()
+    ) -> "ObservationTable":
+        """The table of a result without rows."""
+        J, V = len(joint_names), len(view_names)
+        none = np.zeros(0, dtype=np.int64)
+        return cls(
+            frame=none,
+            person=none,
+            joint_names=np.array(joint_names, dtype=str),
+            view_names=np.array(view_names, dtype=str),
+            candidate=np.zeros((0, J, V), dtype=np.int32),
+            xy=np.zeros((0, J, V, 2), dtype=np.float32),
+            confidence=np.zeros((0, J, V), dtype=np.float32),
+            residual_px=np.zeros((0, J, V, 2), dtype=np.float32),
+            gate=np.zeros((0, J, V), dtype=np.uint8),
+        )
+
+    @classmethod
+    def concatenate(cls, parts: Sequence["ObservationTable"]) -> "ObservationTable":
+        """The rows of `parts`, one after the other; ValueError where joints or views differ."""
+        if len(parts) == 0:
+            return cls.empty()
+        first = parts[0]
+        for part in parts:
+            for name in ("joint_names", "view_names"):
+                if not np.array_equal(getattr(part, name), getattr(first, name)):
+                    raise ValueError(f"parts must have the same {name}")
+        return replace(
+            first, **{name: np.concatenate([getattr(part, name) for part in parts]) for name in cls.ROWS}
+        )
+
+    def rows(self, index: NDArray[Any]) -> "ObservationTable":
+        """The rows that `index` picks: a mask (N,) or row numbers."""
+        return replace(self, **{name: getattr(self, name)[index] for name in self.ROWS})
+
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """(N, J, V) which detections are part of the solution."""
+        return self.gate == Gate.USED
+
+    def reasons(self) -> dict[str, int]:
+        """How many detections have each gate, in words; those that were not seen are left out."""
+        count = np.bincount(self.gate.ravel(), minlength=len(Gate))
+        names = code_names(Gate).tolist()
+        return {names[gate]: int(count[gate]) for gate in Gate if gate != Gate.NOT_SEEN}
+
+    def to_bytes(self) -> memoryview:
+        """The contents of observations.npz."""
+        columns = {name: getattr(self, name) for name in (*self.ROWS, "joint_names", "view_names")}
+        return npz_bytes(columns | {"gate_names": code_names(Gate)})
+
+    def save(self, file: str | Path) -> None:
+        """Write the table as `file`, whole or not at all; NumPy alone reads it (docs/conventions.md)."""
+        content = self.to_bytes()
+        write_atomically(Path(file), lambda stream: stream.write(content))
+
+    @classmethod
+    def load(cls, file: str | Path) -> "ObservationTable":
+        """Read what `save` wrote; InputError, one sentence, on anything else."""
+        file = Path(file)
+        columns = read_npz(file, _CURE)
+        names = (*cls.ROWS, "joint_names", "view_names")
+        for name in (*names, "gate_names"):
+            if name not in columns:
+                raise InputError(f"{file}: column {name} is missing; {_CURE}")
+        if not np.array_equal(columns["gate_names"], code_names(Gate)):
+            raise InputError(f"{file}: gate_names are not those of this version; {_CURE}")
+        try:
+            return cls(**{name: columns[name] for name in names})
+        except ValueError as error:
+            raise InputError(f"{file}: {error}; {_CURE}") from None
+
+
+def place_in_view(candidate: NDArray[np.integer], view: NDArray[np.integer]) -> NDArray[np.int32]:
+    """Detections counted among those of their own view, from where they are counted over all views of a frame.
+
+    `candidate` of any shape holds rows of the frame's `Detections`, -1 for none (and stays so); `view` (D,) is
+    `Detections.view`.
+    """
+    order = np.argsort(view, kind="stable")
+    first = np.searchsorted(view[order], view[order])
+    # One more place, at the end: what -1 leads to.
+    place = np.full(len(view) + 1, -1, dtype=np.int32)
+    place[order] = np.arange(len(view)) - first
+    return place[candidate]

@@ -1,0 +1,137 @@
+"""What run.json of several results says when their rows are put together."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+Run = dict[str, Any]
+
+
+def merged_run(runs: Sequence[Run]) -> Run:
+    """One run of several: what they agree on, frames and counts together, and the rest listed part by part.
+
+    `frames` becomes [start, stop], or a list of those where there are gaps, and is left out where a part does
+    not say; `seconds`, `people` are summed; `inputs` are put together. Everything else is kept where all parts
+    agree and listed under `parts` where they do not. ValueError where configurations or an input's checksum
+    differ, or two parts cover the same frame. Parts of one run, with one and the same `run`, leave it as it is.
+    """
+    runs = _distinct(runs)
+    if len(runs) <= 1:
+        return dict(runs[0]) if runs else {}
+    _refuse_other_settings([run.get("configuration") for run in runs])
+    together: Run = {}
+    own: list[Run] = [{} for _ in runs]
+    for key in dict.fromkeys(key for run in runs for key in run):
+        values = [run.get(key) for run in runs]
+        if key == "frames":
+            together |= _frames(values)
+        elif key in ("seconds", "people"):
+            together[key] = _sum(values)
+        elif key == "inputs":
+            together[key] = _inputs(values)
+        elif all(_same(value, values[0]) for value in values):
+            together[key] = values[0]
+        else:
+            for part, run in zip(own, runs, strict=True):
+                part |= {name: run[name] for name in (key,) if name in run}
+    if any(own):
+        spans = [{"frames": run["frames"]} if "frames" in run else {} for run in runs]
+        together["parts"] = [span | part for span, part in zip(spans, own, strict=True)]
+    return together
+
+
+def covered_frames(run: Mapping[str, Any]) -> list[range] | None:
+    """The frames that a run covered, as ranges; None where it does not say. ValueError where it makes no sense."""
+    frames = run.get("frames")
+    if frames is None:
+        return None
+    try:
+        spans = frames if np.ndim(frames) == 2 else [frames]
+        return [range(int(start), int(stop)) for start, stop in spans]
+    except (TypeError, ValueError):
+        raise ValueError(f'"frames" must be [start, stop] or a list of those, got {frames!r}') from None
+
+
+def plain(value: object) -> object:
+    """What JSON can hold of `value`: arrays as lists, paths as text. TypeError where there is no such thing."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"run must hold plain values, got {type(value).__name__}")
+
+
+def _distinct(runs: Sequence[Run]) -> list[Run]:
+    """Each run once."""
+    found: list[Run] = []
+    for run in runs:
+        if not any(run is other or _same(run, other) for other in found):
+            found.append(run)
+    return found
+
+
+def _same(one: Any, other: Any) -> bool:
+    return json.dumps(one, sort_keys=True, default=plain) == json.dumps(other, sort_keys=True, default=plain)
+
+
+def _refuse_other_settings(configurations: Sequence[Any]) -> None:
+    """ValueError that names the first setting in which two parts differ, of those that say their settings."""
+    known = [each for each in configurations if each is not None]
+    for other in known[1:]:
+        name = _difference(known[0], other)
+        if name is not None:
+            raise ValueError(
+                f"parts must have the same configuration, {name} differs; reconstruct them with one and the same"
+            )
+
+
+def _difference(one: Any, other: Any, name: str = "") -> str | None:
+    """The dotted name of the first setting that differs; None where none does."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        for key in dict.fromkeys((*one, *other)):
+            found = _difference(one.get(key), other.get(key), f"{name}.{key}" if name else key)
+            if found is not None:
+                return found
+        return None
+    return None if _same(one, other) else name or "all of it"
+
+
+def _frames(values: Sequence[Any]) -> Run:
+    """All parts' frames together; ValueError where two parts cover the same frame."""
+    if any(value is None for value in values):
+        return {}
+    ranges = [span for value in values for span in covered_frames({"frames": value}) or []]
+    ordered = sorted((span for span in ranges if len(span) > 0), key=lambda span: span.start)
+    spans: list[list[int]] = []
+    for span in ordered:
+        if spans and span.start < spans[-1][1]:
+            raise ValueError(f"parts must not cover the same frame, two of them cover frame {span.start}")
+        if spans and span.start == spans[-1][1]:
+            spans[-1][1] = span.stop
+        else:
+            spans.append([span.start, span.stop])
+    if len(spans) == 0:
+        return {"frames": values[0]}
+    return {"frames": spans[0] if len(spans) == 1 else spans}
+
+
+def _sum(values: Sequence[Any]) -> Any:
+    """Numbers added up, objects key by key; what one part lacks counts nothing."""
+    values = [value for value in values if value is not None]
+    if all(isinstance(value, dict) for value in values):
+        keys = dict.fromkeys(key for value in values for key in value)
+        return {key: _sum([value.get(key) for value in values]) for key in keys}
+    return sum(values)
+
+
+def _inputs(values: Sequence[Any]) -> Run:
+    """Checksums of all inputs; ValueError where a file changed between two parts."""
+    together: Run = {}
+    for value in values:
+        for path, digest in (value or {}).items():
+            if together.setdefault(path, digest) != digest:
+                raise ValueError(f"parts must be made from the same inputs, {path} changed between two of them")
+    return together

@@ -1,0 +1,311 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
+from shapepose_fg.evaluation.bodies import body_joints, statures, twists
+from shapepose_fg.evaluation.identities import identity_metrics
+from shapepose_fg.evaluation.matching import match_people
+from shapepose_fg.evaluation.tracking import frame_index, joints_by_frame, score_tracks
+from shapepose_fg.evaluation.trajectories import (
+    acceleration_errors,
+    fast_joint_errors,
+    frames_unseen,
+    limb_lengths,
+    spread_by_identity,
+)
+from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.simulation import built_in_scene
+from shapepose_fg.simulation.truth import truth_of
+from shapepose_fg.skeleton import SMPL_24
+
+FPS = 30.0
+J = 25
+
+
+def standing(places_m, frames):
+    """(T, P, 25, 3) people who stand still, each a stack of joints 2 cm apart above its place on the x axis."""
+    person = np.stack([np.zeros(J), np.zeros(J), 0.02 * np.arange(J)], axis=1)
+    at = np.stack([places_m, np.zeros(len(places_m)), np.zeros(len(places_m))], axis=1)
+    return np.broadcast_to(at[:, None] + person, (frames, len(places_m), J, 3)).copy()
+
+
+def identities(truth, rows):
+    """`identity_metrics` of rows (frame, identity, joints)."""
+    frame, identity = (np.array([row[i] for row in rows], dtype=int) for i in (0, 1))
+    joints = np.array([row[2] for row in rows]).reshape(-1, J, 3)
+    return identity_metrics(match_people(frame, joints, truth), frame, identity, joints, truth)
+
+
+def result(frame, identity, joints, sigma_m=0.02):
+    """A result without bodies."""
+    empty = Reconstruction.empty()
+    N = len(frame)
+    shapes = {name: (N, *getattr(empty, name).shape[1:]) for name in Reconstruction.ROWS}
+    columns = {name: np.full(shape, np.nan) for name, shape in shapes.items()}
+    columns |= {"frame": np.asarray(frame), "person": np.asarray(identity), "joints": np.asarray(joints)}
+    columns |= {"confidence": np.ones((N, J)), "status": np.full(N, "ok")}
+    columns["covariance"] = np.broadcast_to(sigma_m**2 * np.eye(3), (N, J, 3, 3))
+    return replace(empty, **columns)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return built_in_scene(people=3, frames=20)
+
+
+@pytest.fixture
+def truth(scene):
+    return truth_of(scene)
+
+
+def noisy(truth, sigma_m=0.02, seed=0):
+    """The truth with independent noise along each axis, and covariances that say so."""
+    rng = np.random.default_rng(seed)
+    covariance = np.broadcast_to(sigma_m**2 * np.eye(3), truth.covariance.shape)
+    return replace(truth, joints=truth.joints + rng.normal(0, sigma_m, truth.joints.shape), covariance=covariance)
+
+
+def test_perfect_identities():
+    truth = standing([0.0, 2.0], 4)
+    found = identities(truth, [(t, 7 + p, truth[t, p]) for t in range(4) for p in range(2)])
+    assert found.idf1 == found.id_precision == found.id_recall == 1.0
+    assert (found.switches, found.fragmentations, found.tracks, found.tracks_of_nobody) == (0, 0, 2, 0)
+
+
+def test_a_swap_after_six_of_ten_frames():
+    """Each identity is its person in 6 of 10 frames: IDTP 12 of 20 rows and 20 people, two switches."""
+    truth = standing([0.0, 2.0], 10)
+    found = identities(truth, [(t, p if t < 6 else 1 - p, truth[t, p]) for t in range(10) for p in range(2)])
+    assert found.idf1 == pytest.approx(0.6)
+    assert (found.switches, found.fragmentations) == (2, 0)
+
+
+def test_a_gap_and_a_new_identity_after_it():
+    """Frames 0-3 as identity 1, 4-5 nobody, 6-9 as identity 2: IDTP 4 (one identity only), rows 8, truth 10."""
+    truth = standing([0.0], 10)
+    found = identities(truth, [(t, 1 if t < 4 else 2, truth[t, 0]) for t in (0, 1, 2, 3, 6, 7, 8, 9)])
+    assert found.idf1 == pytest.approx(2 * 4 / 18)
+    assert (found.switches, found.fragmentations, found.tracks) == (1, 1, 2)
+
+
+def test_a_gap_in_the_truth_is_no_interruption():
+    truth = standing([0.0], 6)
+    truth[2:4] = np.nan
+    found = identities(truth, [(t, 1, truth[t, 0]) for t in (0, 1, 4, 5)])
+    assert found.idf1 == 1.0
+    assert found.people_true == 4
+    assert found.fragmentations == 0
+
+
+def test_the_assignment_of_identities_is_global():
+    """Identity 0 is person A in 3 frames and B in 2, identity 1 is A in 2 frames: A-1 and B-0 (4) beat A-0 (3)."""
+    truth = standing([0.0, 2.0], 5)
+    rows = [(t, 0, truth[t, 0]) for t in range(3)] + [(t, 0, truth[t, 1]) for t in (3, 4)]
+    rows += [(t, 1, truth[t, 0]) for t in (3, 4)]
+    assert identities(truth, rows).true_positives == 4
+
+
+def test_a_phantom_is_a_track_of_nobody():
+    truth = standing([0.0], 5)
+    rows = [(t, 0, truth[t, 0]) for t in range(5)] + [(t, 9, truth[t, 0] + [5.0, 0, 0]) for t in range(2)]
+    found = identities(truth, rows)
+    assert found.idf1 == pytest.approx(10 / 12)
+    assert (found.tracks, found.tracks_of_nobody) == (2, 1)
+
+
+def test_an_identity_twice_in_a_frame_is_refused():
+    truth = standing([0.0, 2.0], 1)
+    with pytest.raises(ValueError, match="two rows in one frame"):
+        identities(truth, [(0, 3, truth[0, 0]), (0, 3, truth[0, 1])])
+
+
+def test_a_person_who_jumps_by_3_cm_in_one_frame():
+    """Second differences of (0, 0, 3 cm, 0, 0) are 3, -6, 3 cm: times 30² 27, 54 and 27 m/s²."""
+    truth = standing([0.0], 5)
+    found = truth.copy()
+    found[2, 0, :, 2] += 0.03
+    together = np.ones((5, 1), dtype=bool)
+    errors = acceleration_errors(found, truth, together, FPS)
+    np.testing.assert_allclose(errors[:, 0, 0], [27, 54, 27])
+    together[3] = False  # frames 2 and 3 are not the same track
+    np.testing.assert_allclose(acceleration_errors(found, truth, together, FPS)[:, 0, 0], [27, np.nan, np.nan])
+
+
+def test_the_acceleration_of_the_truth_is_no_error():
+    truth = standing([0.0], 5)
+    truth[..., 0] += (0.5 * 9.81 * (np.arange(5) / FPS) ** 2)[:, None, None]
+    assert np.abs(acceleration_errors(truth, truth, np.ones((5, 1), dtype=bool), FPS)).max() == 0.0
+    still = np.broadcast_to(truth[:1], truth.shape)
+    errors = acceleration_errors(still, truth, np.ones((5, 1), dtype=bool), FPS)
+    np.testing.assert_allclose(errors, 9.81)
+
+
+def test_fast_joints():
+    """A wrist at 2 m/s is fast, one at 1 m/s not; a smoother that leaves the fast one 5 cm behind is seen."""
+    truth = standing([0.0], 6)
+    truth[:, 0, 4, 1] = 2.0 * np.arange(6) / FPS
+    truth[:, 0, 7, 1] = 1.0 * np.arange(6) / FPS
+    found = truth.copy()
+    found[:, 0, 4, 1] -= 0.05
+    found[:, 0, 7, 1] -= 0.5
+    np.testing.assert_allclose(fast_joint_errors(found, truth, np.arange(6), FPS), 0.05)
+    # Over a gap in the frames there is no speed.
+    assert len(fast_joint_errors(found, truth, np.array([0, 1, 2, 10, 11, 12]), FPS)) == 2
+
+
+def test_lengths_of_limbs_and_their_spread():
+    truth = standing([0.0], 3)
+    lengths = limb_lengths(truth[:, 0])
+    np.testing.assert_allclose(lengths[0], 0.02)  # shoulder to elbow: neighbours in the stack
+    mean, sigma = spread_by_identity(np.array([1.0, 3.0, 10.0, np.nan]), np.array([5, 5, 2, 2]))
+    np.testing.assert_allclose(mean, [10.0, 2.0])
+    np.testing.assert_allclose(sigma, [0.0, 1.0])
+
+
+def test_frames_unseen():
+    seen = np.array([1, 0, 0, 1, 0, 0, 0], dtype=bool)[:, None]
+    frame = np.array([0, 1, 2, 3, 4, 6, 7])  # one missing between 4 and 6
+    assert frames_unseen(seen, frame, np.zeros(7, int))[:, 0].tolist() == [0, 1, 2, 0, 1, 1, 2]
+    order = np.array([3, 0, 6, 2, 5, 1, 4])
+    mixed = frames_unseen(seen[order], frame[order], np.zeros(7, int))[:, 0]
+    assert mixed.tolist() == [[0, 1, 2, 0, 1, 1, 2][i] for i in order]
+    # Another identity is another person.
+    assert frames_unseen(seen, frame, np.array([0, 0, 1, 1, 1, 1, 1]))[:, 0].tolist() == [0, 1, 1, 0, 1, 1, 2]
+
+
+def test_a_noisy_result_by_its_statistics(truth, scene):
+    """20 mm along each axis: mean distance 20 sqrt(8 / pi) = 31.9 mm; second differences have sqrt(6) of that."""
+    score = score_tracks(noisy(truth), truth, scene.fps)
+    # 1,500 joints: standard error of the mean 0.35 mm; accelerations are correlated over time, 5 %.
+    assert score.joints.mpjpe_mm == pytest.approx(31.9, abs=1.4)
+    assert score.motion.acceleration_error == pytest.approx(0.0319 * np.sqrt(6) * scene.fps**2, rel=0.05)
+    assert score.identities.idf1 == 1.0
+    assert score.rows_of_nobody == 0
+    assert score.seen.coverage[0.5] == pytest.approx(0.5, abs=0.05)
+    assert score.bodies.mpjpe_mm < 1e-3
+    assert score.bodies.acceleration_error < 1.0  # float32 joints, times 25²
+    assert score.stature_spread_m == 0.0
+    assert score.as_dict()["rows_of_nobody"] == 0
+
+
+def test_without_identities_the_truth_says_who_is_who(truth, scene):
+    people = noisy(truth)
+    rng = np.random.default_rng(1)
+    shuffled = replace(people, person=np.concatenate([rng.permutation(3) for _ in range(20)]))
+    by_truth = score_tracks(shuffled, truth, scene.fps, identities=False)
+    assert by_truth.identities is None
+    assert by_truth.as_dict()["idf1"] is None
+    assert by_truth.motion == score_tracks(people, truth, scene.fps).motion
+    assert score_tracks(shuffled, truth, scene.fps).identities.idf1 < 0.7
+
+
+def test_joints_long_unseen_are_judged_apart(truth, scene):
+    """Nobody sees the left wrist in frames 5 to 19: from frame 14 on it is long unseen; its sigma is 10 cm."""
+    people = noisy(truth)
+    hidden = people.frame >= 5
+    confidence, covariance = people.confidence.copy(), people.covariance.copy()
+    confidence[hidden, 7], covariance[hidden, 7] = 0.0, 0.01 * np.eye(3)
+    score = score_tracks(replace(people, confidence=confidence, covariance=covariance), truth, scene.fps)
+    assert len(score.long_unseen.nees) == 3 * 6  # frames 14 to 19
+    assert len(score.seen.nees) == 3 * (20 * 25 - 15)
+    assert score.long_unseen.coverage[0.5] == 1.0
+
+
+def test_doubles_phantoms_and_missed(truth, scene):
+    people = noisy(truth)
+    double = replace(people.rows(people.person == 0), person=np.full(20, 17))
+    double = replace(double, joints=double.joints + 0.1)
+    rows = Reconstruction.concatenate([people.rows(people.person != 2), double])
+    score = score_tracks(rows, truth, scene.fps)
+    assert (score.rows_of_nobody, score.joints.people_missed) == (20, 20)
+    assert score.identities.tracks_of_nobody == 1
+    assert score.identities.idf1 == pytest.approx(40 / 60)
+
+
+def test_some_joints_apart_keep_the_matches(truth, scene):
+    people = noisy(truth)
+    joints = people.joints.copy()
+    joints[:, 19:] += 1.0  # feet a metre off
+    score = score_tracks(replace(people, joints=joints), truth, scene.fps, some_joints=range(19))
+    assert score.some_joints.f1 == 1.0
+    assert score.joints.f1 == pytest.approx(19 / 25)
+
+
+def test_some_frames_only(truth, scene):
+    people = noisy(truth)
+    score = score_tracks(people, truth, scene.fps, frames=range(0, 20, 4))
+    assert score.joints.people_true == 15
+    gone = truth.rows((truth.person != 1) | (truth.frame > 10))  # nobody's column in the first frames
+    assert score_tracks(people, gone, scene.fps, frames=range(5)).rows_of_nobody == 5
+    assert np.isnan(score.motion.acceleration_error)  # no three consecutive frames
+    assert score_tracks(people.rows(people.frame < 0), truth, scene.fps).joints.recall == 0.0
+
+
+def test_a_result_without_bodies():
+    truth = standing([0.0, 2.0], 6)
+    people = result(np.repeat(np.arange(6), 2), np.tile([0, 1], 6), truth.reshape(-1, J, 3) + 0.01)
+    reference = replace(people, joints=truth.reshape(-1, J, 3))
+    score = score_tracks(people, reference, FPS)
+    assert score.joints.mpjpe_mm == pytest.approx(10 * np.sqrt(3))
+    assert np.isnan(score.bodies.mpjpe_mm)
+    assert np.isnan(score.stature_spread_m)
+    assert score.motion.acceleration_error == pytest.approx(0.0, abs=1e-9)
+    nobody = score_tracks(Reconstruction.empty(), Reconstruction.empty(), FPS)
+    assert nobody.joints.people_true == 0
+    assert np.isnan(nobody.identities.idf1)
+
+
+def test_frames_and_people_of_a_table():
+    people = result([5, 5, 7], [3, 1, 3], standing([0.0, 1.0, 2.0], 1)[0])
+    table = joints_by_frame(people, np.array([5, 6, 7]))
+    assert table.shape == (3, 2, J, 3)
+    assert np.isnan(table[1]).all()
+    assert table[0, :, 0, 0].tolist() == [1.0, 0.0]
+    assert frame_index(people.frame, np.array([7])).tolist() == [-1, -1, 0]
+    with pytest.raises(ValueError, match="must rise"):
+        frame_index(people.frame, np.array([7, 5]))
+
+
+def test_statures_are_those_of_the_whole_mesh():
+    """Of shapes up to four standard deviations out, against all vertices of the T-pose, float32."""
+    betas = np.clip(np.random.default_rng(0).normal(0, 2, (20, 10)), -4, 4)
+    model, still = BodyModel.default(), torch.zeros(20, 3)
+    parameters = BodyParameters(torch.from_numpy(betas).float(), still, torch.zeros(20, 23, 3), still)
+    up = model.vertices(parameters)[..., 1].numpy()
+    np.testing.assert_allclose(statures(betas), up.max(axis=1) - up.min(axis=1), atol=1e-5)
+    assert np.isnan(statures(np.full((1, 10), np.nan))).all()
+
+
+def test_joints_of_bodies_are_the_scene_s_own(truth):
+    np.testing.assert_allclose(body_joints(truth), truth.joints, atol=1e-5)  # float32
+
+
+def test_twist_about_a_limb_s_own_axis():
+    """The left upper arm turns by 0.5 about its axis in the second frame; the right one swings across its own."""
+    model = BodyModel.default()
+    rest = model.joints(BodyParameters.zeros(1))[0].double().numpy()
+    left, right = (SMPL_24.index(f"{side}_shoulder") for side in ("left", "right"))
+    axis = rest[SMPL_24.index("left_elbow")] - rest[left]
+    across = np.cross(rest[SMPL_24.index("right_elbow")] - rest[right], [0.0, 0.0, 1.0])
+    rotations = np.broadcast_to(Rotation.random(rng=0).as_matrix(), (2, 1, 24, 3, 3)).copy()
+    rotations[1, 0, left] @= Rotation.from_rotvec(0.5 * axis / np.linalg.norm(axis)).as_matrix()
+    rotations[1, 0, right] @= Rotation.from_rotvec(0.5 * across / np.linalg.norm(across)).as_matrix()
+    np.testing.assert_allclose(twists(rotations), [[[0.5, 0, 0, 0, 0, 0, 0, 0]]], atol=1e-6)
+
+
+def test_twists_that_jump_are_counted(truth, scene):
+    """A left elbow of one person in one frame, a radian about its axis: there and back; the wrist hangs on it."""
+    axis = BodyModel.default().joints(BodyParameters.zeros(1))[0].double().numpy()
+    axis = axis[SMPL_24.index("left_wrist")] - axis[SMPL_24.index("left_elbow")]
+    row = np.flatnonzero((truth.frame == 8) & (truth.person == 1))[0]
+    pose = truth.body_pose.copy()
+    elbow = SMPL_24.index("left_elbow") - 1
+    turned = Rotation.from_rotvec(pose[row, elbow]) * Rotation.from_rotvec(axis / np.linalg.norm(axis))
+    pose[row, elbow] = turned.as_rotvec()
+    score = score_tracks(noisy(replace(truth, body_pose=pose)), truth, scene.fps)
+    assert score.twist_jumps == 2
+    assert score_tracks(noisy(truth), truth, scene.fps).twist_jumps == 0
