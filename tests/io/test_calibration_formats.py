@@ -93,10 +93,7 @@ def qualisys(folder: Path) -> Path:
     rows = ""
     for each in TRUTH.cameras:
         M = np.diag([1, -1, -1]) @ each.cTw[:, :3]
-        turn = " ".join(f'r{i + 1}{j + 1}="{M[i, j]!r}"' for i in range(3) for j in range(3)).replace(
-            "np.float64", ""
-        )
-        turn = turn.replace("(", "").replace(")", "")
+        turn = " ".join(f'r{i + 1}{j + 1}="{float(M[i, j])}"' for i in range(3) for j in range(3))
         x, y, z = (1000 * each.centre).tolist()
         k1, k2, p1, p2, k3 = FIVE
         # The recorded part of the sensor begins 8 pixels from the left and 4 from the top.
