@@ -63,8 +63,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 @app.command()
 def reconstruct(
-    calibration: Annotated[Path, typer.Option(help="Cameras: 4D Association's calibration.json, or a rig file.")],
-    detections: Annotated[Path, typer.Option(help="Folder with <camera>.txt, or <camera>/*_keypoints.json.")],
+    calibration: Annotated[Path, typer.Option(help="Cameras: a file, or a folder, of one of the formats known.")],
+    detections: Annotated[Path, typer.Option(help="Folder with what a 2D detector wrote of every camera.")],
     output: Annotated[Path, typer.Option(help="Folder for people.npz and run.json; made if it is not there.")],
     config: Annotated[
         Path | None, typer.Option(help="Settings as TOML; `shapepose-fg config` prints all.")
@@ -76,6 +76,12 @@ def reconstruct(
         str | None, typer.Option(metavar="AXIS", help="World axis that points up: x -x y -y z -z.")
     ] = None,
     unit: Annotated[str | None, typer.Option(metavar="UNIT", help="Unit of the calibration: m, cm or mm.")] = None,
+    image_size: Annotated[
+        str | None, typer.Option(metavar="WxH", help="Size of the calibrated pictures, where the file has none.")
+    ] = None,
+    skeleton: Annotated[
+        str | None, typer.Option(metavar="NAME", help="The detector's skeleton, or a TOML file that describes it.")
+    ] = None,
     body: Annotated[
         Path | None, typer.Option(help="Body model in SMPL's file format, instead of the built-in.")
     ] = None,
@@ -86,8 +92,11 @@ def reconstruct(
     from shapepose_fg.io.detections import read_detections
     from shapepose_fg.provenance import checksums
 
-    rig = read_rig(calibration, up=cast("Axis | None", up), unit=cast("Unit | None", unit))
-    recording = read_detections(detections, rig)
+    size = _image_size(image_size)
+    rig = read_rig(calibration, up=cast("Axis | None", up), unit=cast("Unit | None", unit), image_size=size)
+    recording = read_detections(detections, rig, skeleton)
+    for note in recording.notes:
+        _note(note)
     span = _frame_range(frames, len(recording))
     _prepare(output)
     from shapepose_fg.pipeline import PipelineConfig
@@ -103,7 +112,7 @@ def reconstruct(
     source = settings.offsets.source
     offsets = None if source in ("recording", "none") else Path(source)
     inputs = [path for path in (calibration, *recording.sources, config, body, offsets) if path is not None]
-    people.with_run(inputs=checksums(inputs)).save(output)
+    people.with_run(inputs=checksums(inputs), notes=list(recording.notes)).save(output)
     _print(_summary(people, span, len(rig), seconds, output))
 
 
@@ -226,6 +235,16 @@ def version() -> None:
         print(name, number)
 
 
+def _image_size(text: str | None) -> tuple[int, int] | None:
+    """Width and height of `WxH`."""
+    if text is None:
+        return None
+    match = re.fullmatch(r"\s*(\d+)\s*[x×,]\s*(\d+)\s*", text)
+    if match is None:
+        raise InputError(f"--image-size {text}: must be WIDTHxHEIGHT in pixels, such as 1920x1080")
+    return int(match[1]), int(match[2])
+
+
 def _frame_range(text: str | None, count: int) -> range:
     """Frames that `A:B` selects of a recording of `count` frames: half-open, either end optional."""
     if text is None:
@@ -337,6 +356,14 @@ def _print(content: "RenderableType") -> None:
     from rich.console import Console
 
     Console().print(content)
+
+
+def _note(message: str) -> None:
+    """Say on stderr, in one line, what was made of the input."""
+    from rich.console import Console
+    from rich.text import Text
+
+    Console(stderr=True).print(Text.assemble(("note: ", "bold"), message), soft_wrap=True)
 
 
 def _fail(message: str) -> int:

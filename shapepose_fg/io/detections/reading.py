@@ -114,7 +114,9 @@ def _own_span(people: CameraPeople) -> tuple[int, int] | None:
 def _skeleton_of(people: Sequence[CameraPeople], wanted: Skeleton | None) -> Skeleton:
     """The skeleton that all files have, by the number of keypoints."""
     seen = [each for each in people if len(each.keypoints) > 0]
-    counts = {each.keypoints.shape[1]: each for each in reversed(seen)}
+    counts: dict[int, CameraPeople] = {}
+    for each in seen:
+        counts.setdefault(each.keypoints.shape[1], each)
     if len(counts) > 1:
         (one, first), (other, second) = list(counts.items())[:2]
         raise InputError(
