@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
@@ -16,9 +17,12 @@ from shapepose_fg.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
+    from rich.table import Table
 
     from shapepose_fg.body.fitting.fitter import BodyFitter
-    from shapepose_fg.camera import Axis
+    from shapepose_fg.body.shapes import SubjectShapes
+    from shapepose_fg.camera import Axis, Rig
+    from shapepose_fg.frame_times import FrameTimes
     from shapepose_fg.io.calibration import Unit
     from shapepose_fg.pipeline import PipelineConfig
     from shapepose_fg.reconstruction import Reconstruction
@@ -85,6 +89,19 @@ def reconstruct(
     body: Annotated[
         Path | None, typer.Option(help="Body model in SMPL's file format, instead of the built-in.")
     ] = None,
+    fps: Annotated[float | None, typer.Option(help="Frames a second; 30 are assumed otherwise.")] = None,
+    timestamps: Annotated[
+        Path | None, typer.Option(help="Text file with the time of every frame in seconds, also by camera.")
+    ] = None,
+    cuts: Annotated[
+        str | None, typer.Option(metavar="A,B", help="First frames after a cut: nothing carries over to them.")
+    ] = None,
+    temporal: Annotated[
+        bool | None, typer.Option("--temporal/--no-temporal", help="People over time, or every frame by itself.")
+    ] = None,
+    shapes: Annotated[
+        Path | None, typer.Option(help="File (.npz) of people's shapes: read where it is there, kept up to date.")
+    ] = None,
 ) -> None:
     """Reconstruct the people of a recording: 3D joints with covariances, and bodies."""
     from shapepose_fg.io.calibration import read_rig
@@ -98,22 +115,44 @@ def reconstruct(
     for note in recording.notes:
         _note(note)
     span = _frame_range(frames, len(recording))
+    times = _times(fps, timestamps, rig, len(recording))
+    first_frames = _cuts(cuts, len(recording))
     _prepare(output)
     from shapepose_fg.pipeline import PipelineConfig
     from shapepose_fg.pipeline import reconstruct as run_pipeline
 
     settings = PipelineConfig() if config is None else read_config(config, PipelineConfig)
+    settings = settings if temporal is None else replace(settings, temporal=temporal)
+    if shapes is not None and not settings.temporal:
+        raise InputError("--shapes: a person's shape is known over time only; leave out --shapes or --no-temporal")
+    fitter = _fitter(body, settings)
+    known = None if shapes is None else _known_shapes(shapes, body)
     start = time.perf_counter()
     with _progress("reconstructing") as progress:
         people = run_pipeline(
-            recording, rig, settings, frames=span, fitter=_fitter(body, settings), progress=progress
+            recording,
+            rig,
+            settings,
+            frames=span,
+            fitter=fitter,
+            times=times,
+            cuts=first_frames,
+            shapes=known,
+            progress=progress,
         )
     seconds = time.perf_counter() - start
     source = settings.offsets.source
     offsets = None if source in ("recording", "none") else Path(source)
-    inputs = [path for path in (calibration, *recording.sources, config, body, offsets) if path is not None]
+    read = (calibration, *recording.sources, config, body, offsets, timestamps)
+    inputs = [
+        path for path in (*read, shapes if known is not None and len(known) > 0 else None) if path is not None
+    ]
     people.with_run(inputs=checksums(inputs), notes=list(recording.notes)).save(output)
-    _print(_summary(people, span, len(rig), seconds, output))
+    summary = _summary(people, span, len(rig), seconds, output)
+    if shapes is not None and known is not None and people.shapes is not None:
+        known.updated(people.shapes).save(shapes)
+        summary.add_row("", f"{shapes}  shapes of {len(people.shapes)} people")
+    _print(summary)
 
 
 @evaluate.command("shelf")
@@ -185,7 +224,7 @@ def simulate(
     _prepare(output)
     from shapepose_fg.simulation import DetectorConfig
     from shapepose_fg.simulation import simulate as run_detector
-    from shapepose_fg.simulation.files import check_output, cut, named_scene, write_simulated
+    from shapepose_fg.simulation.files import check_output, cut, cuts_of, named_scene, write_simulated
     from shapepose_fg.simulation.lookout import suitable_workers
 
     last = re.search(r":\s*(\d{1,6})\s*$", frames or "")
@@ -199,22 +238,27 @@ def simulate(
         mocap=mocap,
     )
     span = _frame_range(frames, len(scene))
-    check_output(scene, output, cast("Format", format))
+    part = cut(scene, span)
+    check_output(part, output, cast("Format", format))
     workers = suitable_workers(len(span)) if workers is None else workers
     start = time.perf_counter()
     with _progress("simulating") as progress:
-        detections = run_detector(cut(scene, span), DetectorConfig(), seed, workers=workers, progress=progress)
+        detections = run_detector(part, DetectorConfig(), seed, workers=workers, progress=progress)
     seconds = time.perf_counter() - start
     about = {"name": name, "seed": seed, "first_frame": span.start, "detector": DetectorConfig().as_dict()}
     about |= {} if name == "demo" else {"split": split}
-    written = write_simulated(cut(scene, span), detections, output, cast("Format", format), **about)
+    written = write_simulated(part, detections, output, cast("Format", format), **about)
     print(
         f"{len(span)} frames of {scene.people} people before {cameras} cameras,"
         f" {1e3 * seconds / len(span):.0f} ms a frame"
     )
     for what, path in written.items():
         print(f"{what:<12}{path}")
-    print(f"try: shapepose-fg reconstruct --calibration {written['cameras']} --detections {written['detections']}")
+    timing = f"--fps {part.fps:g}" + (f" --cuts {','.join(map(str, cuts_of(part)))}" if cuts_of(part) else "")
+    print(
+        f"try: shapepose-fg reconstruct --calibration {written['cameras']} --detections {written['detections']}"
+        f" {timing} --output {output / 'results'}"
+    )
 
 
 @app.command("config")
@@ -258,6 +302,50 @@ def _frame_range(text: str | None, count: int) -> range:
             f"--frames {text}: not in the recording, which has {count} frames; give A:B with 0 <= A < B <= {count}"
         )
     return range(start, stop)
+
+
+def _times(fps: float | None, timestamps: Path | None, rig: "Rig", frames: int) -> "FrameTimes | None":
+    """When the frames were taken, as the options say it; None where they do not."""
+    from shapepose_fg.frame_times import FrameTimes
+    from shapepose_fg.io.timestamps import read_timestamps
+
+    if timestamps is not None:
+        if fps is not None:
+            raise InputError("--fps and --timestamps: both say when frames were taken; give one of them")
+        return read_timestamps(timestamps, rig, frames)
+    if fps is None:
+        return None
+    if not 0.01 <= fps <= 1e5:
+        raise InputError(f"--fps {fps:g}: must be a number of frames a second, such as 25")
+    return FrameTimes.from_fps(fps, frames)
+
+
+def _cuts(text: str | None, count: int) -> tuple[int, ...]:
+    """The frames that `A,B,...` names."""
+    from shapepose_fg.frame_times import check_cuts
+
+    if text is None:
+        return ()
+    words = re.split(r"[,\s]+", text.strip())
+    try:
+        return check_cuts([int(word) for word in words], count)
+    except ValueError:
+        raise InputError(
+            f"--cuts {text}: must be rising frame numbers between 1 and {count - 1}, such as 300,600"
+        ) from None
+
+
+def _known_shapes(file: Path, body: Path | None) -> "SubjectShapes":
+    """The people that `file` knows, on the body in use; nobody where there is no such file yet."""
+    from shapepose_fg.body.fitting.weights import fingerprint
+    from shapepose_fg.body.model.body_model import BodyModel
+    from shapepose_fg.body.shapes import SubjectShapes
+
+    whose = fingerprint(BodyModel.default() if body is None else BodyModel.load(body))
+    if file.exists():
+        return SubjectShapes.load(file, whose)
+    _prepare(file.parent)
+    return SubjectShapes.empty(whose)
 
 
 def _prepare(output: Path) -> None:
@@ -306,9 +394,7 @@ def _progress(what: str) -> Iterator[Callable[[int, int], None]]:
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
-def _summary(
-    people: "Reconstruction", span: range, camera_count: int, seconds: float, output: Path
-) -> "RenderableType":
+def _summary(people: "Reconstruction", span: range, camera_count: int, seconds: float, output: Path) -> "Table":
     """What was reconstructed, how well it went, how long it took, and where it is."""
     import numpy as np
     from rich.table import Table
@@ -317,7 +403,7 @@ def _summary(
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     table.add_column(style="bold")
     table.add_column(overflow="fold")
-    table.add_row("frames", f"{len(span)} ({span.start}:{span.stop}) of {camera_count} cameras")
+    table.add_row("frames", f"{len(span)} ({span.start}:{span.stop}) of {camera_count} cameras{_rate(people)}")
     table.add_row(
         "people", f"{len(people)} in all, {per_frame.mean():.1f} a frame ({per_frame.min()} to {per_frame.max()})"
     )
@@ -334,7 +420,17 @@ def _summary(
     table.add_row("", per_stage, style="dim")
     table.add_row("written", str(output / "people.npz"))
     table.add_row("", str(output / "run.json"))
+    if people.observations is not None:
+        table.add_row("", str(output / "observations.npz"))
     return table
+
+
+def _rate(people: "Reconstruction") -> str:
+    """Frames a second, and whether somebody said so."""
+    told = people.run.get("time", {})
+    if told.get("fps") is None:
+        return ""
+    return f", {told['fps']:.4g} a second" + (" (assumed: give --fps)" if told["source"] == "assumed" else "")
 
 
 def _joints(people: "Reconstruction") -> str:

@@ -84,6 +84,7 @@ class Demo:
         told = [
             f"{folder / 'people.npz'}  joints, covariances and bodies",
             f"{folder / 'run.json'}  settings, times",
+            f"{folder / 'observations.npz'}  which detections the joints are made of",
         ]
         picture = folder / "picture.png"
         try:

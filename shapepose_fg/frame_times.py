@@ -27,10 +27,11 @@ class FrameTimes:
         if time_s.ndim not in (1, 2):
             raise ValueError(f"time_s must be (T,) or (T, V), got {time_s.shape}")
         object.__setattr__(self, "time_s", time_s)
-        finite = np.isfinite(time_s).reshape(len(time_s), -1).all(axis=1)
+        cameras = tuple(range(1, time_s.ndim))
+        finite = np.isfinite(time_s).all(axis=cameras)
         if not finite.all():
             raise ValueError(f"time_s must be finite, at frame {int(np.argmin(finite))} it is not")
-        rising = (np.diff(time_s, axis=0) > 0).reshape(max(len(time_s) - 1, 0), -1).all(axis=1)
+        rising = (np.diff(time_s, axis=0) > 0).all(axis=cameras)
         if not rising.all():
             frame = int(np.argmin(rising)) + 1
             raise ValueError(f"time_s must rise from frame to frame, at frame {frame} it does not")

@@ -2,7 +2,7 @@
 
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
@@ -14,6 +14,7 @@ from shapepose_fg.body.fitting.fitters import BodyConfig, make_fitter
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.offsets.estimation import learn_offsets
+from shapepose_fg.body.shapes import SubjectShapes
 from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections, DetectionSequence
@@ -26,6 +27,7 @@ from shapepose_fg.estimation.detector_offsets import (
 )
 from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.estimation.person_graph import PersonGraphConfig
+from shapepose_fg.frame_times import FrameTimes, check_cuts
 from shapepose_fg.observation_table import Gate, ObservationTable, place_in_view
 from shapepose_fg.observations import Observations
 from shapepose_fg.proposal.association import AssociationConfig, associate
@@ -59,6 +61,8 @@ class PipelineConfig:
     """Stage II: where the detector puts its joints on the body."""
     refine: RefineConfig = field(default_factory=RefineConfig)
     """Stage II: the alternation."""
+    temporal: bool = True
+    """People over time: identities, motion, one shape a person. Without it every frame stands alone."""
     batch_frames: int = 64
     """Frames whose people are refined together: bodies are fitted fastest by the hundred."""
     threads: int = 1
@@ -79,6 +83,9 @@ def reconstruct(
     frames: range | None = None,
     fitter: BodyFitter | None = None,
     extra_factors: ExtraFactors | None = None,
+    times: FrameTimes | None = None,
+    cuts: Sequence[int] = (),
+    shapes: SubjectShapes | None = None,
     progress: Progress | None = None,
 ) -> Reconstruction:
     """Reconstruct the people of a recording, every frame by itself.
@@ -87,13 +94,19 @@ def reconstruct(
     `extra_factors` adds factors of your own to every person's graph. In the result a person's number counts the
     people of a frame; it is not an identity over time. `run` of the result holds the configuration, versions,
     seconds per stage, how many people were found and dropped, with reasons, and where the detector's joints lie
-    on the body. That is learnt from frames of the whole recording, whatever `frames` picks, so that a frame comes
-    out the same alone and among others; a fitter of your own takes part if it is an `AdjustableFitter`.
+    on the body. `times` says when the frames were taken; without it 30 frames a second are assumed, and run.json
+    says so. `cuts` are first frames of what follows a cut: nothing carries over to them. `shapes` are people known
+    from other recordings. Offsets are learnt from frames of the whole recording, whatever `frames` picks, so that
+    a frame comes out the same alone and among others; a fitter of your own takes part if it is an
+    `AdjustableFitter`.
     """
     config = PipelineConfig() if config is None else config
     frames = range(len(detections)) if frames is None else frames
     if frames.step != 1 or not 0 <= frames.start <= frames.stop <= len(detections):
         raise ValueError(f"frames must be a range of step 1 within 0:{len(detections)}, got {frames}")
+    times = FrameTimes.assumed(len(detections)) if times is None else times
+    times.check(len(detections), len(rig))
+    cuts = check_cuts(cuts, len(detections))
     run = _Run()
     with run.stage("load"):
         if fitter is None:
@@ -110,8 +123,9 @@ def reconstruct(
             if progress is not None:
                 progress(start + len(batch), len(frames))
     people = Reconstruction.concatenate(parts) if parts else Reconstruction.empty(detections.skeleton.joints)
-    summary = run.summary(config, frames, people)
-    return replace(people, run=summary | {"keypoint_offsets": None if offsets is None else offsets.as_dict()})
+    summary = run.summary(config, frames, people) | {"time": times.as_dict(), "cuts": list(cuts)}
+    summary |= {"keypoint_offsets": None if offsets is None else offsets.as_dict()}
+    return replace(people, time_s=times.frame_s[people.frame], run=summary)
 
 
 def estimate_offsets(

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.body.shapes import SubjectShapes
 from shapepose_fg.columns import check_codes, checked, code_names, npz_bytes, read_npz
 from shapepose_fg.errors import InputError
 from shapepose_fg.files import read_json, write_atomically
@@ -84,6 +85,8 @@ class Reconstruction:
     """How this came about: configuration, versions, checksums, times (goes to run.json)."""
     observations: ObservationTable | None = None
     """What each row was solved from, row by row (goes to observations.npz); None where that is not recorded."""
+    shapes: SubjectShapes | None = None
+    """The shape of each identity with its covariance, named by its number; `save` leaves them out."""
 
     ROWS: ClassVar = (
         "frame person time_s joints covariance velocity velocity_covariance known confidence"
@@ -146,7 +149,8 @@ class Reconstruction:
         """The rows of `parts`, one after the other.
 
         `run` says what all parts together are (`merged_run`): ValueError where their configurations differ or
-        two of them cover the same frame. `observations` are kept where every part that has rows has them.
+        two of them cover the same frame. `observations` are kept where every part that has rows has them, `shapes`
+        are not.
         """
         if len(parts) == 0:
             return cls.empty()
@@ -160,7 +164,7 @@ class Reconstruction:
         together = ObservationTable.concatenate(tables) if 0 < len(tables) == len(filled) else None
         # A part without rows and without a run has nothing to say of the whole.
         runs = [part.run for part in parts if len(part) > 0 or len(part.run) > 0]
-        return replace(first, **columns, observations=together, run=merged_run(runs))
+        return replace(first, **columns, observations=together, shapes=None, run=merged_run(runs))
 
     def rows(self, index: NDArray) -> "Reconstruction":
         """The rows that `index` picks: a mask (N,) or row numbers."""

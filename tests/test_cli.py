@@ -5,13 +5,16 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import shapepose_fg.pipeline
+from shapepose_fg.body.shapes import SubjectShapes
 from shapepose_fg.cli import main
+from shapepose_fg.frame_times import FrameTimes
 from shapepose_fg.reconstruction import Known, Reconstruction, Status
 from shapepose_fg.skeleton import BODY_25
 
@@ -39,8 +42,9 @@ def pipeline(monkeypatch) -> dict:
     """Replace the pipeline by one that finds two people in every frame; returns what it was called with."""
     called: dict = {}
 
-    def fake(detections, rig, config, *, frames, fitter, progress):
+    def fake(detections, rig, config, *, frames, fitter, times, cuts, shapes, progress):
         called.update(detections=detections, rig=rig, config=config, frames=frames, fitter=fitter)
+        called.update(times=times, cuts=cuts, shapes=shapes)
         progress(len(frames), len(frames))
         N = 2 * len(frames)
         return Reconstruction(
@@ -56,7 +60,11 @@ def pipeline(monkeypatch) -> dict:
             body_pose=np.zeros((N, 23, 3)),
             transl=np.zeros((N, 3)),
             status=np.array([Status.OK, Status.TOO_FEW_VIEWS] * len(frames), dtype=str),
-            run={"frames": [frames.start, frames.stop], "seconds": {"load": 3.0, "vote": 0.005 * len(frames)}},
+            run={
+                "frames": [frames.start, frames.stop],
+                "time": (times or FrameTimes.assumed(5)).as_dict(),
+                "seconds": {"load": 3.0, "vote": 0.005 * len(frames)},
+            },
         )
 
     monkeypatch.setattr(shapepose_fg.pipeline, "reconstruct", fake)
@@ -81,7 +89,12 @@ def test_reconstruct_writes_results_and_says_what_it_found(recording, pipeline, 
     printed = capsys.readouterr()
     assert printed.err == ""  # no progress bar where nobody watches
     words = " ".join(printed.out.split())
-    for part in ("5 (0:5) of 2 cameras", "10 in all, 2.0 a frame (2 to 2)", "5 ok", "5 too few views"):
+    for part in (
+        "5 (0:5) of 2 cameras, 30 a second (assumed: give --fps)",
+        "10 in all, 2.0 a frame (2 to 2)",
+        "5 ok",
+        "5 too few views",
+    ):
         assert part in words
     for part in (
         "100.0 % seen; median sigma 20 mm",
@@ -105,6 +118,70 @@ def test_options_reach_the_pipeline(recording, pipeline, tmp_path):
     assert config in Reconstruction.load(tmp_path / "out").run["inputs"]
 
 
+def test_times_cuts_and_time_itself_reach_the_pipeline(recording, pipeline, tmp_path):
+    assert run(*recording) == 0
+    assert pipeline["times"] is None and pipeline["cuts"] == () and pipeline["shapes"] is None
+    assert pipeline["config"].temporal
+    assert run(*recording, "--fps", "25", "--cuts", "2,4", "--no-temporal") == 0
+    np.testing.assert_allclose(pipeline["times"].frame_s, [0, 0.04, 0.08, 0.12, 0.16])
+    assert pipeline["cuts"] == (2, 4) and not pipeline["config"].temporal
+    stamps = tmp_path / "times.csv"
+    stamps.write_text("right,left\n" + "".join(f"{0.05 * t},{0.05 * t + 0.01}\n" for t in range(5)))
+    (tmp_path / "settings.toml").write_text("temporal = false\n")
+    options = ["--timestamps", str(stamps), "--config", str(tmp_path / "settings.toml"), "--temporal"]
+    assert run(*recording, *options) == 0
+    np.testing.assert_allclose(
+        pipeline["times"].time_s[:, 0], 0.05 * np.arange(5) + 0.01
+    )  # left is first in the rig
+    assert pipeline["config"].temporal
+    assert str(stamps) in Reconstruction.load(tmp_path / "out").run["inputs"]
+
+
+def test_shapes_are_kept_from_one_recording_to_the_next(recording, pipeline, tmp_path, monkeypatch, capsys):
+    fake, file = shapepose_fg.pipeline.reconstruct, tmp_path / "kept" / "subjects.npz"
+
+    def with_shapes(*arguments, shapes, **options):
+        people = fake(*arguments, shapes=shapes, **options)
+        found = SubjectShapes(np.array(["0"]), np.full((1, 10), 0.5), np.eye(10)[None], shapes.body)
+        return replace(people, shapes=found)
+
+    monkeypatch.setattr(shapepose_fg.pipeline, "reconstruct", with_shapes)
+    assert run(*recording, "--shapes", str(file)) == 0
+    assert len(pipeline["shapes"]) == 0
+    assert "shapes of 1 people" in " ".join(capsys.readouterr().out.split())
+    assert run(*recording, "--shapes", str(file)) == 0
+    assert pipeline["shapes"].names.tolist() == ["0"]
+    np.testing.assert_array_equal(pipeline["shapes"].betas, 0.5)
+    assert str(file) in Reconstruction.load(tmp_path / "out").run["inputs"]
+
+
+def test_other_formats_are_read_and_what_was_made_of_them_is_said(recording, pipeline, tmp_path, capsys):
+    """Cameras without a picture size, and COCO's results, whose scores are per cent."""
+    cameras = {
+        name: {"R": np.eye(3).tolist(), "T": [[1000.0 * x], [0.0], [0.0]], "k": [0.0] * 3, "p": [0.0] * 2}
+        | {"fx": 1000.0, "fy": 1000.0, "cx": 500.0, "cy": 400.0}
+        for x, name in enumerate(("a", "b"))
+    }
+    (tmp_path / "calibration.json").write_text(json.dumps(cameras))
+    (tmp_path / "pose").mkdir()
+    for name in cameras:
+        person = {"image_id": 0, "keypoints": [100.0, 200.0, 50.0] * 17}
+        (tmp_path / "pose" / f"{name}.json").write_text(json.dumps([person]))
+    options = ["--calibration", str(tmp_path / "calibration.json"), "--detections", str(tmp_path / "pose")]
+    command = ["reconstruct", *options, "--output", str(tmp_path / "out")]
+    assert run(*command) == 2
+    assert "image_size is missing; pass --image-size WIDTHxHEIGHT" in capsys.readouterr().err
+    assert run(*command, "--image-size", "wide") == 2
+    assert "--image-size wide: must be WIDTHxHEIGHT" in capsys.readouterr().err
+    assert run(*command, "--image-size", "1001x801", "--skeleton", "COCO_17") == 0
+    assert pipeline["rig"].centres[1].tolist() == [1, 0, 0] and pipeline["rig"].up == "z"
+    assert pipeline["detections"].skeleton.name == "COCO_17"
+    notes = Reconstruction.load(tmp_path / "out").run["notes"]
+    printed = capsys.readouterr().err
+    assert len(notes) == 2 and all(f"note: {note}" in printed for note in notes)
+    assert "scores reach 50" in notes[0] and "COCO_17 has no Neck and no MidHip" in notes[1]
+
+
 @pytest.mark.parametrize(
     ("text", "frames"), [(":2", range(2)), ("3:", range(3, 5)), (":", range(5)), ("4:5", range(4, 5))]
 )
@@ -123,6 +200,15 @@ def test_frames_are_half_open(recording, pipeline, text, frames):
         (["--frames", "3:3"], "--frames 3:3: not in the recording, which has 5 frames"),
         (["--frames", "-2:"], "--frames -2:: must be A:B, two frame numbers with a colon between, such as 0:100"),
         (["--frames", "all"], "--frames all: must be A:B"),
+        (["--fps", "0"], "--fps 0: must be a number of frames a second, such as 25"),
+        (["--fps", "nan"], "--fps nan: must be a number of frames a second"),
+        (["--cuts", "3,2"], "--cuts 3,2: must be rising frame numbers between 1 and 4, such as 300,600"),
+        (["--cuts", "5"], "--cuts 5: must be rising frame numbers between 1 and 4"),
+        (["--cuts", "a"], "--cuts a: must be rising frame numbers"),
+        (["--timestamps", "/nothing.txt"], "/nothing.txt: there is no such file; check the path"),
+        (["--timestamps", __file__, "--fps", "25"], "--fps and --timestamps: both say when frames were taken"),
+        (["--shapes", "s.npz", "--no-temporal"], "--shapes: a person's shape is known over time only"),
+        (["--shapes", __file__], "cannot be read as an .npz file without pickled objects"),
         (["--up", "up"], "up must be one of x -x y -y z -z, got 'up'"),
         (["--unit", "inch"], "unit must be one of m cm mm, got 'inch'"),
         (["--config", "/nothing.toml"], "/nothing.toml: there is no such file; check the path"),
@@ -248,7 +334,11 @@ def test_demo_without_matplotlib_says_what_to_install(short_scene, tmp_path, mon
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     assert run("demo", "--output", str(tmp_path / "out")) == 0
     assert "no picture: the picture needs matplotlib: pip install shapepose-fg[viewer]" in capsys.readouterr().out
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["people.npz", "run.json"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        "observations.npz",
+        "people.npz",
+        "run.json",
+    ]
 
 
 def test_the_scene_is_what_the_demo_says_it_is():

@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 LEVELS = (
     "factors errors camera skeleton",
     "files provenance rendering run_summary columns body.threads",
-    "body.model",
+    "body.model body.shapes",
     "body.fitting",
     "body.offsets",
     "detections frame_times",

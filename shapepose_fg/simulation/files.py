@@ -1,6 +1,7 @@
 """Simulated recordings as files: what `shapepose-fg simulate` makes, for this program and for any other."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -12,7 +13,7 @@ from shapepose_fg.provenance import versions
 from shapepose_fg.simulation import Scene, built_in_scene
 from shapepose_fg.simulation.mocap import Mocap
 from shapepose_fg.simulation.motion import Motion
-from shapepose_fg.simulation.sequences import SEQUENCES, Split, sequence
+from shapepose_fg.simulation.sequences import SEQUENCES, Sequence, Split, sequence
 from shapepose_fg.simulation.truth import truth_of
 
 Format = Literal["association", "openpose"]
@@ -65,7 +66,18 @@ def cut(scene: Scene, span: range) -> Scene:
     """Some consecutive frames of `scene`."""
     motion, frames = scene.motion, slice(span.start, span.stop)
     part = Motion(motion.betas, motion.global_orient[frames], motion.body_pose[frames], motion.transl[frames])
-    return Scene(scene.rig, scene.body, part, scene.fps)
+    if not isinstance(scene, Sequence):
+        return Scene(scene.rig, scene.body, part, scene.fps)
+    # Segments that reach into the span, each from its cut (the first from frame 0) to the next.
+    segments = zip((0, *scene.cuts), (*scene.cuts, len(scene)), scene.clips, strict=False)
+    clips = tuple(names for start, stop, names in segments if start < span.stop and stop > span.start)
+    cuts = tuple(first - span.start for first in scene.cuts if span.start < first < span.stop)
+    return replace(scene, motion=part, cuts=cuts, clips=clips)
+
+
+def cuts_of(scene: Scene) -> tuple[int, ...]:
+    """First frames of what follows a cut in `scene`; a built-in scene has none."""
+    return scene.cuts if isinstance(scene, Sequence) else ()
 
 
 def check_output(scene: Scene, folder: Path, format: Format) -> None:
@@ -81,7 +93,7 @@ def write_simulated(
 
     `rig.json`; `calibration.json` and `detection/<camera>.txt`, or `openpose/<camera>/`; and `truth/people.npz`,
     apart so that a reconstruction that is saved into the same folder does not take its place. `run` goes into
-    `truth/run.json`.
+    `truth/run.json`, with the frames a second and the cuts: first frames of what follows one.
     """
     write_rig(scene.rig, folder / "rig.json")
     if format == "association":
@@ -90,7 +102,8 @@ def write_simulated(
     else:
         place = folder / _OPENPOSE
         write_openpose(detections, scene.rig, place)
-    about = {"fps": scene.fps, "frames": len(scene), "people": scene.people, "cameras": len(scene.rig), **run}
+    about = {"fps": scene.fps, "frames": len(scene), "people": scene.people, "cameras": len(scene.rig)}
+    about |= {"cuts": list(cuts_of(scene)), **run}
     truth_of(scene).with_run(simulated=about, versions=versions()).save(folder / "truth")
     return {"cameras": folder / "rig.json", "detections": place, "truth": folder / "truth" / "people.npz"}
 

@@ -10,13 +10,15 @@ from shapepose_fg.skeleton import BODY_25
 def truth_of(scene: Scene) -> Reconstruction:
     """Everybody in every frame of `scene`, row by row as `person` 0 to P - 1, frame 0 first.
 
-    Joints and bodies are exact: covariances are zero and confidences one. Nothing says what was visible.
+    Joints and bodies are exact: covariances are zero and confidences one. Velocities and how joints are known are
+    not given: nothing says what was visible.
     """
     T, P = scene.motion.transl.shape[:2]
     N = T * P
     return Reconstruction(
         frame=np.repeat(np.arange(T), P),
         person=np.tile(np.arange(P), T),
+        time_s=np.repeat(np.arange(T) / scene.fps, P),
         joint_names=np.array(BODY_25.joints),
         joints=scene.keypoints.reshape(N, len(BODY_25), 3),
         covariance=np.zeros((N, len(BODY_25), 3, 3)),

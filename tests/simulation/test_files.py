@@ -13,6 +13,7 @@ from shapepose_fg.io.detections import read_detections
 from shapepose_fg.reconstruction import Reconstruction, Status
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.files import cut, named_scene, write_simulated
+from shapepose_fg.simulation.sequences import Sequence
 
 
 def run(*arguments: str) -> int:
@@ -111,5 +112,18 @@ def test_a_sequence_of_recorded_motions(shared_data: Path, tmp_path: Path, monke
     assert run(*options, "--output", str(tmp_path)) == 0
     assert len(Reconstruction.load(tmp_path / "truth")) == 2 * 8
     about = json.loads((tmp_path / "truth" / "run.json").read_text())["simulated"]
-    assert about["split"] == "tune" and about["frames"] == 2 and about["fps"] == 30
+    assert about["split"] == "tune" and about["frames"] == 2 and about["fps"] == 30 and about["cuts"] == []
     assert len(read_detections(tmp_path, read_rig(tmp_path / "rig.json"))[1]) > 100
+
+
+def test_cuts_are_listed_counted_from_the_first_frame_that_is_written(tmp_path: Path):
+    scene = built_in_scene(frames=10)
+    names = tuple((f"clip {segment}",) for segment in range(4))
+    whole = Sequence(scene.rig, scene.body, scene.motion, 25.0, "salsa", "tune", (2, 5, 8), names)
+    part = cut(whole, range(2, 8))
+    assert isinstance(part, Sequence) and part.cuts == (3,) and part.clips == names[1:3] and len(part) == 6
+    np.testing.assert_array_equal(part.keypoints, scene.keypoints[2:8])
+    written = write_simulated(cut(whole, range(4, 9)), simulate(cut(scene, range(4, 9))), tmp_path, "association")
+    truth = Reconstruction.load(written["truth"])
+    assert truth.run["simulated"]["cuts"] == [1, 4] and truth.run["simulated"]["fps"] == 25.0
+    np.testing.assert_allclose(truth.time_s, truth.frame / 25.0)

@@ -1,0 +1,62 @@
+"""When frames were taken: rates, given times, what is refused, and a recording from cut to cut."""
+
+import numpy as np
+import pytest
+
+from shapepose_fg.frame_times import FrameTimes, check_cuts, stretches
+
+
+def test_times_from_a_rate():
+    times = FrameTimes.from_fps(25, 4)
+    np.testing.assert_allclose(times.frame_s, [0, 0.04, 0.08, 0.12])
+    assert times.of_views(3).shape == (4, 3)
+    assert times.as_dict() == {"source": "fps", "fps": pytest.approx(25), "per_camera": False}
+    assumed = FrameTimes.assumed(4)
+    assert assumed.as_dict() == {"source": "assumed", "fps": pytest.approx(30), "per_camera": False}
+    for frames in (0, 1):
+        assert FrameTimes.assumed(frames).as_dict()["fps"] is None
+
+
+def test_a_dropped_frame_is_a_gap_and_cameras_may_have_times_of_their_own():
+    times = FrameTimes(np.array([0, 1, 2, 4, 5]) / 50)
+    assert times.as_dict()["fps"] == pytest.approx(50)  # the median: one gap changes nothing
+    apart = FrameTimes(np.array([0.0, 0.1])[:, None] + [0.0, 0.02])
+    np.testing.assert_allclose(apart.frame_s, [0.01, 0.11])
+    np.testing.assert_allclose(apart.of_views(2)[:, 1], [0.02, 0.12])
+    assert apart.as_dict()["per_camera"]
+
+
+@pytest.mark.parametrize(
+    ("time_s", "message"),
+    [
+        ([0.0, 0.1, 0.1], "time_s must rise from frame to frame, at frame 2 it does not"),
+        ([[0.0, 0.0], [0.1, -0.1]], "at frame 1 it does not"),
+        ([0.0, np.nan], "time_s must be finite, at frame 1 it is not"),
+        (np.zeros((2, 2, 2)), r"time_s must be \(T,\) or \(T, V\), got \(2, 2, 2\)"),
+    ],
+)
+def test_times_that_cannot_be(time_s, message):
+    with pytest.raises(ValueError, match=message):
+        FrameTimes(np.array(time_s))
+
+
+def test_times_of_another_recording():
+    with pytest.raises(ValueError, match="each of the 5 frames, got 4"):
+        FrameTimes.from_fps(30, 4).check(5, 2)
+    with pytest.raises(ValueError, match="each of the 3 cameras, got 2"):
+        FrameTimes(np.array([[0.0, 0.0]])).check(1, 3)
+    for fps in (0, -1, np.nan, np.inf):
+        with pytest.raises(ValueError, match="fps must be a positive number"):
+            FrameTimes.from_fps(fps, 4)
+
+
+def test_a_recording_from_cut_to_cut():
+    cuts = check_cuts([3, 10, 12], 20)
+    assert stretches(range(0, 20), cuts) == [range(0, 3), range(3, 10), range(10, 12), range(12, 20)]
+    assert stretches(range(3, 11), cuts) == [range(3, 10), range(10, 11)]
+    assert stretches(range(4, 9), cuts) == [range(4, 9)]
+    assert stretches(range(4, 4), cuts) == []
+    assert check_cuts((), 0) == ()
+    for wrong in ([0], [20], [3, 3], [5, 2], [1.5], [[1]]):
+        with pytest.raises(ValueError, match="cuts must be rising frame numbers between 1 and 19"):
+            check_cuts(wrong, 20)
