@@ -1,6 +1,8 @@
 """Calibrations of other programs: real files, files written here in their way, and a malformed one of each."""
 
 import json
+import pickle
+import re
 from pathlib import Path
 
 import cv2
@@ -463,6 +465,28 @@ def test_nothing_that_runs_code(tmp_path):
 def written_bytes(path: Path, content: bytes) -> Path:
     path.write_bytes(content)
     return path
+
+
+def test_the_way_out_of_opencap_s_pickles(tmp_path, monkeypatch):
+    """The program in docs/conventions.md, on pickles with the keys, shapes and units of OpenCap."""
+    for each in TRUTH.cameras:
+        folder = tmp_path / "Videos" / f"Cam_{each.name}"
+        folder.mkdir(parents=True)
+        content = {
+            "intrinsicMat": each.K,
+            "distortion": each.distortion[None],
+            "imageSize": np.array([[720.0], [1280.0]]),
+            "rotation": each.cTw[:, :3],
+            "translation": 1000 * each.cTw[:, 3:],
+        }
+        (folder / "cameraIntrinsicsExtrinsics.pickle").write_bytes(pickle.dumps(content))
+    page = (Path(__file__).parents[2] / "docs" / "conventions.md").read_text()
+    (block,) = re.findall(r"```python\n(import pickle.*?)```", page, flags=re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    exec(compile(block, "docs/conventions.md", "exec"), {})
+    rig = read_rig(tmp_path / "rig.json")
+    assert rig.up == "-y" and rig.names == ("Cam_alpha", "Cam_beta", "Cam_gamma")
+    assert_same(renamed(rig, NAMES), TRUTH)
 
 
 def test_unknown_files_are_named_by_what_they_are(tmp_path):

@@ -1,6 +1,7 @@
 """Detections of people in the files of many programs: the same candidates, whatever the format."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from shapepose_fg.camera import Camera, Rig
 from shapepose_fg.errors import InputError
 from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.detections import read_detections
+from shapepose_fg.io.skeleton_file import read_skeleton
 from shapepose_fg.io.write_detections import group_people
 from shapepose_fg.skeleton import BODY_25, COCO_17, COCO_18, COCO_133, HALPE_26, SKELETONS, Skeleton
 
@@ -302,6 +304,15 @@ def test_a_skeleton_of_the_user_s_own(tmp_path, rig):
     hip = table[0].joint == skeleton.index("MidHip")
     np.testing.assert_allclose(table[0].xy[hip], np.tile(person[[4, 5], :2].mean(axis=0), (2, 1)))
     np.testing.assert_allclose(table[0].confidence[hip], person[[4, 5], 2].min())
+
+
+def test_the_skeleton_of_the_documents(tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "conventions.md").read_text()
+    (block,) = re.findall(r"```toml\n(name = .*?)```", page, flags=re.DOTALL)
+    (tmp_path / "ours.toml").write_text(block)
+    skeleton = read_skeleton(tmp_path / "ours.toml")
+    assert skeleton.joints == tuple("Nose RShoulder LShoulder RHip LHip Neck MidHip".split())
+    assert skeleton.keypoints == (0, -1, 1, 2, 3, 4)
 
 
 BAD_SKELETONS = [
