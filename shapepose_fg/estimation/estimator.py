@@ -91,7 +91,9 @@ class Estimator:
         config = self.config
         views = Views.of(self.rig) if views is None else views
         if len(views) != observations.confidence.shape[2] or views.rows_known not in (None, len(observations)):
-            raise ValueError(f"views must be of the {len(observations)} rows' {observations.confidence.shape[2]} views")
+            raise ValueError(
+                f"views must be of the {len(observations)} rows' {observations.confidence.shape[2]} views"
+            )
         X = triangulate(observations, views, config.observations)
         sigmas = observation_sigmas(observations, X, views, config.observations)
         windows = self._windows(observations, sigmas, views, extra_factors)
@@ -108,7 +110,9 @@ class Estimator:
         """One window per track, or per row, with the user's factors in it."""
         time_s = observations.time_s
         if np.any(np.ptp(time_s, axis=1) > 1e-3):
-            raise ValueError("views of one frame must be exposed within 1 ms of each other: synchronise them first")
+            raise ValueError(
+                "views of one frame must be exposed within 1 ms of each other: synchronise them first"
+            )
         windows = []
         still = _cameras(views)
         for rows in window_rows(observations, self.config.motion.temporal):

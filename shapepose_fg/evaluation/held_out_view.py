@@ -91,6 +91,8 @@ def compare_view(
     Rows are matched frame by frame (Hungarian, mean joint distance under 0.5 m). Compared are detections that
     were given to a joint, those that were not used as long as they are near it.
     """
+    if len(people) == 0:
+        return HeldOut(camera.name, np.zeros(0), 0)
     table = people.observations
     if table is None:
         raise ValueError("people come without observations: give what `reconstruct` returns, or load its folder")
