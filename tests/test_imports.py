@@ -26,8 +26,10 @@ LEVELS = (
     "tracking",
     "pipeline",
     "io",
-    "evaluation simulation viewer",
-    "demo training",
+    "simulation viewer",
+    "training",
+    "evaluation",
+    "demo",
     "cli",
 )
 """Each level imports only from those before it; a package may import its own modules too."""
