@@ -14,9 +14,17 @@ from factors.pinhole import project_with_jacobian, to_pixels
 Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
 """A world axis, as a calibration names the direction that is up."""
 
+Lens = Literal["perspective", "fisheye"]
+"""OpenCV's two families of lenses: Brown's model with its rational extension, and the equidistant fisheye."""
+
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _ROTATION_TOLERANCE = 1e-3
 """How far R Rᵀ may be from the identity: calibrations are printed with four to six digits."""
+_COEFFICIENTS: dict[str, tuple[int, ...]] = {"perspective": (5, 8, 12, 14), "fisheye": (4,)}
+"""How many coefficients OpenCV's functions take for each kind of lens."""
+_UNDONE_PX = 0.5
+"""A point that comes back farther than this from where it was has no place without distortion: the polynomial of
+the lens does not reach it. Where there is one, OpenCV's iteration ends within 1e-6 px of it."""
 
 
 @dataclass(frozen=True)
@@ -32,13 +40,20 @@ class Camera:
     image_size: tuple[int, int]
     """(width, height), pixels."""
     distortion: NDArray[np.float64] = field(default_factory=lambda: np.zeros(5))
-    """(5,) k1 k2 p1 p2 k3, as OpenCV orders them; zero for a camera without distortion."""
+    """Coefficients in OpenCV's order, zero for a camera without distortion. Perspective: (5,) k1 k2 p1 p2 k3,
+    or (8,) with k4 k5 k6 of the rational model, (12,) with s1 to s4, (14,) with a tilt. Fisheye: (4,) k1 to k4."""
+    lens: Lens = "perspective"
+    """Which of OpenCV's families the coefficients belong to."""
 
     def __post_init__(self) -> None:
-        for name, shape in (("K", (3, 3)), ("wTc", (4, 4)), ("distortion", (5,))):
+        if self.lens not in _COEFFICIENTS:
+            raise ValueError(f"camera {self.name}: lens must be perspective or fisheye, got {self.lens!r}")
+        lengths = [(count,) for count in _COEFFICIENTS[self.lens]]
+        for name, shapes in (("K", [(3, 3)]), ("wTc", [(4, 4)]), ("distortion", lengths)):
             value = np.asarray(getattr(self, name), dtype=np.float64)
-            if value.shape != shape:
-                raise ValueError(f"camera {self.name}: {name} must be {shape}, got {value.shape}")
+            if value.shape not in shapes:
+                wanted = " or ".join(map(str, shapes))
+                raise ValueError(f"camera {self.name}: {name} must be {wanted}, got {value.shape}")
             if not np.isfinite(value).all():
                 raise ValueError(f"camera {self.name}: {name} holds a value that is not finite")
             object.__setattr__(self, name, value)
@@ -58,11 +73,12 @@ class Camera:
         cTw: NDArray[np.float64],
         image_size: tuple[int, int],
         distortion: Sequence[float] = (),
+        lens: Lens = "perspective",
     ) -> "Camera":
         """Make a camera from a camera-from-world matrix `cTw` (3, 4) or (4, 4): [R | t], metres.
 
         The rotation is projected on the nearest orthonormal one, so that the few printed digits of a
-        calibration do not become a scale. `distortion` may have 0 to 5 coefficients.
+        calibration do not become a scale. `distortion` may leave out coefficients at its end.
         """
         cTw = np.asarray(cTw, dtype=np.float64)
         R = np.asarray(cTw[:3, :3])
@@ -72,9 +88,8 @@ class Camera:
         wTc = np.eye(4)
         wTc[:3, :3] = (U @ Vt).T
         wTc[:3, 3] = -wTc[:3, :3] @ cTw[:3, 3]
-        coefficients = np.zeros(5)
-        coefficients[: len(distortion)] = distortion
-        return cls(name, np.asarray(K, dtype=np.float64), wTc, image_size, coefficients)
+        coefficients = padded_distortion(distortion, lens)
+        return cls(name, np.asarray(K, dtype=np.float64), wTc, image_size, coefficients, lens)
 
     @cached_property
     def cTw(self) -> NDArray[np.float64]:
@@ -96,21 +111,66 @@ class Camera:
         return to_pixels(points_camera, self.K)
 
     def undistort(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Map measured pixels (N, 2) to the pixels of the same camera without distortion."""
-        if len(xy) == 0 or not self.distortion.any():
-            return np.asarray(xy, dtype=np.float64)
-        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-6)
-        points = np.ascontiguousarray(xy, dtype=np.float64).reshape(-1, 1, 2)
-        ideal = cv2.undistortPoints(points, self.K, self.distortion, R=np.eye(3), P=self.K, criteria=criteria)
-        return np.asarray(ideal, dtype=np.float64).reshape(-1, 2)
+        """Map measured pixels (N, 2) to the pixels of the same camera without distortion.
+
+        NaN where there is no such pixel: beyond what the lens's polynomial reaches, or at 90 degrees and more
+        from the axis of a fisheye.
+        """
+        xy = np.asarray(xy, dtype=np.float64)
+        if len(xy) == 0 or not self._bends:
+            return xy
+        rays = self._normalised(xy).reshape(-1, 1, 2)
+        if self.lens == "fisheye":
+            ideal = cv2.fisheye.undistortPoints(rays, np.eye(3), self.distortion, criteria=_CRITERIA)
+        else:
+            ideal = cv2.undistortPoints(rays, np.eye(3), self.distortion, criteria=_CRITERIA)
+        ideal = np.asarray(ideal, dtype=np.float64).reshape(-1, 2)
+        pixels = ideal @ self.K[:2, :2].T + self.K[:2, 2]
+        with np.errstate(invalid="ignore", over="ignore"):
+            undone = np.abs(self.distort(pixels) - xy).max(axis=1) < _UNDONE_PX
+        pixels[~undone] = np.nan
+        return pixels
 
     def distort(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
         """Map undistorted pixels (N, 2) to the pixels that the real lens gives (inverse of `undistort`)."""
-        if len(xy) == 0 or not self.distortion.any():
-            return np.asarray(xy, dtype=np.float64)
-        rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1) @ np.linalg.inv(self.K).T
-        pixels, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), self.K, self.distortion)
-        return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+        xy = np.asarray(xy, dtype=np.float64)
+        if len(xy) == 0 or not self._bends:
+            return xy
+        rays = self._normalised(xy)
+        if self.lens == "fisheye":
+            bent = cv2.fisheye.distortPoints(rays.reshape(-1, 1, 2), np.eye(3), self.distortion)
+        else:
+            rays = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
+            bent, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), np.eye(3), self.distortion)
+        bent = np.asarray(bent, dtype=np.float64).reshape(-1, 2)
+        return bent @ self.K[:2, :2].T + self.K[:2, 2]
+
+    @property
+    def _bends(self) -> bool:
+        """Whether the lens moves any pixel: a fisheye does without a coefficient too."""
+        return self.lens == "fisheye" or bool(self.distortion.any())
+
+    def _normalised(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Normalised image coordinates (N, 2) of pixels (N, 2). Lenses bend these, so that K may have a skew,
+        which OpenCV's own functions pass over.
+        """
+        inverse = np.linalg.inv(self.K)
+        return np.ascontiguousarray(xy @ inverse[:2, :2].T + inverse[:2, 2])
+
+
+_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
+"""Steps and accuracy, in normalised coordinates, of undoing a distortion."""
+
+
+def padded_distortion(coefficients: Sequence[float], lens: Lens = "perspective") -> NDArray[np.float64]:
+    """`coefficients` with zeros up to the next number that OpenCV takes; ValueError where there are too many."""
+    for count in _COEFFICIENTS[lens]:
+        if len(coefficients) <= count:
+            return np.concatenate(
+                [np.asarray(coefficients, dtype=np.float64), np.zeros(count - len(coefficients))]
+            )
+    most = _COEFFICIENTS[lens][-1]
+    raise ValueError(f"a {lens} lens has at most {most} distortion coefficients, got {len(coefficients)}")
 
 
 @dataclass(frozen=True)

@@ -67,8 +67,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 @app.command()
 def reconstruct(
-    calibration: Annotated[Path, typer.Option(help="Cameras: 4D Association's calibration.json, or a rig file.")],
-    detections: Annotated[Path, typer.Option(help="Folder with <camera>.txt, or <camera>/*_keypoints.json.")],
+    calibration: Annotated[Path, typer.Option(help="Cameras: a file, or a folder, of one of the formats known.")],
+    detections: Annotated[Path, typer.Option(help="Folder with what a 2D detector wrote of every camera.")],
     output: Annotated[Path, typer.Option(help="Folder for people.npz and run.json; made if it is not there.")],
     config: Annotated[
         Path | None, typer.Option(help="Settings as TOML; `shapepose-fg config` prints all.")
@@ -80,6 +80,12 @@ def reconstruct(
         str | None, typer.Option(metavar="AXIS", help="World axis that points up: x -x y -y z -z.")
     ] = None,
     unit: Annotated[str | None, typer.Option(metavar="UNIT", help="Unit of the calibration: m, cm or mm.")] = None,
+    image_size: Annotated[
+        str | None, typer.Option(metavar="WxH", help="Size of the calibrated pictures, where the file has none.")
+    ] = None,
+    skeleton: Annotated[
+        str | None, typer.Option(metavar="NAME", help="The detector's skeleton, or a TOML file that describes it.")
+    ] = None,
     body: Annotated[
         Path | None, typer.Option(help="Body model in SMPL's file format, instead of the built-in.")
     ] = None,
@@ -103,8 +109,11 @@ def reconstruct(
     from shapepose_fg.io.detections import read_detections
     from shapepose_fg.provenance import checksums
 
-    rig = read_rig(calibration, up=cast("Axis | None", up), unit=cast("Unit | None", unit))
-    recording = read_detections(detections, rig)
+    size = _image_size(image_size)
+    rig = read_rig(calibration, up=cast("Axis | None", up), unit=cast("Unit | None", unit), image_size=size)
+    recording = read_detections(detections, rig, skeleton)
+    for note in recording.notes:
+        _note(note)
     span = _frame_range(frames, len(recording))
     times = _times(fps, timestamps, rig, len(recording))
     first_frames = _cuts(cuts, len(recording))
@@ -138,7 +147,7 @@ def reconstruct(
     inputs = [
         path for path in (*read, shapes if known is not None and len(known) > 0 else None) if path is not None
     ]
-    people.with_run(inputs=checksums(inputs)).save(output)
+    people.with_run(inputs=checksums(inputs), notes=list(recording.notes)).save(output)
     summary = _summary(people, span, len(rig), seconds, output)
     if shapes is not None and known is not None and people.shapes is not None:
         known.updated(people.shapes).save(shapes)
@@ -268,6 +277,16 @@ def version() -> None:
 
     for name, number in versions().items():
         print(name, number)
+
+
+def _image_size(text: str | None) -> tuple[int, int] | None:
+    """Width and height of `WxH`."""
+    if text is None:
+        return None
+    match = re.fullmatch(r"\s*(\d+)\s*[x×,]\s*(\d+)\s*", text)
+    if match is None:
+        raise InputError(f"--image-size {text}: must be WIDTHxHEIGHT in pixels, such as 1920x1080")
+    return int(match[1]), int(match[2])
 
 
 def _frame_range(text: str | None, count: int) -> range:
@@ -433,6 +452,14 @@ def _print(content: "RenderableType") -> None:
     from rich.console import Console
 
     Console().print(content)
+
+
+def _note(message: str) -> None:
+    """Say on stderr, in one line, what was made of the input."""
+    from rich.console import Console
+    from rich.text import Text
+
+    Console(stderr=True).print(Text.assemble(("note: ", "bold"), message), soft_wrap=True)
 
 
 def _fail(message: str) -> int:

@@ -51,7 +51,7 @@ class ObservationTable:
     view_names: NDArray[np.str_]
     """(V,) names of the cameras."""
     candidate: NDArray[np.int32]
-    """(N, J, V) which detection: its place among all those of its view in this frame; -1 where there is none."""
+    """(N, J, V) which detection: its place among all those of its view in this frame; -1 for none, or not said."""
     xy: NDArray[np.float32]
     """(N, J, V, 2) where the detection lies, undistorted pixels; NaN where there is none."""
     confidence: NDArray[np.float32]
@@ -76,10 +76,10 @@ class ObservationTable:
             object.__setattr__(self, name, checked(name, getattr(self, name), shape, dtype))
         check_codes("gate", self.gate, Gate)
         seen = self.gate != Gate.NOT_SEEN
+        # A score may be too small for a float32, and which detection it was need not be said.
         wrong = {
-            "candidate": (self.candidate >= 0) != seen,
+            "candidate": (self.candidate >= 0) & ~seen,
             "xy": np.isfinite(self.xy).all(axis=-1) != seen,
-            # Not the other way round: a score may be too small for a float32.
             "confidence": (self.confidence != 0) & ~seen,
         }
         for name, where in wrong.items():

@@ -25,6 +25,9 @@ class RefineConfig:
 
     alternations: int = 3
     """N of Algorithm 1: how often the body is fitted and the joints are solved, at the most."""
+    window_alternations: int = 2
+    """The same for windows of several frames: frames settle each other, a third round moved joints by under 0.1 mm
+    in the mean."""
     settled_m: float = 0.002
     """A window whose joints all moved less in a round is done: most frames are after one or two. 0: none is."""
     max_sigma_m: float = 0.5
@@ -37,7 +40,7 @@ class RefineConfig:
     """Fewer joints than this determined by the views are not a person that can be placed in space."""
 
     def __post_init__(self) -> None:
-        for name in ("alternations", "max_sigma_m", "disagreement", "min_joints"):
+        for name in ("alternations", "window_alternations", "max_sigma_m", "disagreement", "min_joints"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
         if self.settled_m < 0:
@@ -117,12 +120,7 @@ def alternate(
     moving = list(windows)
     for n in range(config.refine.alternations):
         rows = np.concatenate([window.rows for window in moving]) if moving else np.zeros(0, dtype=np.intp)
-        observed, sigma, here, start = (
-            observations.rows(rows),
-            sigmas[rows],
-            views.rows(rows),
-            solution.joints[rows],
-        )
+        observed, sigma, here, start = observations.rows(rows), sigmas[rows], views.rows(rows), solution.joints[rows]
         evidence = linearise(observed, sigma, start, here, config.observations)
         if n == 0:
             placed = evidence.sigma_m <= config.refine.max_sigma_m
@@ -149,8 +147,11 @@ def alternate(
         before = np.where((said.known | wrong)[..., None], start, fitted)
         shift = np.linalg.norm(X_new - before, axis=-1)
         settled = ((shift < config.refine.settled_m) | np.isnan(X_new).any(axis=-1)).all(axis=1)
+        more = n + 1 < config.refine.window_alternations
         moving = [
-            window for window, done in zip(moving, _by_window(settled, moving), strict=True) if not done.all()
+            window
+            for window, done in zip(moving, _by_window(settled, moving), strict=True)
+            if not done.all() and (more or not window.graph.temporal)
         ]
         if len(moving) == 0:
             break
@@ -190,11 +191,7 @@ def _by_window(values: NDArray, windows: Sequence[Window]) -> list[NDArray]:
 
 
 def _fit(
-    fitter: BodyFitter,
-    targets: JointTargets,
-    last: BodyFit,
-    groups: NDArray[np.intp] | None,
-    rows: NDArray[np.intp],
+    fitter: BodyFitter, targets: JointTargets, last: BodyFit, groups: NDArray[np.intp] | None, rows: NDArray[np.intp]
 ) -> BodyFit:
     """Fit some of the rows."""
     some = JointTargets(targets.xyz[rows], targets.information[rows])
@@ -220,7 +217,9 @@ def _message(
     targets = joint_targets(evidence, enough)
     for joints in sorted({each for window in windows for each in window.graph.coupled}, key=sorted):
         # Tied to each other, each would get the others' views twice: through the tie, and through the body.
-        tied = np.concatenate([np.full(len(w.rows), joints in w.graph.coupled) for w in windows])  # one flag a row
+        tied = np.concatenate(
+            [np.full(len(w.rows), joints in w.graph.coupled) for w in windows]
+        )  # one flag a row
         rows, columns = np.flatnonzero(tied), np.array(sorted(joints))
         information = targets.information.copy()
         information[:, columns] = 0.0
@@ -242,23 +241,21 @@ def _solve(
     placed = evidence.sigma_m <= config.refine.max_sigma_m
     known = placed | body.known
     start = np.where(placed[..., None], evidence.points, np.where(body.known[..., None], body.xyz, np.nan))
-    badly = evidence.sigma_m > config.motion.badly_seen_m
+    badly = evidence.sigma_m > config.motion.lost_m
     X = np.full(evidence.points.shape, np.nan)
     first = 0
     for window in windows:
         part = slice(first, first + len(window.rows))
         first = part.stop
-        inlier, initial = evidence.inlier[part], start[part]
-        offsets = None
+        inlier, initial, lost = evidence.inlier[part], start[part], None
         if window.graph.temporal:
-            initial = np.where(known[part][..., None], initial, evidence.points[part])
+            initial = np.where(np.isfinite(evidence.points[part]), evidence.points[part], initial)
             initial = interpolated(initial, window.graph.times_s)
-            offsets = badly[part].any(axis=0)
-            offsets[sorted(window.graph.touched)] = True
+            lost = near_in_time(badly[part], window.graph.times_s, config.motion.around_s)
         else:
             inlier = inlier & known[part][..., None]
         views = Message(evidence.target[part], evidence.information[part])
-        X[part] = window.graph.solve(inlier, views, body.rows(np.arange(part.start, part.stop)), initial, offsets)
+        X[part] = window.graph.solve(inlier, views, body.rows(np.arange(part.start, part.stop)), initial, lost)
     return X
 
 
@@ -271,3 +268,13 @@ def interpolated(points: NDArray[np.float64], times_s: NDArray[np.float64]) -> N
         for axis in range(3):
             result[:, joint, axis] = np.interp(times_s, times_s[there], points[there, joint, axis])
     return result
+
+
+def near_in_time(
+    marked: NDArray[np.bool_], times_s: NDArray[np.float64], within_s: float
+) -> NDArray[np.bool_]:
+    """(T, J) which frames are at most `within_s` from one that is `marked` (T, J)."""
+    first = np.searchsorted(times_s, times_s - within_s, side="left")
+    last = np.searchsorted(times_s, times_s + within_s, side="right")
+    count = np.concatenate([np.zeros((1, marked.shape[1]), dtype=int), np.cumsum(marked, axis=0)])
+    return count[last] > count[first]

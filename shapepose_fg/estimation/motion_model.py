@@ -23,12 +23,14 @@ class MotionConfig:
     """File of the motion model, as `scripts/measure_motion.py` writes it; empty: the one that ships."""
     psd_scale: float = 1.0
     """Multiplies the power spectral densities of the joints' accelerations: more follows faster and smooths less."""
-    badly_seen_m: float = 0.05
-    """A joint whose views leave it less certain than this in some direction in some frame of a window is solved with
-    offsets for the lasting errors of views and body (see `WindowGraph`); others get them added afterwards."""
+    lost_m: float = 0.1
+    """A joint whose views leave it less certain than this in some direction is lost from sight: in these frames, and
+    in those around them, the difference between joint and body is followed (`factors.motion`)."""
+    around_s: float = 0.5
+    """How far around them, seconds."""
 
     def __post_init__(self) -> None:
-        for name in ("psd_scale", "badly_seen_m"):
+        for name in ("psd_scale", "lost_m", "around_s"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
 

@@ -16,6 +16,8 @@ RUNAWAY_M = 1.0
 RUNAWAY_SIGMA = 20.0
 """So has one that ends this many standard deviations, and half a metre, from what views and body say of it."""
 _HALF_M = 0.5
+SEEN_M = 0.1
+"""A joint is seen in a frame whose views leave it no less certain than this in any direction, metres."""
 
 
 @dataclass(frozen=True)
@@ -35,14 +37,21 @@ class Problem:
 
 
 def lasting_covariance(solution: Solution, window: Window, white_share: float) -> NDArray[np.float64]:
-    """(T, J, 3, 3) what the graph left out for the joints that it solved without offsets: errors that last, m².
+    """(T, J, 3, 3) what the graph left out: the lasting share of the error that one frame leaves, m².
 
-    The lasting share of the error that views and body leave in one frame; zero for joints solved with offsets.
+    What views and body leave in a frame in which the joint is seen; in others what they left in the nearest such
+    frame, from which motion, or the body's offset, carried it. Zero for joints that were solved with offsets.
     """
     information = solution.views.information[window.rows] + solution.body.information[window.rows]
-    simple = (weakest_sigma(information) < np.inf) & ~window.graph.with_offsets
+    seen = weakest_sigma(solution.views.information[window.rows]) <= SEEN_M
+    seen &= ~window.graph.with_offsets
     result = np.zeros(information.shape)
-    result[simple] = (1.0 - white_share) * np.linalg.inv(information[simple])
+    result[seen] = (1.0 - white_share) * np.linalg.inv(information[seen])
+    times = window.graph.times_s
+    for joint in np.flatnonzero(seen.any(axis=0) & ~seen.all(axis=0)).tolist():
+        frames = np.flatnonzero(seen[:, joint])
+        nearest = frames[np.abs(times[:, None] - times[frames]).argmin(axis=1)]
+        result[:, joint] = result[nearest, joint]
     return result
 
 
@@ -81,7 +90,7 @@ def problems(
     reasons[known & (far > _HALF_M) & (sigmas > RUNAWAY_SIGMA)] = "ran away from what views and body say of it"
     for window in windows:
         graph, rows = window.graph, window.rows
-        touched = np.ix_(rows, sorted(graph.touched))
+        touched = np.ix_(rows, np.flatnonzero(graph.touched))
         with np.errstate(invalid="ignore"):
             ran = np.linalg.norm(X[touched] - first[touched], axis=2) > RUNAWAY_M
         reasons[touched] = np.where(ran, "ran away from its views", reasons[touched])

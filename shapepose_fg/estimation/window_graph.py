@@ -82,15 +82,15 @@ class WindowGraph:
     Windows compose: the keys carry person, joint and frame, so `graph` can be added to another graph as it is.
     Joints are not tied to each other but by factors of your own, which keeps marginal covariances cheap.
 
-    **Errors that last.** A detector that is 2 cm off is so in the next frame too, and so is the body's guess. In a
-    window of several frames a joint is solved in one of two ways:
+    **Errors that last.** A detector that is 2 cm off is so in the next frame too, and so is the body's guess: T frames
+    of one guess are one guess. In a window of several frames therefore
 
-    - *simple*: projections and body prior with the share of their variance that is new in every frame, so that
-      motion smooths that only; the lasting share is `lasting_covariance`, to be added. Cheap, and enough for joints that
-      are well seen throughout.
-    - *with offsets* (`solve(..., offsets)`): what the views say and what the body says are Gaussians, each with an error
-      that decays slowly (`factors.motion`). A joint that is lost from sight then stays where the body puts it, plus the
-      difference that there was when it was last seen; and factors of your own are weighed against errors that last.
+    - projections and body priors count with the share of their variance that is new in every frame, so that motion
+      smooths that only; the rest is `outcome.lasting_covariance`, to be added to what `marginals` gives;
+    - where a joint is lost from sight (`lost` of `solve`) the body's prior gets an offset that decays slowly
+      (`factors.motion`): the joint stays where the body puts it plus the difference that there was when it was seen;
+    - joints with factors of your own are solved with offsets of views and body both, and what the views say is one
+      Gaussian each: your factor is weighed against errors that last, and `marginals` holds all of them.
     """
 
     def __init__(
@@ -130,8 +130,6 @@ class WindowGraph:
         """The factors of the last solution."""
         self.values = gtsam.Values()
         """The last solution, for `gtsam.Marginals` and for graphs that this one is added to."""
-        self.with_offsets = np.zeros(J, dtype=bool)
-        """(J,) joints that the last solution has offsets for."""
         self.failure = ""
         """Why the last solution is none; empty where it is one."""
         self._motion = motion
@@ -177,7 +175,7 @@ class WindowGraph:
             )
         self._added.append((factor, frozenset(keys)))
 
-    @property
+    @cached_property
     def coupled(self) -> list[frozenset[int]]:
         """Joints that factors of your own tie to each other: sets of two or more, without overlap."""
         sets: list[frozenset[int]] = []
@@ -187,10 +185,16 @@ class WindowGraph:
             sets = [*apart, joined.union(*(each for each in sets if each & joined))]
         return [each for each in sets if len(each) > 1]
 
-    @property
-    def touched(self) -> frozenset[int]:
-        """Joints on which there is a factor of your own."""
-        return frozenset(split_key(key).joint for _, keys in self._added for key in keys)
+    @cached_property
+    def with_offsets(self) -> NDArray[np.bool_]:
+        """(J,) joints with a factor of your own, in a window of several frames: solved with offsets throughout."""
+        return self.touched if self.temporal else np.zeros_like(self.touched)
+
+    @cached_property
+    def touched(self) -> NDArray[np.bool_]:
+        """(J,) joints on which there is a factor of your own."""
+        joints = {split_key(key).joint for _, keys in self._added for key in keys}
+        return np.isin(np.arange(self.keys.shape[1]), list(joints))
 
     def solve(
         self,
@@ -198,28 +202,26 @@ class WindowGraph:
         views: Message,
         body: Message,
         initial: NDArray[np.float64],
-        offsets: NDArray[np.bool_] | None = None,
+        lost: NDArray[np.bool_] | None = None,
     ) -> NDArray[np.float64]:
         """Minimise over the joints, from `initial` (T, J, 3) metres; returns (T, J, 3).
 
         `inlier` (T, J, V) are the observations that count (delta_ij of Eq. 2), `views` what they say together at
         `initial`, `body` the priors (Eq. 3). A joint with NaN in `initial` is not in the problem and stays NaN; in
-        a window of several frames that goes for all frames of the joint. `offsets` (J,): the joints that are solved
-        with offsets for errors that last.
+        a window of several frames that goes for all frames of the joint. `lost` (T, J): where joints are hardly seen,
+        or will soon be, or were a moment ago.
         """
         self._present = np.isfinite(initial).all(axis=2)
         if self.temporal:
             self._present &= self._present.all(axis=0)
-        present = self._present[0] & self.temporal
-        chosen = present & (np.zeros(len(present), bool) if offsets is None else offsets)
-        self.with_offsets = chosen
-        simple = self._present & ~chosen
-        self.values = self._start(initial, chosen)
+        of_views = self._present & self.with_offsets
+        of_body = of_views if lost is None or not self.temporal else self._present & (lost | self.with_offsets)
+        self.values = self._start(initial, np.stack([of_views, of_body]))
         self.graph = gtsam.NonlinearFactorGraph()
-        self._push(self._seen(inlier & simple[..., None]))
-        self._push(self._priors(body, simple))
-        self._push(self._lasting(views, 1.0 / self.config.weight_2d, self._motion.views, _OF_VIEWS, chosen))
-        self._push(self._lasting(body, 1.0 / self.config.weight_shape, self._motion.body, _OF_BODY, chosen))
+        self._push(self._seen(inlier & (self._present & ~of_views)[..., None]))
+        self._push(self._priors(body, self._present & ~of_body))
+        self._push(self._lasting(views, 1.0 / self.config.weight_2d, self._motion.views, _OF_VIEWS, of_views))
+        self._push(self._lasting(body, 1.0 / self.config.weight_shape, self._motion.body, _OF_BODY, of_body))
         if self.temporal:
             self._push(self._motions(initial))
         exists = self.values.exists
@@ -255,7 +257,8 @@ class WindowGraph:
     def _parameters(self) -> gtsam.LevenbergMarquardtParams:
         parameters = gtsam.LevenbergMarquardtParams()
         parameters.setMaxIterations(self.config.max_iterations)
-        parameters.setRelativeErrorTol(self.config.tolerance)
+        # Of hundreds of joints that hardly move any more, a few thousandths of a sigma.
+        parameters.setRelativeErrorTol(self.config.tolerance * (10.0 if self.temporal else 1.0))
         return parameters
 
     @property
@@ -313,12 +316,13 @@ class WindowGraph:
     def _lasting(
         self, said: Message, scale: float, errors: Lasting, source: int, chosen: NDArray[np.bool_]
     ) -> list[gtsam.NonlinearFactor]:
-        """What is `said` of the joints of `chosen` (J,), with an offset each that decays slowly."""
+        """What is `said` of the joints of `chosen` (T, J), with an offset each that decays slowly."""
         known, keys = said.known & chosen, self._offset_keys[source]
         roots = symmetric_roots(said.information[known] / scale)
         factors = lasting_prior_factors(self.keys[known], keys[known], said.xyz[known], roots, errors.white_share)
-        for joint in np.flatnonzero(chosen).tolist():
-            factors += offset_factors(keys[:, joint], self.times_s, errors.correlation_s)
+        for joint in np.flatnonzero(chosen.any(axis=0)).tolist():
+            there = chosen[:, joint]
+            factors += offset_factors(keys[there, joint], self.times_s[there], errors.correlation_s)
         return factors
 
     def _motions(self, near: NDArray[np.float64]) -> list[gtsam.NonlinearFactor]:
@@ -334,19 +338,20 @@ class WindowGraph:
         return factors
 
     def _start(self, initial: NDArray[np.float64], offsets: NDArray[np.bool_]) -> gtsam.Values:
-        """`initial` (T, J, 3) with its velocities, and no offsets yet on the joints of `offsets` (J,)."""
+        """`initial` (T, J, 3) with its velocities; `offsets` (2, T, J) of views and body start as they ended."""
         values = gtsam.Values()
         insert = values.insert
         for key, point in zip(self.keys[self._present].tolist(), initial[self._present], strict=True):
             insert(key, point)
         if not self.temporal:
             return values
+        last = self.values
         speed = np.gradient(initial, self.times_s, axis=0)
         for key, velocity in zip(self.velocity_keys[self._present].tolist(), speed[self._present], strict=True):
-            insert(key, velocity)
+            insert(key, last.atPoint3(key) if last.exists(key) else velocity)
         zero = np.zeros(3)
-        for key in self._offset_keys[:, :, offsets].ravel().tolist():
-            insert(key, zero)
+        for key in self._offset_keys[offsets].tolist():
+            insert(key, last.atPoint3(key) if last.exists(key) else zero)
         return values
 
     def _points(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

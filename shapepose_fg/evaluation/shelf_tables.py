@@ -140,8 +140,8 @@ def shelf_observations(folder: Path) -> tuple[Rig, Observations, NDArray[np.floa
     found = [find_people(detections[t], rig, detections.skeleton, CONFIG) for t in range(len(detections))]
     observations = Observations.concatenate(found)
     views = Views.of(rig)
-    sigmas = observation_sigmas(observations, observations.initial, views, CONFIG.observations)
-    return rig, observations, sigmas, triangulate(observations, views, CONFIG.observations)
+    points = triangulate(observations, views, CONFIG.observations)
+    return rig, observations, observation_sigmas(observations, points, views, CONFIG.observations), points
 
 
 def _rule(columns: int) -> str:
