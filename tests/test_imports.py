@@ -28,8 +28,10 @@ LEVELS = (
     "windows",
     "pipeline",
     "io",
-    "evaluation simulation viewer",
-    "demo training",
+    "simulation viewer",
+    "training",
+    "evaluation",
+    "demo",
     "cli",
 )
 """Each level imports only from those before it; a package may import its own modules too."""
