@@ -14,8 +14,8 @@ ROOT = Path(__file__).parents[1]
 LEVELS = (
     "factors errors camera skeleton",
     "files provenance rendering run_summary columns body.threads",
-    "body.model body.shapes",
-    "body.fitting",
+    "body.model",
+    "body.fitting body.shapes",
     "body.offsets",
     "detections frame_times",
     "observations",

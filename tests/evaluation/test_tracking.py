@@ -47,7 +47,7 @@ def result(frame, identity, joints, sigma_m=0.02):
     shapes = {name: (N, *getattr(empty, name).shape[1:]) for name in Reconstruction.ROWS}
     columns = {name: np.full(shape, np.nan) for name, shape in shapes.items()}
     columns |= {"frame": np.asarray(frame), "person": np.asarray(identity), "joints": np.asarray(joints)}
-    columns |= {"confidence": np.ones((N, J)), "status": np.full(N, "ok")}
+    columns |= {"confidence": np.ones((N, J)), "status": np.full(N, "ok"), "known": np.zeros((N, J), dtype=int)}
     columns["covariance"] = np.broadcast_to(sigma_m**2 * np.eye(3), (N, J, 3, 3))
     return replace(empty, **columns)
 
