@@ -28,11 +28,19 @@ from shapepose_fg.simulation.files import cut, named_scene
 from shapepose_fg.simulation.truth import truth_of
 
 STRETCHES = {
-    "salsa": (range(108, 408), range(618, 918)),
-    "crossing": (range(0, 300), range(726, 1026)),
-    "crowd": (range(0, 300), range(826, 1126)),
+    "report": {
+        "salsa": (range(108, 408), range(618, 918)),
+        "crossing": (range(0, 300), range(726, 1026)),
+        "crowd": (range(0, 300), range(826, 1126)),
+    },
+    "tune": {
+        "salsa": (range(0, 300), range(564, 864)),
+        "crossing": (range(0, 300), range(564, 864)),
+        "crowd": (range(241, 541), range(900, 1200)),
+    },
 }
-"""Uncut stretches of the report split, 300 frames each."""
+"""Stretches of each split without a cut, 300 frames each."""
+NAMES = ("salsa", "crossing", "crowd")
 WITHOUT_FEET = tuple(range(19))
 """The joints that the C++ system of Zhang et al. 2020 has too."""
 COLUMNS = {
@@ -64,7 +72,7 @@ def main() -> None:
     """Score every stretch and print a row for each."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--split", choices=("tune", "report"), default="report")
-    parser.add_argument("--only", nargs="*", choices=STRETCHES, default=tuple(STRETCHES), help="sequences")
+    parser.add_argument("--only", nargs="*", choices=NAMES, default=NAMES, help="sequences")
     parser.add_argument("--first", action="store_true", help="the first stretch of each sequence only")
     parser.add_argument("--frames", metavar="A:B", help="these frames in place of the stretches")
     parser.add_argument(
@@ -97,7 +105,8 @@ def spans(name: str, arguments: argparse.Namespace) -> tuple[range, ...]:
     """The stretches of a sequence that are asked for."""
     if arguments.frames is not None:
         return (range(*(int(end) for end in arguments.frames.split(":"))),)
-    return STRETCHES[name][:1] if arguments.first else STRETCHES[name]
+    stretches = STRETCHES[arguments.split][name]
+    return stretches[:1] if arguments.first else stretches
 
 
 def stretch(name: str, span: range, split: str, cameras: int) -> Scene:

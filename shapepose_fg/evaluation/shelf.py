@@ -139,6 +139,47 @@ def evaluate_shelf(
     whose run says which frames it covered (`run["frames"]`, [start, stop] or several) is scored on those.
     InputError if no annotated frame is left to score.
     """
+    matched = match_actors(people, ground_truth, frames)
+    member = matched.actor[:, None] == np.array(ACTORS)
+    known = np.isfinite(matched.distance) & matched.found[:, None]
+    return ShelfScore(
+        limbs_right=member.T.astype(np.int64) @ matched.limbs_right,
+        limbs_all=np.repeat(member.sum(axis=0)[:, None], len(LIMBS), axis=1),
+        mpjpe_mm=1e3 * float(matched.distance[known].mean()) if known.any() else float("nan"),
+        recall=float((matched.distance <= RECALL_M).mean()),
+        people_found=int(matched.found.sum()),
+        people=len(matched.frame),
+        frames=len(np.unique(matched.frame)),
+        frames_annotated=len(np.unique(ground_truth.frame[np.isin(ground_truth.actor, ACTORS)])),
+    )
+
+
+@dataclass(frozen=True)
+class MatchedActors:
+    """The G annotated actors of the scored frames, and what each of them takes."""
+
+    frame: NDArray[np.int64]
+    """(G,) frame."""
+    actor: NDArray[np.int64]
+    """(G,) one of `ACTORS`."""
+    row: NDArray[np.intp]
+    """(G,) row of the people that is taken; -1 where the frame has none."""
+    distance: NDArray[np.float64]
+    """(G, 15) distance of its joints to the annotated ones, metres; NaN where it lacks one."""
+    limbs_right: NDArray[np.bool_]
+    """(G, 10) PCP@0.5 of `LIMBS`."""
+
+    @property
+    def found(self) -> NDArray[np.bool_]:
+        """(G,) whether the mean joint distance is under 0.5 m."""
+        distance = np.where(np.isfinite(self.distance), self.distance, MISSING_JOINT_M)
+        return distance.mean(axis=1) < MISSING_JOINT_M
+
+
+def match_actors(
+    people: People, ground_truth: ShelfGroundTruth, frames: Iterable[int] | None = None
+) -> MatchedActors:
+    """What each annotated actor takes of `people`, by the rules of `evaluate_shelf`; it raises the same errors."""
     actor = np.isin(ground_truth.actor, ACTORS)
     scored = actor & _covered(ground_truth.frame, _frames_run(people) if frames is None else frames)
     if not scored.any():
@@ -146,36 +187,26 @@ def evaluate_shelf(
             "none of the reconstructed frames is annotated; reconstruct frames that the ground truth covers: "
             f"{_spans(np.unique(ground_truth.frame[actor]))}"
         )
-    truth = ground_truth.joints[scored]
-    chosen = _choose(truth, ground_truth.frame[scored], people)
+    truth, frame = ground_truth.joints[scored], ground_truth.frame[scored]
+    row, chosen = _choose(truth, frame, people)
     distance = np.linalg.norm(chosen - truth, axis=2)
-    right = _limbs_right(distance, truth)
-    found = np.where(np.isfinite(distance), distance, MISSING_JOINT_M).mean(axis=1) < MISSING_JOINT_M
-    member = ground_truth.actor[scored][:, None] == np.array(ACTORS)
-    known = np.isfinite(distance) & found[:, None]
-    return ShelfScore(
-        limbs_right=member.T.astype(np.int64) @ right,
-        limbs_all=np.repeat(member.sum(axis=0)[:, None], len(LIMBS), axis=1),
-        mpjpe_mm=1e3 * float(distance[known].mean()) if known.any() else float("nan"),
-        recall=float((distance <= RECALL_M).mean()),
-        people_found=int(found.sum()),
-        people=len(truth),
-        frames=len(np.unique(ground_truth.frame[scored])),
-        frames_annotated=len(np.unique(ground_truth.frame[actor])),
-    )
+    return MatchedActors(frame, ground_truth.actor[scored], row, distance, _limbs_right(distance, truth))
 
 
-def _choose(truth: NDArray[np.float64], frame: NDArray[np.int64], people: People) -> NDArray[np.float64]:
-    """(G, 15, 3) the prediction that each annotated person takes; NaN where its frame has none."""
+def _choose(
+    truth: NDArray[np.float64], frame: NDArray[np.int64], people: People
+) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Row (G,) and joints (G, 15, 3) that each annotated person takes; -1 and NaN where its frame has none."""
     joints = shelf_joints(_body25(people))
     person, row = np.nonzero(frame[:, None] == np.asarray(people.frame)[None, :])
     distance = np.linalg.norm(joints[row] - truth[person], axis=2)
     cost = np.where(np.isfinite(distance), distance, MISSING_JOINT_M).mean(axis=1)
     order = np.lexsort((cost, person))
     first, where = np.unique(person[order], return_index=True)
-    chosen = np.full_like(truth, np.nan)
-    chosen[first] = joints[row[order[where]]]
-    return chosen
+    taken, chosen = np.full(len(truth), -1), np.full_like(truth, np.nan)
+    taken[first] = row[order[where]]
+    chosen[first] = joints[taken[first]]
+    return taken, chosen
 
 
 def _body25(people: People) -> NDArray[np.float64]:

@@ -69,7 +69,7 @@ class TrackingScore:
     twist_jumps: int
     """Bones of bodies that turn about their own axis by 20 degrees more from a frame to the next than in truth."""
     seen: CovarianceCalibration
-    """Covariances of the joints of matched rows that are seen in that frame."""
+    """Covariances of the joints of matched rows that two views or more see in that frame."""
     long_unseen: CovarianceCalibration
     """Covariances of those that no view has seen in this frame and the nine before."""
 
@@ -109,7 +109,6 @@ def score_tracks(
     identities: bool = True,
     frames: Sequence[int] | range | None = None,
     some_joints: Sequence[int] | None = None,
-    seen: NDArray[np.bool_] | None = None,
     model: BodyModel | None = None,
 ) -> TrackingScore:
     """Compare `people` with the `truth` of a recording of `fps` frames a second (`truth_of`, or any result).
@@ -117,8 +116,7 @@ def score_tracks(
     `frames` are the frame numbers that are scored, by default those from the truth's first to its last. Without
     `identities` the column `person` only counts the people of a frame; what asks for one and the same person then
     goes by the person of the truth with whom a row is matched. `some_joints` are indices of joints to be scored
-    apart. `seen` (N, J) says which joints count as seen in their frame, by default those with a confidence.
-    `model` is the body whose parameters `people` holds. ValueError for an identity with two rows in one frame.
+    apart. `model` is the body whose parameters `people` holds. ValueError for an identity twice in one frame.
     """
     numbers = _span(truth) if frames is None else np.asarray(frames, dtype=np.int64)
     true = joints_by_frame(truth, numbers)
@@ -127,8 +125,8 @@ def score_tracks(
         matches, numbers, true.shape[1], people.person[matches.row] if identities else matches.person
     )
     found, index = people.rows(matches.row), frame_index(people.frame, numbers)
-    seen = (people.confidence > 0 if seen is None else np.asarray(seen, dtype=bool))[matches.row]
-    unseen = frames_unseen(seen, found.frame, chains.identity) >= LONG_UNSEEN
+    views = views_used(found)
+    seen, unseen = views >= 2, frames_unseen(views > 0, found.frame, chains.identity) >= LONG_UNSEEN
     error = found.joints - true[matches.frame, matches.person]
     chosen = None if some_joints is None else list(some_joints)
     return TrackingScore(
@@ -173,6 +171,16 @@ def _twist_jumps(
     turned, true = twists(chains.placed(bone_rotations(found, model)), model), twists(rotations, model)
     jumps = (np.abs(turned) > TWIST_JUMP) & (np.abs(turned - true) > TWIST_JUMP)
     return int(jumps[chains.consecutive[1:]].sum())
+
+
+def views_used(people: Reconstruction) -> NDArray[np.intp]:
+    """(N, J) how many views' detections each joint was solved from.
+
+    Without a record of observations a joint with a confidence counts as seen by two: nothing tells more.
+    """
+    if people.observations is None:
+        return np.where(people.confidence > 0, 2, 0)
+    return people.observations.used.sum(axis=-1)
 
 
 def joints_by_frame(people: Reconstruction, frames: NDArray[np.integer]) -> Array:

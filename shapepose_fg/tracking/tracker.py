@@ -120,16 +120,24 @@ class TrackedFrame:
 
     ids: NDArray[np.intp]
     """(A,) identities."""
-    places: Array
-    """(A, J, 3) joints, metres in the world."""
-    sigma_m: Array
-    """(A, J) how surely."""
+    joints: JointStates
+    """Where their joints are."""
     candidate: NDArray[np.intp]
     """(A, J, V) the detections that are theirs, -1 for none."""
     evident: NDArray[np.bool_]
     """(A,) whether the frame is evidence of the person."""
     weak: NDArray[np.bool_]
     """(A,) on trial, with hips that two views saw."""
+
+    @property
+    def places(self) -> Array:
+        """(A, J, 3) joints, metres in the world."""
+        return self.joints.position
+
+    @property
+    def sigma_m(self) -> Array:
+        """(A, J) how surely they are known."""
+        return self.joints.sigma_m
 
 
 @dataclass(frozen=True)
@@ -146,6 +154,8 @@ class Tracker:
     """How people are followed."""
     observation: ObservationConfig
     """How far detections are trusted."""
+    weak_births: bool = True
+    """Whether people are sought whose hips two views saw."""
 
     def step(
         self, state: TrackerState, detections: Detections, rig: Rig, time_s: float, *, births: bool = True
@@ -167,9 +177,7 @@ class Tracker:
         )
         if births:
             state, candidate, evident = self._births(state, candidate, evident, detections, rig)
-        frame = TrackedFrame(
-            state.ids, state.joints.position, state.joints.sigma_m, candidate, evident, state.weak
-        )
+        frame = TrackedFrame(state.ids, state.joints, candidate, evident, state.weak)
         return self._without_the_ended(state), frame
 
     def _predict(self, joints: JointStates, step_s: float) -> JointStates:
@@ -281,7 +289,7 @@ class Tracker:
         rig: Rig,
     ) -> tuple[TrackerState, NDArray[np.intp], NDArray[np.bool_]]:
         """New people among the detections that no track has."""
-        for weak in (False, True):
+        for weak in (False, True) if self.weak_births else (False,):
             free = np.ones(len(detections), dtype=bool)
             free[candidate[candidate >= 0]] = False
             if not self._enough(detections, free):

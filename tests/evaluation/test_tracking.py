@@ -20,7 +20,7 @@ from shapepose_fg.evaluation.trajectories import (
 from shapepose_fg.reconstruction import Reconstruction
 from shapepose_fg.simulation import built_in_scene
 from shapepose_fg.simulation.truth import truth_of
-from shapepose_fg.skeleton import SMPL_24
+from shapepose_fg.skeleton import BODY_25, SMPL_24
 
 FPS = 30.0
 J = 25
@@ -42,14 +42,18 @@ def identities(truth, rows):
 
 def result(frame, identity, joints, sigma_m=0.02):
     """A result without bodies."""
-    empty = Reconstruction.empty()
     N = len(frame)
-    shapes = {name: (N, *getattr(empty, name).shape[1:]) for name in Reconstruction.ROWS}
-    columns = {name: np.full(shape, np.nan) for name, shape in shapes.items()}
-    columns |= {"frame": np.asarray(frame), "person": np.asarray(identity), "joints": np.asarray(joints)}
-    columns |= {"confidence": np.ones((N, J)), "status": np.full(N, "ok"), "known": np.zeros((N, J), dtype=int)}
-    columns["covariance"] = np.broadcast_to(sigma_m**2 * np.eye(3), (N, J, 3, 3))
-    return replace(empty, **columns)
+    bodies = {"betas": (N, 10), "global_orient": (N, 3), "body_pose": (N, 23, 3), "transl": (N, 3)}
+    return Reconstruction(
+        frame=np.asarray(frame),
+        person=np.asarray(identity),
+        joint_names=np.array(BODY_25.joints),
+        joints=np.asarray(joints),
+        covariance=np.broadcast_to(sigma_m**2 * np.eye(3), (N, J, 3, 3)),
+        confidence=np.ones((N, J)),
+        status=np.full(N, "ok"),
+        **{name: np.full(shape, np.nan) for name, shape in bodies.items()},
+    )
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,165 @@
+"""Honest covariances without any truth: a view is left out, and what it saw is compared with the rest."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factors import projection_jacobians, sigma_px
+from shapepose_fg.camera import Camera, Rig
+from shapepose_fg.detections import Detections, DetectionSequence
+from shapepose_fg.estimation.linearisation import ObservationConfig
+from shapepose_fg.evaluation.matching import match_people
+from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.skeleton import Skeleton
+
+NEAR_M = 0.3
+"""A candidate that the gate refused is compared as long as it lies within this length of the joint."""
+INSIDE_95 = 5.991
+"""A chi-squared variable with 2 degrees of freedom is under this in 95 of 100 cases."""
+
+Array = NDArray[np.float64]
+Solve = Callable[[DetectionSequence, Rig], Reconstruction]
+"""Reconstruct a recording: `reconstruct`, with the settings in it."""
+
+
+@dataclass(frozen=True)
+class WithoutView:
+    """A recording as if one camera had not been there."""
+
+    sequence: DetectionSequence
+    """The whole recording."""
+    view: int
+    """The camera that is left out; those after it move up by one."""
+
+    @property
+    def skeleton(self) -> Skeleton:
+        """The detector's joints."""
+        return self.sequence.skeleton
+
+    def __len__(self) -> int:
+        return len(self.sequence)
+
+    def __getitem__(self, frame: int, /) -> Detections:
+        detections = self.sequence[frame]
+        kept = detections.only(detections.view != self.view)
+        view = kept.view - (kept.view > self.view)
+        return Detections(view, kept.joint, kept.xy, kept.confidence, kept.pairs, kept.affinity)
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """What `held_out` found for one view."""
+
+    name: str
+    """The camera."""
+    squared: Array
+    """(M,) squared Mahalanobis distance of each candidate from where the other views put the joint."""
+    unmatched: int
+    """Candidates of rows that the other views alone do not find, or of joints that they do not place."""
+
+    @property
+    def inside(self) -> float:
+        """Share inside the 95 % region; NaN where there is none."""
+        return float((self.squared <= INSIDE_95).mean()) if len(self.squared) > 0 else float("nan")
+
+
+def held_out(
+    recording: DetectionSequence,
+    rig: Rig,
+    people: Reconstruction,
+    solve: Solve,
+    config: ObservationConfig,
+) -> list[HeldOut]:
+    """Solve without each camera in turn, and compare with what that camera saw of the `people` of the whole run.
+
+    ValueError where `people` come without their observations.
+    """
+    found = []
+    for view, camera in enumerate(rig.cameras):
+        others = Rig(tuple(other for other in rig.cameras if other is not camera), rig.up)
+        found.append(compare_view(camera, view, people, solve(WithoutView(recording, view), others), config))
+    return found
+
+
+def compare_view(
+    camera: Camera, view: int, people: Reconstruction, without: Reconstruction, config: ObservationConfig
+) -> HeldOut:
+    """Compare what `camera`, which is `view`, saw of `people` with the same people as they are `without` it.
+
+    Rows are matched frame by frame (Hungarian, mean joint distance under 0.5 m). Compared are detections that
+    were given to a joint, those that were not used as long as they are near it.
+    """
+    table = people.observations
+    if table is None:
+        raise ValueError("people come without observations: give what `reconstruct` returns, or load its folder")
+    xy, confidence = (values[:, :, view].astype(np.float64) for values in (table.xy, table.confidence))
+    there = np.isfinite(xy).all(axis=-1) & (table.used[:, :, view] | _near(camera, xy, people.joints))
+    frames = np.unique(people.frame)
+    row = _row_of(people, frames)
+    joints = np.where((row >= 0)[..., None, None], people.joints[np.maximum(row, 0)], np.nan)
+    matches = match_people(without.frame, without.joints, joints, frames.tolist())
+    matched = row[matches.frame, matches.person]
+    pair, joint = np.nonzero(there[matched] & np.isfinite(without.joints[matches.row]).all(axis=-1))
+    ours, theirs = matched[pair], matches.row[pair]
+    squared = squared_distances(
+        camera,
+        xy[ours, joint],
+        confidence[ours, joint],
+        without.joints[theirs, joint],
+        without.covariance[theirs, joint],
+        config,
+    )
+    known = np.isfinite(squared)
+    return HeldOut(camera.name, squared[known], int(there.sum()) - int(known.sum()))
+
+
+def squared_distances(
+    camera: Camera, xy: Array, confidence: Array, points: Array, covariance: Array, config: ObservationConfig
+) -> Array:
+    """(M,) squared Mahalanobis distances of detections `xy` (M, 2), undistorted pixels, from projected `points`.
+
+    `points` (M, 3) in metres with `covariance` (M, 3, 3), m², were found without them. S = J C J^T + sigma² I
+    has the joint's uncertainty in the image and the noise that the graph gives a detection of that `confidence`
+    (M,). NaN behind the camera.
+    """
+    count = len(points)
+    projected, depth = camera.project(points)
+    J = projection_jacobians(
+        points, np.broadcast_to(camera.K, (count, 3, 3)), np.broadcast_to(camera.cTw, (count, 3, 4))
+    )
+    ahead = depth >= config.min_depth_m
+    sigma = np.full(count, np.nan)
+    sigma[ahead] = sigma_px(
+        confidence[ahead] ** config.confidence_power,
+        depth[ahead],
+        np.full(ahead.sum(), _focal(camera)),
+        sigma_m=config.sigma_m,
+        floor_px=config.floor_px,
+    )
+    S = J @ covariance @ J.transpose(0, 2, 1) + sigma[:, None, None] ** 2 * np.eye(2)
+    apart = np.where(ahead[:, None], projected - xy, np.nan)
+    safe = np.where(ahead[:, None, None], S, np.eye(2))
+    return np.einsum("mi,mi->m", apart, np.linalg.solve(safe, apart[..., None])[..., 0])
+
+
+def _near(camera: Camera, xy: Array, joints: Array) -> NDArray[np.bool_]:
+    """(N, J) which detections lie within 0.3 m of the joint, as a length at its depth."""
+    projected, depth = camera.project(joints)
+    return np.linalg.norm(projected - xy, axis=-1) * depth / _focal(camera) < NEAR_M
+
+
+def _focal(camera: Camera) -> float:
+    return float(camera.K[[0, 1], [0, 1]].mean())
+
+
+def _row_of(people: Reconstruction, frames: NDArray[np.integer]) -> NDArray[np.intp]:
+    """(T, P) row of each person of each frame in `people`; -1 where there are fewer than P."""
+    index = np.searchsorted(frames, people.frame)
+    order = np.argsort(index, kind="stable")
+    rank = np.empty(len(order), dtype=np.intp)
+    rank[order] = np.arange(len(order)) - np.searchsorted(index[order], index[order])
+    table = np.full((len(frames), int(rank.max(initial=-1)) + 1), -1)
+    table[index, rank] = np.arange(len(index))
+    return table

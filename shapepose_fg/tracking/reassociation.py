@@ -1,0 +1,84 @@
+"""Every detection is given out again, once it is known where people's joints are."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.observations import Observations
+from shapepose_fg.skeleton import Skeleton
+from shapepose_fg.tracking.following import Input
+from shapepose_fg.tracking.view_assignment import AssignmentConfig, assign
+
+_UNKNOWN_SIGMA_M = 0.3
+"""Sigma of a joint that is not placed at all."""
+
+
+@dataclass(frozen=True)
+class Survival:
+    """Which people of a frame that stands alone stay people when the detections are given out again."""
+
+    min_seen_twice: int = 6
+    """Core joints that two views must see: as many as a new person needs."""
+    double_m: float = 0.2
+    """Of two people whose core joints are nearer in the mean, one goes: a pelvis is 20 cm deep."""
+
+
+def reassociate(
+    given: Sequence[Input],
+    rows: Observations,
+    joints: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+    skeleton: Skeleton,
+    config: AssignmentConfig,
+    survival: Survival | None = None,
+) -> Observations:
+    """The same rows with the detections around their `joints` (N, J, 3), known to `covariance` (N, J, 3, 3).
+
+    All views and people of a frame at once, one-to-one. With `survival` people may go: those whose detections
+    belong to others, and doubles. Rows come back sorted by frame.
+    """
+    sigma_m = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1) / 3)
+    parts = []
+    for frame in given:
+        index = np.flatnonzero(rows.frame == frame.frame)
+        lost = ~np.isfinite(sigma_m[index])
+        index = index[~lost.all(axis=1)]
+        candidate = _candidates(frame, joints[index], sigma_m[index], skeleton, config)
+        while survival is not None and len(index) > 0:
+            gone = _gone(candidate, joints[index], skeleton, survival)
+            if not gone.any():
+                break
+            index = index[~gone]
+            candidate = _candidates(frame, joints[index], sigma_m[index], skeleton, config)
+        part = Observations.of(candidate, frame.detections, joints[index])
+        parts.append(replace(part, track=rows.track[index], frame=rows.frame[index], time_s=rows.time_s[index]))
+    return Observations.concatenate(parts)
+
+
+def _candidates(
+    frame: Input,
+    joints: NDArray[np.float64],
+    sigma_m: NDArray[np.float64],
+    skeleton: Skeleton,
+    config: AssignmentConfig,
+) -> NDArray[np.intp]:
+    """(P, J, V) the detections of one frame's people."""
+    lost = ~np.isfinite(sigma_m)
+    sigma = np.where(lost, _UNKNOWN_SIGMA_M, sigma_m)
+    return assign(joints, sigma, lost, frame.detections, frame.rig, skeleton, config)
+
+
+def _gone(
+    candidate: NDArray[np.intp], joints: NDArray[np.float64], skeleton: Skeleton, survival: Survival
+) -> NDArray[np.bool_]:
+    """(P,) who has too few detections of their own, or is a double of one who has more."""
+    core = list(skeleton.core)
+    seen = ((candidate >= 0).sum(axis=-1) >= 2)[:, core].sum(axis=1)
+    distance = np.linalg.norm(joints[:, None, core] - joints[None, :, core], axis=-1)
+    known = np.isfinite(distance)
+    apart = np.where(known, distance, 0.0).sum(axis=-1) / np.maximum(known.sum(axis=-1), 1)
+    apart = np.where(known.any(axis=-1), apart, np.inf)
+    lesser = (seen[:, None] < seen) | ((seen[:, None] == seen) & np.tri(len(seen), k=-1, dtype=bool))
+    return (seen < survival.min_seen_twice) | ((apart < survival.double_m) & lesser).any(axis=1)

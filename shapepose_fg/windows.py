@@ -1,0 +1,146 @@
+"""Frames in, solved rows out: people are followed, and solved in windows of frames that overlap.
+
+One function, `advance`, from (frames, state) to (rows, state): memory does not grow with the recording.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from shapepose_fg.estimation.estimator import Estimates, Estimator, ExtraFactors
+from shapepose_fg.observations import Observations
+from shapepose_fg.skeleton import Skeleton
+from shapepose_fg.tracking.following import Decided, FollowingConfig, FollowState, Input, finish, follow
+from shapepose_fg.tracking.reassociation import Survival, reassociate
+from shapepose_fg.tracking.tracker import Tracker, TrackerState
+
+
+@dataclass(frozen=True)
+class WindowConfig:
+    """How frames are cut into windows."""
+
+    frames: int = 96
+    """Frames that a window adds to the result."""
+    overlap_s: float = 0.4
+    """What a window takes of the frames before and after them, and does not return: motion and views of 0.4 s on
+    either side decide a joint to less than a millimetre."""
+
+    def __post_init__(self) -> None:
+        if self.frames < 1 or not self.overlap_s >= 0:
+            raise ValueError(f"frames must be at least 1 and overlap_s not negative, got {self}")
+
+
+@dataclass(frozen=True)
+class Solved:
+    """Rows that are done."""
+
+    observations: Observations
+    """Who, when, and from what."""
+    estimates: Estimates
+    """Joints and bodies."""
+
+
+@dataclass(frozen=True)
+class StreamState:
+    """What is carried from call to call."""
+
+    follow: FollowState
+    """The tracks, and the frames that are not decided."""
+    decided: tuple[Decided, ...] = ()
+    """Frames that wait to be solved, and before them those that the next window overlaps."""
+    before: int = 0
+    """How many of `decided` have been returned already."""
+
+
+@dataclass(frozen=True)
+class Engine:
+    """All steps from frames to rows, and their settings."""
+
+    tracker: Tracker
+    """Follows people; finds new ones."""
+    estimator: Estimator
+    """Stage II."""
+    following: FollowingConfig
+    """What becomes of tracks."""
+    windows: WindowConfig
+    """How frames are cut."""
+    temporal: bool
+    """Whether frames hang together; if not, every frame is a recording of its own."""
+    reassociations: int
+    """How often detections are given out again around the solution."""
+    extra_factors: ExtraFactors | None = None
+    """The user's own factors."""
+    timed: Callable[[str], object] | None = None
+    """A context manager for each stage's name, to take its time."""
+
+    @property
+    def skeleton(self) -> Skeleton:
+        """The detector's joints."""
+        return self.tracker.skeleton
+
+    def start(self, next_id: int = 0) -> StreamState:
+        """Before the first frame, or after a cut; identities count from `next_id`."""
+        return StreamState(FollowState(TrackerState.start(self.skeleton, next_id)))
+
+    def advance(
+        self, state: StreamState, frames: Sequence[Input], *, last: bool = False
+    ) -> tuple[list[Solved], StreamState]:
+        """Take in `frames`; returns the rows that are done. With `last` the recording ends, or is cut, there."""
+        following, decided = state.follow, list(state.decided)
+        for frame in frames:
+            following, more = follow(self.tracker, following, frame, self.following)
+            decided += more
+        if last:
+            following, more = finish(following, self.following)
+            decided += more
+        before, done = state.before, list[Solved]()
+        while (cut := self._next(decided, before, last)) is not None:
+            stop, end = cut
+            done.append(self._solve(decided[:end], before, stop))
+            keep = self._overlap(decided, stop, -1)
+            decided, before = decided[keep:], stop - keep
+        return done, StreamState(following, tuple(decided), before)
+
+    def alone(self, frame: Input) -> list[Decided]:
+        """The people of a frame that stands alone."""
+        _, decided = finish(follow(self.tracker, self.start().follow, frame, self.following)[0], self.following)
+        return decided
+
+    def solve_alone(self, decided: Sequence[Decided]) -> Solved:
+        """Frames that have nothing to do with each other, solved together because bodies are fitted fastest so."""
+        return self._solve(list(decided), 0, len(decided))
+
+    def _next(self, decided: Sequence[Decided], before: int, last: bool) -> tuple[int, int] | None:
+        """Where the next window's own frames stop, and where it ends; None where there is too little."""
+        stop = before + self.windows.frames
+        if stop < len(decided):
+            end = self._overlap(decided, stop, 1)
+            if end < len(decided) or last:
+                return stop, end
+        return (len(decided), len(decided)) if last and len(decided) > before else None
+
+    def _overlap(self, decided: Sequence[Decided], at: int, direction: int) -> int:
+        """The frame `overlap_s` before or after the border at `at`."""
+        times = np.array([frame.time_s.mean() for frame, _ in decided])
+        border = times[min(at, len(times) - 1)]
+        near = np.abs(times - border) <= self.windows.overlap_s
+        return int(np.flatnonzero(near)[0]) if direction < 0 else int(np.flatnonzero(near)[-1]) + 1
+
+    def _solve(self, decided: list[Decided], start: int, stop: int) -> Solved:
+        """One window; the rows of its frames `start` to `stop` are returned."""
+        given = [frame for frame, _ in decided]
+        rows = Observations.concatenate([part for _, part in decided])
+        if not self.temporal:
+            rows = replace(rows, track=np.arange(len(rows)))
+        estimates = self.estimator.estimate(rows, self.extra_factors)
+        survival = None if self.temporal else Survival()
+        for _ in range(self.reassociations if len(rows) > 0 else 0):
+            rows = reassociate(
+                given, rows, estimates.joints, estimates.covariance, self.skeleton,
+                self.tracker.config.assignment, survival,
+            )  # fmt: skip
+            estimates = self.estimator.estimate(rows, self.extra_factors)
+        own = [frame.frame for frame in given[start:stop]]
+        index = np.flatnonzero(np.isin(rows.frame, own))
+        return Solved(rows.rows(index), estimates.rows(index))
