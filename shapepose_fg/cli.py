@@ -101,9 +101,10 @@ def reconstruct(
     ] = None,
 ) -> None:
     """Reconstruct the people of a recording: 3D joints with covariances, and bodies."""
-    from shapepose_fg.io.calibration import read_rig
+    from shapepose_fg.io.calibration import read_rig, write_rig
     from shapepose_fg.io.config import read_config
     from shapepose_fg.io.corrections import refuse_corrected
+    from shapepose_fg.io.solved_setup import CAMERAS
     from shapepose_fg.io.detections import read_detections
     from shapepose_fg.provenance import checksums
 
@@ -144,6 +145,9 @@ def reconstruct(
         path for path in (*read, shapes if known is not None and len(known) > 0 else None) if path is not None
     ]
     people.with_run(inputs=checksums(inputs), body=body).save(output)
+    # What the observations were seen with: to solve or draw them anew.
+    if not (output / CAMERAS).exists() or not (output / CAMERAS).samefile(calibration):
+        write_rig(rig, output / CAMERAS)
     summary = _summary(people, span, len(rig), seconds, output)
     if shapes is not None and known is not None and people.shapes is not None:
         known.updated(people.shapes).save(shapes)
@@ -565,6 +569,7 @@ def _summary(people: "Reconstruction", span: range, camera_count: int, seconds: 
     table.add_row("", str(output / "run.json"))
     if people.observations is not None:
         table.add_row("", str(output / "observations.npz"))
+    table.add_row("", str(output / CAMERAS))
     return table
 
 
