@@ -32,10 +32,10 @@ from shapepose_fg.simulation.files import NAMES, cut, named_scene
 
 STAGES = ("read", "triangulate", "vote", "propose", "associate", "refine")
 PARTS = {
-    "graphs built": ("alternation.py", "_graphs"),
+    "graphs built": ("estimator.py", "_windows"),
     "graphs solved": ("alternation.py", "_solve"),
-    "covariances": ("person_graph.py", "covariance"),
-    "gates and weights": ("linearisation.py", "weigh"),
+    "covariances": ("window_graph.py", "marginals"),
+    "gates and weights": ("linearisation.py", "linearise"),
 }
 """Parts of stage II beside the body fits, and the function whose time is taken for each."""
 

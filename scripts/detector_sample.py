@@ -5,7 +5,7 @@ judged by the others, and nothing here knows an annotation or the truth of a sim
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +15,11 @@ from scipy.spatial.transform import Rotation
 from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter
 from shapepose_fg.body.fitting.fitter import BodyFit
 from shapepose_fg.body.model.body_model import BodyModel
-from shapepose_fg.camera import Rig
+from shapepose_fg.camera import Rig, Views
 from shapepose_fg.detections import Detections, DetectionSequence
-from shapepose_fg.estimation.alternation import refine
-from shapepose_fg.estimation.linearisation import observation_sigmas, triangulate, weigh
+from shapepose_fg.estimation.alternation import EstimatorConfig
+from shapepose_fg.estimation.estimator import Estimator
+from shapepose_fg.estimation.linearisation import linearise, observation_sigmas, triangulate
 from shapepose_fg.observations import Observations
 from shapepose_fg.pipeline import PipelineConfig, find_people
 from shapepose_fg.proposal.assignment import match_best_first
@@ -101,11 +102,9 @@ def find(detections: DetectionSequence, rig: Rig, config: PipelineConfig) -> Peo
         numbers = range(start, min(start + BATCH, len(detections)))
         found = [find_people(detections[t], rig, BODY_25, config) for t in numbers]
         frame = np.repeat(np.array(numbers), [len(people) for people in found])
-        observations = Observations.concatenate(found)
-        refined = refine(
-            observations, rig, fitter, config.observations, config.person_graph, config.refine,
-            person=np.arange(len(frame)), frame=frame,
-        )  # fmt: skip
+        observations = replace(Observations.concatenate(found), track=np.arange(len(frame)), frame=frame)
+        settings = EstimatorConfig(config.observations, config.window_graph, config.refine, config.motion)
+        refined = Estimator(rig, fitter, BODY_25.joints, settings).estimate(observations)
         parts.append(observations)
         frames.append(frame)
         joints.append(refined.joints)
@@ -194,11 +193,12 @@ def left_out(people: People, rig: Rig, view: int, config: PipelineConfig) -> tup
     confidence = people.observations.confidence.copy()
     confidence[..., view] = 0.0
     others = Observations(people.observations.xy, confidence, people.joints)
-    sigmas = observation_sigmas(others, people.joints, rig, config.observations)
-    points = triangulate(others, rig, sigmas, config.observations)
-    evidence = weigh(others, sigmas, points, rig, config.observations)
+    views = Views.of(rig)
+    sigmas = observation_sigmas(others, people.joints, views, config.observations)
+    points = triangulate(others, views, config.observations)
+    evidence = linearise(others, sigmas, points, views, config.observations)
     for _ in range(4):
-        evidence = weigh(others, sigmas, points, rig, config.observations)
+        evidence = linearise(others, sigmas, points, views, config.observations)
         points = evidence.target
     known = evidence.inlier.sum(axis=-1) >= OTHERS
     values, vectors = np.linalg.eigh(evidence.information)

@@ -78,7 +78,7 @@ def _scene(
     matches = match_people(people.frame, people.joints, meant.keypoints)
     true = meant.keypoints[matches.frame, matches.person]
     error = np.linalg.norm(people.joints[matches.row] - true, axis=-1)
-    doubtful = people.confidence[matches.row] < config.person_graph.rho_3d
+    doubtful = people.confidence[matches.row] < config.window_graph.rho_3d
     return metrics.f1, metrics.mpjpe_mm, error[doubtful & np.isfinite(error)]
 
 

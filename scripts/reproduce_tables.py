@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
-from shapepose_fg.camera import Rig
+from shapepose_fg.camera import Rig, Views
 from shapepose_fg.estimation.alternation import disagreement, joint_targets
-from shapepose_fg.estimation.linearisation import observation_sigmas, triangulate, weigh
+from shapepose_fg.estimation.linearisation import linearise, observation_sigmas, triangulate
 from shapepose_fg.evaluation.alternation import BeforeRefinement, alternation_errors, before_refinement
 from shapepose_fg.evaluation.matching import match_people
 from shapepose_fg.evaluation.metrics import JointMetrics, covariance_calibration, joint_metrics
@@ -161,10 +161,10 @@ def camera_table() -> list[str]:
 
 def alternation_table(trials: list[Trial]) -> list[str]:
     """Mean and median error of the same joints before and after stage II, by confidence before it."""
-    rho = CONFIG.person_graph.rho_3d
+    rho = CONFIG.window_graph.rho_3d
     settings = {
         "views, body where they leave it open": replace(
-            CONFIG, person_graph=replace(CONFIG.person_graph, rho_3d=0.0)
+            CONFIG, window_graph=replace(CONFIG.window_graph, rho_3d=0.0)
         ),
         "1 alternation": replace(CONFIG, refine=replace(CONFIG.refine, alternations=1)),
         f"**{CONFIG.refine.alternations} alternations**": CONFIG,
@@ -247,7 +247,7 @@ def limb_table(steps: dict[str, ShelfScore]) -> list[str]:
 def contradiction_table(folder: Path) -> list[str]:
     """How often the views put a joint where the rest of the body cannot have it, by how many views agree."""
     rig, observations, sigmas, points = shelf_observations(folder)
-    evidence = weigh(observations, sigmas, points, rig, CONFIG.observations)
+    evidence = linearise(observations, sigmas, points, Views.of(rig), CONFIG.observations)
     fit = make_fitter(CONFIG.body).fit(joint_targets(evidence, np.ones(len(points), dtype=bool)), None)
     apart, views = disagreement(evidence, fit), evidence.inlier.sum(axis=-1)
     rows = []
@@ -271,8 +271,8 @@ def sigma_table(folder: Path) -> list[str]:
         unseen = replace(observations, confidence=np.where(others > 0, observations.confidence, 0.0))
         place = points
         for _ in range(6):
-            place = weigh(unseen, others, place, rig, config).target
-        evidence = weigh(unseen, others, place, rig, config)
+            place = linearise(unseen, others, place, Views.of(rig), config).target
+        evidence = linearise(unseen, others, place, Views.of(rig), config)
         usable = (evidence.inlier.sum(axis=-1) >= 3) & observations.seen[:, :, view]
         xy, depth = rig.project(place)
         metres = (depth[view] / rig.focal_px[view])[usable]
@@ -305,8 +305,8 @@ def shelf_observations(folder: Path) -> tuple[Rig, Observations, NDArray[np.floa
     detections = read_detections(folder, rig)
     found = [find_people(detections[t], rig, detections.skeleton, CONFIG) for t in range(len(detections))]
     observations = Observations.concatenate(found)
-    sigmas = observation_sigmas(observations, observations.initial, rig, CONFIG.observations)
-    return rig, observations, sigmas, triangulate(observations, rig, sigmas, CONFIG.observations)
+    points = triangulate(observations, Views.of(rig), CONFIG.observations)
+    return rig, observations, observation_sigmas(observations, points, Views.of(rig), CONFIG.observations), points
 
 
 def body_joints(people: Reconstruction) -> NDArray[np.float64]:

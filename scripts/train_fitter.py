@@ -48,6 +48,9 @@ def main(
     threads: Annotated[int, typer.Option(min=1, help="CPU threads.")] = 1,
     validate_every: Annotated[int, typer.Option(min=1, help="Iterations between validations.")] = 500,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint beside the output.")] = False,
+    calibrate: Annotated[
+        bool, typer.Option("--calibrate", help="Only measure the covariances of the weights in the output anew.")
+    ] = False,
 ) -> None:
     """Train, validate, write."""
     torch.set_num_threads(threads)
@@ -59,6 +62,10 @@ def main(
             raise InputError(
                 f"{motions}: no {split} subjects in it; add motions of more people (training/split.py)"
             )
+    if calibrate:
+        weights = FitterWeights.load(output)
+        _calibrated(weights, recorded, model, config).save(output)
+        return
     train = recorded.of("train")
     frame = PersonFrame.of(model, train.poses, train.weight)
     trainer = _trainer(recorded, model, frame, config)
@@ -81,10 +88,17 @@ def main(
                 save_checkpoint(trainer, checkpoint)
     card = _card(trainer, recorded, motions, validation(trainer.averaged))
     network = trainer.averaged.requires_grad_(False).eval().cpu()
-    still = replace(config, shake_rad=0.0, exchange=0.0)
-    unseen = PeopleSource(recorded.of("validation"), model, frame, still)
-    calibrated(FitterWeights(network, frame, fingerprint(model), card=card), unseen, model).save(output)
+    weights = FitterWeights(network, frame, fingerprint(model), card=card)
+    _calibrated(weights, recorded, model, config).save(output)
     print(f"{output}: {output.stat().st_size / 1e6:.1f} MB, {num_weights(trainer.averaged)} weights")
+
+
+def _calibrated(
+    weights: FitterWeights, recorded: Motions, model: BodyModel, config: TrainingConfig
+) -> FitterWeights:
+    """The weights with covariances that hold on the validation subjects."""
+    still = replace(config, shake_rad=0.0, exchange=0.0)
+    return calibrated(weights, PeopleSource(recorded.of("validation"), model, weights.frame, still), model)
 
 
 def _trainer(recorded: Motions, model: BodyModel, frame: PersonFrame, config: TrainingConfig) -> Trainer:

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import typer
 
 from shapepose_fg.errors import InputError
+from shapepose_fg.tracks_command import tracks
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
     from rich.table import Table
 
     from shapepose_fg.body.fitting.fitter import BodyFitter
-    from shapepose_fg.body.model.smpl_file import SmplArrays
     from shapepose_fg.body.shapes import SubjectShapes
     from shapepose_fg.camera import Axis, Rig
     from shapepose_fg.frame_times import FrameTimes
@@ -39,7 +39,6 @@ app = typer.Typer(
 )
 evaluate = typer.Typer(help="Score a reconstruction against an annotation.")
 app.add_typer(evaluate, name="evaluate")
-tracks = typer.Typer(invoke_without_command=True)
 app.add_typer(tracks, name="tracks")
 
 _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
@@ -70,8 +69,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 @app.command()
 def reconstruct(
-    calibration: Annotated[Path, typer.Option(help="Cameras: 4D Association's calibration.json, or a rig file.")],
-    detections: Annotated[Path, typer.Option(help="Folder with <camera>.txt, or <camera>/*_keypoints.json.")],
+    calibration: Annotated[Path, typer.Option(help="Cameras: a file, or a folder, of one of the formats known.")],
+    detections: Annotated[Path, typer.Option(help="Folder with what a 2D detector wrote of every camera.")],
     output: Annotated[Path, typer.Option(help="Folder for people.npz and run.json; made if it is not there.")],
     config: Annotated[
         Path | None, typer.Option(help="Settings as TOML; `shapepose-fg config` prints all.")
@@ -83,6 +82,12 @@ def reconstruct(
         str | None, typer.Option(metavar="AXIS", help="World axis that points up: x -x y -y z -z.")
     ] = None,
     unit: Annotated[str | None, typer.Option(metavar="UNIT", help="Unit of the calibration: m, cm or mm.")] = None,
+    image_size: Annotated[
+        str | None, typer.Option(metavar="WxH", help="Size of the calibrated pictures, where the file has none.")
+    ] = None,
+    skeleton: Annotated[
+        str | None, typer.Option(metavar="NAME", help="The detector's skeleton, or a TOML file that describes it.")
+    ] = None,
     body: Annotated[
         Path | None, typer.Option(help="Body model in SMPL's file format, instead of the built-in.")
     ] = None,
@@ -104,12 +109,15 @@ def reconstruct(
     from shapepose_fg.io.calibration import read_rig, write_rig
     from shapepose_fg.io.config import read_config
     from shapepose_fg.io.corrections import refuse_corrected
-    from shapepose_fg.io.solved_setup import CAMERAS
     from shapepose_fg.io.detections import read_detections
+    from shapepose_fg.io.solved_setup import CAMERAS
     from shapepose_fg.provenance import checksums
 
-    rig = read_rig(calibration, up=cast("Axis | None", up), unit=cast("Unit | None", unit))
-    recording = read_detections(detections, rig)
+    size = _image_size(image_size)
+    rig = read_rig(calibration, up=cast("Axis | None", up), unit=cast("Unit | None", unit), image_size=size)
+    recording = read_detections(detections, rig, skeleton)
+    for note in recording.notes:
+        _note(note)
     span = _frame_range(frames, len(recording))
     times = _times(fps, timestamps, rig, len(recording))
     first_frames = _cuts(cuts, len(recording))
@@ -144,7 +152,7 @@ def reconstruct(
     inputs = [
         path for path in (*read, shapes if known is not None and len(known) > 0 else None) if path is not None
     ]
-    people.with_run(inputs=checksums(inputs), body=body).save(output)
+    people.with_run(inputs=checksums(inputs), notes=list(recording.notes), body=body).save(output)
     # What the observations were seen with: to solve or draw them anew.
     if not (output / CAMERAS).exists() or not (output / CAMERAS).samefile(calibration):
         write_rig(rig, output / CAMERAS)
@@ -170,93 +178,6 @@ def evaluate_shelf_command(
         print(json.dumps(score.as_dict(), indent=2, allow_nan=False))
     else:
         _print(score.table())
-
-
-Person = Annotated[int, typer.Argument(metavar="A", help="Number of a person.", min=0)]
-Other = Annotated[int, typer.Argument(metavar="B", help="Number of another person.", min=0)]
-From = Annotated[int, typer.Argument(metavar="FRAME", help="First frame that changes.", min=0)]
-
-
-@tracks.callback()
-def people_over_time(
-    context: typer.Context,
-    results: Annotated[Path, typer.Argument(metavar="RESULTS", help="Folder of a reconstruction.")],
-) -> None:
-    """List the people of a result over time, or correct who is who: shapepose-fg tracks RESULTS merge 3 9.
-
-    Without a command everybody is listed. The result as it was before the first correction stays in
-    RESULTS/uncorrected, and `undo` takes corrections back one by one.
-    """
-    context.obj = results
-    if context.invoked_subcommand is None:
-        list_people(context)
-
-
-@tracks.command("list")
-def list_people(
-    context: typer.Context,
-    as_json: Annotated[bool, typer.Option("--json", help="Print them as JSON.")] = False,
-) -> None:
-    """Everybody: frames, gaps, stature, how often seen, how far they walked."""
-    from dataclasses import asdict
-
-    from shapepose_fg.reconstruction import Reconstruction
-    from shapepose_fg.tracking.listing import list_tracks
-
-    people = Reconstruction.load(context.obj)
-    if not as_json:
-        _print(_tracks_table(context.obj, people))
-        return
-    listed = [asdict(track) for track in list_tracks(people, _body_of(people))]
-    plain = [{name: None if value != value else value for name, value in track.items()} for track in listed]
-    print(json.dumps(plain, indent=2, allow_nan=False))
-
-
-@tracks.command("merge")
-def merge_people(context: typer.Context, person: Person, other: Other) -> None:
-    """B is A: B's rows become A's."""
-    _correct(context, "merge", person, other=other)
-
-
-@tracks.command("split")
-def split_person(
-    context: typer.Context,
-    person: Person,
-    frame: From,
-    new: Annotated[
-        int | None, typer.Option(help="Number of the new person; by default the next free one.")
-    ] = None,
-) -> None:
-    """From FRAME on A is somebody else: a new person."""
-    _correct(context, "split", person, other=new, frame=frame)
-
-
-@tracks.command("rename")
-def rename_person(context: typer.Context, person: Person, other: Other) -> None:
-    """A gets the number B, which must be free."""
-    _correct(context, "rename", person, other=other)
-
-
-@tracks.command("drop")
-def drop_person(context: typer.Context, person: Person) -> None:
-    """A is nobody: A's rows are taken out."""
-    _correct(context, "drop", person)
-
-
-@tracks.command("swap")
-def swap_people(context: typer.Context, person: Person, other: Other, frame: From) -> None:
-    """From FRAME on A is B and B is A."""
-    _correct(context, "swap", person, other=other, frame=frame)
-
-
-@tracks.command("undo")
-def undo_correction(context: typer.Context) -> None:
-    """Take the last correction back."""
-    from shapepose_fg.io.corrections import take_back
-
-    edit, people = take_back(_folder(context.obj))
-    print(f"taken back: {edit}")
-    _print(_tracks_table(context.obj, people))
 
 
 _DEMO = """\
@@ -366,74 +287,14 @@ def version() -> None:
         print(name, number)
 
 
-def _folder(results: Path) -> Path:
-    """The folder of a result, which may be given as its people.npz too."""
-    return results.parent if results.name == "people.npz" else results
-
-
-def _tracks_table(results: Path, people: "Reconstruction") -> "RenderableType":
-    """Everybody of a result, and what was corrected."""
-    from rich.console import Group
-    from rich.padding import Padding
-    from rich.table import Table
-
-    from shapepose_fg.io.corrections import read_corrections
-    from shapepose_fg.tracking.listing import list_tracks
-
-    listed = list_tracks(people, _body_of(people))
-    table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
-    for name in ("person", "frames", "rows", "gaps", "stature", "seen", "confidence", "walked"):
-        table.add_column(name, justify="right")
-    for track in listed:
-        table.add_row(
-            str(track.person),
-            f"{track.first}-{track.last}",
-            str(track.rows),
-            str(track.gaps),
-            _or_dash(track.stature_m, "{:.2f} m"),
-            _or_dash(100 * track.seen, "{:.0f} %"),
-            f"{track.confidence:.2f}",
-            f"{track.walked_m:.1f} m",
-        )
-    lines = [f"{len(listed)} people, {len(people)} rows{_rate(people)}"]
-    if not people.run.get("configuration", {}).get("temporal", True):
-        lines.append("every frame stands alone here: a number is nobody's over time")
-    edits = read_corrections(_folder(results))
-    if len(edits) > 0:
-        lines.append(f"corrected: {'; '.join(map(str, edits))}")
-    return Group(*([table] if listed else []), Padding("\n".join(lines), (1 if listed else 0, 0, 0, 0)))
-
-
-def _or_dash(value: float, text: str) -> str:
-    """`value` as `text` formats it; a dash where it is NaN."""
-    return "-" if value != value else text.format(value)
-
-
-def _body_of(people: "Reconstruction") -> "SmplArrays | None":
-    """The body model that a result was made with; None where its file is not there any more."""
-    from shapepose_fg.body.shapes import read_body
-
-    file = people.run.get("body")
-    if file is None:
-        return read_body()
-    return read_body(Path(file)) if Path(file).is_file() else None
-
-
-def _correct(context: typer.Context, action: str, person: int, **more: int | None) -> None:
-    """Make one correction, and say what came of it."""
-    from shapepose_fg.io.corrections import correct
-    from shapepose_fg.reconstruction import Reconstruction
-    from shapepose_fg.tracking.edits import Action, Edit, free_number
-
-    folder = _folder(context.obj)
-    if action == "split" and more["other"] is None:
-        more["other"] = free_number(Reconstruction.load(folder))
-    edit = Edit(Action(action), person, **more)
-    edited = correct(folder, edit)
-    unsolved = "; joints and bodies stay as they were solved" if len(edited.changed) > 0 else ""
-    print(f"done: {edit}{unsolved}")
-    _print(_tracks_table(context.obj, edited.people))
-    print(f"take it back: shapepose-fg tracks {context.obj} undo")
+def _image_size(text: str | None) -> tuple[int, int] | None:
+    """Width and height of `WxH`."""
+    if text is None:
+        return None
+    match = re.fullmatch(r"\s*(\d+)\s*[x×,]\s*(\d+)\s*", text)
+    if match is None:
+        raise InputError(f"--image-size {text}: must be WIDTHxHEIGHT in pixels, such as 1920x1080")
+    return int(match[1]), int(match[2])
 
 
 def _frame_range(text: str | None, count: int) -> range:
@@ -546,11 +407,16 @@ def _summary(people: "Reconstruction", span: range, camera_count: int, seconds: 
     import numpy as np
     from rich.table import Table
 
+    from shapepose_fg.frame_times import rate_words
+    from shapepose_fg.io.solved_setup import CAMERAS
+
     per_frame = np.bincount(people.frame - span.start, minlength=len(span))
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     table.add_column(style="bold")
     table.add_column(overflow="fold")
-    table.add_row("frames", f"{len(span)} ({span.start}:{span.stop}) of {camera_count} cameras{_rate(people)}")
+    table.add_row(
+        "frames", f"{len(span)} ({span.start}:{span.stop}) of {camera_count} cameras{rate_words(people.run)}"
+    )
     table.add_row(
         "people", f"{len(people)} in all, {per_frame.mean():.1f} a frame ({per_frame.min()} to {per_frame.max()})"
     )
@@ -573,14 +439,6 @@ def _summary(people: "Reconstruction", span: range, camera_count: int, seconds: 
     return table
 
 
-def _rate(people: "Reconstruction") -> str:
-    """Frames a second, and whether somebody said so."""
-    told = people.run.get("time", {})
-    if told.get("fps") is None:
-        return ""
-    return f", {told['fps']:.4g} a second" + (" (assumed: give --fps)" if told["source"] == "assumed" else "")
-
-
 def _joints(people: "Reconstruction") -> str:
     """How the joints are known, as shares, and how sure they are, as words."""
     import numpy as np
@@ -600,6 +458,14 @@ def _print(content: "RenderableType") -> None:
     from rich.console import Console
 
     Console().print(content)
+
+
+def _note(message: str) -> None:
+    """Say on stderr, in one line, what was made of the input."""
+    from rich.console import Console
+    from rich.text import Text
+
+    Console(stderr=True).print(Text.assemble(("note: ", "bold"), message), soft_wrap=True)
 
 
 def _fail(message: str) -> int:

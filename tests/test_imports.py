@@ -27,7 +27,7 @@ LEVELS = (
     "pipeline",
     "io",
     "evaluation simulation viewer",
-    "demo training",
+    "demo training tracks_command",
     "cli",
 )
 """Each level imports only from those before it; a package may import its own modules too."""

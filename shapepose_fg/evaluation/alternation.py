@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Rig
+from shapepose_fg.camera import Rig, Views
 from shapepose_fg.detections import DetectionSequence
-from shapepose_fg.estimation.linearisation import observation_sigmas, triangulate
+from shapepose_fg.estimation.linearisation import triangulate
 from shapepose_fg.evaluation.matching import match_people
 from shapepose_fg.observations import Observations
 from shapepose_fg.pipeline import PipelineConfig, find_people
@@ -49,8 +49,7 @@ def before_refinement(
     config = PipelineConfig() if config is None else config
     found = [find_people(detections[t], rig, detections.skeleton, config) for t in range(len(detections))]
     observations = Observations.concatenate(found)
-    sigmas = observation_sigmas(observations, observations.initial, rig, config.observations)
-    joints = triangulate(observations, rig, sigmas, config.observations)
+    joints = triangulate(observations, Views.of(rig), config.observations)
     return BeforeRefinement(joints, observations.confidence.mean(axis=-1))
 
 

@@ -4,12 +4,12 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter, PlainFitterConfig
-from shapepose_fg.body.fitting.evidence import Evidence
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
 from shapepose_fg.body.fitting.pose_prior import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel
@@ -17,6 +17,9 @@ from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.evaluation.closed_form import ClosedFormStart
 from shapepose_fg.evaluation.fitting import batches, concatenated
 from shapepose_fg.evaluation.gradient_descent import GradientDescentConfig, GradientDescentFitter
+
+if TYPE_CHECKING:
+    import torch
 
 Array = NDArray[np.float64]
 
@@ -65,18 +68,12 @@ class ClosedFormFitter(LevenbergMarquardtFitter):
         """The same fitter for a detector that puts its joints `offsets` away from the body's."""
         return ClosedFormFitter(self.model.with_keypoint_offsets(offsets), self._prior, self._steps)
 
-    def _start(
-        self, evidence: Evidence, rows: NDArray[np.intp], centre: Array, warm: NDArray[np.bool_],
-        initial: BodyFit | None,
-    ) -> Array:  # fmt: skip
+    def _start(self, xyz: "torch.Tensor", variance: Array) -> "torch.Tensor":
         import torch
 
-        start = super()._start(evidence, rows, centre, warm, initial)
-        xyz = torch.from_numpy(evidence.xyz[rows] - centre[:, None]).float()
-        body = self._closed_form(xyz, torch.from_numpy(evidence.variance_m2[rows]).float())
+        body = self._closed_form(xyz, torch.from_numpy(variance).float())
         pose = body.body_pose.flatten(1)[:, torch.from_numpy(self._energy.angles)]
-        found = torch.cat((body.betas, body.global_orient, pose, body.transl), 1).double().numpy()
-        return np.where(warm[:, None], start, found)
+        return torch.cat((body.betas, body.global_orient, pose, body.transl), 1)
 
     def _solve(self, free, targets, warm, held=None):
         return free if self._steps == 0 else super()._solve(free, targets, warm, held)

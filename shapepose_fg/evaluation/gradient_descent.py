@@ -69,7 +69,7 @@ class GradientDescentFitter(LevenbergMarquardtFitter):
         for n in range(config.max_iterations):
             done = n / config.max_iterations
             widening = annealing * max(0.0, 1 - 5 * done)
-            gradient = self._energy.gradient(free, targets, config.kernel_scale * 2.0**widening, held)
+            gradient = self._energy.slope(free, targets, config.kernel_scale * 2.0**widening, held).gradient
             first = _MOMENTUM * first + (1 - _MOMENTUM) * gradient
             second = _MEMORY * second + (1 - _MEMORY) * gradient.square()
             scale = math.sqrt(1 - _MEMORY ** (n + 1)) / (1 - _MOMENTUM ** (n + 1))

@@ -10,9 +10,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Rig
+from shapepose_fg.camera import Rig, Views
 from shapepose_fg.detections import Detections
-from shapepose_fg.estimation.linearisation import ObservationConfig, observation_sigmas, triangulate, weigh
+from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas, triangulate
 from shapepose_fg.observations import Observations
 from shapepose_fg.skeleton import Skeleton
 from shapepose_fg.tracking.motion_filter import JointStates
@@ -249,12 +249,13 @@ class Tracker:
         if len(joints) == 0:
             return joints, candidate
         seen = Observations.of(candidate, detections, np.where(lost[..., None], np.nan, joints.position))
-        sigmas = observation_sigmas(seen, joints.position, rig, self.observation)
-        placed = triangulate(seen, rig, sigmas, self.observation)
+        views = Views.of(rig)
+        sigmas = observation_sigmas(seen, joints.position, views, self.observation)
+        placed = triangulate(seen, views, self.observation)
         at = np.where(np.isfinite(placed), placed, joints.position)
         measured, inlier = joints, candidate >= 0
         for _ in range(self.config.iterations):
-            said = weigh(seen, sigmas, at, rig, self.observation)
+            said = linearise(seen, sigmas, at, views, self.observation)
             toward = np.einsum("...ij,...j->...i", said.information, at - joints.position) - said.gradient
             measured, inlier = joints.updated(said.information, toward), said.inlier
             at = measured.position

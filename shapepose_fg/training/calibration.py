@@ -1,4 +1,4 @@
-"""How wide the learned fitter's beliefs about hidden joints must be: measured on people that it was not taught."""
+"""How wide the learned fitter's covariances without a target must be: measured on people it was not taught."""
 
 from dataclasses import replace
 
@@ -16,25 +16,26 @@ from shapepose_fg.training.corruption import corrupt
 from shapepose_fg.training.train import PeopleSource
 
 INSIDE = 0.9
-"""Share of the hidden joints that shall lie inside their ellipsoid of that probability."""
+"""Share of the joints that shall lie inside the ellipsoid of that probability which their prior claims."""
 _SKELETONS = ("SMPL_24", "HALPE_26", "BODY_25")
 """The last one that has a point decides."""
 _ENOUGH = 50
-"""Hidden joints without which nothing is said."""
+"""Joints without which nothing is said."""
 
 
 def calibrated(weights: FitterWeights, source: PeopleSource, model: BodyModel, count: int = 4096) -> FitterWeights:
     """The same weights with `spread` measured on `count` people of `source` for each skeleton.
 
-    What is claimed of a joint without a target is widened or narrowed so that `INSIDE` of them are where it says.
-    Left and right are taken together.
+    What is claimed of joints without their own target (`BodyFit.prior_covariance`, less the error of the model;
+    whether or not they have one) is widened or narrowed so that `INSIDE` of them are there. Left and right are taken
+    together.
     """
     plain = replace(weights, spread=torch.ones(len(BODY_POINTS)))
     spread = np.ones(len(BODY_POINTS))
     generator = torch.Generator().manual_seed(2)
     for name in _SKELETONS:
         places = slots(TARGET_SKELETONS[name])
-        squared = _hidden_squared(plain, source, model, places, count, generator)
+        squared = left_out_squared(plain, source, model, places, count, generator)
         for place in places:
             both = np.concatenate([squared.get(place, np.zeros(0)), squared.get(MIRROR[place], np.zeros(0))])
             if len(both) >= _ENOUGH:
@@ -42,7 +43,7 @@ def calibrated(weights: FitterWeights, source: PeopleSource, model: BodyModel, c
     return replace(weights, spread=torch.from_numpy(spread).float())
 
 
-def _hidden_squared(
+def left_out_squared(
     weights: FitterWeights,
     source: PeopleSource,
     model: BodyModel,
@@ -50,16 +51,14 @@ def _hidden_squared(
     count: int,
     generator: torch.Generator,
 ) -> dict[int, NDArray[np.float64]]:
-    """By point: squared Mahalanobis distances of true joints to what is believed of them without a target."""
+    """By point: squared Mahalanobis distances of true joints to where the body puts them without their target."""
     names = tuple(BODY_POINTS[place] for place in places)
     fitter = LearnedFitter(model.with_keypoints(names), weights=weights)
     people = source.draw(count, generator)
     target, information = corrupt(people.points, torch.ones(count, len(BODY_POINTS)), generator)
     chosen = list(places)
     fit = fitter.fit(JointTargets(target[:, chosen].double().numpy(), information[:, chosen].double().numpy()))
-    hidden = fit.ok[:, None] & ~(information[:, chosen] != 0).any(-1).any(-1).numpy()
-    error = fit.joints - people.points[:, chosen].double().numpy()
-    squared = np.full(hidden.shape, np.nan)
-    inverse = np.linalg.inv(fit.covariance[hidden])
-    squared[hidden] = np.einsum("ni,nij,nj->n", error[hidden], inverse, error[hidden])
-    return {place: squared[hidden[:, row], row] for row, place in enumerate(places)}
+    error = (fit.prior_xyz - people.points[:, chosen].double().numpy())[fit.ok]
+    covariance = fit.prior_covariance[fit.ok] - fitter.config.evidence.model_sigma_m**2 * np.eye(3)
+    squared = np.einsum("nji,njik,njk->nj", error, np.linalg.inv(covariance), error)
+    return {place: squared[:, row] for row, place in enumerate(places)}

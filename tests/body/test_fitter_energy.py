@@ -11,7 +11,7 @@ from shapepose_fg.body.fitting.energy import (
     robust_weight,
     visible_joints,
 )
-from shapepose_fg.body.fitting.evidence import EvidenceConfig, spread_m, weigh
+from shapepose_fg.body.fitting.evidence import EvidenceConfig, determine_pose, weigh
 from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.pose_energy import PoseEnergy
@@ -210,9 +210,13 @@ def test_model_error_is_added_to_covariances_and_rays_stay_rays():
     assert not weighed[0, 6].any()
 
 
-def test_spread_is_the_distance_from_the_best_line():
+def test_joints_on_a_line_do_not_determine_a_pose():
     line = np.arange(-2.0, 3.0)[:, None] * np.array([0.3, 0.4, 0.0])
-    used = np.ones((2, 5), dtype=bool)
     side = np.array([0.1, -0.1, 0.0, -0.1, 0.1])[:, None] * np.array([0.0, 0.0, 1.0])
-    spread = spread_m(np.stack([line, line + side]), used)
-    np.testing.assert_allclose(spread, [0.0, 0.1 * np.sqrt(4 / 5)], atol=1e-7)
+    xyz, used = np.stack([line, line + side, line + side, line + 4]), np.ones((4, 5), dtype=bool)
+    used[2, 1:3] = False
+    xyz[2, 1] = 100.0  # is not looked at
+    off = 0.1 * np.sqrt(4 / 5)  # root mean square distance from the line of the second
+    for least, expected in ((off - 1e-6, [False, True, False, False]), (off + 1e-6, [False] * 4)):
+        found = determine_pose(xyz, used, EvidenceConfig(min_spread_m=least))
+        assert found.tolist() == expected

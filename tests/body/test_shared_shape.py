@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from shapepose_fg.body.fitting.energy import Held
-from shapepose_fg.body.fitting.shared_shape import check_groups, pooled_betas
+from shapepose_fg.body.fitting.shared_shape import check_groups, pooled_betas, shape_precision, shared
 
 BETAS, REST = 10, 6
 
@@ -48,7 +48,8 @@ def test_a_linear_problem_is_pooled_exactly(own_centres):
     free = torch.from_numpy(np.stack([x for x, _ in alone]))
     hessian = torch.from_numpy(np.stack([H for _, H in alone]))
     held = Held(torch.from_numpy(centre), torch.full((6, 1), 2.5, dtype=torch.float64))
-    pooled = pooled_betas(free, hessian, groups, held).numpy()
+    votes = np.ones(6, dtype=bool)
+    pooled = pooled_betas(free[:, :BETAS], shape_precision(hessian), groups, votes, held).numpy()
     for number in (5, -2):
         rows = groups == number
         # What a group was held by counts once: around the mean of where its rows were held.
@@ -61,8 +62,22 @@ def test_shapes_held_by_the_priors_alone_are_pooled_too():
     A, y = linear_rows(3, seed=2)
     alone = [solved_alone(A[row], y[row], np.zeros(BETAS), 1.0) for row in range(3)]
     free, hessian = (torch.from_numpy(np.stack(part)).float() for part in zip(*alone, strict=True))
-    pooled = pooled_betas(free, hessian, np.zeros(3, dtype=int), Held.by_priors()).numpy()
+    pooled = pooled_betas(
+        free[:, :BETAS], shape_precision(hessian), np.zeros(3, dtype=int), np.ones(3, bool), Held.by_priors()
+    ).numpy()
     np.testing.assert_allclose(pooled[0], solved_jointly(A, y, np.zeros(BETAS), 1.0), atol=1e-4)  # single
+
+
+def test_rows_that_do_not_vote_take_the_others_shape():
+    A, y = linear_rows(5, seed=3)
+    alone = [solved_alone(A[row], y[row], np.zeros(BETAS), 1.0) for row in range(5)]
+    free, hessian = (torch.from_numpy(np.stack(part)).float() for part in zip(*alone, strict=True))
+    pools, votes = np.array([0, 0, 0, 1, 1]), np.array([True, True, False, False, False])
+    pooled = pooled_betas(free[:, :BETAS], shape_precision(hessian), pools, votes, Held.by_priors()).numpy()
+    expected = solved_jointly(A[:2], y[:2], np.zeros(BETAS), 1.0)
+    np.testing.assert_allclose(pooled[:3], np.tile(expected, (3, 1)), atol=1e-4)  # single precision
+    np.testing.assert_array_equal(pooled[3:], free[3:, :BETAS].numpy())  # no vote in their pool
+    assert shared(pools, votes).tolist() == [True, True, True, False, False]
 
 
 @pytest.mark.parametrize("groups", [[0, 1], [[0], [1], [2]], [0.0, 1.0, 2.0], ["a", "b", "c"], [True] * 3])

@@ -16,7 +16,7 @@ from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.errors import InputError
-from shapepose_fg.training.calibration import INSIDE, _hidden_squared, calibrated
+from shapepose_fg.training.calibration import INSIDE, calibrated, left_out_squared
 from shapepose_fg.training.checkpoint import load_checkpoint, save_checkpoint
 from shapepose_fg.training.motions import Motions, mirror_joints
 from shapepose_fg.training.train import PeopleSource, Trainer, TrainingConfig, body_points, prepared
@@ -207,7 +207,7 @@ def test_calibrated_beliefs_hold_what_they_say_of_hidden_joints(frame):
     places = tuple(range(25))
     inside = {}
     for name, judged in (("raw", raw), ("calibrated", weights)):
-        squared = _hidden_squared(judged, source, model, places, 500, generator)
+        squared = left_out_squared(judged, source, model, places, 500, generator)
         inside[name] = np.mean(np.concatenate(list(squared.values())) < chi2.ppf(INSIDE, 3))
     # About 3,000 hidden joints that go missing by limbs: sigma of the share is about 1.5 %.
     assert inside["calibrated"] == pytest.approx(INSIDE, abs=0.04)

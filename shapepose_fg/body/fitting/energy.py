@@ -6,7 +6,7 @@ with S_iᵀ S_i the information of target z_i, rho a robust kernel, p the pose p
 (Bogo et al. 2016) for 3D joints. There is no factor 1/2, so that the inverse of the Hessian below is a covariance.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -52,7 +52,18 @@ class Held:
         """By nothing else than the priors."""
         return cls(torch.zeros(10), torch.ones(1))
 
-    def __getitem__(self, rows: Tensor) -> "Held":
+    def for_rows(self, count: int) -> "Held":
+        """The same with one row of everything for each of `count` rows."""
+        return Held(self.betas.expand(count, 10), self.stiffness.expand(count, 1), self.angles)
+
+    @staticmethod
+    def concatenated(parts: "list[Held]") -> "Held":
+        """The rows of all, in order; all hold the same."""
+        betas, stiffness = (torch.cat([getattr(part, name) for part in parts]) for name in ("betas", "stiffness"))
+        angles = [part.angles for part in parts if part.angles is not None]
+        return Held(betas, stiffness, torch.cat(angles) if angles else None)
+
+    def __getitem__(self, rows: "Tensor | slice") -> "Held":
         return Held(self.betas[rows], self.stiffness[rows], None if self.angles is None else self.angles[rows])
 
     def at_shape(self, betas: Tensor, settled: Tensor) -> "Held":
@@ -104,6 +115,24 @@ def robust_weight(squared: Tensor, scale: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
+class Slope:
+    """Bodies and the slope of the energy: what `linearise` gives, at 40 % of the cost, without the Hessian."""
+
+    xyz: Tensor
+    """(B, K, 3) keypoints, metres."""
+    squared: Tensor
+    """(B, K) squared Mahalanobis distance of every joint to its target."""
+    prior: Tensor
+    """(B,) what betas and pose prior add to the energy."""
+    gradient: Tensor
+    """(B, P) half the gradient."""
+
+    def energy(self, kernel_scale: Tensor) -> Tensor:
+        """(B,) the energy with the kernel's scale (B, 1)."""
+        return robust_cost(self.squared, kernel_scale).sum(-1) + self.prior
+
+
+@dataclass(frozen=True)
 class Evaluated:
     """Bodies, their keypoints and the energy around them."""
 
@@ -115,18 +144,49 @@ class Evaluated:
     """(B, 3 K, P) of the keypoints by the free parameters."""
     here: Linearisation
     """The energy."""
+    factor: Tensor
+    """(B, P, P) lower Cholesky factor of its Hessian, see `factored`."""
 
-    def replaced(self, where: Tensor, other: "Evaluated") -> "Evaluated":
-        """The same, but with the rows `where` (B,) taken from another."""
-        if bool(where.all()):
-            return other
-        rows, three = where[:, None], where[:, None, None]
-        return Evaluated(
-            torch.where(rows, other.free, self.free),
-            torch.where(three, other.xyz, self.xyz),
-            torch.where(three, other.jacobian, self.jacobian),
-            self.here.replaced(where, other.here),
+    @property
+    def step(self) -> Tensor:
+        """(B, P) the Newton step."""
+        return -torch.cholesky_solve(self.here.gradient[..., None], self.factor).squeeze(-1)
+
+    @property
+    def left(self) -> Tensor:
+        """(B,) by how much that step would lower the energy."""
+        gradient = self.here.gradient[..., None]
+        return torch.linalg.solve_triangular(self.factor, gradient, upper=False).square().sum((-1, -2))
+
+    def moved(self, where: Tensor, free: Tensor, slope: Slope) -> "Evaluated":
+        """Rows `where` (B,) at `free` (B, P) with the slope there; Jacobian and Hessian stay as they were."""
+        old, rows = self.here, where[:, None]
+        here = Linearisation(
+            torch.where(rows, slope.squared, old.squared),
+            torch.where(where, slope.prior, old.prior),
+            torch.where(rows, slope.gradient, old.gradient),
+            old.hessian,
         )
+        xyz = torch.where(rows[..., None], slope.xyz, self.xyz)
+        return replace(self, free=torch.where(rows, free, self.free), xyz=xyz, here=here)
+
+    def put(self, index: Tensor, other: "Evaluated") -> None:
+        """Write the rows of `other` over the rows `index` (R,)."""
+        for own, new in ((self, other), (self.here, other.here)):
+            for name, value in vars(own).items():
+                if name != "here":
+                    value.index_copy_(0, index, getattr(new, name))
+
+
+def factored(hessian: Tensor) -> Tensor:
+    """Lower Cholesky factor of Hessians (B, P, P), with next to no information about the root added.
+
+    Priors say nothing about rotation and place of the root. Where too few joints are left to determine them, as in
+    some leave-one-out passes, they are known to a radian and a metre.
+    """
+    added = hessian.new_zeros(hessian.shape[-1])
+    added[10:13] = added[-3:] = 1.0
+    return torch.linalg.cholesky_ex(hessian + torch.diag(added))[0]
 
 
 class BodyEnergy:
@@ -148,16 +208,9 @@ class BodyEnergy:
         self._hidden = torch.from_numpy(np.setdiff1d(np.arange(NUM_ANGLES), self.angles))
         self._visible = torch.from_numpy(self.angles)
         self._pose = PoseEnergy(prior, self.angles, self.dtype)
-        # From free parameters to the model's 85 columns: identity, but right Jacobians for the angles.
-        spread = torch.zeros(10 + 72 + 3, self.num_free, dtype=self.dtype)
-        spread[:13, :13] = torch.eye(13)
-        spread[-3:, -3:] = torch.eye(3)
-        self._spread = spread
-        joint = torch.from_numpy(visible)
-        within = torch.arange(3)
-        place = torch.arange(len(visible))
-        self._block_rows = (13 + 3 * joint[:, None] + within)[:, :, None]
-        self._block_columns = (13 + 3 * place[:, None] + within)[:, None, :]
+        columns = 13 + self._visible
+        self._columns = torch.cat((torch.arange(13), columns, torch.arange(-3, 0) + 85))
+        self._visible_joints = 1 + torch.from_numpy(visible)
 
     def complete(self, free: Tensor) -> BodyParameters:
         """The body (B rows) of free parameters (B, P); invisible joints are where the prior expects them."""
@@ -178,11 +231,10 @@ class BodyEnergy:
 
     def keypoints_with_jacobian(self, free: Tensor) -> tuple[Tensor, Tensor]:
         """Keypoints (B, K, 3) and their Jacobian by the free parameters (B, 3 K, P)."""
-        xyz, jacobian = self.model.keypoints_with_jacobian(self.complete(free))
-        spread = self._spread.repeat(len(free), 1, 1)
-        blocks = right_jacobian(free[:, self._angle_slice].unflatten(1, (-1, 3)))
-        spread[:, self._block_rows, self._block_columns] = blocks
-        return xyz, jacobian.flatten(1, 2) @ spread
+        tangents = torch.eye(3, dtype=self.dtype).repeat(len(free), 24, 1, 1)
+        tangents[:, self._visible_joints] = right_jacobian(free[:, self._angle_slice].unflatten(1, (-1, 3)))
+        xyz, jacobian = self.model.keypoints_with_jacobian(self.complete(free), tangents)
+        return xyz, jacobian.flatten(1, 2).index_select(2, self._columns)
 
     def evaluate(
         self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor, held: "Held | None" = None
@@ -190,7 +242,7 @@ class BodyEnergy:
         """What `linearise` gives, with keypoints and Jacobian."""
         xyz, jacobian = self.keypoints_with_jacobian(free)
         here = self.linearise_at(free, xyz, jacobian, targets, kernel_scale, held)
-        return Evaluated(free, xyz, jacobian, here)
+        return Evaluated(free, xyz, jacobian, here, factored(here.hessian))
 
     def linearise(
         self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor, held: "Held | None" = None
@@ -221,10 +273,10 @@ class BodyEnergy:
         prior = self._add_priors(free, gradient, hessian, held)
         return Linearisation(squared, prior, gradient, hessian)
 
-    def gradient(
+    def slope(
         self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor, held: "Held | None" = None
-    ) -> Tensor:
-        """(B, P) half the gradient, as in `linearise` at 40 % of the cost, for optimisers that need no more."""
+    ) -> Slope:
+        """Keypoints, energy and gradient at free parameters (B, P), with the kernel's scale (B, 1)."""
         body, points = self.complete(free), self.model.keypoint_points
         local = exp_so3(torch.cat((body.global_orient[:, None], body.body_pose), 1))
         rotations = accumulate(local)
@@ -232,7 +284,8 @@ class BodyEnergy:
         feature = None if points.offsets_pose is None else blend
         xyz, arms = points.positions_with_arms(rotations, body.betas, body.transl, feature)
         residual = (targets.root @ (xyz - targets.xyz)[..., None]).squeeze(-1)
-        weight = robust_weight(residual.square().sum(-1), kernel_scale)[..., None]
+        squared = residual.square().sum(-1)
+        weight = robust_weight(squared, kernel_scale)[..., None]
         forces = (targets.root @ (weight * residual)[..., None]).squeeze(-1)
         by_column = points.pull_back(forces, arms, rotations, local)
         angles = free[:, self._angle_slice]
@@ -241,7 +294,8 @@ class BodyEnergy:
         turned = (right_jacobian(angles.unflatten(1, (-1, 3))).mT @ torques[..., None]).flatten(1)
         by_betas = by_column[:, :10] + stiffness * away
         by_angles = turned + pose.gradient
-        return torch.cat((by_betas, by_column[:, 10:13], by_angles, by_column[:, -3:]), 1)
+        gradient = torch.cat((by_betas, by_column[:, 10:13], by_angles, by_column[:, -3:]), 1)
+        return Slope(xyz, squared, (stiffness * away.square()).sum(-1) + pose.energy, gradient)
 
     def _add_priors(self, free: Tensor, gradient: Tensor, hessian: Tensor, held: "Held | None") -> Tensor:
         """Add the gradients and Hessians of shape and pose prior in place; returns their energy (B,)."""

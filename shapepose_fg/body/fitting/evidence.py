@@ -50,6 +50,10 @@ class Evidence:
     centre: Array
     """(B, 3) mean of the joints with full information, metres."""
 
+    def rows(self, index: NDArray[np.intp]) -> "Evidence":
+        """The rows `index` (R,)."""
+        return Evidence(*(value[index] for value in vars(self).values()))
+
 
 def weigh(targets: JointTargets, config: EvidenceConfig) -> Evidence:
     """Judge the rows, and add the model's error to every target.
@@ -66,9 +70,8 @@ def weigh(targets: JointTargets, config: EvidenceConfig) -> Evidence:
     full = values[..., 0] > 1 / config.seen_sigma_m**2
     count = full.sum(axis=1)
     centre = np.where(full[..., None], xyz, 0.0).sum(axis=1) / np.maximum(count, 1)[:, None]
-    spread = spread_m(xyz - centre[:, None], full)
     status = np.full(len(xyz), FitStatus.OK, dtype=_STATUS_TYPE)
-    status[(count < config.min_joints) | (spread < config.min_spread_m)] = FitStatus.TOO_FEW_JOINTS
+    status[~determine_pose(xyz, full, config)] = FitStatus.TOO_FEW_JOINTS
     status[~valid] = FitStatus.INVALID_TARGETS
     half = np.sqrt(values / (1 + values * config.model_sigma_m**2))
     root = (vectors * half[..., None, :]) @ vectors.swapaxes(-1, -2)
@@ -76,14 +79,16 @@ def weigh(targets: JointTargets, config: EvidenceConfig) -> Evidence:
     return Evidence(status, xyz, root, np.where(full, variance, np.inf), centre)
 
 
-def spread_m(centred: Array, used: NDArray[np.bool_]) -> Array:
-    """How far the joints `used` (B, K) lie off their best line: root mean square, metres (B,).
-
-    `centred` (B, K, 3) are their places with the mean taken away.
-    """
-    points = centred * used[..., None]
-    scatter = points.swapaxes(-1, -2) @ points / np.maximum(used.sum(axis=1), 1)[:, None, None]
-    return np.sqrt(np.maximum(np.linalg.eigvalsh(scatter)[:, :2].sum(axis=1), 0.0))
+def determine_pose(xyz: Array, used: NDArray[np.bool_], config: EvidenceConfig) -> NDArray[np.bool_]:
+    """(...) whether the joints `used` (..., K) of `xyz` (..., K, 3) are enough, and do not lie on a line."""
+    count = used.sum(axis=-1)
+    points = np.where(used[..., None], xyz, 0.0)
+    centre = points.sum(axis=-2) / np.maximum(count, 1)[..., None]
+    points = np.where(used[..., None], points - centre[..., None, :], 0.0)
+    scatter = points.swapaxes(-1, -2) @ points / np.maximum(count, 1)[..., None, None]
+    # How far they lie off their best line, squared, is what the largest eigenvalue leaves of the trace.
+    off = np.maximum(np.linalg.eigvalsh(scatter)[..., :2].sum(axis=-1), 0.0)
+    return (count >= config.min_joints) & (off >= config.min_spread_m**2)
 
 
 def _refuse_nonsense(targets: JointTargets) -> tuple[Array, Array, NDArray[np.bool_]]:

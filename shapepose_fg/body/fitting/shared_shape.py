@@ -8,43 +8,52 @@ from torch import Tensor
 from shapepose_fg.body.fitting.energy import Held
 
 
-def pooled_betas(free: Tensor, hessian: Tensor, groups: NDArray[np.intp], held: Held) -> Tensor:
-    """Shapes (B, 10) at which the rows of each group agree best, to first order; single rows keep their own.
+def shape_precision(hessian: Tensor) -> Tensor:
+    """(B, 10, 10) what each row alone knows of its betas: the Schur complement of its Hessian (B, P, P)."""
+    factor, _ = torch.linalg.cholesky_ex(hessian[:, 10:, 10:])
+    across = hessian[:, 10:, :10]
+    return hessian[:, :10, :10] - across.mT @ torch.cholesky_solve(across, factor)
 
-    A row's fit is a Gaussian belief about its betas: precision S, the Schur complement of its `hessian` (B, P, P),
-    around `free[:, :10]`. Taken out of it, what the row was held by leaves what its joints said, so that what a
-    group was held by counts once, not once a row:
+
+def pooled_betas(
+    alone: Tensor, precision: Tensor, pool: NDArray[np.intp], votes: NDArray[np.bool_], held: Held
+) -> Tensor:
+    """Shapes (B, 10) at which the rows of each `pool` (B,) agree best, to first order; single rows keep their own.
+
+    A row's fit is a Gaussian over its betas: `precision` S (B, 10, 10) around the shape `alone` (B, 10). Taken out
+    of it, what the row was held by leaves what its joints said, so that what a pool was held by counts once, not
+    once a row:
 
         (W + sum_i (S_i - W)) b = W c + sum_i (S_i b_i - W c_i)
 
-    with W the stiffness and c_i where row i was held. Bone lengths that were well seen decide.
+    with W the stiffness and c_i where row i was held. Bone lengths that were well seen decide. Rows that do not
+    vote (B,) take the shape of the others.
     """
-    rest = hessian[:, 10:, 10:]
-    factor, _ = torch.linalg.cholesky_ex(rest)
-    across = hessian[:, 10:, :10]
-    precision = hessian[:, :10, :10] - across.mT @ torch.cholesky_solve(across, factor)
     eye = held.stiffness[..., None] * torch.eye(10)
-    centre = held.betas.expand(len(free), 10)
+    centre = held.betas.expand(len(alone), 10)
     own = precision - eye
-    said = (precision @ free[:, :10, None] - eye @ centre[..., None]).squeeze(-1)
-    _, place, size = np.unique(groups, return_inverse=True, return_counts=True)
-    index = torch.from_numpy(place)
-    count = torch.from_numpy(size).to(free.dtype)
+    said = (precision @ alone[..., None] - eye @ centre[..., None]).squeeze(-1)
+    _, place = np.unique(pool, return_inverse=True)
+    size = np.bincount(place, weights=votes)
+    index, used = torch.from_numpy(place), torch.from_numpy(votes)
+    count = torch.from_numpy(np.maximum(size, 1)).to(alone.dtype)
 
     def summed(values: Tensor) -> Tensor:
-        return values.new_zeros(len(size), *values.shape[1:]).index_add_(0, index, values)
+        zeros = values.new_zeros(len(size), *values.shape[1:])
+        return zeros.index_add_(0, index[used], values[used])
 
     mean_centre = summed(centre) / count[:, None]
     weight = summed(eye.expand_as(own)) / count[:, None, None]
+    weight[torch.from_numpy(size == 0)] = torch.eye(10, dtype=weight.dtype)
     right = (weight @ mean_centre[..., None]).squeeze(-1) + summed(said)
     betas = torch.linalg.solve(weight + summed(own), right)[index]
-    return torch.where((count[index] > 1)[:, None], betas, free[:, :10])
+    return torch.where(shared(pool, votes)[:, None], betas, alone)
 
 
-def shared(groups: NDArray[np.intp]) -> Tensor:
-    """(B,) which rows are not alone in their group."""
-    _, place, size = np.unique(groups, return_inverse=True, return_counts=True)
-    return torch.from_numpy(size[place] > 1)
+def shared(pool: NDArray[np.intp], votes: NDArray[np.bool_]) -> Tensor:
+    """(B,) which rows take a shape that others of their `pool` (B,) have a part in."""
+    _, place = np.unique(pool, return_inverse=True)
+    return torch.from_numpy((np.bincount(place, weights=votes)[place] - votes) > 0)
 
 
 def check_groups(groups: NDArray[np.intp], rows: int) -> NDArray[np.intp]:

@@ -34,7 +34,7 @@ class FitterWeights:
     body: str
     """Fingerprint of the body model it was trained on (see `fingerprint`)."""
     spread: Tensor = field(default_factory=lambda: torch.ones(len(BODY_POINTS)))
-    """(K,) by which the variance of each of `BODY_POINTS` is multiplied where it has no target: calibrated."""
+    """(K,) by which the variance of each of `BODY_POINTS` without its own target is multiplied: calibrated."""
     card: dict[str, str] = field(default_factory=dict)
     """What it was trained on, by which command, and its errors."""
 

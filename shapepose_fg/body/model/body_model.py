@@ -177,15 +177,18 @@ class BodyModel:
         return self.keypoint_points.positions(rotations, parameters.betas, parameters.transl, feature)
 
     @torch.no_grad()
-    def keypoints_with_jacobian(self, parameters: BodyParameters) -> tuple[Tensor, Tensor]:
+    def keypoints_with_jacobian(
+        self, parameters: BodyParameters, tangents: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Keypoints (B, K, 3) and their analytic Jacobian (B, K, 3, 85); carries no autograd graph.
 
         Columns: betas 10, global_orient 3, body_pose 23 x 3, transl 3. A rotation's columns are its right tangent
-        `R <- R exp(delta)`, the rotation being the joint's own, relative to its parent.
+        `R <- R exp(delta)`, the rotation being the joint's own, relative to its parent; with `tangents` T
+        (B, 24, 3, 3) it is `R <- R exp(T delta)`: with T its right Jacobian the columns are those of axis-angles.
         """
         local, rotations = self._rotations(parameters)
         return self.keypoint_points.positions_with_jacobian(
-            rotations, parameters.betas, parameters.transl, local, self._blend_feature(local)
+            rotations, parameters.betas, parameters.transl, local, self._blend_feature(local), tangents
         )
 
     @property

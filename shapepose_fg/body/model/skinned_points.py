@@ -84,23 +84,33 @@ class SkinnedPoints:
         return terms.sum(-1) + self._anchor(betas, transl)
 
     def positions_with_jacobian(
-        self, rotations: Tensor, betas: Tensor, transl: Tensor, local: Tensor, pose_feature: Tensor | None
+        self,
+        rotations: Tensor,
+        betas: Tensor,
+        transl: Tensor,
+        local: Tensor,
+        pose_feature: Tensor | None,
+        tangents: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Positions (B, K, 3) and their Jacobian (B, K, 3, 85); `local` are the joints' own rotations.
 
-        Columns: betas 10, then 24 right tangents `R <- R exp(delta)` of the local rotations, then transl 3.
+        Columns: betas 10, then 24 right tangents `R <- R exp(T delta)` of the local rotations, with T of
+        `tangents` (B, 24, 3, 3) or the identity, then transl 3.
         """
+        axes = rotations if tangents is None else rotations @ tangents
         batch, count = len(betas), len(self.root)
         position = betas.new_empty(batch, count, 3)
         jacobian = betas.new_empty(batch, count, 3, NUM_COLUMNS)
         for start in range(0, batch, _CHUNK):
             part = slice(start, start + _CHUNK)
             feature = None if pose_feature is None else pose_feature[part]
-            arms = self._write_turns(jacobian[part], rotations[part], self._offsets(betas[part], feature))
+            offsets = self._offsets(betas[part], feature)
+            arms = self._write_turns(jacobian[part], rotations[part], axes[part], offsets)
             torch.add(arms, self._anchor(betas[part], transl[part]), out=position[part])
             self._write_shape(jacobian[part], rotations[part])
             if self.offsets_pose is not None:
-                self._add_pose_blend(jacobian[part], rotations[part], local[part])
+                turns = None if tangents is None else tangents[part]
+                self._add_pose_blend(jacobian[part], rotations[part], local[part], turns)
         jacobian[..., -3:] = self.translation[:, None, None] * torch.eye(3, dtype=betas.dtype)
         return position, jacobian
 
@@ -157,14 +167,14 @@ class SkinnedPoints:
         x, y, z = offsets[:, :, :1], offsets[:, :, 1:2], offsets[:, :, 2:]
         return torch.addcmul(torch.addcmul(columns[0] * x, columns[1], y), columns[2], z)
 
-    def _write_turns(self, jacobian: Tensor, rotations: Tensor, offsets: Tensor) -> Tensor:
-        """Fills the columns of the rotations; returns sum_j R_j d_kj (B, K, 3).
+    def _write_turns(self, jacobian: Tensor, rotations: Tensor, axes: Tensor, offsets: Tensor) -> Tensor:
+        """Fills the columns of the rotations about `axes` A (B, 24, 3, 3); returns sum_j R_j d_kj (B, K, 3).
 
-        With p the sum of the terms that hang on joint j, column c is `R_j[:, c] x p`.
+        With p the sum of the terms that hang on joint j, column c is `A_j[:, c] x p`.
         """
         # Each lever arm three times over, once per column of R_j: the product below writes that layout itself.
         arms = self._terms(rotations, offsets) @ self.subtree.repeat_interleave(3, dim=1)
-        rows = rotations.permute(0, 2, 1, 3).flatten(2)[:, :, None]  # (B, 3, 1, 72)
+        rows = axes.permute(0, 2, 1, 3).flatten(2)[:, :, None]  # (B, 3, 1, 72)
         for x, y, z in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
             column = jacobian[:, :, x, 10:-3]
             torch.mul(rows[:, y], arms[:, :, z], out=column)
@@ -179,7 +189,7 @@ class SkinnedPoints:
         product = (stacked @ slopes).view(batch, 3, count, 10).transpose(1, 2)
         torch.add(product, self.root_shape.permute(1, 2, 0), out=jacobian[..., :10])
 
-    def _add_pose_blend(self, jacobian: Tensor, rotations: Tensor, local: Tensor) -> None:
+    def _add_pose_blend(self, jacobian: Tensor, rotations: Tensor, local: Tensor, tangents: Tensor | None) -> None:
         """Adds what a joint's own rotation does through the pose blend shapes."""
         assert self.offsets_pose is not None
         batch, count = jacobian.shape[:2]
@@ -190,6 +200,8 @@ class SkinnedPoints:
         generators = local.new_tensor([[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]],
                                        [[0, -1, 0], [1, 0, 0], [0, 0, 0]]])  # fmt: skip
         entries = (local[:, 1:, None] @ generators).flatten(-2).transpose(-1, -2)  # (B, 23, 9, 3)
+        if tangents is not None:
+            entries = entries @ tangents[:, 1:]
         turned = by_entry.permute(0, 3, 2, 1, 4).flatten(2, 3) @ entries  # (B, 23, 3K, 3)
         turned = turned.unflatten(2, (count, 3)).permute(0, 2, 3, 1, 4).flatten(-2)
         jacobian[..., 13:-3] += turned

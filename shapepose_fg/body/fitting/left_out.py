@@ -1,0 +1,154 @@
+"""Leave-one-out: which targets are taken out together, and the passes of a fit that never see them."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from shapepose_fg.body.fitting.energy import BodyEnergy, Held, WhitenedTargets
+from shapepose_fg.body.fitting.evidence import Evidence, EvidenceConfig, determine_pose
+from shapepose_fg.body.fitting.pose_prior import PosePrior
+
+Array = NDArray[np.float64]
+
+_POSES = 8
+"""Poses of the prior at which the coupling of joints is linearised."""
+_ROOT_INFORMATION = 1e-2
+"""Of the root's rotation and place in that linearisation, 1/rad² and 1/m²: next to nothing."""
+
+
+@dataclass(frozen=True)
+class Passes:
+    """M fits to the targets of R rows: first each row with all its targets, then with some of them left out.
+
+    A joint's prior is taken from a pass that saw none of its targets: the gain on its own noise is 0 by
+    construction, not to first order.
+    """
+
+    row: NDArray[np.intp]
+    """(M,) whose targets; the first R are 0 to R - 1."""
+    without: NDArray[np.bool_]
+    """(M, J) targets that are left out."""
+    pool: NDArray[np.intp]
+    """(M,) passes with the same number get one shape: rows of one group, with the same targets left out of all."""
+    votes: NDArray[np.bool_]
+    """(M,) whether a pass has a part in its pool's shape."""
+    source: NDArray[np.intp]
+    """(R, J) the pass from which each joint's prior is taken."""
+
+    def __len__(self) -> int:
+        """Count of passes, M."""
+        return len(self.row)
+
+    @property
+    def num_rows(self) -> int:
+        """Count of rows, R."""
+        return len(self.source)
+
+    def chunks(self, size: int) -> Iterator[NDArray[np.intp]]:
+        """Indices of all passes, at most `size` at a time: those with all targets, then those without some."""
+        for start, stop in ((0, self.num_rows), (self.num_rows, len(self))):
+            yield from (np.arange(at, min(at + size, stop)) for at in range(start, stop, size))
+
+    def asked(self, index: NDArray[np.intp]) -> NDArray[np.intp]:
+        """(B, N) joints that some passes are for: all, or those left out, of some sets others too."""
+        without = self.without[index]
+        if not without.any():
+            return np.broadcast_to(np.arange(without.shape[1]), without.shape)
+        return np.argsort(~without, axis=1, kind="stable")[:, : self.without.sum(axis=1).max()]
+
+    def targets(self, xyz: Array, root: Array, index: NDArray[np.intp]) -> WhitenedTargets:
+        """The targets of some passes, single precision, from those of the rows: (R, J, 3) and (R, J, 3, 3)."""
+        kept, row = ~self.without[index], self.row[index]
+        parts = (xyz[row], root[row] * kept[..., None, None])
+        return WhitenedTargets(*(torch.from_numpy(part).float() for part in parts))
+
+    def variance(self, variance: Array, index: NDArray[np.intp]) -> Array:
+        """(B, J) variance of each target of some passes, infinite where it is left out, from that of the rows."""
+        return np.where(self.without[index], np.inf, variance[self.row[index]])
+
+
+def plan_passes(
+    evidence: Evidence, sets: NDArray[np.intp], groups: NDArray[np.intp], config: EvidenceConfig
+) -> Passes:
+    """One pass with all targets for each row (R), one more for every set of joints (J,) to leave out.
+
+    A set without a target in any row of a group (R,) needs no pass. Where what is left would not determine the
+    pose, the joints of the set are left out one by one; these passes take the shape of their group's others.
+    """
+    seen, full = evidence.root.any(axis=(2, 3)), np.isfinite(evidence.variance_m2)
+    R, J, S = *seen.shape, sets.max() + 1
+    member = sets == np.arange(S)[:, None]  # (S, J)
+    _, group = np.unique(groups, return_inverse=True)
+    asked = np.zeros((group.max() + 1, S), dtype=bool)
+    np.logical_or.at(asked, group, seen @ member.T)
+    determined = determine_pose(evidence.xyz[:, None], full[:, None] & ~member, config)  # (R, S)
+    together = np.argwhere(asked[group] & determined)
+    singly = np.argwhere((asked[group] & ~determined)[:, sets])
+    source = np.repeat(np.arange(R)[:, None], S, axis=1)
+    source[together[:, 0], together[:, 1]] = R + np.arange(len(together))
+    source = source[:, sets]
+    source[singly[:, 0], singly[:, 1]] = R + len(together) + np.arange(len(singly))
+    of_set = np.concatenate([np.full(R, -1), together[:, 1], sets[singly[:, 1]]])
+    row = np.concatenate([np.arange(R), together[:, 0], singly[:, 0]])
+    without = np.concatenate(
+        [np.zeros((R, J), dtype=bool), member[together[:, 1]], np.eye(J, dtype=bool)[singly[:, 1]]]
+    )
+    votes = np.arange(len(row)) < R + len(together)
+    return Passes(row, without, group[row] * (S + 1) + of_set + 1, votes, source)
+
+
+def left_out_sets(energy: BodyEnergy, prior: PosePrior, count: int) -> NDArray[np.intp]:
+    """Which of `count` sets each joint (J,) is left out with: joints that tell little of each other.
+
+    The cost of a pair is how much less certain each of the two is when the other is missing too (`_coupling`); the
+    sum over all pairs in one set is made small by placing joint by joint, then moving and exchanging them.
+    """
+    cost = _coupling(energy, prior)
+    sets = np.full(len(cost), -1)
+    for joint in np.argsort(-cost.sum(axis=1), kind="stable"):
+        sets[joint] = np.argmin([cost[joint, sets == each].sum() for each in range(count)])
+    while True:
+        by_set = cost @ (sets[:, None] == np.arange(count))  # (J, S) cost of each joint in each set
+        own = by_set[np.arange(len(sets)), sets]
+        moved = by_set - own[:, None]
+        swapped = moved[:, sets] + moved[:, sets].T - 2 * cost
+        swapped[sets[:, None] == sets] = 0.0
+        if min(moved.min(), swapped.min()) > -1e-9:
+            return sets
+        if moved.min() <= swapped.min():
+            joint, to = np.unravel_index(moved.argmin(), moved.shape)
+            sets[joint] = to
+        else:
+            one, other = np.unravel_index(swapped.argmin(), swapped.shape)
+            sets[one], sets[other] = sets[other], sets[one]
+
+
+def _coupling(energy: BodyEnergy, prior: PosePrior) -> Array:
+    """(J, J) how much a pair of joints costs that are left out together, nats.
+
+    With P the covariance of all joints under the priors and K = (P + model_sigma² I)^-1, the joints A are
+    predicted from all others with the covariance K_AA^-1. Leaving b out with a widens a's part of it.
+    """
+    free = torch.zeros(_POSES, energy.num_free, dtype=energy.dtype)
+    poses = prior.sample(np.random.default_rng(0), _POSES).reshape(_POSES, -1)
+    free[:, 13:-3] = torch.from_numpy(poses[:, energy.angles]).to(energy.dtype)
+    count = len(energy.model.keypoint_names)
+    nothing = WhitenedTargets(free.new_zeros(_POSES, count, 3), free.new_zeros(_POSES, count, 3, 3))
+    body = energy.evaluate(free, nothing, free.new_ones(1), Held.by_priors())
+    H, J = body.here.hessian.double().numpy(), body.jacobian.double().numpy()
+    root = [10, 11, 12, -3, -2, -1]
+    H[:, root, root] += _ROOT_INFORMATION
+    covariance = J @ np.linalg.solve(H, J.swapaxes(1, 2)) + EvidenceConfig.model_sigma_m**2 * np.eye(3 * count)
+    K = np.linalg.inv(covariance).reshape(_POSES, count, 3, count, 3).swapaxes(2, 3)  # (N, J, J, 3, 3)
+    own = K[:, np.arange(count), np.arange(count)]
+    # The Schur complement: K_aa - K_ab K_bb^-1 K_ba is a's information when b is missing too.
+    less = own[:, :, None] - K @ np.linalg.solve(own[:, None], K.swapaxes(-1, -2))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        widened = np.linalg.slogdet(own)[1][:, :, None] - np.linalg.slogdet(less)[1]
+    cost = np.nan_to_num(widened, nan=0.0, posinf=0.0).mean(axis=0) / 2
+    cost = cost + cost.T
+    np.fill_diagonal(cost, 0.0)
+    return cost

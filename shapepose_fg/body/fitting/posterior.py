@@ -1,0 +1,134 @@
+"""What fits say of joints: places with covariances, given all targets and without each joint's own."""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from shapepose_fg.body.fitting.energy import BodyEnergy, Evaluated, factored
+from shapepose_fg.body.fitting.evidence import Evidence
+from shapepose_fg.body.fitting.fitter import BodyFit, FitStatus
+from shapepose_fg.body.fitting.left_out import Passes
+
+Array = NDArray[np.float64]
+
+LIMB_M = 0.4
+"""Radius on which the end of a swinging limb moves, for the curvature that a linearisation leaves out.
+
+Chosen so that hidden wrists, arms and legs of held-out motions lie where their covariance says."""
+
+
+@dataclass(frozen=True)
+class JointPosterior:
+    """What B passes say of their joints."""
+
+    free: Array
+    """(B, P) parameters of the body."""
+    xyz: Array
+    """(B, J, 3) joints, metres."""
+    covariance: Array
+    """(B, N, 3, 3) of the joints that were asked for (`Passes.asked`), m² (Laplace)."""
+    squared: Array
+    """(B, J) squared Mahalanobis distance of each joint to its target."""
+    left: Array
+    """(B,) by how much a Newton step would still lower the energy."""
+
+    @classmethod
+    def of(cls, body: Evaluated, asked: NDArray[np.intp]) -> "JointPosterior":
+        """From bodies and the joints (B, N) whose covariance is asked for."""
+        by_joint = body.jacobian.unflatten(1, (-1, 3))
+        if asked.shape[1] == by_joint.shape[1]:  # with all targets: in double precision
+            covariance = joint_covariance(factored(body.here.hessian.double()), by_joint.double())
+        else:
+            rows = torch.arange(len(asked))[:, None]
+            covariance = joint_covariance(body.factor, by_joint[rows, torch.from_numpy(asked)])
+        parts = (body.free, body.xyz, covariance, body.here.squared, body.left)
+        return cls(*(part.double().numpy() for part in parts))
+
+    @classmethod
+    def concatenated(cls, parts: "list[JointPosterior]") -> "JointPosterior":
+        """The rows of all, in order."""
+        return cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))
+
+    def put(self, index: NDArray[np.intp], other: "JointPosterior") -> None:
+        """Write the rows of `other` over the rows `index`."""
+        for field in fields(self):
+            getattr(self, field.name)[index] = getattr(other, field.name)
+
+
+def joint_covariance(factor: Tensor, jacobian: Tensor) -> Tensor:
+    """(B, N, 3, 3) covariance A_i = J_i H^-1 J_iᵀ of joints around their fitted places (Laplace), m².
+
+    To first order a limb that may swing moves in a plane; in truth on a sphere. Where A_i is large, the sag
+    tr(A_i) / (2 LIMB_M) is added as a sigma along every axis: a hidden wrist is not a thin disc.
+
+    Parameters
+    ----------
+    factor: (B, P, P) lower Cholesky factor of the Hessian H.
+    jacobian: (B, N, 3, P) J_i, of some or all joints.
+    """
+    half = torch.linalg.solve_triangular(factor, jacobian.flatten(1, 2).mT, upper=False)
+    blocks = half.mT.unflatten(1, (-1, 3))
+    A = blocks @ blocks.mT
+    sag = torch.diagonal(A, dim1=-2, dim2=-1).sum(-1) / (2 * LIMB_M)
+    A = (A + A.mT) / 2  # to the last digit: products of single precision are not
+    return A + sag.square()[..., None, None] * torch.eye(3, dtype=A.dtype)
+
+
+def fill(
+    fit: BodyFit,
+    rows: NDArray[np.intp],
+    passes: Passes,
+    energy: BodyEnergy,
+    parts: list[JointPosterior],
+    evidence: Evidence,
+    spread: Array,
+    *,
+    model_sigma_m: float,
+    unfinished: float,
+) -> None:
+    """Fill `fit`'s `rows` (R,) with what the passes found: those with all targets, and those without some, if any.
+
+    `evidence` is that of the rows. Rows whose energy a Newton step would lower by more than `unfinished`, or that
+    are not finite, become NOT_CONVERGED. `spread` (J,) multiplies the variance of what is said of a joint without
+    its own target.
+    """
+    root, centre = evidence.root, evidence.centre
+    wider = spread[:, None, None]
+    unseen = np.all(root == 0, axis=(-1, -2))[..., None, None]
+    found = parts[0]
+    prior_xyz, prior_covariance = _left_out(passes, *parts)
+    information = np.square(root).sum(axis=(1, 2, 3)) / 3
+    done = found.left < unfinished  # NaN is not
+    done &= np.isfinite(prior_xyz).all(axis=(1, 2)) & np.isfinite(prior_covariance).all(axis=(1, 2, 3))
+    whole = energy.complete(torch.from_numpy(found.free[done]).to(energy.dtype))
+
+    fit.status[rows[~done]] = FitStatus.NOT_CONVERGED
+    rows, origin = rows[done], centre[done]
+    fit.betas[rows] = whole.betas.double().numpy()
+    fit.global_orient[rows] = whole.global_orient.double().numpy()
+    fit.body_pose[rows] = whole.body_pose.double().numpy()
+    fit.transl[rows] = whole.transl.double().numpy() + origin
+    fit.joints[rows] = found.xyz[done] + origin[:, None]
+    fit.covariance[rows] = np.where(unseen, wider * found.covariance, found.covariance)[done]
+    fit.prior_xyz[rows] = prior_xyz[done] + origin[:, None]
+    fit.prior_covariance[rows] = wider * prior_covariance[done] + model_sigma_m**2 * np.eye(3)
+    fit.residual_m[rows] = np.sqrt(found.squared.sum(axis=1) / information)[done]
+
+
+def _left_out(
+    passes: Passes, found: JointPosterior, left_out: JointPosterior | None = None
+) -> tuple[Array, Array]:
+    """Place (R, J, 3) and covariance (R, J, 3, 3) of each joint in the pass that never saw its targets."""
+    if left_out is None:
+        return found.xyz, found.covariance
+    R, J = passes.source.shape
+    xyz = np.concatenate([found.xyz, left_out.xyz])[passes.source, np.arange(J)]
+    covariance, index = found.covariance.copy(), np.arange(R, len(passes))
+    asked = passes.asked(index)
+    wanted = np.take_along_axis(passes.without[index], asked, axis=1)  # not what only fills up a smaller set
+    row = np.broadcast_to(passes.row[index, None], asked.shape)
+    covariance[row[wanted], asked[wanted]] = left_out.covariance[wanted]
+    return xyz, covariance
