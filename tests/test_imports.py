@@ -25,7 +25,7 @@ LEVELS = (
     "proposal",
     "estimation",
     "tracking",
-    "windows",
+    "windows bodies_over_time",
     "pipeline",
     "io",
     "simulation viewer",
