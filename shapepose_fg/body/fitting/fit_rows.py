@@ -63,7 +63,9 @@ class RowFitter:
         *,
         leave_out: bool = True,
     ) -> BodyFit:
-        """A body for every row; see `BodyFitter.fit`. Without `leave_out` priors of joints are NaN: much faster."""
+        """A body for every row; see `BodyFitter.fit`. Without `leave_out` priors of joints are NaN: much
+        faster.
+        """
         count = len(self.sets)
         if targets.xyz.shape[1] != count:
             raise ValueError(f"targets must be the {count} keypoints of the body, got {targets.xyz.shape[1]}")
