@@ -130,7 +130,7 @@ def reconstruct(
     settings = settings if temporal is None else replace(settings, temporal=temporal)
     if shapes is not None and not settings.temporal:
         raise InputError("--shapes: a person's shape is known over time only; leave out --shapes or --no-temporal")
-    fitter = _fitter(body, settings)
+    fitter = _fitter(body, settings, recording.skeleton.joints)
     known = None if shapes is None else _known_shapes(shapes, body)
     start = time.perf_counter()
     with _progress("reconstructing") as progress:
@@ -370,14 +370,14 @@ def _prepare(output: Path) -> None:
         ) from None
 
 
-def _fitter(body: Path | None, settings: "PipelineConfig") -> "BodyFitter | None":
+def _fitter(body: Path | None, settings: "PipelineConfig", joints: tuple[str, ...]) -> "BodyFitter | None":
     """The body fitter with the model of the file `body`; without one, the pipeline takes its own."""
     if body is None:
         return None
     from shapepose_fg.body.fitting.fitters import make_fitter
     from shapepose_fg.body.model.body_model import BodyModel
 
-    return make_fitter(settings.body, BodyModel.load(body))
+    return make_fitter(settings.body, BodyModel.load(body).with_keypoints(joints))
 
 
 @contextmanager
