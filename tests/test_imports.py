@@ -15,8 +15,8 @@ LEVELS = (
     "factors errors",
     "camera skeleton",
     "files provenance rendering run_summary columns body.threads",
-    "body.model",
-    "body.fitting body.shapes",
+    "body.model body.shapes",
+    "body.fitting",
     "body.offsets",
     "detections frame_times",
     "observations",
@@ -28,8 +28,10 @@ LEVELS = (
     "windows solved_rows",
     "pipeline",
     "io solving",
-    "evaluation simulation viewer",
-    "demo training tracks_command",
+    "simulation viewer",
+    "training",
+    "evaluation",
+    "demo tracks_command",
     "cli",
 )
 """Each level imports only from those before it; a package may import its own modules too."""
