@@ -148,3 +148,31 @@ def test_the_setup_of_a_result(scene, people, tmp_path):
         read_setup(folder, other, PipelineConfig)
     with pytest.raises(InputError, match=r"run.json: configuration is missing"):
         read_setup(folder, replace(loaded, run={}), PipelineConfig)
+
+
+def test_any_damaged_file_of_a_result_is_one_sentence(scene, people, tmp_path, capsys):
+    """Bytes of each file changed at random, then listed and corrected: an answer, or one sentence."""
+    rng, first = np.random.default_rng(0), int(people.person[0])
+    folder = saved(people, scene, tmp_path / "results")
+    assert run("tracks", folder, "rename", first, 30) == 0
+    kept = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    refused = 0
+    for name in ("run.json", "corrections.json", CAMERAS, "observations.npz", "people.npz"):
+        for _ in range(12):
+            for path, content in kept.items():
+                path.parent.mkdir(exist_ok=True)
+                path.write_bytes(content)
+            damaged = bytearray(kept[folder / name])
+            place = int(rng.integers(len(damaged)))
+            if rng.random() < 0.5:
+                damaged[place] = int(rng.integers(256))
+            else:
+                del damaged[place : place + int(rng.integers(1, 30))]
+            (folder / name).write_bytes(bytes(damaged))
+            capsys.readouterr()
+            for arguments in ((), ("drop", 30), ("undo",)):
+                code = run("tracks", folder, *arguments)
+                error = capsys.readouterr().err
+                assert code in (0, 2) and error.count("\n") == (code == 2), error
+                refused += code == 2
+    assert refused > 60
