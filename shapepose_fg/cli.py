@@ -417,9 +417,10 @@ def _summary(people: "Reconstruction", span: range, camera_count: int, seconds: 
     table.add_row(
         "frames", f"{len(span)} ({span.start}:{span.stop}) of {camera_count} cameras{rate_words(people.run)}"
     )
-    table.add_row(
-        "people", f"{len(people)} in all, {per_frame.mean():.1f} a frame ({per_frame.min()} to {per_frame.max()})"
-    )
+    over_time = people.run.get("configuration", {}).get("temporal", False)
+    count = f"{len(np.unique(people.person))} people over time" if over_time else "no identities"
+    table.add_row("people", f"{count}, {per_frame.mean():.1f} a frame ({per_frame.min()} to {per_frame.max()})")
+    table.add_row("rows", f"{len(people)} in all")
     for status, count in zip(*np.unique(people.status, return_counts=True), strict=True):
         table.add_row("", f"{count} {status}", style="green" if status == "ok" else "yellow")
     for reason, count in people.run.get("people", {}).get("dropped", {}).items():
