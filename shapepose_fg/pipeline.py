@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from shapepose_fg.bodies_over_time import SequenceFitting, with_bodies_over_time
 from shapepose_fg.body.fitting.bone_reach import longest_bones
 from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.fitting.fitters import BodyConfig, make_fitter
@@ -140,7 +141,10 @@ def reconstruct(
             done += count
             if progress is not None:
                 progress(done, len(frames))
-    people = Reconstruction.concatenate(parts) if parts else Reconstruction.empty(detections.skeleton.joints)
+        people = Reconstruction.concatenate(parts) if parts else Reconstruction.empty(detections.skeleton.joints)
+        if config.temporal and isinstance(fitter, SequenceFitting):
+            with run.stage("bodies over time"):
+                people = with_bodies_over_time(people, fitter, shapes)
     summary = run.summary(config, frames, people) | {"time": times.as_dict(), "cuts": list(cuts)}
     summary |= {"keypoint_offsets": None if offsets is None else offsets.as_dict()}
     return replace(people, run=summary)

@@ -25,7 +25,7 @@ LEVELS = (
     "proposal",
     "estimation",
     "tracking",
-    "windows solved_rows",
+    "windows bodies_over_time solved_rows",
     "pipeline",
     "io solving",
     "simulation viewer",

@@ -10,7 +10,15 @@ from numpy.typing import NDArray
 from factors import make_camera
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter
 from shapepose_fg.camera import Rig, Views
-from shapepose_fg.estimation.alternation import EstimatorConfig, Solution, Window, alternate
+from shapepose_fg.estimation.alternation import (
+    EstimatorConfig,
+    Solution,
+    Window,
+    alternate,
+    final_bodies,
+    joint_targets,
+)
+from shapepose_fg.estimation.draft import WholeFitter, drafted
 from shapepose_fg.estimation.linearisation import linearise, mean_confidence, observation_sigmas, triangulate
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.outcome import Problem, how_known, lasting_covariance, problems
@@ -100,6 +108,23 @@ class Estimator:
         solution = alternate(observations, views, sigmas, X, windows, self.fitter, config)
         return self._estimates(observations, sigmas, views, windows, X, solution)
 
+    def draft(
+        self, observations: Observations, views: Views | None = None
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """About where the joints of N rows are (N, J, 3), metres, and how surely (N, J, 3, 3), without any graph.
+
+        Enough to give detections out again: what the views say, and where that is little, or contradicts the body,
+        what the body says. A joint's views are in the body, too, so that these covariances are too small.
+        """
+        config = self.config
+        views = Views.of(self.rig) if views is None else views
+        X = triangulate(observations, views, config.observations)
+        sigmas = observation_sigmas(observations, X, views, config.observations)
+        evidence = linearise(observations, sigmas, X, views, config.observations)
+        enough = (evidence.sigma_m <= config.refine.max_sigma_m).sum(axis=1) >= config.refine.min_joints
+        whole = self.fitter.fit_whole if isinstance(self.fitter, WholeFitter) else self.fitter.fit
+        return drafted(evidence, whole(joint_targets(evidence, enough)), config.refine.disagreement)
+
     def _windows(
         self,
         observations: Observations,
@@ -154,10 +179,11 @@ class Estimator:
                 velocity[rows] = graph.velocity()
                 velocity_covariance[rows] = graph.marginals(graph.velocity_keys)
                 covariance[rows] += lasting_covariance(solution, window, self._motion.views.white_share)
+        fit = final_bodies(solution, covariance, windows, self.fitter)
         final = linearise(observations, sigmas, X, views, self.config.observations)
         wrong = problems(observations, windows, solution, first, covariance)
         enough = np.where(solution.enough, Status.BODY_UNDETERMINED, Status.TOO_FEW_VIEWS)
-        status = np.where(solution.fit.ok, Status.OK, enough)
+        status = np.where(fit.ok, Status.OK, enough)
         status[[problem.row for problem in wrong]] = Status.NOT_SOLVED
         return Estimates(
             joints=X,
@@ -168,7 +194,7 @@ class Estimator:
             inlier=solution.inlier,
             residual_px=final.residual_px,
             known=how_known(solution, covariance),
-            fit=solution.fit,
+            fit=fit,
             status=status,
             problems=wrong,
         )
