@@ -32,7 +32,7 @@ from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
 from shapepose_fg.estimation.window_graph import WindowGraphConfig
 from shapepose_fg.frame_times import FrameTimes, check_cuts, stretches
-from shapepose_fg.observation_table import Gate, ObservationTable, place_in_view
+from shapepose_fg.observation_table import place_in_view
 from shapepose_fg.observations import Observations
 from shapepose_fg.proposal.association import AssociationConfig, associate
 from shapepose_fg.proposal.candidates import CandidateConfig, triangulate_pairs, vote
@@ -40,6 +40,7 @@ from shapepose_fg.proposal.proposals import ProposalConfig, propose
 from shapepose_fg.provenance import versions
 from shapepose_fg.reconstruction import Reconstruction
 from shapepose_fg.skeleton import BODY_25, Skeleton
+from shapepose_fg.solved_rows import result_rows
 from shapepose_fg.tracking.following import FollowingConfig, Input
 from shapepose_fg.tracking.stitching import StitchingConfig, stitch
 from shapepose_fg.tracking.tracker import BodyScale, Tracker, TrackingConfig
@@ -283,40 +284,11 @@ def _rows(solved: Solved, rig: Rig, detections: DetectionSequence, config: Pipel
     order = np.lexsort((solved.observations.track, solved.observations.frame))
     rows, estimates = solved.observations.rows(order), solved.estimates.rows(order)
     person = rows.track if config.temporal else _number_in_frame(rows.frame)
-    fit = estimates.fit
-    body = {name: getattr(fit, name).copy() for name in ("betas", "global_orient", "body_pose", "transl")}
-    for values in body.values():
-        values[~fit.ok] = np.nan
-    joint_names = detections.skeleton.joints
     place = np.full(rows.candidate.shape, -1, dtype=np.int32)
     for frame in np.unique(rows.frame).tolist():
         of_frame = rows.frame == frame
         place[of_frame] = place_in_view(rows.candidate[of_frame], detections[frame].view)
-    table = ObservationTable.of(
-        rows,
-        place,
-        estimates.joints,
-        np.where(estimates.inlier, Gate.USED, Gate.TOO_FAR),
-        rig,
-        frame=rows.frame,
-        person=person,
-        joint_names=joint_names,
-    )
-    return Reconstruction(
-        frame=rows.frame,
-        person=person,
-        time_s=rows.time_s.mean(axis=1),
-        joint_names=np.array(joint_names),
-        joints=estimates.joints,
-        covariance=estimates.covariance,
-        velocity=estimates.velocity,
-        velocity_covariance=estimates.velocity_covariance,
-        known=estimates.known,
-        confidence=estimates.confidence,
-        status=estimates.status,
-        observations=table,
-        **body,
-    )
+    return result_rows(rows, estimates, place, rig, detections.skeleton.joints, person)
 
 
 def _stitched(
