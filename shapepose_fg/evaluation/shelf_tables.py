@@ -30,6 +30,7 @@ OTHERS = (
 """Other methods on the same frames and detections, by the same protocol."""
 
 
+@cache
 def shelf_steps(folder: Path) -> dict[str, ShelfScore]:
     """Scores on the Shelf recording: after stage I, of the bodies' joints, of the result without time and with."""
     truth = read_shelf_ground_truth(folder / "gt_dev.txt")
