@@ -6,10 +6,6 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 README, DOCS = ROOT / "README.md", ROOT / "docs"
 EVALUATION, SIMULATION, IMAGES = DOCS / "evaluation.md", DOCS / "simulation.md", DOCS / "images"
-    ROOT / "README.md",
-    ROOT / "docs" / "evaluation.md",
-    ROOT / "docs" / "simulation.md",
-)
 
 
 def write_table(name: str, text: str, *pages: Path) -> None:
