@@ -336,9 +336,7 @@ class _Run:
             "frames": [frames.start, frames.stop],
             "seconds": dict(self.seconds),
             "people": {
-                "found": len(people),
-                "status": dict(Counter(people.status.tolist())),
-                "joints": people.count_known(),
+                **people.counts(),
                 "dropped": {reason: count for reason, count in self.dropped.items() if count > 0},
             },
         }

@@ -12,7 +12,8 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 LEVELS = (
-    "factors errors camera skeleton",
+    "factors errors",
+    "camera skeleton",
     "files provenance rendering run_summary columns body.threads",
     "body.model body.shapes",
     "body.fitting",
@@ -24,6 +25,7 @@ LEVELS = (
     "proposal",
     "estimation",
     "tracking",
+    "windows",
     "pipeline",
     "io",
     "simulation viewer",

@@ -120,7 +120,12 @@ def alternate(
     moving = list(windows)
     for n in range(config.refine.alternations):
         rows = np.concatenate([window.rows for window in moving]) if moving else np.zeros(0, dtype=np.intp)
-        observed, sigma, here, start = observations.rows(rows), sigmas[rows], views.rows(rows), solution.joints[rows]
+        observed, sigma, here, start = (
+            observations.rows(rows),
+            sigmas[rows],
+            views.rows(rows),
+            solution.joints[rows],
+        )
         evidence = linearise(observed, sigma, start, here, config.observations)
         if n == 0:
             placed = evidence.sigma_m <= config.refine.max_sigma_m
@@ -191,7 +196,11 @@ def _by_window(values: NDArray, windows: Sequence[Window]) -> list[NDArray]:
 
 
 def _fit(
-    fitter: BodyFitter, targets: JointTargets, last: BodyFit, groups: NDArray[np.intp] | None, rows: NDArray[np.intp]
+    fitter: BodyFitter,
+    targets: JointTargets,
+    last: BodyFit,
+    groups: NDArray[np.intp] | None,
+    rows: NDArray[np.intp],
 ) -> BodyFit:
     """Fit some of the rows."""
     some = JointTargets(targets.xyz[rows], targets.information[rows])
@@ -217,9 +226,7 @@ def _message(
     targets = joint_targets(evidence, enough)
     for joints in sorted({each for window in windows for each in window.graph.coupled}, key=sorted):
         # Tied to each other, each would get the others' views twice: through the tie, and through the body.
-        tied = np.concatenate(
-            [np.full(len(w.rows), joints in w.graph.coupled) for w in windows]
-        )  # one flag a row
+        tied = np.concatenate([np.full(len(w.rows), joints in w.graph.coupled) for w in windows])  # one flag a row
         rows, columns = np.flatnonzero(tied), np.array(sorted(joints))
         information = targets.information.copy()
         information[:, columns] = 0.0
@@ -270,9 +277,7 @@ def interpolated(points: NDArray[np.float64], times_s: NDArray[np.float64]) -> N
     return result
 
 
-def near_in_time(
-    marked: NDArray[np.bool_], times_s: NDArray[np.float64], within_s: float
-) -> NDArray[np.bool_]:
+def near_in_time(marked: NDArray[np.bool_], times_s: NDArray[np.float64], within_s: float) -> NDArray[np.bool_]:
     """(T, J) which frames are at most `within_s` from one that is `marked` (T, J)."""
     first = np.searchsorted(times_s, times_s - within_s, side="left")
     last = np.searchsorted(times_s, times_s + within_s, side="right")

@@ -73,6 +73,31 @@ class RowFitter:
             self._fit_passes(fit, usable, rows, passes, start)
         return fit
 
+    def starts(self, evidence: Evidence) -> tuple[Tensor, Held, NDArray[np.bool_]]:
+        """Bodies of rows (R) with all their targets, nothing left out, each with a shape of its own.
+
+        Returns their parameters (R, P) around `evidence.centre`, what they are held by, and which (R,) are finished.
+        """
+        inside = torch.from_numpy(evidence.xyz - evidence.centre[:, None]).float()
+        targets, found, holds = WhitenedTargets(inside, torch.from_numpy(evidence.root).float()), [], []
+        for at in range(0, len(inside), _CHUNK):
+            part = slice(at, at + _CHUNK)
+            body, held = self.optimiser.first(targets[part], evidence.variance_m2[part], None)
+            found.append(torch.cat((body.free, (body.left < self.unfinished)[:, None]), 1))
+            holds.append(held.for_rows(len(body.free)))
+        free, held = torch.cat(found), Held.concatenated(holds)
+        free, done = free[:, :-1], free[:, -1].bool().numpy()
+        unsettled = np.flatnonzero(~done)
+        if self.fallback is not None and len(unsettled) > 0:
+            body, _ = self.fallback.first(
+                targets[torch.from_numpy(unsettled)], evidence.variance_m2[unsettled], None
+            )
+            free[unsettled], done[unsettled] = body.free, (body.left < self.unfinished).numpy()
+            held.betas[unsettled] = body.free[:, :10]
+            if held.angles is not None:
+                held.angles[unsettled] = body.free[:, 13:-3]
+        return free, held, done
+
     def _fit_passes(
         self, fit: BodyFit, evidence: Evidence, rows: NDArray[np.intp], passes: Passes, start: Tensor | None
     ) -> None:

@@ -1,4 +1,4 @@
-"""The X step: one person's graph against closed forms and against SciPy."""
+"""The X step: one person's graph of one frame and of many, against closed forms and against SciPy."""
 
 import gtsam
 import numpy as np
@@ -6,13 +6,16 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from factors import DEFAULT_WIDTH_SIGMA, split_key
+from factors import DEFAULT_WIDTH_SIGMA, make_camera, split_key
 from shapepose_fg.camera import Rig
-from shapepose_fg.estimation.person_graph import PersonGraph, PersonGraphConfig, make_cameras
+from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.window_graph import Message, WindowGraph, WindowGraphConfig
+from shapepose_fg.skeleton import BODY_25
 
-EXACT = PersonGraphConfig(max_iterations=100, tolerance=1e-12)
+EXACT = WindowGraphConfig(max_iterations=100, tolerance=1e-12)
 """Solved to the end, so that the comparison is with the minimum and not with the stopping rule."""
 NO_PRIOR = np.zeros(25, dtype=bool)
+MOTION = MotionModel.load(BODY_25.joints)
 
 
 @pytest.fixture(scope="module")
@@ -23,8 +26,46 @@ def person(five_cameras, two_people) -> tuple[NDArray[np.float64], NDArray[np.fl
     return two_people[0], xy + rng.normal(0, 6.0, xy.shape), rng.uniform(4.0, 12.0, xy.shape[:2])
 
 
-def graph_of(rig: Rig, xy, sigmas, config=EXACT, kernel=None, **names) -> PersonGraph:
-    return PersonGraph(make_cameras(rig), xy, sigmas, config, kernel, **names)
+def message(known, xyz, covariance) -> Message:
+    """What is said of the joints of `known` (..., J); the rest may be NaN."""
+    information = np.zeros(np.shape(covariance))
+    information[known] = np.linalg.inv(covariance[known])
+    return Message(np.array(xyz), information)
+
+
+class OneFrame:
+    """A window of one frame, gates and priors set one after the other, arrays without the frame's axis."""
+
+    def __init__(self, rig: Rig, xy, sigmas, config, kernel, person, frame) -> None:
+        cameras = [[make_camera(camera.K, camera.wTc) for camera in rig.cameras]]
+        self.window = WindowGraph(
+            cameras, xy[None], sigmas[None], config, kernel, MOTION, track=person, frames=[frame], times_s=[0.0]
+        )
+        self.inlier = np.ones(sigmas.shape, dtype=bool)
+        self.body = message(NO_PRIOR, np.zeros((25, 3)), np.zeros((25, 3, 3)))
+        self.keys = self.window.keys[0]
+        self.add = self.window.add
+
+    def set_gates(self, inlier) -> None:
+        self.inlier = inlier
+
+    def set_priors(self, pulled, mean, covariance) -> None:
+        self.body = message(pulled, mean, covariance)
+
+    def solve(self, initial):
+        body = Message(self.body.xyz[None], self.body.information[None])
+        return self.window.solve(self.inlier[None], body, body, initial[None])[0]
+
+    def covariance(self):
+        return self.window.marginals(self.window.keys)[0]
+
+    @property
+    def graph(self):
+        return self.window.graph
+
+
+def graph_of(rig: Rig, xy, sigmas, config=EXACT, kernel=None, person=0, frame=0) -> OneFrame:
+    return OneFrame(rig, xy, sigmas, config, kernel, person, frame)
 
 
 def numeric_jacobian(rig: Rig, point: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -175,11 +216,11 @@ def test_weights_divide_the_covariances(five_cameras, person):
     plain = graph_of(five_cameras, xy, sigmas)
     plain.solve(truth)
     heavy = graph_of(
-        five_cameras, xy, sigmas, PersonGraphConfig(weight_2d=4.0, max_iterations=100, tolerance=1e-12)
+        five_cameras, xy, sigmas, WindowGraphConfig(weight_2d=4.0, max_iterations=100, tolerance=1e-12)
     )
     heavy.solve(truth)
     np.testing.assert_allclose(4.0 * heavy.covariance(), plain.covariance(), rtol=1e-6)
-    body = graph_of(five_cameras, xy, 0.0 * sigmas, PersonGraphConfig(weight_shape=9.0))
+    body = graph_of(five_cameras, xy, 0.0 * sigmas, WindowGraphConfig(weight_shape=9.0))
     covariance = random_covariances(25, 0.05)
     body.set_priors(~NO_PRIOR, truth, covariance)
     body.solve(truth)
@@ -252,6 +293,6 @@ def test_a_bone_length_of_one_s_own_is_kept(five_cameras, person):
 
 def test_refuses_settings_that_make_no_sense():
     with pytest.raises(ValueError, match="weight_2d must be positive"):
-        PersonGraphConfig(weight_2d=0.0)
+        WindowGraphConfig(weight_2d=0.0)
     with pytest.raises(ValueError, match="rho_3d must be between 0 and 1"):
-        PersonGraphConfig(rho_3d=1.5)
+        WindowGraphConfig(rho_3d=1.5)
