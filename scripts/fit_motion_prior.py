@@ -35,8 +35,8 @@ def main() -> None:
     train = [index for index, clip in enumerate(clips) if split_of(clip.subject) == "train"]
     frames = sum(len(clips[index]) for index in train)
     provenance = (
-        f"{ACKNOWLEDGEMENT} Fitted by scripts/fit_motion_prior.py to {frames} frames at 30 a second of the training "
-        f"subjects (not {' '.join(TEST_SUBJECTS + VALIDATION_SUBJECTS)}): accelerations from frame to frame, "
+        f"{ACKNOWLEDGEMENT} Fitted by scripts/fit_motion_prior.py to {frames} frames of the training subjects "
+        f" (not {' '.join(TEST_SUBJECTS + VALIDATION_SUBJECTS)}): accelerations from frame to frame, "
         f"velocities over {STEP_S:g} s. Collars follow the arms; hands were not recorded and move as wrists."
     )
     prior = learn_motion_prior((clips[index] for index in train), weights[train], provenance)

@@ -163,6 +163,29 @@ def alternate(
     return solution
 
 
+def final_bodies(
+    solution: Solution,
+    covariance: NDArray[np.float64],
+    windows: Sequence[Window],
+    fitter: BodyFitter,
+) -> BodyFit:
+    """The bodies that are returned: fitted to the joints as they were solved, where more than views decided them.
+
+    In windows of several frames, and where there are factors of the user's own, the bodies follow motion and factors
+    so. What these bodies say goes nowhere else: joints and covariances are done.
+    """
+    chosen = [window for window in windows if window.graph.temporal or window.graph.touched.any()]
+    if len(chosen) == 0:
+        return solution.fit
+    rows = np.concatenate([window.rows for window in chosen])
+    xyz, information = solution.joints[rows], np.zeros((len(rows), *covariance.shape[1:]))
+    known = np.isfinite(xyz).all(axis=2) & np.isfinite(covariance[rows]).all(axis=(2, 3))
+    information[known] = np.linalg.inv(covariance[rows][known])
+    information = (information + information.swapaxes(2, 3)) / 2
+    fit = fitter.fit(JointTargets(np.nan_to_num(xyz), information), solution.fit.rows(rows), _groups(chosen))
+    return solution.fit.with_rows(rows[fit.ok], fit.rows(np.flatnonzero(fit.ok)))
+
+
 def disagreement(evidence: ViewEvidence, fit: BodyFit) -> NDArray[np.float64]:
     """How far (N, J) each joint's views put it from where the rest of the body puts it, in standard deviations.
 

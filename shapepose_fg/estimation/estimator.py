@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from factors import make_camera
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter
 from shapepose_fg.camera import Rig, Views
-from shapepose_fg.estimation.alternation import EstimatorConfig, Solution, Window, alternate
+from shapepose_fg.estimation.alternation import EstimatorConfig, Solution, Window, alternate, final_bodies
 from shapepose_fg.estimation.linearisation import linearise, mean_confidence, observation_sigmas, triangulate
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.outcome import Problem, how_known, lasting_covariance, problems
@@ -154,10 +154,11 @@ class Estimator:
                 velocity[rows] = graph.velocity()
                 velocity_covariance[rows] = graph.marginals(graph.velocity_keys)
                 covariance[rows] += lasting_covariance(solution, window, self._motion.views.white_share)
+        fit = final_bodies(solution, covariance, windows, self.fitter)
         final = linearise(observations, sigmas, X, views, self.config.observations)
         wrong = problems(observations, windows, solution, first, covariance)
         enough = np.where(solution.enough, Status.BODY_UNDETERMINED, Status.TOO_FEW_VIEWS)
-        status = np.where(solution.fit.ok, Status.OK, enough)
+        status = np.where(fit.ok, Status.OK, enough)
         status[[problem.row for problem in wrong]] = Status.NOT_SOLVED
         return Estimates(
             joints=X,
@@ -168,7 +169,7 @@ class Estimator:
             inlier=solution.inlier,
             residual_px=final.residual_px,
             known=how_known(solution, covariance),
-            fit=solution.fit,
+            fit=fit,
             status=status,
             problems=wrong,
         )

@@ -17,8 +17,8 @@ _WRISTS, _HANDS, _TOES = (20, 21), (22, 23), (10, 11)
 STEP_S = 1.0
 """Over which the random walk is measured, seconds: what is not seen moves as far as people do in that time."""
 FLOORS = (1.0, 0.1)
-"""Root densities of acceleration, rad/s^1.5, and velocity, rad/s^0.5, that nothing goes below: recorded knees and toes
-are hinges, and collars were not recorded."""
+"""Root densities of acceleration, rad/s^1.5, and velocity, rad/s^0.5, that no angle goes below: recorded knees and
+toes are hinges, and collars were not recorded."""
 WRAPS_RAD = 2.6
 """Angle of a joint from which on its axis-angle may jump to the other side of the turn."""
 

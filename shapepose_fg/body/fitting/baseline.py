@@ -13,8 +13,8 @@ from shapepose_fg.body.fitting.evidence import EvidenceConfig
 from shapepose_fg.body.fitting.fit_rows import RowFitter
 from shapepose_fg.body.fitting.fitter import BodyFit, JointTargets
 from shapepose_fg.body.fitting.left_out import left_out_sets
-from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.motion_prior import MotionPrior
+from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.pose_prior import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets

@@ -36,7 +36,7 @@ class SequenceConfig:
     """Steps of Levenberg-Marquardt, refused ones included."""
     tolerance: float = 0.05
     """A chain is done when a step lowers its energy by less than this a row, in squared standard deviations."""
-    segment_rows: int = 256
+    segment_rows: int = 320
     """Longer chains are cut, so that memory does not grow with them."""
     overlap_rows: int = 16
     """Rows that a cut-off segment has of its neighbours, on either side."""
@@ -122,7 +122,7 @@ class SequenceFitter:
         return SequenceFit(fit, numbers, known)
 
     def _start(self, evidence: Evidence, group: NDArray[np.intp], time_s: Array, count: int) -> "_Start":
-        """Bodies row by row; a row that has none starts as the nearest in time of its group, at a place between."""
+        """Bodies row by row; one that has none starts as the nearest in time of its group, at a place between."""
         ok = np.flatnonzero(evidence.status == FitStatus.OK)
         B, A = len(group), self.rows.energy.num_angles
         free, angles, found = torch.zeros(B, 16 + A), None, np.zeros(B, dtype=bool)
@@ -167,7 +167,7 @@ class SequenceFitter:
         prior = known.information * share[:, None, None]
         held = ChainShapes(torch.from_numpy(known.mean[owner]), torch.from_numpy(prior[owner]))
         free, found = solver.solve(start.free, start.rows, segments, held, fixed=False)
-        # Each segment's Gaussian without the prior: information S and S times its mean; rows that overlap count once.
+        # Each segment's Gaussian without the prior: information S, and S times its mean. Overlaps count once.
         kept = np.array([segment.kept.mean() for segment in segments])[:, None, None]
         S = kept * found.information.numpy()
         pull = kept * ((found.information + held.information) @ found.betas[..., None]
@@ -175,7 +175,7 @@ class SequenceFitter:
         total, right = prior.copy(), prior @ known.mean[..., None]
         np.add.at(total, owner, S)
         np.add.at(right, owner, pull)
-        mean = np.linalg.solve(total, right)[..., 0]
+        mean = np.asarray(np.linalg.solve(total, right)[..., 0], dtype=np.float64)
         shapes = Shapes(mean, known.information + (total - prior) / share[:, None, None])
         several = np.bincount(owner, minlength=len(mean)) > 1
         if several.any():

@@ -72,7 +72,7 @@ class _State:
 
 @dataclass(frozen=True)
 class _Normal:
-    """The energy of G chains and its normal equations; couplings of one row with the next are in `Motion`'s form."""
+    """The energy of G chains and its normal equations; couplings of rows are those of `MotionTerm`."""
 
     energy: Tensor
     """(G,)"""

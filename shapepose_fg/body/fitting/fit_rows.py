@@ -76,7 +76,7 @@ class RowFitter:
     def starts(self, evidence: Evidence) -> tuple[Tensor, Held, NDArray[np.bool_]]:
         """Bodies of rows (R) with all their targets, nothing left out, each with a shape of its own.
 
-        Returns their parameters (R, P) around `evidence.centre`, what they are held by, and which (R,) are finished.
+        Returns their parameters (R, P) around `evidence.centre`, what holds them, and which (R,) are finished.
         """
         inside = torch.from_numpy(evidence.xyz - evidence.centre[:, None]).float()
         targets, found, holds = WhitenedTargets(inside, torch.from_numpy(evidence.root).float()), [], []
