@@ -37,7 +37,7 @@ def shelf_steps(folder: Path) -> dict[str, ShelfScore]:
     rig = read_rig(folder / "calibration.json")
     detections = read_detections(folder, rig)
     people = reconstruct(detections, rig, CONFIG)
-    before = replace(people, joints=before_refinement(detections, rig, CONFIG).joints)
+    before = before_refinement(detections, rig, CONFIG)
     bodies = replace(people, joints=body_joints(people))
     steps = {"stage I alone": before, "bodies' joints": bodies, "**shapepose-fg, without time**": people}
     steps["**shapepose-fg, with time**"] = reconstruct(detections, rig, replace(CONFIG, temporal=True))
