@@ -1,4 +1,4 @@
-"""GTSAM factors for people seen by calibrated cameras: keys, noise, projection, body priors.
+"""GTSAM factors for people seen by calibrated cameras: keys, noise, projection, body priors, motion.
 
 Only GTSAM and NumPy. A builder takes keys, arrays and noise and returns native `gtsam.NonlinearFactor`s for
 a graph of your own. Units: metres in the world, pixels in the image; cameras look along +z, x right, y down.
@@ -12,10 +12,14 @@ from factors.keys import (
     format_key,
     joint_key,
     joint_keys,
+    offset_key,
+    offset_keys,
     split_camera_key,
     split_key,
     velocity_key,
+    velocity_keys,
 )
+from factors.motion import lasting_prior_factors, motion_covariance, motion_factors, offset_factors
 from factors.noise import (
     DEFAULT_WIDTH_SIGMA,
     Kernel,
@@ -29,6 +33,7 @@ from factors.noise import (
     robust_kernel,
     sigma_px,
 )
+from factors.pinhole import project_with_jacobian, to_pixels
 from factors.projection import (
     in_front,
     inlier_gate,
@@ -38,7 +43,7 @@ from factors.projection import (
     projection_factor,
     projection_factors,
 )
-from factors.rank import determined, joint_information, projection_jacobians
+from factors.rank import determined, joint_information
 from factors.testing import assert_jacobian, assert_zero_at_truth
 
 __all__ = [
@@ -64,16 +69,24 @@ __all__ = [
     "joint_key",
     "joint_keys",
     "kernel_weight",
+    "lasting_prior_factors",
     "make_calibration",
     "make_camera",
+    "motion_covariance",
+    "motion_factors",
+    "offset_factors",
+    "offset_key",
+    "offset_keys",
     "posed_projection_factor",
+    "project_with_jacobian",
     "projection_factor",
     "projection_factors",
-    "projection_jacobians",
     "robust",
     "robust_kernel",
     "sigma_px",
     "split_camera_key",
     "split_key",
+    "to_pixels",
     "velocity_key",
+    "velocity_keys",
 ]

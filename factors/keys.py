@@ -1,12 +1,14 @@
-"""Keys of the variables: who, which joint, when; packed into GTSAM's 64 bits so that graphs compose.
+"""Keys of the variables: who, which joint, when; decimal numbers that GTSAM's own messages show in full.
 
-A key is a `gtsam.Symbol`: 8 bits of character, then 56 bits that hold
+A key is a 17-digit number, to be read from left to right:
 
-    character | person or view, 16 bits | frame, 32 bits | joint, 8 bits
+    kind, 1 digit | person or view, 5 digits | joint, 3 digits | frame, 8 digits
 
-The joints of one person in one frame have consecutive keys. The characters are upper case ('J' joint,
-'V' velocity, 'C' camera), so that they stay clear of the lower-case symbols usual in robotics
-(`x` poses, `l` landmarks, `v` velocities, `c` cameras) in a graph that holds both.
+so 1 00003 004 00000012 is the position of joint 4 of person 3 in frame 12. GTSAM cuts what it prints of a
+`gtsam.Symbol` to eight digits behind the character, which is too little for three numbers; a key without a
+character is printed whole, in messages, drawings and `Values.print`. `format_key` spells it out. Symbols (`x5`,
+`l3`) have a character in their upper bits and are larger, plain numbers of your own are smaller: all three fit
+into one graph. Keys of one joint over time are consecutive, sorted by kind, person, joint, frame.
 """
 
 from typing import NamedTuple
@@ -15,18 +17,24 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-MAX_PERSON = MAX_VIEW = (1 << 16) - 1
+MAX_PERSON = MAX_VIEW = 99_999
 """Largest person and view number in a key."""
-MAX_FRAME = (1 << 32) - 1
-"""Largest frame number in a key: 2.3 years at 60 frames a second."""
-MAX_JOINT = (1 << 8) - 1
+MAX_JOINT = 999
 """Largest joint number in a key."""
+MAX_FRAME = 99_999_999
+"""Largest frame number in a key: 19 days at 60 frames a second."""
 
-_JOINT, _VELOCITY, _CAMERA = ord("J"), ord("V"), ord("C")
+_JOINT, _VELOCITY, _CAMERA, _OFFSET = 1, 2, 3, 4
+_SOURCES = 3
+_NAMES = {_JOINT: "position", _VELOCITY: "velocity", _CAMERA: "camera"}
+_NAMES |= {_OFFSET + source: f"offset {source}" for source in range(_SOURCES)}
+_PER_JOINT = MAX_FRAME + 1
+_PER_PERSON = (MAX_JOINT + 1) * _PER_JOINT
+_PER_KIND = (MAX_PERSON + 1) * _PER_PERSON
 
 
 class JointKey(NamedTuple):
-    """What the key of a joint, or of a joint's velocity, says."""
+    """What the key of a joint, of its velocity or of its offset says."""
 
     person: int
     joint: int
@@ -42,63 +50,87 @@ class CameraKey(NamedTuple):
 
 def joint_key(person: int, joint: int, frame: int = 0) -> int:
     """Key of the position (`Point3`, metres, world) of a joint; ValueError beyond the limits above."""
-    return _pack(_JOINT, person, joint, frame)
+    return int(_pack(_JOINT, person, joint, frame))
 
 
 def velocity_key(person: int, joint: int, frame: int = 0) -> int:
     """Key of the velocity (`Point3`, metres per second, world) of a joint."""
-    return _pack(_VELOCITY, person, joint, frame)
+    return int(_pack(_VELOCITY, person, joint, frame))
+
+
+def offset_key(person: int, joint: int, frame: int = 0, source: int = 0) -> int:
+    """Key of the slowly varying error (`Point3`, standard deviations) of what a `source` (0 to 2) says of a
+    joint.
+    """
+    return int(_pack(_offset(source), person, joint, frame))
 
 
 def camera_key(view: int, frame: int = 0) -> int:
     """Key of the pose (`Pose3`, world from camera) of a camera; frame 0 for one that stands still."""
-    return _pack(_CAMERA, view, 0, frame)
+    return int(_pack(_CAMERA, view, 0, frame))
 
 
-def joint_keys(person: int, joints: ArrayLike, frame: int = 0) -> NDArray[np.int64]:
-    """Keys (D,) of `joints` (D,) of one person in one frame: `joint_key` for an array."""
-    index = np.asarray(joints)
-    if index.size and not (index.min() >= 0 and index.max() <= MAX_JOINT):
-        raise ValueError(f"joint must be 0 to {MAX_JOINT}, got {index.min()} to {index.max()}")
-    return joint_key(person, 0, frame) + index.astype(np.int64)
+def joint_keys(person: int, joints: ArrayLike, frames: ArrayLike = 0) -> NDArray[np.int64]:
+    """`joint_key` for arrays: `joints` and `frames` broadcast against each other."""
+    return _pack(_JOINT, person, joints, frames)
+
+
+def velocity_keys(person: int, joints: ArrayLike, frames: ArrayLike = 0) -> NDArray[np.int64]:
+    """`velocity_key` for arrays: `joints` and `frames` broadcast against each other."""
+    return _pack(_VELOCITY, person, joints, frames)
+
+
+def offset_keys(person: int, joints: ArrayLike, frames: ArrayLike = 0, source: int = 0) -> NDArray[np.int64]:
+    """`offset_key` for arrays: `joints` and `frames` broadcast against each other."""
+    return _pack(_offset(source), person, joints, frames)
 
 
 def split_key(key: int) -> JointKey:
-    """Person, joint and frame of a joint's or a velocity's key; ValueError for any other key."""
-    if int(key) >> 56 not in (_JOINT, _VELOCITY):
-        raise ValueError(f"{gtsam.DefaultKeyFormatter(int(key))} is not the key of a joint or a velocity")
-    return JointKey(*_unpack(key))
+    """Person, joint and frame of the key of a joint, a velocity or an offset; ValueError for any other key."""
+    kind, person, joint, frame = _unpack(key)
+    if kind not in _NAMES or kind == _CAMERA:
+        raise ValueError(f"{format_key(key)} is not the key of a joint, a velocity or an offset")
+    return JointKey(person, joint, frame)
 
 
 def split_camera_key(key: int) -> CameraKey:
     """View and frame of a camera's key; ValueError for any other key."""
-    if int(key) >> 56 != _CAMERA:
-        raise ValueError(f"{gtsam.DefaultKeyFormatter(int(key))} is not the key of a camera")
-    view, _, frame = _unpack(key)
+    kind, view, _, frame = _unpack(key)
+    if kind != _CAMERA:
+        raise ValueError(f"{format_key(key)} is not the key of a camera")
     return CameraKey(view, frame)
 
 
 def format_key(key: int) -> str:
     """Readable name of any key; goes where GTSAM takes a key formatter: `graph.print("", format_key)`."""
-    kind = int(key) >> 56
-    if kind in (_JOINT, _VELOCITY):
-        person, joint, frame = _unpack(key)
-        return f"{chr(kind)}(person {person}, joint {joint}, frame {frame})"
+    kind, first, joint, frame = _unpack(key)
     if kind == _CAMERA:
-        view, _, frame = _unpack(key)
-        return f"C(view {view}, frame {frame})"
+        return f"camera(view {first}, frame {frame})"
+    if kind in _NAMES:
+        return f"{_NAMES[kind]}(person {first}, joint {joint}, frame {frame})"
     return gtsam.DefaultKeyFormatter(int(key))
 
 
-def _pack(character: int, first: int, joint: int, frame: int) -> int:
-    if not (0 <= first <= MAX_PERSON and 0 <= joint <= MAX_JOINT and 0 <= frame <= MAX_FRAME):
-        raise ValueError(
-            f"a key holds person or view 0 to {MAX_PERSON}, joint 0 to {MAX_JOINT}, frame 0 to {MAX_FRAME}; "
-            f"got {first}, {joint}, {frame}"
-        )
-    return (character << 56) | (int(first) << 40) | (int(frame) << 8) | int(joint)
+def _offset(source: int) -> int:
+    if not 0 <= source < _SOURCES:
+        raise ValueError(f"source in a key must be 0 to {_SOURCES - 1}, got {source}")
+    return _OFFSET + source
 
 
-def _unpack(key: int) -> tuple[int, int, int]:
-    bits = int(key)
-    return (bits >> 40) & MAX_PERSON, bits & MAX_JOINT, (bits >> 8) & MAX_FRAME
+def _pack(kind: int, first: int, joint: ArrayLike, frame: ArrayLike) -> NDArray[np.int64]:
+    joints, frames = np.asarray(joint), np.asarray(frame)
+    for name, value, limit in (
+        ("person or view", np.asarray(first), MAX_PERSON),
+        ("joint", joints, MAX_JOINT),
+        ("frame", frames, MAX_FRAME),
+    ):
+        if value.size and not (value.min() >= 0 and value.max() <= limit):
+            raise ValueError(f"{name} in a key must be 0 to {limit}, got {value.min()} to {value.max()}")
+    base = kind * _PER_KIND + int(first) * _PER_PERSON
+    return base + joints.astype(np.int64) * _PER_JOINT + frames.astype(np.int64)
+
+
+def _unpack(key: int) -> tuple[int, int, int, int]:
+    kind, rest = divmod(int(key), _PER_KIND)
+    person, rest = divmod(rest, _PER_PERSON)
+    return (kind, person, *divmod(rest, _PER_JOINT))

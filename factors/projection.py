@@ -105,11 +105,12 @@ def in_front(depth_m: ArrayLike, min_depth_m: float = 0.1) -> NDArray[np.bool_]:
     return np.asarray(depth_m, dtype=np.float64) >= min_depth_m
 
 
-def inlier_gate(residual_px: ArrayLike, rho_2d_px: float) -> NDArray[np.bool_]:
-    """delta_ij of Eq. 2: which reprojection distances (...,) are under `rho_2d_px`; NaN is not."""
-    if not rho_2d_px > 0:
-        raise ValueError(f"rho_2d_px must be positive, got {rho_2d_px}")
-    return np.asarray(residual_px, dtype=np.float64) < rho_2d_px
+def inlier_gate(residual_px: ArrayLike, rho_2d_px: ArrayLike) -> NDArray[np.bool_]:
+    """delta_ij of Eq. 2: which reprojection distances (...,) are under `rho_2d_px` (...,); NaN is not."""
+    rho = np.asarray(rho_2d_px, dtype=np.float64)
+    if np.any(rho <= 0):
+        raise ValueError(f"rho_2d_px must be positive, got {rho.min()}")
+    return np.asarray(residual_px, dtype=np.float64) < rho
 
 
 def _pixel(uv: ArrayLike) -> NDArray[np.float64]:

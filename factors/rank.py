@@ -7,21 +7,7 @@ The information of a joint is J^T W J, summed over its observations and priors, 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-
-def projection_jacobians(
-    points_world: NDArray[np.float64], K: NDArray[np.float64], cTw: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Derivative (D, 2, 3) of pixels by position, pixels per metre, of D points each seen by its own camera.
-
-    `points_world` (D, 3) metres; `K` (D, 3, 3) pixels; `cTw` (D, 3, 4) camera-from-world. NaN where the depth
-    is not positive.
-    """
-    rotation = cTw[:, :, :3]
-    x, y, z = (np.einsum("dij,dj->di", rotation, points_world) + cTw[:, :, 3]).T
-    z = np.where(z > 0, z, np.nan)
-    zero = np.zeros_like(z)
-    pinhole = np.stack([np.stack([1 / z, zero, -x / z**2], -1), np.stack([zero, 1 / z, -y / z**2], -1)], 1)
-    return K[:, :2, :2] @ pinhole @ rotation
+from factors.pinhole import project_with_jacobian
 
 
 def joint_information(
@@ -42,7 +28,7 @@ def joint_information(
     """
     points = np.asarray(points_world, dtype=np.float64)
     joints, views = np.asarray(joint, dtype=np.intp), np.asarray(view, dtype=np.intp)
-    jacobian = projection_jacobians(points[joints], np.asarray(K)[views], np.asarray(cTw)[views])
+    _, _, jacobian = project_with_jacobian(points[joints], np.asarray(K)[views], np.asarray(cTw)[views])
     jacobian = np.nan_to_num(jacobian) / np.asarray(sigmas_px, dtype=np.float64)[:, None, None]
     information = np.zeros((len(points), 3, 3))
     np.add.at(information, joints, jacobian.transpose(0, 2, 1) @ jacobian)

@@ -13,14 +13,13 @@ SHAPEPOSE_DATA).
 import argparse
 import os
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
-from evaluate_time import uses_time, with_time
+from evaluate_time import with_time
 
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.camera import Rig
@@ -30,6 +29,7 @@ from shapepose_fg.evaluation.overlay import cropped, draw_bodies, draw_skeletons
 from shapepose_fg.evaluation.shelf import evaluate_shelf, match_actors, read_shelf_ground_truth
 from shapepose_fg.evaluation.shelf_events import identity_switches, lost_limbs, pcp_interval
 from shapepose_fg.evaluation.single_person import FPS, man_of, measure_single_person
+from shapepose_fg.frame_times import FrameTimes
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.pipeline import PipelineConfig, reconstruct
@@ -74,7 +74,7 @@ def shelf(folder: Path, config: PipelineConfig, parts: Sequence[str]) -> None:
         matched = match_actors(people, truth)
         low, high = pcp_interval(matched)
         print(f"Avg PCP {evaluate_shelf(people, truth).pcp_average:.2f} %, 95 % interval {low:.2f} to {high:.2f}")
-        switches = identity_switches(matched, people.person) if uses_time(config) else "-"
+        switches = identity_switches(matched, people.person) if config.temporal else "-"
         print(f"identity switches {switches}; lost limbs:")
         print("\n".join(f"  {event}" for event in lost_limbs(matched)))
     if "views" in parts:
@@ -94,17 +94,12 @@ def single(folder: Path, config: PipelineConfig, pictures: Path | None, frames: 
     """Pose2Sim's recording."""
     rig = read_rig(folder / "rig.json")
     recording = read_detections(folder / "openpose", rig)
-    people = reconstruct(recording, rig, with_rate(config))
+    people = reconstruct(recording, rig, config, times=FrameTimes.from_fps(FPS, len(recording)))
     for name, value in measure_single_person(people, recording, rig).as_dict().items():
         print(f"{name:<22}{value}")
     if pictures is not None:
         pictures.mkdir(parents=True, exist_ok=True)
         draw(people, rig, folder, frames, pictures)
-
-
-def with_rate(config: PipelineConfig) -> PipelineConfig:
-    """The settings for 60 frames a second, where settings have a rate."""
-    return replace(config, fps=FPS) if hasattr(config, "fps") else config  # type: ignore[call-arg]
 
 
 def draw(people: Reconstruction, rig: Rig, folder: Path, frames: range, pictures: Path) -> None:

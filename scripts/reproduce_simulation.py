@@ -9,18 +9,14 @@ two, seven and one. What the detector draws from is made by `measure_detector.py
 
 import argparse
 import os
-import re
 from collections.abc import Callable
 from pathlib import Path
 
-import detector_figures
-import sequence_difficulty
 import torch
-import visibility_agreement
+from marked_tables import IMAGES, ROOT, SIMULATION, write_table
 
-ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "docs" / "simulation.md"
-IMAGES = ROOT / "docs" / "images"
+from shapepose_fg.evaluation import sequence_difficulty, visibility_agreement
+from shapepose_fg.simulation.measurement.comparison import compare, table
 
 
 def main() -> None:
@@ -43,7 +39,7 @@ def main() -> None:
     images = IMAGES if arguments.update else None
     splits = arguments.split or ("tune", "report")
     tables: dict[str, tuple[Path | None, Callable[[], list[str]]]] = {
-        "detector": (shelf, lambda: detector_figures.tables_and_figures(shelf, images)),
+        "detector": (shelf, lambda: detector(shelf, images)),
         "difficulty": (motions, lambda: sequence_difficulty.table(motions, splits, arguments.stride)),
         "visibility": (None, visibility_agreement.table),
     }
@@ -55,16 +51,17 @@ def main() -> None:
         text = "\n".join(make())
         print(f"{name}\n\n{text}\n", flush=True)
         if arguments.update:
-            write(name, text)
+            write_table(name, text, SIMULATION)
 
 
-def write(name: str, text: str) -> None:
-    """Put a table between its marks."""
-    page = PAGE.read_text(encoding="utf-8")
-    marked = re.compile(rf"(<!-- {name} -->\n).*?(<!-- end -->)", re.DOTALL)
-    if marked.search(page) is None:
-        raise ValueError(f"{PAGE.name} has no marks <!-- {name} --> and <!-- end -->: add them where it belongs")
-    PAGE.write_text(marked.sub(lambda found: f"{found[1]}\n{text}\n\n{found[2]}", page), encoding="utf-8")
+def detector(shelf: Path, images: Path | None) -> list[str]:
+    """The simulated detector beside the real one; figures into the folder `images`, if given."""
+    both, each = compare(shelf)
+    if images is not None:
+        from shapepose_fg.simulation.measurement.figures import draw_figures
+
+        draw_figures(images, both)
+    return table(both, each)
 
 
 if __name__ == "__main__":

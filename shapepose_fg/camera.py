@@ -1,4 +1,6 @@
-"""Where a camera stands and what it sees: pinhole cameras in the world, and a rig of them."""
+"""Where a camera stands and what it sees: pinhole cameras in the world, a rig of them, and their views over
+time.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -9,12 +11,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.pinhole import project_with_jacobian, to_pixels
+
 Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
 """A world axis, as a calibration names the direction that is up."""
+
+Lens = Literal["perspective", "fisheye"]
+"""OpenCV's two families of lenses: Brown's model with its rational extension, and the equidistant fisheye."""
 
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _ROTATION_TOLERANCE = 1e-3
 """How far R Rᵀ may be from the identity: calibrations are printed with four to six digits."""
+_COEFFICIENTS: dict[str, tuple[int, ...]] = {"perspective": (5, 8, 12, 14), "fisheye": (4,)}
+"""How many coefficients OpenCV's functions take for each kind of lens."""
+_UNDONE_PX = 0.5
+"""A point that comes back farther than this from where it was has no place without distortion: the polynomial of
+the lens does not reach it. Where there is one, OpenCV's iteration ends within 1e-6 px of it."""
 
 
 @dataclass(frozen=True)
@@ -30,13 +42,20 @@ class Camera:
     image_size: tuple[int, int]
     """(width, height), pixels."""
     distortion: NDArray[np.float64] = field(default_factory=lambda: np.zeros(5))
-    """(5,) k1 k2 p1 p2 k3, as OpenCV orders them; zero for a camera without distortion."""
+    """Coefficients in OpenCV's order, zero for a camera without distortion. Perspective: (5,) k1 k2 p1 p2 k3,
+    or (8,) with k4 k5 k6 of the rational model, (12,) with s1 to s4, (14,) with a tilt. Fisheye: (4,) k1 to k4."""
+    lens: Lens = "perspective"
+    """Which of OpenCV's families the coefficients belong to."""
 
     def __post_init__(self) -> None:
-        for name, shape in (("K", (3, 3)), ("wTc", (4, 4)), ("distortion", (5,))):
+        if self.lens not in _COEFFICIENTS:
+            raise ValueError(f"camera {self.name}: lens must be perspective or fisheye, got {self.lens!r}")
+        lengths = [(count,) for count in _COEFFICIENTS[self.lens]]
+        for name, shapes in (("K", [(3, 3)]), ("wTc", [(4, 4)]), ("distortion", lengths)):
             value = np.asarray(getattr(self, name), dtype=np.float64)
-            if value.shape != shape:
-                raise ValueError(f"camera {self.name}: {name} must be {shape}, got {value.shape}")
+            if value.shape not in shapes:
+                wanted = " or ".join(map(str, shapes))
+                raise ValueError(f"camera {self.name}: {name} must be {wanted}, got {value.shape}")
             if not np.isfinite(value).all():
                 raise ValueError(f"camera {self.name}: {name} holds a value that is not finite")
             object.__setattr__(self, name, value)
@@ -45,8 +64,10 @@ class Camera:
         R = self.wTc[:3, :3]
         if np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(R) < 0:
             raise ValueError(f"camera {self.name}: the rotation of wTc must be orthonormal with determinant 1")
-        if min(self.image_size) <= 0:
+        width, height = self.image_size
+        if min(width, height) <= 0:
             raise ValueError(f"camera {self.name}: image_size must be positive, got {self.image_size}")
+        object.__setattr__(self, "image_size", (int(width), int(height)))
 
     @classmethod
     def from_camera_from_world(
@@ -56,11 +77,12 @@ class Camera:
         cTw: NDArray[np.float64],
         image_size: tuple[int, int],
         distortion: Sequence[float] = (),
+        lens: Lens = "perspective",
     ) -> "Camera":
         """Make a camera from a camera-from-world matrix `cTw` (3, 4) or (4, 4): [R | t], metres.
 
         The rotation is projected on the nearest orthonormal one, so that the few printed digits of a
-        calibration do not become a scale. `distortion` may have 0 to 5 coefficients.
+        calibration do not become a scale. `distortion` may leave out coefficients at its end.
         """
         cTw = np.asarray(cTw, dtype=np.float64)
         R = np.asarray(cTw[:3, :3])
@@ -70,9 +92,8 @@ class Camera:
         wTc = np.eye(4)
         wTc[:3, :3] = (U @ Vt).T
         wTc[:3, 3] = -wTc[:3, :3] @ cTw[:3, 3]
-        coefficients = np.zeros(5)
-        coefficients[: len(distortion)] = distortion
-        return cls(name, np.asarray(K, dtype=np.float64), wTc, image_size, coefficients)
+        coefficients = padded_distortion(distortion, lens)
+        return cls(name, np.asarray(K, dtype=np.float64), wTc, image_size, coefficients, lens)
 
     @cached_property
     def cTw(self) -> NDArray[np.float64]:
@@ -91,24 +112,69 @@ class Camera:
         A point that is not in front of the camera (depth <= 0) gets NaN pixels.
         """
         points_camera = points_world @ self.cTw[:, :3].T + self.cTw[:, 3]
-        return _to_pixels(points_camera, self.K)
+        return to_pixels(points_camera, self.K)
 
     def undistort(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Map measured pixels (N, 2) to the pixels of the same camera without distortion."""
-        if len(xy) == 0 or not self.distortion.any():
-            return np.asarray(xy, dtype=np.float64)
-        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-6)
-        points = np.ascontiguousarray(xy, dtype=np.float64).reshape(-1, 1, 2)
-        ideal = cv2.undistortPoints(points, self.K, self.distortion, R=np.eye(3), P=self.K, criteria=criteria)
-        return np.asarray(ideal, dtype=np.float64).reshape(-1, 2)
+        """Map measured pixels (N, 2) to the pixels of the same camera without distortion.
+
+        NaN where there is no such pixel: beyond what the lens's polynomial reaches, or at 90 degrees and more
+        from the axis of a fisheye.
+        """
+        xy = np.asarray(xy, dtype=np.float64)
+        if len(xy) == 0 or not self._bends:
+            return xy
+        rays = self._normalised(xy).reshape(-1, 1, 2)
+        if self.lens == "fisheye":
+            ideal = cv2.fisheye.undistortPoints(rays, np.eye(3), self.distortion, criteria=_CRITERIA)
+        else:
+            ideal = cv2.undistortPoints(rays, np.eye(3), self.distortion, criteria=_CRITERIA)
+        ideal = np.asarray(ideal, dtype=np.float64).reshape(-1, 2)
+        pixels = ideal @ self.K[:2, :2].T + self.K[:2, 2]
+        with np.errstate(invalid="ignore", over="ignore"):
+            undone = np.abs(self.distort(pixels) - xy).max(axis=1) < _UNDONE_PX
+        pixels[~undone] = np.nan
+        return pixels
 
     def distort(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
         """Map undistorted pixels (N, 2) to the pixels that the real lens gives (inverse of `undistort`)."""
-        if len(xy) == 0 or not self.distortion.any():
-            return np.asarray(xy, dtype=np.float64)
-        rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1) @ np.linalg.inv(self.K).T
-        pixels, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), self.K, self.distortion)
-        return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+        xy = np.asarray(xy, dtype=np.float64)
+        if len(xy) == 0 or not self._bends:
+            return xy
+        rays = self._normalised(xy)
+        if self.lens == "fisheye":
+            bent = cv2.fisheye.distortPoints(rays.reshape(-1, 1, 2), np.eye(3), self.distortion)
+        else:
+            rays = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
+            bent, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), np.eye(3), self.distortion)
+        bent = np.asarray(bent, dtype=np.float64).reshape(-1, 2)
+        return bent @ self.K[:2, :2].T + self.K[:2, 2]
+
+    @property
+    def _bends(self) -> bool:
+        """Whether the lens moves any pixel: a fisheye does without a coefficient too."""
+        return self.lens == "fisheye" or bool(self.distortion.any())
+
+    def _normalised(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Normalised image coordinates (N, 2) of pixels (N, 2). Lenses bend these, so that K may have a skew,
+        which OpenCV's own functions pass over.
+        """
+        inverse = np.linalg.inv(self.K)
+        return np.ascontiguousarray(xy @ inverse[:2, :2].T + inverse[:2, 2])
+
+
+_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
+"""Steps and accuracy, in normalised coordinates, of undoing a distortion."""
+
+
+def padded_distortion(coefficients: Sequence[float], lens: Lens = "perspective") -> NDArray[np.float64]:
+    """`coefficients` with zeros up to the next number that OpenCV takes; ValueError where there are too many."""
+    for count in _COEFFICIENTS[lens]:
+        if len(coefficients) <= count:
+            return np.concatenate(
+                [np.asarray(coefficients, dtype=np.float64), np.zeros(count - len(coefficients))]
+            )
+    most = _COEFFICIENTS[lens][-1]
+    raise ValueError(f"a {lens} lens has at most {most} distortion coefficients, got {len(coefficients)}")
 
 
 @dataclass(frozen=True)
@@ -175,7 +241,7 @@ class Rig:
         shape = points_world.shape[:-1]
         flat = points_world.reshape(-1, 3)
         points_camera = flat @ self.cTw[:, :, :3].transpose(0, 2, 1) + self.cTw[:, None, :, 3]
-        xy, depth = _to_pixels(points_camera, self.K)
+        xy, depth = to_pixels(points_camera, self.K[:, None])
         return xy.reshape(len(self), *shape, 2), depth.reshape(len(self), *shape)
 
     def normalise(self, view: NDArray[np.intp], xy: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -184,13 +250,54 @@ class Rig:
         return np.einsum("dij,dj->di", K_inverse[:, :2, :2], xy) + K_inverse[:, :2, 2]
 
 
-def _to_pixels(
-    points_camera: NDArray[np.float64], K: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Pixels and depths of points (..., 3) in camera coordinates; `K` is (3, 3) or (V, 3, 3)."""
-    depth = points_camera[..., 2]
-    safe = np.where(depth > 0, depth, np.nan)
-    normalised = points_camera[..., :2] / safe[..., None]
-    return normalised @ np.swapaxes(K[..., :2, :2], -1, -2) + K[..., None, :2, 2].reshape(
-        K.shape[:-2] + (1,) * (normalised.ndim - K.ndim + 1) + (2,)
-    ), depth
+@dataclass(frozen=True)
+class Views:
+    """The cameras of N rows (people, frames or both), each row with cameras of its own if they move."""
+
+    K: NDArray[np.float64]
+    """(V, 3, 3) intrinsic matrices of cameras that are the same for all rows, or (N, V, 3, 3), pixels."""
+    cTw: NDArray[np.float64]
+    """(V, 3, 4) camera from world of cameras that stand still, or (N, V, 3, 4), metres."""
+
+    def __post_init__(self) -> None:
+        K, cTw = np.asarray(self.K, dtype=np.float64), np.asarray(self.cTw, dtype=np.float64)
+        if K.shape[-2:] != (3, 3) or cTw.shape[-2:] != (3, 4) or K.ndim not in (3, 4) or cTw.ndim not in (3, 4):
+            raise ValueError(f"K must be ([N,] V, 3, 3) and cTw ([N,] V, 3, 4), got {K.shape} and {cTw.shape}")
+        if K.shape[-3] != cTw.shape[-3] or (K.ndim == cTw.ndim == 4 and len(K) != len(cTw)):
+            raise ValueError(f"K and cTw must be of the same rows and views, got {K.shape} and {cTw.shape}")
+        if not (np.isfinite(K).all() and np.isfinite(cTw).all()):
+            raise ValueError("K or cTw holds a value that is not finite")
+
+    @classmethod
+    def of(cls, rig: Rig) -> "Views":
+        """The cameras of a rig that stands still."""
+        return cls(rig.K, rig.cTw)
+
+    def __len__(self) -> int:
+        """V, the number of views."""
+        return self.K.shape[-3]
+
+    @property
+    def rows_known(self) -> int | None:
+        """N where cameras are given row by row; None where all rows have the same."""
+        lengths = [len(array) for array in (self.K, self.cTw) if array.ndim == 4]
+        return lengths[0] if lengths else None
+
+    @property
+    def focal_px(self) -> NDArray[np.float64]:
+        """(V,) or (N, V) mean of the two focal lengths, pixels."""
+        return (self.K[..., 0, 0] + self.K[..., 1, 1]) / 2
+
+    def rows(self, index: NDArray[np.intp]) -> "Views":
+        """The cameras of some of the rows."""
+        return Views(*(array[index] if array.ndim == 4 else array for array in (self.K, self.cTw)))
+
+    def project(
+        self, points: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Pixels (N, J, V, 2), depths (N, J, V) and derivatives (N, J, V, 2, 3) of `points` (N, J, 3), metres.
+
+        Undistorted pixels; they and the derivatives are NaN where the depth is not positive.
+        """
+        K, cTw = (array[:, None] if array.ndim == 4 else array for array in (self.K, self.cTw))
+        return project_with_jacobian(points[:, :, None], K, cTw)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import typer
 
 from shapepose_fg.errors import InputError
+from shapepose_fg.tracks_command import tracks
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -38,6 +39,7 @@ app = typer.Typer(
 )
 evaluate = typer.Typer(help="Score a reconstruction against an annotation.")
 app.add_typer(evaluate, name="evaluate")
+app.add_typer(tracks, name="tracks")
 
 _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
 """What typer raises for a wrong command line; older and newer versions keep the class in different places."""
@@ -67,8 +69,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 @app.command()
 def reconstruct(
-    calibration: Annotated[Path, typer.Option(help="Cameras: 4D Association's calibration.json, or a rig file.")],
-    detections: Annotated[Path, typer.Option(help="Folder with <camera>.txt, or <camera>/*_keypoints.json.")],
+    calibration: Annotated[Path, typer.Option(help="Cameras: a file, or a folder, of one of the formats known.")],
+    detections: Annotated[Path, typer.Option(help="Folder with what a 2D detector wrote of every camera.")],
     output: Annotated[Path, typer.Option(help="Folder for people.npz and run.json; made if it is not there.")],
     config: Annotated[
         Path | None, typer.Option(help="Settings as TOML; `shapepose-fg config` prints all.")
@@ -80,6 +82,12 @@ def reconstruct(
         str | None, typer.Option(metavar="AXIS", help="World axis that points up: x -x y -y z -z.")
     ] = None,
     unit: Annotated[str | None, typer.Option(metavar="UNIT", help="Unit of the calibration: m, cm or mm.")] = None,
+    image_size: Annotated[
+        str | None, typer.Option(metavar="WxH", help="Size of the calibrated pictures, where the file has none.")
+    ] = None,
+    skeleton: Annotated[
+        str | None, typer.Option(metavar="NAME", help="The detector's skeleton, or a TOML file that describes it.")
+    ] = None,
     body: Annotated[
         Path | None, typer.Option(help="Body model in SMPL's file format, instead of the built-in.")
     ] = None,
@@ -98,16 +106,22 @@ def reconstruct(
     ] = None,
 ) -> None:
     """Reconstruct the people of a recording: 3D joints with covariances, and bodies."""
-    from shapepose_fg.io.calibration import read_rig
+    from shapepose_fg.io.calibration import read_rig, write_rig
     from shapepose_fg.io.config import read_config
+    from shapepose_fg.io.corrections import refuse_corrected
     from shapepose_fg.io.detections import read_detections
+    from shapepose_fg.io.solved_setup import CAMERAS
     from shapepose_fg.provenance import checksums
 
-    rig = read_rig(calibration, up=cast("Axis | None", up), unit=cast("Unit | None", unit))
-    recording = read_detections(detections, rig)
+    size = _image_size(image_size)
+    rig = read_rig(calibration, up=cast("Axis | None", up), unit=cast("Unit | None", unit), image_size=size)
+    recording = read_detections(detections, rig, skeleton)
+    for note in recording.notes:
+        _note(note)
     span = _frame_range(frames, len(recording))
     times = _times(fps, timestamps, rig, len(recording))
     first_frames = _cuts(cuts, len(recording))
+    refuse_corrected(output)
     _prepare(output)
     from shapepose_fg.pipeline import PipelineConfig
     from shapepose_fg.pipeline import reconstruct as run_pipeline
@@ -116,7 +130,7 @@ def reconstruct(
     settings = settings if temporal is None else replace(settings, temporal=temporal)
     if shapes is not None and not settings.temporal:
         raise InputError("--shapes: a person's shape is known over time only; leave out --shapes or --no-temporal")
-    fitter = _fitter(body, settings)
+    fitter = _fitter(body, settings, recording.skeleton.joints)
     known = None if shapes is None else _known_shapes(shapes, body)
     start = time.perf_counter()
     with _progress("reconstructing") as progress:
@@ -138,7 +152,10 @@ def reconstruct(
     inputs = [
         path for path in (*read, shapes if known is not None and len(known) > 0 else None) if path is not None
     ]
-    people.with_run(inputs=checksums(inputs)).save(output)
+    people.with_run(inputs=checksums(inputs), notes=list(recording.notes), body=body).save(output)
+    # What the observations were seen with: to solve or draw them anew.
+    if not (output / CAMERAS).exists() or not (output / CAMERAS).samefile(calibration):
+        write_rig(rig, output / CAMERAS)
     summary = _summary(people, span, len(rig), seconds, output)
     if shapes is not None and known is not None and people.shapes is not None:
         known.updated(people.shapes).save(shapes)
@@ -270,6 +287,16 @@ def version() -> None:
         print(name, number)
 
 
+def _image_size(text: str | None) -> tuple[int, int] | None:
+    """Width and height of `WxH`."""
+    if text is None:
+        return None
+    match = re.fullmatch(r"\s*(\d+)\s*[x×,]\s*(\d+)\s*", text)
+    if match is None:
+        raise InputError(f"--image-size {text}: must be WIDTHxHEIGHT in pixels, such as 1920x1080")
+    return int(match[1]), int(match[2])
+
+
 def _frame_range(text: str | None, count: int) -> range:
     """Frames that `A:B` selects of a recording of `count` frames: half-open, either end optional."""
     if text is None:
@@ -343,14 +370,14 @@ def _prepare(output: Path) -> None:
         ) from None
 
 
-def _fitter(body: Path | None, settings: "PipelineConfig") -> "BodyFitter | None":
+def _fitter(body: Path | None, settings: "PipelineConfig", joints: tuple[str, ...]) -> "BodyFitter | None":
     """The body fitter with the model of the file `body`; without one, the pipeline takes its own."""
     if body is None:
         return None
     from shapepose_fg.body.fitting.fitters import make_fitter
     from shapepose_fg.body.model.body_model import BodyModel
 
-    return make_fitter(settings.body, BodyModel.load(body))
+    return make_fitter(settings.body, BodyModel.load(body).with_keypoints(joints))
 
 
 @contextmanager
@@ -380,14 +407,20 @@ def _summary(people: "Reconstruction", span: range, camera_count: int, seconds: 
     import numpy as np
     from rich.table import Table
 
+    from shapepose_fg.frame_times import rate_words
+    from shapepose_fg.io.solved_setup import CAMERAS
+
     per_frame = np.bincount(people.frame - span.start, minlength=len(span))
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     table.add_column(style="bold")
     table.add_column(overflow="fold")
-    table.add_row("frames", f"{len(span)} ({span.start}:{span.stop}) of {camera_count} cameras{_rate(people)}")
     table.add_row(
-        "people", f"{len(people)} in all, {per_frame.mean():.1f} a frame ({per_frame.min()} to {per_frame.max()})"
+        "frames", f"{len(span)} ({span.start}:{span.stop}) of {camera_count} cameras{rate_words(people.run)}"
     )
+    over_time = people.run.get("configuration", {}).get("temporal", False)
+    count = f"{len(np.unique(people.person))} people over time" if over_time else "no identities"
+    table.add_row("people", f"{count}, {per_frame.mean():.1f} a frame ({per_frame.min()} to {per_frame.max()})")
+    table.add_row("rows", f"{len(people)} in all")
     for status, count in zip(*np.unique(people.status, return_counts=True), strict=True):
         table.add_row("", f"{count} {status}", style="green" if status == "ok" else "yellow")
     for reason, count in people.run.get("people", {}).get("dropped", {}).items():
@@ -403,15 +436,8 @@ def _summary(people: "Reconstruction", span: range, camera_count: int, seconds: 
     table.add_row("", str(output / "run.json"))
     if people.observations is not None:
         table.add_row("", str(output / "observations.npz"))
+    table.add_row("", str(output / CAMERAS))
     return table
-
-
-def _rate(people: "Reconstruction") -> str:
-    """Frames a second, and whether somebody said so."""
-    told = people.run.get("time", {})
-    if told.get("fps") is None:
-        return ""
-    return f", {told['fps']:.4g} a second" + (" (assumed: give --fps)" if told["source"] == "assumed" else "")
 
 
 def _joints(people: "Reconstruction") -> str:
@@ -433,6 +459,14 @@ def _print(content: "RenderableType") -> None:
     from rich.console import Console
 
     Console().print(content)
+
+
+def _note(message: str) -> None:
+    """Say on stderr, in one line, what was made of the input."""
+    from rich.console import Console
+    from rich.text import Text
+
+    Console(stderr=True).print(Text.assemble(("note: ", "bold"), message), soft_wrap=True)
 
 
 def _fail(message: str) -> int:

@@ -122,7 +122,7 @@ def _accuracy(demo: Demo) -> Table:
 
 def _alternation(demo: Demo) -> Table:
     """What the factor graphs and the body make of what the views alone say."""
-    rho = float(demo.people.run["configuration"]["person_graph"]["rho_3d"])
+    rho = float(demo.people.run["configuration"]["window_graph"]["rho_3d"])
     table = Table(
         title="What stage II brings: mean distance to the truth",
         title_justify="left",

@@ -51,7 +51,7 @@ class ObservationTable:
     view_names: NDArray[np.str_]
     """(V,) names of the cameras."""
     candidate: NDArray[np.int32]
-    """(N, J, V) which detection: its place among all those of its view in this frame; -1 where there is none."""
+    """(N, J, V) which detection: its place among all those of its view in this frame; -1 for none, or not said."""
     xy: NDArray[np.float32]
     """(N, J, V, 2) where the detection lies, undistorted pixels; NaN where there is none."""
     confidence: NDArray[np.float32]
@@ -76,10 +76,10 @@ class ObservationTable:
             object.__setattr__(self, name, checked(name, getattr(self, name), shape, dtype))
         check_codes("gate", self.gate, Gate)
         seen = self.gate != Gate.NOT_SEEN
+        # A score may be too small for a float32, and which detection it was need not be said.
         wrong = {
-            "candidate": (self.candidate >= 0) != seen,
+            "candidate": (self.candidate >= 0) & ~seen,
             "xy": np.isfinite(self.xy).all(axis=-1) != seen,
-            # Not the other way round: a score may be too small for a float32.
             "confidence": (self.confidence != 0) & ~seen,
         }
         for name, where in wrong.items():
@@ -167,6 +167,22 @@ class ObservationTable:
     def rows(self, index: NDArray[Any]) -> "ObservationTable":
         """The rows that `index` picks: a mask (N,) or row numbers."""
         return replace(self, **{name: getattr(self, name)[index] for name in self.ROWS})
+
+    def observations(self, initial: NDArray[np.float64], time_s: NDArray[np.float64]) -> Observations:
+        """The rows as they were given to be solved, dropped detections too: to solve them anew.
+
+        `initial` (N, J, 3) is where to begin, `time_s` (N,) when the rows' frames were taken. Which detection each
+        observation was is not told: there a view's detections are counted over all views, here in their own.
+        """
+        seen = self.gate != Gate.NOT_SEEN
+        return Observations(
+            xy=np.where(seen[..., None], self.xy, 0.0).astype(np.float64),
+            confidence=np.where(seen, self.confidence, 0.0).astype(np.float64),
+            initial=initial,
+            track=self.person.astype(np.intp),
+            frame=self.frame.astype(np.intp),
+            time_s=np.repeat(time_s[:, None], len(self.view_names), axis=1),
+        )
 
     @property
     def used(self) -> NDArray[np.bool_]:

@@ -1,4 +1,4 @@
-"""The whole way: triangulate, vote, propose, associate, refine; frame by frame, refined in batches of frames."""
+"""The whole way: triangulate, vote, propose, associate; follow, solve in windows, put bodies on; rows out."""
 
 import time
 from collections import Counter, defaultdict
@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from shapepose_fg.bodies_over_time import SequenceFitting, with_bodies_over_time
+from shapepose_fg.body.fitting.bone_reach import longest_bones
 from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.fitting.fitters import BodyConfig, make_fitter
 from shapepose_fg.body.model.body_model import BodyModel
@@ -18,24 +20,34 @@ from shapepose_fg.body.shapes import SubjectShapes
 from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections, DetectionSequence
-from shapepose_fg.estimation.alternation import ExtraFactors, RefineConfig, Refined, refine
+from shapepose_fg.estimation.alternation import EstimatorConfig, RefineConfig
 from shapepose_fg.estimation.detector_offsets import (
     AdjustableFitter,
     OffsetConfig,
     confident_targets,
     spread_frames,
 )
+from shapepose_fg.estimation.estimator import Estimator, ExtraFactors
 from shapepose_fg.estimation.linearisation import ObservationConfig
-from shapepose_fg.estimation.person_graph import PersonGraphConfig
-from shapepose_fg.frame_times import FrameTimes, check_cuts
-from shapepose_fg.observation_table import Gate, ObservationTable, place_in_view
+from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
+from shapepose_fg.estimation.window_graph import WindowGraphConfig
+from shapepose_fg.frame_times import FrameTimes, check_cuts, stretches
+from shapepose_fg.observation_table import place_in_view
 from shapepose_fg.observations import Observations
 from shapepose_fg.proposal.association import AssociationConfig, associate
 from shapepose_fg.proposal.candidates import CandidateConfig, triangulate_pairs, vote
 from shapepose_fg.proposal.proposals import ProposalConfig, propose
 from shapepose_fg.provenance import versions
-from shapepose_fg.reconstruction import Known, Reconstruction
+from shapepose_fg.reconstruction import Reconstruction
 from shapepose_fg.skeleton import BODY_25, Skeleton
+from shapepose_fg.solved_rows import result_rows
+from shapepose_fg.tracking.following import FollowingConfig, Input
+from shapepose_fg.tracking.stitching import StitchingConfig, stitch
+from shapepose_fg.tracking.tracker import BodyScale, Tracker, TrackingConfig
+from shapepose_fg.windows import Engine, Solved, WindowConfig
+
+FAST_M_S = 3.0
+"""The tracker predicts joints as if they moved so fast: a hand that is thrown up or strikes."""
 
 Progress = Callable[[int, int], None]
 """Called with the number of frames that are done and the number of all."""
@@ -53,8 +65,18 @@ class PipelineConfig:
     """Stage I (e): people to their 2D observations."""
     observations: ObservationConfig = field(default_factory=ObservationConfig)
     """How far a 2D observation is trusted."""
-    person_graph: PersonGraphConfig = field(default_factory=PersonGraphConfig)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    """People over time: how they are followed from frame to frame."""
+    following: FollowingConfig = field(default_factory=FollowingConfig)
+    """People over time: what becomes of tracks."""
+    stitching: StitchingConfig = field(default_factory=StitchingConfig)
+    """People over time: who comes back after a longer time out of sight."""
+    windows: WindowConfig = field(default_factory=WindowConfig)
+    """People over time: how frames are cut into windows, and how often detections are given out again."""
+    window_graph: WindowGraphConfig = field(default_factory=WindowGraphConfig)
     """Stage II: the factor graph of a person."""
+    motion: MotionConfig = field(default_factory=MotionConfig)
+    """Stage II: how frames hang together."""
     body: BodyConfig = field(default_factory=BodyConfig)
     """Stage II: how bodies are fitted."""
     offsets: OffsetConfig = field(default_factory=OffsetConfig)
@@ -63,8 +85,8 @@ class PipelineConfig:
     """Stage II: the alternation."""
     temporal: bool = True
     """People over time: identities, motion, one shape a person. Without it every frame stands alone."""
-    batch_frames: int = 64
-    """Frames whose people are refined together: bodies are fitted fastest by the hundred."""
+    batch_frames: int = 96
+    """Frames that are solved together and returned: bodies are fitted fastest by the hundred."""
     threads: int = 1
     """Threads of torch while bodies are fitted: the matrices are small, and where cores are busy a second thread
     costs more than it brings."""
@@ -88,17 +110,16 @@ def reconstruct(
     shapes: SubjectShapes | None = None,
     progress: Progress | None = None,
 ) -> Reconstruction:
-    """Reconstruct the people of a recording, every frame by itself.
+    """Reconstruct the people of a recording over time; with `config.temporal` false, every frame by itself.
 
     `frames` picks frames of the recording (all of them by default). `fitter` replaces the body fitter, and
-    `extra_factors` adds factors of your own to every person's graph. In the result a person's number counts the
-    people of a frame; it is not an identity over time. `run` of the result holds the configuration, versions,
-    seconds per stage, how many people were found and dropped, with reasons, and where the detector's joints lie
-    on the body. `times` says when the frames were taken; without it 30 frames a second are assumed, and run.json
-    says so. `cuts` are first frames of what follows a cut: nothing carries over to them. `shapes` are people known
-    from other recordings. Offsets are learnt from frames of the whole recording, whatever `frames` picks, so that
-    a frame comes out the same alone and among others; a fitter of your own takes part if it is an
-    `AdjustableFitter`.
+    `extra_factors` adds factors of your own to every person's window. In the result `person` is an identity over
+    time (without time, the number of a person within the frame). `times` says when the frames were taken; without
+    it 30 frames a second are assumed, and `run` says so. `cuts` are first frames of what follows a cut: nothing
+    carries over to them, identities least of all. `shapes` are people known from other recordings. `run` of the
+    result holds the configuration, versions, seconds per stage, how many people were found and dropped, with
+    reasons, and where the detector's joints lie on the body. That is learnt from frames spread over the whole
+    recording, whatever `frames` picks; a fitter of your own takes part if it is an `AdjustableFitter`.
     """
     config = PipelineConfig() if config is None else config
     frames = range(len(detections)) if frames is None else frames
@@ -111,21 +132,28 @@ def reconstruct(
     with run.stage("load"):
         if fitter is None:
             fitter = make_fitter(config.body, BodyModel.default().with_keypoints(detections.skeleton.joints))
-    found: dict[int, Observations] = {}
-    parts = []
     with torch_threads(config.threads):
-        offsets = _offsets(detections, rig, config, frames, fitter, found, run)
+        with run.stage("offsets"):
+            offsets = _offsets(detections, rig, config, fitter)
         if isinstance(fitter, AdjustableFitter) and offsets is not None:
             fitter = fitter.with_keypoint_offsets(offsets)
-        for start in range(0, len(frames), config.batch_frames):
-            batch = frames[start : start + config.batch_frames]
-            parts.append(_reconstruct_batch(detections, rig, config, batch, fitter, extra_factors, found, run))
+        engine = _engine(rig, detections.skeleton, config, fitter, extra_factors, run)
+        parts, done = [], 0
+        for solved, count in _solved(engine, config, _inputs(detections, rig, frames, times, run), frames, cuts):
+            parts += [_rows(each, rig, detections, config) for each in solved]
+            done += count
             if progress is not None:
-                progress(start + len(batch), len(frames))
-    people = Reconstruction.concatenate(parts) if parts else Reconstruction.empty(detections.skeleton.joints)
+                progress(done, len(frames))
+        people = Reconstruction.concatenate(parts) if parts else Reconstruction.empty(detections.skeleton.joints)
+        if config.temporal:
+            with run.stage("follow"):
+                people = _stitched(people, detections.skeleton, config, times.frame_s[list(cuts)])
+        if config.temporal and isinstance(fitter, SequenceFitting):
+            with run.stage("bodies over time"):
+                people = with_bodies_over_time(people, fitter, shapes)
     summary = run.summary(config, frames, people) | {"time": times.as_dict(), "cuts": list(cuts)}
     summary |= {"keypoint_offsets": None if offsets is None else offsets.as_dict()}
-    return replace(people, time_s=times.frame_s[people.frame], run=summary)
+    return replace(people, run=summary)
 
 
 def estimate_offsets(
@@ -144,7 +172,7 @@ def estimate_offsets(
     fitter = make_fitter(config.body) if fitter is None else fitter
     config = replace(config, offsets=replace(config.offsets, source="recording"))
     with torch_threads(config.threads):
-        offsets = _offsets(detections, rig, config, range(0), fitter, {}, _Run())
+        offsets = _offsets(detections, rig, config, fitter)
     if offsets is None:
         raise ValueError(
             f"offsets are known for {BODY_25.name} only, these are joints of {detections.skeleton.name}"
@@ -170,75 +198,70 @@ def find_people(
     return observations
 
 
-def _reconstruct_batch(
-    detections: DetectionSequence,
+def _engine(
     rig: Rig,
+    skeleton: Skeleton,
     config: PipelineConfig,
-    frames: range,
     fitter: BodyFitter,
     extra_factors: ExtraFactors | None,
-    found: dict[int, Observations],
     run: "_Run",
-) -> Reconstruction:
-    """Stage I frame by frame, then stage II for all people of these frames together.
+) -> Engine:
+    """Everything from frames to rows."""
+    weaker = replace(config, candidates=replace(config.candidates, min_votes=1))
 
-    Frames whose people are `found` already are not looked at again.
-    """
-    parts = [found.pop(t) if t in found else _look(detections, t, rig, config, run) for t in frames]
-    counts = np.array([len(observations) for observations in parts])
-    frame = np.repeat(np.array(frames), counts)
-    person = np.arange(len(frame)) - np.repeat(np.cumsum(counts) - counts, counts)
-    observations = Observations.concatenate(parts)
-    with run.stage("refine"):
-        refined = refine(
-            observations,
-            rig,
-            fitter,
-            config.observations,
-            config.person_graph,
-            config.refine,
-            person=person,
-            frame=frame,
-            extra_factors=extra_factors,
-        )
-    people = _rows(refined, frame, person, detections.skeleton)
-    if observations.candidate is None:
-        return people
-    with run.stage("refine"):
-        starts = np.cumsum(counts)[:-1]
-        candidates = zip(frames, np.split(observations.candidate, starts), strict=True)
-        table = ObservationTable.of(
-            observations,
-            np.concatenate([place_in_view(candidate, detections[t].view) for t, candidate in candidates]),
-            refined.joints,
-            np.where(refined.inlier, Gate.USED, Gate.TOO_FAR),
-            rig,
-            frame=frame,
-            person=person,
-            joint_names=detections.skeleton.joints,
-        )
-    return replace(people, observations=table)
+    def find(detections: Detections, rig: Rig, weak: bool) -> Observations:
+        return find_people(detections, rig, skeleton, weaker if weak else config, run)
+
+    motion = MotionModel.load(skeleton.joints, config.motion)
+    scale = BodyScale(longest_bones(skeleton), motion.psd(np.full(len(skeleton), FAST_M_S)))
+    settings = EstimatorConfig(config.observations, config.window_graph, config.refine, config.motion)
+    return Engine(
+        Tracker(skeleton, scale, find, config.tracking, config.observations, weak_births=config.temporal),
+        Estimator(rig, fitter, skeleton.joints, settings),
+        config.following,
+        config.windows,
+        frames=config.batch_frames,
+        temporal=config.temporal,
+        extra_factors=extra_factors,
+        stage=run.stage,
+    )
 
 
-def _look(
-    detections: DetectionSequence, frame: int, rig: Rig, config: PipelineConfig, run: "_Run"
-) -> Observations:
-    """Read a frame, and stage I."""
-    with run.stage("read"):
-        seen = detections[frame]
-    return find_people(seen, rig, detections.skeleton, config, run)
+def _inputs(
+    detections: DetectionSequence, rig: Rig, frames: range, times: FrameTimes, run: "_Run"
+) -> Callable[[int], Input]:
+    """What the cameras give of a frame."""
+    of_views = times.of_views(len(rig))
+
+    def read(frame: int) -> Input:
+        with run.stage("read"):
+            return Input(frame, of_views[frame], detections[frame], rig)
+
+    return read
+
+
+def _solved(
+    engine: Engine, config: PipelineConfig, read: Callable[[int], Input], frames: range, cuts: Sequence[int]
+) -> Iterator[tuple[list[Solved], int]]:
+    """Rows that are done, and how many frames have been read for them."""
+    next_id = 0
+    for stretch in stretches(frames, cuts):
+        state = engine.start(next_id)
+        for start in range(stretch.start, stretch.stop, config.batch_frames):
+            batch = stretch[start - stretch.start : start - stretch.start + config.batch_frames]
+            given = [read(frame) for frame in batch]
+            if config.temporal:
+                done, state = engine.advance(state, given, last=batch.stop == stretch.stop)
+                next_id = state.follow.tracker.next_id
+            else:
+                done = [engine.alone(given)]
+            yield done, len(batch)
 
 
 def _offsets(
-    detections: DetectionSequence,
-    rig: Rig,
-    config: PipelineConfig,
-    frames: range,
-    fitter: BodyFitter,
-    found: dict[int, Observations],
-    run: "_Run",
+    detections: DetectionSequence, rig: Rig, config: PipelineConfig, fitter: BodyFitter
 ) -> KeypointOffsets | None:
-    """Where the detector puts its joints; None where nobody asks. Fills `found` with people of `frames`."""
+    """Where the detector puts its joints, by frames spread over the recording; None where nothing says it."""
     source = config.offsets.source
     if source == "none":
         return None
@@ -249,37 +272,37 @@ def _offsets(
     if source != "recording":
         return KeypointOffsets.load(source)
     spread = spread_frames(len(detections), config.offsets.frames)
-    for frame in spread:
-        if frame in frames:
-            found[frame] = _look(detections, frame, rig, config, run)
-    with run.stage("offsets"):
-        # What was found elsewhere is not this run's: neither its stages nor what it dropped.
-        people = [found[t] if t in frames else _look(detections, t, rig, config, _Run()) for t in spread]
-        if len(people) == 0:
-            return KeypointOffsets.identity()
-        targets = confident_targets(Observations.concatenate(people), rig, config.observations, config.offsets)
-        return learn_offsets(targets, fitter.model, config=config.body.plain, prior=config.offsets.prior)
+    people = [find_people(detections[t], rig, detections.skeleton, config) for t in spread]
+    if len(people) == 0:
+        return KeypointOffsets.identity()
+    targets = confident_targets(Observations.concatenate(people), rig, config.observations, config.offsets)
+    return learn_offsets(targets, fitter.model, config=config.body.plain, prior=config.offsets.prior)
 
 
-def _rows(refined: Refined, frame: np.ndarray, person: np.ndarray, skeleton: Skeleton) -> Reconstruction:
-    """The refined people as rows of the result; bodies that were not fitted are NaN there."""
-    fit = refined.fit
-    body = {name: getattr(fit, name).copy() for name in ("betas", "global_orient", "body_pose", "transl")}
-    for values in body.values():
-        values[~fit.ok] = np.nan
-    known = np.where(refined.inlier.any(axis=-1), Known.SEEN, Known.BODY)
-    known = np.where(np.isfinite(refined.joints).all(axis=-1), known, Known.UNKNOWN)
-    return Reconstruction(
-        frame=frame,
-        person=person,
-        joint_names=np.array(skeleton.joints),
-        joints=refined.joints,
-        covariance=refined.covariance,
-        confidence=refined.confidence,
-        known=known,
-        status=refined.status,
-        **body,
-    )
+def _rows(solved: Solved, rig: Rig, detections: DetectionSequence, config: PipelineConfig) -> Reconstruction:
+    """Solved rows as rows of the result, by frame and person; bodies that were not fitted are NaN there."""
+    order = np.lexsort((solved.observations.track, solved.observations.frame))
+    rows, estimates = solved.observations.rows(order), solved.estimates.rows(order)
+    person = rows.track if config.temporal else _number_in_frame(rows.frame)
+    place = np.full(rows.candidate.shape, -1, dtype=np.int32)
+    for frame in np.unique(rows.frame).tolist():
+        of_frame = rows.frame == frame
+        place[of_frame] = place_in_view(rows.candidate[of_frame], detections[frame].view)
+    return result_rows(rows, estimates, place, rig, detections.skeleton.joints, person)
+
+
+def _stitched(
+    people: Reconstruction, skeleton: Skeleton, config: PipelineConfig, cuts_s: np.ndarray
+) -> Reconstruction:
+    """The same rows, tracks of one person joined over longer times out of sight."""
+    person = stitch(people.person, people.time_s, people.joints, skeleton, config.stitching, cuts_s.tolist())
+    table = None if people.observations is None else replace(people.observations, person=person)
+    return replace(people, person=person, observations=table)
+
+
+def _number_in_frame(frame: np.ndarray) -> np.ndarray:
+    """(N,) which of its frame's rows each row is; `frame` (N,) rises."""
+    return np.arange(len(frame)) - np.searchsorted(frame, frame)
 
 
 class _Run:
@@ -304,9 +327,7 @@ class _Run:
             "frames": [frames.start, frames.stop],
             "seconds": dict(self.seconds),
             "people": {
-                "found": len(people),
-                "status": dict(Counter(people.status.tolist())),
-                "joints": people.count_known(),
+                **people.counts(),
                 "dropped": {reason: count for reason, count in self.dropped.items() if count > 0},
             },
         }

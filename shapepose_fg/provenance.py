@@ -27,8 +27,12 @@ def versions() -> dict[str, str]:
     return found
 
 
+_INPUTS = (".txt", ".json", ".toml", ".yml", ".yaml", ".xml")
+"""Files of a folder that may be read: calibrations and detections."""
+
+
 def checksums(inputs: Iterable[str | Path]) -> dict[str, str]:
-    """sha256 of every input file; of a folder, of its `.txt` and `.json` files by name and content.
+    """sha256 of every input file; of a folder, of its files of numbers by name and content.
 
     A recording of 10,000 JSON files is one line of run.json, and a file renamed or lost changes it.
     """
@@ -46,7 +50,7 @@ def _digest(path: Path) -> str:
     """sha256 in hexadecimal."""
     try:
         if path.is_dir():
-            files = sorted(file for file in path.rglob("*") if file.suffix in (".txt", ".json"))
+            files = sorted(file for file in path.rglob("*") if file.suffix in _INPUTS)
             whole = hashlib.sha256()
             for file in files:
                 whole.update(f"{file.relative_to(path).as_posix()} {_digest(file)}\n".encode())

@@ -1,6 +1,7 @@
 """What comes out: the people of every frame, as arrays with one row per person and frame."""
 
 import json
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum, StrEnum
@@ -15,7 +16,7 @@ from shapepose_fg.columns import check_codes, checked, code_names, npz_bytes, re
 from shapepose_fg.errors import InputError
 from shapepose_fg.files import read_json, write_atomically
 from shapepose_fg.observation_table import ObservationTable
-from shapepose_fg.run_summary import merged_run, plain
+from shapepose_fg.run_summary import check_run, merged_run, plain
 from shapepose_fg.skeleton import BODY_25
 
 
@@ -28,6 +29,8 @@ class Status(StrEnum):
     """No joint is seen by two views, or too few are: nothing fixes the person in space."""
     BODY_UNDETERMINED = "body undetermined"
     """Joints are there, but too few of them to fit a body; what no view saw stays NaN."""
+    NOT_SOLVED = "not solved"
+    """A joint ran away from what was seen of it, or nothing determines it: `run` names person, frame and joint."""
 
 
 class Known(IntEnum):
@@ -192,6 +195,11 @@ class Reconstruction:
             kind.name.lower(): int(count[kind]) for kind in (Known.SEEN, Known.BODY, Known.MOTION, Known.UNKNOWN)
         }
 
+    def counts(self) -> dict[str, Any]:
+        """What run.json says of the rows: how many, with which status, and how their joints are known."""
+        status = Counter(self.status.tolist())
+        return {"found": len(self), "status": dict(status), "joints": self.count_known()}
+
     def save(self, folder: str | Path) -> None:
         """Write people.npz, run.json and observations.npz into `folder`, each whole or not at all.
 
@@ -230,6 +238,10 @@ class Reconstruction:
         run = read_json(run_file) if run_file.is_file() else {}
         if not isinstance(run, dict):
             raise InputError(f"{run_file}: must hold an object; restore it or delete it")
+        try:
+            check_run(run)
+        except ValueError as error:
+            raise InputError(f"{run_file}: {error}; restore it or delete it") from None
         given: dict[str, Any] = {name: columns[name] for name in (*cls.ROWS, "joint_names") if name in columns}
         try:
             people = cls(**given, run=run)

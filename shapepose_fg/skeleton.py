@@ -1,5 +1,6 @@
 """What a detector's joints are called, how limbs join them, and which are left and right of each other."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -23,6 +24,73 @@ class Skeleton:
     """(J,) the same joint on the other side of the body; a joint in the middle is its own mirror."""
     core: tuple[int, ...]
     """The body parts by which a person is recognised: trunk, arms and legs, without face and toes."""
+    middles: tuple[tuple[int, int, int], ...] = ()
+    """Joints that the detector does not give: (joint, first, second), the middle of two that it gives."""
+    keypoints: tuple[int, ...] | None = None
+    """The joint of each keypoint that the detector writes, in its order, -1 where it is passed over (hands and
+    face, say); None where they are the joints, in this order."""
+
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        keypoints: Sequence[str],
+        limbs: Sequence[tuple[str, str]],
+        *,
+        anchor: str | tuple[str, str],
+        mirror: Sequence[tuple[str, str]],
+        core: Sequence[str],
+        middles: Mapping[str, tuple[str, str]] | None = None,
+        parents: Mapping[str, str] | None = None,
+        passed_over: int = 0,
+    ) -> "Skeleton":
+        """A skeleton described by names.
+
+        `keypoints` are the detector's, in its order; "" is passed over, and so are `passed_over` more at the end.
+        `middles` are made of two keypoints each. `anchor` is a joint, or the name of two of which the middle is
+        made ("MidHip" then). `mirror` are pairs of joints on both sides of the body. `parents` are found along
+        the limbs, from the anchor outwards, where they are not given. ValueError names what does not fit.
+        """
+        middles = dict(middles or {})
+        if not isinstance(anchor, str):
+            middles[MID_HIP] = anchor
+            limbs = [*limbs, *((MID_HIP, end) for end in anchor)]
+            anchor = MID_HIP
+        joints = (*(joint for joint in keypoints if joint), *middles)
+        place = {joint: index for index, joint in enumerate(joints)}
+        if len(place) < len(joints):
+            twice = next(joint for joint in joints if joints.count(joint) > 1)
+            raise ValueError(f"{name}: joint {twice} occurs twice; give each its own name")
+        pairs = [*limbs, *mirror, *middles.values()]
+        for joint in (anchor, *core, *(end for pair in pairs for end in pair)):
+            if joint not in place:
+                raise ValueError(f"{name} has no joint {joint!r}; it has {' '.join(joints)}")
+        other = {place[a]: place[b] for a, b in (*mirror, *((b, a) for a, b in mirror))}
+        edges = tuple((place[a], place[b]) for a, b in limbs)
+        grown = (
+            _grown(place[anchor], edges, len(joints))
+            if parents is None
+            else [place.get(parents.get(joint, ""), -1) for joint in joints]
+        )
+        lost = [joints[j] for j, parent in enumerate(grown) if parent < 0 and joints[j] != anchor]
+        if lost:
+            raise ValueError(f"{name}: no limbs lead from the anchor {anchor} to {' '.join(lost)}; add limbs")
+        skeleton = cls(
+            name=name,
+            joints=joints,
+            limbs=edges,
+            parents=tuple(grown),
+            mirror=tuple(other.get(index, index) for index in range(len(joints))),
+            core=tuple(place[joint] for joint in core),
+            middles=tuple((place[joint], place[a], place[b]) for joint, (a, b) in middles.items()),
+            keypoints=(*(place[joint] if joint else -1 for joint in keypoints), *[-1] * passed_over),
+        )
+        beside = [j for j in range(len(joints)) if grown[j] == place[anchor] and skeleton.mirror[j] != j]
+        if len(beside) < 2:
+            raise ValueError(
+                f"{name}: two joints beside the anchor {anchor} must mirror each other, as hips do; anchor it so"
+            )
+        return skeleton
 
     def __len__(self) -> int:
         return len(self.joints)
@@ -39,8 +107,18 @@ class Skeleton:
         return self.parents.index(-1)
 
     @property
+    def anchor(self) -> tuple[int, ...]:
+        """What places a person: the root joint, or the two of which it is made."""
+        return next(((first, second) for joint, first, second in self.middles if joint == self.root), (self.root,))
+
+    @property
+    def keypoint_count(self) -> int:
+        """K, the keypoints of a person in the detector's files."""
+        return len(self) if self.keypoints is None else len(self.keypoints)
+
+    @property
     def hips(self) -> tuple[int, int]:
-        """The two joints beside the root that mirror each other, right first."""
+        """The two joints beside the root that mirror each other."""
         beside = [j for j in range(len(self)) if self.parents[j] == self.root and self.mirror[j] != j]
         return beside[0], beside[1]
 
@@ -80,6 +158,21 @@ def _limbs(text: str) -> tuple[tuple[int, int], ...]:
     return tuple((int(first), int(second)) for first, second in pairs)
 
 
+def _grown(root: int, limbs: Sequence[tuple[int, int]], count: int) -> list[int]:
+    """The parent of each joint when a tree is grown from `root` along the limbs, -1 where none leads."""
+    parents, reached = [-1] * count, [root]
+    for joint in reached:
+        for first, second in limbs:
+            for end, other in ((first, second), (second, first)):
+                if end == joint and other not in reached:
+                    parents[other] = joint
+                    reached.append(other)
+    return parents
+
+
+MID_HIP = "MidHip"
+"""The anchor of a person where it is made: the middle of the hips."""
+
 BODY_25 = Skeleton(
     name="BODY_25",
     joints=tuple(
@@ -94,7 +187,57 @@ BODY_25 = Skeleton(
     mirror=(0, 1, 5, 6, 7, 2, 3, 4, 8, 12, 13, 14, 9, 10, 11, 16, 15, 18, 17, 22, 23, 24, 19, 20, 21),
     core=tuple(range(15)),
 )
-"""OpenPose's BODY_25: the skeleton of the detections and of the results."""
+"""OpenPose's BODY_25: the skeleton in which everything else here is described."""
+
+_MIDDLES = {"Neck": ("RShoulder", "LShoulder"), MID_HIP: ("RHip", "LHip")}
+"""How BODY_25's own middle joints were labelled: a skeleton without them has them made so."""
+
+
+def _like_body_25(name: str, keypoints: str, passed_over: int = 0) -> Skeleton:
+    """A skeleton of joints of BODY_25 (and HALPE's top of the head), with the limbs whose ends it has."""
+    given = keypoints.split()
+    middles = {joint: ends for joint, ends in _MIDDLES.items() if joint not in given}
+    joints = (*given, *middles)
+    names = BODY_25.joints
+    limbs = [(names[a], names[b]) for a, b in BODY_25.limbs if names[a] in joints and names[b] in joints]
+    parents = {joint: names[parent] for joint, parent in zip(names, BODY_25.parents, strict=True) if parent >= 0}
+    if "Head" in given:
+        limbs, parents = [*limbs, ("Neck", "Head")], parents | {"Head": "Neck"}
+    return Skeleton.of(
+        name,
+        given,
+        limbs,
+        anchor=MID_HIP,
+        mirror=[(joint, "L" + joint[1:]) for joint in joints if joint[0] == "R"],
+        core=[names[joint] for joint in BODY_25.core],
+        middles=middles,
+        parents={joint: parent for joint, parent in parents.items() if joint in joints},
+        passed_over=passed_over,
+    )
+
+
+_COCO = (
+    "Nose LEye REye LEar REar LShoulder RShoulder LElbow RElbow LWrist RWrist LHip RHip LKnee RKnee LAnkle RAnkle"
+)
+_HALPE = f"{_COCO} Head Neck MidHip LBigToe RBigToe LSmallToe RSmallToe LHeel RHeel"
+
+COCO_17 = _like_body_25("COCO_17", _COCO)
+"""COCO's 17 keypoints; neck and mid-hip are made."""
+COCO_18 = _like_body_25(
+    "COCO_18",
+    "Nose Neck RShoulder RElbow RWrist LShoulder LElbow LWrist RHip RKnee RAnkle LHip LKnee LAnkle "
+    "REye LEye REar LEar",
+)
+"""OpenPose's COCO model; mid-hip is made."""
+HALPE_26 = _like_body_25("HALPE_26", _HALPE)
+"""HALPE's body with feet, AlphaPose's and RTMPose's."""
+HALPE_136 = _like_body_25("HALPE_136", _HALPE, passed_over=110)
+"""HALPE's whole body; face and hands are passed over."""
+COCO_133 = _like_body_25("COCO_133", f"{_COCO} LBigToe LSmallToe LHeel RBigToe RSmallToe RHeel", passed_over=110)
+"""COCO-WholeBody; neck and mid-hip are made, face and hands are passed over."""
+
+SKELETONS = {each.name: each for each in (BODY_25, COCO_17, COCO_18, HALPE_26, COCO_133, HALPE_136)}
+"""The skeletons that files of detections are known to have; they differ in the number of keypoints."""
 
 SMPL_24 = tuple(
     "pelvis left_hip right_hip spine1 left_knee right_knee spine2 left_ankle right_ankle spine3 left_foot "

@@ -4,6 +4,7 @@ One function, `advance`, from (frames, state) to (rows, state): memory does not 
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,15 +21,19 @@ from shapepose_fg.tracking.tracker import Tracker, TrackerState
 class WindowConfig:
     """How frames are cut into windows."""
 
-    frames: int = 96
-    """Frames that a window adds to the result."""
     overlap_s: float = 0.4
     """What a window takes of the frames before and after them, and does not return: motion and views of 0.4 s on
     either side decide a joint to less than a millimetre."""
 
+    again_over_time: int = 2
+    """How often detections are given out again around the solution of a window."""
+    again_alone: int = 2
+    """The same for frames that stand alone."""
+
     def __post_init__(self) -> None:
-        if self.frames < 1 or not self.overlap_s >= 0:
-            raise ValueError(f"frames must be at least 1 and overlap_s not negative, got {self}")
+        for name, value in vars(self).items():
+            if not value >= 0:
+                raise ValueError(f"{name} must not be negative, got {value}")
 
 
 @dataclass(frozen=True)
@@ -65,14 +70,14 @@ class Engine:
     """What becomes of tracks."""
     windows: WindowConfig
     """How frames are cut."""
+    frames: int
+    """Frames that a window returns."""
     temporal: bool
     """Whether frames hang together; if not, every frame is a recording of its own."""
-    reassociations: int
-    """How often detections are given out again around the solution."""
     extra_factors: ExtraFactors | None = None
     """The user's own factors."""
-    timed: Callable[[str], object] | None = None
-    """A context manager for each stage's name, to take its time."""
+    stage: Callable[[str], AbstractContextManager[None]] = lambda name: nullcontext()
+    """Takes the time of a stage, by its name."""
 
     @property
     def skeleton(self) -> Skeleton:
@@ -88,32 +93,38 @@ class Engine:
     ) -> tuple[list[Solved], StreamState]:
         """Take in `frames`; returns the rows that are done. With `last` the recording ends, or is cut, there."""
         following, decided = state.follow, list(state.decided)
-        for frame in frames:
-            following, more = follow(self.tracker, following, frame, self.following)
-            decided += more
-        if last:
-            following, more = finish(following, self.following)
-            decided += more
+        with self.stage("follow"):
+            for frame in frames:
+                following, more = follow(self.tracker, following, frame, self.following)
+                decided += more
+            if last:
+                following, more = finish(following, self.following)
+                decided += more
         before, done = state.before, list[Solved]()
         while (cut := self._next(decided, before, last)) is not None:
             stop, end = cut
-            done.append(self._solve(decided[:end], before, stop))
+            done.append(self._solve(decided[:end], before, stop, None, self.windows.again_over_time))
             keep = self._overlap(decided, stop, -1)
             decided, before = decided[keep:], stop - keep
         return done, StreamState(following, tuple(decided), before)
 
-    def alone(self, frame: Input) -> list[Decided]:
-        """The people of a frame that stands alone."""
-        _, decided = finish(follow(self.tracker, self.start().follow, frame, self.following)[0], self.following)
-        return decided
-
-    def solve_alone(self, decided: Sequence[Decided]) -> Solved:
+    def alone(self, frames: Sequence[Input]) -> Solved:
         """Frames that have nothing to do with each other, solved together because bodies are fitted fastest so."""
-        return self._solve(list(decided), 0, len(decided))
+        decided = list[Decided]()
+        with self.stage("follow"):
+            for frame in frames:
+                first, _ = follow(self.tracker, self.start().follow, frame, self.following)
+                decided += finish(first, self.following)[1]
+        numbered = np.cumsum([0, *(len(rows) for _, rows in decided)])
+        decided = [
+            (frame, replace(rows, track=first + np.arange(len(rows))))
+            for (frame, rows), first in zip(decided, numbered.tolist(), strict=False)
+        ]
+        return self._solve(decided, 0, len(decided), Survival(), self.windows.again_alone)
 
     def _next(self, decided: Sequence[Decided], before: int, last: bool) -> tuple[int, int] | None:
         """Where the next window's own frames stop, and where it ends; None where there is too little."""
-        stop = before + self.windows.frames
+        stop = before + self.frames
         if stop < len(decided):
             end = self._overlap(decided, stop, 1)
             if end < len(decided) or last:
@@ -127,19 +138,19 @@ class Engine:
         near = np.abs(times - border) <= self.windows.overlap_s
         return int(np.flatnonzero(near)[0]) if direction < 0 else int(np.flatnonzero(near)[-1]) + 1
 
-    def _solve(self, decided: list[Decided], start: int, stop: int) -> Solved:
+    def _solve(
+        self, decided: Sequence[Decided], start: int, stop: int, survival: Survival | None, again: int
+    ) -> Solved:
         """One window; the rows of its frames `start` to `stop` are returned."""
         given = [frame for frame, _ in decided]
         rows = Observations.concatenate([part for _, part in decided])
-        if not self.temporal:
-            rows = replace(rows, track=np.arange(len(rows)))
-        estimates = self.estimator.estimate(rows, self.extra_factors)
-        survival = None if self.temporal else Survival()
-        for _ in range(self.reassociations if len(rows) > 0 else 0):
-            rows = reassociate(
-                given, rows, estimates.joints, estimates.covariance, self.skeleton,
-                self.tracker.config.assignment, survival,
-            )  # fmt: skip
+        for _ in range(again if len(rows) > 0 else 0):
+            with self.stage("associate again"):
+                joints, covariance = self.estimator.draft(rows)
+                rows = reassociate(
+                    given, rows, joints, covariance, self.skeleton, self.tracker.config.assignment, survival
+                )
+        with self.stage("solve"):
             estimates = self.estimator.estimate(rows, self.extra_factors)
         own = [frame.frame for frame in given[start:stop]]
         index = np.flatnonzero(np.isin(rows.frame, own))

@@ -34,7 +34,7 @@ def test_undistort_inverts_distort():
     camera = Camera("a", plain, np.eye(4), (1000, 800), LENS)
     xy = np.random.default_rng(0).uniform((0, 0), (1000, 800), (50, 2))
     # The inverse is iterated to 1e-6 of a normalised coordinate, a thousandth of a pixel.
-    np.testing.assert_allclose(camera.distort(camera.undistort(xy)), xy, atol=1e-3)
+    np.testing.assert_allclose(camera.distort(camera.undistort(xy)), xy, atol=1e-6)
     assert np.abs(camera.undistort(xy) - xy).max() > 5.0, "the lens must bend something for this to test anything"
 
 
@@ -92,3 +92,50 @@ def test_rig_needs_two_cameras_with_different_names_and_an_up_axis():
     with pytest.raises(ValueError, match="up must be"):
         Rig((posed(), posed("b")), "up")  # type: ignore[arg-type]
     np.testing.assert_array_equal(Rig((posed(), posed("b")), "-y").up_vector, [0, -1, 0])
+
+
+LENSES = {
+    "five": ("perspective", [-0.3, 0.1, 0.001, -0.002, 0.02]),
+    "rational": ("perspective", [5.1, 2.3, 1e-4, -2e-4, 0.12, 5.4, 3.9, 0.6]),
+    "thin prism": ("perspective", [-0.2, 0.05, 1e-3, -1e-3, 0, 0.1, 0, 0, 1e-3, -2e-3, 1e-3, 0]),
+    "fisheye": ("fisheye", [0.05, -0.01, 0.003, -0.001]),
+}
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_a_lens_bends_as_opencv_says_and_is_undone(lens):
+    family, coefficients = LENSES[lens]
+    plain = K.copy()
+    plain[0, 1] = 0.0  # OpenCV's own functions have no skew
+    camera = Camera("a", plain, np.eye(4), (1000, 800), np.array(coefficients), family)
+    rays = np.random.default_rng(0).uniform(-0.45, 0.45, (60, 2))
+    points = np.concatenate([rays, np.ones((60, 1))], axis=1)
+    project = cv2.fisheye.projectPoints if family == "fisheye" else cv2.projectPoints
+    seen, _ = project(points.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), plain, np.array(coefficients))
+    ideal, _ = camera.project(points)
+    np.testing.assert_allclose(camera.distort(ideal), seen[:, 0], atol=1e-9)
+    np.testing.assert_allclose(camera.undistort(seen[:, 0]), ideal, atol=1e-6)  # pixels
+
+
+def test_skew_is_bent_too():
+    camera = posed()
+    xy = np.random.default_rng(0).uniform((100, 100), (900, 700), (50, 2))
+    np.testing.assert_allclose(camera.distort(camera.undistort(xy)), xy, atol=1e-6)
+
+
+def test_what_the_lens_does_not_reach_is_nan():
+    # r (1 - 0.28 r^2 + 0.08 r^4 - 0.01 r^6) stays under 1.0: a corner at r = 1.1 is no point of any ray.
+    camera = Camera("a", np.diag([1000.0, 1000, 1]), np.eye(4), (1000, 800), np.array([-0.28, 0.08, 0, 0, -0.01]))
+    ideal = camera.undistort(np.array([[960.0, 540.0], [300.0, 200.0]]))
+    assert np.isnan(ideal[0]).all() and np.isfinite(ideal[1]).all()
+
+
+def test_refuses_coefficients_of_another_lens():
+    with pytest.raises(ValueError, match="distortion must be"):
+        Camera("a", K, np.eye(4), (10, 10), np.zeros(6))
+    with pytest.raises(ValueError, match=r"distortion must be \(4,\)"):
+        Camera("a", K, np.eye(4), (10, 10), np.zeros(5), "fisheye")
+    with pytest.raises(ValueError, match="lens must be"):
+        Camera("a", K, np.eye(4), (10, 10), np.zeros(5), "mirror")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="at most 4"):
+        Camera.from_camera_from_world("a", K, np.eye(4), (10, 10), [0.1] * 5, "fisheye")

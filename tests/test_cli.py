@@ -91,7 +91,8 @@ def test_reconstruct_writes_results_and_says_what_it_found(recording, pipeline, 
     words = " ".join(printed.out.split())
     for part in (
         "5 (0:5) of 2 cameras, 30 a second (assumed: give --fps)",
-        "10 in all, 2.0 a frame (2 to 2)",
+        "no identities, 2.0 a frame (2 to 2)",
+        "rows 10 in all",
         "5 ok",
         "5 too few views",
     ):
@@ -153,6 +154,33 @@ def test_shapes_are_kept_from_one_recording_to_the_next(recording, pipeline, tmp
     assert pipeline["shapes"].names.tolist() == ["0"]
     np.testing.assert_array_equal(pipeline["shapes"].betas, 0.5)
     assert str(file) in Reconstruction.load(tmp_path / "out").run["inputs"]
+
+
+def test_other_formats_are_read_and_what_was_made_of_them_is_said(recording, pipeline, tmp_path, capsys):
+    """Cameras without a picture size, and COCO's results, whose scores are per cent."""
+    cameras = {
+        name: {"R": np.eye(3).tolist(), "T": [[1000.0 * x], [0.0], [0.0]], "k": [0.0] * 3, "p": [0.0] * 2}
+        | {"fx": 1000.0, "fy": 1000.0, "cx": 500.0, "cy": 400.0}
+        for x, name in enumerate(("a", "b"))
+    }
+    (tmp_path / "calibration.json").write_text(json.dumps(cameras))
+    (tmp_path / "pose").mkdir()
+    for name in cameras:
+        person = {"image_id": 0, "keypoints": [100.0, 200.0, 50.0] * 17}
+        (tmp_path / "pose" / f"{name}.json").write_text(json.dumps([person]))
+    options = ["--calibration", str(tmp_path / "calibration.json"), "--detections", str(tmp_path / "pose")]
+    command = ["reconstruct", *options, "--output", str(tmp_path / "out")]
+    assert run(*command) == 2
+    assert "image_size is missing; pass --image-size WIDTHxHEIGHT" in capsys.readouterr().err
+    assert run(*command, "--image-size", "wide") == 2
+    assert "--image-size wide: must be WIDTHxHEIGHT" in capsys.readouterr().err
+    assert run(*command, "--image-size", "1001x801", "--skeleton", "COCO_17") == 0
+    assert pipeline["rig"].centres[1].tolist() == [1, 0, 0] and pipeline["rig"].up == "z"
+    assert pipeline["detections"].skeleton.name == "COCO_17"
+    notes = Reconstruction.load(tmp_path / "out").run["notes"]
+    printed = capsys.readouterr().err
+    assert len(notes) == 2 and all(f"note: {note}" in printed for note in notes)
+    assert "scores reach 50" in notes[0] and "COCO_17 has no Neck and no MidHip" in notes[1]
 
 
 @pytest.mark.parametrize(

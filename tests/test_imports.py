@@ -12,10 +12,11 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 LEVELS = (
-    "factors errors camera skeleton",
+    "factors errors",
+    "camera skeleton",
     "files provenance rendering run_summary columns body.threads",
-    "body.model body.shapes",
-    "body.fitting",
+    "body.model",
+    "body.fitting body.shapes",
     "body.offsets",
     "detections frame_times",
     "observations",
@@ -24,10 +25,13 @@ LEVELS = (
     "proposal",
     "estimation",
     "tracking",
+    "windows bodies_over_time solved_rows",
     "pipeline",
-    "io",
-    "evaluation simulation viewer",
-    "demo training",
+    "io solving",
+    "simulation viewer",
+    "training",
+    "evaluation",
+    "demo tracks_command",
     "cli",
 )
 """Each level imports only from those before it; a package may import its own modules too."""

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from shapepose_fg.skeleton import BODY_25, SMPL_24
+from shapepose_fg.body.model.target_skeletons import TARGET_SKELETONS, slots
+from shapepose_fg.skeleton import BODY_25, COCO_17, SKELETONS, SMPL_24, Skeleton
 
 
 def test_body_25_is_openpose_s():
@@ -29,3 +30,44 @@ def test_tree_hangs_on_limbs_and_reaches_every_joint():
 
 def test_tree_neighbours_are_parent_and_children():
     assert set(BODY_25.tree_neighbours[BODY_25.index("Neck")].tolist()) - {-1} == {8, 2, 5, 0}
+
+
+@pytest.mark.parametrize("skeleton", SKELETONS.values(), ids=SKELETONS)
+def test_every_skeleton_is_one_tree_on_its_limbs_and_mirrors_itself(skeleton):
+    assert sorted(np.concatenate(skeleton.tree_levels)) == list(range(len(skeleton)))
+    for joint, parent in enumerate(skeleton.parents):
+        assert parent < 0 or skeleton.adjacency[joint, parent] == 1
+    mirror = np.array(skeleton.mirror)
+    np.testing.assert_array_equal(mirror[mirror], np.arange(len(skeleton)))
+    assert [skeleton.joints[joint] for joint in skeleton.core] == [BODY_25.joints[joint] for joint in BODY_25.core]
+    assert {skeleton.joints[hip] for hip in skeleton.hips} == {"RHip", "LHip"}
+    assert skeleton.joints[skeleton.root] == "MidHip"
+    # A body has a point for every joint.
+    slots(skeleton.joints)
+
+
+def test_a_skeleton_without_middles_has_them_made():
+    assert [COCO_17.joints[joint] for joint, _, _ in COCO_17.middles] == ["Neck", "MidHip"]
+    assert {COCO_17.joints[joint] for joint in COCO_17.anchor} == {"RHip", "LHip"}
+    assert BODY_25.anchor == (8,) and BODY_25.middles == ()
+    assert {name: (each.keypoint_count, len(each)) for name, each in SKELETONS.items()} == {
+        "BODY_25": (25, 25),
+        "COCO_17": (17, 19),
+        "COCO_18": (18, 19),
+        "HALPE_26": (26, 26),
+        "COCO_133": (133, 25),
+        "HALPE_136": (136, 26),
+    }
+
+
+def test_target_skeletons_have_the_detectors_order():
+    for name in ("COCO_17", "HALPE_26", "BODY_25"):
+        given = list(TARGET_SKELETONS[name])
+        assert list(SKELETONS[name].joints[: len(given)]) == given
+
+
+def test_an_anchor_needs_two_joints_that_mirror_each_other_beside_it():
+    parts = {"limbs": [("A", "B"), ("B", "LC"), ("B", "RC")], "mirror": [("RC", "LC")], "core": ["A", "B"]}
+    assert Skeleton.of("four", ["A", "B", "LC", "RC"], anchor="B", **parts).parents == (1, -1, 1, 1)
+    with pytest.raises(ValueError, match="two joints beside the anchor A must mirror each other"):
+        Skeleton.of("four", ["A", "B", "LC", "RC"], anchor="A", **parts)

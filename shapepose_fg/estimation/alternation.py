@@ -1,29 +1,22 @@
-"""Stage II: joints and bodies in alternation, as in Algorithm 1 of the paper."""
+"""Stage II: joints and bodies in alternation, as in Algorithm 1 of the paper, over windows of frames."""
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import determined
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus, JointTargets
-from shapepose_fg.camera import Rig
+from shapepose_fg.camera import Views
 from shapepose_fg.estimation.linearisation import (
-    Evidence,
     ObservationConfig,
+    ViewEvidence,
+    linearise,
     mean_confidence,
-    observation_sigmas,
-    triangulate,
-    weigh,
 )
-from shapepose_fg.estimation.person_graph import PersonGraph, PersonGraphConfig, make_cameras
+from shapepose_fg.estimation.motion_model import MotionConfig
+from shapepose_fg.estimation.window_graph import Message, WindowGraph, WindowGraphConfig
 from shapepose_fg.observations import Observations
-from shapepose_fg.reconstruction import Status
-
-ExtraFactors = Callable[[PersonGraph], Iterable[gtsam.NonlinearFactor]]
-"""Your own factors for a person's graph, made from its keys."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +25,11 @@ class RefineConfig:
 
     alternations: int = 3
     """N of Algorithm 1: how often the body is fitted and the joints are solved, at the most."""
+    window_alternations: int = 2
+    """The same for windows of several frames: frames settle each other, a third round moved joints by under 0.1 mm
+    in the mean."""
     settled_m: float = 0.002
-    """A person whose joints all moved less in a round is done: most are after one or two. 0: nobody is."""
+    """A window whose joints all moved less in a round is done: most frames are after one or two. 0: none is."""
     max_sigma_m: float = 0.5
     """A joint whose views leave it less certain than this in some direction is not determined by them."""
     disagreement: float = 4.0
@@ -44,7 +40,7 @@ class RefineConfig:
     """Fewer joints than this determined by the views are not a person that can be placed in space."""
 
     def __post_init__(self) -> None:
-        for name in ("alternations", "max_sigma_m", "disagreement", "min_joints"):
+        for name in ("alternations", "window_alternations", "max_sigma_m", "disagreement", "min_joints"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
         if self.settled_m < 0:
@@ -52,115 +48,148 @@ class RefineConfig:
 
 
 @dataclass(frozen=True)
-class Refined:
-    """P people after stage II."""
+class EstimatorConfig:
+    """The settings of stage II."""
+
+    observations: ObservationConfig = field(default_factory=ObservationConfig)
+    """How far a 2D observation is trusted."""
+    graph: WindowGraphConfig = field(default_factory=WindowGraphConfig)
+    """What goes into the factor graph of a person."""
+    refine: RefineConfig = field(default_factory=RefineConfig)
+    """How joints and bodies alternate."""
+    motion: MotionConfig = field(default_factory=MotionConfig)
+    """How frames hang together."""
+
+
+@dataclass(frozen=True)
+class Window:
+    """The rows of one person that are solved together."""
+
+    rows: NDArray[np.intp]
+    """(T,) rows of the observations, frames rising."""
+    graph: WindowGraph
+    """Their factor graph."""
+
+
+@dataclass
+class Solution:
+    """N rows on their way through the alternation; each round changes those that still move."""
 
     joints: NDArray[np.float64]
-    """(P, J, 3) X, metres in the world; NaN where unknown."""
-    covariance: NDArray[np.float64]
-    """(P, J, 3, 3) marginal covariance of each joint, m²; NaN where unknown."""
-    confidence: NDArray[np.float64]
-    """(P, J) w_i of Eq. 4, mean confidence over all views of the observations that were kept."""
+    """(N, J, 3) X, metres; NaN where unknown."""
     inlier: NDArray[np.bool_]
-    """(P, J, V) delta_ij of Eq. 2: which observations were kept."""
+    """(N, J, V) delta_ij of Eq. 2: which observations were kept."""
+    views: Message
+    """What the views alone say of N rows, all of the error in it."""
+    body: Message
+    """What the body says of each joint without the joint's own views; zero where it does not pull."""
+    enough: NDArray[np.bool_]
+    """(N,) rows whose views place enough joints to place a person."""
     fit: BodyFit
-    """Theta: the bodies, P rows."""
-    status: NDArray[np.str_]
-    """(P,) a `Status` each."""
+    """Theta: the bodies, N rows."""
+
+    @classmethod
+    def start(cls, X: NDArray[np.float64], views: int) -> "Solution":
+        """Nothing but X_0 (N, J, 3)."""
+        N, J = X.shape[:2]
+
+        def nothing() -> Message:
+            return Message(np.full((N, J, 3), np.nan), np.zeros((N, J, 3, 3)))
+
+        none = np.zeros(N, dtype=bool)
+        fit = BodyFit.failed(np.full(N, FitStatus.TOO_FEW_JOINTS), J)
+        return cls(X.copy(), np.zeros((N, J, views), dtype=bool), nothing(), nothing(), none, fit)
 
 
-def refine(
+def alternate(
     observations: Observations,
-    rig: Rig,
+    views: Views,
+    sigmas: NDArray[np.float64],
+    X: NDArray[np.float64],
+    windows: Sequence[Window],
     fitter: BodyFitter,
-    observation_config: ObservationConfig,
-    graph_config: PersonGraphConfig,
-    config: RefineConfig,
-    *,
-    person: NDArray[np.intp],
-    frame: NDArray[np.intp],
-    extra_factors: ExtraFactors | None = None,
-) -> Refined:
-    """Refine P people, of one frame or of many: `person` (P,) and `frame` (P,) name them in the keys.
+    config: EstimatorConfig,
+) -> Solution:
+    """Refine N rows, from X_0 (N, J, 3).
 
-    In each round the body is fitted to what the views alone say of all joints, and then pulls the joints of low
-    confidence. What it says of a joint leaves that joint's own views out (`BodyFit.prior_xyz`), so that nothing
-    is counted twice and the covariances stay honest.
+    In each round the body is fitted to what the views alone say of all joints, and then pulls the joints. What it
+    says of a joint leaves that joint's own views out (`BodyFit.prior_xyz`), so that nothing is counted twice and
+    the covariances stay honest. Motion acts on the joints, never on what the body is fitted to.
     """
-    sigmas = observation_sigmas(observations, observations.initial, rig, observation_config)
-    X = triangulate(observations, rig, sigmas, observation_config).copy()
-    graphs = _graphs(observations, sigmas, rig, observation_config, graph_config, person, frame, extra_factors)
-    inlier, confidence = np.zeros(sigmas.shape, dtype=bool), np.zeros(X.shape[:2])
-    enough = np.zeros(len(X), dtype=bool)
-    fit = BodyFit.failed(np.full(len(X), FitStatus.TOO_FEW_JOINTS), X.shape[1])
-    moving = np.arange(len(X))
-    for n in range(config.alternations):
-        observed, sigma, start = observations.rows(moving), sigmas[moving], X[moving]
-        evidence = weigh(observed, sigma, start, rig, observation_config)
+    solution = Solution.start(X, len(views))
+    moving = list(windows)
+    for n in range(config.refine.alternations):
+        rows = np.concatenate([window.rows for window in moving]) if moving else np.zeros(0, dtype=np.intp)
+        observed, sigma, here, start = (
+            observations.rows(rows),
+            sigmas[rows],
+            views.rows(rows),
+            solution.joints[rows],
+        )
+        evidence = linearise(observed, sigma, start, here, config.observations)
         if n == 0:
-            enough = _placed(evidence, config).sum(axis=1) >= config.min_joints
-        body = fitter.fit(joint_targets(evidence, enough[moving]), fit.rows(moving))  # the Theta step
+            placed = evidence.sigma_m <= config.refine.max_sigma_m
+            solution.enough[rows] = placed.sum(axis=1) >= config.refine.min_joints
+        groups = _groups(moving)
+        enough = solution.enough[rows]
+        body = fitter.fit(joint_targets(evidence, enough), solution.fit.rows(rows), groups)  # the Theta step
         fitted = evidence.target
-        wrong = disagreement(evidence, body) > config.disagreement
+        wrong = disagreement(evidence, body) > config.refine.disagreement
         if wrong.any():
+            # Gated anew around the body's place; and the body is fitted again, without what was thrown away.
             there = np.where(wrong[..., None], body.prior_xyz, start)
-            evidence = weigh(observed, sigma, there, rig, observation_config)
-        confidence[moving] = mean_confidence(observed, evidence.inlier)
-        pulled = _pulled(evidence, body, confidence[moving], config, graph_config)
-        X[moving] = _solve([graphs[row] for row in moving], evidence, pulled, body, config)
-        inlier[moving], fit = evidence.inlier, fit.with_rows(moving, body)
+            evidence = linearise(observed, sigma, there, here, config.observations)
+            again = np.flatnonzero(wrong.any(axis=1))
+            targets = joint_targets(evidence, enough)
+            body = body.with_rows(again, _fit(fitter, targets, body, groups, again))
+        said = _message(observed, evidence, body, moving, groups, enough, fitter, config)
+        X_new = _solve(moving, evidence, said, config)
+        solution.joints[rows], solution.inlier[rows] = X_new, evidence.inlier
+        for kept, new in ((solution.views, Message(evidence.target, evidence.information)), (solution.body, said)):
+            kept.xyz[rows], kept.information[rows] = new.xyz, new.information
+        solution.fit = solution.fit.with_rows(rows, body)
         # Settled: the body was fitted to where the joints are now, and pulled joints stay where they were.
-        before = np.where((pulled | wrong)[..., None], start, fitted)
-        shift = np.linalg.norm(X[moving] - before, axis=-1)
-        unknown = np.isnan(X[moving]).any(axis=-1)
-        moving = moving[~((shift < config.settled_m) | unknown).all(axis=1)]
+        before = np.where((said.known | wrong)[..., None], start, fitted)
+        shift = np.linalg.norm(X_new - before, axis=-1)
+        settled = ((shift < config.refine.settled_m) | np.isnan(X_new).any(axis=-1)).all(axis=1)
+        more = n + 1 < config.refine.window_alternations
+        moving = [
+            window
+            for window, done in zip(moving, _by_window(settled, moving), strict=True)
+            if not done.all() and (more or not window.graph.temporal)
+        ]
         if len(moving) == 0:
             break
-    covariance = np.stack([graph.covariance() for graph in graphs]) if graphs else np.zeros((*X.shape, 3))
-    status = np.where(fit.ok, Status.OK, np.where(enough, Status.BODY_UNDETERMINED, Status.TOO_FEW_VIEWS))
-    return Refined(X, covariance, confidence, inlier, fit, status)
+    return solution
 
 
-def _graphs(
-    observations: Observations,
-    sigmas: NDArray[np.float64],
-    rig: Rig,
-    observation_config: ObservationConfig,
-    graph_config: PersonGraphConfig,
-    person: NDArray[np.intp],
-    frame: NDArray[np.intp],
-    extra_factors: ExtraFactors | None,
-) -> list[PersonGraph]:
-    """One graph per person, with the user's factors in it."""
-    cameras = make_cameras(rig)
-    graphs = []
-    for row in range(len(observations)):
-        graph = PersonGraph(
-            cameras,
-            observations.xy[row],
-            sigmas[row],
-            graph_config,
-            observation_config.kernel,
-            person=int(person[row]),
-            frame=int(frame[row]),
-        )
-        for factor in extra_factors(graph) if extra_factors is not None else ():
-            graph.add(factor)
-        graphs.append(graph)
-    return graphs
+def final_bodies(
+    solution: Solution,
+    covariance: NDArray[np.float64],
+    windows: Sequence[Window],
+    fitter: BodyFitter,
+) -> BodyFit:
+    """The bodies that are returned: where there are factors of the user's own, fitted to the joints as solved.
+
+    The bodies follow these factors so. What they say goes nowhere else: joints and covariances are done.
+    """
+    chosen = [window for window in windows if window.graph.touched.any()]
+    if len(chosen) == 0:
+        return solution.fit
+    rows = np.concatenate([window.rows for window in chosen])
+    xyz, information = solution.joints[rows], np.zeros((len(rows), *covariance.shape[1:]))
+    known = np.isfinite(xyz).all(axis=2) & np.isfinite(covariance[rows]).all(axis=(2, 3))
+    information[known] = np.linalg.inv(covariance[rows][known])
+    information = (information + information.swapaxes(2, 3)) / 2
+    fit = fitter.fit(JointTargets(np.nan_to_num(xyz), information), solution.fit.rows(rows), _groups(chosen))
+    return solution.fit.with_rows(rows[fit.ok], fit.rows(np.flatnonzero(fit.ok)))
 
 
-def _placed(evidence: Evidence, config: RefineConfig) -> NDArray[np.bool_]:
-    """(P, J) whether the views alone determine a joint: the rank check that the solver does not make."""
-    information = evidence.information.reshape(-1, 3, 3)
-    return determined(information, max_sigma_m=config.max_sigma_m).reshape(evidence.points.shape[:2])
-
-
-def disagreement(evidence: Evidence, fit: BodyFit) -> NDArray[np.float64]:
-    """How far (P, J) each joint's views put it from where the rest of the body puts it, in standard deviations.
+def disagreement(evidence: ViewEvidence, fit: BodyFit) -> NDArray[np.float64]:
+    """How far (N, J) each joint's views put it from where the rest of the body puts it, in standard deviations.
 
     The distance between the two, measured against the sum of their covariances; where the views leave a
-    direction open, they cannot disagree in it. 0 for people without a body.
+    direction open, they cannot disagree in it. 0 for rows without a body.
     """
     apart = np.nan_to_num(evidence.target - fit.prior_xyz)
     body = np.where(fit.ok[:, None, None, None], fit.prior_covariance, np.eye(3))
@@ -171,40 +200,109 @@ def disagreement(evidence: Evidence, fit: BodyFit) -> NDArray[np.float64]:
     return np.where(fit.ok[:, None], np.sqrt(np.maximum(squared, 0.0)), 0.0)
 
 
-def joint_targets(evidence: Evidence, enough: NDArray[np.bool_]) -> JointTargets:
-    """What the body is fitted to: what the views say of all joints, of people whom they determine (`enough`)."""
+def joint_targets(evidence: ViewEvidence, enough: NDArray[np.bool_]) -> JointTargets:
+    """What the body is fitted to: what the views say of all joints, of rows whom they determine (`enough`)."""
     information = np.where(enough[:, None, None, None], evidence.information, 0.0)
     return JointTargets(np.nan_to_num(evidence.target), information)
 
 
-def _pulled(
-    evidence: Evidence,
-    fit: BodyFit,
-    confidence: NDArray[np.float64],
-    config: RefineConfig,
-    graph_config: PersonGraphConfig,
-) -> NDArray[np.bool_]:
-    """(P, J) which joints the body pulls: delta of Eq. 4, and joints that their views do not determine.
+def _groups(windows: Sequence[Window]) -> NDArray[np.intp] | None:
+    """(R,) a number for each row that says whose shape it has; None where every row is alone."""
+    lengths = [len(window.rows) for window in windows]
+    return np.repeat(np.arange(len(lengths)), lengths) if any(length > 1 for length in lengths) else None
+
+
+def _by_window(values: NDArray, windows: Sequence[Window]) -> list[NDArray]:
+    """Values (R, ...) of the windows' rows, one after the other, cut into windows again."""
+    return np.split(values, np.cumsum([len(window.rows) for window in windows])[:-1]) if windows else []
+
+
+def _fit(
+    fitter: BodyFitter,
+    targets: JointTargets,
+    last: BodyFit,
+    groups: NDArray[np.intp] | None,
+    rows: NDArray[np.intp],
+) -> BodyFit:
+    """Fit some of the rows."""
+    some = JointTargets(targets.xyz[rows], targets.information[rows])
+    return fitter.fit(some, last.rows(rows), None if groups is None else groups[rows])
+
+
+def _message(
+    observed: Observations,
+    evidence: ViewEvidence,
+    body: BodyFit,
+    windows: Sequence[Window],
+    groups: NDArray[np.intp] | None,
+    enough: NDArray[np.bool_],
+    fitter: BodyFitter,
+    config: EstimatorConfig,
+) -> Message:
+    """What the body says of the joints that it pulls: delta of Eq. 4, and joints that their views do not
+    determine.
 
     The latter need the body however sure their one view is.
     """
-    return ((confidence < graph_config.rho_3d) | ~_placed(evidence, config)) & fit.ok[:, None]
+    xyz, covariance = body.prior_xyz.copy(), body.prior_covariance.copy()
+    ok = np.repeat(body.ok[:, None], xyz.shape[1], axis=1)
+    targets = joint_targets(evidence, enough)
+    for joints in sorted({each for window in windows for each in window.graph.coupled}, key=sorted):
+        # Tied to each other, each would get the others' views twice: through the tie, and through the body.
+        tied = np.concatenate([np.full(len(w.rows), joints in w.graph.coupled) for w in windows])  # one flag a row
+        rows, columns = np.flatnonzero(tied), np.array(sorted(joints))
+        information = targets.information.copy()
+        information[:, columns] = 0.0
+        alone = _fit(fitter, JointTargets(targets.xyz, information), body, groups, rows)
+        here = np.ix_(rows, columns)
+        xyz[here], covariance[here] = alone.prior_xyz[:, columns], alone.prior_covariance[:, columns]
+        ok[here] = alone.ok[:, None]
+    doubtful = mean_confidence(observed, evidence.inlier) <= config.graph.rho_3d
+    pulled = (doubtful | (evidence.sigma_m > config.refine.max_sigma_m)) & ok
+    information = np.zeros_like(covariance)
+    information[pulled] = np.linalg.inv(covariance[pulled])
+    return Message(np.where(pulled[..., None], xyz, np.nan), information)
 
 
 def _solve(
-    graphs: list[PersonGraph],
-    evidence: Evidence,
-    pulled: NDArray[np.bool_],
-    fit: BodyFit,
-    config: RefineConfig,
+    windows: Sequence[Window], evidence: ViewEvidence, body: Message, config: EstimatorConfig
 ) -> NDArray[np.float64]:
-    """The X step for every person: (P, J, 3)."""
-    placed = _placed(evidence, config)
-    solved = placed | pulled
-    start = np.where(placed[..., None], evidence.points, np.where(pulled[..., None], fit.prior_xyz, np.nan))
+    """The X step for every window: (R, J, 3)."""
+    placed = evidence.sigma_m <= config.refine.max_sigma_m
+    known = placed | body.known
+    start = np.where(placed[..., None], evidence.points, np.where(body.known[..., None], body.xyz, np.nan))
+    badly = evidence.sigma_m > config.motion.lost_m
     X = np.full(evidence.points.shape, np.nan)
-    for row, graph in enumerate(graphs):
-        graph.set_gates(evidence.inlier[row] & solved[row, :, None])
-        graph.set_priors(pulled[row], fit.prior_xyz[row], fit.prior_covariance[row])
-        X[row] = graph.solve(start[row])
+    first = 0
+    for window in windows:
+        part = slice(first, first + len(window.rows))
+        first = part.stop
+        inlier, initial, lost = evidence.inlier[part], start[part], None
+        if window.graph.temporal:
+            initial = np.where(np.isfinite(evidence.points[part]), evidence.points[part], initial)
+            initial = interpolated(initial, window.graph.times_s)
+            lost = near_in_time(badly[part], window.graph.times_s, config.motion.around_s)
+        else:
+            inlier = inlier & known[part][..., None]
+        views = Message(evidence.target[part], evidence.information[part])
+        X[part] = window.graph.solve(inlier, views, body.rows(np.arange(part.start, part.stop)), initial, lost)
     return X
+
+
+def interpolated(points: NDArray[np.float64], times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points (T, J, 3) with gaps closed in a straight line, and the ends held; joints never known stay NaN."""
+    known = np.isfinite(points).all(axis=2)
+    result = points.copy()
+    for joint in np.flatnonzero(known.any(axis=0) & ~known.all(axis=0)).tolist():
+        there = known[:, joint]
+        for axis in range(3):
+            result[:, joint, axis] = np.interp(times_s, times_s[there], points[there, joint, axis])
+    return result
+
+
+def near_in_time(marked: NDArray[np.bool_], times_s: NDArray[np.float64], within_s: float) -> NDArray[np.bool_]:
+    """(T, J) which frames are at most `within_s` from one that is `marked` (T, J)."""
+    first = np.searchsorted(times_s, times_s - within_s, side="left")
+    last = np.searchsorted(times_s, times_s + within_s, side="right")
+    count = np.concatenate([np.zeros((1, marked.shape[1]), dtype=int), np.cumsum(marked, axis=0)])
+    return count[last] > count[first]

@@ -5,13 +5,12 @@ from typing import Protocol, Self, runtime_checkable
 
 import numpy as np
 
-from factors import determined
 from shapepose_fg.body.fitting.fitter import BodyFitter, JointTargets
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.offsets.estimation import OffsetPrior
-from shapepose_fg.camera import Rig
-from shapepose_fg.estimation.linearisation import ObservationConfig, observation_sigmas, triangulate, weigh
+from shapepose_fg.camera import Rig, Views
+from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas, triangulate
 from shapepose_fg.observations import Observations
 
 
@@ -67,13 +66,13 @@ def confident_targets(
 ) -> JointTargets:
     """Where the views alone put the joints that they know well, information zero for all others.
 
-    No body has a say in it: what was pulled towards the body's joint would hide the detector's own.
+    Without the body: what it pulled towards its own joint would hide the detector's.
     """
-    sigmas = observation_sigmas(observations, observations.initial, rig, observation_config)
-    points = triangulate(observations, rig, sigmas, observation_config)
-    evidence = weigh(observations, sigmas, points, rig, observation_config)
-    evidence = weigh(observations, sigmas, evidence.target, rig, observation_config)
+    views = Views.of(rig)
+    points = triangulate(observations, views, observation_config)
+    sigmas = observation_sigmas(observations, points, views, observation_config)
+    evidence = linearise(observations, sigmas, points, views, observation_config)
+    evidence = linearise(observations, sigmas, evidence.target, views, observation_config)
     sure = (evidence.inlier & (observations.confidence >= config.min_confidence)).sum(axis=-1) >= config.min_views
-    information = evidence.information.reshape(-1, 3, 3)
-    sure &= determined(information, max_sigma_m=config.max_sigma_m).reshape(sure.shape)
+    sure &= evidence.sigma_m <= config.max_sigma_m
     return JointTargets(np.nan_to_num(evidence.target), np.where(sure[..., None, None], evidence.information, 0.0))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import projection_jacobians, sigma_px
+from factors import project_with_jacobian, sigma_px
 from shapepose_fg.camera import Camera, Rig
 from shapepose_fg.detections import Detections, DetectionSequence
 from shapepose_fg.estimation.linearisation import ObservationConfig
@@ -91,6 +91,8 @@ def compare_view(
     Rows are matched frame by frame (Hungarian, mean joint distance under 0.5 m). Compared are detections that
     were given to a joint, those that were not used as long as they are near it.
     """
+    if len(people) == 0:
+        return HeldOut(camera.name, np.zeros(0), 0)
     table = people.observations
     if table is None:
         raise ValueError("people come without observations: give what `reconstruct` returns, or load its folder")
@@ -125,10 +127,7 @@ def squared_distances(
     (M,). NaN behind the camera.
     """
     count = len(points)
-    projected, depth = camera.project(points)
-    J = projection_jacobians(
-        points, np.broadcast_to(camera.K, (count, 3, 3)), np.broadcast_to(camera.cTw, (count, 3, 4))
-    )
+    projected, depth, J = project_with_jacobian(points, camera.K, camera.cTw)
     ahead = depth >= config.min_depth_m
     sigma = np.full(count, np.nan)
     sigma[ahead] = sigma_px(

@@ -26,6 +26,7 @@ from shapepose_fg.evaluation.trajectories import (
     frames_unseen,
     limb_lengths,
     spread_by_identity,
+    velocities,
 )
 from shapepose_fg.reconstruction import Reconstruction
 
@@ -68,6 +69,10 @@ class TrackingScore:
     """Tallest minus smallest body of an identity, metres: the largest over the identities."""
     twist_jumps: int
     """Bones of bodies that turn about their own axis by 20 degrees more from a frame to the next than in truth."""
+    velocity_error: float
+    """Mean length of the difference between a joint's velocity and the true one, m/s; NaN without velocities."""
+    velocity: CovarianceCalibration
+    """Covariances of the velocities."""
     seen: CovarianceCalibration
     """Covariances of the joints of matched rows that two views or more see in that frame."""
     long_unseen: CovarianceCalibration
@@ -87,12 +92,17 @@ class TrackingScore:
             "f1_some_joints": np.nan if self.some_joints is None else 100 * self.some_joints.f1,
             "idf1": np.nan if self.identities is None else 100 * self.identities.idf1,
             "stature_spread_cm": 100 * self.stature_spread_m,
+            "velocity_error": self.velocity_error,
         }
         for prefix, motion in {"": self.motion, "body_": self.bodies}.items():
             figures |= {f"{prefix}{name}": value for name, value in vars(motion).items()}
-        for name, calibration in {"seen": self.seen, "unseen": self.long_unseen}.items():
+        for name, calibration in self._calibrations.items():
             figures |= {f"{name}_inside_{100 * level:.0f}": 100 * s for level, s in calibration.coverage.items()}
         return {name: float(v) if np.isfinite(v) else None for name, v in figures.items()} | self._counts()
+
+    @property
+    def _calibrations(self) -> dict[str, CovarianceCalibration]:
+        return {"seen": self.seen, "unseen": self.long_unseen, "velocity": self.velocity}
 
     def _counts(self) -> dict[str, int]:
         counts = {"rows_of_nobody": self.rows_of_nobody, "people_missed": self.joints.people_missed}
@@ -128,6 +138,7 @@ def score_tracks(
     views = views_used(found)
     seen, unseen = views >= 2, frames_unseen(views > 0, found.frame, chains.identity) >= LONG_UNSEEN
     error = found.joints - true[matches.frame, matches.person]
+    moving = found.velocity - velocities(true, numbers, fps)[matches.frame, matches.person]
     chosen = None if some_joints is None else list(some_joints)
     return TrackingScore(
         metrics_of(matches, people.joints, true),
@@ -137,9 +148,23 @@ def score_tracks(
         bodies=_motion(body_joints(found, model), true, chains, fps),
         stature_spread_m=_widest(statures(found.betas, model), chains.identity),
         twist_jumps=_twist_jumps(found, truth, numbers, chains, model),
+        velocity_error=_mean(np.linalg.norm(moving, axis=-1)),
+        velocity=covariance_calibration(moving, found.velocity_covariance),
         seen=covariance_calibration(error[seen], found.covariance[seen]),
         long_unseen=covariance_calibration(error[unseen], found.covariance[unseen]),
     )
+
+
+def stature_by_person(
+    people: Reconstruction, truth: Reconstruction, model: BodyModel | None = None
+) -> NDArray[np.float64]:
+    """(P,) median stature, metres, of the bodies matched with each person of the `truth`; NaN without any."""
+    frames = np.intersect1d(people.frame, truth.frame)
+    matches = match_people(people.frame, people.joints, joints_by_frame(truth, frames), frames.tolist())
+    height = statures(people.betas[matches.row], model)
+    count = len(np.unique(truth.person))
+    found = [height[(matches.person == person) & np.isfinite(height)] for person in range(count)]
+    return np.array([np.median(each) if len(each) > 0 else np.nan for each in found])
 
 
 def _motion(joints: Array, truth: Array, chains: Chains, fps: float) -> MotionScore:

@@ -68,14 +68,24 @@ def acceleration_errors(placed: Array, truth: Array, consecutive: NDArray[np.boo
     return np.where(whole[..., None], np.linalg.norm(second, axis=-1), np.nan)
 
 
+def velocities(truth: Array, frames: NDArray[np.integer], fps: float) -> Array:
+    """(T, P, J, 3) velocities in m/s of `truth` (T, P, J, 3), metres: half the difference over two frames.
+
+    NaN in the first and last frame, and beside a frame that is missing.
+    """
+    velocity = np.full(truth.shape, np.nan)
+    whole = (frames[2:] - frames[:-2] == 2)[:, None, None, None]
+    velocity[1:-1] = np.where(whole, (truth[2:] - truth[:-2]) * fps / 2, np.nan)
+    return velocity
+
+
 def fast_joint_errors(
     placed: Array, truth: Array, frames: NDArray[np.integer], fps: float, joints: tuple[int, ...] = WRISTS
 ) -> Array:
     """(M,) errors in metres of those `joints` whose truth is faster than 1.5 m/s (difference over two frames)."""
-    near, true = placed[1:-1, :, list(joints)], truth[:, :, list(joints)]
-    speed = np.linalg.norm(true[2:] - true[:-2], axis=-1) * fps / 2
-    fast = (speed > FAST_M_S) & (frames[2:] - frames[:-2] == 2)[:, None, None]
-    error = np.linalg.norm(near - true[1:-1], axis=-1)
+    true = truth[:, :, list(joints)]
+    fast = np.linalg.norm(velocities(true, frames, fps), axis=-1) > FAST_M_S
+    error = np.linalg.norm(placed[:, :, list(joints)] - true, axis=-1)
     return error[fast & np.isfinite(error)]
 
 

@@ -14,6 +14,9 @@ from shapepose_fg.skeleton import Skeleton
 
 MARGIN = 0.25
 """How far outside the picture a detector may place a joint, as a part of the picture's size."""
+_STRAY = 0.01
+"""Up to this share of a camera's joints may have no place in its picture: they are left out, and it is said. More
+are detections of other pictures, or another camera's calibration."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,8 @@ class DetectionTable:
     """(T + 1,) where each frame's pairs begin."""
     sources: tuple[Path, ...] = ()
     """The file or folder that each view was read from."""
+    notes: tuple[str, ...] = ()
+    """What the reader made of the files and left out, a sentence each."""
 
     def __len__(self) -> int:
         return len(self.candidate_start) - 1
@@ -98,7 +103,8 @@ def assemble(views: Sequence[ViewCandidates], rig: Rig, skeleton: Skeleton) -> D
                 f"{view.source} starts at frame {view.first_number}, but {views[0].source} starts at frame"
                 f" {views[0].first_number}; give the same frames of every camera"
             )
-    ideal = [_undistorted(view, camera) for view, camera in zip(views, rig.cameras, strict=True)]
+    read = [_undistorted(view, camera) for view, camera in zip(views, rig.cameras, strict=True)]
+    ideal = [view for view, _ in read]
     counts = [len(view.frame) for view in ideal]
     frame = np.concatenate([view.frame for view in ideal])
     # Views come in order and each is sorted by frame: a stable sort leaves (frame, view, joint).
@@ -121,26 +127,54 @@ def assemble(views: Sequence[ViewCandidates], rig: Rig, skeleton: Skeleton) -> D
         affinity=np.concatenate([view.affinity for view in ideal])[pair_order],
     )
     pair_start = np.searchsorted(pair_frame[pair_order], edges)
-    return DetectionTable(skeleton, candidates, candidate_start, pair_start, tuple(view.source for view in views))
+    sources = tuple(view.source for view in views)
+    notes = tuple(note for _, found in read for note in found)
+    return DetectionTable(skeleton, candidates, candidate_start, pair_start, sources, notes)
 
 
-def _undistorted(view: ViewCandidates, camera: Camera) -> ViewCandidates:
-    """`view` with the pixels of a camera without distortion, its points checked against the picture."""
+def _undistorted(view: ViewCandidates, camera: Camera) -> tuple[ViewCandidates, list[str]]:
+    """`view` with the pixels of a camera without distortion, and sentences about candidates that were left out.
+
+    InputError where so many have no place that the calibration must be another's.
+    """
     size = np.array(camera.image_size, dtype=np.float64)
     outside = np.any((view.xy < -MARGIN * size) | (view.xy > (1 + MARGIN) * size), axis=1)
+    notes = []
     if outside.any():
         row = int(np.argmax(outside))
         x, y = view.xy[row]
-        raise InputError(
+        where = (
             f"{view.source}: frame {view.frame[row]} has a joint at pixel ({x:.0f}, {y:.0f}), far outside the"
-            f" {camera.image_size[0]} x {camera.image_size[1]} picture of the calibration;"
-            " give detections made on pictures of the calibrated size"
+            f" {camera.image_size[0]} x {camera.image_size[1]} picture of the calibration"
         )
+        if outside.mean() > _STRAY:
+            raise InputError(f"{where}; give detections made on pictures of the calibrated size")
+        notes.append(f"{where}; {outside.sum()} such joints of {len(outside)} were left out")
+        view = _only(view, ~outside)
     xy = camera.undistort(view.xy)
-    if not np.isfinite(xy).all():
-        row = int(np.argmin(np.isfinite(xy).all(axis=1)))
-        raise InputError(
+    undone = np.asarray(np.isfinite(xy).all(axis=1))
+    if not undone.all():
+        where = (
             f"{view.source}: the distortion of camera {camera.name} cannot be undone at frame"
-            f" {view.frame[row]}; check the distortion coefficients in the calibration"
+            f" {view.frame[int(np.argmin(undone))]}"
         )
-    return replace(view, xy=xy)
+        if (~undone).mean() > _STRAY:
+            raise InputError(f"{where}; check the distortion coefficients in the calibration")
+        notes.append(f"{where}; {(~undone).sum()} joints of {len(undone)} were left out")
+        view, xy = _only(view, undone), xy[undone]
+    return replace(view, xy=xy), notes
+
+
+def _only(view: ViewCandidates, keep: NDArray[np.bool_]) -> ViewCandidates:
+    """The candidates of the mask `keep` (D,), and the pairs between them."""
+    place = np.cumsum(keep) - 1
+    both = keep[view.pairs].all(axis=1)
+    return replace(
+        view,
+        frame=view.frame[keep],
+        joint=view.joint[keep],
+        xy=view.xy[keep],
+        confidence=view.confidence[keep],
+        pairs=place[view.pairs[both]],
+        affinity=view.affinity[both],
+    )

@@ -5,16 +5,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from factors import joint_information
-from shapepose_fg.camera import Camera, Rig
+from factors import joint_information, make_camera, projection_factors, robust_kernel
+from shapepose_fg.camera import Camera, Rig, Views
 from shapepose_fg.estimation.linearisation import (
     ObservationConfig,
+    linearise,
     mean_confidence,
     observation_sigmas,
     triangulate,
-    weigh,
 )
-from shapepose_fg.estimation.person_graph import PersonGraph, PersonGraphConfig, make_cameras
 from shapepose_fg.observations import Observations
 
 
@@ -53,7 +52,7 @@ def test_sigma_is_the_detector_s_error_at_the_joint_s_depth(two_views):
     config = ObservationConfig(sigma_m=0.02, floor_px=3.0)
     points = np.array([[[0.0, 0, 2], [0, 0, 1], [0, 0, np.nan]]])
     seen = Observations(np.zeros((1, 3, 2, 2)), np.array([[[1.0, 0.0], [1.0, 0.25], [1.0, 0.0]]]), points)
-    sigma = observation_sigmas(seen, points, two_views, config)[0]
+    sigma = observation_sigmas(seen, points, Views.of(two_views), config)[0]
     # 2 cm are 10 px at 2 m and 20 px at 1 m; unknown joints are taken at the mean depth of the others, 1.5 m.
     expected = np.hypot(3.0, [10.0, 20.0, 20.0 / 1.5])
     np.testing.assert_allclose(sigma[:, 0], expected)
@@ -66,8 +65,8 @@ def test_exact_observations_have_the_information_of_their_geometry(five_cameras,
     """Residuals are zero, so every kernel's weight is one."""
     config = ObservationConfig(kernel=kernel)
     seen = observations_of(five_cameras, two_people)
-    sigmas = observation_sigmas(seen, two_people, five_cameras, config)
-    evidence = weigh(seen, sigmas, two_people, five_cameras, config)
+    sigmas = observation_sigmas(seen, two_people, Views.of(five_cameras), config)
+    evidence = linearise(seen, sigmas, two_people, Views.of(five_cameras), config)
     joint, view = (index.ravel() for index in np.indices(sigmas.shape[1:]))
     for person in range(2):
         expected = joint_information(
@@ -88,15 +87,19 @@ def test_information_and_gradient_are_those_of_the_graph(five_cameras, two_peopl
     seen = without(seen, unseen)
     seen.xy[0, 3, 1] += 300.0
     points = two_people[:1] + rng.normal(0, 0.02, (1, 25, 3))
-    sigmas = observation_sigmas(seen, points, five_cameras, config)
-    evidence = weigh(seen, sigmas, points, five_cameras, config)
+    sigmas = observation_sigmas(seen, points, Views.of(five_cameras), config)
+    evidence = linearise(seen, sigmas, points, Views.of(five_cameras), config)
     assert not evidence.inlier[0, 3, 1] and 0.6 < evidence.inlier.mean() < 0.9
-    graph = PersonGraph(make_cameras(five_cameras), seen.xy[0], sigmas[0], PersonGraphConfig(), kernel)
-    graph.set_gates(evidence.inlier[0])
-    values = gtsam.Values()
-    for key, point in zip(graph.keys.tolist(), points[0], strict=True):
+    cameras = [make_camera(camera.K, camera.wTc) for camera in five_cameras.cameras]
+    joint, view = np.nonzero(evidence.inlier[0])
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for factor in projection_factors(
+        cameras, view, joint, seen.xy[0, joint, view], sigmas[0, joint, view], robust_kernel(kernel)
+    ):
+        graph.add(factor)
+    for key, point in enumerate(points[0]):
         values.insert(key, point)
-    hessian, right = graph.graph.linearize(values).hessian()
+    hessian, right = graph.linearize(values).hessian()
     blocks = hessian.reshape(25, 3, 25, 3)[np.arange(25), :, np.arange(25)]
     np.testing.assert_allclose(evidence.information[0], blocks, rtol=1e-7, atol=1e-4)
     np.testing.assert_allclose(evidence.gradient[0], -right.reshape(25, 3), rtol=1e-7, atol=1e-4)
@@ -110,7 +113,7 @@ def test_the_gate_is_rho_as_a_length_at_the_joint_s_depth(two_views):
     for off_px, kept in ((74.999, True), (75.001, False)):
         for direction in ([1.0, 0.0], [0.0, -1.0], [0.6, 0.8]):
             seen = seen_at(two_views, centre + np.array([[off_px], [0.0]]) * direction, point)
-            evidence = weigh(seen, np.full((1, 1, 2), 10.0), point[None, None], two_views, config)
+            evidence = linearise(seen, np.full((1, 1, 2), 10.0), point[None, None], Views.of(two_views), config)
             assert evidence.inlier[0, 0].tolist() == [kept, True]
             np.testing.assert_allclose(np.linalg.norm(evidence.residual_px[0, 0, 0]), off_px)
 
@@ -121,8 +124,8 @@ def test_what_is_gated_says_nothing(two_views):
     config, sigmas = ObservationConfig(), np.full((1, 1, 2), 10.0)
     alone = without(seen_at(two_views, xy, point), np.array([[[False, True]]]))
     far = seen_at(two_views, xy + np.array([[0.0, 0.0], [400.0, 0.0]]), point)
-    one = weigh(alone, np.array([[[10.0, 0.0]]]), point[None, None], two_views, config)
-    both = weigh(far, sigmas, point[None, None], two_views, config)
+    one = linearise(alone, np.array([[[10.0, 0.0]]]), point[None, None], Views.of(two_views), config)
+    both = linearise(far, sigmas, point[None, None], Views.of(two_views), config)
     np.testing.assert_array_equal(one.information, both.information)
     np.testing.assert_array_equal(one.target, both.target)
 
@@ -133,7 +136,9 @@ def test_a_joint_behind_the_camera_is_not_seen_by_it(two_views):
     mirrored = two_views.cameras[0].project(-behind)[0]
     seen = seen_at(two_views, np.stack([mirrored, [500.0, 400.0]]), behind)
     with np.errstate(all="raise"):
-        evidence = weigh(seen, np.full((1, 1, 2), 10.0), behind[None, None], two_views, ObservationConfig())
+        evidence = linearise(
+            seen, np.full((1, 1, 2), 10.0), behind[None, None], Views.of(two_views), ObservationConfig()
+        )
     assert not evidence.inlier[0, 0, 0]
     assert np.isfinite(evidence.information).all()
 
@@ -145,8 +150,8 @@ def test_a_joint_whose_place_is_not_known_has_no_evidence(five_cameras, two_peop
     seen = observations_of(five_cameras, two_people, initial=points)
     config = ObservationConfig()
     with np.errstate(all="raise"):
-        sigmas = observation_sigmas(seen, points, five_cameras, config)
-        evidence = weigh(seen, sigmas, points, five_cameras, config)
+        sigmas = observation_sigmas(seen, points, Views.of(five_cameras), config)
+        evidence = linearise(seen, sigmas, points, Views.of(five_cameras), config)
     unknown = np.isnan(points).any(axis=-1)
     assert not evidence.inlier[unknown].any() and evidence.inlier[~unknown].all()
     assert (evidence.information[unknown] == 0).all() and (evidence.gradient[unknown] == 0).all()
@@ -157,7 +162,9 @@ def test_one_view_moves_a_joint_onto_its_ray_and_leaves_the_depth(two_views):
     point = np.array([0.1, -0.05, 2.0])
     xy = two_views.project(point)[0] + [[6.0, -4.0], [0.0, 0.0]]
     seen = without(seen_at(two_views, xy, point), np.array([[[False, True]]]))
-    evidence = weigh(seen, np.array([[[10.0, 0.0]]]), point[None, None], two_views, ObservationConfig(kernel=None))
+    evidence = linearise(
+        seen, np.array([[[10.0, 0.0]]]), point[None, None], Views.of(two_views), ObservationConfig(kernel=None)
+    )
     target = evidence.target[0, 0]
     assert np.linalg.matrix_rank(evidence.information[0, 0], tol=1.0) == 2
     # The step is across the ray, and one Gauss-Newton step of 7 px is exact to its second order: 7² / 1000 px.
@@ -169,7 +176,9 @@ def test_two_views_move_a_joint_where_they_meet(two_views):
     truth = np.array([0.1, -0.05, 2.0])
     seen = seen_at(two_views, two_views.project(truth)[0], truth)
     beside = truth + np.array([0.01, -0.02, 0.015])
-    evidence = weigh(seen, np.full((1, 1, 2), 10.0), beside[None, None], two_views, ObservationConfig(kernel=None))
+    evidence = linearise(
+        seen, np.full((1, 1, 2), 10.0), beside[None, None], Views.of(two_views), ObservationConfig(kernel=None)
+    )
     # 2.7 cm off at 2 m: the second order is 0.027² / 2 m.
     np.testing.assert_allclose(evidence.target[0, 0], truth, atol=5e-4)
 
@@ -190,7 +199,7 @@ def test_joints_that_stage_one_missed_are_triangulated(five_cameras, two_people,
     unseen[:, [4, 14], views:] = True
     seen = without(seen, unseen)
     config = ObservationConfig()
-    complete = triangulate(seen, five_cameras, observation_sigmas(seen, initial, five_cameras, config), config)
+    complete = triangulate(seen, Views.of(five_cameras), config)
     np.testing.assert_allclose(complete, two_people, atol=1e-4)
     known = np.isfinite(initial)
     np.testing.assert_array_equal(complete[known], initial[known])
@@ -203,7 +212,7 @@ def test_of_five_views_a_wrong_one_is_outvoted(five_cameras, two_people):
     seen.confidence[...] = 0.8
     seen.xy[0, 4, 2] += 150.0
     config = ObservationConfig()
-    complete = triangulate(seen, five_cameras, observation_sigmas(seen, initial, five_cameras, config), config)
+    complete = triangulate(seen, Views.of(five_cameras), config)
     # 150 px at 3.5 m and 900 px are 58 cm; plain least squares would be about a fifth of that off.
     np.testing.assert_allclose(complete[0, 4], two_people[0, 4], atol=0.05)
 
@@ -211,15 +220,15 @@ def test_of_five_views_a_wrong_one_is_outvoted(five_cameras, two_people):
 def test_what_too_few_or_contradicting_views_saw_stays_unknown(two_views):
     truth = np.array([0.1, -0.05, 2.0])
     unknown = np.full(3, np.nan)
-    config, sigmas = ObservationConfig(), np.full((1, 1, 2), 10.0)
+    config = ObservationConfig()
     xy = two_views.project(truth)[0]
     both = seen_at(two_views, xy, unknown)
-    np.testing.assert_allclose(triangulate(both, two_views, sigmas, config)[0, 0], truth, atol=1e-5)
+    np.testing.assert_allclose(triangulate(both, Views.of(two_views), config)[0, 0], truth, atol=1e-5)
     # Rays that pass each other a metre apart: both cameras are upright, so the height cannot be explained away.
     contradicting = seen_at(two_views, xy + np.array([[0.0, 250.0], [0.0, -250.0]]), unknown)
-    assert np.isnan(triangulate(contradicting, two_views, sigmas, config)).all()
+    assert np.isnan(triangulate(contradicting, Views.of(two_views), config)).all()
     alone = without(both, np.array([[[False, True]]]))
-    assert np.isnan(triangulate(alone, two_views, sigmas, config)).all()
+    assert np.isnan(triangulate(alone, Views.of(two_views), config)).all()
 
 
 def test_people_of_several_frames_follow_each_other(five_cameras, two_people):
@@ -236,3 +245,25 @@ def test_refuses_shapes_and_settings_that_make_no_sense():
         ObservationConfig(sigma_m=0.0)
     with pytest.raises(ValueError, match="floor_px must not be negative"):
         ObservationConfig(floor_px=-1.0)
+
+
+def test_cameras_may_differ_from_row_to_row(five_cameras, two_people):
+    """The second row's cameras in reverse order: its evidence is that of a rig in that order."""
+    order = np.stack([np.arange(5), np.arange(5)[::-1]])
+    views = Views(five_cameras.K[order], five_cameras.cTw[order])
+    seen = observations_of(five_cameras, two_people, noise_px=3.0)
+    turned = Observations(
+        np.stack([seen.xy[0], seen.xy[1, :, ::-1]]),
+        np.stack([seen.confidence[0], seen.confidence[1, :, ::-1]]),
+        seen.initial,
+    )
+    config, still = ObservationConfig(), Views.of(five_cameras)
+    sigmas = observation_sigmas(seen, two_people, still, config)
+    swapped = observation_sigmas(turned, two_people, views, config)
+    np.testing.assert_allclose(swapped[1], sigmas[1, :, ::-1])
+    one = linearise(seen, sigmas, two_people, still, config)
+    other = linearise(turned, swapped, two_people, views, config)
+    np.testing.assert_allclose(other.information, one.information)
+    np.testing.assert_allclose(other.target, one.target)
+    with pytest.raises(ValueError, match="same rows"):
+        Views(five_cameras.K[order], five_cameras.cTw[order[:1]])

@@ -2,7 +2,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import determined, joint_information, projection_factors, projection_jacobians
+from factors import determined, joint_information, project_with_jacobian, projection_factors
 
 
 def _information(scene, joint, view, **kwargs):
@@ -53,8 +53,8 @@ def test_a_joint_on_the_line_through_both_cameras_is_not_determined(scene):
 
 def test_behind_a_camera_counts_nothing(scene):
     behind = scene.wTc[0, :3, 3] - 2.0 * scene.wTc[0, :3, 2]
-    jacobian = projection_jacobians(behind[None], scene.K[:1], scene.cTw[:1])
-    assert np.isnan(jacobian).all()
+    xy, depth, jacobian = project_with_jacobian(behind, scene.K[0], scene.cTw[0])
+    assert depth < 0 and np.isnan(xy).all() and np.isnan(jacobian).all()
     information = joint_information(behind[None], [0], [0], [1.0], scene.K, scene.cTw)
     np.testing.assert_array_equal(information, np.zeros((1, 3, 3)))
 

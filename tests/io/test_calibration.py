@@ -191,7 +191,7 @@ BAD_TEXT = [
     (json.dumps(association(), indent=1)[:300], "is not JSON: "),
     ('{"a": {"K": [1,\n 2,, 3]}}', "line 2 column 4 is not JSON"),
     ('{"a": {"K": []}, "a": {"K": []}}', 'key "a" occurs twice in one object; give each its own name'),
-    ("[1, 2]", "this is not a calibration that is known here; give the calibration.json of 4D Association"),
+    ("[1, 2]", "recognised as JSON (a list of 2), but this is not a calibration that is known here; give one of"),
     ("3", "this is not a calibration that is known here"),
     ("{}", "this is not a calibration that is known here"),
     ('{"a": {"fx": 3}}', "this is not a calibration that is known here"),

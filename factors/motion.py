@@ -1,0 +1,119 @@
+"""How joints move: white noise on acceleration between frames, and knowledge whose error lasts.
+
+Native factors only, all linear. Times may have any steps.
+
+**Motion** (Barfoot's white-noise-on-acceleration prior): between the states (x, v) of a joint at t and t + dt
+
+    r = [x' - x - dt v,  v' - v]  ~  N(0, q [[dt³/3, dt²/2], [dt²/2, dt]])
+
+with q the power spectral density of the acceleration, m²/s³.
+
+**A slowly varying offset.** Who says every frame again where a joint is, and errs the same way every time, has
+said it once. The error of a message "the joint is at m_t, covariance C_t" is split into a share that is new in
+every frame and one that lasts, an Ornstein-Uhlenbeck chain b_t in units of standard deviations. With R_t the
+symmetric square root of the message's information, R_t C_t R_t = I, and w the white share:
+
+    r = R_t (x_t - m_t) - sqrt(1 - w) b_t  ~  N(0, w I)
+    r = b' - a b                           ~  N(0, (1 - a²) I),    a = exp(-dt / correlation_s),    b_0 ~ N(0, I)
+"""
+
+from collections.abc import Iterable
+from itertools import pairwise, repeat
+
+import gtsam
+import numpy as np
+from gtsam import noiseModel
+from numpy.typing import ArrayLike, NDArray
+
+
+def motion_factors(
+    keys: ArrayLike, velocity_keys: ArrayLike, times_s: ArrayLike, psd: ArrayLike
+) -> list[gtsam.NoiseModelFactor]:
+    """White noise on acceleration between the T consecutive states of one joint: T - 1 native factors.
+
+    `keys` (T,) of the positions, `velocity_keys` (T,), `times_s` (T,) rising; `psd` in m²/s³: one number or one a
+    step (T - 1,).
+    """
+    times = np.asarray(times_s, dtype=np.float64)
+    positions, velocities = np.asarray(keys), np.asarray(velocity_keys)
+    if not positions.shape == velocities.shape == times.shape == (len(times),):
+        raise ValueError(
+            "keys, velocity_keys and times_s must be (T,), got"
+            f" {positions.shape}, {velocities.shape}, {times.shape}"
+        )
+    if not np.all(np.diff(times) > 0):
+        raise ValueError("times_s must rise from state to state")
+    densities = np.broadcast_to(np.asarray(psd, dtype=np.float64), max(len(times) - 1, 0))
+    if not np.all((densities > 0) & np.isfinite(densities)):
+        raise ValueError("psd must be positive and finite, m²/s³")
+    states = list(map(gtsam.StateData, positions.tolist(), velocities.tolist(), times.tolist()))
+    diagonals = np.repeat(densities[:, None], 3, axis=1)
+    return list(map(gtsam.WnoaMotionFactorPoint3, states[:-1], states[1:], diagonals))
+
+
+def offset_factors(
+    offset_keys: ArrayLike, times_s: ArrayLike, correlation_s: float
+) -> list[gtsam.NonlinearFactor]:
+    """The chain of offsets b_t: a unit prior on the first, then T - 1 links that forget within `correlation_s`."""
+    times, keys = np.asarray(times_s, dtype=np.float64), np.asarray(offset_keys)
+    if keys.shape != times.shape or times.ndim != 1 or not np.all(np.diff(times) > 0):
+        raise ValueError(f"offset_keys and times_s must be (T,), times rising; got {keys.shape}, {times.shape}")
+    if not (np.isfinite(correlation_s) and correlation_s > 0):
+        raise ValueError(f"correlation_s must be positive, got {correlation_s}")
+    kept = np.exp(-np.diff(times) / correlation_s)
+    scale = 1.0 / np.sqrt(-np.expm1(-2.0 * np.diff(times) / correlation_s))
+    unit, zero, eye = noiseModel.Unit.Create(3), np.zeros(3), np.eye(3)
+    links = [
+        gtsam.JacobianFactor(key, -a * s * eye, after, s * eye, zero, unit)
+        for (key, after), a, s in zip(pairwise(keys.tolist()), kept.tolist(), scale.tolist(), strict=True)
+    ]
+    first = [gtsam.PriorFactorPoint3(key, zero, unit) for key in keys[:1].tolist()]
+    return [*first, *_contained(links, keys)]
+
+
+def lasting_prior_factors(
+    keys: ArrayLike, offset_keys: ArrayLike, means: ArrayLike, roots: ArrayLike, white_share: float
+) -> list[gtsam.NonlinearFactor]:
+    """Messages about D joints whose errors last: position `keys` (D,) against `means` (D, 3) and their offsets.
+
+    `roots` (D, 3, 3), 1/m, are the symmetric square roots of the messages' information, of the whole error; they
+    may be singular (a ray). `white_share` of the error's variance, between 0 and 1, is new each time.
+    """
+    points, whiten = np.asarray(means, dtype=np.float64), np.asarray(roots, dtype=np.float64)
+    positions, offsets = np.asarray(keys), np.asarray(offset_keys)
+    count = len(positions)
+    if not (offsets.shape == (count,) and points.shape == (count, 3) and whiten.shape == (count, 3, 3)):
+        raise ValueError(
+            f"keys and offset_keys must be (D,), means (D, 3), roots (D, 3, 3), got {positions.shape}, "
+            f"{offsets.shape}, {points.shape}, {whiten.shape}"
+        )
+    if not (np.isfinite(points).all() and np.isfinite(whiten).all()):
+        raise ValueError("a mean or a root holds a value that is not finite: give no prior to such a joint")
+    if not 0 < white_share < 1:
+        raise ValueError(f"white_share must be between 0 and 1, got {white_share}")
+    scaled = whiten / np.sqrt(white_share)
+    of_offset = -np.sqrt((1.0 - white_share) / white_share) * np.eye(3)
+    right = np.einsum("dij,dj->di", scaled, points)
+    linear = map(
+        gtsam.JacobianFactor, positions.tolist(), scaled, offsets.tolist(), repeat(of_offset), right,
+        repeat(noiseModel.Unit.Create(3)),
+    )  # fmt: skip
+    return _contained(linear, np.concatenate([positions, offsets]))
+
+
+def motion_covariance(dt_s: ArrayLike, psd: ArrayLike) -> NDArray[np.float64]:
+    """Covariance (..., 6, 6) of [x' - x - dt v, v' - v] over steps `dt_s` (...,): m², m²/s, m²/s²."""
+    dt, q = np.asarray(dt_s, dtype=np.float64), np.asarray(psd, dtype=np.float64)
+    blocks = np.stack([np.stack([dt**3 / 3, dt**2 / 2], -1), np.stack([dt**2 / 2, dt], -1)], -2)
+    return np.einsum("...ab,ij->...aibj", q[..., None, None] * blocks, np.eye(3)).reshape(*blocks.shape[:-2], 6, 6)
+
+
+def _contained(linear: Iterable[gtsam.JacobianFactor], keys: NDArray[np.int64]) -> list[gtsam.NonlinearFactor]:
+    """Linear factors on `Point3` variables `keys` (D,) as factors of a nonlinear graph.
+
+    They must be told that they are linearised at zero: without that their error is always 0.
+    """
+    zeros, origin = gtsam.Values(), np.zeros(3)
+    for key in keys.tolist():
+        zeros.insert(key, origin)
+    return list(map(gtsam.LinearContainerFactor, linear, repeat(zeros)))

@@ -1,0 +1,221 @@
+"""From whose 2D detections are whose to joints, velocities and bodies: stage II as one object."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from factors import make_camera
+from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter
+from shapepose_fg.camera import Rig, Views
+from shapepose_fg.estimation.alternation import (
+    EstimatorConfig,
+    Solution,
+    Window,
+    alternate,
+    final_bodies,
+    joint_targets,
+)
+from shapepose_fg.estimation.draft import WholeFitter, drafted
+from shapepose_fg.estimation.linearisation import linearise, mean_confidence, observation_sigmas, triangulate
+from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.outcome import Problem, how_known, lasting_covariance, problems
+from shapepose_fg.estimation.window_graph import WindowGraph
+from shapepose_fg.observations import Observations
+from shapepose_fg.reconstruction import Status
+
+ExtraFactors = Callable[[WindowGraph, NDArray[np.int64]], Iterable[gtsam.NonlinearFactor]]
+"""Your own factors for a person's window, made from its keys (T, J)."""
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """N rows after stage II, in the order of the observations."""
+
+    joints: NDArray[np.float64]
+    """(N, J, 3) X, metres in the world; NaN where unknown."""
+    covariance: NDArray[np.float64]
+    """(N, J, 3, 3) covariance of each joint, m², errors that last in it; NaN where unknown."""
+    velocity: NDArray[np.float64]
+    """(N, J, 3) m/s; NaN where unknown, and in rows that stand alone."""
+    velocity_covariance: NDArray[np.float64]
+    """(N, J, 3, 3) m²/s²; NaN where the velocity is."""
+    confidence: NDArray[np.float64]
+    """(N, J) w_i of Eq. 4, mean confidence over all views of the observations that were kept."""
+    inlier: NDArray[np.bool_]
+    """(N, J, V) delta_ij of Eq. 2: which observations were kept."""
+    residual_px: NDArray[np.float64]
+    """(N, J, V, 2) projection of the joint minus observation; NaN where unseen or unknown."""
+    known: NDArray[np.uint8]
+    """(N, J) a `Known` each."""
+    fit: BodyFit
+    """Theta: the bodies, N rows."""
+    status: NDArray[np.str_]
+    """(N,) a `Status` each."""
+    problems: tuple[Problem, ...] = field(default=())
+    """What went wrong, joint by joint; rows of these have the status `not solved`."""
+
+    def __len__(self) -> int:
+        return len(self.joints)
+
+    def rows(self, index: NDArray[np.intp]) -> "Estimates":
+        """Some of the rows."""
+        kept = {name: getattr(self, name)[index] for name in _COLUMNS}
+        place = {row: n for n, row in enumerate(np.asarray(index).tolist())}
+        problems = (replace(each, row=place[each.row]) for each in self.problems if each.row in place)
+        return Estimates(**kept, fit=self.fit.rows(index), problems=tuple(problems))
+
+
+_COLUMNS = "joints covariance velocity velocity_covariance confidence inlier residual_px known status".split()
+"""The arrays of `Estimates`."""
+
+
+class Estimator:
+    """Stage II: rig, settings and fitter in one place.
+
+    Rows of one track at several frames are a window, one factor graph; a row alone (or `motion.temporal` false) is
+    the paper's frame-by-frame method, by the same code.
+    """
+
+    def __init__(
+        self, rig: Rig, fitter: BodyFitter, joints: tuple[str, ...], config: EstimatorConfig | None = None
+    ) -> None:
+        """`joints` are the names of the detector's joints: the motion model goes by them."""
+        self.rig = rig
+        self.fitter = fitter
+        self.config = EstimatorConfig() if config is None else config
+        self._motion = MotionModel.load(joints, self.config.motion)
+
+    def estimate(
+        self, observations: Observations, extra_factors: ExtraFactors | None = None, views: Views | None = None
+    ) -> Estimates:
+        """Joints, covariances and bodies of N rows, sorted in any way; (track, frame) must differ.
+
+        `extra_factors` adds factors of your own to every window. `views` are the cameras row by row, where they
+        are not the rig's.
+        """
+        config = self.config
+        views = Views.of(self.rig) if views is None else views
+        if len(views) != observations.confidence.shape[2] or views.rows_known not in (None, len(observations)):
+            raise ValueError(
+                f"views must be of the {len(observations)} rows' {observations.confidence.shape[2]} views"
+            )
+        X = triangulate(observations, views, config.observations)
+        sigmas = observation_sigmas(observations, X, views, config.observations)
+        windows = self._windows(observations, sigmas, views, extra_factors)
+        solution = alternate(observations, views, sigmas, X, windows, self.fitter, config)
+        return self._estimates(observations, sigmas, views, windows, X, solution)
+
+    def draft(
+        self, observations: Observations, views: Views | None = None
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """About where the joints of N rows are (N, J, 3), metres, and how surely (N, J, 3, 3), without any graph.
+
+        Enough to give detections out again: what the views say, and where that is little, or contradicts the body,
+        what the body says. A joint's views are in the body, too, so that these covariances are too small.
+        """
+        config = self.config
+        views = Views.of(self.rig) if views is None else views
+        X = triangulate(observations, views, config.observations)
+        sigmas = observation_sigmas(observations, X, views, config.observations)
+        evidence = linearise(observations, sigmas, X, views, config.observations)
+        enough = (evidence.sigma_m <= config.refine.max_sigma_m).sum(axis=1) >= config.refine.min_joints
+        whole = self.fitter.fit_whole if isinstance(self.fitter, WholeFitter) else self.fitter.fit
+        return drafted(evidence, whole(joint_targets(evidence, enough)), config.refine.disagreement)
+
+    def _windows(
+        self,
+        observations: Observations,
+        sigmas: NDArray[np.float64],
+        views: Views,
+        extra_factors: ExtraFactors | None,
+    ) -> list[Window]:
+        """One window per track, or per row, with the user's factors in it."""
+        time_s = observations.time_s
+        if np.any(np.ptp(time_s, axis=1) > 1e-3):
+            raise ValueError(
+                "views of one frame must be exposed within 1 ms of each other: synchronise them first"
+            )
+        windows = []
+        still = _cameras(views)
+        for rows in window_rows(observations, self.config.motion.temporal):
+            moving = views.rows_known is not None
+            cameras = [_cameras(views, row) if moving else still for row in rows.tolist()]
+            graph = WindowGraph(
+                cameras,
+                observations.xy[rows],
+                sigmas[rows],
+                self.config.graph,
+                self.config.observations.kernel,
+                self._motion,
+                track=int(observations.track[rows[0]]),
+                frames=observations.frame[rows],
+                times_s=time_s[rows].mean(axis=1),
+            )
+            for factor in extra_factors(graph, graph.keys) if extra_factors is not None else ():
+                graph.add(factor)
+            windows.append(Window(rows, graph))
+        return windows
+
+    def _estimates(
+        self,
+        observations: Observations,
+        sigmas: NDArray[np.float64],
+        views: Views,
+        windows: Sequence[Window],
+        first: NDArray[np.float64],
+        solution: Solution,
+    ) -> Estimates:
+        """Covariances, codes and statuses of what was solved."""
+        X = solution.joints
+        covariance, velocity_covariance = (np.full((*X.shape, 3), np.nan) for _ in range(2))
+        velocity = np.full(X.shape, np.nan)
+        for window in windows:
+            graph, rows = window.graph, window.rows
+            covariance[rows] = graph.marginals(graph.keys)
+            if graph.temporal:
+                velocity[rows] = graph.velocity()
+                velocity_covariance[rows] = graph.marginals(graph.velocity_keys)
+                covariance[rows] += lasting_covariance(solution, window, self._motion.views.white_share)
+        fit = final_bodies(solution, covariance, windows, self.fitter)
+        final = linearise(observations, sigmas, X, views, self.config.observations)
+        wrong = problems(observations, windows, solution, first, covariance)
+        enough = np.where(solution.enough, Status.BODY_UNDETERMINED, Status.TOO_FEW_VIEWS)
+        status = np.where(fit.ok, Status.OK, enough)
+        status[[problem.row for problem in wrong]] = Status.NOT_SOLVED
+        return Estimates(
+            joints=X,
+            covariance=covariance,
+            velocity=velocity,
+            velocity_covariance=velocity_covariance,
+            confidence=mean_confidence(observations, solution.inlier),
+            inlier=solution.inlier,
+            residual_px=final.residual_px,
+            known=how_known(solution, covariance),
+            fit=fit,
+            status=status,
+            problems=wrong,
+        )
+
+
+def window_rows(observations: Observations, temporal: bool) -> list[NDArray[np.intp]]:
+    """Rows of each window, frames rising: those of one track; or every row by itself.
+
+    ValueError where a person is twice in a frame.
+    """
+    if not temporal:
+        return [np.array([row]) for row in range(len(observations))]
+    order = np.lexsort((observations.frame, observations.track))
+    track, frame = observations.track[order], observations.frame[order]
+    if np.any((np.diff(track) == 0) & (np.diff(frame) == 0)):
+        raise ValueError("a track may have one row a frame: tell people apart by their track")
+    return np.split(order, np.flatnonzero(np.diff(track)) + 1) if len(order) else []
+
+
+def _cameras(views: Views, row: int = 0) -> tuple[gtsam.PinholeCameraCal3_S2, ...]:
+    """GTSAM's cameras of a row."""
+    K, cTw = (array[row] if array.ndim == 4 else array for array in (views.K, views.cTw))
+    wTc = np.linalg.inv(np.concatenate([cTw, np.tile([[[0.0, 0.0, 0.0, 1.0]]], (len(cTw), 1, 1))], axis=1))
+    return tuple(map(make_camera, K, wTc))

@@ -1,0 +1,100 @@
+"""How joints move, and how long the errors of what is known of them last: measured numbers, read from a file."""
+
+from dataclasses import dataclass
+from importlib.resources import as_file, files
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.errors import InputError
+from shapepose_fg.files import read_json
+
+FORMAT = "shapepose-fg motion model 1"
+
+
+@dataclass(frozen=True)
+class MotionConfig:
+    """Whether, and how, the frames of a person are solved together."""
+
+    temporal: bool = True
+    """Rows of one track at several frames are one window. False: every frame stands alone."""
+    model: str = ""
+    """File of the motion model, as `scripts/measure_motion.py` writes it; empty: the one that ships."""
+    psd_scale: float = 1.0
+    """Multiplies the power spectral densities of the joints' accelerations: more follows faster and smooths
+    less."""
+    lost_m: float = 0.1
+    """A joint whose views leave it less certain than this in some direction is lost from sight: in these frames,
+    and in those around them, the difference between joint and body is followed (`factors.motion`)."""
+    around_s: float = 0.5
+    """How far around them, seconds."""
+
+    def __post_init__(self) -> None:
+        for name in ("psd_scale", "lost_m", "around_s"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class Lasting:
+    """How the error of a message about a joint goes on from frame to frame."""
+
+    white_share: float
+    """Share of its variance that is new in every frame, between 0 and 1."""
+    correlation_s: float
+    """The rest has the autocorrelation exp(-t / this)."""
+
+
+@dataclass(frozen=True)
+class MotionModel:
+    """The numbers of a window's motion factors for J joints."""
+
+    psd_still: NDArray[np.float64]
+    """(J,) power spectral density of the acceleration of a joint that hardly moves, m²/s³, per axis."""
+    psd_speed: NDArray[np.float64]
+    """(J,) what is added to it for each (m/s)² of the joint's speed: fast joints turn faster, too."""
+    views: Lasting
+    """What the views of one frame say of a joint, taken together."""
+    body: Lasting
+    """What the body says of a joint without the joint's own views."""
+    speed_m_s: float = 2.0
+    """How fast a joint is, one sigma per axis, before anything is known of it."""
+
+    def psd(self, speed_m_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Power spectral density (..., J) of joints of this speed (..., J)."""
+        return self.psd_still + self.psd_speed * np.asarray(speed_m_s) ** 2
+
+    @classmethod
+    def load(cls, joints: tuple[str, ...], config: MotionConfig | None = None) -> "MotionModel":
+        """The model of the configuration's file for the `joints` of a detector.
+
+        A joint that the file does not name moves as the mean of those that it does. InputError for a file that is
+        not a motion model.
+        """
+        config = MotionConfig() if config is None else config
+        if config.model:
+            return cls._read(Path(config.model), joints, config.psd_scale)
+        with as_file(files("shapepose_fg.estimation") / "data" / "motion.json") as path:
+            return cls._read(path, joints, config.psd_scale)
+
+    @classmethod
+    def _read(cls, path: Path, joints: tuple[str, ...], scale: float) -> "MotionModel":
+        data = read_json(path)
+        try:
+            if data["format"] != FORMAT:
+                raise KeyError("format")
+            known = {name: (float(still), float(speed)) for name, (still, speed) in data["joints"].items()}
+            views, body = (
+                Lasting(float(data[name]["white_share"]), float(data[name]["correlation_s"]))
+                for name in ("views", "body")
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(
+                f"{path}: is not a motion model ({error}); give what scripts/measure_motion.py writes"
+            ) from None
+        table = np.array(list(known.values()))
+        if not (np.isfinite(table).all() and (table[:, 0] > 0).all() and (table[:, 1] >= 0).all()):
+            raise InputError(f"{path}: densities must be positive; give what scripts/measure_motion.py writes")
+        chosen = scale * np.array([known.get(name, tuple(table.mean(axis=0))) for name in joints])
+        return cls(chosen[:, 0], chosen[:, 1], views, body)

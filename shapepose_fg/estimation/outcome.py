@@ -1,0 +1,111 @@
+"""What came of a solved window: errors that last, how each joint is known, and what went wrong."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.estimation.alternation import Solution, Window
+from shapepose_fg.estimation.linearisation import weakest_sigma
+from shapepose_fg.observations import Observations
+from shapepose_fg.reconstruction import Known
+
+RUNAWAY_M = 1.0
+"""A joint with a factor of the user's own that ends this far from where its views first put it has run away."""
+RUNAWAY_SIGMA = 20.0
+"""So has one that ends this many standard deviations, and half a metre, from what views and body say of it."""
+_HALF_M = 0.5
+SEEN_M = 0.1
+"""A joint is seen in a frame whose views leave it no less certain than this in any direction, metres."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What went wrong with one joint of one person in one frame."""
+
+    row: int
+    """Row of the estimates."""
+    track: int
+    """Who."""
+    frame: int
+    """When."""
+    joint: int
+    """Which joint, an index into the skeleton."""
+    reason: str
+    """What happened, in words."""
+
+
+def lasting_covariance(solution: Solution, window: Window, white_share: float) -> NDArray[np.float64]:
+    """(T, J, 3, 3) what the graph left out: the lasting share of the error that one frame leaves, m².
+
+    What views and body leave in a frame in which the joint is seen; in others what they left in the nearest such
+    frame, from which motion, or the body's offset, carried it. Zero for joints that were solved with offsets.
+    """
+    information = solution.views.information[window.rows] + solution.body.information[window.rows]
+    seen = weakest_sigma(solution.views.information[window.rows]) <= SEEN_M
+    seen &= ~window.graph.with_offsets
+    result = np.zeros(information.shape)
+    result[seen] = (1.0 - white_share) * np.linalg.inv(information[seen])
+    times = window.graph.times_s
+    for joint in np.flatnonzero(seen.any(axis=0) & ~seen.all(axis=0)).tolist():
+        frames = np.flatnonzero(seen[:, joint])
+        nearest = frames[np.abs(times[:, None] - times[frames]).argmin(axis=1)]
+        result[:, joint] = result[nearest, joint]
+    return result
+
+
+def how_known(solution: Solution, covariance: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """(N, J) a `Known` for each joint, `covariance` (N, J, 3, 3) being its own.
+
+    A joint that no view saw is carried by motion where it is known much better (half the variance) than the body
+    knows it.
+    """
+    pulled = solution.body.known
+    information = np.where(pulled[..., None, None], solution.body.information, np.eye(3))
+    said = np.trace(np.linalg.inv(information), axis1=2, axis2=3)
+    carried = ~pulled | (np.trace(covariance, axis1=2, axis2=3) < 0.5 * said)
+    code = np.where(solution.inlier.any(axis=2), Known.SEEN, np.where(carried, Known.MOTION, Known.BODY))
+    return np.where(np.isfinite(solution.joints).all(axis=2), code, Known.UNKNOWN).astype(np.uint8)
+
+
+def problems(
+    observations: Observations,
+    windows: Sequence[Window],
+    solution: Solution,
+    first: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+) -> tuple[Problem, ...]:
+    """Joints that could not be solved, by person, frame and joint; `first` (N, J, 3) is where views first put
+    them.
+    """
+    X = solution.joints
+    finite = np.isfinite(X).all(axis=2)
+    reasons = np.full(finite.shape, "", dtype=object)
+    information = solution.views.information + solution.body.information
+    pulls = _pull(solution.views, X) + _pull(solution.body, X)
+    known = finite & (weakest_sigma(information) < np.inf)
+    away = np.zeros(X.shape)
+    away[known] = np.linalg.solve(information[known], pulls[known][..., None])[..., 0]
+    sigmas = np.sqrt(np.maximum(np.einsum("...i,...i->...", away, pulls), 0.0))
+    far = np.linalg.norm(away, axis=2)
+    reasons[known & (far > _HALF_M) & (sigmas > RUNAWAY_SIGMA)] = "ran away from what views and body say of it"
+    for window in windows:
+        graph, rows = window.graph, window.rows
+        touched = np.ix_(rows, np.flatnonzero(graph.touched))
+        with np.errstate(invalid="ignore"):
+            ran = np.linalg.norm(X[touched] - first[touched], axis=2) > RUNAWAY_M
+        reasons[touched] = np.where(ran, "ran away from its views", reasons[touched])
+        if graph.failure:
+            reasons[rows] = np.where(finite[rows], graph.failure, reasons[rows])
+    lost = finite & ~np.isfinite(covariance).all(axis=(2, 3)) & (reasons == "")
+    reasons[lost] = "nothing determines it: its system is singular"
+    return tuple(
+        Problem(int(n), int(observations.track[n]), int(observations.frame[n]), int(j), reasons[n, j])
+        for n, j in np.argwhere(reasons != "")
+    )
+
+
+def _pull(message, X: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, J, 3) information times the way from `X` to where the message has the joint, 1/m."""
+    return np.einsum("...ij,...j->...i", message.information, np.nan_to_num(message.xyz) - np.nan_to_num(X))

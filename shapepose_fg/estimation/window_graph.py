@@ -1,0 +1,376 @@
+"""A person over a window of frames as one factor graph: a position of every joint in every frame.
+
+Stage II of the paper, the X step: E(X) = w_2D E_2D(X) + w_shape E_shape(X, Theta) with Theta fixed; with
+more than one frame, joints have velocities too, and motion factors between their states.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from factors import (
+    DEFAULT_WIDTH_SIGMA,
+    KernelName,
+    body_prior_factors,
+    diagonal,
+    joint_keys,
+    lasting_prior_factors,
+    motion_factors,
+    offset_factors,
+    offset_keys,
+    projection_factors,
+    robust_kernel,
+    split_key,
+    velocity_keys,
+)
+from shapepose_fg.estimation.motion_model import Lasting, MotionModel
+
+_OF_VIEWS, _OF_BODY = 0, 1
+"""Sources of messages about joints, for the keys of their offsets."""
+
+
+@dataclass(frozen=True)
+class WindowGraphConfig:
+    """What goes into a person's graph."""
+
+    rho_3d: float = 1.0
+    """rho_3D of Eq. 4: joints whose mean confidence over all views is at most this are pulled by the body model.
+    The covariances are meant, so the body is evidence on every joint; the paper's 0.25 is for comparisons."""
+    weight_2d: float = 1.0
+    """w_2D of Eq. 5, multiplies the squared reprojection errors. With sigmas that are true, both weights are 1."""
+    weight_shape: float = 1.0
+    """w_shape of Eq. 5, multiplies the squared distances to the body model."""
+    max_iterations: int = 20
+    """Levenberg-Marquardt steps at the most."""
+    tolerance: float = 1e-4
+    """Relative change of the error at which Levenberg-Marquardt stops."""
+
+    def __post_init__(self) -> None:
+        for name in ("weight_2d", "weight_shape", "max_iterations", "tolerance"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        if not 0 <= self.rho_3d <= 1:
+            raise ValueError(f"rho_3d must be between 0 and 1, got {self.rho_3d}")
+
+
+@dataclass(frozen=True)
+class Message:
+    """What somebody says of the joints of T frames (or of N rows), as Gaussians."""
+
+    xyz: NDArray[np.float64]
+    """(T, J, 3) where they are, metres; anything where the information is zero."""
+    information: NDArray[np.float64]
+    """(T, J, 3, 3) 1/m², positive semi-definite; zero where nothing is said."""
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """(T, J) of which joints anything is said."""
+        return self.information.any(axis=(2, 3))
+
+    def rows(self, index: NDArray[np.intp]) -> "Message":
+        """Some of the rows."""
+        return Message(self.xyz[index], self.information[index])
+
+
+class WindowGraph:
+    """The graph of one person in T frames; T = 1 is a frame by itself, without velocities.
+
+    Windows compose: the keys carry person, joint and frame, so `graph` can be added to another graph as it is.
+    Joints are not tied to each other but by factors of your own, which keeps marginal covariances cheap.
+
+    **Errors that last.** A detector that is 2 cm off is so in the next frame too, and so is the body's guess: T
+    frames of one guess are one guess. In a window of several frames therefore
+
+    - projections and body priors count with the share of their variance that is new in every frame, so that motion
+      smooths that only; the rest is `outcome.lasting_covariance`, to be added to what `marginals` gives;
+    - where a joint is lost from sight (`lost` of `solve`) the body's prior gets an offset that decays slowly
+      (`factors.motion`): the joint stays where the body puts it plus the difference that there was when it was
+      seen;
+    - joints with factors of your own are solved with offsets of views and body both, and what the views say is one
+      Gaussian each: your factor is weighed against errors that last, and `marginals` holds all of them.
+    """
+
+    def __init__(
+        self,
+        cameras: Sequence[Sequence[gtsam.PinholeCameraCal3_S2]],
+        xy: NDArray[np.float64],
+        sigmas_px: NDArray[np.float64],
+        config: WindowGraphConfig,
+        kernel: KernelName | None,
+        motion: MotionModel,
+        *,
+        track: int,
+        frames: NDArray[np.intp],
+        times_s: NDArray[np.float64],
+    ) -> None:
+        """Make the factors of all observations.
+
+        `cameras` are V of each of the T frames, `xy` (T, J, V, 2) undistorted pixels, `sigmas_px` (T, J, V), 0
+        where the view did not see the joint; `frames` (T,) and `times_s` (T,) seconds, both rising.
+        """
+        T, J = sigmas_px.shape[:2]
+        if np.shape(frames) != (T,) or np.shape(times_s) != (T,) or np.any(np.diff(frames) <= 0):
+            raise ValueError(f"frames and times_s must be ({T},), frames rising, got {frames}")
+        self.config = config
+        self.track = track
+        """Who it is."""
+        self.frames = np.asarray(frames)
+        """(T,) frame of each row."""
+        self.times_s = np.asarray(times_s, dtype=np.float64)
+        """(T,) time of each frame, seconds."""
+        joints = np.arange(J)
+        self.keys = joint_keys(track, joints, self.frames[:, None])
+        """(T, J) key of each joint's position, `Point3`, metres."""
+        self.velocity_keys = velocity_keys(track, joints, self.frames[:, None])
+        """(T, J) key of each joint's velocity, `Point3`, m/s; not in the graph of a single frame."""
+        self.graph = gtsam.NonlinearFactorGraph()
+        """The factors of the last solution."""
+        self.values = gtsam.Values()
+        """The last solution, for `gtsam.Marginals` and for graphs that this one is added to."""
+        self.failure = ""
+        """Why the last solution is none; empty where it is one."""
+        self._motion = motion
+        self._frame, self._joint, self._view = np.nonzero(sigmas_px > 0)
+        share = motion.views.white_share if T > 1 else 1.0
+        # A lasting error is no outlier: the kernel is as wide as before the sigma was split.
+        width = None if kernel is None else DEFAULT_WIDTH_SIGMA[kernel] / np.sqrt(share)
+        V = sigmas_px.shape[2]
+        self._projections = projection_factors(
+            [camera for row in cameras for camera in row],
+            self._frame * V + self._view,
+            self.keys[self._frame, self._joint],
+            xy[self._frame, self._joint, self._view],
+            sigmas_px[self._frame, self._joint, self._view] * np.sqrt(share / config.weight_2d),
+            robust_kernel(kernel, width),
+        )
+        self._offset_keys = np.stack(
+            [offset_keys(track, joints, self.frames[:, None], source) for source in (_OF_VIEWS, _OF_BODY)]
+        )
+        self._added: list[tuple[gtsam.NonlinearFactor, frozenset[int]]] = []
+        self._present = np.zeros((T, J), dtype=bool)
+
+    def __len__(self) -> int:
+        """T, the number of frames."""
+        return len(self.frames)
+
+    @property
+    def temporal(self) -> bool:
+        """Whether there is more than one frame: then joints have velocities and motion factors."""
+        return len(self) > 1
+
+    def add(self, factor: gtsam.NonlinearFactor) -> None:
+        """Append a factor of your own on any of `keys` and `velocity_keys`; it stays through all alternations.
+
+        While one of its variables is not in the problem, because neither views nor body nor motion place it, it
+        rests. ValueError if it is on anything but this window's keys.
+        """
+        own = {*self.keys.ravel().tolist(), *self.velocity_keys.ravel().tolist()}
+        keys = set(factor.keys())
+        if not keys <= own:
+            raise ValueError(
+                "a factor of your own must be on the window's own keys only (WindowGraph.keys and velocity_keys)"
+            )
+        self._added.append((factor, frozenset(keys)))
+
+    @cached_property
+    def coupled(self) -> list[frozenset[int]]:
+        """Joints that factors of your own tie to each other: sets of two or more, without overlap."""
+        sets: list[frozenset[int]] = []
+        for _, keys in self._added:
+            joined = frozenset(split_key(key).joint for key in keys)
+            apart = [each for each in sets if not each & joined]
+            sets = [*apart, joined.union(*(each for each in sets if each & joined))]
+        return [each for each in sets if len(each) > 1]
+
+    @cached_property
+    def with_offsets(self) -> NDArray[np.bool_]:
+        """(J,) joints with a factor of your own, in a window of several frames: solved with offsets throughout."""
+        return self.touched if self.temporal else np.zeros_like(self.touched)
+
+    @cached_property
+    def touched(self) -> NDArray[np.bool_]:
+        """(J,) joints on which there is a factor of your own."""
+        joints = {split_key(key).joint for _, keys in self._added for key in keys}
+        return np.isin(np.arange(self.keys.shape[1]), list(joints))
+
+    def solve(
+        self,
+        inlier: NDArray[np.bool_],
+        views: Message,
+        body: Message,
+        initial: NDArray[np.float64],
+        lost: NDArray[np.bool_] | None = None,
+    ) -> NDArray[np.float64]:
+        """Minimise over the joints, from `initial` (T, J, 3) metres; returns (T, J, 3).
+
+        `inlier` (T, J, V) are the observations that count (delta_ij of Eq. 2), `views` what they say together at
+        `initial`, `body` the priors (Eq. 3). A joint with NaN in `initial` is not in the problem and stays NaN; in
+        a window of several frames that goes for all frames of the joint. `lost` (T, J): where joints are hardly
+        seen, or will soon be, or were a moment ago.
+        """
+        self._present = np.isfinite(initial).all(axis=2)
+        if self.temporal:
+            self._present &= self._present.all(axis=0)
+        of_views = self._present & self.with_offsets
+        of_body = of_views if lost is None or not self.temporal else self._present & (lost | self.with_offsets)
+        self.values = self._start(initial, np.stack([of_views, of_body]))
+        self.graph = gtsam.NonlinearFactorGraph()
+        self._push(self._seen(inlier & (self._present & ~of_views)[..., None]))
+        self._push(self._priors(body, self._present & ~of_body))
+        self._push(self._lasting(views, 1.0 / self.config.weight_2d, self._motion.views, _OF_VIEWS, of_views))
+        self._push(self._lasting(body, 1.0 / self.config.weight_shape, self._motion.body, _OF_BODY, of_body))
+        if self.temporal:
+            self._push(self._motions(initial))
+        exists = self.values.exists
+        self._push([factor for factor, keys in self._added if all(map(exists, keys))])
+        if self.values.empty():
+            return np.full(initial.shape, np.nan)
+        self._optimise()
+        return self._points()[0]
+
+    def velocity(self) -> NDArray[np.float64]:
+        """(T, J, 3) velocities of the last solution, m/s; NaN where there are none."""
+        return self._points()[1]
+
+    def marginals(self, keys: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Marginal covariance (..., 3, 3) of any of the window's keys (...,) at the last solution.
+
+        m² for positions, m²/s² for velocities. NaN where a variable is not in the problem, and where the problem
+        leaves it undetermined (more than 10 m or 10 m/s in some direction): singular systems raise no error.
+        """
+        result = np.full((keys.size, 3, 3), np.nan)
+        inside = [(n, key) for n, key in enumerate(keys.ravel().tolist()) if self.values.exists(key)]
+        if len(inside) == 0 or self.failure:
+            return result.reshape(*keys.shape, 3, 3)
+        try:
+            found = self._marginals
+            for n, key in inside:
+                result[n] = found.marginalCovariance(key)
+        except RuntimeError:
+            result = self._damped_marginals(inside, keys.size)
+        return result.reshape(*keys.shape, 3, 3)
+
+    @cached_property
+    def _parameters(self) -> gtsam.LevenbergMarquardtParams:
+        parameters = gtsam.LevenbergMarquardtParams()
+        parameters.setMaxIterations(self.config.max_iterations)
+        # Of hundreds of joints that hardly move any more, a few thousandths of a sigma.
+        parameters.setRelativeErrorTol(self.config.tolerance * (10.0 if self.temporal else 1.0))
+        return parameters
+
+    @property
+    def _marginals(self) -> gtsam.Marginals:
+        """Of the last solution; RuntimeError where the system is singular."""
+        return gtsam.Marginals(self.graph, self.values)
+
+    def _damped_marginals(self, inside: list[tuple[int, int]], count: int) -> NDArray[np.float64]:
+        """The same with a prior of 100 m on every variable: what is then wider than 10 m is not determined."""
+        result = np.full((count, 3, 3), np.nan)
+        damped = gtsam.NonlinearFactorGraph(self.graph)
+        wide = gtsam.noiseModel.Isotropic.Sigma(3, 100.0)
+        for key in self.values.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
+            damped.push_back(gtsam.PriorFactorPoint3(key, self.values.atPoint3(key), wide))
+        try:
+            found = gtsam.Marginals(damped, self.values)
+            for n, key in inside:
+                result[n] = found.marginalCovariance(key)
+        except RuntimeError:
+            return np.full((count, 3, 3), np.nan)
+        lost = ~(np.trace(result, axis1=1, axis2=2) < 10.0**2)
+        result[lost] = np.nan
+        return result
+
+    def _optimise(self) -> None:
+        """Levenberg-Marquardt from `values`; where it fails they stay as they are, and `failure` says why."""
+        self.failure = ""
+        try:
+            optimizer = gtsam.LevenbergMarquardtOptimizer(self.graph, self.values, self._parameters)
+            self.values = optimizer.optimize()
+        except RuntimeError:
+            self.failure = "the solver failed: its system is singular"
+            return
+        if not np.isfinite(optimizer.error()):
+            self.failure = "the solver left the finite numbers"
+
+    def _push(self, factors: list[gtsam.NonlinearFactor]) -> None:
+        push = self.graph.push_back
+        for factor in factors:
+            push(factor)
+
+    def _seen(self, inlier: NDArray[np.bool_]) -> list[gtsam.NonlinearFactor]:
+        """The projection factors of `inlier` (T, J, V)."""
+        chosen = np.flatnonzero(inlier[self._frame, self._joint, self._view])
+        return [self._projections[n] for n in chosen.tolist()]
+
+    def _priors(self, body: Message, where: NDArray[np.bool_]) -> list[gtsam.NonlinearFactor]:
+        """The body's pull on the joints of `where` (T, J)."""
+        known = body.known & where
+        share = self._motion.views.white_share if self.temporal else 1.0
+        covariances = np.linalg.inv(body.information[known]) * (share / self.config.weight_shape)
+        symmetric = (covariances + covariances.swapaxes(1, 2)) / 2
+        return body_prior_factors(self.keys[known], body.xyz[known], symmetric)
+
+    def _lasting(
+        self, said: Message, scale: float, errors: Lasting, source: int, chosen: NDArray[np.bool_]
+    ) -> list[gtsam.NonlinearFactor]:
+        """What is `said` of the joints of `chosen` (T, J), with an offset each that decays slowly."""
+        known, keys = said.known & chosen, self._offset_keys[source]
+        roots = symmetric_roots(said.information[known] / scale)
+        factors = lasting_prior_factors(self.keys[known], keys[known], said.xyz[known], roots, errors.white_share)
+        for joint in np.flatnonzero(chosen.any(axis=0)).tolist():
+            there = chosen[:, joint]
+            factors += offset_factors(keys[there, joint], self.times_s[there], errors.correlation_s)
+        return factors
+
+    def _motions(self, near: NDArray[np.float64]) -> list[gtsam.NonlinearFactor]:
+        """Motion of the joints that are in the problem; how far they may turn goes by their speed at `near`."""
+        speed = np.linalg.norm(np.diff(near, axis=0), axis=2) / np.diff(self.times_s)[:, None]
+        psd = self._motion.psd(speed)
+        unknown = diagonal(np.full(3, self._motion.speed_m_s))
+        factors: list[gtsam.NonlinearFactor] = []
+        for joint in np.flatnonzero(self._present[0]).tolist():
+            keys, velocities = self.keys[:, joint], self.velocity_keys[:, joint]
+            factors.append(gtsam.PriorFactorPoint3(int(velocities[0]), np.zeros(3), unknown))
+            factors += motion_factors(keys, velocities, self.times_s, psd[:, joint])
+        return factors
+
+    def _start(self, initial: NDArray[np.float64], offsets: NDArray[np.bool_]) -> gtsam.Values:
+        """`initial` (T, J, 3) with its velocities; `offsets` (2, T, J) of views and body start as they ended."""
+        values = gtsam.Values()
+        insert = values.insert
+        for key, point in zip(self.keys[self._present].tolist(), initial[self._present], strict=True):
+            insert(key, point)
+        if not self.temporal:
+            return values
+        last = self.values
+        speed = np.gradient(initial, self.times_s, axis=0)
+        for key, velocity in zip(self.velocity_keys[self._present].tolist(), speed[self._present], strict=True):
+            insert(key, last.atPoint3(key) if last.exists(key) else velocity)
+        zero = np.zeros(3)
+        for key in self._offset_keys[offsets].tolist():
+            insert(key, last.atPoint3(key) if last.exists(key) else zero)
+        return values
+
+    def _points(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Positions and velocities (T, J, 3) of the last solution. Values are sorted as keys are: by joint, then
+        frame.
+        """
+        present = self._present.T
+        positions, speeds = (np.full((*present.shape, 3), np.nan) for _ in range(2))
+        count = int(present.sum())
+        if count > 0:
+            points = gtsam.utilities.extractPoint3(self.values)
+            positions[present] = points[:count]
+            if self.temporal:
+                speeds[present] = points[count : 2 * count]
+        return positions.swapaxes(0, 1), speeds.swapaxes(0, 1)
+
+
+def symmetric_roots(information: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Symmetric square roots (D, 3, 3) of positive semi-definite matrices."""
+    values, vectors = np.linalg.eigh(information)
+    return np.einsum("dik,dk,djk->dij", vectors, np.sqrt(np.maximum(values, 0.0)), vectors)

@@ -1,0 +1,133 @@
+"""COLMAP's text model: cameras.txt and images.txt. Camera from world; no unit and no up axis of its own."""
+
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from shapepose_fg.camera import Lens
+from shapepose_fg.errors import InputError
+from shapepose_fg.files import read_text
+from shapepose_fg.io.calibration.content import Content
+from shapepose_fg.io.calibration.written import Format, WrittenCamera, WrittenRig, intrinsics, pose, rotation_of
+
+_FILES = ("cameras.txt", "images.txt")
+_BINARY = ("cameras.bin", "images.bin")
+_HALF_PIXEL = 0.5
+"""COLMAP's (0, 0) is the corner of the first pixel; ours is its centre."""
+_MODELS: dict[str, tuple[str, Lens]] = {
+    "SIMPLE_PINHOLE": ("f cx cy", "perspective"),
+    "PINHOLE": ("fx fy cx cy", "perspective"),
+    "SIMPLE_RADIAL": ("f cx cy k1", "perspective"),
+    "RADIAL": ("f cx cy k1 k2", "perspective"),
+    "OPENCV": ("fx fy cx cy k1 k2 p1 p2", "perspective"),
+    "FULL_OPENCV": ("fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6", "perspective"),
+    "SIMPLE_RADIAL_FISHEYE": ("f cx cy k1", "fisheye"),
+    "RADIAL_FISHEYE": ("f cx cy k1 k2", "fisheye"),
+    "OPENCV_FISHEYE": ("fx fy cx cy k1 k2 k3 k4", "fisheye"),
+}
+"""COLMAP's camera models that are lenses of OpenCV, and their parameters in order."""
+_ORDER: dict[str, str] = {"perspective": "k1 k2 p1 p2 k3 k4 k5 k6", "fisheye": "k1 k2 k3 k4"}
+
+
+@dataclass(frozen=True)
+class _Lens:
+    """A line of cameras.txt."""
+
+    K: np.ndarray
+    image_size: tuple[int, int]
+    distortion: list[float]
+    lens: Lens
+
+
+def recognise(content: Content) -> bool:
+    """Whether this is one of the two files, or a folder with COLMAP's model."""
+    if content.syntax == "folder":
+        return any(path.name in (*_FILES, *_BINARY) for path in content.value)
+    return content.syntax == "text" and content.path.name in _FILES
+
+
+def read(content: Content) -> WrittenRig:
+    """A camera per image, in the order of images.txt; called after the image, or its folder."""
+    folder = content.path if content.syntax == "folder" else content.path.parent
+    for name, binary in zip(_FILES, _BINARY, strict=True):
+        if not (folder / name).is_file():
+            cure = "copy it there too"
+            if (folder / binary).is_file():
+                cure = f"{binary} is COLMAP's binary: run colmap model_converter --output_type TXT"
+            raise InputError(f"{folder / name}: this half of COLMAP's model is missing; {cure}")
+    lenses = _lenses(folder / _FILES[0])
+    cameras = _images(folder / _FILES[1], lenses)
+    cures = {
+        "unit": "pass --unit (a model is to no scale until colmap model_aligner or the cameras' known distances"
+        " gave it one)",
+        "up": "pass --up with the axis of the model that points up",
+    }
+    return WrittenRig(cameras, None, None, cures)
+
+
+def _lenses(path: Path) -> dict[str, _Lens]:
+    """The cameras of cameras.txt by their id: CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]."""
+    lenses = {}
+    for number, line in enumerate(read_text(path).splitlines(), 1):
+        words = line.split()
+        if len(words) == 0 or line.startswith("#"):
+            continue
+        place = f"{path}: line {number}"
+        model = words[1] if len(words) > 1 else ""
+        if model not in _MODELS:
+            raise InputError(
+                f"{place}: camera model {model or 'missing'} is not read; use one of {' '.join(_MODELS)}"
+            )
+        names, lens = _MODELS[model]
+        values = _numbers(words[2:], 2 + len(names.split()), place)
+        given = dict(zip(names.split(), values[2:], strict=True))
+        fx, fy = given.get("fx", given.get("f", 0.0)), given.get("fy", given.get("f", 0.0))
+        K = intrinsics(fx, fy, given["cx"] - _HALF_PIXEL, given["cy"] - _HALF_PIXEL)
+        distortion = [given.get(name, 0.0) for name in _ORDER[lens].split()]
+        while len(distortion) > 5 and distortion[-1] == 0:
+            distortion.pop()
+        lenses[words[0]] = _Lens(K, (round(values[0]), round(values[1])), distortion, lens)
+    return lenses
+
+
+def _images(path: Path, lenses: dict[str, _Lens]) -> list[WrittenCamera]:
+    """images.txt: IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; each followed by a line of points."""
+    lines = [(number, line) for number, line in enumerate(read_text(path).splitlines(), 1) if line[:1] != "#"]
+    rows = [(number, line.split(maxsplit=9)) for number, line in lines[::2] if line.strip()]
+    names = _names([words[9] if len(words) == 10 else "" for _, words in rows])
+    cameras = []
+    for (number, words), name in zip(rows, names, strict=True):
+        place = f"{path}: line {number}"
+        if len(words) != 10 or words[8] not in lenses:
+            raise InputError(
+                f"{place}: must hold id, quaternion, translation, camera id and name; export it again"
+            )
+        qw, qx, qy, qz, *t = _numbers(words[1:8], 7, place)
+        wTc = pose(rotation_of([qx, qy, qz, qw], "QW QX QY QZ", place), t, "QW QX QY QZ", place)
+        lens = lenses[words[8]]
+        cameras.append(WrittenCamera(name, lens.K, wTc, lens.image_size, lens.distortion, lens.lens))
+    return cameras
+
+
+def _names(files: list[str]) -> list[str]:
+    """Names of cameras from names of images: the folders where they tell them apart, else the files."""
+    folders = [str(PurePosixPath(file).parent) for file in files]
+    if "." not in folders and len(set(folders)) == len(folders):
+        return folders
+    return [str(PurePosixPath(file).with_suffix("")) if file else "" for file in files]
+
+
+def _numbers(words: list[str], count: int, place: str) -> list[float]:
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        values = []
+    if len(values) != count or not np.isfinite(values).all():
+        raise InputError(
+            f"{place}: must hold {count} finite numbers here, got {len(words)} words; export it again"
+        )
+    return values
+
+
+COLMAP = Format("COLMAP's cameras.txt and images.txt", recognise, read)

@@ -1,0 +1,118 @@
+"""Calibration files to a `Rig`: the formats that are known, which one a file is, and what it does not say."""
+
+from pathlib import Path
+from typing import get_args
+
+from shapepose_fg.camera import Axis, Rig
+from shapepose_fg.errors import InputError
+from shapepose_fg.io.calibration.association import ASSOCIATION
+from shapepose_fg.io.calibration.camera_tables import CAMERA_TABLES
+from shapepose_fg.io.calibration.colmap import COLMAP
+from shapepose_fg.io.calibration.content import Content, load
+from shapepose_fg.io.calibration.easymocap import EASYMOCAP
+from shapepose_fg.io.calibration.opencv_storage import MULTIVIEW, ONE_NODE_EACH
+from shapepose_fg.io.calibration.panoptic import PANOPTIC, VOXELPOSE
+from shapepose_fg.io.calibration.qualisys import QUALISYS
+from shapepose_fg.io.calibration.rig_file import RIG_FILE
+from shapepose_fg.io.calibration.ros import ROS
+from shapepose_fg.io.calibration.vicon import VICON
+from shapepose_fg.io.calibration.written import METRES, Format, Unit, finished
+from shapepose_fg.io.validation import describe
+
+FORMATS: tuple[Format, ...] = (
+    RIG_FILE,
+    PANOPTIC,
+    VOXELPOSE,
+    ASSOCIATION,
+    *CAMERA_TABLES,
+    QUALISYS,
+    VICON,
+    EASYMOCAP,
+    MULTIVIEW,
+    ONE_NODE_EACH,
+    COLMAP,
+    ROS,
+)
+"""All formats that are known; the first that recognises a file reads it."""
+
+_MISSING = {
+    "unit": "pass --unit m, cm or mm",
+    "up": "pass --up with the axis that points up (x -x y -y z -z)",
+    "image_size": "pass --image-size WIDTHxHEIGHT, the pictures that were calibrated, in pixels",
+}
+"""What the user can say, and how, in the order of the sentence."""
+
+
+def read_rig(
+    path: str | Path,
+    *,
+    up: Axis | None = None,
+    unit: Unit | None = None,
+    image_size: tuple[int, int] | None = None,
+) -> Rig:
+    """Read the cameras of a calibration file, or folder; the format is told by the content.
+
+    The formats are `FORMATS`; docs/conventions.md says what unit and up axis each has. `up` and `unit` overrule
+    the file. `image_size` (width, height) is for formats that do not say how large the pictures are. What neither
+    the file nor the caller says is an InputError: one sentence that names the file, the key and the cure.
+    """
+    path = Path(path)
+    if up is not None and up not in get_args(Axis):
+        raise InputError(f"up must be one of {' '.join(get_args(Axis))}, got {up!r}")
+    if unit is not None and unit not in METRES:
+        raise InputError(f"unit must be one of {' '.join(METRES)}, got {unit!r}")
+    content = load(path)
+    if content.syntax == "pickle":
+        raise InputError(
+            f"{path}: this is a Python pickle, as OpenCap writes it, and could run any program when it is opened;"
+            " write it as a rig file where you trust it, as docs/conventions.md shows"
+        )
+    form = next((each for each in FORMATS if each.recognise(content)), None)
+    if form is None:
+        raise InputError(_unknown(content))
+    written = form.read(content)
+    up, unit = up or written.up, unit or written.unit
+    sizes_missing = any(camera.image_size is None for camera in written.cameras)
+    if image_size is not None and not sizes_missing:
+        raise InputError(f"{path}: {form.name} says itself how large the pictures are; leave --image-size out")
+    given = {"unit": unit, "up": up, "image_size": image_size if sizes_missing else True}
+    missing = [name for name, value in given.items() if value is None]
+    if up is None or unit is None or missing:
+        cures = [written.cures.get(name, _MISSING[name]) for name in missing]
+        names = " and ".join(missing)
+        raise InputError(
+            f"{path}: recognised as {form.name}, where {names} {'is' if len(missing) == 1 else 'are'} missing;"
+            f" {' and '.join(cures)}"
+        )
+    size = (0, 0) if image_size is None else image_size
+    try:
+        return Rig(tuple(finished(camera, METRES[unit], size, path, form.cure) for camera in written.cameras), up)
+    except InputError:
+        raise
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def _unknown(content: Content) -> str:
+    """What was found instead of a calibration, and what is known."""
+    known = ", ".join(form.name for form in FORMATS)
+    if content.syntax == "folder":
+        names = [path.name for path in content.value]
+        listing = " ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
+        return (
+            f"{content.path}: this is a folder; give the file inside it, or the folder with the files of"
+            f" EasyMocap, COLMAP or ROS; here is {listing or 'nothing'}"
+        )
+    found = content.syntax if content.syntax == "text" else f"{content.syntax} ({_about(content)})"
+    return (
+        f"{content.path}: recognised as {found}, but this is not a calibration that is known here; give one of"
+        f" {known} (docs/conventions.md)"
+    )
+
+
+def _about(content: Content) -> str:
+    """A few words about what the file holds."""
+    if isinstance(content.value, dict):
+        return f"with {' '.join(list(map(str, content.value))[:5]) or 'nothing'}"
+    tag = getattr(content.value, "tag", None)
+    return f"<{tag}>" if tag is not None else describe(content.value)

@@ -1,0 +1,163 @@
+"""A JSON file per frame: OpenPose's, Pose2Sim's (RTMLib's people written in OpenPose's way), MMPose's of pictures.
+
+Pose2Sim leaves `_keypoints` out of the names, writes NaN for people whom it dropped, and `{}` for people whom a
+camera does not see.
+"""
+
+import re
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, FiniteFloat, TypeAdapter, ValidationError
+
+from shapepose_fg.errors import InputError
+from shapepose_fg.files import read_text
+from shapepose_fg.io.detections.people import CameraPeople
+from shapepose_fg.io.validation import first_problem, key_text
+
+_FILE = re.compile(r"(\d+)(_keypoints)?\.json$")
+"""How the file of a frame is named."""
+_RERUN = {
+    "OpenPose's JSON": "run OpenPose again with --write_json --keypoint_scale 0",
+    "Pose2Sim's JSON": "run Pose2Sim's pose estimation again",
+    "MMPose's JSON of pictures": "run MMPose again with --pred-out-dir",
+}
+
+
+class _Person(BaseModel):
+    """A person of a frame; hands and face are passed over."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+    pose_keypoints_2d: list[float] | None = None
+
+
+class _Frame(BaseModel):
+    """The file of one frame."""
+
+    model_config = ConfigDict(strict=True)
+    people: list[_Person]
+
+
+class _Instance(BaseModel):
+    """A person of a frame, as MMPose writes it."""
+
+    model_config = ConfigDict(strict=True)
+    keypoints: list[list[FiniteFloat]]
+    keypoint_scores: list[FiniteFloat]
+
+
+_INSTANCES = TypeAdapter(list[_Instance])
+
+
+def frame_files(folder: Path) -> list[Path]:
+    """Files of a folder that are named after a frame, in order of their names."""
+    return sorted(each for each in folder.iterdir() if _FILE.search(each.name) is not None and each.is_file())
+
+
+def read_frame_files(folder: Path) -> CameraPeople:
+    """Read the frames that one camera saw; InputError naming file, key and cure.
+
+    A frame's number is in its file's name. Numbers must follow each other.
+    """
+    program = _program(folder)
+    rerun = _RERUN[program]
+    first, files = _numbered(folder, program)
+    read = _instances if program.startswith("MMPose") else _people
+    frames, people = [], []
+    for number, file in enumerate(files, first):
+        found = read(file, program)
+        people += found
+        frames += [number] * len(found)
+    counts = {len(person) // 3 for person in people}
+    if len(counts) > 1:
+        listing = " and ".join(map(str, sorted(counts)))
+        raise InputError(
+            f"{folder}: recognised as {program}, with people of {listing} keypoints; give those of one model"
+        )
+    count = counts.pop() if counts else 0
+    keypoints = np.array(people, dtype=np.float64).reshape(len(people), count, 3)
+    frame = np.array(frames, dtype=np.intp)
+    return CameraPeople(folder, program, frame, keypoints, first, first + len(files) - 1, rerun=rerun)
+
+
+def _program(folder: Path) -> str:
+    """Whose files these are, by the first one."""
+    files = frame_files(folder)
+    if len(files) == 0:
+        return "OpenPose's JSON"
+    if files[0].name.endswith("_keypoints.json"):
+        return "OpenPose's JSON"
+    begin = read_text(files[0]).lstrip()[:1]
+    return "MMPose's JSON of pictures" if begin == "[" else "Pose2Sim's JSON"
+
+
+def _numbered(folder: Path, program: str) -> tuple[int, list[Path]]:
+    """The number of the first frame, and the frames' files, in order and without a gap."""
+    rerun = _RERUN[program]
+    files = frame_files(folder)
+    if len(files) == 0:
+        raise InputError(
+            f"{folder}: no *_keypoints.json (OpenPose) or *_000000.json (Pose2Sim) in this folder; run OpenPose"
+            " or Pose2Sim's pose estimation into it"
+        )
+    numbered = sorted((int(match[1]), file) for file in files if (match := _FILE.search(file.name)) is not None)
+    for (number, file), (following, other) in pairwise(numbered):
+        if following == number:
+            raise InputError(f"{other}: frame {number} is also in {file.name}; keep one recording in a folder")
+        if following > number + 1:
+            match = _FILE.search(file.name)
+            assert match is not None
+            digits, ending = match[1], match[0][len(match[1]) :]
+            missing = file.with_name(file.name[: match.start()] + f"{number + 1:0{len(digits)}d}{ending}")
+            raise InputError(
+                f"{missing}: this frame is missing, {other.name} comes next; {rerun}"
+                " (a frame without people has a file too)"
+            )
+    return numbered[0][0], [file for _, file in numbered]
+
+
+def _people(file: Path, program: str) -> list[list[float]]:
+    """Flat keypoints of the people of a frame; empty people are nobody."""
+    try:
+        frame = _Frame.model_validate_json(read_text(file))
+    except ValidationError as error:
+        place, problem = first_problem(error)
+        raise InputError(f"{file}: {key_text(place)} {problem}; {_RERUN[program]}") from None
+    found = []
+    for number, person in enumerate(frame.people):
+        values = person.pose_keypoints_2d
+        place = f"{file}: people[{number}].pose_keypoints_2d"
+        if values is None and person.model_extra:
+            raise InputError(f"{place} is missing; {_RERUN[program]}")
+        if values is None or len(values) == 0:
+            continue
+        if len(values) % 3 != 0:
+            raise InputError(
+                f"{place} must hold x, y and score of each keypoint, got {len(values)} numbers; {_RERUN[program]}"
+            )
+        if any(value in (float("inf"), float("-inf")) for value in values):
+            raise InputError(f"{place} holds Infinity; {_RERUN[program]}")
+        found.append(values)
+    return found
+
+
+def _instances(file: Path, program: str) -> list[list[float]]:
+    """Flat keypoints of the people of a picture of MMPose."""
+    try:
+        instances = _INSTANCES.validate_json(read_text(file))
+    except ValidationError as error:
+        place, problem = first_problem(error)
+        raise InputError(f"{file}: {key_text(place)} {problem}; {_RERUN[program]}") from None
+    found = []
+    for number, person in enumerate(instances):
+        if len(person.keypoints) != len(person.keypoint_scores) or any(
+            len(each) != 2 for each in person.keypoints
+        ):
+            raise InputError(
+                f"{file}: [{number}].keypoints must hold x and y for each of the {len(person.keypoint_scores)}"
+                f" keypoint_scores; {_RERUN[program]}"
+            )
+        pairs = zip(person.keypoints, person.keypoint_scores, strict=True)
+        found.append([value for (x, y), score in pairs for value in (x, y, score)])
+    return found

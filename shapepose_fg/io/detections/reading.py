@@ -1,0 +1,153 @@
+"""2D detections of every camera, from a folder: which files are whose, which format they are, one table of all."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from shapepose_fg.camera import Rig
+from shapepose_fg.errors import InputError
+from shapepose_fg.files import read_json
+from shapepose_fg.io.detection_table import DetectionTable, assemble
+from shapepose_fg.io.detections.association_text import read_association_text
+from shapepose_fg.io.detections.frame_files import frame_files, read_frame_files
+from shapepose_fg.io.detections.one_file import is_one_file, read_one_file
+from shapepose_fg.io.detections.people import CameraPeople, candidates_of
+from shapepose_fg.io.detections.places import find_places
+from shapepose_fg.io.detections.scores import as_probabilities
+from shapepose_fg.io.skeleton_file import find_skeleton
+from shapepose_fg.skeleton import BODY_25, SKELETONS, Skeleton
+
+
+def read_detections(path: str | Path, rig: Rig, skeleton: Skeleton | str | Path | None = None) -> DetectionTable:
+    """Read what every camera of `rig` saw from the folder `path`, undistorted.
+
+    The formats are told by the files (docs/conventions.md): `<camera>.txt` of 4D Association; a folder per camera
+    with a JSON file per frame (OpenPose, Pose2Sim, MMPose); a JSON file per camera (COCO's results, AlphaPose,
+    MMPose). Cameras that the rig does not have are passed over. `skeleton` is a `Skeleton`, the name of one in
+    `SKELETONS`, or a TOML file that describes it; without it the number of keypoints tells. `notes` of the table
+    say what was made of the files. Raises InputError, one sentence that names file, place and cure.
+    """
+    places = find_places(Path(path), rig)
+    wanted = find_skeleton(skeleton)
+    if places.kind == "text":
+        if wanted is not None and wanted.joints != BODY_25.joints:
+            raise InputError(f"{places.paths[0]}: 4D Association's text is read with BODY_25, not {wanted.name}")
+        texts = zip(places.paths, rig.cameras, strict=True)
+        table = assemble([read_association_text(text, camera) for text, camera in texts], rig, BODY_25)
+        return replace(table, notes=(*places.notes, *table.notes))
+    people = [_camera(each) for each in places.paths]
+    found = _Found(people, _skeleton_of(people, wanted))
+    first, last = found.span()
+    found, notes = found.with_probabilities()
+    found.refuse_normalised()
+    views = [candidates_of(each, found.skeleton, *(_own_span(each) or (first, last))) for each in found.people]
+    table = assemble(views, rig, found.skeleton)
+    return replace(table, notes=(*places.notes, *notes, *found.middles(), *table.notes))
+
+
+def _camera(place: Path) -> CameraPeople:
+    """What one camera saw: all in one file, or a folder of files."""
+    if place.is_file():
+        return read_one_file(place)
+    lists = [each for each in place.glob("*.json") if not each.name.startswith(".")]
+    if len(lists) == 1 and is_one_file(read_json(lists[0])):
+        return read_one_file(lists[0])
+    if len(frame_files(place)) == 0 and len(lists) > 1:
+        names = " ".join(sorted(each.name for each in lists)[:4])
+        raise InputError(f"{place}: several JSON files without frame numbers ({names}); leave the one to be read")
+    return read_frame_files(place)
+
+
+_MOST_FRAMES = 2_000_000
+"""No recording is as long: ids of pictures that are not frames' numbers."""
+
+
+@dataclass(frozen=True)
+class _Found:
+    """The people of all cameras, in one skeleton."""
+
+    people: Sequence[CameraPeople]
+    skeleton: Skeleton
+
+    def span(self) -> tuple[int, int]:
+        """Numbers of the first and last frame that any camera lists."""
+        listed = [each for each in self.people if each.last >= each.first]
+        if len(listed) == 0:
+            raise InputError(
+                f"{self.people[0].source}: recognised as {self.people[0].program}, where no camera lists a frame;"
+                " give detections of people"
+            )
+        first, last = min(each.first for each in listed), max(each.last for each in listed)
+        if last - first >= _MOST_FRAMES:
+            raise InputError(
+                f"{listed[0].source}: recognised as {listed[0].program}, whose frames would run from {first} to"
+                f" {last}; number the pictures by their frames"
+            )
+        return first, last
+
+    def with_probabilities(self) -> tuple["_Found", list[str]]:
+        """The same people with scores from 0 to 1, and what was done to them."""
+        count = self.skeleton.keypoint_count
+        keypoints = [
+            each.keypoints if len(each.keypoints) > 0 else np.zeros((0, count, 3)) for each in self.people
+        ]
+        scored, note = as_probabilities(keypoints)
+        people = [replace(each, keypoints=new) for each, new in zip(self.people, scored, strict=True)]
+        return _Found(people, self.skeleton), [] if note is None else [note]
+
+    def refuse_normalised(self) -> None:
+        """Refuse keypoints that are parts of the picture's size instead of pixels."""
+        for each in self.people:
+            xy = each.keypoints[each.keypoints[..., 2] > 0][:, :2]
+            if len(xy) > 0 and np.nanmax(np.abs(xy)) <= 1:
+                raise InputError(
+                    f"{each.source}: recognised as {each.program}, but all keypoints lie between -1 and 1,"
+                    f" and pixels were expected; {each.rerun}"
+                )
+
+    def middles(self) -> list[str]:
+        """What the reader made itself."""
+        made = [self.skeleton.joints[joint] for joint, _, _ in self.skeleton.middles]
+        if len(made) == 0:
+            return []
+        name = self.skeleton.name
+        return [f"{name} has no {' and no '.join(made)}: made as middles, where a person's two ends were seen"]
+
+
+def _own_span(people: CameraPeople) -> tuple[int, int] | None:
+    """The frames of a camera that lists every one of its frames, which must be those of the others."""
+    return (people.first, people.last) if people.every_frame else None
+
+
+def _skeleton_of(people: Sequence[CameraPeople], wanted: Skeleton | None) -> Skeleton:
+    """The skeleton that all files have, by the number of keypoints."""
+    seen = [each for each in people if len(each.keypoints) > 0]
+    counts: dict[int, CameraPeople] = {}
+    for each in seen:
+        counts.setdefault(each.keypoints.shape[1], each)
+    if len(counts) > 1:
+        (one, first), (other, second) = list(counts.items())[:2]
+        raise InputError(
+            f"{first.source} has people of {one} keypoints, {second.source} of {other}; give the detections of one"
+            " model for all cameras"
+        )
+    if len(counts) == 0:
+        return wanted or BODY_25
+    count, each = next(iter(counts.items()))
+    place = f"{each.source}: recognised as {each.program} with {count} keypoints a person"
+    if wanted is not None:
+        if wanted.keypoint_count != count:
+            raise InputError(
+                f"{place}, but {wanted.name} has {wanted.keypoint_count}; name the detector's own skeleton"
+            )
+        return wanted
+    for known in SKELETONS.values():
+        if known.keypoint_count == count:
+            return known
+    listing = ", ".join(f"{known.keypoint_count} ({known.name})" for known in SKELETONS.values())
+    what = "MPI's: run OpenPose with --model_pose BODY_25" if count == 15 else "not known here"
+    raise InputError(
+        f"{place}, which is {what}, or describe them in a skeleton file (--skeleton); known are {listing}"
+    )

@@ -1,0 +1,108 @@
+"""A detector's own skeleton, described in TOML: its keypoints, limbs, mirror, anchor and places on the body."""
+
+import tomllib
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from shapepose_fg.body.model.target_skeletons import BODY_POINTS
+from shapepose_fg.errors import InputError
+from shapepose_fg.files import read_text
+from shapepose_fg.io.validation import first_problem, key_text
+from shapepose_fg.skeleton import MID_HIP, SKELETONS, Skeleton
+
+_Pair = Annotated[list[str], Field(min_length=2, max_length=2)]
+_CURE = "docs/conventions.md describes the file"
+_FACE_AND_TOES = {
+    "REye", "LEye", "REar", "LEar", "Head", "LBigToe", "RBigToe", "LSmallToe", "RSmallToe", "LHeel", "RHeel",
+    "left_hand", "right_hand", "left_foot", "right_foot",
+}  # fmt: skip
+"""Points of the body by which a person is not recognised."""
+_HIPS = ({"RHip", "LHip"}, {"right_hip", "left_hip"})
+
+
+class _File(BaseModel):
+    """The whole file."""
+
+    model_config = ConfigDict(strict=True, extra="forbid")
+    name: Annotated[str, Field(min_length=1)]
+    keypoints: Annotated[list[str], Field(min_length=3)]
+    limbs: list[_Pair]
+    mirror: Annotated[list[_Pair], Field(min_length=1)]
+    anchor: str | _Pair
+    core: list[str] | None = None
+    middles: dict[str, _Pair] = {}
+    body: dict[str, str] = {}
+
+
+def find_skeleton(wanted: Skeleton | str | Path | None) -> Skeleton | None:
+    """A skeleton, by itself, its name in `SKELETONS`, or the file that describes it."""
+    if wanted is None or isinstance(wanted, Skeleton):
+        return wanted
+    name = str(wanted)
+    if name in SKELETONS:
+        return SKELETONS[name]
+    if not Path(name).is_file():
+        raise InputError(
+            f"{name}: neither a file nor a known skeleton; give a TOML file, or one of {' '.join(SKELETONS)}"
+        )
+    return read_skeleton(name)
+
+
+def read_skeleton(path: str | Path) -> Skeleton:
+    """Read a skeleton's TOML file; its joints are then called as the body calls those points.
+
+    InputError, one sentence that names the file, the key and the cure.
+    """
+    path = Path(path)
+    try:
+        file = _File.model_validate(tomllib.loads(read_text(path)))
+    except ValidationError as error:
+        place, problem = first_problem(error)
+        raise InputError(f"{path}: {key_text(place)} {problem}; {_CURE}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: is not TOML: {error}; correct it there") from None
+    points = _points(file, path)
+
+    def pairs(rows: list[list[str]]) -> list[tuple[str, str]]:
+        return [(points.get(first, first), points.get(second, second)) for first, second in rows]
+
+    anchor = points.get(file.anchor, file.anchor) if isinstance(file.anchor, str) else pairs([file.anchor])[0]
+    if not isinstance(anchor, str) and not any(set(anchor) == hips for hips in _HIPS):
+        raise InputError(
+            f"{path}: an anchor of two is the middle of the hips; name others under [middles] and anchor there"
+        )
+    if file.core is None:
+        core = [point for point in points.values() if point not in _FACE_AND_TOES]
+        core += [] if isinstance(anchor, str) else [MID_HIP]
+    else:
+        core = [points.get(joint, joint) for joint in file.core]
+    middles = dict(zip(file.middles, pairs(list(file.middles.values())), strict=True))
+    try:
+        return Skeleton.of(
+            file.name,
+            [points.get(joint, "") for joint in file.keypoints],
+            pairs(file.limbs),
+            anchor=anchor,
+            mirror=pairs(file.mirror),
+            core=core,
+            middles={points[joint]: pair for joint, pair in middles.items()},
+        )
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def _points(file: _File, path: Path) -> dict[str, str]:
+    """The point of the body that each joint is, by the joint's name in the file."""
+    points = {joint: file.body.get(joint, joint) for joint in (*file.keypoints, *file.middles) if joint}
+    unknown = [name for name in file.body if name not in points]
+    if unknown:
+        raise InputError(f"{path}: body.{unknown[0]} is no keypoint of {file.name}; it has {' '.join(points)}")
+    for joint, point in points.items():
+        if point not in BODY_POINTS:
+            raise InputError(
+                f"{path}: the body has no point {point!r}; say under [body] which of its points {joint} is"
+                f' ({" ".join(BODY_POINTS)}), or write "" for keypoints to be passed over'
+            )
+    return points
