@@ -169,12 +169,11 @@ def final_bodies(
     windows: Sequence[Window],
     fitter: BodyFitter,
 ) -> BodyFit:
-    """The bodies that are returned: fitted to the joints as they were solved, where more than views decided them.
+    """The bodies that are returned: where there are factors of the user's own, fitted to the joints as solved.
 
-    In windows of several frames, and where there are factors of the user's own, the bodies follow motion and factors
-    so. What these bodies say goes nowhere else: joints and covariances are done.
+    The bodies follow these factors so. What they say goes nowhere else: joints and covariances are done.
     """
-    chosen = [window for window in windows if window.graph.temporal or window.graph.touched.any()]
+    chosen = [window for window in windows if window.graph.touched.any()]
     if len(chosen) == 0:
         return solution.fit
     rows = np.concatenate([window.rows for window in chosen])
@@ -240,7 +239,8 @@ def _message(
     fitter: BodyFitter,
     config: EstimatorConfig,
 ) -> Message:
-    """What the body says of the joints that it pulls: delta of Eq. 4, and joints that their views do not determine.
+    """What the body says of the joints that it pulls: delta of Eq. 4, and joints that their views do not
+    determine.
 
     The latter need the body however sure their one view is.
     """

@@ -10,7 +10,15 @@ from numpy.typing import NDArray
 from factors import make_camera
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter
 from shapepose_fg.camera import Rig, Views
-from shapepose_fg.estimation.alternation import EstimatorConfig, Solution, Window, alternate, final_bodies
+from shapepose_fg.estimation.alternation import (
+    EstimatorConfig,
+    Solution,
+    Window,
+    alternate,
+    final_bodies,
+    joint_targets,
+)
+from shapepose_fg.estimation.draft import WholeFitter, drafted
 from shapepose_fg.estimation.linearisation import linearise, mean_confidence, observation_sigmas, triangulate
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.outcome import Problem, how_known, lasting_covariance, problems
@@ -85,8 +93,8 @@ class Estimator:
     ) -> Estimates:
         """Joints, covariances and bodies of N rows, sorted in any way; (track, frame) must differ.
 
-        `extra_factors` adds factors of your own to every window. `views` are the cameras row by row, where they are
-        not the rig's.
+        `extra_factors` adds factors of your own to every window. `views` are the cameras row by row, where they
+        are not the rig's.
         """
         config = self.config
         views = Views.of(self.rig) if views is None else views
@@ -99,6 +107,23 @@ class Estimator:
         windows = self._windows(observations, sigmas, views, extra_factors)
         solution = alternate(observations, views, sigmas, X, windows, self.fitter, config)
         return self._estimates(observations, sigmas, views, windows, X, solution)
+
+    def draft(
+        self, observations: Observations, views: Views | None = None
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """About where the joints of N rows are (N, J, 3), metres, and how surely (N, J, 3, 3), without any graph.
+
+        Enough to give detections out again: what the views say, and where that is little, or contradicts the body,
+        what the body says. A joint's views are in the body, too, so that these covariances are too small.
+        """
+        config = self.config
+        views = Views.of(self.rig) if views is None else views
+        X = triangulate(observations, views, config.observations)
+        sigmas = observation_sigmas(observations, X, views, config.observations)
+        evidence = linearise(observations, sigmas, X, views, config.observations)
+        enough = (evidence.sigma_m <= config.refine.max_sigma_m).sum(axis=1) >= config.refine.min_joints
+        whole = self.fitter.fit_whole if isinstance(self.fitter, WholeFitter) else self.fitter.fit
+        return drafted(evidence, whole(joint_targets(evidence, enough)), config.refine.disagreement)
 
     def _windows(
         self,

@@ -76,7 +76,9 @@ def problems(
     first: NDArray[np.float64],
     covariance: NDArray[np.float64],
 ) -> tuple[Problem, ...]:
-    """Joints that could not be solved, by person, frame and joint; `first` (N, J, 3) is where views first put them."""
+    """Joints that could not be solved, by person, frame and joint; `first` (N, J, 3) is where views first put
+    them.
+    """
     X = solution.joints
     finite = np.isfinite(X).all(axis=2)
     reasons = np.full(finite.shape, "", dtype=object)
