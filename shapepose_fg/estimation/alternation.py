@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus, JointTargets
 from shapepose_fg.camera import Views
+from shapepose_fg.estimation.draft import WholeFitter
 from shapepose_fg.estimation.linearisation import (
     ObservationConfig,
     ViewEvidence,
@@ -177,11 +178,13 @@ def final_bodies(
     if len(chosen) == 0:
         return solution.fit
     rows = np.concatenate([window.rows for window in chosen])
+    rows = rows[solution.fit.ok[rows]]
     xyz, information = solution.joints[rows], np.zeros((len(rows), *covariance.shape[1:]))
     known = np.isfinite(xyz).all(axis=2) & np.isfinite(covariance[rows]).all(axis=(2, 3))
     information[known] = np.linalg.inv(covariance[rows][known])
     information = (information + information.swapaxes(2, 3)) / 2
-    fit = fitter.fit(JointTargets(np.nan_to_num(xyz), information), solution.fit.rows(rows), _groups(chosen))
+    whole = fitter.fit_whole if isinstance(fitter, WholeFitter) else fitter.fit
+    fit = whole(JointTargets(np.nan_to_num(xyz), information), solution.fit.rows(rows))
     return solution.fit.with_rows(rows[fit.ok], fit.rows(np.flatnonzero(fit.ok)))
 
 
