@@ -13,10 +13,10 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-import detector_figures
-import sequence_difficulty
 import torch
-import visibility_agreement
+
+from shapepose_fg.evaluation import sequence_difficulty, visibility_agreement
+from shapepose_fg.simulation.measurement.comparison import compare, table
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "simulation.md"
@@ -43,7 +43,7 @@ def main() -> None:
     images = IMAGES if arguments.update else None
     splits = arguments.split or ("tune", "report")
     tables: dict[str, tuple[Path | None, Callable[[], list[str]]]] = {
-        "detector": (shelf, lambda: detector_figures.tables_and_figures(shelf, images)),
+        "detector": (shelf, lambda: detector(shelf, images)),
         "difficulty": (motions, lambda: sequence_difficulty.table(motions, splits, arguments.stride)),
         "visibility": (None, visibility_agreement.table),
     }
@@ -56,6 +56,16 @@ def main() -> None:
         print(f"{name}\n\n{text}\n", flush=True)
         if arguments.update:
             write(name, text)
+
+
+def detector(shelf: Path, images: Path | None) -> list[str]:
+    """The simulated detector beside the real one; figures into the folder `images`, if given."""
+    both, each = compare(shelf)
+    if images is not None:
+        from shapepose_fg.simulation.measurement.figures import draw_figures
+
+        draw_figures(images, both)
+    return table(both, each)
 
 
 def write(name: str, text: str) -> None:

@@ -62,8 +62,10 @@ class Camera:
         R = self.wTc[:3, :3]
         if np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(R) < 0:
             raise ValueError(f"camera {self.name}: the rotation of wTc must be orthonormal with determinant 1")
-        if min(self.image_size) <= 0:
+        width, height = self.image_size
+        if min(width, height) <= 0:
             raise ValueError(f"camera {self.name}: image_size must be positive, got {self.image_size}")
+        object.__setattr__(self, "image_size", (int(width), int(height)))
 
     @classmethod
     def from_camera_from_world(

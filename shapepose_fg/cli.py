@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import typer
 
 from shapepose_fg.errors import InputError
+from shapepose_fg.tracks_command import tracks
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -38,6 +39,7 @@ app = typer.Typer(
 )
 evaluate = typer.Typer(help="Score a reconstruction against an annotation.")
 app.add_typer(evaluate, name="evaluate")
+app.add_typer(tracks, name="tracks")
 
 _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
 """What typer raises for a wrong command line; older and newer versions keep the class in different places."""
@@ -104,9 +106,11 @@ def reconstruct(
     ] = None,
 ) -> None:
     """Reconstruct the people of a recording: 3D joints with covariances, and bodies."""
-    from shapepose_fg.io.calibration import read_rig
+    from shapepose_fg.io.calibration import read_rig, write_rig
     from shapepose_fg.io.config import read_config
+    from shapepose_fg.io.corrections import refuse_corrected
     from shapepose_fg.io.detections import read_detections
+    from shapepose_fg.io.solved_setup import CAMERAS
     from shapepose_fg.provenance import checksums
 
     size = _image_size(image_size)
@@ -117,6 +121,7 @@ def reconstruct(
     span = _frame_range(frames, len(recording))
     times = _times(fps, timestamps, rig, len(recording))
     first_frames = _cuts(cuts, len(recording))
+    refuse_corrected(output)
     _prepare(output)
     from shapepose_fg.pipeline import PipelineConfig
     from shapepose_fg.pipeline import reconstruct as run_pipeline
@@ -147,7 +152,10 @@ def reconstruct(
     inputs = [
         path for path in (*read, shapes if known is not None and len(known) > 0 else None) if path is not None
     ]
-    people.with_run(inputs=checksums(inputs), notes=list(recording.notes)).save(output)
+    people.with_run(inputs=checksums(inputs), notes=list(recording.notes), body=body).save(output)
+    # What the observations were seen with: to solve or draw them anew.
+    if not (output / CAMERAS).exists() or not (output / CAMERAS).samefile(calibration):
+        write_rig(rig, output / CAMERAS)
     summary = _summary(people, span, len(rig), seconds, output)
     if shapes is not None and known is not None and people.shapes is not None:
         known.updated(people.shapes).save(shapes)
@@ -399,11 +407,16 @@ def _summary(people: "Reconstruction", span: range, camera_count: int, seconds: 
     import numpy as np
     from rich.table import Table
 
+    from shapepose_fg.frame_times import rate_words
+    from shapepose_fg.io.solved_setup import CAMERAS
+
     per_frame = np.bincount(people.frame - span.start, minlength=len(span))
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     table.add_column(style="bold")
     table.add_column(overflow="fold")
-    table.add_row("frames", f"{len(span)} ({span.start}:{span.stop}) of {camera_count} cameras{_rate(people)}")
+    table.add_row(
+        "frames", f"{len(span)} ({span.start}:{span.stop}) of {camera_count} cameras{rate_words(people.run)}"
+    )
     table.add_row(
         "people", f"{len(people)} in all, {per_frame.mean():.1f} a frame ({per_frame.min()} to {per_frame.max()})"
     )
@@ -422,15 +435,8 @@ def _summary(people: "Reconstruction", span: range, camera_count: int, seconds: 
     table.add_row("", str(output / "run.json"))
     if people.observations is not None:
         table.add_row("", str(output / "observations.npz"))
+    table.add_row("", str(output / CAMERAS))
     return table
-
-
-def _rate(people: "Reconstruction") -> str:
-    """Frames a second, and whether somebody said so."""
-    told = people.run.get("time", {})
-    if told.get("fps") is None:
-        return ""
-    return f", {told['fps']:.4g} a second" + (" (assumed: give --fps)" if told["source"] == "assumed" else "")
 
 
 def _joints(people: "Reconstruction") -> str:

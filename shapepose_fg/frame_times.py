@@ -1,6 +1,6 @@
 """When each frame of a recording was taken, and where the recording is cut."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -73,6 +73,14 @@ class FrameTimes:
         """What run.json says of the times: where they come from, and the median rate."""
         rate = 1.0 / float(np.median(np.diff(self.frame_s))) if len(self) > 1 else None
         return {"source": self.source, "fps": rate, "per_camera": self.time_s.ndim == 2}
+
+
+def rate_words(run: Mapping[str, Any]) -> str:
+    """The rate that a result's `run` tells of, and whether it was assumed; empty where it tells of none."""
+    told = run.get("time") or {}
+    if told.get("fps") is None:
+        return ""
+    return f", {told['fps']:.4g} a second" + (" (assumed: give --fps)" if told["source"] == "assumed" else "")
 
 
 def check_cuts(cuts: Sequence[int], frames: int) -> tuple[int, ...]:

@@ -168,6 +168,22 @@ class ObservationTable:
         """The rows that `index` picks: a mask (N,) or row numbers."""
         return replace(self, **{name: getattr(self, name)[index] for name in self.ROWS})
 
+    def observations(self, initial: NDArray[np.float64], time_s: NDArray[np.float64]) -> Observations:
+        """The rows as they were given to be solved, dropped detections too: to solve them anew.
+
+        `initial` (N, J, 3) is where to begin, `time_s` (N,) when the rows' frames were taken. Which detection each
+        observation was is not told: there a view's detections are counted over all views, here in their own.
+        """
+        seen = self.gate != Gate.NOT_SEEN
+        return Observations(
+            xy=np.where(seen[..., None], self.xy, 0.0).astype(np.float64),
+            confidence=np.where(seen, self.confidence, 0.0).astype(np.float64),
+            initial=initial,
+            track=self.person.astype(np.intp),
+            frame=self.frame.astype(np.intp),
+            time_s=np.repeat(time_s[:, None], len(self.view_names), axis=1),
+        )
+
     @property
     def used(self) -> NDArray[np.bool_]:
         """(N, J, V) which detections are part of the solution."""

@@ -17,6 +17,7 @@ from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.offsets.estimation import learn_offsets
 from shapepose_fg.body.shapes import SubjectShapes
 from shapepose_fg.body.threads import torch_threads
+from shapepose_fg.bodies_over_time import SequenceFitting, with_bodies_over_time
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections, DetectionSequence
 from shapepose_fg.estimation.alternation import EstimatorConfig, RefineConfig
@@ -139,7 +140,10 @@ def reconstruct(
             done += count
             if progress is not None:
                 progress(done, len(frames))
-    people = Reconstruction.concatenate(parts) if parts else Reconstruction.empty(detections.skeleton.joints)
+        people = Reconstruction.concatenate(parts) if parts else Reconstruction.empty(detections.skeleton.joints)
+        if config.temporal and isinstance(fitter, SequenceFitting):
+            with run.stage("bodies over time"):
+                people = with_bodies_over_time(people, fitter, shapes)
     summary = run.summary(config, frames, people) | {"time": times.as_dict(), "cuts": list(cuts)}
     summary |= {"keypoint_offsets": None if offsets is None else offsets.as_dict()}
     return replace(people, run=summary)
@@ -336,9 +340,7 @@ class _Run:
             "frames": [frames.start, frames.stop],
             "seconds": dict(self.seconds),
             "people": {
-                "found": len(people),
-                "status": dict(Counter(people.status.tolist())),
-                "joints": people.count_known(),
+                **people.counts(),
                 "dropped": {reason: count for reason, count in self.dropped.items() if count > 0},
             },
         }

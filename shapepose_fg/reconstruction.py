@@ -1,6 +1,7 @@
 """What comes out: the people of every frame, as arrays with one row per person and frame."""
 
 import json
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum, StrEnum
@@ -193,6 +194,11 @@ class Reconstruction:
         return {
             kind.name.lower(): int(count[kind]) for kind in (Known.SEEN, Known.BODY, Known.MOTION, Known.UNKNOWN)
         }
+
+    def counts(self) -> dict[str, Any]:
+        """What run.json says of the rows: how many, with which status, and how their joints are known."""
+        status = Counter(self.status.tolist())
+        return {"found": len(self), "status": dict(status), "joints": self.count_known()}
 
     def save(self, folder: str | Path) -> None:
         """Write people.npz, run.json and observations.npz into `folder`, each whole or not at all.

@@ -25,7 +25,7 @@ class WindowConfig:
     """What a window takes of the frames before and after them, and does not return: motion and views of 0.4 s on
     either side decide a joint to less than a millimetre."""
 
-    again_over_time: int = 1
+    again_over_time: int = 2
     """How often detections are given out again around the solution of a window."""
     again_alone: int = 2
     """The same for frames that stand alone."""
@@ -144,16 +144,14 @@ class Engine:
         """One window; the rows of its frames `start` to `stop` are returned."""
         given = [frame for frame, _ in decided]
         rows = Observations.concatenate([part for _, part in decided])
-        with self.stage("solve"):
-            estimates = self.estimator.estimate(rows, self.extra_factors)
         for _ in range(again if len(rows) > 0 else 0):
             with self.stage("associate again"):
+                joints, covariance = self.estimator.draft(rows)
                 rows = reassociate(
-                    given, rows, estimates.joints, estimates.covariance, self.skeleton,
-                    self.tracker.config.assignment, survival,
-                )  # fmt: skip
-            with self.stage("solve"):
-                estimates = self.estimator.estimate(rows, self.extra_factors)
+                    given, rows, joints, covariance, self.skeleton, self.tracker.config.assignment, survival
+                )
+        with self.stage("solve"):
+            estimates = self.estimator.estimate(rows, self.extra_factors)
         own = [frame.frame for frame in given[start:stop]]
         index = np.flatnonzero(np.isin(rows.frame, own))
         return Solved(rows.rows(index), estimates.rows(index))

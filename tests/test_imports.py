@@ -12,8 +12,8 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 LEVELS = (
-    "factors errors skeleton",
-    "camera",
+    "factors errors",
+    "camera skeleton",
     "files provenance rendering run_summary columns body.threads",
     "body.model body.shapes",
     "body.fitting",
@@ -25,11 +25,13 @@ LEVELS = (
     "proposal",
     "estimation",
     "tracking",
-    "windows",
+    "windows bodies_over_time",
     "pipeline",
     "io",
-    "evaluation simulation viewer",
-    "demo training",
+    "simulation viewer",
+    "training",
+    "evaluation",
+    "demo",
     "cli",
 )
 """Each level imports only from those before it; a package may import its own modules too."""

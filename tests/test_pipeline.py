@@ -12,6 +12,7 @@ from shapepose_fg.detections import Detections, Recording
 from shapepose_fg.estimation.detector_offsets import OffsetConfig
 from shapepose_fg.evaluation.metrics import joint_metrics
 from shapepose_fg.evaluation.shelf import evaluate_shelf, read_shelf_ground_truth
+from shapepose_fg.frame_times import FrameTimes
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.pipeline import PipelineConfig, find_people, reconstruct
@@ -38,6 +39,9 @@ def recording(scene) -> Recording:
 @pytest.fixture(scope="module")
 def people(scene, recording) -> Reconstruction:
     return reconstruct(recording, scene.rig)
+
+
+ALONE = PipelineConfig(temporal=False)
 
 
 def assert_same(one: Reconstruction, other: Reconstruction) -> None:
@@ -77,12 +81,13 @@ def test_the_run_says_how_it_came_about(recording, people):
     assert run["versions"]["gtsam"].startswith("4.")
 
 
-def test_frames_stand_alone_and_batches_do_not_matter(scene, recording, people):
-    part = reconstruct(recording, scene.rig, frames=range(5, 9))
-    rows = people.rows((people.frame >= 5) & (people.frame < 9))
+def test_without_time_frames_stand_alone_and_batches_do_not_matter(scene, recording):
+    whole = reconstruct(recording, scene.rig, ALONE)
+    part = reconstruct(recording, scene.rig, ALONE, frames=range(5, 9))
+    rows = whole.rows((whole.frame >= 5) & (whole.frame < 9))
     assert_same(part, rows)
     assert part.run["frames"] == [5, 9]
-    assert_same(reconstruct(recording, scene.rig, PipelineConfig(batch_frames=3), frames=range(5, 9)), rows)
+    assert_same(reconstruct(recording, scene.rig, replace(ALONE, batch_frames=3), frames=range(5, 9)), rows)
 
 
 def test_the_same_input_gives_the_same_bytes(scene, recording):
@@ -121,7 +126,7 @@ def test_an_empty_frame_and_a_blind_view_harm_no_other(scene, recording):
     blind = recording[1].only(recording[1].view != 2)
     frames = [recording[0], Detections.empty(), blind, recording[3]]
     # What is learnt of the detector is learnt from all frames, so it is left out here.
-    config = PipelineConfig(offsets=OffsetConfig(source="none"))
+    config = PipelineConfig(offsets=OffsetConfig(source="none"), temporal=False)
     result = reconstruct(Recording(BODY_25, frames), scene.rig, config)
     assert np.bincount(result.frame, minlength=4).tolist() == [4, 0, 4, 4]
     assert_same(result.at(0), reconstruct(recording, scene.rig, config, frames=range(1)))
@@ -166,13 +171,13 @@ def test_settings_reach_their_steps(scene, recording):
 
 
 def test_shelf_is_as_good_as_promised(shared_data):
-    """Every frame by itself, annotated frames only; the figures are those that the project promises."""
+    """Over time, all frames; the figures are those that the project promises."""
     shelf = shared_data / "shelf"
     rig = read_rig(shelf / "calibration.json")
     detections = read_detections(shelf, rig)
     truth = read_shelf_ground_truth(shelf / "gt_dev.txt")
-    parts = [reconstruct(detections, rig, frames=r) for r in (range(0, 101), range(216, 231), range(270, 285))]
-    score = evaluate_shelf(Reconstruction.concatenate(parts).with_run(frames=[0, 301]), truth)
+    times = FrameTimes.from_fps(25.0, len(detections))
+    score = evaluate_shelf(reconstruct(detections, rig, times=times), truth)
     assert score.people_found == score.people
     assert score.pcp_average >= 96.4 and (score.pcp >= 92.5).all()
 

@@ -10,10 +10,18 @@ from numpy.typing import NDArray
 from factors import make_camera
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter
 from shapepose_fg.camera import Rig, Views
-from shapepose_fg.estimation.alternation import EstimatorConfig, Solution, Window, alternate, final_bodies
+from shapepose_fg.estimation.alternation import (
+    EstimatorConfig,
+    Solution,
+    Window,
+    alternate,
+    final_bodies,
+    joint_targets,
+)
+from shapepose_fg.estimation.draft import WholeFitter, drafted
 from shapepose_fg.estimation.linearisation import linearise, mean_confidence, observation_sigmas, triangulate
 from shapepose_fg.estimation.motion_model import MotionModel
-from shapepose_fg.estimation.outcome import Problem, how_known, reported_covariance, problems
+from shapepose_fg.estimation.outcome import Problem, how_known, problems, reported_covariance
 from shapepose_fg.estimation.window_graph import WindowGraph
 from shapepose_fg.observations import Observations
 from shapepose_fg.reconstruction import Status
@@ -95,10 +103,41 @@ class Estimator:
                 f"views must be of the {len(observations)} rows' {observations.confidence.shape[2]} views"
             )
         X = triangulate(observations, views, config.observations)
+        if config.motion.temporal and len(np.unique(observations.track)) < len(observations):
+            X = self._completed(X, observations, views)
         sigmas = observation_sigmas(observations, X, views, config.observations)
         windows = self._windows(observations, sigmas, views, extra_factors)
         solution = alternate(observations, views, sigmas, X, windows, self.fitter, config)
         return self._estimates(observations, sigmas, views, windows, X, solution)
+
+    def draft(
+        self, observations: Observations, views: Views | None = None
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """About where the joints of N rows are (N, J, 3), metres, and how surely (N, J, 3, 3), without any graph.
+
+        Enough to give detections out again: what the views say, and where that is little, or contradicts the body,
+        what the body says. A joint's views are in the body, too, so that these covariances are too small.
+        """
+        config = self.config
+        views = Views.of(self.rig) if views is None else views
+        X = triangulate(observations, views, config.observations)
+        sigmas = observation_sigmas(observations, X, views, config.observations)
+        evidence = linearise(observations, sigmas, X, views, config.observations)
+        enough = (evidence.sigma_m <= config.refine.max_sigma_m).sum(axis=1) >= config.refine.min_joints
+        whole = self.fitter.fit_whole if isinstance(self.fitter, WholeFitter) else self.fitter.fit
+        return drafted(evidence, whole(joint_targets(evidence, enough)), config.refine.disagreement)
+
+    def _completed(self, X: NDArray[np.float64], observations: Observations, views: Views) -> NDArray[np.float64]:
+        """X_0 (N, J, 3) with joints that are not placed where a draft has them: a view that sees one counts from the
+        first round on, and windows need no second."""
+        unknown = np.isnan(X).any(axis=2)
+        rows = np.flatnonzero(unknown.any(axis=1))
+        if len(rows) == 0:
+            return X
+        places, _ = self.draft(observations.rows(rows), views.rows(rows))
+        complete = X.copy()
+        complete[rows] = np.where(unknown[rows][..., None], places, X[rows])
+        return complete
 
     def _windows(
         self,

@@ -99,7 +99,9 @@ class MotionModel:
                 f"{path}: is not a motion model ({error}); give what scripts/measure_motion.py writes"
             ) from None
         table = np.array(list(known.values()))
-        if not (np.isfinite(table).all() and (table[:, 0] > 0).all() and table.shape[1] == 3 and (table >= 0).all()):
+        if not (
+            np.isfinite(table).all() and (table[:, 0] > 0).all() and table.shape[1] == 3 and (table >= 0).all()
+        ):
             raise InputError(f"{path}: densities must be positive; give what scripts/measure_motion.py writes")
         chosen = config.psd_scale * np.array([known.get(name, tuple(table.mean(axis=0))) for name in joints])
         return cls(*chosen.T, views, body, config.around_s)

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
+from shapepose_fg.body.shapes import statures_m
 from shapepose_fg.reconstruction import Reconstruction
 from shapepose_fg.skeleton import SMPL_24
 
@@ -35,12 +36,7 @@ def body_joints(people: Reconstruction, model: BodyModel | None = None) -> NDArr
 def statures(betas: NDArray[np.float64], model: BodyModel | None = None) -> NDArray[np.float64]:
     """(N,) height in metres of bodies of shape `betas` (N, 10) in the T-pose, sole to crown; NaN where unknown."""
     model = BodyModel.default() if model is None else model
-    arrays = model.arrays
-    up = arrays.template[:, 1]
-    # No shape within three standard deviations moves a vertex past another that is 10 cm higher.
-    ends = np.flatnonzero((up < up.min() + 0.1) | (up > up.max() - 0.1))
-    height = up[ends] + np.asarray(betas, dtype=np.float64) @ arrays.shapes[ends, 1].T
-    return height.max(axis=1) - height.min(axis=1)
+    return statures_m(np.asarray(betas, dtype=np.float64), model.arrays)
 
 
 def bone_rotations(people: Reconstruction, model: BodyModel | None = None) -> NDArray[np.float64]:

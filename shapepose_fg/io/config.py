@@ -36,6 +36,14 @@ def read_config(path: str | Path, kind: type[T]) -> T:
     return _build(kind, table, path)
 
 
+def config_from(table: dict[str, Any], kind: type[T], path: str | Path) -> T:
+    """Settings of the dataclass `kind` from nested plain values, as run.json has them (`asdict`) in `path`.
+
+    Raises InputError naming file and key, as `read_config` does.
+    """
+    return _build(kind, table, Path(path))
+
+
 def toml_text(config: object) -> str:
     """`config` (a dataclass) as TOML that `read_config` reads back, each field's docstring above it."""
     return "\n".join(_lines(config)).strip() + "\n"

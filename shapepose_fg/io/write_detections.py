@@ -31,9 +31,13 @@ def write_association(recording: DetectionSequence, rig: Rig, folder: str | Path
 
     Positions have seven decimals (parts of the picture), scores and affinities six. What lies a quarter of
     the picture or more outside it is left out: readers refuse it. ValueError where the skeleton is not
-    BODY_25, there is no frame, or the world's z does not point up, as the format wants it.
+    BODY_25, there is no frame, a lens is not one of five coefficients, or the world's z does not point up, as the
+    format wants it.
     """
     _check(recording)
+    for camera in rig.cameras:
+        if camera.lens != "perspective" or camera.distortion[5:].any():
+            raise ValueError(f"the format has five coefficients of distortion, camera {camera.name} another lens")
     if rig.up != "z":
         raise ValueError(
             f"the format has z up, this rig {rig.up}: turn the world before writing, and the truth with it"
@@ -113,7 +117,7 @@ def _calibration(camera: Camera) -> dict[str, list[float] | list[int]]:
     entry: dict[str, list[float] | list[int]] = {"K": camera.K.ravel().tolist(), "RT": camera.cTw.ravel().tolist()}
     entry["imgSize"] = list(camera.image_size)
     if camera.distortion.any():
-        entry["distCoeff"] = camera.distortion.tolist()
+        entry["distCoeff"] = camera.distortion[:5].tolist()
     return entry
 
 

@@ -27,8 +27,8 @@ def calibrated(weights: FitterWeights, source: PeopleSource, model: BodyModel, c
     """The same weights with `spread` measured on `count` people of `source` for each skeleton.
 
     What is claimed of joints without their own target (`BodyFit.prior_covariance`, less the error of the model;
-    whether or not they have one) is widened or narrowed so that `INSIDE` of them are there. Left and right are taken
-    together.
+    whether or not they have one) is widened or narrowed so that `INSIDE` of them are there. Left and right are
+    taken together.
     """
     plain = replace(weights, spread=torch.ones(len(BODY_POINTS)))
     spread = np.ones(len(BODY_POINTS))

@@ -1,5 +1,7 @@
 """Where the body puts a joint without its own target: the contract of `BodyFit.prior_xyz`, every fitter."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 import torch
@@ -54,7 +56,7 @@ def people() -> tuple[np.ndarray, np.ndarray]:
     return truth, truth + rng.normal(0, NOISE_M, truth.shape)
 
 
-def make_targets(xyz: np.ndarray, without: tuple[int, ...] = (), sigma_m: float = NOISE_M) -> JointTargets:
+def make_targets(xyz: np.ndarray, without: Sequence[int] = (), sigma_m: float = NOISE_M) -> JointTargets:
     information = np.broadcast_to(np.eye(3) / sigma_m**2, (*xyz.shape, 3)).copy()
     information[:, list(without)] = 0
     return JointTargets(xyz, information)
@@ -144,7 +146,7 @@ def test_nothing_jumps_where_information_goes_to_zero(fitter, people):
 def test_a_joint_that_no_pass_must_leave_out_is_where_the_body_has_it(fitter, people):
     """Where no joint of a set has a target, the pass with all targets has left them out already."""
     sets = fitter._rows.sets
-    alike = tuple(np.flatnonzero(sets == sets[BODY_25.index("LWrist")]))
+    alike = np.flatnonzero(sets == sets[BODY_25.index("LWrist")]).tolist()
     fit = fitter.fit(make_targets(people[1][:40], without=alike))
     np.testing.assert_array_equal(fit.prior_xyz[:, alike], fit.joints[:, alike])
     model_error = MODEL_SIGMA_M**2 * np.eye(3)

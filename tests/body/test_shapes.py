@@ -6,7 +6,7 @@ import torch
 
 from shapepose_fg.body.fitting.weights import fingerprint
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
-from shapepose_fg.body.shapes import SubjectShapes, statures_m
+from shapepose_fg.body.shapes import SubjectShapes, read_body, statures_m
 from shapepose_fg.errors import InputError
 
 
@@ -90,6 +90,6 @@ def test_stature_is_that_of_the_mesh():
         BodyParameters(torch.from_numpy(betas).float(), pose.global_orient, pose.body_pose, pose.transl)
     )
     tall = np.ptp(vertices[..., 1].numpy(), axis=1)
-    found = statures_m(betas, model.arrays.template, model.arrays.shapes)
+    found = statures_m(betas, read_body())
     np.testing.assert_allclose(found, tall, atol=1e-5)  # the mesh is float32
     assert found.min() > 1.3 and found.max() < 2.2

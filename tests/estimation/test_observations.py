@@ -136,7 +136,9 @@ def test_a_joint_behind_the_camera_is_not_seen_by_it(two_views):
     mirrored = two_views.cameras[0].project(-behind)[0]
     seen = seen_at(two_views, np.stack([mirrored, [500.0, 400.0]]), behind)
     with np.errstate(all="raise"):
-        evidence = linearise(seen, np.full((1, 1, 2), 10.0), behind[None, None], Views.of(two_views), ObservationConfig())
+        evidence = linearise(
+            seen, np.full((1, 1, 2), 10.0), behind[None, None], Views.of(two_views), ObservationConfig()
+        )
     assert not evidence.inlier[0, 0, 0]
     assert np.isfinite(evidence.information).all()
 
@@ -160,7 +162,9 @@ def test_one_view_moves_a_joint_onto_its_ray_and_leaves_the_depth(two_views):
     point = np.array([0.1, -0.05, 2.0])
     xy = two_views.project(point)[0] + [[6.0, -4.0], [0.0, 0.0]]
     seen = without(seen_at(two_views, xy, point), np.array([[[False, True]]]))
-    evidence = linearise(seen, np.array([[[10.0, 0.0]]]), point[None, None], Views.of(two_views), ObservationConfig(kernel=None))
+    evidence = linearise(
+        seen, np.array([[[10.0, 0.0]]]), point[None, None], Views.of(two_views), ObservationConfig(kernel=None)
+    )
     target = evidence.target[0, 0]
     assert np.linalg.matrix_rank(evidence.information[0, 0], tol=1.0) == 2
     # The step is across the ray, and one Gauss-Newton step of 7 px is exact to its second order: 7² / 1000 px.
@@ -172,7 +176,9 @@ def test_two_views_move_a_joint_where_they_meet(two_views):
     truth = np.array([0.1, -0.05, 2.0])
     seen = seen_at(two_views, two_views.project(truth)[0], truth)
     beside = truth + np.array([0.01, -0.02, 0.015])
-    evidence = linearise(seen, np.full((1, 1, 2), 10.0), beside[None, None], Views.of(two_views), ObservationConfig(kernel=None))
+    evidence = linearise(
+        seen, np.full((1, 1, 2), 10.0), beside[None, None], Views.of(two_views), ObservationConfig(kernel=None)
+    )
     # 2.7 cm off at 2 m: the second order is 0.027² / 2 m.
     np.testing.assert_allclose(evidence.target[0, 0], truth, atol=5e-4)
 

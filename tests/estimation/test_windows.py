@@ -8,10 +8,10 @@ import pytest
 from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitter import BodyFit, FitStatus
+from shapepose_fg.errors import InputError
 from shapepose_fg.estimation.alternation import EstimatorConfig, RefineConfig, interpolated
 from shapepose_fg.estimation.estimator import Estimates, Estimator, window_rows
 from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
-from shapepose_fg.errors import InputError
 from shapepose_fg.estimation.window_graph import near_in_time
 from shapepose_fg.observations import Observations
 from shapepose_fg.reconstruction import Known, Status
@@ -97,7 +97,9 @@ def test_motion_takes_noise_away_and_knows_the_velocity(walk, five_cameras, two_
     expected = np.array([[0.5, 0.0, 0.0], [0.0, -1.0, 0.0]])[observations.track]
     np.testing.assert_allclose(found.velocity.mean(axis=1), expected, atol=0.1)
     # Four sigmas of 60 x 25 x 3 numbers.
-    error = np.abs(found.velocity - expected[:, None]) / np.sqrt(np.einsum("...ii->...i", found.velocity_covariance))
+    error = np.abs(found.velocity - expected[:, None]) / np.sqrt(
+        np.einsum("...ii->...i", found.velocity_covariance)
+    )
     assert np.mean(error < 4) > 0.999
 
 

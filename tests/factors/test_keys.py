@@ -33,7 +33,7 @@ def test_every_key_is_its_own():
     keys |= {camera_key(p, f) for p, _, f in many}
     assert len(keys) == 5 * len(many) + 5 * 4
     # Symbols have a character in their upper eight bits, plain numbers are small.
-    assert 10**16 <= min(keys) and max(keys) < 1 << 56
+    assert min(keys) >= 10**16 and max(keys) < 1 << 56
 
 
 def test_keys_sort_by_kind_person_joint_and_frame():

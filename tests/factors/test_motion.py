@@ -115,7 +115,9 @@ def test_smoothing_is_the_kalman_smoother_s():
         # The filter starts from a prior of 1 km, the graph from none: a relative 1e-9 of it.
         np.testing.assert_allclose(solution.atPoint3(int(KEYS[i])), means[i, :3], atol=1e-6)
         np.testing.assert_allclose(solution.atPoint3(int(SPEEDS[i])), means[i, 3:], atol=1e-5)
-        np.testing.assert_allclose(marginals.marginalCovariance(int(KEYS[i])), covs[i, :3, :3], rtol=1e-4, atol=1e-9)
+        np.testing.assert_allclose(
+            marginals.marginalCovariance(int(KEYS[i])), covs[i, :3, :3], rtol=1e-4, atol=1e-9
+        )
         np.testing.assert_allclose(
             marginals.marginalCovariance(int(SPEEDS[i])), covs[i, 3:, 3:], rtol=1e-4, atol=1e-7
         )
@@ -156,7 +158,9 @@ def test_errors_that_last_are_filtered_as_such():
 
     def observation(i):
         # r = R (x - m) - sqrt(1 - w) b ~ N(0, w): R m seen through [R, -sqrt(1 - w)].
-        rows = [(np.hstack([roots[i], -np.sqrt(1 - share) * eye]), share * eye, roots[i] @ m[i])] if i < told else []
+        rows = (
+            [(np.hstack([roots[i], -np.sqrt(1 - share) * eye]), share * eye, roots[i] @ m[i])] if i < told else []
+        )
         rows += [(np.hstack([eye, zero]), sigma**2 * eye, np.zeros(3))] if i < 3 else []
         if len(rows) == 0:
             return None
@@ -222,7 +226,10 @@ def test_a_ray_leaves_its_direction_open():
         (lambda: motion_factors(KEYS[:2], SPEEDS, TIMES, 1.0), r"must be \(T,\)"),
         (lambda: offset_factors(OFFSETS, TIMES, 0.0), "correlation_s must be positive"),
         (lambda: offset_factors(OFFSETS, TIMES[::-1], 1.0), "times rising"),
-        (lambda: lasting_prior_factors(KEYS[:1], OFFSETS[:1], [[0, 0, np.nan]], np.eye(3)[None], 0.5), "not finite"),
+        (
+            lambda: lasting_prior_factors(KEYS[:1], OFFSETS[:1], [[0, 0, np.nan]], np.eye(3)[None], 0.5),
+            "not finite",
+        ),
         (lambda: lasting_prior_factors(KEYS[:1], OFFSETS[:1], [[0, 0, 0]], np.eye(3)[None], 1.0), "white_share"),
         (lambda: lasting_prior_factors(KEYS[:1], OFFSETS[:1], [[0, 0]], np.eye(3)[None], 0.5), r"means \(D, 3\)"),
     ],

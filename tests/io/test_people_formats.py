@@ -223,6 +223,17 @@ def test_cameras_are_told_by_their_numbers_where_names_differ():
         read_detections(DATA / "pose2sim", two_cameras("cam 1 a,", "other"))
 
 
+def test_cameras_are_told_by_their_names_within_others(tmp_path):
+    rig = two_cameras("23087", "1")
+    people = people_of(BODY_25)
+    names = {"left": "walk3_Miqus_2_23087", "right": "walk3_Miqus_1_23088"}
+    pose2sim(tmp_path, {names[name]: frames for name, frames in people.items()})
+    with pytest.raises(InputError, match="no detections of the cameras 23087 walk3 here"):
+        read_detections(tmp_path, two_cameras("23087", "walk3"))  # which stands in both
+    (note,) = read_detections(tmp_path, rig).notes
+    assert note.endswith("23087 is walk3_Miqus_2_23087_json, 1 is walk3_Miqus_1_23088_json")
+
+
 def test_middles_are_said(tmp_path, rig):
     coco(tmp_path, people_of(COCO_17))
     assert read_detections(tmp_path, rig).notes == (
@@ -400,6 +411,10 @@ BAD_FILES = [
         "0 keypoints have 1 keypoint_sc",
     ),
     ('[{"frame_id": -1, "instances": []}]', "[0].frame_id"),
+    (
+        '[{"image_id": 99999999999999, "keypoints": [1, 2, 3]}]',
+        "[0].image_id '99999999999999' has no frame number",
+    ),
     ('{"annotations": 3}', "the file must be a list, got 3"),
 ]
 
@@ -432,6 +447,12 @@ def test_a_few_joints_far_outside_the_picture_are_left_out_and_said(tmp_path, ri
     (note,) = table.notes
     assert "frame 0 has a joint at pixel (5000, 5000), far outside the 1001 x 801" in note
     assert "1 such joints of 125 were left out" in note
+
+
+def test_ids_of_pictures_that_are_no_frames(tmp_path, rig):
+    coco(tmp_path, people_of(COCO_17))
+    (tmp_path / "right.json").write_text(json.dumps([{"image_id": 900_100_200, "keypoints": [5.0, 5, 0.5] * 17}]))
+    refuses(tmp_path, rig, "whose frames would run from 0 to 900100200; number the pictures by their frames")
 
 
 def test_nobody_anywhere(tmp_path, rig):

@@ -200,6 +200,9 @@ def test_a_stronger_pair_is_grouped_first_and_nobody_gets_two_of_a_kind():
 def test_misuse_and_leftovers_are_refused(rig: Rig, recording: Recording, tmp_path: Path):
     with pytest.raises(ValueError, match="z up"):
         write_association(recording, Rig(rig.cameras, up="y"), tmp_path)
+    fisheye = replace(rig.cameras[0], distortion=np.zeros(4), lens="fisheye")
+    with pytest.raises(ValueError, match="five coefficients of distortion, camera left another lens"):
+        write_association(recording, replace(rig, cameras=(fisheye, *rig.cameras[1:])), tmp_path)
     with pytest.raises(ValueError, match="no frame"):
         write_association(Recording(BODY_25, []), rig, tmp_path)
     other = Skeleton("three", ("a", "b", "c"), ((0, 1),), (-1, 0, 1), (0, 1, 2), (0, 1, 2))

@@ -7,11 +7,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from shapepose_fg.body.fitting.body_sequence import SequenceConfig, SequenceFit, SequenceFitter, Shapes
 from shapepose_fg.body.fitting.energy import BodyEnergy, Evaluated, Held, Linearisation, WhitenedTargets
 from shapepose_fg.body.fitting.evidence import EvidenceConfig
 from shapepose_fg.body.fitting.fit_rows import RowFitter
 from shapepose_fg.body.fitting.fitter import BodyFit, JointTargets
 from shapepose_fg.body.fitting.left_out import left_out_sets
+from shapepose_fg.body.fitting.motion_prior import MotionPrior
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.pose_prior import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel
@@ -33,6 +35,8 @@ class PlainFitterConfig:
 
     evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
     """How targets are judged and weighed."""
+    sequence: SequenceConfig = field(default_factory=SequenceConfig)
+    """How bodies are fitted over time."""
     kernel_scale: float = 6.0
     """Mahalanobis distance at which the Geman-McClure kernel has cut a joint's weight to a quarter."""
     anneal_steps: int = 2
@@ -94,6 +98,26 @@ class LevenbergMarquardtFitter:
         leave targets out start cold.
         """
         return self._rows.fit(targets, initial, groups)
+
+    @torch.inference_mode()
+    def fit_whole(self, targets: JointTargets, initial: BodyFit | None = None) -> BodyFit:
+        """The same bodies in a fraction of the time, without `prior_xyz` and `prior_covariance`, which are NaN."""
+        return self._rows.fit(targets, initial, None, leave_out=False)
+
+    @torch.inference_mode()
+    def fit_sequence(
+        self,
+        targets: JointTargets,
+        groups: NDArray[np.intp],
+        time_s: Array,
+        shapes: Shapes | None = None,
+        *,
+        fixed_shapes: bool = False,
+    ) -> SequenceFit:
+        """See `LearnedFitter.fit_sequence`."""
+        motion, config = MotionPrior.default(), self.config.sequence
+        sequence = SequenceFitter(self._rows, motion, self.config.kernel_scale, config)
+        return sequence.fit(targets, groups, time_s, shapes, fixed_shapes=fixed_shapes)
 
     def first(
         self, targets: WhitenedTargets, variance: Array, start: Tensor | None = None

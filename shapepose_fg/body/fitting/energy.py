@@ -32,7 +32,7 @@ class WhitenedTargets:
     root: Tensor
     """(B, K, 3, 3) symmetric square root S_i of the information, 1/m."""
 
-    def __getitem__(self, rows: Tensor) -> "WhitenedTargets":
+    def __getitem__(self, rows: "Tensor | slice") -> "WhitenedTargets":
         return WhitenedTargets(self.xyz[rows], self.root[rows])
 
 
@@ -54,7 +54,7 @@ class Held:
 
     def for_rows(self, count: int) -> "Held":
         """The same with one row of everything for each of `count` rows."""
-        return Held(self.betas.expand(count, 10), self.stiffness.expand(count, 1), self.angles)
+        return Held(self.betas.expand(count, 10).clone(), self.stiffness.expand(count, 1).clone(), self.angles)
 
     @staticmethod
     def concatenated(parts: "list[Held]") -> "Held":

@@ -55,8 +55,15 @@ class RowFitter:
     fallback: Optimiser | None = None
     """What fits the passes that `optimiser` left unfinished."""
 
-    def fit(self, targets: JointTargets, initial: BodyFit | None, groups: NDArray[np.intp] | None) -> BodyFit:
-        """A body for every row; see `BodyFitter.fit`."""
+    def fit(
+        self,
+        targets: JointTargets,
+        initial: BodyFit | None,
+        groups: NDArray[np.intp] | None,
+        *,
+        leave_out: bool = True,
+    ) -> BodyFit:
+        """A body for every row; see `BodyFitter.fit`. Without `leave_out` priors of joints are NaN: much faster."""
         count = len(self.sets)
         if targets.xyz.shape[1] != count:
             raise ValueError(f"targets must be the {count} keypoints of the body, got {targets.xyz.shape[1]}")
@@ -69,9 +76,39 @@ class RowFitter:
         if len(rows) > 0:
             start = None if initial is None else self._start(initial.rows(rows), evidence.centre[rows])
             usable = evidence.rows(rows)
-            passes = plan_passes(usable, self.sets, groups[rows], self.evidence)
+            if leave_out:
+                passes = plan_passes(usable, self.sets, groups[rows], self.evidence)
+            else:
+                passes = Passes.whole(groups[rows], count)
             self._fit_passes(fit, usable, rows, passes, start)
+        if not leave_out:
+            fit.prior_xyz[:], fit.prior_covariance[:] = np.nan, np.nan
         return fit
+
+    def starts(self, evidence: Evidence) -> tuple[Tensor, Held, NDArray[np.bool_]]:
+        """Bodies of rows (R) with all their targets, nothing left out, each with a shape of its own.
+
+        Returns their parameters (R, P) around `evidence.centre`, what holds them, and which (R,) are finished.
+        """
+        inside = torch.from_numpy(evidence.xyz - evidence.centre[:, None]).float()
+        targets, found, holds = WhitenedTargets(inside, torch.from_numpy(evidence.root).float()), [], []
+        for at in range(0, len(inside), _CHUNK):
+            part = slice(at, at + _CHUNK)
+            body, held = self.optimiser.first(targets[part], evidence.variance_m2[part], None)
+            found.append(torch.cat((body.free, (body.left < self.unfinished)[:, None]), 1))
+            holds.append(held.for_rows(len(body.free)))
+        free, held = torch.cat(found), Held.concatenated(holds)
+        free, done = free[:, :-1], free[:, -1].bool().numpy()
+        unsettled = np.flatnonzero(~done)
+        if self.fallback is not None and len(unsettled) > 0:
+            body, _ = self.fallback.first(
+                targets[torch.from_numpy(unsettled)], evidence.variance_m2[unsettled], None
+            )
+            free[unsettled], done[unsettled] = body.free, (body.left < self.unfinished).numpy()
+            held.betas[unsettled] = body.free[:, :10]
+            if held.angles is not None:
+                held.angles[unsettled] = body.free[:, 13:-3]
+        return free, held, done
 
     def _fit_passes(
         self, fit: BodyFit, evidence: Evidence, rows: NDArray[np.intp], passes: Passes, start: Tensor | None

@@ -9,12 +9,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter, PlainFitterConfig
+from shapepose_fg.body.fitting.body_sequence import SequenceConfig, SequenceFit, SequenceFitter, Shapes
 from shapepose_fg.body.fitting.descent import BodyState, DescentTargets, LearnedDescent
 from shapepose_fg.body.fitting.energy import BodyEnergy, Evaluated, Held, WhitenedTargets, robust_weight
 from shapepose_fg.body.fitting.evidence import EvidenceConfig
 from shapepose_fg.body.fitting.fit_rows import RowFitter
 from shapepose_fg.body.fitting.fitter import BodyFit, JointTargets
 from shapepose_fg.body.fitting.left_out import left_out_sets
+from shapepose_fg.body.fitting.motion_prior import MotionPrior
 from shapepose_fg.body.fitting.pose_prior import PosePrior
 from shapepose_fg.body.fitting.weights import FitterWeights
 from shapepose_fg.body.model.body_model import BodyModel
@@ -32,6 +34,8 @@ class LearnedFitterConfig:
 
     evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
     """How targets are judged and weighed."""
+    sequence: SequenceConfig = field(default_factory=SequenceConfig)
+    """How bodies are fitted over time."""
     kernel_scale: float = 6.0
     """Mahalanobis distance at which the Geman-McClure kernel has cut a joint's weight to a quarter."""
     polish_steps: int = 1
@@ -108,6 +112,37 @@ class LearnedFitter:
         the same targets are the same fit.
         """
         return self._rows.fit(targets, None, groups)
+
+    @torch.inference_mode()
+    def fit_whole(self, targets: JointTargets, initial: BodyFit | None = None) -> BodyFit:
+        """The same bodies in a fraction of the time, without `prior_xyz` and `prior_covariance`, which are NaN."""
+        return self._rows.fit(targets, None, None, leave_out=False)
+
+    @torch.inference_mode()
+    def fit_sequence(
+        self,
+        targets: JointTargets,
+        groups: NDArray[np.intp],
+        time_s: Array,
+        shapes: Shapes | None = None,
+        *,
+        fixed_shapes: bool = False,
+    ) -> SequenceFit:
+        """One shape per group and poses that move as people do, over time.
+
+        Parameters
+        ----------
+        targets: of B rows: where a person's joints are, and how surely, in one frame each.
+        groups: (B,) whole numbers: who.
+        time_s: (B,) when, seconds. Rows of a group more than `sequence.gap_s` apart are not linked.
+        shapes: what is known of the shape of each group, in the order of `np.unique(groups)`; None: nothing.
+        fixed_shapes: keep the means of `shapes`.
+
+        Rows with too few joints follow those before and after; ValueError where a group has two rows at one time.
+        """
+        motion, config = MotionPrior.default(), self.config.sequence
+        sequence = SequenceFitter(self._rows, motion, self.config.kernel_scale, config)
+        return sequence.fit(targets, groups, time_s, shapes, fixed_shapes=fixed_shapes)
 
     def first(
         self, targets: WhitenedTargets, variance: Array, start: Tensor | None = None

@@ -38,6 +38,13 @@ class Passes:
     source: NDArray[np.intp]
     """(R, J) the pass from which each joint's prior is taken."""
 
+    @classmethod
+    def whole(cls, groups: NDArray[np.intp], joints: int) -> "Passes":
+        """One pass with all targets for each row of `groups` (R,), and nothing left out."""
+        row = np.arange(len(groups))
+        without = np.zeros((len(row), joints), dtype=bool)
+        return cls(row, without, groups, np.ones(len(row), dtype=bool), np.repeat(row[:, None], joints, axis=1))
+
     def __len__(self) -> int:
         """Count of passes, M."""
         return len(self.row)

@@ -80,7 +80,7 @@ def learn_offsets(
     precision = np.linalg.inv(_prior_covariance(prior))
     model, fit = model.with_keypoint_offsets(_made(np.zeros(75), precision, np.zeros(25))), None
     for _ in range(prior.rounds):
-        fit = LevenbergMarquardtFitter(model, wide, config).fit(targets, fit)
+        fit = LevenbergMarquardtFitter(model, wide, config).fit_whole(targets, fit)
         if not fit.ok.any():
             break
         energy = BodyEnergy(model.to(torch.float64), wide)

@@ -34,7 +34,7 @@ class _Camera(BaseModel):
     cam_id: int | None = None
     port: int | None = None
     ignore: bool = False
-    size: Annotated[list[Annotated[float, Field(gt=0)]], Field(min_length=2, max_length=2)]
+    size: Annotated[list[Annotated[FiniteFloat, Field(gt=0)]], Field(min_length=2, max_length=2)]
     matrix: Matrix33
     distortions: Annotated[list[FiniteFloat], Field(max_length=14)] = []
     rotation: Row3 | Matrix33

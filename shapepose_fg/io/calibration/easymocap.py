@@ -7,8 +7,9 @@ import numpy as np
 
 from shapepose_fg.errors import InputError
 from shapepose_fg.files import read_text
-from shapepose_fg.io.calibration.content import Content, load_opencv
-from shapepose_fg.io.calibration.written import Format, WrittenCamera, WrittenRig, pose
+from shapepose_fg.io.calibration.content import Content
+from shapepose_fg.io.calibration.filestorage import load_storage
+from shapepose_fg.io.calibration.written import Format, WrittenCamera, WrittenRig, picture_size, pose
 
 
 def recognise(content: Content) -> bool:
@@ -23,11 +24,11 @@ def recognise(content: Content) -> bool:
 def read(content: Content) -> WrittenRig:
     """The cameras in the order of the names in the intrinsics."""
     intri, extri = _both(content)
-    inner, outer = (load_opencv(path, read_text(path)) for path in (intri, extri))
+    inner, outer = (load_storage(path, read_text(path)) for path in (intri, extri))
     names = inner.get("names")
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+    if not isinstance(names, list) or not all(isinstance(name, str | int) for name in names):
         raise InputError(f"{intri}: names must be a list of the cameras' names; write it with EasyMocap again")
-    cameras = [_camera(name, number, inner, outer, intri, extri) for number, name in enumerate(names, 1)]
+    cameras = [_camera(str(name), number, inner, outer, intri, extri) for number, name in enumerate(names, 1)]
     return WrittenRig(cameras, "m", "z")
 
 
@@ -64,7 +65,7 @@ def _camera(
     R = _matrix(outer, rotation, tags, 9 if rotation == "Rot" else 3, extri)
     wTc = pose(R, _matrix(outer, "T", tags, 3, extri), f"{rotation}_{name}", str(extri))
     width, height = (inner.get(f"{letter}_{name}") for letter in "WH")
-    size = (round(width), round(height)) if isinstance(width, float) and isinstance(height, float) else None
+    size = picture_size(width, height, f'{intri}: camera "{name}"')
     return WrittenCamera(name, K, wTc, size, distortion.tolist())
 
 

@@ -7,8 +7,9 @@ import numpy as np
 from shapepose_fg.camera import Lens
 from shapepose_fg.errors import InputError
 from shapepose_fg.files import read_text
-from shapepose_fg.io.calibration.content import Content, load_opencv
-from shapepose_fg.io.calibration.written import ONE_CAMERA, Format, WrittenCamera, WrittenRig, pose
+from shapepose_fg.io.calibration.content import Content
+from shapepose_fg.io.calibration.filestorage import load_storage
+from shapepose_fg.io.calibration.written import ONE_CAMERA, Format, WrittenCamera, WrittenRig, picture_size, pose
 
 _FISHEYE = 1
 """OpenCV's CALIB_MODEL_FISHEYE."""
@@ -61,8 +62,9 @@ def read_multiview(content: Content) -> WrittenRig:
         lens: Lens = "fisheye" if fisheye[index] else "perspective"
         coefficients = numbers[end - (4 if fisheye[index] else int(plain)) : end].tolist()
         wTc = pose(Rs[index], Ts[index], "Rs", f'{path}: camera "{name}"')
-        width, height = sizes[index].astype(int).tolist()
-        cameras.append(WrittenCamera(name, Ks[index].reshape(3, 3), wTc, (width, height), coefficients, lens))
+        width, height = sizes[index].tolist()
+        image_size = picture_size(width, height, f"{path}: image_sizes[{index}]")
+        cameras.append(WrittenCamera(name, Ks[index].reshape(3, 3), wTc, image_size, coefficients, lens))
     return WrittenRig(cameras, None, None, _ASK)
 
 
@@ -78,7 +80,7 @@ def read_nodes(content: Content) -> WrittenRig:
     """Cameras by name, of MC-Calib or of hand-written files: K, distortion, picture size and pose."""
     if content.syntax == "folder":
         nodes = {
-            path.stem: load_opencv(path, read_text(path))
+            path.stem: load_storage(path, read_text(path))
             for path in content.value
             if path.suffix in (".yml", ".yaml", ".xml")
         }
@@ -106,13 +108,12 @@ def _camera(name: str, node: dict[str, Any], place: str) -> WrittenCamera:
         raise InputError(f"{place}: camera_matrix must be a 3x3 matrix; write it with OpenCV's FileStorage")
     distortion = _find(node, "distortion")
     width, height = _find(node, "width"), _find(node, "height")
-    sized = isinstance(width, float) and isinstance(height, float)
-    fisheye = node.get("distortion_type") == 1.0 or node.get("fisheye") in (1.0, "true")
+    fisheye = node.get("distortion_type") == 1 or node.get("fisheye") in (1, "true")
     return WrittenCamera(
         name,
         K.reshape(3, 3),
         _pose(node, place),
-        (round(width), round(height)) if sized else None,
+        picture_size(width, height, place),
         distortion.ravel().tolist() if isinstance(distortion, np.ndarray) else (),
         "fisheye" if fisheye else "perspective",
     )
@@ -137,6 +138,8 @@ def _stack(nodes: dict[str, Any], key: str, path: object) -> np.ndarray:
     """A matrix, or a list of equal matrices, as one finite array."""
     try:
         values = np.asarray(nodes[key], dtype=np.float64)
+        if nodes[key] is None or values.size == 0:
+            raise ValueError
     except (KeyError, TypeError, ValueError):
         raise InputError(
             f"{path}: {key} is missing or no array; save it with OpenCV's calibration again"

@@ -12,7 +12,15 @@ import numpy as np
 from shapepose_fg.camera import Lens
 from shapepose_fg.errors import InputError
 from shapepose_fg.io.calibration.content import Content, load
-from shapepose_fg.io.calibration.written import ONE_CAMERA, Format, WrittenCamera, WrittenRig, pose, rotation_of
+from shapepose_fg.io.calibration.written import (
+    ONE_CAMERA,
+    Format,
+    WrittenCamera,
+    WrittenRig,
+    picture_size,
+    pose,
+    rotation_of,
+)
 
 _SUFFIXES = (".yaml", ".yml")
 _LENSES: dict[str, Lens] = {
@@ -79,13 +87,11 @@ def _camera(name: str, path: Path, value: dict[str, Any], wTc: np.ndarray) -> Wr
         )
     K = _array(value, ("camera_matrix", "k", "K"), path)
     distortion = _array(value, ("distortion_coefficients", "d", "D"), path)
-    size = [value.get(f"image_{side}", value.get(side)) for side in ("width", "height")]
-    width, height = size
-    if len(K) != 9 or not (isinstance(width, int) and isinstance(height, int)):
-        raise InputError(
-            f"{path}: camera_matrix must hold 9 numbers, image_width and image_height one; {ONE_CAMERA}"
-        )
-    return WrittenCamera(name, K.reshape(3, 3), wTc, (width, height), distortion.tolist(), _LENSES[model])
+    width, height = (value.get(f"image_{side}", value.get(side)) for side in ("width", "height"))
+    if len(K) != 9:
+        raise InputError(f"{path}: camera_matrix must hold 9 numbers, got {len(K)}; {ONE_CAMERA}")
+    image_size = picture_size(width, height, str(path))
+    return WrittenCamera(name, K.reshape(3, 3), wTc, image_size, distortion.tolist(), _LENSES[model])
 
 
 def _array(value: dict[str, Any], keys: tuple[str, ...], path: Path) -> np.ndarray:

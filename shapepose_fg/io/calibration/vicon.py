@@ -34,6 +34,8 @@ def _camera(camera: ET.Element, place: str) -> WrittenCamera:
         raise InputError(f"{place}: it has no <KeyFrame>, so it is not calibrated; calibrate it, or delete it")
     width, height = _numbers(camera, "SENSOR_SIZE", 2, place)
     aspect = _numbers(camera, "PIXEL_ASPECT_RATIO", 1, place)[0] if camera.get("PIXEL_ASPECT_RATIO") else 1.0
+    if aspect <= 0:
+        raise InputError(f"{place}: PIXEL_ASPECT_RATIO must be above 0, got {aspect:g}; {_CURE}")
     focal = _numbers(frame, "FOCAL_LENGTH", 1, place)[0]
     K = intrinsics(focal, focal / aspect, *_numbers(frame, "PRINCIPAL_POINT", 2, place))
     # ORIENTATION x y z w turns the world's axes into the camera's; POSITION is the centre.

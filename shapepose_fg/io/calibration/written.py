@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
@@ -22,6 +22,8 @@ METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 _ROTATION_TOLERANCE = 1e-3
 """How far R Rᵀ may be from the identity: calibrations are printed with four to six digits."""
+_MOST_PIXELS = 1_000_000
+"""No picture is as wide."""
 _EXACT = 1e-12
 """Below this a rotation is left as written, so that a rig that is written and read stays the same."""
 
@@ -113,6 +115,16 @@ def rotation_of(quaternion: ArrayLike, key: str, place: str) -> NDArray[np.float
     x, y, z, w = (value / length for value in (x, y, z, w))
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + 2 * w * cross + 2 * cross @ cross
+
+
+def picture_size(width: Any, height: Any, place: str) -> tuple[int, int] | None:
+    """Width and height in pixels, None where neither is there; InputError where they are no numbers of pixels."""
+    if width is None and height is None:
+        return None
+    sides = [side for side in (width, height) if isinstance(side, int | float) and 1 <= side <= _MOST_PIXELS]
+    if len(sides) < 2:
+        raise InputError(f"{place}: the picture's size must be pixels, got {width} x {height}; correct it")
+    return round(sides[0]), round(sides[1])
 
 
 def intrinsics(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:

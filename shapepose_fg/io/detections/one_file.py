@@ -18,6 +18,8 @@ _RERUN = {
     _ALPHAPOSE: "run AlphaPose again with --format coco",
     _MMPOSE: "run MMPose again with --save-predictions or --pred-out-dir",
 }
+_MOST = 10**12
+"""No frame has a higher number."""
 _FRAME_NUMBER = re.compile(r"(\d+)\D*$")
 """The last number in the name of a picture."""
 
@@ -42,7 +44,7 @@ class _VideoFrame(BaseModel):
     """A frame of MMPose."""
 
     model_config = ConfigDict(strict=True)
-    frame_id: Annotated[int, Field(ge=0)]
+    frame_id: Annotated[int, Field(ge=0, lt=_MOST)]
     instances: list[_Instance]
 
 
@@ -148,10 +150,10 @@ def _picture_names(value: dict[str, Any]) -> dict[int, str]:
 def _number(image: int | str, names: dict[int, str], place: str, program: str) -> int:
     """The frame of a picture: its id, or the last number in its name."""
     if isinstance(image, int):
-        if image not in names:
+        if image not in names and 0 <= image < _MOST:
             return image
-        image = names[image]
+        image = names.get(image, str(image))
     match = _FRAME_NUMBER.search(Path(image).stem)
-    if match is None:
+    if match is None or len(match[1]) > len(str(_MOST)):
         raise InputError(f"{place} {image[:40]!r} has no frame number; {_RERUN[program]}, of numbered pictures")
     return int(match[1])

@@ -37,9 +37,9 @@ def find_places(path: Path, rig: Rig) -> Places:
         return Places("text", texts)
     found = [_named(folder, name) for name in rig.names]
     if all(each is None for each in found):
-        by_number = _by_number(folder, rig)
-        if by_number is not None:
-            return by_number
+        alike = _alike(folder, rig)
+        if alike is not None:
+            return alike
         names = " ".join(rig.names)
         raise InputError(
             f"{folder}: no detections of the cameras {names} here, only {_listing(folder)}; {_EXPECTED}"
@@ -70,19 +70,36 @@ def _named(folder: Path, name: str) -> Path | None:
     return None
 
 
-def _by_number(folder: Path, rig: Rig) -> Places | None:
-    """Folders or files that have the cameras' numbers in their names, as `cam01_json` of camera `int_cam1`.
+def _alike(folder: Path, rig: Rig) -> Places | None:
+    """Folders or files that have the cameras' names in theirs (`walk_Miqus_1_23087_json` of camera `23087`), or
+    the cameras' numbers (`cam01_json` of camera `int_cam1`).
 
-    Only where every camera and every folder has one number, and all are different: else nothing is guessed.
+    Only where it is so for every camera, and nothing else could be meant: else nothing is guessed.
     """
     offered = [each for each in sorted(folder.iterdir()) if each.is_dir() or each.suffix == ".json"]
     offered = [each for each in offered if not each.name.startswith(".")]
-    wanted, there = (_one_number_each(names) for names in (rig.names, [each.name for each in offered]))
-    if wanted is None or there is None or not set(wanted) <= set(there):
-        return None
-    places = [offered[there.index(number)] for number in wanted]
+    names = [each.name.removesuffix(".json").removesuffix("_json") for each in offered]
+    chosen = _within(rig.names, names)
+    if chosen is None:
+        wanted, there = _one_number_each(rig.names), _one_number_each(names)
+        if wanted is None or there is None or not set(wanted) <= set(there):
+            return None
+        chosen = [there.index(number) for number in wanted]
+    places = [offered[index] for index in chosen]
     pairs = ", ".join(f"{name} is {place.name}" for name, place in zip(rig.names, places, strict=True))
-    return Places("people", places, (f"{folder}: cameras were told by their numbers: {pairs}",))
+    return Places("people", places, (f"{folder}: cameras were told by parts of the names: {pairs}",))
+
+
+def _within(cameras: Sequence[str], names: Sequence[str]) -> list[int] | None:
+    """For each camera the only name in which its own stands as a word; None where one has none or several."""
+    chosen = []
+    for camera in cameras:
+        word = re.compile(rf"(?<![A-Za-z0-9]){re.escape(camera)}(?![A-Za-z0-9])")
+        found = [index for index, name in enumerate(names) if word.search(name) is not None]
+        if len(found) != 1:
+            return None
+        chosen += found
+    return chosen if len(set(chosen)) == len(chosen) else None
 
 
 def _one_number_each(names: Sequence[str]) -> list[int] | None:

@@ -60,6 +60,10 @@ def _camera(place: Path) -> CameraPeople:
     return read_frame_files(place)
 
 
+_MOST_FRAMES = 2_000_000
+"""No recording is as long: ids of pictures that are not frames' numbers."""
+
+
 @dataclass(frozen=True)
 class _Found:
     """The people of all cameras, in one skeleton."""
@@ -75,7 +79,13 @@ class _Found:
                 f"{self.people[0].source}: recognised as {self.people[0].program}, where no camera lists a frame;"
                 " give detections of people"
             )
-        return min(each.first for each in listed), max(each.last for each in listed)
+        first, last = min(each.first for each in listed), max(each.last for each in listed)
+        if last - first >= _MOST_FRAMES:
+            raise InputError(
+                f"{listed[0].source}: recognised as {listed[0].program}, whose frames would run from {first} to"
+                f" {last}; number the pictures by their frames"
+            )
+        return first, last
 
     def with_probabilities(self) -> tuple["_Found", list[str]]:
         """The same people with scores from 0 to 1, and what was done to them."""

@@ -1,6 +1,6 @@
 """Why joints are missed: hidden people are missed as wholes, and some are lost without anybody before them.
 
-For `measure_detector.py`. Misses are told on a probit scale, on which causes add up.
+Misses are told on a probit scale, on which causes add up.
 """
 
 from typing import Any

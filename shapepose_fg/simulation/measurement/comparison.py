@@ -1,49 +1,33 @@
-"""The simulated detector beside the real one, for `reproduce_simulation.py`: a table of distances, and figures.
-
-Both are measured alike (`detector_sample.py`): the Shelf recording, and simulated recordings of the same poses
-before the same cameras, with seeds on which nothing was calibrated.
-"""
+"""The simulated detector beside the real one, both measured alike: a table of their distances."""
 
 from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
 
-import matplotlib
 import numpy as np
-from detector_misses import is_lost
-from detector_sample import Sample, pool, take_sample, twin
-from measure_detector import (
-    CONFIG,
-    FPS,
-    GROUP,
-    GROUPS,
-    autocorrelation,
-    false_candidates,
-    hits_about_mean,
-    joint_states,
-    merging,
-    normal_scores,
-    shelf_people,
-    simulated,
-    statistics,
-    swaps,
-    watch,
-    whitened,
-)
 from numpy.typing import NDArray
 
 from shapepose_fg.simulation import DetectorConfig
-from shapepose_fg.skeleton import BODY_25
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-from matplotlib.axes import Axes
+from shapepose_fg.simulation.measurement.calibration import simulated, watch
+from shapepose_fg.simulation.measurement.classes import (
+    GROUP,
+    GROUPS,
+    joint_states,
+)
+from shapepose_fg.simulation.measurement.confusions import false_candidates, merging, swaps
+from shapepose_fg.simulation.measurement.errors import whitened
+from shapepose_fg.simulation.measurement.memories import autocorrelation, hits_about_mean, normal_scores
+from shapepose_fg.simulation.measurement.misses import is_lost
+from shapepose_fg.simulation.measurement.people import CONFIG, FPS, shelf_people, twin
+from shapepose_fg.simulation.measurement.sample import Sample, pool, take_sample
+from shapepose_fg.simulation.measurement.statistics import statistics
 
 UNSEEN = (100, 101, 102, 103, 104, 105)
 """Of the simulated recordings, which are taken together; calibration used 0 and up."""
-COLOURS = {"real": "black", "simulated": "#d95f02"}
 STATES = ("visible", "hidden by itself", "hidden by another")
+"""Names of `joint_states`."""
 LAGS = np.arange(1, 41)
+"""Frames over which memories are compared."""
 
 
 class Measured:
@@ -122,8 +106,8 @@ class Measured:
         return pairs["affinity"][those]
 
 
-def tables_and_figures(shelf: Path, images: Path | None) -> list[str]:
-    """Measure the recording in the folder `shelf` and its simulation, compare; draw into `images` if given."""
+def compare(shelf: Path) -> tuple[dict[str, Measured], list[Measured]]:
+    """The recording in the folder `shelf` and its simulation ("real", "simulated"); and each seed alone."""
     detections, rig, people = shelf_people(shelf)
     scene = twin(people, rig, FPS)
     samples = simulated(scene, watch(scene), DetectorConfig(), UNSEEN)
@@ -131,11 +115,7 @@ def tables_and_figures(shelf: Path, images: Path | None) -> list[str]:
         "real": Measured(take_sample(detections, rig, people, CONFIG), rig),
         "simulated": Measured(pool(samples), rig),
     }
-    if images is not None:
-        draw(images / "detector_joints.png", both, [confidences, errors, misses])
-        draw(images / "detector_time.png", both, [memories, counts, tails])
-        draw(images / "detector_affinities.png", both, [right_pairs, wrong_pairs, wrong_shares])
-    return table(both, [Measured(sample, rig) for sample in samples])
+    return both, [Measured(sample, rig) for sample in samples]
 
 
 def table(both: dict[str, Measured], each: list[Measured]) -> list[str]:
@@ -210,122 +190,3 @@ def _distance_of_counts(real: Measured, simulated: Measured) -> str:
     distance = 0.5 * np.abs(shares[0] - shares[1]).sum()
     means = f"{a.mean():.2f} | {b.mean():.2f}"
     return f"| candidates of a joint in a view, mean | {means} | total variation {distance:.3f} | |"
-
-
-def draw(path: Path, both: dict[str, Measured], panels: list[Callable[[Axes, dict[str, Measured]], None]]) -> None:
-    """A row of panels as an image."""
-    figure, axes = plt.subplots(1, len(panels), figsize=(4.2 * len(panels), 3.6), layout="constrained")
-    for axis, panel in zip(axes, panels, strict=True):
-        panel(axis, both)
-        axis.grid(alpha=0.3)
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
-
-
-def _cumulative(axis: Axes, values: NDArray, **style) -> None:
-    axis.plot(np.quantile(values, np.linspace(0, 1, 200)), np.linspace(0, 1, 200), **style)
-
-
-def confidences(axis: Axes, both: dict[str, Measured]) -> None:
-    """Distribution of the confidence, by state."""
-    for state, dash in enumerate(("-", "--", ":")):
-        for name, measured in both.items():
-            _cumulative(
-                axis, measured.confidences(state), color=COLOURS[name], ls=dash, label=f"{name}, {STATES[state]}"
-            )
-    axis.set(xlabel="confidence", ylabel="share of joints below", title="Confidence of joints found")
-    axis.legend(fontsize=7)
-
-
-def errors(axis: Axes, both: dict[str, Measured]) -> None:
-    """Residual quantiles against confidence."""
-    edges = np.array([0.15, 0.3, 0.45, 0.55, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9, 1.0])
-    middle = (edges[:-1] + edges[1:]) / 2
-    for name, measured in both.items():
-        found = measured.expected["hit"] & (measured.state == 0)
-        which = np.searchsorted(edges, measured.expected["confidence"][found], side="right") - 1
-        length = measured.length_mm[found]
-        for level, dash in ((0.5, "-"), (0.9, "--")):
-            rows = [np.quantile(length[which == k], level) for k in range(len(middle))]
-            axis.plot(middle, rows, color=COLOURS[name], ls=dash, marker=".", label=f"{name}, {level:.0%} below")
-    axis.set(
-        xlabel="confidence", ylabel="distance, mm", title="Visible joints, from where other views put them", ylim=0
-    )
-    axis.legend(fontsize=7)
-
-
-def misses(axis: Axes, both: dict[str, Measured]) -> None:
-    """Share missed, by joint."""
-    names = [BODY_25.joints[j].removeprefix("R").removeprefix("L") for j in GROUPS]
-    for state, marker in ((0, "o"), (1, "s"), (2, "^")):
-        for name, measured in both.items():
-            shift = 0.12 if name == "simulated" else -0.12
-            axis.plot(np.arange(len(GROUPS)) + shift, measured.misses(state), marker, ms=4, color=COLOURS[name],
-                      mfc=COLOURS[name] if state == 0 else "none", label=f"{name}, {STATES[state]}")  # fmt: skip
-    axis.set_xticks(np.arange(len(GROUPS)), names, rotation=60, ha="right", fontsize=7)
-    axis.set(ylabel="share missed", title="Misses", ylim=(-0.02, 1.02))
-    axis.legend(fontsize=6, loc="upper center", bbox_to_anchor=(0.5, -0.28), ncols=3)
-
-
-def memories(axis: Axes, both: dict[str, Measured]) -> None:
-    """Autocorrelations."""
-    for name, measured in both.items():
-        for (what, values), dash in zip(measured.memories().items(), ("-", "--", ":"), strict=True):
-            axis.plot(LAGS, values, color=COLOURS[name], ls=dash, label=f"{name}, {what}")
-    axis.set(xlabel="frames apart", ylabel="autocorrelation", title="How long errors last", ylim=(0, 1))
-    axis.legend(fontsize=7)
-
-
-def counts(axis: Axes, both: dict[str, Measured]) -> None:
-    """Histogram of candidates per joint and view."""
-    for name, measured in both.items():
-        share = np.bincount(np.minimum(measured.counts(), 5), minlength=6) / len(measured.counts())
-        axis.bar(
-            np.arange(6) + (0.2 if name == "simulated" else -0.2), share, 0.4, color=COLOURS[name], label=name
-        )
-    axis.set_xticks(range(6), ["0", "1", "2", "3", "4", "5+"])
-    axis.set(xlabel="candidates of a joint in a view", ylabel="share", title="Candidates")
-    axis.legend(fontsize=7)
-
-
-def tails(axis: Axes, both: dict[str, Measured]) -> None:
-    """Distribution of the residual by what is expected."""
-    for name, measured in both.items():
-        length = np.linalg.norm(whitened(measured.expected, measured.state, both["real"].statistics), axis=1)
-        length = length[np.isfinite(length)]
-        axis.semilogy(np.quantile(length, np.linspace(0, 0.9995, 400)), 1 - np.linspace(0, 0.9995, 400),
-                      color=COLOURS[name], label=name)  # fmt: skip
-    r = np.linspace(0, 4, 100)
-    axis.semilogy(r, np.exp(-(r**2) / 2), color="grey", ls=":", label="Gaussian")
-    axis.set(xlabel="residual / its expected sigma", ylabel="share beyond", title="Tails", ylim=(1e-3, 1))
-    axis.legend(fontsize=7)
-
-
-def right_pairs(axis: Axes, both: dict[str, Measured]) -> None:
-    """Affinities of right pairs."""
-    for name, measured in both.items():
-        _cumulative(axis, measured.affinities(True), color=COLOURS[name], label=name)
-    axis.set(xlabel="affinity", ylabel="share of pairs below", title="Right pairs")
-    axis.legend(fontsize=7)
-
-
-def wrong_pairs(axis: Axes, both: dict[str, Measured]) -> None:
-    """Affinities of wrong pairs."""
-    for name, measured in both.items():
-        _cumulative(axis, measured.affinities(False), color=COLOURS[name], label=name)
-    axis.set(xlabel="affinity", ylabel="share of pairs below", title="Pairs of two people that have one")
-    axis.legend(fontsize=7)
-
-
-def wrong_shares(axis: Axes, both: dict[str, Measured]) -> None:
-    """Share of wrong pairs with an affinity."""
-    for name, measured in both.items():
-        found = measured.statistics["affinity"]
-        for key, dash in (("wrong", "-"), ("nobody", "--")):
-            label = f"{name}, {'two people' if key == 'wrong' else 'with a false candidate'}"
-            axis.step([*found["detours"], 7.0], [*found[f"{key}_share"], found[f"{key}_share"][-1]], where="post",
-                      color=COLOURS[name], ls=dash, label=label)  # fmt: skip
-    axis.set(
-        xlabel="distance from the right end, limb lengths", ylabel="share with an affinity", title="Wrong pairs"
-    )
-    axis.legend(fontsize=7)

@@ -1,7 +1,4 @@
-"""How well the quick visibility agrees with the whole mesh at full resolution, and how long it takes.
-
-For `reproduce_simulation.py`; on frames of two built-in scenes.
-"""
+"""How well the quick visibility agrees with the whole mesh at full resolution, and how long it takes."""
 
 import time
 

@@ -1,6 +1,7 @@
-"""How hard the named sequences are, for `reproduce_simulation.py`: some frames, each alone, default settings."""
+"""How hard the named sequences are: some frames, each alone, default settings."""
 
 from collections.abc import Sequence as TypingSequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,8 @@ from shapepose_fg.simulation.mocap import Mocap
 from shapepose_fg.simulation.sequences import SEQUENCES, Sequence, Split, sequence
 from shapepose_fg.skeleton import BODY_25
 
+ALONE = replace(PipelineConfig(), temporal=False)
+"""Every frame by itself."""
 HIP = BODY_25.index("MidHip")
 NEAR_M = 0.1
 """A candidate this near to the true hip, as a length at its depth, is a view that sees it."""
@@ -34,7 +37,7 @@ def row(scene: Sequence, name: str, split: Split, stride: int) -> str:
     """One sequence, scored."""
     some = simulate(scene, seed=0, frames=range(0, len(scene), stride))
     truth = scene.keypoints[::stride]
-    m = joint_metrics(reconstruct(some, scene.rig, PipelineConfig()), truth)
+    m = joint_metrics(reconstruct(some, scene.rig, ALONE), truth)
     hips = views_that_see_the_hip(some, scene, truth)
     shares = " | ".join(f"{100 * share:.1f}" for share in (m.precision, m.recall, m.f1))
     found = f"{100 * m.people_found / m.people_true:.1f} | {m.people_duplicated + m.people_invented}"

@@ -1,46 +1,28 @@
-"""The comparison of body fitters: tables and the figure of docs/evaluation.md, run by `reproduce_tables.py`.
-
-Bodies in poses of people whom nothing was learnt from or chosen on (`training.split`, "test"), their joints made
-worse step by step, the same targets for every fitter. Times are of whole fits (evidence, start, steps,
-covariances), and the processor's: of one thread, but where it says otherwise.
-"""
+"""The comparison of body fitters as Markdown tables, and its figure."""
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter
-from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
-from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import DetectionSequence
-from shapepose_fg.errors import InputError
+from shapepose_fg.evaluation.fitter_comparison import BATCH, LARGE_BATCH, Comparison, first, learned
 from shapepose_fg.evaluation.fitting import (
     GROUPS,
     SETTINGS,
-    Corruption,
     FitErrors,
-    TrueBodies,
-    corrupt,
     fit_calibration,
-    fit_errors,
     sigma_ratios,
-    true_bodies,
 )
 from shapepose_fg.evaluation.fitting_methods import (
     PLAIN_STEPS,
-    Curve,
-    Method,
-    curve,
     fits_per_second,
-    learned_methods,
-    plain_methods,
-    timed_fit,
 )
 from shapepose_fg.evaluation.fitting_optimum import check_optimum
 from shapepose_fg.evaluation.metrics import joint_metrics
@@ -51,84 +33,12 @@ from shapepose_fg.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.reconstruction import Reconstruction
 from shapepose_fg.simulation import simulate
 from shapepose_fg.simulation.mocap import Mocap
-from shapepose_fg.simulation.sequences import DANCERS, SEQUENCES, sequence
-from shapepose_fg.training.motions import load_motions
+from shapepose_fg.simulation.sequences import SEQUENCES, sequence
 
-IMAGES = Path(__file__).parents[1] / "docs" / "images"
-BODIES = 2048
-"""Half of them dance salsa, half are everybody else of the test subjects."""
-CURVE_BODIES = 512
-BATCH, LARGE_BATCH = 64, 128
-ALONE = 12
-"""How many single fits are timed."""
 STRIDE = 20
 """Every so-many-th frame of the simulated sequences is reconstructed."""
 COLOURS = ("black", "#7570b3", "#1b9e77", "#d95f02", "#e7298a")
-
 Table = Callable[[], list[str]]
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What one fitter made of one kind of targets."""
-
-    fit: BodyFit
-    """All rows."""
-    errors: FitErrors
-    """Against the truth."""
-    ms_batch: NDArray[np.float64]
-    """Milliseconds a fit, in batches of 64: one value for each batch."""
-    ms_alone: NDArray[np.float64]
-    """Milliseconds for single rows."""
-
-
-class Comparison:
-    """All fitters on all targets; what is asked for is computed once."""
-
-    def __init__(self, motions: Path, bodies: int = BODIES):
-        self.motions, self.bodies = motions, bodies
-        self.methods = (*plain_methods(), *_learned())
-        self.model = BodyModel.default()
-
-    @cached_property
-    def drawn(self) -> tuple[TrueBodies, NDArray[np.bool_]]:
-        """The bodies, and which of them dance salsa; frames evenly spread over each group's recordings."""
-        test = load_motions(self.motions).of("test")
-        salsa = np.isin(test.subject, sorted(DANCERS))
-        half = self.bodies // 2
-        rows = [
-            group[np.linspace(0, len(group) - 1, half).astype(np.intp)]
-            for group in map(np.flatnonzero, (salsa, ~salsa))
-        ]
-        rows = np.stack(rows, axis=1).ravel()  # alternating, so that any part of them is half salsa
-        return true_bodies(test.poses[rows].astype(np.float64), self.model, np.random.default_rng(0)), salsa[rows]
-
-    @cached_property
-    def targets(self) -> dict[Corruption, tuple[JointTargets, NDArray[np.bool_]]]:
-        """For each setting the targets, and which joints are missing."""
-        keypoints = self.drawn[0].keypoints
-        return {each: corrupt(keypoints, each, np.random.default_rng(1)) for each in SETTINGS}
-
-    @cached_property
-    def outcomes(self) -> dict[Corruption, dict[str, Outcome]]:
-        """By setting, by method."""
-        return {each: {m.name: self._outcome(each, m) for m in self.methods} for each in SETTINGS}
-
-    def _outcome(self, setting: Corruption, method: Method) -> Outcome:
-        targets, missing = self.targets[setting]
-        fitter = method.make(None)
-        fit, in_batches = timed_fit(fitter, targets, BATCH)
-        _, alone = timed_fit(fitter, _first(targets, ALONE), 1)
-        return Outcome(fit, fit_errors(fit, self.drawn[0], missing, self.model), in_batches, alone)
-
-    @cached_property
-    def curves(self) -> dict[Corruption, dict[str, Curve]]:
-        """Error against time, by setting, by method."""
-        truth = self.drawn[0].keypoints[:CURVE_BODIES]
-        return {
-            each: {m.name: curve(m, _first(self.targets[each][0], CURVE_BODIES), truth) for m in self.methods}
-            for each in SETTINGS
-        }
 
 
 def tables(data: Path, images: Path | None) -> dict[str, Table]:
@@ -241,7 +151,7 @@ def speed_table(comparison: Comparison) -> list[str]:
     for method in comparison.methods:
         fitter = method.make(None)
         asked = ((1, BATCH), (1, LARGE_BATCH), (2, LARGE_BATCH))
-        some = _first(targets, 4 * LARGE_BATCH)
+        some = first(targets, 4 * LARGE_BATCH)
         cells = [f"{fits_per_second(fitter, some, batch, workers):.0f}" for workers, batch in asked]
         rows.append(f"| {method.name} | {' | '.join(cells)} |")
     head = f"| fits a second | 1 thread, {BATCH} at a time | 1 thread, {LARGE_BATCH} | 2, {LARGE_BATCH} each |"
@@ -256,7 +166,7 @@ def optimum_lines(comparison: Comparison, rows: int = 8) -> list[str]:
         _rule(6),
     ]
     for setting, (targets, _) in comparison.targets.items():
-        some = _first(targets, rows)
+        some = first(targets, rows)
         found = check_optimum(some, comparison.methods[0].make(None).fit(some))
         gain, elsewhere = found.energy - found.from_there, found.energy - found.from_elsewhere
         worse = int((elsewhere < -0.1).sum())
@@ -305,9 +215,9 @@ def sigma_table(comparison: Comparison) -> list[str]:
 
 def alternation_table(motions: Path, shelf: Path) -> list[str]:
     """The whole pipeline with each fitter, on the same detections."""
-    config = PipelineConfig()
+    config = replace(PipelineConfig(), temporal=False)
     fitters = {"Levenberg-Marquardt": LevenbergMarquardtFitter(config=config.body.plain)}
-    fitters |= {method.name: method.make(None) for method in _learned()[1:]}
+    fitters |= {method.name: method.make(None) for method in learned()[1:]}
     rows = []
     if shelf.is_dir():
         truth, rig = read_shelf_ground_truth(shelf / "gt_dev.txt"), read_rig(shelf / "calibration.json")
@@ -335,20 +245,6 @@ def _reconstructed(
     start = time.process_time()
     people = reconstruct(detections, rig, config, fitter=fitter)
     return people, 1e3 * (time.process_time() - start) / len(detections)
-
-
-def _learned() -> tuple[Method, ...]:
-    try:
-        methods = learned_methods()
-        methods[0].make(None)  # reads the weights
-    except (ImportError, InputError) as error:
-        print(f"(the learned fitter is left out: {error})\n")
-        return ()
-    return methods
-
-
-def _first(targets: JointTargets, count: int) -> JointTargets:
-    return JointTargets(targets.xyz[:count], targets.information[:count])
 
 
 def _mm(value: float) -> str:

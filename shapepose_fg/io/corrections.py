@@ -1,0 +1,151 @@
+"""Corrections of a result's identities, kept beside it: corrections.json, and the result as it was before them."""
+
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from shapepose_fg.errors import InputError
+from shapepose_fg.files import read_json, write_atomically
+from shapepose_fg.io.validation import first_problem, key_text
+from shapepose_fg.provenance import checksums
+from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.tracking.edits import Edit, Edited, Solve, apply, solve_anew, undo
+
+CORRECTIONS, UNCORRECTED = "corrections.json", "uncorrected"
+"""The list of what was corrected, and the folder of the result as it was before."""
+_FORMAT = "shapepose-fg corrections 1"
+_FILES = ("people.npz", "run.json", "observations.npz")
+_CURE = f"copy the files of {UNCORRECTED} back and delete {CORRECTIONS} to begin anew"
+
+Number = Annotated[int, Field(ge=0, lt=2**62)]
+
+
+class _Edit(BaseModel):
+    model_config = ConfigDict(strict=True, extra="forbid")
+    action: Literal["merge", "split", "rename", "drop", "swap"]
+    person: Number
+    other: Number | None = None
+    frame: Number | None = None
+
+
+class _File(BaseModel):
+    model_config = ConfigDict(strict=True, extra="forbid")
+    format: Literal["shapepose-fg corrections 1"]
+    people: str
+    edits: Annotated[list[_Edit], Field(min_length=1)]
+
+
+def read_corrections(folder: str | Path) -> tuple[Edit, ...]:
+    """What was corrected in the result in `folder`, first to last; none where there is no corrections.json.
+
+    InputError, one sentence, where that file is damaged or people.npz is not what the corrections led to.
+    """
+    file = Path(folder) / CORRECTIONS
+    if not file.is_file():
+        return ()
+    try:
+        content = _File.model_validate(read_json(file))
+        edits = tuple(Edit(**edit.model_dump()) for edit in content.edits)
+    except ValidationError as error:
+        place, problem = first_problem(error)
+        raise InputError(f"{file}: {key_text(place)} {problem}; {_CURE}") from None
+    except ValueError as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{file}: {error}; {_CURE}") from None
+    if content.people != _checksum(Path(folder)):
+        raise InputError(f"{file}: people.npz is not what these corrections led to; {_CURE}")
+    return edits
+
+
+def correct(folder: str | Path, edit: Edit, solve: Solve | None = None) -> Edited:
+    """Make one more correction to the result in `folder`, and note it down; returns the result and who changed.
+
+    Who changed is solved anew by `solve`; without it joints and bodies stay as they were. InputError where the
+    correction cannot be made. The first one keeps the result as it was in `uncorrected`.
+    """
+    folder = Path(folder)
+    edits, people = read_corrections(folder), Reconstruction.load(folder)
+    try:
+        edited = apply(people, edit)
+    except ValueError as error:
+        raise InputError(f"{folder}: {error}") from None
+    solved = edited.people if solve is None else solve_anew(edited, solve)
+    _keep(folder)
+    _write(folder, solved, (*edits, edit))
+    return replace(edited, people=solved)
+
+
+def take_back(folder: str | Path, solve: Solve | None = None) -> tuple[Edit, Reconstruction]:
+    """Take the last correction back; returns it and the result without it. InputError where there is none.
+
+    Without any other, the files are again what they were before the first. Of the others, only those people are
+    solved anew whom the last correction touched.
+    """
+    folder = Path(folder)
+    edits = read_corrections(folder)
+    if len(edits) == 0:
+        raise InputError(
+            f"{folder}: there is no correction to take back; shapepose-fg tracks {folder} lists people"
+        )
+    if len(edits) == 1:
+        _restore(folder)
+        return edits[-1], Reconstruction.load(folder)
+    before = undo(Reconstruction.load(folder / UNCORRECTED), Reconstruction.load(folder), edits)
+    people = before.people if solve is None else solve_anew(before, solve)
+    _write(folder, people, edits[:-1])
+    return edits[-1], people
+
+
+def refuse_corrected(folder: Path) -> None:
+    """InputError where `folder` holds a result that was corrected by hand: a new one would make that worthless."""
+    if (folder / CORRECTIONS).exists():
+        raise InputError(
+            f"{folder}: this result was corrected by hand ({CORRECTIONS}); give another folder, or delete it first"
+        )
+
+
+def _write(folder: Path, people: Reconstruction, edits: Sequence[Edit]) -> None:
+    """Save the result, and then what led to it: killed between the two, the next reader is told."""
+    counts = people.run.get("people", {})
+    people.with_run(people=counts | people.counts()).save(folder)
+    kept = [{name: value for name, value in vars(edit).items() if value is not None} for edit in edits]
+    content = {"format": _FORMAT, "people": _checksum(folder), "edits": kept}
+    text = json.dumps(content, indent=1) + "\n"
+    write_atomically(folder / CORRECTIONS, lambda stream: stream.write(text.encode()))
+
+
+def _keep(folder: Path) -> None:
+    """Copy the result aside, before the first correction: whole or not at all."""
+    if (folder / UNCORRECTED).is_dir():
+        return
+    part = folder / f".{UNCORRECTED}.part"
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir()
+    for name in _FILES:
+        if (folder / name).is_file():
+            shutil.copy2(folder / name, part / name)
+    part.rename(folder / UNCORRECTED)
+
+
+def _restore(folder: Path) -> None:
+    """The files as they were before the first correction, which leaves no trace."""
+    for name in _FILES:
+        file = folder / UNCORRECTED / name
+        if file.is_file():
+            content = file.read_bytes()
+            write_atomically(folder / name, lambda stream, content=content: stream.write(content))
+        else:
+            (folder / name).unlink(missing_ok=True)
+    (folder / CORRECTIONS).unlink()
+    shutil.rmtree(folder / UNCORRECTED)
+
+
+def _checksum(folder: Path) -> str:
+    """Which people.npz it is."""
+    return next(iter(checksums([folder / "people.npz"]).values()))

@@ -1,0 +1,57 @@
+"""What a saved result was solved with: its cameras, its settings, and where the detector puts its joints."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
+from shapepose_fg.camera import Rig
+from shapepose_fg.errors import InputError
+from shapepose_fg.io.calibration import read_rig
+from shapepose_fg.io.config import config_from
+from shapepose_fg.reconstruction import Reconstruction
+
+CAMERAS = "cameras.json"
+"""The cameras of a result, as a rig file of our own, beside its people.npz."""
+
+Settings = TypeVar("Settings")
+
+
+@dataclass(frozen=True)
+class SolvedSetup(Generic[Settings]):
+    """Enough to solve rows of a result anew from its observations."""
+
+    rig: Rig
+    """The cameras, in the order of the observations' views."""
+    settings: Settings
+    """The settings."""
+    offsets: KeypointOffsets | None
+    """Where the detector puts its joints on the body; None where that was not asked for."""
+    body: Path | None
+    """File of the body model; None for the one that ships."""
+
+
+def read_setup(folder: Path, people: Reconstruction, kind: type[Settings]) -> SolvedSetup[Settings]:
+    """The setup of the result `people` that was loaded from `folder`; `kind` is the class of its settings.
+
+    InputError, one sentence, where a file is missing or damaged, or the settings are another version's.
+    """
+    run_file = folder / "run.json"
+    rig = read_rig(folder / CAMERAS)
+    table = people.observations
+    if table is not None and tuple(table.view_names.tolist()) != tuple(rig.names):
+        raise InputError(
+            f"{folder / CAMERAS}: the cameras are not those of observations.npz; reconstruct the recording again"
+        )
+    configuration: Any = people.run.get("configuration")
+    if not isinstance(configuration, dict):
+        raise InputError(f"{run_file}: configuration is missing; reconstruct the recording again")
+    settings = config_from(configuration, kind, run_file)
+    learnt = people.run.get("keypoint_offsets") is not None
+    body = people.run.get("body")
+    return SolvedSetup(
+        rig=rig,
+        settings=settings,
+        offsets=KeypointOffsets.load(run_file) if learnt else None,
+        body=None if body is None else Path(str(body)),
+    )

@@ -1,0 +1,246 @@
+"""Corrections of identities by hand: who is whom is changed row by row, and what has to be solved anew is named.
+
+Every correction is a function of a result to a result; nothing is read or written here. A person's body has one
+shape over all frames, so a person whose rows changed is solved anew as a whole, and nobody else.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.reconstruction import Reconstruction
+
+Solve = Callable[[Reconstruction], Reconstruction]
+"""Rows of some people with their `observations` to rows of the same people, solved anew; other frames may join."""
+
+
+class Action(StrEnum):
+    """What is done to identities."""
+
+    MERGE = "merge"
+    """The rows of `other` become `person`'s."""
+    SPLIT = "split"
+    """The rows of `person` from `frame` on become `other`'s, who is new."""
+    RENAME = "rename"
+    """`person` gets the number `other`, which is free."""
+    DROP = "drop"
+    """The rows of `person` are taken out."""
+    SWAP = "swap"
+    """From `frame` on `person` and `other` change places."""
+
+
+_OTHER = frozenset({Action.MERGE, Action.SPLIT, Action.RENAME, Action.SWAP})
+_FRAME = frozenset({Action.SPLIT, Action.SWAP})
+
+
+@dataclass(frozen=True)
+class Edit:
+    """One correction."""
+
+    action: Action
+    """What is done."""
+    person: int
+    """The identity that it is done to."""
+    other: int | None = None
+    """The second identity, where there is one."""
+    frame: int | None = None
+    """First frame that is changed, where not all are."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "action", Action(self.action))
+        for what, value, actions in (("second person", self.other, _OTHER), ("frame", self.frame, _FRAME)):
+            if (value is not None) != (self.action in actions):
+                raise ValueError(f"{self.action} needs {'a' if self.action in actions else 'no'} {what}")
+
+    def __str__(self) -> str:
+        """The correction as it is typed."""
+        words = {
+            Action.MERGE: f"{self.person} {self.other}",
+            Action.SPLIT: f"{self.person} {self.frame} --new {self.other}",
+            Action.RENAME: f"{self.person} {self.other}",
+            Action.DROP: f"{self.person}",
+            Action.SWAP: f"{self.person} {self.other} {self.frame}",
+        }
+        return f"{self.action} {words[self.action]}"
+
+
+@dataclass(frozen=True)
+class Edited:
+    """A result with other identities."""
+
+    people: Reconstruction
+    """The rows with their new identities, joints and bodies as they were."""
+    changed: frozenset[int] = frozenset()
+    """Identities whose rows are not what they were solved from: these are to be solved anew."""
+
+    @property
+    def spans(self) -> dict[int, range]:
+        """The frames of each changed identity, first to last."""
+        frames = {person: self.people.frame[self.people.person == person] for person in sorted(self.changed)}
+        return {person: range(int(rows.min()), int(rows.max()) + 1) for person, rows in frames.items()}
+
+
+def free_number(people: Reconstruction) -> int:
+    """The number that a new identity gets."""
+    return int(people.person.max(initial=-1)) + 1
+
+
+def apply(people: Reconstruction, edit: Edit) -> Edited:
+    """`people` after one correction; ValueError, with the cure, where it cannot be made."""
+    return _EDITS[edit.action](people, edit)
+
+
+def replay(people: Reconstruction, edits: Sequence[Edit]) -> Edited:
+    """`people` after several corrections, one after the other; what is to be solved anew after all of them."""
+    edited = Edited(people)
+    for edit in edits:
+        earlier, edited = edited.changed, apply(edited.people, edit)
+        if edit.action is Action.RENAME and edit.person in earlier and edit.other is not None:
+            earlier = earlier - {edit.person} | {edit.other}
+        left = frozenset(edited.people.person.tolist())
+        edited = replace(edited, changed=(earlier | edited.changed) & left)
+    return edited
+
+
+def undo(original: Reconstruction, current: Reconstruction, edits: Sequence[Edit]) -> Edited:
+    """`original` after all of `edits` but the last, where `current` is what they all led to.
+
+    What the last one did not touch has been solved since, and is taken from `current`.
+    """
+    before, last = replay(original, edits[:-1]), edits[-1]
+    touched = {last.person, last.other} - {None}
+    settled = np.array(sorted(before.changed - touched), dtype=np.int64)
+    if len(settled) == 0:
+        return before
+    kept = before.people.rows(~np.isin(before.people.person, settled))
+    since = replace(current.rows(np.isin(current.person, settled)), run=kept.run)
+    return Edited(in_order(Reconstruction.concatenate([kept, since])), before.changed & touched)
+
+
+def solve_anew(edited: Edited, solve: Solve) -> Reconstruction:
+    """The result with the identities that changed solved anew by `solve`, and nobody else.
+
+    ValueError where the result does not say what its rows were solved from, or `solve` returns other people.
+    """
+    people, changed = edited.people, np.array(sorted(edited.changed), dtype=np.int64)
+    if len(changed) == 0:
+        return people
+    if people.observations is None:
+        raise ValueError("people without observations cannot be solved anew; reconstruct them again")
+    touched = np.isin(people.person, changed)
+    solved = solve(people.rows(touched))
+    if not np.isin(solved.person, changed).all() or solved.observations is None:
+        raise ValueError("solve must return rows, with their observations, of the people that it was given")
+    return in_order(Reconstruction.concatenate([people.rows(~touched), replace(solved, run=people.run)]))
+
+
+def in_order(people: Reconstruction) -> Reconstruction:
+    """The rows sorted by frame, then by person."""
+    return people.rows(np.lexsort((people.person, people.frame)))
+
+
+def _merge(people: Reconstruction, edit: Edit) -> Edited:
+    one, other = _rows_of(people, edit.person), _rows_of(people, _other(edit))
+    both = np.intersect1d(people.frame[one], people.frame[other])
+    if edit.person == edit.other:
+        raise ValueError(f"merge needs two people, got {edit.person} twice")
+    if len(both) > 0:
+        raise ValueError(
+            f"{edit.person} and {edit.other} are both there in {len(both)} frames, the first is {both[0]}:"
+            " they are two people; split one of them there, or drop one"
+        )
+    return _relabelled(people, {_other(edit): edit.person}, other, changed={edit.person})
+
+
+def _split(people: Reconstruction, edit: Edit) -> Edited:
+    rows, frame = _rows_of(people, edit.person), _frame(edit)
+    _refuse_taken(people, edit)
+    later = rows & (people.frame >= frame)
+    if not later.any() or (later == rows).all():
+        frames = people.frame[rows]
+        raise ValueError(
+            f"{edit.person} is there in frames {frames.min()} to {frames.max()}, and cannot be split at {frame};"
+            f" give a frame from {frames.min() + 1} to {frames.max()}"
+        )
+    return _relabelled(people, {edit.person: _other(edit)}, later, changed={edit.person, _other(edit)})
+
+
+def _rename(people: Reconstruction, edit: Edit) -> Edited:
+    rows = _rows_of(people, edit.person)
+    _refuse_taken(people, edit)
+    return _relabelled(people, {edit.person: _other(edit)}, rows, changed=set())
+
+
+def _drop(people: Reconstruction, edit: Edit) -> Edited:
+    return Edited(people.rows(~_rows_of(people, edit.person)))
+
+
+def _swap(people: Reconstruction, edit: Edit) -> Edited:
+    one, other = _rows_of(people, edit.person), _rows_of(people, _other(edit))
+    if edit.person == edit.other:
+        raise ValueError(f"swap needs two people, got {edit.person} twice")
+    later = (one | other) & (people.frame >= _frame(edit))
+    if not later.any():
+        last = people.frame[one | other].max()
+        raise ValueError(
+            f"neither {edit.person} nor {edit.other} is there from frame {edit.frame} on; give one up to {last}"
+        )
+    names = {edit.person: _other(edit), _other(edit): edit.person}
+    if later.sum() == (one | other).sum():  # from before both began: they only change names
+        return _relabelled(people, names, later, changed=set())
+    return _relabelled(people, names, later, changed={edit.person, _other(edit)})
+
+
+_EDITS: dict[Action, Callable[[Reconstruction, Edit], Edited]] = {
+    Action.MERGE: _merge,
+    Action.SPLIT: _split,
+    Action.RENAME: _rename,
+    Action.DROP: _drop,
+    Action.SWAP: _swap,
+}
+
+
+def _relabelled(
+    people: Reconstruction, names: dict[int, int], rows: NDArray[np.bool_], changed: set[int]
+) -> Edited:
+    """`people` with other identities in `rows` (N,); identities that lost all their rows are not to be solved."""
+    person = people.person.copy()
+    for old, new in names.items():
+        person[rows & (people.person == old)] = new
+    return Edited(in_order(people.relabelled(person)), frozenset(changed) & frozenset(person.tolist()))
+
+
+def _rows_of(people: Reconstruction, person: int) -> NDArray[np.bool_]:
+    """(N,) the rows of one identity; ValueError where there is nobody of that number."""
+    rows = people.person == person
+    if not rows.any():
+        known = np.unique(people.person).tolist()
+        listed = " ".join(map(str, known[:20])) + (f" and {len(known) - 20} more" if len(known) > 20 else "")
+        raise ValueError(f"there is no person {person}; there are {listed or 'none'}")
+    return rows
+
+
+def _refuse_taken(people: Reconstruction, edit: Edit) -> None:
+    """ValueError where the number that is to be given belongs to somebody, or cannot be one."""
+    if _other(edit) < 0:
+        raise ValueError(f"{edit.other} cannot be a person's number; give one from 0")
+    if (people.person == edit.other).any():
+        raise ValueError(
+            f"{edit.other} is somebody already; give another number such as {free_number(people)}, or merge"
+            f" {edit.person} and {edit.other}"
+        )
+
+
+def _other(edit: Edit) -> int:
+    """The second identity of a correction that has one."""
+    assert edit.other is not None
+    return edit.other
+
+
+def _frame(edit: Edit) -> int:
+    """The frame of a correction that has one."""
+    assert edit.frame is not None
+    return edit.frame

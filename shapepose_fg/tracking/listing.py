@@ -1,0 +1,95 @@
+"""Who is in a result: each identity's frames, gaps, stature, and how far it walked."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.body.model.smpl_file import SmplArrays
+from shapepose_fg.body.shapes import statures_m
+from shapepose_fg.frame_times import ASSUMED_FPS
+from shapepose_fg.reconstruction import Known, Reconstruction
+
+_STEP_S = 0.5
+"""Walked distance is measured between mean places of this long: a joint's noise, summed up, is no walk."""
+_STILL_M = 0.05
+"""Between two such places, less than this is no walk either."""
+
+
+@dataclass(frozen=True)
+class TrackSummary:
+    """One identity of a result."""
+
+    person: int
+    """Its number."""
+    first: int
+    """First frame."""
+    last: int
+    """Last frame."""
+    rows: int
+    """Frames in which it is there."""
+    gaps: int
+    """Stretches between first and last in which it is not."""
+    stature_m: float
+    """Height of its mean body in T-pose, metres; NaN where it has no body."""
+    confidence: float
+    """Mean confidence of its joints, 0 to 1."""
+    seen: float
+    """Share of its placed joints that a view saw; NaN where the result does not say."""
+    walked_m: float
+    """How far it walked, metres: from half second to half second, steps under 5 cm left out."""
+
+
+def list_tracks(people: Reconstruction, body: SmplArrays | None = None) -> list[TrackSummary]:
+    """The identities of `people`, by number; statures on the model `body`, and NaN without one."""
+    order = np.lexsort((people.frame, people.person))
+    persons, first = np.unique(people.person[order], return_index=True)
+    if len(persons) == 0:
+        return []
+    tracks = np.split(order, first[1:])
+    betas = np.stack([_mean_betas(people.betas[rows]) for rows in tracks])
+    statures = np.full(len(tracks), np.nan) if body is None else statures_m(betas, body)
+    return [
+        _summary(people, int(person), rows, float(stature))
+        for person, rows, stature in zip(persons, tracks, statures, strict=True)
+    ]
+
+
+def _mean_betas(betas: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(10,) the mean shape of one person's rows (N, 10); NaN where none has a body."""
+    fitted = np.isfinite(betas).all(axis=1)
+    return betas[fitted].mean(axis=0) if fitted.any() else np.full(betas.shape[1], np.nan)
+
+
+def _summary(people: Reconstruction, person: int, rows: NDArray[np.intp], stature_m: float) -> TrackSummary:
+    """The summary of the identity in `rows`, which are sorted by frame."""
+    frame, known = people.frame[rows], people.known[rows]
+    placed = np.isfinite(people.joints[rows]).all(axis=-1)
+    told = placed & (known != Known.UNKNOWN)
+    return TrackSummary(
+        person=person,
+        first=int(frame[0]),
+        last=int(frame[-1]),
+        rows=len(rows),
+        gaps=int((np.diff(frame) > 1).sum()),
+        stature_m=stature_m,
+        confidence=float(people.confidence[rows].mean()),
+        seen=float((known[told] == Known.SEEN).mean()) if told.any() else float("nan"),
+        walked_m=_walked_m(people, rows),
+    )
+
+
+def _walked_m(people: Reconstruction, rows: NDArray[np.intp]) -> float:
+    """How far the middle of a person's placed joints went: hips alone may be hidden."""
+    count = np.isfinite(people.joints[rows].sum(axis=-1)).sum(axis=1)
+    rows, count = rows[count > 0], count[count > 0]
+    if len(rows) == 0:
+        return 0.0
+    middle = np.nansum(people.joints[rows], axis=1) / count[:, None]
+    time_s = people.time_s[rows]
+    time_s = np.where(np.isfinite(time_s), time_s, people.frame[rows] / ASSUMED_FPS)
+    _, step = np.unique(np.floor((time_s - time_s[0]) / _STEP_S), return_inverse=True)
+    size = np.bincount(step)
+    place = np.stack([np.bincount(step, middle[:, axis]) / size for axis in range(3)], axis=1)
+    apart_m = np.linalg.norm(np.diff(place, axis=0), axis=1)
+    return float(apart_m[apart_m > _STILL_M].sum())

@@ -1,0 +1,180 @@
+"""The command `tracks`: who is in a result over time, and who is who, corrected by hand."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+    from shapepose_fg.body.model.smpl_file import SmplArrays
+    from shapepose_fg.reconstruction import Reconstruction
+
+# Everything else is imported inside the commands: `--help` must not wait for it.
+
+tracks = typer.Typer(invoke_without_command=True)
+
+Person = Annotated[int, typer.Argument(metavar="A", help="Number of a person.", min=0)]
+Other = Annotated[int, typer.Argument(metavar="B", help="Number of another person.", min=0)]
+From = Annotated[int, typer.Argument(metavar="FRAME", help="First frame that changes.", min=0)]
+
+
+@tracks.callback()
+def people_over_time(
+    context: typer.Context,
+    results: Annotated[Path, typer.Argument(metavar="RESULTS", help="Folder of a reconstruction.")],
+) -> None:
+    """List the people of a result over time, or correct who is who: shapepose-fg tracks RESULTS merge 3 9.
+
+    Without a command everybody is listed. The result as it was before the first correction stays in
+    RESULTS/uncorrected, and `undo` takes corrections back one by one.
+    """
+    context.obj = results
+    if context.invoked_subcommand is None:
+        list_people(context)
+
+
+@tracks.command("list")
+def list_people(
+    context: typer.Context,
+    as_json: Annotated[bool, typer.Option("--json", help="Print them as JSON.")] = False,
+) -> None:
+    """Everybody: frames, gaps, stature, how often seen, how far they walked."""
+    from shapepose_fg.reconstruction import Reconstruction
+    from shapepose_fg.tracking.listing import list_tracks
+
+    people = Reconstruction.load(context.obj)
+    if not as_json:
+        _print(_tracks_table(context.obj, people))
+        return
+    listed = [asdict(track) for track in list_tracks(people, _body_of(people))]
+    plain = [{name: None if value != value else value for name, value in track.items()} for track in listed]
+    print(json.dumps(plain, indent=2, allow_nan=False))
+
+
+@tracks.command("merge")
+def merge_people(context: typer.Context, person: Person, other: Other) -> None:
+    """B is A: B's rows become A's."""
+    _correct(context, "merge", person, other=other)
+
+
+@tracks.command("split")
+def split_person(
+    context: typer.Context,
+    person: Person,
+    frame: From,
+    new: Annotated[
+        int | None, typer.Option(help="Number of the new person; by default the next free one.")
+    ] = None,
+) -> None:
+    """From FRAME on A is somebody else: a new person."""
+    _correct(context, "split", person, other=new, frame=frame)
+
+
+@tracks.command("rename")
+def rename_person(context: typer.Context, person: Person, other: Other) -> None:
+    """A gets the number B, which must be free."""
+    _correct(context, "rename", person, other=other)
+
+
+@tracks.command("drop")
+def drop_person(context: typer.Context, person: Person) -> None:
+    """A is nobody: A's rows are taken out."""
+    _correct(context, "drop", person)
+
+
+@tracks.command("swap")
+def swap_people(context: typer.Context, person: Person, other: Other, frame: From) -> None:
+    """From FRAME on A is B and B is A."""
+    _correct(context, "swap", person, other=other, frame=frame)
+
+
+@tracks.command("undo")
+def undo_correction(context: typer.Context) -> None:
+    """Take the last correction back."""
+    from shapepose_fg.io.corrections import take_back
+
+    edit, people = take_back(_folder(context.obj))
+    print(f"taken back: {edit}")
+    _print(_tracks_table(context.obj, people))
+
+
+def _folder(results: Path) -> Path:
+    """The folder of a result, which may be given as its people.npz too."""
+    return results.parent if results.name == "people.npz" else results
+
+
+def _tracks_table(results: Path, people: "Reconstruction") -> "RenderableType":
+    """Everybody of a result, and what was corrected."""
+    from rich.console import Group
+    from rich.padding import Padding
+    from rich.table import Table
+
+    from shapepose_fg.frame_times import rate_words
+    from shapepose_fg.io.corrections import read_corrections
+    from shapepose_fg.tracking.listing import list_tracks
+
+    listed = list_tracks(people, _body_of(people))
+    table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
+    for name in ("person", "frames", "rows", "gaps", "stature", "seen", "confidence", "walked"):
+        table.add_column(name, justify="right")
+    for track in listed:
+        table.add_row(
+            str(track.person),
+            f"{track.first}-{track.last}",
+            str(track.rows),
+            str(track.gaps),
+            _or_dash(track.stature_m, "{:.2f} m"),
+            _or_dash(100 * track.seen, "{:.0f} %"),
+            f"{track.confidence:.2f}",
+            f"{track.walked_m:.1f} m",
+        )
+    lines = [f"{len(listed)} people, {len(people)} rows{rate_words(people.run)}"]
+    if not people.run.get("configuration", {}).get("temporal", True):
+        lines.append("every frame stands alone here: a number is nobody's over time")
+    edits = read_corrections(_folder(results))
+    if len(edits) > 0:
+        lines.append(f"corrected: {'; '.join(map(str, edits))}")
+    return Group(*([table] if listed else []), Padding("\n".join(lines), (1 if listed else 0, 0, 0, 0)))
+
+
+def _or_dash(value: float, text: str) -> str:
+    """`value` as `text` formats it; a dash where it is NaN."""
+    return "-" if value != value else text.format(value)
+
+
+def _body_of(people: "Reconstruction") -> "SmplArrays | None":
+    """The body model that a result was made with; None where its file is not there any more."""
+    from shapepose_fg.body.shapes import read_body
+
+    file = people.run.get("body")
+    if file is None:
+        return read_body()
+    return read_body(Path(file)) if Path(file).is_file() else None
+
+
+def _correct(context: typer.Context, action: str, person: int, **more: int | None) -> None:
+    """Make one correction, and say what came of it."""
+    from shapepose_fg.io.corrections import correct
+    from shapepose_fg.reconstruction import Reconstruction
+    from shapepose_fg.tracking.edits import Action, Edit, free_number
+
+    folder = _folder(context.obj)
+    if action == "split" and more["other"] is None:
+        more["other"] = free_number(Reconstruction.load(folder))
+    edit = Edit(Action(action), person, **more)
+    edited = correct(folder, edit)
+    unsolved = "; joints and bodies stay as they were solved" if len(edited.changed) > 0 else ""
+    print(f"done: {edit}{unsolved}")
+    _print(_tracks_table(context.obj, edited.people))
+    print(f"take it back: shapepose-fg tracks {context.obj} undo")
+
+
+def _print(content: "RenderableType") -> None:
+    """Print on stdout; with colours on a terminal only."""
+    from rich.console import Console
+
+    Console().print(content)
