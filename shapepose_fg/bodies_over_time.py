@@ -39,8 +39,8 @@ def with_bodies_over_time(
 ) -> Reconstruction:
     """The same rows with one body per person, fitted to the joints as they were solved, and everybody's shape.
 
-    `known` are shapes from other recordings, by the number of the identity. Nothing of this returns into the joints
-    or their covariances. Rows without a body keep the body that they had.
+    `known` are shapes from other recordings, by the number of the identity. Nothing of this returns into the
+    joints or their covariances. Rows without a body keep the body that they had.
     """
     if len(people) == 0:
         return people

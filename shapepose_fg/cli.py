@@ -130,7 +130,7 @@ def reconstruct(
     settings = settings if temporal is None else replace(settings, temporal=temporal)
     if shapes is not None and not settings.temporal:
         raise InputError("--shapes: a person's shape is known over time only; leave out --shapes or --no-temporal")
-    fitter = _fitter(body, settings)
+    fitter = _fitter(body, settings, recording.skeleton.joints)
     known = None if shapes is None else _known_shapes(shapes, body)
     start = time.perf_counter()
     with _progress("reconstructing") as progress:
@@ -370,14 +370,14 @@ def _prepare(output: Path) -> None:
         ) from None
 
 
-def _fitter(body: Path | None, settings: "PipelineConfig") -> "BodyFitter | None":
+def _fitter(body: Path | None, settings: "PipelineConfig", joints: tuple[str, ...]) -> "BodyFitter | None":
     """The body fitter with the model of the file `body`; without one, the pipeline takes its own."""
     if body is None:
         return None
     from shapepose_fg.body.fitting.fitters import make_fitter
     from shapepose_fg.body.model.body_model import BodyModel
 
-    return make_fitter(settings.body, BodyModel.load(body))
+    return make_fitter(settings.body, BodyModel.load(body).with_keypoints(joints))
 
 
 @contextmanager
@@ -417,9 +417,10 @@ def _summary(people: "Reconstruction", span: range, camera_count: int, seconds: 
     table.add_row(
         "frames", f"{len(span)} ({span.start}:{span.stop}) of {camera_count} cameras{rate_words(people.run)}"
     )
-    table.add_row(
-        "people", f"{len(people)} in all, {per_frame.mean():.1f} a frame ({per_frame.min()} to {per_frame.max()})"
-    )
+    over_time = people.run.get("configuration", {}).get("temporal", False)
+    count = f"{len(np.unique(people.person))} people over time" if over_time else "no identities"
+    table.add_row("people", f"{count}, {per_frame.mean():.1f} a frame ({per_frame.min()} to {per_frame.max()})")
+    table.add_row("rows", f"{len(people)} in all")
     for status, count in zip(*np.unique(people.status, return_counts=True), strict=True):
         table.add_row("", f"{count} {status}", style="green" if status == "ok" else "yellow")
     for reason, count in people.run.get("people", {}).get("dropped", {}).items():

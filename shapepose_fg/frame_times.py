@@ -80,7 +80,8 @@ def rate_words(run: Mapping[str, Any]) -> str:
     told = run.get("time") or {}
     if told.get("fps") is None:
         return ""
-    return f", {told['fps']:.4g} a second" + (" (assumed: give --fps)" if told["source"] == "assumed" else "")
+    assumed = " (assumed: give --fps)" if told.get("source") == "assumed" else ""
+    return f", {told['fps']:.4g} a second{assumed}"
 
 
 def check_cuts(cuts: Sequence[int], frames: int) -> tuple[int, ...]:

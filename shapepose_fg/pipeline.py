@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from shapepose_fg.bodies_over_time import SequenceFitting, with_bodies_over_time
 from shapepose_fg.body.fitting.bone_reach import longest_bones
 from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.fitting.fitters import BodyConfig, make_fitter
@@ -17,7 +18,6 @@ from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.offsets.estimation import learn_offsets
 from shapepose_fg.body.shapes import SubjectShapes
 from shapepose_fg.body.threads import torch_threads
-from shapepose_fg.bodies_over_time import SequenceFitting, with_bodies_over_time
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections, DetectionSequence
 from shapepose_fg.estimation.alternation import EstimatorConfig, RefineConfig
@@ -32,7 +32,7 @@ from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
 from shapepose_fg.estimation.window_graph import WindowGraphConfig
 from shapepose_fg.frame_times import FrameTimes, check_cuts, stretches
-from shapepose_fg.observation_table import Gate, ObservationTable, place_in_view
+from shapepose_fg.observation_table import place_in_view
 from shapepose_fg.observations import Observations
 from shapepose_fg.proposal.association import AssociationConfig, associate
 from shapepose_fg.proposal.candidates import CandidateConfig, triangulate_pairs, vote
@@ -40,7 +40,9 @@ from shapepose_fg.proposal.proposals import ProposalConfig, propose
 from shapepose_fg.provenance import versions
 from shapepose_fg.reconstruction import Reconstruction
 from shapepose_fg.skeleton import BODY_25, Skeleton
+from shapepose_fg.solved_rows import result_rows
 from shapepose_fg.tracking.following import FollowingConfig, Input
+from shapepose_fg.tracking.stitching import StitchingConfig, stitch
 from shapepose_fg.tracking.tracker import BodyScale, Tracker, TrackingConfig
 from shapepose_fg.windows import Engine, Solved, WindowConfig
 
@@ -67,6 +69,8 @@ class PipelineConfig:
     """People over time: how they are followed from frame to frame."""
     following: FollowingConfig = field(default_factory=FollowingConfig)
     """People over time: what becomes of tracks."""
+    stitching: StitchingConfig = field(default_factory=StitchingConfig)
+    """People over time: who comes back after a longer time out of sight."""
     windows: WindowConfig = field(default_factory=WindowConfig)
     """People over time: how frames are cut into windows, and how often detections are given out again."""
     window_graph: WindowGraphConfig = field(default_factory=WindowGraphConfig)
@@ -141,6 +145,9 @@ def reconstruct(
             if progress is not None:
                 progress(done, len(frames))
         people = Reconstruction.concatenate(parts) if parts else Reconstruction.empty(detections.skeleton.joints)
+        if config.temporal:
+            with run.stage("follow"):
+                people = _stitched(people, detections.skeleton, config, times.frame_s[list(cuts)])
         if config.temporal and isinstance(fitter, SequenceFitting):
             with run.stage("bodies over time"):
                 people = with_bodies_over_time(people, fitter, shapes)
@@ -277,40 +284,20 @@ def _rows(solved: Solved, rig: Rig, detections: DetectionSequence, config: Pipel
     order = np.lexsort((solved.observations.track, solved.observations.frame))
     rows, estimates = solved.observations.rows(order), solved.estimates.rows(order)
     person = rows.track if config.temporal else _number_in_frame(rows.frame)
-    fit = estimates.fit
-    body = {name: getattr(fit, name).copy() for name in ("betas", "global_orient", "body_pose", "transl")}
-    for values in body.values():
-        values[~fit.ok] = np.nan
-    joint_names = detections.skeleton.joints
     place = np.full(rows.candidate.shape, -1, dtype=np.int32)
     for frame in np.unique(rows.frame).tolist():
         of_frame = rows.frame == frame
         place[of_frame] = place_in_view(rows.candidate[of_frame], detections[frame].view)
-    table = ObservationTable.of(
-        rows,
-        place,
-        estimates.joints,
-        np.where(estimates.inlier, Gate.USED, Gate.TOO_FAR),
-        rig,
-        frame=rows.frame,
-        person=person,
-        joint_names=joint_names,
-    )
-    return Reconstruction(
-        frame=rows.frame,
-        person=person,
-        time_s=rows.time_s.mean(axis=1),
-        joint_names=np.array(joint_names),
-        joints=estimates.joints,
-        covariance=estimates.covariance,
-        velocity=estimates.velocity,
-        velocity_covariance=estimates.velocity_covariance,
-        known=estimates.known,
-        confidence=estimates.confidence,
-        status=estimates.status,
-        observations=table,
-        **body,
-    )
+    return result_rows(rows, estimates, place, rig, detections.skeleton.joints, person)
+
+
+def _stitched(
+    people: Reconstruction, skeleton: Skeleton, config: PipelineConfig, cuts_s: np.ndarray
+) -> Reconstruction:
+    """The same rows, tracks of one person joined over longer times out of sight."""
+    person = stitch(people.person, people.time_s, people.joints, skeleton, config.stitching, cuts_s.tolist())
+    table = None if people.observations is None else replace(people.observations, person=person)
+    return replace(people, person=person, observations=table)
 
 
 def _number_in_frame(frame: np.ndarray) -> np.ndarray:

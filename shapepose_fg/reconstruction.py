@@ -16,7 +16,7 @@ from shapepose_fg.columns import check_codes, checked, code_names, npz_bytes, re
 from shapepose_fg.errors import InputError
 from shapepose_fg.files import read_json, write_atomically
 from shapepose_fg.observation_table import ObservationTable
-from shapepose_fg.run_summary import merged_run, plain
+from shapepose_fg.run_summary import check_run, merged_run, plain
 from shapepose_fg.skeleton import BODY_25
 
 
@@ -238,6 +238,10 @@ class Reconstruction:
         run = read_json(run_file) if run_file.is_file() else {}
         if not isinstance(run, dict):
             raise InputError(f"{run_file}: must hold an object; restore it or delete it")
+        try:
+            check_run(run)
+        except ValueError as error:
+            raise InputError(f"{run_file}: {error}; restore it or delete it") from None
         given: dict[str, Any] = {name: columns[name] for name in (*cls.ROWS, "joint_names") if name in columns}
         try:
             people = cls(**given, run=run)

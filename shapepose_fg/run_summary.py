@@ -1,6 +1,7 @@
 """What run.json of several results says when their rows are put together."""
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -51,8 +52,35 @@ def covered_frames(run: Mapping[str, Any]) -> list[range] | None:
     try:
         spans = frames if np.ndim(frames) == 2 else [frames]
         return [range(int(start), int(stop)) for start, stop in spans]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(f'"frames" must be [start, stop] or a list of those, got {frames!r}') from None
+
+
+def check_run(run: Mapping[str, Any]) -> None:
+    """ValueError where an entry that is read again is not what it must be; other entries may be anything."""
+    for key in ("configuration", "versions", "inputs", "seconds", "people", "time"):
+        if not isinstance(run.get(key, {}), dict):
+            raise ValueError(f'"{key}" must be an object, got {_short(run[key])}')
+    for key, values in (("seconds", run.get("seconds", {})), ("time", {"fps": run.get("time", {}).get("fps")})):
+        for name, value in values.items():
+            if not (value is None and name == "fps") and not _is_number(value):
+                raise ValueError(f'"{key}.{name}" must be a number, got {_short(value)}')
+    cuts = run.get("cuts", [])
+    if not isinstance(cuts, list) or not all(type(cut) is int and cut >= 0 for cut in cuts):
+        raise ValueError(f'"cuts" must be a list of frame numbers, got {_short(cuts)}')
+    if not isinstance(run.get("body"), str | None):
+        raise ValueError(f'"body" must be the name of a file or null, got {_short(run["body"])}')
+    covered_frames(run)
+
+
+def _short(value: object) -> str:
+    """A value as a message shows it."""
+    text = repr(value)
+    return text if len(text) <= 40 else f"{text[:40]}..."
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def plain(value: object) -> object:

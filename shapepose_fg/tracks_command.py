@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
     from shapepose_fg.body.model.smpl_file import SmplArrays
     from shapepose_fg.reconstruction import Reconstruction
+    from shapepose_fg.tracking.edits import Edited, Solve
 
 # Everything else is imported inside the commands: `--help` must not wait for it.
 
@@ -97,7 +98,8 @@ def undo_correction(context: typer.Context) -> None:
     """Take the last correction back."""
     from shapepose_fg.io.corrections import take_back
 
-    edit, people = take_back(_folder(context.obj))
+    folder = _folder(context.obj)
+    edit, people = take_back(folder, _solver(folder))
     print(f"taken back: {edit}")
     _print(_tracks_table(context.obj, people))
 
@@ -166,11 +168,52 @@ def _correct(context: typer.Context, action: str, person: int, **more: int | Non
     if action == "split" and more["other"] is None:
         more["other"] = free_number(Reconstruction.load(folder))
     edit = Edit(Action(action), person, **more)
-    edited = correct(folder, edit)
-    unsolved = "; joints and bodies stay as they were solved" if len(edited.changed) > 0 else ""
-    print(f"done: {edit}{unsolved}")
+    solve = _solver(folder)
+    edited = correct(folder, edit, solve)
+    print(f"done: {edit}{_solved_words(edited, solve)}")
     _print(_tracks_table(context.obj, edited.people))
     print(f"take it back: shapepose-fg tracks {context.obj} undo")
+
+
+def _solver(folder: Path) -> "Solve | None":
+    """What solves rows of the result in `folder` anew.
+
+    None where the result does not hold what that takes, or without time: then every row is solved by itself,
+    whoever it is.
+    """
+    from shapepose_fg.files import read_json
+    from shapepose_fg.io.solved_setup import CAMERAS
+
+    needed = [folder / name for name in ("run.json", "observations.npz", CAMERAS)]
+    if not all(file.is_file() for file in needed):
+        return None
+    if not read_json(needed[0]).get("configuration", {}).get("temporal", False):
+        return None
+
+    def solve(rows: "Reconstruction") -> "Reconstruction":
+        from shapepose_fg.body.fitting.fitters import make_fitter
+        from shapepose_fg.body.model.body_model import BodyModel
+        from shapepose_fg.io.solved_setup import read_setup
+        from shapepose_fg.pipeline import PipelineConfig
+        from shapepose_fg.solving import solve_rows
+
+        setup = read_setup(folder, rows, PipelineConfig)
+        model = BodyModel.default() if setup.body is None else BodyModel.load(setup.body)
+        fitter = make_fitter(setup.settings.body, model.with_keypoints(tuple(rows.joint_names.tolist())))
+        if setup.offsets is not None:
+            fitter = fitter.with_keypoint_offsets(setup.offsets)
+        return solve_rows(rows, setup.rig, setup.settings, fitter)
+
+    return solve
+
+
+def _solved_words(edited: "Edited", solve: "Solve | None") -> str:
+    """Who was solved anew, in words."""
+    if len(edited.changed) == 0:
+        return ""
+    if solve is None:
+        return "; joints and bodies stay as they were solved"
+    return f"; solved anew: {' '.join(map(str, sorted(edited.changed)))}"
 
 
 def _print(content: "RenderableType") -> None:

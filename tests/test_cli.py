@@ -91,7 +91,8 @@ def test_reconstruct_writes_results_and_says_what_it_found(recording, pipeline, 
     words = " ".join(printed.out.split())
     for part in (
         "5 (0:5) of 2 cameras, 30 a second (assumed: give --fps)",
-        "10 in all, 2.0 a frame (2 to 2)",
+        "no identities, 2.0 a frame (2 to 2)",
+        "rows 10 in all",
         "5 ok",
         "5 too few views",
     ):

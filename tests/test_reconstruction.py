@@ -417,3 +417,24 @@ def test_a_file_that_is_damaged_anywhere_is_one_sentence_or_none(tmp_path, file)
             refused += 1
             assert str(error).startswith(f"{path}: ") and "\n" not in str(error)
     assert refused > 200
+
+
+@pytest.mark.parametrize(
+    ("run", "sentence"),
+    [
+        ({"configuration": []}, '"configuration" must be an object, got []'),
+        ({"people": 3}, '"people" must be an object, got 3'),
+        ({"seconds": {"vote": "1"}}, "\"seconds.vote\" must be a number, got '1'"),
+        ({"time": {"fps": True}}, '"time.fps" must be a number, got True'),
+        ({"cuts": [1.5]}, '"cuts" must be a list of frame numbers, got [1.5]'),
+        ({"body": 7}, '"body" must be the name of a file or null, got 7'),
+        ({"frames": [[0, 1], [2]]}, '"frames" must be [start, stop] or a list of those'),
+    ],
+)
+def test_entries_of_run_json_that_are_read_again(tmp_path, run, sentence):
+    people([0]).save(tmp_path)
+    (tmp_path / "run.json").write_text(json.dumps(run))
+    with pytest.raises(InputError) as caught:
+        Reconstruction.load(tmp_path)
+    assert str(caught.value).startswith(f"{tmp_path / 'run.json'}: ")
+    assert sentence in str(caught.value) and "restore it or delete it" in str(caught.value)

@@ -243,7 +243,8 @@ def _message(
     fitter: BodyFitter,
     config: EstimatorConfig,
 ) -> Message:
-    """What the body says of the joints that it pulls: delta of Eq. 4, and joints that their views do not determine.
+    """What the body says of the joints that it pulls: delta of Eq. 4, and joints that their views do not
+    determine.
 
     The latter need the body however sure their one view is.
     """

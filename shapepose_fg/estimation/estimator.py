@@ -93,8 +93,8 @@ class Estimator:
     ) -> Estimates:
         """Joints, covariances and bodies of N rows, sorted in any way; (track, frame) must differ.
 
-        `extra_factors` adds factors of your own to every window. `views` are the cameras row by row, where they are
-        not the rig's.
+        `extra_factors` adds factors of your own to every window. `views` are the cameras row by row, where they
+        are not the rig's.
         """
         config = self.config
         views = Views.of(self.rig) if views is None else views

@@ -22,10 +22,11 @@ class MotionConfig:
     model: str = ""
     """File of the motion model, as `scripts/measure_motion.py` writes it; empty: the one that ships."""
     psd_scale: float = 1.0
-    """Multiplies the power spectral densities of the joints' accelerations: more follows faster and smooths less."""
+    """Multiplies the power spectral densities of the joints' accelerations: more follows faster and smooths
+    less."""
     lost_m: float = 0.1
-    """A joint whose views leave it less certain than this in some direction is lost from sight: in these frames, and
-    in those around them, the difference between joint and body is followed (`factors.motion`)."""
+    """A joint whose views leave it less certain than this in some direction is lost from sight: in these frames,
+    and in those around them, the difference between joint and body is followed (`factors.motion`)."""
     around_s: float = 0.5
     """How far around them, seconds."""
 
@@ -56,7 +57,8 @@ class MotionModel:
     psd_speed: NDArray[np.float64]
     """(J,) what is added to it for each (m/s)² of the joint's speed: fast joints turn faster, too."""
     psd_lost: NDArray[np.float64]
-    """(J,) what it is at least while a joint is lost from sight, and its speed unknown: the mean over all speeds."""
+    """(J,) what it is at least while a joint is lost from sight, and its speed unknown: the mean over all
+    speeds."""
     views: Lasting
     """What the views of one frame say of a joint, taken together."""
     body: Lasting

@@ -43,10 +43,11 @@ def reported_covariance(
     """(T, J, 3, 3) covariance of the joints, m²: `marginal` of the graph, and the errors that the graph left out.
 
     The graph of several frames holds only the share of the errors that is new in every frame. Added is the share
-    that lasts, of what views and body leave in one frame, C_t; and of the share that motion smooths, that part which it
-    does not take away in truth, because errors fade over a few frames and not from one to the next (`Lasting.kept`).
-    Where a joint is not seen, what was left in the nearest frame in which it was is carried along; a view that still sees
-    it brings its own lasting error in, through the gain that it has. Joints solved with offsets have it all in `marginal`.
+    that lasts, of what views and body leave in one frame, C_t; and of the share that motion smooths, that part
+    which it does not take away in truth, because errors fade over a few frames and not from one to the next
+    (`Lasting.kept`). Where a joint is not seen, what was left in the nearest frame in which it was is carried
+    along; a view that still sees it brings its own lasting error in, through the gain that it has. Joints solved
+    with offsets have it all in `marginal`.
     """
     said = solution.views.information[window.rows]
     information = said + solution.body.information[window.rows]
@@ -86,7 +87,9 @@ def problems(
     first: NDArray[np.float64],
     covariance: NDArray[np.float64],
 ) -> tuple[Problem, ...]:
-    """Joints that could not be solved, by person, frame and joint; `first` (N, J, 3) is where views first put them."""
+    """Joints that could not be solved, by person, frame and joint; `first` (N, J, 3) is where views first put
+    them.
+    """
     X = solution.joints
     finite = np.isfinite(X).all(axis=2)
     reasons = np.full(finite.shape, "", dtype=object)

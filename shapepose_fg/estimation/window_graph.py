@@ -38,8 +38,8 @@ class WindowGraphConfig:
     """What goes into a person's graph."""
 
     rho_3d: float = 1.0
-    """rho_3D of Eq. 4: joints whose mean confidence over all views is at most this are pulled by the body model. The
-    covariances are meant, so the body is evidence on every joint; the paper's 0.25 is for comparisons."""
+    """rho_3D of Eq. 4: joints whose mean confidence over all views is at most this are pulled by the body model.
+    The covariances are meant, so the body is evidence on every joint; the paper's 0.25 is for comparisons."""
     weight_2d: float = 1.0
     """w_2D of Eq. 5, multiplies the squared reprojection errors. With sigmas that are true, both weights are 1."""
     weight_shape: float = 1.0
@@ -82,13 +82,14 @@ class WindowGraph:
     Windows compose: the keys carry person, joint and frame, so `graph` can be added to another graph as it is.
     Joints are not tied to each other but by factors of your own, which keeps marginal covariances cheap.
 
-    **Errors that last.** A detector that is 2 cm off is so in the next frame too, and so is the body's guess: T frames
-    of one guess are one guess. In a window of several frames therefore
+    **Errors that last.** A detector that is 2 cm off is so in the next frame too, and so is the body's guess: T
+    frames of one guess are one guess. In a window of several frames therefore
 
     - projections and body priors count with the share of their variance that is new in every frame, so that motion
       smooths that only; the rest is `outcome.lasting_covariance`, to be added to what `marginals` gives;
     - where a joint is lost from sight (`lost` of `solve`) the body's prior gets an offset that decays slowly
-      (`factors.motion`): the joint stays where the body puts it plus the difference that there was when it was seen;
+      (`factors.motion`): the joint stays where the body puts it plus the difference that there was when it was
+      seen;
     - joints with factors of your own are solved with offsets of views and body both, and what the views say is one
       Gaussian each: your factor is weighed against errors that last, and `marginals` holds all of them.
     """
@@ -108,8 +109,8 @@ class WindowGraph:
     ) -> None:
         """Make the factors of all observations.
 
-        `cameras` are V of each of the T frames, `xy` (T, J, V, 2) undistorted pixels, `sigmas_px` (T, J, V), 0 where
-        the view did not see the joint; `frames` (T,) and `times_s` (T,) seconds, both rising.
+        `cameras` are V of each of the T frames, `xy` (T, J, V, 2) undistorted pixels, `sigmas_px` (T, J, V), 0
+        where the view did not see the joint; `frames` (T,) and `times_s` (T,) seconds, both rising.
         """
         T, J = sigmas_px.shape[:2]
         if np.shape(frames) != (T,) or np.shape(times_s) != (T,) or np.any(np.diff(frames) <= 0):
@@ -208,7 +209,8 @@ class WindowGraph:
 
         `inlier` (T, J, V) are the observations that count (delta_ij of Eq. 2), `views` what they say together at
         `initial`, `body` the priors (Eq. 3). A joint with NaN in `initial` is not in the problem and stays NaN; in
-        a window of several frames that goes for all frames of the joint. `lost` (T, J): where joints are hardly seen.
+        a window of several frames that goes for all frames of the joint. `lost` (T, J): where joints are hardly
+        seen.
         """
         self._present = np.isfinite(initial).all(axis=2)
         if self.temporal:
@@ -272,7 +274,7 @@ class WindowGraph:
         result = np.full((count, 3, 3), np.nan)
         damped = gtsam.NonlinearFactorGraph(self.graph)
         wide = gtsam.noiseModel.Isotropic.Sigma(3, 100.0)
-        for key in self.values.keys():
+        for key in self.values.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
             damped.push_back(gtsam.PriorFactorPoint3(key, self.values.atPoint3(key), wide))
         try:
             found = gtsam.Marginals(damped, self.values)
@@ -358,7 +360,9 @@ class WindowGraph:
         return values
 
     def _points(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Positions and velocities (T, J, 3) of the last solution. Values are sorted as keys are: by joint, then frame."""
+        """Positions and velocities (T, J, 3) of the last solution. Values are sorted as keys are: by joint, then
+        frame.
+        """
         present = self._present.T
         positions, speeds = (np.full((*present.shape, 3), np.nan) for _ in range(2))
         count = int(present.sum())
