@@ -5,10 +5,10 @@ A key is a 17-digit number, to be read from left to right:
     kind, 1 digit | person or view, 5 digits | joint, 3 digits | frame, 8 digits
 
 so 1 00003 004 00000012 is the position of joint 4 of person 3 in frame 12. GTSAM cuts what it prints of a
-`gtsam.Symbol` to eight digits behind the character, which is too little for three numbers; a key without a character
-is printed whole, in messages, drawings and `Values.print`. `format_key` spells it out. Symbols (`x5`, `l3`) have a
-character in their upper bits and are larger, plain numbers of your own are smaller: all three fit into one graph.
-Keys of one joint over time are consecutive, sorted by kind, person, joint, frame.
+`gtsam.Symbol` to eight digits behind the character, which is too little for three numbers; a key without a
+character is printed whole, in messages, drawings and `Values.print`. `format_key` spells it out. Symbols (`x5`,
+`l3`) have a character in their upper bits and are larger, plain numbers of your own are smaller: all three fit
+into one graph. Keys of one joint over time are consecutive, sorted by kind, person, joint, frame.
 """
 
 from typing import NamedTuple
@@ -59,7 +59,9 @@ def velocity_key(person: int, joint: int, frame: int = 0) -> int:
 
 
 def offset_key(person: int, joint: int, frame: int = 0, source: int = 0) -> int:
-    """Key of the slowly varying error (`Point3`, standard deviations) of what a `source` (0 to 2) says of a joint."""
+    """Key of the slowly varying error (`Point3`, standard deviations) of what a `source` (0 to 2) says of a
+    joint.
+    """
     return int(_pack(_offset(source), person, joint, frame))
 
 

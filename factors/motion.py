@@ -8,10 +8,10 @@ Native factors only, all linear. Times may have any steps.
 
 with q the power spectral density of the acceleration, m²/s³.
 
-**A slowly varying offset.** Who says every frame again where a joint is, and errs the same way every time, has said it
-once. The error of a message "the joint is at m_t, covariance C_t" is split into a share that is new in every
-frame and one that lasts, an Ornstein-Uhlenbeck chain b_t in units of standard deviations. With R_t the symmetric
-square root of the message's information, R_t C_t R_t = I, and w the white share:
+**A slowly varying offset.** Who says every frame again where a joint is, and errs the same way every time, has
+said it once. The error of a message "the joint is at m_t, covariance C_t" is split into a share that is new in
+every frame and one that lasts, an Ornstein-Uhlenbeck chain b_t in units of standard deviations. With R_t the
+symmetric square root of the message's information, R_t C_t R_t = I, and w the white share:
 
     r = R_t (x_t - m_t) - sqrt(1 - w) b_t  ~  N(0, w I)
     r = b' - a b                           ~  N(0, (1 - a²) I),    a = exp(-dt / correlation_s),    b_0 ~ N(0, I)
@@ -38,7 +38,8 @@ def motion_factors(
     positions, velocities = np.asarray(keys), np.asarray(velocity_keys)
     if not positions.shape == velocities.shape == times.shape == (len(times),):
         raise ValueError(
-            f"keys, velocity_keys and times_s must be (T,), got {positions.shape}, {velocities.shape}, {times.shape}"
+            "keys, velocity_keys and times_s must be (T,), got"
+            f" {positions.shape}, {velocities.shape}, {times.shape}"
         )
     if not np.all(np.diff(times) > 0):
         raise ValueError("times_s must rise from state to state")
@@ -75,8 +76,8 @@ def lasting_prior_factors(
 ) -> list[gtsam.NonlinearFactor]:
     """Messages about D joints whose errors last: position `keys` (D,) against `means` (D, 3) and their offsets.
 
-    `roots` (D, 3, 3), 1/m, are the symmetric square roots of the messages' information, of the whole error; they may
-    be singular (a ray). `white_share` of the error's variance, between 0 and 1, is new each time.
+    `roots` (D, 3, 3), 1/m, are the symmetric square roots of the messages' information, of the whole error; they
+    may be singular (a ray). `white_share` of the error's variance, between 0 and 1, is new each time.
     """
     points, whiten = np.asarray(means, dtype=np.float64), np.asarray(roots, dtype=np.float64)
     positions, offsets = np.asarray(keys), np.asarray(offset_keys)

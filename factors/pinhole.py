@@ -25,7 +25,8 @@ def project_with_jacobian(
     """Pixels (..., 2), depths (...,) and derivatives (..., 2, 3), pixels per metre, of `points_world` (..., 3).
 
     `K` (..., 3, 3) in pixels and `cTw` (..., 3, 4), camera from world, broadcast against the points. Pixels and
-    derivatives are NaN where the depth is not positive. With R the rotation, K' the upper 2 x 2 of K and z the depth,
+    derivatives are NaN where the depth is not positive. With R the rotation, K' the upper 2 x 2 of K and z the
+    depth,
 
         d uv / d point = (K' R[:2] - (uv - c) R[2]) / z
     """

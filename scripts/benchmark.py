@@ -1,47 +1,36 @@
-"""Milliseconds a frame, stage by stage: python scripts/benchmark.py [--data FOLDER].
+"""Milliseconds a frame, with time and frame by frame: python scripts/benchmark.py [--data FOLDER].
 
-Reconstructs the Shelf recording (or another one, or the built-in scene where there is no recording) in the
-batches that the pipeline makes, and prints the median over the batches, the mean over all frames, where stage
-II's time goes, and ratios of settings against each other; with --simulate NAME, how fast a recording is simulated
-instead, with one worker and with two. Run it on a machine that does nothing else.
+Reconstructs the Shelf recording (or another one, or the built-in scene where there is no recording) both ways,
+alternately in one run, and prints the time of every stage, the processor's time and the clock's, their ratios, and
+where stage II's time goes. Then a cheap recording (two people, four cameras) of rising `--lengths`: time a frame
+must not grow, nor memory beyond the rows of the result. `--stretch NAME:A:B` takes frames of a simulated recording
+instead, `--simulate NAME` times the simulator, with one worker and two. On a machine that does nothing else.
 """
 
 import argparse
-import cProfile
 import os
 import platform
-import pstats
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
+import torch
 from rich.console import Console
 from rich.table import Table
 
-from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
-from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import DetectionSequence
+from shapepose_fg.evaluation.speed import STAGES, BackAndForth, Spent, peak_mib, rows_mib, spend, stage_two
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
-from shapepose_fg.pipeline import PipelineConfig, reconstruct
+from shapepose_fg.pipeline import PipelineConfig
 from shapepose_fg.provenance import versions
 from shapepose_fg.simulation import Scene, built_in_scene, simulate
 from shapepose_fg.simulation.files import NAMES, cut, named_scene
 
-STAGES = ("read", "triangulate", "vote", "propose", "associate", "refine")
-PARTS = {
-    "graphs built": ("estimator.py", "_windows"),
-    "graphs solved": ("alternation.py", "_solve"),
-    "covariances": ("window_graph.py", "marginals"),
-    "gates and weights": ("linearisation.py", "linearise"),
-}
-"""Parts of stage II beside the body fits, and the function whose time is taken for each."""
-
 
 @dataclass(frozen=True)
-class Recording:
+class Timed:
     """What is reconstructed."""
 
     name: str
@@ -50,47 +39,6 @@ class Recording:
     """Its frames."""
     rig: Rig
     """Its cameras."""
-    read_s: float
-    """Seconds that reading the files took; 0 for the scene."""
-
-
-@dataclass
-class TimedFitter:
-    """A body fitter that adds up the time it takes."""
-
-    fitter: BodyFitter
-    """Does the work."""
-    seconds: float = 0.0
-    """Time since the last reset."""
-
-    def fit(
-        self, targets: JointTargets, initial: BodyFit | None = None, groups: np.ndarray | None = None
-    ) -> BodyFit:
-        """Fit, and look at the clock before and after."""
-        start = time.perf_counter()
-        result = self.fitter.fit(targets, initial, groups)
-        self.seconds += time.perf_counter() - start
-        return result
-
-
-@dataclass(frozen=True)
-class Timing:
-    """Time of every stage in every batch."""
-
-    frames: np.ndarray
-    """(B,) frames of each batch."""
-    people: int
-    """People found in all."""
-    seconds: dict[str, np.ndarray]
-    """Stage -> (B,) seconds; `bodies` is the part of `refine` in which bodies are fitted."""
-
-    def median_ms(self, stage: str) -> float:
-        """Median over the batches of milliseconds a frame."""
-        return float(1e3 * np.median(self.seconds[stage] / self.frames))
-
-    def mean_ms(self, stage: str) -> float:
-        """All batches' time over all frames, milliseconds."""
-        return float(1e3 * self.seconds[stage].sum() / self.frames.sum())
 
 
 def main() -> None:
@@ -102,81 +50,58 @@ def main() -> None:
     parser.add_argument(
         "--scene", action="store_true", help="use the built-in scene, even where there is a recording"
     )
+    parser.add_argument("--stretch", metavar="NAME:A:B", help="frames of a sequence, report split: salsa:108:408")
     parser.add_argument("--frames", type=int, help="the first frames only (default: all)")
     parser.add_argument("--threads", type=int, default=PipelineConfig().threads, help="threads of torch")
-    parser.add_argument("--rounds", type=int, default=3, help="how often settings are compared; 0: not at all")
+    parser.add_argument("--rounds", type=int, default=2, help="runs of each mode, the best counts; 0: none")
+    parser.add_argument("--lengths", type=int, nargs="*", default=[300, 3000], help="of the cheap recording")
     parser.add_argument(
         "--simulate", metavar="NAME", choices=NAMES, help="time the simulator on this scene instead"
     )
     arguments = parser.parse_args()
-
+    torch.set_num_threads(1)
     console = Console()
     config = replace(PipelineConfig(), threads=arguments.threads)
+    console.print(_machine(config), highlight=False)
     if arguments.simulate is not None:
-        console.print(_machine(config), highlight=False)
         console.print(_simulation_table(arguments.simulate, arguments.frames or 600))
         return
-    recording = _scene() if arguments.scene or arguments.data is None else _read(arguments.data)
-    count = len(recording.detections)
-    frames = range(count if arguments.frames is None else min(arguments.frames, count))
-    console.print(_machine(config), highlight=False)
-    fitter = TimedFitter(make_fitter(config.body))
-    reconstruct(recording.detections, recording.rig, config, frames=frames[:8], fitter=fitter)  # warm-up
-    timing = measure(recording, config, frames, fitter)
-    console.print(_stage_table(recording, timing, stage_two(recording, config, frames, fitter)))
     if arguments.rounds > 0:
-        console.print(_ratio_table(ratios(recording, config, frames[:64], fitter, arguments.rounds), frames[:64]))
+        recording = _recording(arguments)
+        count = len(recording.detections)
+        frames = range(count if arguments.frames is None else min(arguments.frames, count))
+        best = compare(recording, config, frames, arguments.rounds)
+        shares = stage_two(recording.detections, recording.rig, config, frames[:96])
+        console.print(_stage_table(recording, best, shares))
+    for line in linearity(config, sorted(arguments.lengths)):
+        console.print(line, highlight=False)
 
 
-def measure(recording: Recording, config: PipelineConfig, frames: range, fitter: TimedFitter) -> Timing:
-    """Time every batch of `config.batch_frames` frames by itself."""
-    runs = []
-    for start in range(0, len(frames), config.batch_frames):
-        batch = frames[start : start + config.batch_frames]
-        fitter.seconds = 0.0
-        people = reconstruct(recording.detections, recording.rig, config, frames=batch, fitter=fitter)
-        runs.append((len(batch), len(people), people.run["seconds"] | {"bodies": fitter.seconds}))
-    lengths = np.array([length for length, _, _ in runs])
-    seconds = {name: np.array([spent[name] for _, _, spent in runs]) for name in (*STAGES, "bodies")}
-    seconds["read"] = seconds["read"] + recording.read_s * lengths / len(recording.detections)
-    seconds["all"] = np.sum([seconds[stage] for stage in STAGES], axis=0)
-    return Timing(lengths, sum(people for _, people, _ in runs), seconds)
-
-
-def stage_two(
-    recording: Recording, config: PipelineConfig, frames: range, fitter: TimedFitter
-) -> dict[str, float]:
-    """Shares of stage II without the body fits, from a pass under Python's profiler.
-
-    The profiler slows Python down and leaves GTSAM and torch as they are: shares of a few per cent are rough.
-    """
-    profile = cProfile.Profile()
-    profile.runcall(reconstruct, recording.detections, recording.rig, config, frames=frames, fitter=fitter)
-    spent: dict[tuple[str, str], float] = {}
-    for (file, _, function), row in vars(pstats.Stats(profile))["stats"].items():
-        spent[Path(file).name, function] = row[3]
-    whole = spent["alternation.py", "refine"] - spent[Path(__file__).name, "fit"]
-    shares = {part: spent.get(where, 0.0) / whole for part, where in PARTS.items()}
-    return shares | {"the rest": 1.0 - sum(shares.values())}
-
-
-def ratios(
-    recording: Recording, config: PipelineConfig, frames: range, fitter: BodyFitter, rounds: int
-) -> dict[str, float]:
-    """Time of other settings over that of `config`, alternately in one run: the best of `rounds` of each."""
-    here = f"batch_frames = {config.batch_frames}, threads = {config.threads}"
-    settings = {here: config}
-    for size in (1, 4, 16, 64):
-        settings[f"batch_frames = {size}"] = replace(config, batch_frames=size)
-    for threads in (1, 2):
-        settings[f"threads = {threads}"] = replace(config, threads=threads)
-    settings = {name: other for name, other in settings.items() if name == here or other != config}
-    best = dict.fromkeys(settings, float("inf"))
+def compare(recording: Timed, config: PipelineConfig, frames: range, rounds: int) -> dict[bool, Spent]:
+    """With time (True) and frame by frame, alternately; the best of `rounds` of each, by the processor's time."""
+    spend(recording.detections, recording.rig, config, frames[:8])  # warm-up
+    best: dict[bool, Spent] = {}
     for _ in range(rounds):
-        for name, other in settings.items():
-            people = reconstruct(recording.detections, recording.rig, other, frames=frames, fitter=fitter)
-            best[name] = min(best[name], sum(people.run["seconds"].values()))
-    return {name: spent / best[here] for name, spent in best.items()}
+        for temporal in (False, True):
+            now = spend(recording.detections, recording.rig, replace(config, temporal=temporal), frames)
+            if temporal not in best or now.cpu_s < best[temporal].cpu_s:
+                best[temporal] = now
+    return best
+
+
+def linearity(config: PipelineConfig, lengths: list[int]):
+    """Lines about one recording, longer and longer: time a frame, peak memory."""
+    if len(lengths) == 0:
+        return
+    scene = built_in_scene(people=2, cameras=4, frames=100)
+    short = simulate(scene)
+    spend(short, scene.rig, config, range(len(short)))  # warm-up: what is loaded once counts for none
+    for length in lengths:
+        now = spend(BackAndForth(short, length), scene.rig, config, range(length))
+        yield (
+            f"{length} frames: processor {now.cpu_ms:.2f} ms a frame, peak memory {peak_mib():.0f} MiB,"
+            f" {rows_mib(now.people):.1f} MiB of it rows of the result"
+        )
 
 
 def simulation_speed(scene: Scene, workers: int) -> tuple[float, float]:
@@ -207,19 +132,22 @@ def _default_data() -> Path | None:
     return root if (root / "data" / "shelf").is_dir() else None
 
 
-def _read(folder: Path) -> Recording:
-    """A recording in 4D Association's format."""
-    inner = folder / "data" / "shelf"
-    folder = inner if inner.is_dir() else folder
+def _recording(arguments: argparse.Namespace) -> Timed:
+    """What was asked for."""
+    if arguments.stretch is not None:
+        name, first, last = arguments.stretch.split(":")
+        scene = named_scene(name, split="report", frames=int(last))
+        return _simulated(arguments.stretch, cut(scene, range(int(first), int(last))))
+    if arguments.scene or arguments.data is None:
+        return _simulated("the built-in scene", built_in_scene())
+    inner = arguments.data / "data" / "shelf"
+    folder = inner if inner.is_dir() else arguments.data
     rig = read_rig(folder / "calibration.json")
-    start = time.perf_counter()
-    detections = read_detections(folder, rig)
-    return Recording(folder.resolve().name, detections, rig, time.perf_counter() - start)
+    return Timed(folder.resolve().name, read_detections(folder, rig), rig)
 
 
-def _scene() -> Recording:
-    scene = built_in_scene()
-    return Recording("the built-in scene", simulate(scene), scene.rig, 0.0)
+def _simulated(name: str, scene: Scene) -> Timed:
+    return Timed(name, simulate(scene), scene.rig)
 
 
 def _machine(config: PipelineConfig) -> str:
@@ -242,35 +170,25 @@ def _processor() -> str:
     return named[0] if named else platform.processor() or platform.machine()
 
 
-def _stage_table(recording: Recording, timing: Timing, shares: dict[str, float]) -> Table:
-    """Time by stage, stage II taken apart."""
-    frames = int(timing.frames.sum())
-    seen = f"{len(recording.rig)} cameras, {timing.people / frames:.1f} people a frame"
-    title = f"{recording.name}: {frames} frames, {seen}"
-    table = Table(title=title, title_justify="left")
-    table.add_column("milliseconds a frame")
-    table.add_column(f"median of {len(timing.frames)} batches", justify="right")
-    table.add_column("all frames", justify="right")
+def _stage_table(recording: Timed, best: dict[bool, Spent], shares: dict[str, float]) -> Table:
+    """Time by stage of both modes, stage II of the one with time taken apart."""
+    alone, over_time = best[False], best[True]
+    people = len(over_time.people) / over_time.frames
+    seen = f"{len(recording.rig)} cameras, {people:.1f} people a frame"
+    table = Table(title=f"{recording.name}: {over_time.frames} frames, {seen}", title_justify="left")
+    for heading in ("milliseconds a frame", "with time", "frame by frame", "ratio"):
+        table.add_column(heading, justify="left" if heading == "milliseconds a frame" else "right")
     for stage in STAGES:
-        table.add_row(stage, f"{timing.median_ms(stage):.1f}", f"{timing.mean_ms(stage):.1f}")
-    table.add_row("  bodies fitted", f"{timing.median_ms('bodies'):.1f}", f"{timing.mean_ms('bodies'):.1f}")
-    rest = [figure("refine") - figure("bodies") for figure in (timing.median_ms, timing.mean_ms)]
-    for part, share in shares.items():
-        table.add_row(f"  {part}", *(f"{share * value:.1f}" for value in rest), style="dim")
+        table.add_row(stage, f"{over_time.ms(stage):.1f}", f"{alone.ms(stage):.1f}")
+        if stage == "solve":
+            table.add_row("  bodies fitted", f"{over_time.ms('bodies'):.1f}", f"{alone.ms('bodies'):.1f}")
+            rest = over_time.ms("solve") - over_time.ms("bodies")
+            for part, share in shares.items():
+                table.add_row(f"  {part}", f"{share * rest:.1f}", style="dim")
     table.add_section()
-    table.add_row("all", f"{timing.median_ms('all'):.1f}", f"{timing.mean_ms('all'):.1f}", style="bold")
-    return table
-
-
-def _ratio_table(found: dict[str, float], frames: range) -> Table:
-    """How much longer other settings take."""
-    table = Table(
-        title=f"Time of other settings over that of the first ({len(frames)} frames)", title_justify="left"
-    )
-    table.add_column("setting")
-    table.add_column("ratio", justify="right")
-    for name, ratio in found.items():
-        table.add_row(name, f"{ratio:.2f}")
+    for name, of in (("all, processor", "cpu_ms"), ("all, clock", "wall_ms")):
+        with_time, without = getattr(over_time, of), getattr(alone, of)
+        table.add_row(name, f"{with_time:.1f}", f"{without:.1f}", f"{with_time / without:.2f}", style="bold")
     return table
 
 

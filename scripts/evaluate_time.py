@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from marked_tables import EVALUATION, write_table
 
 from shapepose_fg.detections import DetectionSequence
 from shapepose_fg.evaluation.tracking import score_tracks, stature_by_person
@@ -67,6 +68,7 @@ COLUMNS = {
     "stature": ("stature_spread_cm", 1),
     "50 %": ("seen_inside_50", 1),
     "95 %": ("seen_inside_95", 1),
+    "u": ("joints_long_unseen", 0),
     "u 50 %": ("unseen_inside_50", 1),
     "u 95 %": ("unseen_inside_95", 1),
     "v": ("velocity_error", 2),
@@ -94,6 +96,7 @@ def main() -> None:
     parser.add_argument("--halves", action="store_true", help="both halves alone, too: do statures agree?")
     parser.add_argument("--crowd", nargs="+", type=int, metavar="V", help="the crowd of seed 2000, V cameras")
     parser.add_argument("--data", type=Path, help="folder that holds data/cmu_mocap; default SHAPEPOSE_DATA")
+    parser.add_argument("--update", action="store_true", help="write the table into docs/evaluation.md")
     parser.add_argument("--json", type=Path, help="write all figures here")
     arguments = parser.parse_args()
     if arguments.data is not None:
@@ -113,7 +116,10 @@ def main() -> None:
             if arguments.halves:
                 scores[label]["halves_apart_cm"] = halves_apart_cm(scene, detections, config)
             print(line(label, scores[label]), flush=True)
-    print(line("mean", mean(list(scores.values()))))
+    scores["mean"] = mean(list(scores.values()))
+    print(line("mean", scores["mean"]))
+    if arguments.update:
+        write_table("time" if config.temporal else "time off", "\n".join(markdown(scores)), EVALUATION)
     if arguments.json is not None:
         arguments.json.write_text(json.dumps(scores, indent=2) + "\n", encoding="utf-8")
 
@@ -190,6 +196,16 @@ def mean(scores: list[dict[str, Any]]) -> dict[str, Any]:
     """The mean of every figure that some stretch has."""
     found = {name: [s[name] for s in scores if s.get(name) is not None] for name in scores[0]} if scores else {}
     return {name: float(np.mean(values)) for name, values in found.items() if values}
+
+
+def markdown(scores: dict[str, dict[str, Any]]) -> list[str]:
+    """The table for the documents: columns for which there is something to tell."""
+    told = {h: (n, d) for h, (n, d) in COLUMNS.items() if any(each.get(n) is not None for each in scores.values())}
+    rows = []
+    for label, figures in scores.items():
+        cells = ["-" if figures.get(n) is None else f"{figures[n]:.{d}f}" for n, d in told.values()]
+        rows.append(f"| {label} | {' | '.join(cells)} |")
+    return [f"| | {' | '.join(told)} |", "|---" * (1 + len(told)) + "|", *rows]
 
 
 def line(label: str, figures: dict[str, Any]) -> str:

@@ -9,18 +9,14 @@ two, seven and one. What the detector draws from is made by `measure_detector.py
 
 import argparse
 import os
-import re
 from collections.abc import Callable
 from pathlib import Path
 
 import torch
+from marked_tables import IMAGES, ROOT, SIMULATION, write_table
 
 from shapepose_fg.evaluation import sequence_difficulty, visibility_agreement
 from shapepose_fg.simulation.measurement.comparison import compare, table
-
-ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "docs" / "simulation.md"
-IMAGES = ROOT / "docs" / "images"
 
 
 def main() -> None:
@@ -55,7 +51,7 @@ def main() -> None:
         text = "\n".join(make())
         print(f"{name}\n\n{text}\n", flush=True)
         if arguments.update:
-            write(name, text)
+            write_table(name, text, SIMULATION)
 
 
 def detector(shelf: Path, images: Path | None) -> list[str]:
@@ -66,15 +62,6 @@ def detector(shelf: Path, images: Path | None) -> list[str]:
 
         draw_figures(images, both)
     return table(both, each)
-
-
-def write(name: str, text: str) -> None:
-    """Put a table between its marks."""
-    page = PAGE.read_text(encoding="utf-8")
-    marked = re.compile(rf"(<!-- {name} -->\n).*?(<!-- end -->)", re.DOTALL)
-    if marked.search(page) is None:
-        raise ValueError(f"{PAGE.name} has no marks <!-- {name} --> and <!-- end -->: add them where it belongs")
-    PAGE.write_text(marked.sub(lambda found: f"{found[1]}\n{text}\n\n{found[2]}", page), encoding="utf-8")
 
 
 if __name__ == "__main__":

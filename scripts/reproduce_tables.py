@@ -9,15 +9,13 @@ ten more for the fitters.
 
 import argparse
 import os
-import re
 from collections.abc import Callable
 from pathlib import Path
 
 import torch
+from marked_tables import EVALUATION, IMAGES, README, ROOT, write_table
 
 from shapepose_fg.evaluation import fitter_tables, scene_tables, shelf_tables
-
-ROOT = Path(__file__).parents[1]
 
 
 def main() -> None:
@@ -39,10 +37,9 @@ def main() -> None:
         "cameras": scene_tables.camera_table,
     }
     if shelf.is_dir():
-        steps = shelf_tables.shelf_steps(shelf)
         tables |= {
-            "shelf": lambda: shelf_tables.shelf_table(steps),
-            "shelf limbs": lambda: shelf_tables.limb_table(steps),
+            "shelf": lambda: shelf_tables.shelf_table(shelf_tables.shelf_steps(shelf)),
+            "shelf limbs": lambda: shelf_tables.limb_table(shelf_tables.shelf_steps(shelf)),
         }
         tables |= {
             "contradictions": lambda: shelf_tables.contradiction_table(shelf),
@@ -50,22 +47,14 @@ def main() -> None:
         }
     else:
         print(f"(no Shelf recording in {shelf}: its tables are left out)\n")
-    images = ROOT / "docs" / "images" if arguments.update else None
+    images = IMAGES if arguments.update else None
     tables |= fitter_tables.tables(arguments.data, images)
     for name, table in tables.items():
         if arguments.only is None or any(f"{name} ".startswith(f"{only} ") for only in arguments.only):
             text = "\n".join(table())
             print(f"{name}\n\n{text}\n", flush=True)
             if arguments.update:
-                update(name, text)
-
-
-def update(name: str, text: str) -> None:
-    """Put a table between its marks in the documents."""
-    for path in (ROOT / "README.md", ROOT / "docs" / "evaluation.md"):
-        old = path.read_text(encoding="utf-8")
-        marked = re.compile(rf"(<!-- {re.escape(name)} -->\n).*?(<!-- end -->)", re.DOTALL)
-        path.write_text(marked.sub(lambda found: f"{found[1]}\n{text}\n\n{found[2]}", old), encoding="utf-8")
+                write_table(name, text, README, EVALUATION)
 
 
 if __name__ == "__main__":

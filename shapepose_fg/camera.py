@@ -1,4 +1,6 @@
-"""Where a camera stands and what it sees: pinhole cameras in the world, a rig of them, and their views over time."""
+"""Where a camera stands and what it sees: pinhole cameras in the world, a rig of them, and their views over
+time.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -42,6 +42,7 @@ from shapepose_fg.reconstruction import Reconstruction
 from shapepose_fg.skeleton import BODY_25, Skeleton
 from shapepose_fg.solved_rows import result_rows
 from shapepose_fg.tracking.following import FollowingConfig, Input
+from shapepose_fg.tracking.stitching import StitchingConfig, stitch
 from shapepose_fg.tracking.tracker import BodyScale, Tracker, TrackingConfig
 from shapepose_fg.windows import Engine, Solved, WindowConfig
 
@@ -68,6 +69,8 @@ class PipelineConfig:
     """People over time: how they are followed from frame to frame."""
     following: FollowingConfig = field(default_factory=FollowingConfig)
     """People over time: what becomes of tracks."""
+    stitching: StitchingConfig = field(default_factory=StitchingConfig)
+    """People over time: who comes back after a longer time out of sight."""
     windows: WindowConfig = field(default_factory=WindowConfig)
     """People over time: how frames are cut into windows, and how often detections are given out again."""
     window_graph: WindowGraphConfig = field(default_factory=WindowGraphConfig)
@@ -142,6 +145,9 @@ def reconstruct(
             if progress is not None:
                 progress(done, len(frames))
         people = Reconstruction.concatenate(parts) if parts else Reconstruction.empty(detections.skeleton.joints)
+        if config.temporal:
+            with run.stage("follow"):
+                people = _stitched(people, detections.skeleton, config, times.frame_s[list(cuts)])
         if config.temporal and isinstance(fitter, SequenceFitting):
             with run.stage("bodies over time"):
                 people = with_bodies_over_time(people, fitter, shapes)
@@ -283,6 +289,15 @@ def _rows(solved: Solved, rig: Rig, detections: DetectionSequence, config: Pipel
         of_frame = rows.frame == frame
         place[of_frame] = place_in_view(rows.candidate[of_frame], detections[frame].view)
     return result_rows(rows, estimates, place, rig, detections.skeleton.joints, person)
+
+
+def _stitched(
+    people: Reconstruction, skeleton: Skeleton, config: PipelineConfig, cuts_s: np.ndarray
+) -> Reconstruction:
+    """The same rows, tracks of one person joined over longer times out of sight."""
+    person = stitch(people.person, people.time_s, people.joints, skeleton, config.stitching, cuts_s.tolist())
+    table = None if people.observations is None else replace(people.observations, person=person)
+    return replace(people, person=person, observations=table)
 
 
 def _number_in_frame(frame: np.ndarray) -> np.ndarray:

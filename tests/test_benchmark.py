@@ -5,11 +5,19 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
+from shapepose_fg.evaluation.speed import (
+    PARTS,
+    STAGES,
+    BackAndForth,
+    peak_mib,
+    rows_mib,
+    spend,
+    stage_two,
+)
 from shapepose_fg.pipeline import PipelineConfig
-from shapepose_fg.simulation import built_in_scene
+from shapepose_fg.simulation import built_in_scene, simulate
 
 SCRIPT = Path(__file__).parents[1] / "scripts" / "benchmark.py"
 
@@ -27,50 +35,53 @@ def benchmark():
 
 @pytest.fixture
 def five_frames(benchmark, monkeypatch):
-    monkeypatch.setattr(benchmark, "built_in_scene", lambda: built_in_scene(frames=5))
+    monkeypatch.setattr(benchmark, "built_in_scene", lambda **more: built_in_scene(**(more | {"frames": 5})))
 
 
-def test_times_of_batches_add_up(benchmark, five_frames):
-    config = replace(PipelineConfig(), batch_frames=2)
-    fitter = benchmark.TimedFitter(benchmark.make_fitter())
-    timing = benchmark.measure(benchmark._scene(), config, range(5), fitter)
-    assert timing.frames.tolist() == [2, 2, 1]
-    assert timing.people == 20
-    whole = sum(timing.mean_ms(stage) for stage in benchmark.STAGES)
-    assert timing.mean_ms("all") == pytest.approx(whole)
-    # Fitting bodies is a part of stage II, in every batch.
-    assert (timing.seconds["bodies"] > 0).all()
-    assert (timing.seconds["bodies"] < timing.seconds["refine"]).all()
+@pytest.fixture(scope="module")
+def recording():
+    scene = built_in_scene(frames=5)
+    return simulate(scene), scene.rig
 
 
-def test_stage_two_is_taken_apart_by_functions_that_exist(benchmark, five_frames):
-    fitter = benchmark.TimedFitter(benchmark.make_fitter())
-    shares = benchmark.stage_two(benchmark._scene(), PipelineConfig(), range(2), fitter)
-    assert set(shares) == {*benchmark.PARTS, "the rest"}
+@pytest.mark.parametrize("temporal", [False, True])
+def test_times_of_stages_add_up(recording, temporal):
+    spent = spend(*recording, replace(PipelineConfig(), temporal=temporal), range(5))
+    assert spent.frames == 5
+    assert len(spent.people) == 20
+    whole = sum(spent.ms(stage) for stage in STAGES)
+    # All but what lies between the stages is in one of them.
+    assert 0.5 * spent.wall_ms < whole <= 1.001 * spent.wall_ms
+    assert 0 < spent.seconds["bodies"] < spent.seconds["solve"]
+    assert all(spent.seconds[stage] >= 0 for stage in STAGES if stage in spent.seconds)
+
+
+def test_stage_two_is_taken_apart_by_functions_that_exist(recording):
+    shares = stage_two(*recording, PipelineConfig(), range(3))
+    assert set(shares) == {*PARTS, "the rest"}
     assert all(share > 0 for share in shares.values()), shares
     assert sum(shares.values()) == pytest.approx(1.0)
 
 
+def test_a_long_recording_goes_back_and_forth(recording):
+    long = BackAndForth(recording[0], 12)
+    assert len(long) == 12
+    assert [id(long[t]) for t in range(12)] == [id(recording[0][t]) for t in (0, 1, 2, 3, 4, 4, 3, 2, 1, 0, 0, 1)]
+
+
+def test_memory_of_rows(recording):
+    spent = spend(*recording, PipelineConfig(), range(2))
+    assert 0 < rows_mib(spent.people) < peak_mib()
+
+
 def test_prints_machine_stages_and_ratios(benchmark, five_frames, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["benchmark.py", "--scene", "--frames", "3", "--rounds", "1"])
+    monkeypatch.setattr(
+        sys, "argv", ["benchmark.py", "--scene", "--frames", "3", "--rounds", "1", "--lengths", "7"]
+    )
     benchmark.main()
     printed = capsys.readouterr().out
-    for part in (
-        "cores",
-        "torch",
-        "the built-in scene: 3 frames",
-        "median of 1 batches",
-        "covariances",
-        "threads = 2",
-    ):
+    for part in ("cores", "torch", "the built-in scene: 3 frames", "covariances", "all, processor", "7 frames: "):
         assert part in printed
-
-
-def test_median_and_mean_of_unequal_batches(benchmark):
-    seconds = {"vote": np.array([0.02, 0.04, 0.03])}
-    timing = benchmark.Timing(np.array([2, 2, 1]), 0, seconds)
-    assert timing.median_ms("vote") == pytest.approx(20.0)  # of 10, 20 and 30 ms a frame
-    assert timing.mean_ms("vote") == pytest.approx(18.0)  # 90 ms over 5 frames
 
 
 def test_prints_how_fast_it_simulates(benchmark, monkeypatch, capsys):

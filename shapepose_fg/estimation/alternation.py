@@ -239,7 +239,8 @@ def _message(
     fitter: BodyFitter,
     config: EstimatorConfig,
 ) -> Message:
-    """What the body says of the joints that it pulls: delta of Eq. 4, and joints that their views do not determine.
+    """What the body says of the joints that it pulls: delta of Eq. 4, and joints that their views do not
+    determine.
 
     The latter need the body however sure their one view is.
     """
@@ -280,7 +281,7 @@ def _solve(
         if window.graph.temporal:
             initial = np.where(np.isfinite(evidence.points[part]), evidence.points[part], initial)
             initial = interpolated(initial, window.graph.times_s)
-            lost = near_in_time(badly[part], window.graph.times_s, config.motion.around_s)
+            lost = badly[part]
         else:
             inlier = inlier & known[part][..., None]
         views = Message(evidence.target[part], evidence.information[part])
@@ -297,11 +298,3 @@ def interpolated(points: NDArray[np.float64], times_s: NDArray[np.float64]) -> N
         for axis in range(3):
             result[:, joint, axis] = np.interp(times_s, times_s[there], points[there, joint, axis])
     return result
-
-
-def near_in_time(marked: NDArray[np.bool_], times_s: NDArray[np.float64], within_s: float) -> NDArray[np.bool_]:
-    """(T, J) which frames are at most `within_s` from one that is `marked` (T, J)."""
-    first = np.searchsorted(times_s, times_s - within_s, side="left")
-    last = np.searchsorted(times_s, times_s + within_s, side="right")
-    count = np.concatenate([np.zeros((1, marked.shape[1]), dtype=int), np.cumsum(marked, axis=0)])
-    return count[last] > count[first]

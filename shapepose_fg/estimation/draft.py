@@ -26,8 +26,8 @@ def drafted(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Places (N, J, 3), metres, and covariances (N, J, 3, 3) of joints; NaN where neither views nor body say any.
 
-    What the views say and what the body says, weighted by their information. Views that are `disagreement` standard
-    deviations from the body count nothing: its robust kernel has passed over them, too.
+    What the views say and what the body says, weighted by their information. Views that are `disagreement`
+    standard deviations from the body count nothing: its robust kernel has passed over them, too.
     """
     known = body.ok[:, None, None]
     covariance = np.where(known[..., None], body.covariance + MODEL_SIGMA_M**2 * np.eye(3), np.eye(3))

@@ -21,7 +21,7 @@ from shapepose_fg.estimation.alternation import (
 from shapepose_fg.estimation.draft import WholeFitter, drafted
 from shapepose_fg.estimation.linearisation import linearise, mean_confidence, observation_sigmas, triangulate
 from shapepose_fg.estimation.motion_model import MotionModel
-from shapepose_fg.estimation.outcome import Problem, how_known, lasting_covariance, problems
+from shapepose_fg.estimation.outcome import Problem, how_known, problems, reported_covariance
 from shapepose_fg.estimation.window_graph import WindowGraph
 from shapepose_fg.observations import Observations
 from shapepose_fg.reconstruction import Status
@@ -93,8 +93,8 @@ class Estimator:
     ) -> Estimates:
         """Joints, covariances and bodies of N rows, sorted in any way; (track, frame) must differ.
 
-        `extra_factors` adds factors of your own to every window. `views` are the cameras row by row, where they are
-        not the rig's.
+        `extra_factors` adds factors of your own to every window. `views` are the cameras row by row, where they
+        are not the rig's.
         """
         config = self.config
         views = Views.of(self.rig) if views is None else views
@@ -178,7 +178,7 @@ class Estimator:
             if graph.temporal:
                 velocity[rows] = graph.velocity()
                 velocity_covariance[rows] = graph.marginals(graph.velocity_keys)
-                covariance[rows] += lasting_covariance(solution, window, self._motion.views.white_share)
+                covariance[rows] = reported_covariance(solution, window, covariance[rows], self._motion.views)
         fit = final_bodies(solution, covariance, windows, self.fitter)
         final = linearise(observations, sigmas, X, views, self.config.observations)
         wrong = problems(observations, windows, solution, first, covariance)

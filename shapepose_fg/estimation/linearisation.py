@@ -80,7 +80,9 @@ class ViewEvidence:
 
 
 def weakest_sigma(information: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Standard deviation (...,) along the direction that `information` (..., 3, 3) knows least; infinite for a ray."""
+    """Standard deviation (...,) along the direction that `information` (..., 3, 3) knows least; infinite for a
+    ray.
+    """
     return _weakest(np.linalg.eigvalsh(information))
 
 

@@ -38,8 +38,8 @@ class WindowGraphConfig:
     """What goes into a person's graph."""
 
     rho_3d: float = 1.0
-    """rho_3D of Eq. 4: joints whose mean confidence over all views is at most this are pulled by the body model. The
-    covariances are meant, so the body is evidence on every joint; the paper's 0.25 is for comparisons."""
+    """rho_3D of Eq. 4: joints whose mean confidence over all views is at most this are pulled by the body model.
+    The covariances are meant, so the body is evidence on every joint; the paper's 0.25 is for comparisons."""
     weight_2d: float = 1.0
     """w_2D of Eq. 5, multiplies the squared reprojection errors. With sigmas that are true, both weights are 1."""
     weight_shape: float = 1.0
@@ -82,13 +82,14 @@ class WindowGraph:
     Windows compose: the keys carry person, joint and frame, so `graph` can be added to another graph as it is.
     Joints are not tied to each other but by factors of your own, which keeps marginal covariances cheap.
 
-    **Errors that last.** A detector that is 2 cm off is so in the next frame too, and so is the body's guess: T frames
-    of one guess are one guess. In a window of several frames therefore
+    **Errors that last.** A detector that is 2 cm off is so in the next frame too, and so is the body's guess: T
+    frames of one guess are one guess. In a window of several frames therefore
 
     - projections and body priors count with the share of their variance that is new in every frame, so that motion
       smooths that only; the rest is `outcome.lasting_covariance`, to be added to what `marginals` gives;
     - where a joint is lost from sight (`lost` of `solve`) the body's prior gets an offset that decays slowly
-      (`factors.motion`): the joint stays where the body puts it plus the difference that there was when it was seen;
+      (`factors.motion`): the joint stays where the body puts it plus the difference that there was when it was
+      seen;
     - joints with factors of your own are solved with offsets of views and body both, and what the views say is one
       Gaussian each: your factor is weighed against errors that last, and `marginals` holds all of them.
     """
@@ -108,8 +109,8 @@ class WindowGraph:
     ) -> None:
         """Make the factors of all observations.
 
-        `cameras` are V of each of the T frames, `xy` (T, J, V, 2) undistorted pixels, `sigmas_px` (T, J, V), 0 where
-        the view did not see the joint; `frames` (T,) and `times_s` (T,) seconds, both rising.
+        `cameras` are V of each of the T frames, `xy` (T, J, V, 2) undistorted pixels, `sigmas_px` (T, J, V), 0
+        where the view did not see the joint; `frames` (T,) and `times_s` (T,) seconds, both rising.
         """
         T, J = sigmas_px.shape[:2]
         if np.shape(frames) != (T,) or np.shape(times_s) != (T,) or np.any(np.diff(frames) <= 0):
@@ -208,14 +209,16 @@ class WindowGraph:
 
         `inlier` (T, J, V) are the observations that count (delta_ij of Eq. 2), `views` what they say together at
         `initial`, `body` the priors (Eq. 3). A joint with NaN in `initial` is not in the problem and stays NaN; in
-        a window of several frames that goes for all frames of the joint. `lost` (T, J): where joints are hardly seen,
-        or will soon be, or were a moment ago.
+        a window of several frames that goes for all frames of the joint. `lost` (T, J): where joints are hardly
+        seen.
         """
         self._present = np.isfinite(initial).all(axis=2)
         if self.temporal:
             self._present &= self._present.all(axis=0)
         of_views = self._present & self.with_offsets
-        of_body = of_views if lost is None or not self.temporal else self._present & (lost | self.with_offsets)
+        of_body = of_views
+        if self.temporal and lost is not None:
+            of_body = self._present & (self.with_offsets | near_in_time(lost, self.times_s, self._motion.around_s))
         self.values = self._start(initial, np.stack([of_views, of_body]))
         self.graph = gtsam.NonlinearFactorGraph()
         self._push(self._seen(inlier & (self._present & ~of_views)[..., None]))
@@ -223,7 +226,7 @@ class WindowGraph:
         self._push(self._lasting(views, 1.0 / self.config.weight_2d, self._motion.views, _OF_VIEWS, of_views))
         self._push(self._lasting(body, 1.0 / self.config.weight_shape, self._motion.body, _OF_BODY, of_body))
         if self.temporal:
-            self._push(self._motions(initial))
+            self._push(self._motions(initial, lost))
         exists = self.values.exists
         self._push([factor for factor, keys in self._added if all(map(exists, keys))])
         if self.values.empty():
@@ -271,7 +274,7 @@ class WindowGraph:
         result = np.full((count, 3, 3), np.nan)
         damped = gtsam.NonlinearFactorGraph(self.graph)
         wide = gtsam.noiseModel.Isotropic.Sigma(3, 100.0)
-        for key in self.values.keys():
+        for key in self.values.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
             damped.push_back(gtsam.PriorFactorPoint3(key, self.values.atPoint3(key), wide))
         try:
             found = gtsam.Marginals(damped, self.values)
@@ -325,10 +328,12 @@ class WindowGraph:
             factors += offset_factors(keys[there, joint], self.times_s[there], errors.correlation_s)
         return factors
 
-    def _motions(self, near: NDArray[np.float64]) -> list[gtsam.NonlinearFactor]:
+    def _motions(self, near: NDArray[np.float64], lost: NDArray[np.bool_] | None) -> list[gtsam.NonlinearFactor]:
         """Motion of the joints that are in the problem; how far they may turn goes by their speed at `near`."""
         speed = np.linalg.norm(np.diff(near, axis=0), axis=2) / np.diff(self.times_s)[:, None]
         psd = self._motion.psd(speed)
+        if lost is not None:
+            psd = np.where(lost[1:] & lost[:-1], np.maximum(psd, self._motion.psd_lost), psd)
         unknown = diagonal(np.full(3, self._motion.speed_m_s))
         factors: list[gtsam.NonlinearFactor] = []
         for joint in np.flatnonzero(self._present[0]).tolist():
@@ -355,7 +360,9 @@ class WindowGraph:
         return values
 
     def _points(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Positions and velocities (T, J, 3) of the last solution. Values are sorted as keys are: by joint, then frame."""
+        """Positions and velocities (T, J, 3) of the last solution. Values are sorted as keys are: by joint, then
+        frame.
+        """
         present = self._present.T
         positions, speeds = (np.full((*present.shape, 3), np.nan) for _ in range(2))
         count = int(present.sum())
@@ -365,6 +372,14 @@ class WindowGraph:
             if self.temporal:
                 speeds[present] = points[count : 2 * count]
         return positions.swapaxes(0, 1), speeds.swapaxes(0, 1)
+
+
+def near_in_time(marked: NDArray[np.bool_], times_s: NDArray[np.float64], within_s: float) -> NDArray[np.bool_]:
+    """(T, J) which frames are at most `within_s` from one that is `marked` (T, J)."""
+    first = np.searchsorted(times_s, times_s - within_s, side="left")
+    last = np.searchsorted(times_s, times_s + within_s, side="right")
+    count = np.concatenate([np.zeros((1, marked.shape[1]), dtype=int), np.cumsum(marked, axis=0)])
+    return count[last] > count[first]
 
 
 def symmetric_roots(information: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -16,8 +16,10 @@ from shapepose_fg.reconstruction import Reconstruction
 
 @dataclass(frozen=True)
 class BeforeRefinement:
-    """What stage I knows of the people that stage II starts from, row by row as in the reconstruction."""
+    """What stage I makes of each frame by itself: N rows, one per person and frame."""
 
+    frame: NDArray[np.intp]
+    """(N,) frame of each row."""
     joints: NDArray[np.float64]
     """(N, J, 3) X_0 of Algorithm 1, metres; NaN where no two views agree."""
     confidence: NDArray[np.float64]
@@ -45,28 +47,40 @@ class JointErrors:
 def before_refinement(
     detections: DetectionSequence, rig: Rig, config: PipelineConfig | None = None
 ) -> BeforeRefinement:
-    """Run stage I alone. Its rows are those that `reconstruct` makes of the same input and settings."""
+    """Run stage I alone, and triangulate what it left open."""
     config = PipelineConfig() if config is None else config
     found = [find_people(detections[t], rig, detections.skeleton, config) for t in range(len(detections))]
+    frame = np.repeat(np.arange(len(found)), [len(people) for people in found])
+    if len(frame) == 0:
+        J = len(detections.skeleton)
+        return BeforeRefinement(frame, np.zeros((0, J, 3)), np.zeros((0, J)))
     observations = Observations.concatenate(found)
     joints = triangulate(observations, Views.of(rig), config.observations)
-    return BeforeRefinement(joints, observations.confidence.mean(axis=-1))
+    return BeforeRefinement(frame, joints, observations.confidence.mean(axis=-1))
 
 
 def alternation_errors(
     before: BeforeRefinement, people: Reconstruction, truth: NDArray[np.floating]
 ) -> JointErrors:
-    """Errors before and after, against `truth` (T, P, J, 3) in metres; people who match nobody are left out."""
-    if before.joints.shape != people.joints.shape:
-        raise ValueError(
-            f"before and people must be of one recording and one configuration: {before.joints.shape} joints "
-            f"before, {people.joints.shape} after"
-        )
-    matches = match_people(people.frame, people.joints, truth)
-    true = np.asarray(truth)[matches.frame, matches.person]
-    known = np.isfinite(true).all(axis=-1)
+    """Errors before and after, against `truth` (T, P, J, 3) in metres, of people who are found both times.
+
+    Rows are matched with the truth before and after, each by itself: tracking and re-association may have found
+    others than stage I did.
+    """
+    true = np.asarray(truth, dtype=np.float64)
+    tables = []
+    for rows in (before, people):
+        matches = match_people(rows.frame, rows.joints, true)
+        row = np.full(true.shape[:2], -1)
+        row[matches.frame, matches.person] = matches.row
+        tables.append(row)
+    both = (tables[0] >= 0) & (tables[1] >= 0)
+    first, last = (row[both] for row in tables)
+    known = np.isfinite(true[both].sum(axis=-1))
 
     def error_mm(joints: NDArray[np.float64]) -> NDArray[np.float64]:
-        return 1e3 * np.linalg.norm(joints[matches.row] - true, axis=-1)[known]
+        return 1e3 * np.linalg.norm(joints - true[both], axis=-1)[known]
 
-    return JointErrors(before.confidence[matches.row][known], error_mm(before.joints), error_mm(people.joints))
+    return JointErrors(
+        before.confidence[first][known], error_mm(before.joints[first]), error_mm(people.joints[last])
+    )

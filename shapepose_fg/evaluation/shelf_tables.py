@@ -30,13 +30,14 @@ OTHERS = (
 """Other methods on the same frames and detections, by the same protocol."""
 
 
+@cache
 def shelf_steps(folder: Path) -> dict[str, ShelfScore]:
     """Scores on the Shelf recording: after stage I, of the bodies' joints, of the result without time and with."""
     truth = read_shelf_ground_truth(folder / "gt_dev.txt")
     rig = read_rig(folder / "calibration.json")
     detections = read_detections(folder, rig)
     people = reconstruct(detections, rig, CONFIG)
-    before = replace(people, joints=before_refinement(detections, rig, CONFIG).joints)
+    before = before_refinement(detections, rig, CONFIG)
     bodies = replace(people, joints=body_joints(people))
     steps = {"stage I alone": before, "bodies' joints": bodies, "**shapepose-fg, without time**": people}
     steps["**shapepose-fg, with time**"] = reconstruct(detections, rig, replace(CONFIG, temporal=True))

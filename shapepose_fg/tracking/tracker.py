@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 
 from shapepose_fg.camera import Rig, Views
 from shapepose_fg.detections import Detections
@@ -44,8 +45,6 @@ class TrackingConfig:
     """Core joints that two views must see for a frame to count as evidence of the person."""
     min_new_joints: int = 6
     """Core joints that two views must see, by detections that no track has, for a new person."""
-    min_own: float = 0.6
-    """Share of a new person's detections that no track may have."""
     apart_m: float = 0.25
     """A new person's joints are at least this far from any track's, in the mean: nearer is the same person."""
     double_m: float = 0.15
@@ -56,6 +55,8 @@ class TrackingConfig:
     """A new track that has not had evidence for nearly all of this time was a phantom."""
     weak_trial_s: float = 0.5
     """The same for a person whose hips two views saw: only time tells one from a crossing of rays."""
+    walk_mps: float = 1.0
+    """How far off a person is who comes back into view, per second out of sight: people turn and stop."""
     birth_sigma_m: float = 0.04
     """Sigma of a new person's joints as stage I places them."""
     birth_speed_mps: float = 2.0
@@ -301,11 +302,53 @@ class Tracker:
                 continue
             theirs = np.where(people.candidate >= 0, rest[people.candidate], -1)
             new = self._seen_twice(theirs) >= self.config.min_new_joints
+            track, person = self._returned(people.initial, new, state, evident)
+            if len(track) > 0:
+                state = self._revived(state, track, people.initial[person])
+                candidate[track], evident[track], new[person] = theirs[person], True, False
             new &= self._apart(people.initial, state)
             state = self._with_new(state, people.initial[new], weak)
             candidate = np.concatenate([candidate, theirs[new]])
             evident = np.append(evident, np.ones(new.sum(), dtype=bool))
         return state, candidate, evident
+
+    def _returned(
+        self, places: Array, found: NDArray[np.bool_], state: TrackerState, evident: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Tracks (K,) that lack evidence, and the people `found` (P,) at `places` (P, J, 3) who are these, (K,).
+
+        One-to-one by the distance of their core joints' centres, within what a person walks meanwhile.
+        """
+        waiting, people = np.flatnonzero(~evident & ~state.weak), np.flatnonzero(found)
+        if len(waiting) == 0 or len(people) == 0:
+            return np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
+        core = list(self.skeleton.core)
+        known = np.isfinite(places[people][:, core]).all(axis=-1)[..., None]  # (K, C, 1)
+        count = np.maximum(known.sum(axis=1), 1)
+        centre = np.where(known, places[people][:, core], 0.0).sum(axis=1) / count
+        expected = np.where(known, state.joints.position[waiting][:, None, core], 0.0).sum(axis=2) / count
+        distance = np.linalg.norm(centre - expected, axis=-1)  # (W, K)
+        waited_s = np.abs(state.time_s - state.evident_s[waiting])
+        gate_m = self.config.apart_m + self.config.walk_mps * waited_s
+        first, second = linear_sum_assignment(np.minimum(distance, gate_m.max()))
+        near = distance[first, second] < gate_m[first]
+        return waiting[first[near]], people[second[near]]
+
+    def _revived(self, state: TrackerState, track: NDArray[np.intp], places: Array) -> TrackerState:
+        """Tracks (K,) that go on at `places` (K, J, 3) with evidence; velocities are as if they were new."""
+        fresh = self._states_at(places)
+        mean, covariance = state.joints.mean.copy(), state.joints.covariance.copy()
+        mean[track], covariance[track] = fresh.mean, fresh.covariance
+        evident_s = state.evident_s.copy()
+        evident_s[track] = state.time_s
+        return replace(state, joints=JointStates(mean, covariance), evident_s=evident_s)
+
+    def _states_at(self, places: Array) -> JointStates:
+        """People at `places` (P, J, 3), whose NaN joints are lost."""
+        known = np.isfinite(places).all(axis=-1)
+        centre = np.nanmean(places, axis=1, keepdims=True)
+        sigma = np.where(known, self.config.birth_sigma_m, 2 * self.config.lost_m)
+        return JointStates.at(np.where(known[..., None], places, centre), sigma, self.config.birth_speed_mps)
 
     def _enough(self, detections: Detections, free: NDArray[np.bool_]) -> bool:
         """Whether the free detections can be a person: enough core joints, each in two views."""
@@ -331,10 +374,7 @@ class Tracker:
         count = len(places)
         if count == 0:
             return state
-        known = np.isfinite(places).all(axis=-1)
-        centre = np.nanmean(places, axis=1, keepdims=True)
-        sigma = np.where(known, self.config.birth_sigma_m, 2 * self.config.lost_m)
-        joints = JointStates.at(np.where(known[..., None], places, centre), sigma, self.config.birth_speed_mps)
+        joints = self._states_at(places)
         now = np.full(count, state.time_s)
         return replace(
             state,

@@ -49,7 +49,9 @@ def test_a_linear_problem_is_pooled_exactly(own_centres):
     hessian = torch.from_numpy(np.stack([H for _, H in alone]))
     held = Held(torch.from_numpy(centre), torch.full((6, 1), 2.5, dtype=torch.float64))
     votes = np.ones(6, dtype=bool)
-    pooled = pooled_betas(free[:, :BETAS], shape_precision(hessian), groups, votes, held).numpy()
+    pooled = pooled_betas(
+        free[:, :BETAS], shape_precision(torch.linalg.cholesky(hessian)), groups, votes, held
+    ).numpy()
     for number in (5, -2):
         rows = groups == number
         # What a group was held by counts once: around the mean of where its rows were held.
@@ -63,7 +65,11 @@ def test_shapes_held_by_the_priors_alone_are_pooled_too():
     alone = [solved_alone(A[row], y[row], np.zeros(BETAS), 1.0) for row in range(3)]
     free, hessian = (torch.from_numpy(np.stack(part)).float() for part in zip(*alone, strict=True))
     pooled = pooled_betas(
-        free[:, :BETAS], shape_precision(hessian), np.zeros(3, dtype=int), np.ones(3, bool), Held.by_priors()
+        free[:, :BETAS],
+        shape_precision(torch.linalg.cholesky(hessian)),
+        np.zeros(3, dtype=int),
+        np.ones(3, bool),
+        Held.by_priors(),
     ).numpy()
     np.testing.assert_allclose(pooled[0], solved_jointly(A, y, np.zeros(BETAS), 1.0), atol=1e-4)  # single
 
@@ -73,7 +79,9 @@ def test_rows_that_do_not_vote_take_the_others_shape():
     alone = [solved_alone(A[row], y[row], np.zeros(BETAS), 1.0) for row in range(5)]
     free, hessian = (torch.from_numpy(np.stack(part)).float() for part in zip(*alone, strict=True))
     pools, votes = np.array([0, 0, 0, 1, 1]), np.array([True, True, False, False, False])
-    pooled = pooled_betas(free[:, :BETAS], shape_precision(hessian), pools, votes, Held.by_priors()).numpy()
+    pooled = pooled_betas(
+        free[:, :BETAS], shape_precision(torch.linalg.cholesky(hessian)), pools, votes, Held.by_priors()
+    ).numpy()
     expected = solved_jointly(A[:2], y[:2], np.zeros(BETAS), 1.0)
     np.testing.assert_allclose(pooled[:3], np.tile(expected, (3, 1)), atol=1e-4)  # single precision
     np.testing.assert_array_equal(pooled[3:], free[3:, :BETAS].numpy())  # no vote in their pool

@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitter import BodyFit, FitStatus
 from shapepose_fg.errors import InputError
-from shapepose_fg.estimation.alternation import EstimatorConfig, RefineConfig, interpolated, near_in_time
+from shapepose_fg.estimation.alternation import EstimatorConfig, RefineConfig, interpolated
 from shapepose_fg.estimation.estimator import Estimates, Estimator, window_rows
 from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
+from shapepose_fg.estimation.window_graph import near_in_time
 from shapepose_fg.observations import Observations
 from shapepose_fg.reconstruction import Known, Status
 from shapepose_fg.skeleton import BODY_25
@@ -22,7 +23,8 @@ WRIST, OTHER_WRIST = BODY_25.index("RWrist"), BODY_25.index("LWrist")
 
 
 class BesideFitter:
-    """Puts each row's body where the seen joints are, moved by `beside` (3,) metres; remembers what it was asked."""
+    """Puts each row's body where the seen joints are, moved by `beside` (3,) metres; remembers what it was
+    asked."""
 
     def __init__(self, shape: NDArray[np.float64], beside=(0.0, 0.0, 0.0), sigma_m: float = 0.1) -> None:
         self.shape, self.beside, self.sigma_m = shape, np.array(beside), sigma_m
@@ -91,7 +93,8 @@ def test_motion_takes_noise_away_and_knows_the_velocity(walk, five_cameras, two_
     found = solve(observations, five_cameras, BesideFitter(two_people[0]))
     before, after = (np.linalg.norm(each.joints - truth, axis=-1) for each in (alone, found))
     assert (found.status == Status.OK).all() and not found.problems
-    # The noise here is white; the model says that 30 % of it are, and smooths no more than that deserves. Measured: 0.57.
+    # The noise here is white; the model says that 30 % of it are, and smooths no more than that deserves.
+    # Measured: 0.57.
     assert after.mean() < 0.65 * before.mean()
     expected = np.array([[0.5, 0.0, 0.0], [0.0, -1.0, 0.0]])[observations.track]
     np.testing.assert_allclose(found.velocity.mean(axis=1), expected, atol=0.1)
@@ -118,7 +121,8 @@ def test_rows_of_a_track_are_one_group_of_the_fitter(walk, five_cameras, two_peo
 
 
 def test_a_joint_lost_from_sight_keeps_its_place_beside_the_body(walk, five_cameras, two_people):
-    """The body is 12 cm beside the joints. A wrist hidden for ten frames stays where it is, not where the body is."""
+    """The body is 12 cm beside the joints. A wrist hidden for ten frames stays where it is, not where the body
+    is."""
     observations, truth = walk
     rows = np.flatnonzero((observations.track == 0) & (observations.frame >= 10) & (observations.frame < 20))
     seen = hidden(observations, rows, WRIST)
@@ -201,7 +205,7 @@ def test_joints_tied_to_each_other_get_the_body_without_any_of_their_targets(
 
 @pytest.mark.parametrize("temporal", [True, False])
 def test_a_joint_thrown_away_is_a_status_with_a_name(walk, five_cameras, two_people, temporal):
-    observations, truth = walk
+    observations, _ = walk
 
     def throw(window, keys):
         if window.track == 1 and 4 in window.frames:

@@ -38,7 +38,8 @@ def solved(factors, values) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
 
 
 def smoothed(transition, process, prior, observations):
-    """Means and covariances (T, n), (T, n, n) of a linear Gaussian chain: Kalman filter and RTS smoother, in NumPy.
+    """Means and covariances (T, n), (T, n, n) of a linear Gaussian chain: Kalman filter and RTS smoother, in
+    NumPy.
 
     `transition(i)`, `process(i)` lead from state i to i + 1; `prior` is the first state's (mean, covariance);
     `observations[i]` is (H, R, z), or None.

@@ -63,7 +63,9 @@ class RowFitter:
         *,
         leave_out: bool = True,
     ) -> BodyFit:
-        """A body for every row; see `BodyFitter.fit`. Without `leave_out` priors of joints are NaN: much faster."""
+        """A body for every row; see `BodyFitter.fit`. Without `leave_out` priors of joints are NaN: much
+        faster.
+        """
         count = len(self.sets)
         if targets.xyz.shape[1] != count:
             raise ValueError(f"targets must be the {count} keypoints of the body, got {targets.xyz.shape[1]}")
@@ -151,7 +153,7 @@ class RowFitter:
             body, held = self.optimiser.first(targets, variance, _part(start, chunk))
             settled = body.left < self.unfinished
             bodies.append(torch.cat((body.free, settled[:, None]), 1))
-            precisions.append(shape_precision(body.here.hessian))
+            precisions.append(shape_precision(body.factor))
             holds.append(held.for_rows(len(settled)))
         found, held = torch.cat(bodies), Held.concatenated(holds)
         free, votes = found[:, :-1], passes.votes & found[:, -1].bool().numpy()

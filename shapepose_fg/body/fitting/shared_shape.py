@@ -8,11 +8,14 @@ from torch import Tensor
 from shapepose_fg.body.fitting.energy import Held
 
 
-def shape_precision(hessian: Tensor) -> Tensor:
-    """(B, 10, 10) what each row alone knows of its betas: the Schur complement of its Hessian (B, P, P)."""
-    factor, _ = torch.linalg.cholesky_ex(hessian[:, 10:, 10:])
-    across = hessian[:, 10:, :10]
-    return hessian[:, :10, :10] - across.mT @ torch.cholesky_solve(across, factor)
+def shape_precision(factor: Tensor) -> Tensor:
+    """(B, 10, 10) what each row alone knows of its betas, from the Cholesky factor (B, P, P) of its Hessian.
+
+    The Schur complement: the inverse of the betas' block of the Hessian's inverse.
+    """
+    by_betas = torch.eye(factor.shape[-1], 10, dtype=factor.dtype).expand(len(factor), -1, -1)
+    half = torch.linalg.solve_triangular(factor, by_betas, upper=False)
+    return torch.linalg.inv(half.mT @ half)
 
 
 def pooled_betas(

@@ -1,0 +1,96 @@
+"""Detections of predicted joints, joints that cannot be a person's own, and detections given out again."""
+
+import numpy as np
+
+from shapepose_fg.observations import Observations
+from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.tracking.following import Input
+from shapepose_fg.tracking.plausibility import torn_joints
+from shapepose_fg.tracking.reassociation import Survival, reassociate
+from shapepose_fg.tracking.view_assignment import AssignmentConfig, assign
+
+WRIST, ELBOW = BODY_25.index("RWrist"), BODY_25.index("RElbow")
+
+
+def own(detections, rig, people, candidate):
+    """Share of the detections in `candidate` (P, J, V) that are the person's own."""
+    xy, _ = rig.project(people)
+    right = total = 0
+    for person, joint, view in np.argwhere(candidate >= 0):
+        right += np.linalg.norm(detections.xy[candidate[person, joint, view]] - xy[view, person, joint]) < 1e-6
+        total += 1
+    return right / total, total
+
+
+def test_everybody_gets_their_own_detection_once(five_cameras, two_people, seen_exactly):
+    detections = seen_exactly(five_cameras, two_people)
+    rng = np.random.default_rng(0)
+    predicted = two_people + rng.normal(0, 0.02, two_people.shape)
+    sigma, lost = np.full((2, 25), 0.02), np.zeros((2, 25), dtype=bool)
+    candidate = assign(predicted, sigma, lost, detections, five_cameras, BODY_25, AssignmentConfig())
+    share, total = own(detections, five_cameras, two_people, candidate)
+    assert share == 1.0 and total == 2 * 25 * 5
+    taken = candidate[candidate >= 0]
+    assert len(np.unique(taken)) == len(taken)
+
+
+def test_a_lost_wrist_is_found_by_its_elbow(five_cameras, two_people, seen_exactly):
+    detections = seen_exactly(five_cameras, two_people)
+    predicted, sigma = two_people.copy(), np.full((2, 25), 0.02)
+    lost = np.zeros((2, 25), dtype=bool)
+    lost[:, WRIST] = True
+    predicted[:, WRIST] = predicted[:, ELBOW]
+    sigma[:, WRIST] = 0.3
+    candidate = assign(predicted, sigma, lost, detections, five_cameras, BODY_25, AssignmentConfig())
+    share, _ = own(detections, five_cameras, two_people, candidate)
+    assert share == 1.0 and (candidate[:, WRIST] >= 0).all()
+
+
+def test_nobody_gets_what_is_too_far_away(five_cameras, two_people, seen_exactly):
+    detections = seen_exactly(five_cameras, two_people[:1])
+    beside = two_people[:1] + np.array([0.0, 0.0, 0.4])
+    nothing = assign(
+        beside,
+        np.full((1, 25), 0.02),
+        np.zeros((1, 25), bool),
+        detections,
+        five_cameras,
+        BODY_25,
+        AssignmentConfig(),
+    )
+    # 0.4 m up is farther than 0.12 + 2 x 0.02 m, but for other joints of the same kind; there are none.
+    assert (nothing < 0).all()
+
+
+def test_a_wrist_a_metre_from_its_elbow_is_torn_and_its_neighbours_are_not(two_people):
+    places = two_people.copy()
+    places[0, WRIST] += 1.0
+    longest, views = np.full(25, 0.7), np.full((2, 25), 4)
+    torn = torn_joints(places, np.ones((2, 25), bool), views, longest, BODY_25)
+    assert torn.sum() == 1 and torn[0, WRIST]
+    # A shoulder that is off takes two bones with it: it goes, and nothing else.
+    shoulder = BODY_25.index("RShoulder")
+    places = two_people.copy()
+    places[1, shoulder] += [0.0, 0.0, 1.0]
+    torn = torn_joints(places, np.ones((2, 25), bool), views, longest, BODY_25)
+    assert np.argwhere(torn).tolist() == [[1, shoulder]]
+    assert not torn_joints(places, np.zeros((2, 25), bool), views, longest, BODY_25).any(), "nothing is judged"
+
+
+def test_detections_are_given_out_again_and_doubles_go(five_cameras, two_people, seen_exactly):
+    detections = seen_exactly(five_cameras, two_people)
+    given = [Input(7, np.zeros(5), detections, five_cameras)]
+    double = two_people[1] + 0.05
+    joints = np.stack([two_people[0], two_people[1], double])
+    covariance = np.broadcast_to(0.02**2 * np.eye(3), (3, 25, 3, 3))
+    none = np.full((3, 25, 5), -1)
+    rows = Observations.of(none, detections, joints)
+    from dataclasses import replace
+
+    rows = replace(rows, track=np.array([4, 5, 6]), frame=np.full(3, 7), time_s=np.full((3, 5), 0.5))
+    kept = reassociate(given, rows, joints, covariance, BODY_25, AssignmentConfig())
+    assert kept.track.tolist() == [4, 5, 6] and (kept.time_s == 0.5).all()
+    alone = reassociate(given, rows, joints, covariance, BODY_25, AssignmentConfig(), Survival())
+    assert alone.track.tolist() == [4, 5]
+    share, total = own(detections, five_cameras, two_people, alone.candidate)
+    assert share == 1.0 and total == 250

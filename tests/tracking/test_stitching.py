@@ -1,0 +1,65 @@
+"""People who leave and come back, and people who only look like it."""
+
+import numpy as np
+import pytest
+
+from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.tracking.stitching import StitchingConfig, stitch
+
+
+@pytest.fixture
+def rows(two_people):
+    """A function of (track, person, size, first frame, x) tuples -> track, time_s, joints; 20 rows each."""
+
+    def make(*parts):
+        rng = np.random.default_rng(0)
+        track, time_s, joints = [], [], []
+        for name, size, first, x in parts:
+            body = two_people[0] * size + [x, 0, 0]
+            # An error of 1 cm that lasts, and one of 5 mm that does not.
+            lasting = rng.normal(0, 0.01, body.shape)
+            track += [name] * 20
+            time_s += ((first + np.arange(20)) / 30).tolist()
+            joints += [body + lasting + rng.normal(0, 0.005, body.shape) for _ in range(20)]
+        return np.array(track), np.array(time_s), np.array(joints)
+
+    return make
+
+
+def test_who_comes_back_two_seconds_later_is_the_same(rows):
+    track, time_s, joints = rows((3, 1.0, 0, 0.0), (7, 1.0, 80, 1.0), (5, 1.0, 0, 4.0))
+    named = stitch(track, time_s, joints, BODY_25, StitchingConfig())
+    assert np.unique(named[track == 7]).tolist() == [3] and np.unique(named[track == 5]).tolist() == [5]
+
+
+@pytest.mark.parametrize(
+    ("size", "first", "x"),
+    [
+        (1.15, 80, 1.0),  # 15 % taller
+        (1.0, 80, 5.0),  # 5 m in 2 s
+        (1.0, 400, 1.0),  # 12 s later
+        (1.0, 10, 1.0),  # both at once
+    ],
+)
+def test_who_is_taller_too_far_away_too_late_or_there_at_the_same_time_is_not(rows, size, first, x):
+    track, time_s, joints = rows((3, 1.0, 0, 0.0), (7, size, first, x))
+    np.testing.assert_array_equal(stitch(track, time_s, joints, BODY_25, StitchingConfig()), track)
+
+
+def test_a_chain_of_tracks_gets_one_name_and_a_cut_breaks_it(rows):
+    track, time_s, joints = rows((4, 1.0, 0, 0.0), (6, 1.0, 60, 0.5), (9, 1.0, 120, 1.0))
+    assert set(stitch(track, time_s, joints, BODY_25, StitchingConfig()).tolist()) == {4}
+    cut = stitch(track, time_s, joints, BODY_25, StitchingConfig(), cuts_s=[100 / 30])
+    assert np.unique(cut[track == 6]).tolist() == [4] and np.unique(cut[track == 9]).tolist() == [9]
+
+
+def test_two_who_swap_places_out_of_sight_are_told_apart_by_their_build(rows):
+    track, time_s, joints = rows((1, 1.0, 0, 0.0), (2, 1.15, 0, 1.0), (3, 1.15, 60, 0.0), (4, 1.0, 60, 1.0))
+    named = stitch(track, time_s, joints, BODY_25, StitchingConfig())
+    assert np.unique(named[track == 3]).tolist() == [2] and np.unique(named[track == 4]).tolist() == [1]
+
+
+def test_nobody_is_nobody():
+    none = np.zeros(0)
+    named = stitch(none.astype(int), none, np.zeros((0, 25, 3)), BODY_25, StitchingConfig())
+    assert len(named) == 0
