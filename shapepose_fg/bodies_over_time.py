@@ -45,18 +45,18 @@ def with_bodies_over_time(
     """
     if len(people) == 0:
         return people
-    solved = np.isfinite(people.joints).all(axis=-1) & np.isfinite(people.covariance).all(axis=(-1, -2))
+    solved = np.isfinite(people.joints.sum(axis=-1)) & np.isfinite(people.covariance.sum(axis=(-1, -2)))
     information = np.zeros_like(people.covariance)
     information[solved] = np.linalg.inv(people.covariance[solved])
     targets = JointTargets(
         np.where(solved[..., None], people.joints, 0.0), (information + information.swapaxes(-1, -2)) / 2
     )
-    body = fingerprint(fitter.model)
+    body, person = fingerprint(fitter.model), people.person.astype(np.intp)
     known = SubjectShapes.empty(body) if known is None else known
-    found = fitter.fit_sequence(targets, people.person, people.time_s)
+    found = fitter.fit_sequence(targets, person, people.time_s)
     whose = recognise(_subjects(found, body), known)
     if (whose >= 0).any():
-        found = fitter.fit_sequence(targets, people.person, people.time_s, _prior(known, whose))
+        found = fitter.fit_sequence(targets, person, people.time_s, _prior(known, whose))
     ok = found.fit.ok
     columns = {}
     for name in ("betas", "global_orient", "body_pose", "transl"):
