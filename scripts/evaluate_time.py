@@ -68,6 +68,7 @@ COLUMNS = {
     "stature": ("stature_spread_cm", 1),
     "50 %": ("seen_inside_50", 1),
     "95 %": ("seen_inside_95", 1),
+    "u": ("joints_long_unseen", 0),
     "u 50 %": ("unseen_inside_50", 1),
     "u 95 %": ("unseen_inside_95", 1),
     "v": ("velocity_error", 2),

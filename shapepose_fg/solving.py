@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.bodies_over_time import SequenceFitting, with_bodies_over_time
 from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.camera import Rig
@@ -47,7 +48,8 @@ def solve_rows(
             estimates = estimator.estimate(observations, extra_factors)
             solved = result_rows(observations, estimates, table.candidate, rig, joint_names, part.person)
             parts.append(solved.rows(np.isin(part.frame, np.array(own))))
-    return replace(Reconstruction.concatenate(parts), run=rows.run) if parts else rows
+        solved = replace(Reconstruction.concatenate(parts), run=rows.run) if parts else rows
+        return with_bodies_over_time(solved, fitter) if isinstance(fitter, SequenceFitting) else solved
 
 
 def _windows(rows: Reconstruction, config: PipelineConfig) -> list[range]:

@@ -21,7 +21,7 @@ from shapepose_fg.estimation.alternation import (
 from shapepose_fg.estimation.draft import WholeFitter, drafted
 from shapepose_fg.estimation.linearisation import linearise, mean_confidence, observation_sigmas, triangulate
 from shapepose_fg.estimation.motion_model import MotionModel
-from shapepose_fg.estimation.outcome import Problem, how_known, lasting_covariance, problems
+from shapepose_fg.estimation.outcome import Problem, how_known, problems, reported_covariance
 from shapepose_fg.estimation.window_graph import WindowGraph
 from shapepose_fg.observations import Observations
 from shapepose_fg.reconstruction import Status
@@ -103,6 +103,8 @@ class Estimator:
                 f"views must be of the {len(observations)} rows' {observations.confidence.shape[2]} views"
             )
         X = triangulate(observations, views, config.observations)
+        if config.motion.temporal and len(np.unique(observations.track)) < len(observations):
+            X = self._completed(X, observations, views)
         sigmas = observation_sigmas(observations, X, views, config.observations)
         windows = self._windows(observations, sigmas, views, extra_factors)
         solution = alternate(observations, views, sigmas, X, windows, self.fitter, config)
@@ -124,6 +126,18 @@ class Estimator:
         enough = (evidence.sigma_m <= config.refine.max_sigma_m).sum(axis=1) >= config.refine.min_joints
         whole = self.fitter.fit_whole if isinstance(self.fitter, WholeFitter) else self.fitter.fit
         return drafted(evidence, whole(joint_targets(evidence, enough)), config.refine.disagreement)
+
+    def _completed(self, X: NDArray[np.float64], observations: Observations, views: Views) -> NDArray[np.float64]:
+        """X_0 (N, J, 3) with joints that are not placed where a draft has them: a view that sees one counts from the
+        first round on, and windows need no second."""
+        unknown = np.isnan(X).any(axis=2)
+        rows = np.flatnonzero(unknown.any(axis=1))
+        if len(rows) == 0:
+            return X
+        places, _ = self.draft(observations.rows(rows), views.rows(rows))
+        complete = X.copy()
+        complete[rows] = np.where(unknown[rows][..., None], places, X[rows])
+        return complete
 
     def _windows(
         self,
@@ -178,7 +192,7 @@ class Estimator:
             if graph.temporal:
                 velocity[rows] = graph.velocity()
                 velocity_covariance[rows] = graph.marginals(graph.velocity_keys)
-                covariance[rows] += lasting_covariance(solution, window, self._motion.views.white_share)
+                covariance[rows] = reported_covariance(solution, window, covariance[rows], self._motion.views)
         fit = final_bodies(solution, covariance, windows, self.fitter)
         final = linearise(observations, sigmas, X, views, self.config.observations)
         wrong = problems(observations, windows, solution, first, covariance)

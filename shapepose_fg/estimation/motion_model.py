@@ -44,6 +44,8 @@ class Lasting:
     """Share of its variance that is new in every frame, between 0 and 1."""
     correlation_s: float
     """The rest has the autocorrelation exp(-t / this)."""
+    kept: float = 0.0
+    """How much of the first share motion leaves in, because it lasts for a few frames after all, 0 to 1."""
 
 
 @dataclass(frozen=True)
@@ -54,10 +56,15 @@ class MotionModel:
     """(J,) power spectral density of the acceleration of a joint that hardly moves, m²/s³, per axis."""
     psd_speed: NDArray[np.float64]
     """(J,) what is added to it for each (m/s)² of the joint's speed: fast joints turn faster, too."""
+    psd_lost: NDArray[np.float64]
+    """(J,) what it is at least while a joint is lost from sight, and its speed unknown: the mean over all
+    speeds."""
     views: Lasting
     """What the views of one frame say of a joint, taken together."""
     body: Lasting
     """What the body says of a joint without the joint's own views."""
+    around_s: float = 0.5
+    """How long before and after a joint is lost from sight the difference between joint and body is followed."""
     speed_m_s: float = 2.0
     """How fast a joint is, one sigma per axis, before anything is known of it."""
 
@@ -74,19 +81,19 @@ class MotionModel:
         """
         config = MotionConfig() if config is None else config
         if config.model:
-            return cls._read(Path(config.model), joints, config.psd_scale)
+            return cls._read(Path(config.model), joints, config)
         with as_file(files("shapepose_fg.estimation") / "data" / "motion.json") as path:
-            return cls._read(path, joints, config.psd_scale)
+            return cls._read(path, joints, config)
 
     @classmethod
-    def _read(cls, path: Path, joints: tuple[str, ...], scale: float) -> "MotionModel":
+    def _read(cls, path: Path, joints: tuple[str, ...], config: MotionConfig) -> "MotionModel":
         data = read_json(path)
         try:
             if data["format"] != FORMAT:
                 raise KeyError("format")
-            known = {name: (float(still), float(speed)) for name, (still, speed) in data["joints"].items()}
+            known = {name: tuple(map(float, numbers)) for name, numbers in data["joints"].items()}
             views, body = (
-                Lasting(float(data[name]["white_share"]), float(data[name]["correlation_s"]))
+                Lasting(*(float(data[name][key]) for key in ("white_share", "correlation_s", "kept")))
                 for name in ("views", "body")
             )
         except (KeyError, TypeError, ValueError) as error:
@@ -94,7 +101,9 @@ class MotionModel:
                 f"{path}: is not a motion model ({error}); give what scripts/measure_motion.py writes"
             ) from None
         table = np.array(list(known.values()))
-        if not (np.isfinite(table).all() and (table[:, 0] > 0).all() and (table[:, 1] >= 0).all()):
+        if not (
+            np.isfinite(table).all() and (table[:, 0] > 0).all() and table.shape[1] == 3 and (table >= 0).all()
+        ):
             raise InputError(f"{path}: densities must be positive; give what scripts/measure_motion.py writes")
-        chosen = scale * np.array([known.get(name, tuple(table.mean(axis=0))) for name in joints])
-        return cls(chosen[:, 0], chosen[:, 1], views, body)
+        chosen = config.psd_scale * np.array([known.get(name, tuple(table.mean(axis=0))) for name in joints])
+        return cls(*chosen.T, views, body, config.around_s)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.estimation.alternation import Solution, Window
 from shapepose_fg.estimation.linearisation import weakest_sigma
+from shapepose_fg.estimation.motion_model import Lasting
 from shapepose_fg.observations import Observations
 from shapepose_fg.reconstruction import Known
 
@@ -36,23 +37,33 @@ class Problem:
     """What happened, in words."""
 
 
-def lasting_covariance(solution: Solution, window: Window, white_share: float) -> NDArray[np.float64]:
-    """(T, J, 3, 3) what the graph left out: the lasting share of the error that one frame leaves, m².
+def reported_covariance(
+    solution: Solution, window: Window, marginal: NDArray[np.float64], views: Lasting
+) -> NDArray[np.float64]:
+    """(T, J, 3, 3) covariance of the joints, m²: `marginal` of the graph, and the errors that the graph left out.
 
-    What views and body leave in a frame in which the joint is seen; in others what they left in the nearest such
-    frame, from which motion, or the body's offset, carried it. Zero for joints that were solved with offsets.
+    The graph of several frames holds only the share of the errors that is new in every frame. Added is the share
+    that lasts, of what views and body leave in one frame, C_t; and of the share that motion smooths, that part
+    which it does not take away in truth, because errors fade over a few frames and not from one to the next
+    (`Lasting.kept`). Where a joint is not seen, what was left in the nearest frame in which it was is carried
+    along; a view that still sees it brings its own lasting error in, through the gain that it has. Joints solved
+    with offsets have it all in `marginal`.
     """
-    information = solution.views.information[window.rows] + solution.body.information[window.rows]
-    seen = weakest_sigma(solution.views.information[window.rows]) <= SEEN_M
-    seen &= ~window.graph.with_offsets
-    result = np.zeros(information.shape)
-    result[seen] = (1.0 - white_share) * np.linalg.inv(information[seen])
+    said = solution.views.information[window.rows]
+    information = said + solution.body.information[window.rows]
+    simple = np.broadcast_to(~window.graph.with_offsets, said.shape[:2])
+    seen = (weakest_sigma(said) <= SEEN_M) & simple
+    f, kept = views.white_share, views.kept
+    left = np.zeros(information.shape)
+    left[seen] = np.linalg.inv(information[seen])
     times = window.graph.times_s
     for joint in np.flatnonzero(seen.any(axis=0) & ~seen.all(axis=0)).tolist():
         frames = np.flatnonzero(seen[:, joint])
         nearest = frames[np.abs(times[:, None] - times[frames]).argmin(axis=1)]
-        result[:, joint] = result[nearest, joint]
-    return result
+        left[:, joint] = left[nearest, joint]
+    own = (1 - f) / f**2 * marginal @ said @ marginal
+    total = np.where(seen[..., None, None], (1 - kept) * marginal, marginal + own) + (1 - f + kept * f) * left
+    return np.where(simple[..., None, None], total, marginal)
 
 
 def how_known(solution: Solution, covariance: NDArray[np.float64]) -> NDArray[np.uint8]:

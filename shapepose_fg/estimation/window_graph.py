@@ -210,13 +210,15 @@ class WindowGraph:
         `inlier` (T, J, V) are the observations that count (delta_ij of Eq. 2), `views` what they say together at
         `initial`, `body` the priors (Eq. 3). A joint with NaN in `initial` is not in the problem and stays NaN; in
         a window of several frames that goes for all frames of the joint. `lost` (T, J): where joints are hardly
-        seen, or will soon be, or were a moment ago.
+        seen.
         """
         self._present = np.isfinite(initial).all(axis=2)
         if self.temporal:
             self._present &= self._present.all(axis=0)
         of_views = self._present & self.with_offsets
-        of_body = of_views if lost is None or not self.temporal else self._present & (lost | self.with_offsets)
+        of_body = of_views
+        if self.temporal and lost is not None:
+            of_body = self._present & (self.with_offsets | near_in_time(lost, self.times_s, self._motion.around_s))
         self.values = self._start(initial, np.stack([of_views, of_body]))
         self.graph = gtsam.NonlinearFactorGraph()
         self._push(self._seen(inlier & (self._present & ~of_views)[..., None]))
@@ -224,7 +226,7 @@ class WindowGraph:
         self._push(self._lasting(views, 1.0 / self.config.weight_2d, self._motion.views, _OF_VIEWS, of_views))
         self._push(self._lasting(body, 1.0 / self.config.weight_shape, self._motion.body, _OF_BODY, of_body))
         if self.temporal:
-            self._push(self._motions(initial))
+            self._push(self._motions(initial, lost))
         exists = self.values.exists
         self._push([factor for factor, keys in self._added if all(map(exists, keys))])
         if self.values.empty():
@@ -326,10 +328,12 @@ class WindowGraph:
             factors += offset_factors(keys[there, joint], self.times_s[there], errors.correlation_s)
         return factors
 
-    def _motions(self, near: NDArray[np.float64]) -> list[gtsam.NonlinearFactor]:
+    def _motions(self, near: NDArray[np.float64], lost: NDArray[np.bool_] | None) -> list[gtsam.NonlinearFactor]:
         """Motion of the joints that are in the problem; how far they may turn goes by their speed at `near`."""
-        speed = np.linalg.norm(np.diff(near, axis=0), axis=2) / np.diff(self.times_s)[:, None]
+        speed = speeds(near, self.times_s)
         psd = self._motion.psd(speed)
+        if lost is not None:
+            psd = np.where(lost[1:] & lost[:-1], np.maximum(psd, self._motion.psd_lost), psd)
         unknown = diagonal(np.full(3, self._motion.speed_m_s))
         factors: list[gtsam.NonlinearFactor] = []
         for joint in np.flatnonzero(self._present[0]).tolist():
@@ -368,6 +372,25 @@ class WindowGraph:
             if self.temporal:
                 speeds[present] = points[count : 2 * count]
         return positions.swapaxes(0, 1), speeds.swapaxes(0, 1)
+
+
+SPEED_S = 0.1
+"""Speeds are taken over this time before and after a step, so that noise does not pass for speed."""
+
+
+def speeds(points: NDArray[np.float64], times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(T - 1, J) how fast points (T, J, 3) are in each step, m/s, over `SPEED_S` on either side."""
+    first = np.searchsorted(times_s, times_s[:-1] - SPEED_S, side="left")
+    last = np.searchsorted(times_s, times_s[1:] + SPEED_S, side="right") - 1
+    return np.linalg.norm(points[last] - points[first], axis=2) / (times_s[last] - times_s[first])[:, None]
+
+
+def near_in_time(marked: NDArray[np.bool_], times_s: NDArray[np.float64], within_s: float) -> NDArray[np.bool_]:
+    """(T, J) which frames are at most `within_s` from one that is `marked` (T, J)."""
+    first = np.searchsorted(times_s, times_s - within_s, side="left")
+    last = np.searchsorted(times_s, times_s + within_s, side="right")
+    count = np.concatenate([np.zeros((1, marked.shape[1]), dtype=int), np.cumsum(marked, axis=0)])
+    return count[last] > count[first]
 
 
 def symmetric_roots(information: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitter import BodyFit, FitStatus
 from shapepose_fg.errors import InputError
-from shapepose_fg.estimation.alternation import EstimatorConfig, RefineConfig, interpolated, near_in_time
+from shapepose_fg.estimation.alternation import EstimatorConfig, RefineConfig, interpolated
 from shapepose_fg.estimation.estimator import Estimates, Estimator, window_rows
 from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
+from shapepose_fg.estimation.window_graph import near_in_time
 from shapepose_fg.observations import Observations
 from shapepose_fg.reconstruction import Known, Status
 from shapepose_fg.skeleton import BODY_25
