@@ -29,7 +29,7 @@ def drafted(
     What the views say and what the body says, weighted by their information. Views that are `disagreement`
     standard deviations from the body count nothing: its robust kernel has passed over them, too.
     """
-    known = body.ok[:, None, None]
+    known = (body.ok[:, None] & np.isfinite(body.covariance).all(axis=(2, 3)))[..., None]
     covariance = np.where(known[..., None], body.covariance + MODEL_SIGMA_M**2 * np.eye(3), np.eye(3))
     at = np.where(known, body.joints, np.nan_to_num(evidence.target))
     apart = np.nan_to_num(evidence.target) - at

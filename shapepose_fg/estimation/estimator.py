@@ -103,6 +103,8 @@ class Estimator:
                 f"views must be of the {len(observations)} rows' {observations.confidence.shape[2]} views"
             )
         X = triangulate(observations, views, config.observations)
+        if config.motion.temporal and len(np.unique(observations.track)) < len(observations):
+            X = self._completed(X, observations, views)
         sigmas = observation_sigmas(observations, X, views, config.observations)
         windows = self._windows(observations, sigmas, views, extra_factors)
         solution = alternate(observations, views, sigmas, X, windows, self.fitter, config)
@@ -124,6 +126,18 @@ class Estimator:
         enough = (evidence.sigma_m <= config.refine.max_sigma_m).sum(axis=1) >= config.refine.min_joints
         whole = self.fitter.fit_whole if isinstance(self.fitter, WholeFitter) else self.fitter.fit
         return drafted(evidence, whole(joint_targets(evidence, enough)), config.refine.disagreement)
+
+    def _completed(self, X: NDArray[np.float64], observations: Observations, views: Views) -> NDArray[np.float64]:
+        """X_0 (N, J, 3) with joints that are not placed where a draft has them: a view that sees one counts from the
+        first round on, and windows need no second."""
+        unknown = np.isnan(X).any(axis=2)
+        rows = np.flatnonzero(unknown.any(axis=1))
+        if len(rows) == 0:
+            return X
+        places, _ = self.draft(observations.rows(rows), views.rows(rows))
+        complete = X.copy()
+        complete[rows] = np.where(unknown[rows][..., None], places, X[rows])
+        return complete
 
     def _windows(
         self,

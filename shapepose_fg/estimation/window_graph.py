@@ -330,7 +330,7 @@ class WindowGraph:
 
     def _motions(self, near: NDArray[np.float64], lost: NDArray[np.bool_] | None) -> list[gtsam.NonlinearFactor]:
         """Motion of the joints that are in the problem; how far they may turn goes by their speed at `near`."""
-        speed = np.linalg.norm(np.diff(near, axis=0), axis=2) / np.diff(self.times_s)[:, None]
+        speed = speeds(near, self.times_s)
         psd = self._motion.psd(speed)
         if lost is not None:
             psd = np.where(lost[1:] & lost[:-1], np.maximum(psd, self._motion.psd_lost), psd)
@@ -372,6 +372,17 @@ class WindowGraph:
             if self.temporal:
                 speeds[present] = points[count : 2 * count]
         return positions.swapaxes(0, 1), speeds.swapaxes(0, 1)
+
+
+SPEED_S = 0.1
+"""Speeds are taken over this time before and after a step, so that noise does not pass for speed."""
+
+
+def speeds(points: NDArray[np.float64], times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(T - 1, J) how fast points (T, J, 3) are in each step, m/s, over `SPEED_S` on either side."""
+    first = np.searchsorted(times_s, times_s[:-1] - SPEED_S, side="left")
+    last = np.searchsorted(times_s, times_s[1:] + SPEED_S, side="right") - 1
+    return np.linalg.norm(points[last] - points[first], axis=2) / (times_s[last] - times_s[first])[:, None]
 
 
 def near_in_time(marked: NDArray[np.bool_], times_s: NDArray[np.float64], within_s: float) -> NDArray[np.bool_]:
