@@ -34,8 +34,8 @@ class RefineConfig:
     max_sigma_m: float = 0.5
     """A joint whose views leave it less certain than this in some direction is not determined by them."""
     disagreement: float = 4.0
-    """A joint that its views put this many standard deviations from where the body can have it is seen wrongly: its
-    gates are decided anew from the place of a body that was fitted without it. Of three coordinates, 0.1 % are
+    """A joint that its views put this many standard deviations from where the body can have it is seen wrongly:
+    its gates are decided anew from the place of a body that was fitted without it. Of three coordinates, 0.1 % are
     farther by chance."""
     min_joints: int = 4
     """Fewer joints than this determined by the views are not a person that can be placed in space."""
@@ -210,7 +210,9 @@ def disagreement(evidence: ViewEvidence, fit: BodyFit) -> NDArray[np.float64]:
 def _sigmas_apart(
     evidence: ViewEvidence, xyz: NDArray[np.float64], covariance: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Distance (N, J) of what the views say from `xyz` (N, J, 3) +- `covariance`, standard deviations; NaN unknown."""
+    """Distance (N, J) of what the views say from `xyz` (N, J, 3) +- `covariance`, standard deviations; NaN
+    unknown.
+    """
     known = np.isfinite(xyz).all(axis=2)
     apart = np.where(known[..., None], np.nan_to_num(evidence.target - xyz), 0.0)
     other = np.where(known[..., None, None], covariance, np.eye(3))
