@@ -132,7 +132,7 @@ class Estimator:
 
         A view that sees one counts from the first round on, then, and windows need no second.
         """
-        unknown = np.isnan(X).any(axis=2)
+        unknown = np.asarray(np.isnan(X).any(axis=2))
         rows = np.flatnonzero(unknown.any(axis=1))
         if len(rows) == 0:
             return X

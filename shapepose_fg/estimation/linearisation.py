@@ -83,7 +83,7 @@ def weakest_sigma(information: NDArray[np.float64]) -> NDArray[np.float64]:
     """Standard deviation (...,) along the direction that `information` (..., 3, 3) knows least; infinite for a
     ray.
     """
-    return _weakest(np.linalg.eigvalsh(information))
+    return _weakest(np.asarray(np.linalg.eigvalsh(information), dtype=np.float64))
 
 
 def _weakest(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -91,7 +91,7 @@ def problems(
     them.
     """
     X = solution.joints
-    finite = np.isfinite(X).all(axis=2)
+    finite = np.asarray(np.isfinite(X).all(axis=2))
     reasons = np.full(finite.shape, "", dtype=object)
     information = solution.views.information + solution.body.information
     pulls = _pull(solution.views, X) + _pull(solution.body, X)
@@ -112,7 +112,7 @@ def problems(
     lost = finite & ~np.isfinite(covariance).all(axis=(2, 3)) & (reasons == "")
     reasons[lost] = "nothing determines it: its system is singular"
     return tuple(
-        Problem(int(n), int(observations.track[n]), int(observations.frame[n]), int(j), reasons[n, j])
+        Problem(int(n), int(observations.track[n]), int(observations.frame[n]), int(j), str(reasons[n, j]))
         for n, j in np.argwhere(reasons != "")
     )
 

@@ -69,7 +69,7 @@ class Message:
     @property
     def known(self) -> NDArray[np.bool_]:
         """(T, J) of which joints anything is said."""
-        return self.information.any(axis=(2, 3))
+        return np.asarray(self.information.any(axis=(2, 3)))
 
     def rows(self, index: NDArray[np.intp]) -> "Message":
         """Some of the rows."""
@@ -212,7 +212,7 @@ class WindowGraph:
         a window of several frames that goes for all frames of the joint. `lost` (T, J): where joints are hardly
         seen.
         """
-        self._present = np.isfinite(initial).all(axis=2)
+        self._present = np.asarray(np.isfinite(initial).all(axis=2))
         if self.temporal:
             self._present &= self._present.all(axis=0)
         of_views = self._present & self.with_offsets
@@ -314,7 +314,7 @@ class WindowGraph:
         share = self._motion.views.white_share if self.temporal else 1.0
         covariances = np.linalg.inv(body.information[known]) * (share / self.config.weight_shape)
         symmetric = (covariances + covariances.swapaxes(1, 2)) / 2
-        return body_prior_factors(self.keys[known], body.xyz[known], symmetric)
+        return list(body_prior_factors(self.keys[known], body.xyz[known], symmetric))
 
     def _lasting(
         self, said: Message, scale: float, errors: Lasting, source: int, chosen: NDArray[np.bool_]

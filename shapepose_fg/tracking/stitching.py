@@ -92,7 +92,7 @@ def _ends(
     core = list(skeleton.core)
     bone = np.array([(j, p) for j, p in enumerate(skeleton.parents) if j in core and p in core])
     length = np.linalg.norm(joints[:, bone[:, 0]] - joints[:, bone[:, 1]], axis=-1)
-    known = np.isfinite(joints[:, core]).all(axis=-1)[..., None]
+    known = np.asarray(np.isfinite(joints[:, core]).all(axis=-1))[..., None]
     centre = np.where(known, joints[:, core], 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
     times, places, bones = [], [], []
     for each in ids.tolist():

@@ -323,7 +323,7 @@ class Tracker:
         if len(waiting) == 0 or len(people) == 0:
             return np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
         core = list(self.skeleton.core)
-        known = np.isfinite(places[people][:, core]).all(axis=-1)[..., None]  # (K, C, 1)
+        known = np.asarray(np.isfinite(places[people][:, core]).all(axis=-1))[..., None]  # (K, C, 1)
         count = np.maximum(known.sum(axis=1), 1)
         centre = np.where(known, places[people][:, core], 0.0).sum(axis=1) / count
         expected = np.where(known, state.joints.position[waiting][:, None, core], 0.0).sum(axis=2) / count
@@ -345,7 +345,7 @@ class Tracker:
 
     def _states_at(self, places: Array) -> JointStates:
         """People at `places` (P, J, 3), whose NaN joints are lost."""
-        known = np.isfinite(places).all(axis=-1)
+        known = np.asarray(np.isfinite(places).all(axis=-1))
         centre = np.nanmean(places, axis=1, keepdims=True)
         sigma = np.where(known, self.config.birth_sigma_m, 2 * self.config.lost_m)
         return JointStates.at(np.where(known[..., None], places, centre), sigma, self.config.birth_speed_mps)
