@@ -44,7 +44,8 @@ def solve_rows(
             part = rows.rows(near)
             table = part.observations
             assert table is not None
-            observations = table.observations(part.joints, part.time_s)
+            # From the views: the joints as they are may be somebody else's.
+            observations = table.observations(np.full_like(part.joints, np.nan), part.time_s)
             estimates = estimator.estimate(observations, extra_factors)
             solved = result_rows(observations, estimates, table.candidate, rig, joint_names, part.person)
             parts.append(solved.rows(np.isin(part.frame, np.array(own))))

@@ -119,12 +119,13 @@ class SubjectShapes:
 def recognise(found: SubjectShapes, known: SubjectShapes, ratio: float = 10.0) -> NDArray[np.intp]:
     """(G,) which of the `known` people each of the `found` ones is, by shape alone; -1 for a stranger.
 
-    `found` were estimated from the adults' prior N(0, I). Somebody is recognised where what was seen is `ratio`
-    times as likely of a known shape as of any adult's (Bayes factor): by Markov's inequality, at most one stranger
-    in ten passes for a given person. Stature is most of what is seen of a shape: on the built-in scene, joints known
-    to 3 mm, the factors of the right people were 40 to 410, of wrong ones below 1e-4. Two people who are taken for
-    each other differ little in shape. Everybody is one person at the most, so that the product of all factors is
-    largest. ValueError where the two are of different bodies.
+    `found` were estimated from the adults' prior N(0, I). Somebody is recognised where what was seen is
+    `ratio` times as likely of a known shape as of any adult's (Bayes factor): by Markov's inequality, at
+    most one stranger in ten passes for a given person. Stature is most of what is seen of a shape: on the
+    built-in scene, joints known to 3 mm, the factors of the right people were 40 to 410, of wrong ones
+    below 1e-4. Two people who are taken for each other differ little in shape. Everybody is one person at
+    the most, so that the product of all factors is largest. ValueError where the two are of different
+    bodies.
     """
     if found.body != known.body:
         raise ValueError("shapes must be of the same body model")

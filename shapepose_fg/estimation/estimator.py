@@ -128,8 +128,10 @@ class Estimator:
         return drafted(evidence, whole(joint_targets(evidence, enough)), config.refine.disagreement)
 
     def _completed(self, X: NDArray[np.float64], observations: Observations, views: Views) -> NDArray[np.float64]:
-        """X_0 (N, J, 3) with joints that are not placed where a draft has them: a view that sees one counts from the
-        first round on, and windows need no second."""
+        """X_0 (N, J, 3) with joints that are not placed where a draft has them.
+
+        A view that sees one counts from the first round on, then, and windows need no second.
+        """
         unknown = np.isnan(X).any(axis=2)
         rows = np.flatnonzero(unknown.any(axis=1))
         if len(rows) == 0:
