@@ -105,7 +105,7 @@ class SequenceFitter:
         evidence = weigh(targets, self.rows.evidence)
         fit = BodyFit.failed(evidence.status, targets.xyz.shape[1])
         start = self._start(evidence, group, time_s, len(numbers))
-        known = _unknown(start.betas) if shapes is None else shapes
+        known = _unknown(len(numbers)) if shapes is None else shapes
         usable = np.flatnonzero(evidence.status != FitStatus.INVALID_TARGETS)
         config = self.config
         segments = [
@@ -126,7 +126,7 @@ class SequenceFitter:
         ok = np.flatnonzero(evidence.status == FitStatus.OK)
         B, A = len(group), self.rows.energy.num_angles
         free, angles, found = torch.zeros(B, 16 + A), None, np.zeros(B, dtype=bool)
-        origin, betas = np.zeros((count, 3)), np.zeros((count, 10))
+        origin = np.zeros((count, 3))
         if len(ok) > 0:
             alone, held, done = self.rows.starts(evidence.rows(ok))
             ok, chosen = ok[done], torch.from_numpy(np.flatnonzero(done))
@@ -135,7 +135,6 @@ class SequenceFitter:
             for number in np.unique(group[ok]):
                 mine, theirs = np.flatnonzero(group == number), ok[group[ok] == number]
                 origin[number] = evidence.centre[theirs].mean(axis=0)
-                betas[number] = held.betas[chosen[group[ok] == number]].double().mean(0).numpy()
                 free[theirs, -3:] += torch.from_numpy(evidence.centre[theirs] - origin[number]).float()
                 order = theirs[np.argsort(time_s[theirs])]
                 nearest = order[_nearest(time_s[order], time_s[mine])]
@@ -149,7 +148,7 @@ class SequenceFitter:
                     angles[mine] = held.angles[chosen[row]]
         xyz = torch.from_numpy(evidence.xyz - origin[group][:, None]).float()
         targets = WhitenedTargets(xyz, torch.from_numpy(evidence.root).float())
-        return _Start(free, ChainRows(targets, angles, time_s), found, group, origin, betas)
+        return _Start(free, ChainRows(targets, angles, time_s), found, group, origin)
 
     def _solved(
         self, start: "_Start", segments: list[Segment], known: Shapes, fixed: bool
@@ -227,8 +226,6 @@ class _Start:
     """(B,) whose."""
     origin: Array
     """(G, 3) of each group, metres."""
-    betas: Array
-    """(G, 10) mean of what the rows are held by."""
 
     def rows_per_look(self, segments: list[Segment], lasting_s: float, count: int) -> Array:
         """(G,) how many rows of a group tell of its shape as one: those within the time that errors last."""
@@ -240,9 +237,9 @@ class _Start:
         return np.maximum(rows / (1 + looks), 1.0)
 
 
-def _unknown(betas: Array) -> Shapes:
-    """Shapes of people who were never seen: a standard deviation wide, around `betas` (G, 10)."""
-    return Shapes(betas, np.tile(np.eye(10), (len(betas), 1, 1)))
+def _unknown(count: int) -> Shapes:
+    """Shapes of people who were never seen: adults."""
+    return Shapes(np.zeros((count, 10)), np.tile(np.eye(10), (count, 1, 1)))
 
 
 def _nearest(sorted_s: Array, asked_s: Array) -> NDArray[np.intp]:
