@@ -10,7 +10,7 @@ from shapepose_fg.body.fitting.body_sequence import SequenceFit, Shapes
 from shapepose_fg.body.fitting.fitter import BodyFitter, JointTargets
 from shapepose_fg.body.fitting.weights import fingerprint
 from shapepose_fg.body.model.body_model import BodyModel
-from shapepose_fg.body.shapes import SubjectShapes
+from shapepose_fg.body.shapes import SubjectShapes, recognise
 from shapepose_fg.reconstruction import Reconstruction, Status
 
 
@@ -39,45 +39,57 @@ def with_bodies_over_time(
 ) -> Reconstruction:
     """The same rows with one body per person, fitted to the joints as they were solved, and everybody's shape.
 
-    `known` are shapes from other recordings, by the number of the identity. Nothing of this returns into the
-    joints or their covariances. Rows without a body keep the body that they had.
+    `known` are people from other recordings: who is recognised by shape (`recognise`) is fitted again with that as
+    the prior. Nothing of this returns into the joints or their covariances. Rows without a body keep the body that
+    they had. `shapes` of the result are everybody's, those who were recognised by their known names.
     """
     if len(people) == 0:
         return people
-    solved = np.isfinite(people.joints).all(axis=-1) & np.isfinite(people.covariance).all(axis=(-1, -2))
+    solved = np.isfinite(people.joints.sum(axis=-1)) & np.isfinite(people.covariance.sum(axis=(-1, -2)))
     information = np.zeros_like(people.covariance)
     information[solved] = np.linalg.inv(people.covariance[solved])
     targets = JointTargets(
         np.where(solved[..., None], people.joints, 0.0), (information + information.swapaxes(-1, -2)) / 2
     )
-    groups = np.unique(people.person)
-    body = fingerprint(fitter.model)
-    found = fitter.fit_sequence(targets, people.person, people.time_s, _prior(groups, known, body))
+    body, person = fingerprint(fitter.model), people.person.astype(np.intp)
+    known = SubjectShapes.empty(body) if known is None else known
+    found = fitter.fit_sequence(targets, person, people.time_s)
+    whose = recognise(_subjects(found, body), known)
+    if (whose >= 0).any():
+        found = fitter.fit_sequence(targets, person, people.time_s, _prior(known, whose))
     ok = found.fit.ok
     columns = {}
     for name in ("betas", "global_orient", "body_pose", "transl"):
         old, new = getattr(people, name), getattr(found.fit, name)
         columns[name] = np.where(ok.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
     status = np.where(ok & (people.status == Status.BODY_UNDETERMINED), Status.OK, people.status)
-    shapes = SubjectShapes(
-        names=np.array([str(each) for each in found.groups.tolist()]),
-        betas=found.shapes.mean,
-        information=found.shapes.information,
-        body=body,
-    )
+    shapes = _subjects(found, body).named(_names(found.groups, known, whose))
     return replace(people, status=status, shapes=shapes, **columns)
 
 
-def _prior(groups: NDArray[np.integer], known: SubjectShapes | None, body: str) -> Shapes | None:
-    """What is known of the shape of each of `groups` (G,); the population's shape for the others."""
-    if known is None or len(known) == 0:
-        return None
-    if known.body != body:
-        raise ValueError("shapes must be of the body that is fitted: leave them out, or give those of this body")
-    mean, information = np.zeros((len(groups), 10)), np.tile(np.eye(10), (len(groups), 1, 1))
-    names = known.names.tolist()
-    for place, group in enumerate(groups.tolist()):
-        if str(group) in names:
-            row = names.index(str(group))
-            mean[place], information[place] = known.betas[row], known.information[row]
+def _subjects(found: SequenceFit, body: str) -> SubjectShapes:
+    """The shapes of a fit, named by their numbers."""
+    names = np.array([str(each) for each in found.groups.tolist()])
+    return SubjectShapes(names, found.shapes.mean, found.shapes.information, body)
+
+
+def _prior(known: SubjectShapes, whose: NDArray[np.intp]) -> Shapes:
+    """The shapes of those of `known` whom each person is, `whose` (G,); the population's for strangers."""
+    mean, information = np.zeros((len(whose), 10)), np.tile(np.eye(10), (len(whose), 1, 1))
+    mean[whose >= 0], information[whose >= 0] = (
+        known.betas[whose[whose >= 0]],
+        known.information[whose[whose >= 0]],
+    )
     return Shapes(mean, information)
+
+
+def _names(groups: NDArray[np.intp], known: SubjectShapes, whose: NDArray[np.intp]) -> list[str]:
+    """What people are called in the file of shapes: known names; strangers by their number, or the next free."""
+    names, taken = [], set(known.names.tolist())
+    for group, subject in zip(groups.tolist(), whose.tolist(), strict=True):
+        number = group
+        while subject < 0 and str(number) in taken:
+            number = 1 + max(int(name) for name in taken if name.isdecimal())
+        names.append(str(known.names[subject]) if subject >= 0 else str(number))
+        taken.add(names[-1])
+    return names

@@ -133,8 +133,7 @@ def reconstruct(
         if fitter is None:
             fitter = make_fitter(config.body, BodyModel.default().with_keypoints(detections.skeleton.joints))
     with torch_threads(config.threads):
-        with run.stage("offsets"):
-            offsets = _offsets(detections, rig, config, fitter)
+        offsets = _offsets(detections, rig, config, fitter, run)
         if isinstance(fitter, AdjustableFitter) and offsets is not None:
             fitter = fitter.with_keypoint_offsets(offsets)
         engine = _engine(rig, detections.skeleton, config, fitter, extra_factors, run)
@@ -172,7 +171,7 @@ def estimate_offsets(
     fitter = make_fitter(config.body) if fitter is None else fitter
     config = replace(config, offsets=replace(config.offsets, source="recording"))
     with torch_threads(config.threads):
-        offsets = _offsets(detections, rig, config, fitter)
+        offsets = _offsets(detections, rig, config, fitter, _Run())
     if offsets is None:
         raise ValueError(
             f"offsets are known for {BODY_25.name} only, these are joints of {detections.skeleton.name}"
@@ -259,7 +258,7 @@ def _solved(
 
 
 def _offsets(
-    detections: DetectionSequence, rig: Rig, config: PipelineConfig, fitter: BodyFitter
+    detections: DetectionSequence, rig: Rig, config: PipelineConfig, fitter: BodyFitter, run: "_Run"
 ) -> KeypointOffsets | None:
     """Where the detector puts its joints, by frames spread over the recording; None where nothing says it."""
     source = config.offsets.source
@@ -271,12 +270,13 @@ def _offsets(
         raise ValueError(f"offsets of {source} need a fitter with `with_keypoint_offsets` and joints of BODY_25")
     if source != "recording":
         return KeypointOffsets.load(source)
-    spread = spread_frames(len(detections), config.offsets.frames)
-    people = [find_people(detections[t], rig, detections.skeleton, config) for t in spread]
-    if len(people) == 0:
-        return KeypointOffsets.identity()
-    targets = confident_targets(Observations.concatenate(people), rig, config.observations, config.offsets)
-    return learn_offsets(targets, fitter.model, config=config.body.plain, prior=config.offsets.prior)
+    with run.stage("offsets"):
+        spread = spread_frames(len(detections), config.offsets.frames)
+        people = [find_people(detections[t], rig, detections.skeleton, config) for t in spread]
+        if len(people) == 0:
+            return KeypointOffsets.identity()
+        targets = confident_targets(Observations.concatenate(people), rig, config.observations, config.offsets)
+        return learn_offsets(targets, fitter.model, config=config.body.plain, prior=config.offsets.prior)
 
 
 def _rows(solved: Solved, rig: Rig, detections: DetectionSequence, config: PipelineConfig) -> Reconstruction:
@@ -310,14 +310,17 @@ class _Run:
 
     def __init__(self) -> None:
         self.seconds: defaultdict[str, float] = defaultdict(float)
+        self._inner = 0.0
         self.dropped: Counter[str] = Counter()
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Add the time of a block to a stage."""
-        start = time.perf_counter()
+        """Add the time of a block to a stage, but for that of stages inside it."""
+        start, outside, self._inner = time.perf_counter(), self._inner, 0.0
         yield
-        self.seconds[name] += time.perf_counter() - start
+        whole = time.perf_counter() - start
+        self.seconds[name] += whole - self._inner
+        self._inner = outside + whole
 
     def summary(self, config: PipelineConfig, frames: range, people: Reconstruction) -> dict[str, Any]:
         """The contents of `Reconstruction.run`."""

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.bodies_over_time import SequenceFitting, with_bodies_over_time
 from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.camera import Rig
@@ -43,11 +44,13 @@ def solve_rows(
             part = rows.rows(near)
             table = part.observations
             assert table is not None
-            observations = table.observations(part.joints, part.time_s)
+            # From the views: the joints as they are may be somebody else's.
+            observations = table.observations(np.full_like(part.joints, np.nan), part.time_s)
             estimates = estimator.estimate(observations, extra_factors)
             solved = result_rows(observations, estimates, table.candidate, rig, joint_names, part.person)
             parts.append(solved.rows(np.isin(part.frame, np.array(own))))
-    return replace(Reconstruction.concatenate(parts), run=rows.run) if parts else rows
+        solved = replace(Reconstruction.concatenate(parts), run=rows.run) if parts else rows
+        return with_bodies_over_time(solved, fitter) if isinstance(fitter, SequenceFitting) else solved
 
 
 def _windows(rows: Reconstruction, config: PipelineConfig) -> list[range]:

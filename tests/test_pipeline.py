@@ -77,7 +77,7 @@ def test_the_run_says_how_it_came_about(recording, people):
     assert run["frames"] == [0, 16]
     assert run["people"]["found"] == len(people) == run["people"]["status"]["ok"]
     assert run["configuration"]["window_graph"]["rho_3d"] == PipelineConfig().window_graph.rho_3d
-    assert set(run["seconds"]) >= {"triangulate", "vote", "propose", "associate", "refine"}
+    assert set(run["seconds"]) >= {"triangulate", "vote", "propose", "associate", "follow", "solve"}
     assert run["versions"]["gtsam"].startswith("4.")
 
 

@@ -1,11 +1,13 @@
 """Known people's body shapes, kept from one recording for the next: means, how sure they are, on which body."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 
 from shapepose_fg.body.model.smpl_file import SmplArrays, read_smpl_file
 from shapepose_fg.columns import checked, npz_bytes, read_npz
@@ -46,7 +48,8 @@ class SubjectShapes:
             raise ValueError(
                 f"betas and information must be finite, those of {names[np.argmin(finite)]!r} are not"
             )
-        symmetric = np.allclose(self.information, self.information.mT, rtol=1e-6, atol=1e-9)
+        largest = float(np.abs(self.information).max(initial=0.0))
+        symmetric = np.allclose(self.information, self.information.mT, rtol=0.0, atol=1e-5 * largest)
         if not symmetric or (G > 0 and (np.linalg.eigvalsh(self.information) <= 0).any()):
             raise ValueError("information must be symmetric and positive definite, for each of the people")
 
@@ -66,6 +69,10 @@ class SubjectShapes:
     def rows(self, index: NDArray[Any]) -> "SubjectShapes":
         """Some of the people: a mask (G,) or row numbers."""
         return replace(self, names=self.names[index], betas=self.betas[index], information=self.information[index])
+
+    def named(self, names: Sequence[str]) -> "SubjectShapes":
+        """The same people with other names."""
+        return replace(self, names=np.array(list(names), dtype=str))
 
     def updated(self, other: "SubjectShapes") -> "SubjectShapes":
         """These people and those of `other`, whose shapes take the place of older ones of the same name.
@@ -107,6 +114,53 @@ class SubjectShapes:
             return cls(columns["names"], columns["betas"], columns["information"], body)
         except ValueError as error:
             raise InputError(f"{file}: {error}; {_CURE}") from None
+
+
+def recognise(found: SubjectShapes, known: SubjectShapes, ratio: float = 10.0) -> NDArray[np.intp]:
+    """(G,) which of the `known` people each of the `found` ones is, by shape alone; -1 for a stranger.
+
+    `found` were estimated from the adults' prior N(0, I). Somebody is recognised where what was seen is
+    `ratio` times as likely of a known shape as of any adult's (Bayes factor): by Markov's inequality, at
+    most one stranger in ten passes for a given person. Stature is most of what is seen of a shape: on the
+    built-in scene, joints known to 3 mm, the factors of the right people were 40 to 410, of wrong ones
+    below 1e-4. Two people who are taken for each other differ little in shape. Everybody is one person at
+    the most, so that the product of all factors is largest. ValueError where the two are of different
+    bodies.
+    """
+    if found.body != known.body:
+        raise ValueError("shapes must be of the same body model")
+    whose = np.full(len(found), -1, dtype=np.intp)
+    if len(found) == 0 or len(known) == 0:
+        return whose
+    eye = np.eye(found.betas.shape[1])
+    seen = found.information - eye  # what the recording added to the prior
+    gradient = np.einsum("gij,gj->gi", found.information, found.betas)
+    factor = _log_evidence(seen, gradient, known.betas, known.information)
+    factor -= _log_evidence(seen, gradient, np.zeros((1, len(eye))), eye[None])
+    gain = np.maximum(factor - np.log(ratio), 0.0)
+    rows, columns = linear_sum_assignment(gain, maximize=True)
+    kept = gain[rows, columns] > 0
+    whose[rows[kept]] = columns[kept]
+    return whose
+
+
+def _log_evidence(
+    seen: NDArray[np.float64],
+    gradient: NDArray[np.float64],
+    mean: NDArray[np.float64],
+    information: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """(G, K) log of how likely observations are under each of K priors, up to a constant of each observation.
+
+    `seen` (G, 10, 10) and `gradient` (G, 10) are information and information times mean of what was seen alone,
+    which may be singular; the priors are `mean` (K, 10), `information` (K, 10, 10).
+    """
+    total = seen[:, None] + information[None]
+    pulled = np.einsum("kij,kj->ki", information, mean)
+    right = gradient[:, None] + pulled[None]
+    fitted = np.einsum("gki,gki->gk", right, np.linalg.solve(total, right[..., None])[..., 0])
+    volume = np.linalg.slogdet(information)[1] - np.linalg.slogdet(total)[1]
+    return 0.5 * (volume - np.einsum("ki,ki->k", pulled, mean) + fitted)
 
 
 def statures_m(betas: NDArray[np.float64], body: SmplArrays) -> NDArray[np.float64]:

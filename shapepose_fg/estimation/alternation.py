@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus, JointTargets
 from shapepose_fg.camera import Views
-from shapepose_fg.estimation.draft import MODEL_SIGMA_M
+from shapepose_fg.estimation.draft import MODEL_SIGMA_M, WholeFitter
 from shapepose_fg.estimation.linearisation import (
     ObservationConfig,
     ViewEvidence,
@@ -34,9 +34,10 @@ class RefineConfig:
     max_sigma_m: float = 0.5
     """A joint whose views leave it less certain than this in some direction is not determined by them."""
     disagreement: float = 6.0
-    """A joint that its views put this many standard deviations from where the body can have it is seen wrongly: its
-    gates are decided anew from the body's place, and the body is fitted again without what was thrown away. 4 threw
-    away more joints that were right than wrong ones, in simulated crowds whose detections had been given out again."""
+    """A joint that its views put this many standard deviations from where the body can have it is seen wrongly:
+    its gates are decided anew from the body's place, and the body is fitted again without what was thrown away. 4
+    threw away more joints that were right than wrong ones, in simulated crowds whose detections had been given out
+    again."""
     min_joints: int = 4
     """Fewer joints than this determined by the views are not a person that can be placed in space."""
 
@@ -182,11 +183,13 @@ def final_bodies(
     if len(chosen) == 0:
         return solution.fit
     rows = np.concatenate([window.rows for window in chosen])
+    rows = rows[solution.fit.ok[rows]]
     xyz, information = solution.joints[rows], np.zeros((len(rows), *covariance.shape[1:]))
     known = np.isfinite(xyz).all(axis=2) & np.isfinite(covariance[rows]).all(axis=(2, 3))
     information[known] = np.linalg.inv(covariance[rows][known])
     information = (information + information.swapaxes(2, 3)) / 2
-    fit = fitter.fit(JointTargets(np.nan_to_num(xyz), information), solution.fit.rows(rows), _groups(chosen))
+    whole = fitter.fit_whole if isinstance(fitter, WholeFitter) else fitter.fit
+    fit = whole(JointTargets(np.nan_to_num(xyz), information), solution.fit.rows(rows))
     return solution.fit.with_rows(rows[fit.ok], fit.rows(np.flatnonzero(fit.ok)))
 
 
@@ -208,7 +211,9 @@ def disagreement(evidence: ViewEvidence, fit: BodyFit) -> NDArray[np.float64]:
 def _sigmas_apart(
     evidence: ViewEvidence, xyz: NDArray[np.float64], covariance: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Distance (N, J) of what the views say from `xyz` (N, J, 3) +- `covariance`, standard deviations; NaN unknown."""
+    """Distance (N, J) of what the views say from `xyz` (N, J, 3) +- `covariance`, standard deviations; NaN
+    unknown.
+    """
     known = np.isfinite(xyz).all(axis=2)
     apart = np.where(known[..., None], np.nan_to_num(evidence.target - xyz), 0.0)
     other = np.where(known[..., None, None], covariance, np.eye(3))

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter
 from shapepose_fg.body.fitting.energy import BodyEnergy
 from shapepose_fg.body.fitting.evidence import EvidenceConfig, weigh
+from shapepose_fg.body.fitting.fit_rows import _evenly
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
 from shapepose_fg.body.fitting.learned import LearnedFitter
 from shapepose_fg.body.fitting.left_out import left_out_sets, plan_passes
@@ -169,6 +170,24 @@ def test_few_joints_are_left_out_one_by_one(fitter, people):
     assert np.abs(again.prior_xyz - fit.prior_xyz)[both, kept[0]].max() < 1e-3
     inside = mahalanobis((fit.prior_xyz - truth)[fit.ok][:, kept], fit.prior_covariance[fit.ok][:, kept]) < 7.81
     assert inside.mean() > 0.8
+
+
+def test_a_long_window_s_shape_is_agreed_upon_by_rows_spread_over_it(fitter):
+    people, rows = 2, 40
+    xyz = draw(people, rows) + np.random.default_rng(1).normal(0, NOISE_M, (people * rows, 25, 3))
+    groups = np.append(np.repeat([3, 1], rows)[:-1], 7)  # one row is alone
+    voters = _evenly(groups, 24)
+    assert [voters[groups == number].sum() for number in (1, 3, 7)] == [24, 24, 1]
+    assert np.diff(np.flatnonzero(voters[groups == 3])).max() == 2
+    fit = fitter.fit(make_targets(xyz), groups=groups)
+    for number in (1, 3):
+        betas = fit.betas[(groups == number) & fit.ok]
+        assert np.ptp(betas, axis=0).max() < 1e-3  # held by a precision of 1e6
+    alone = fitter.fit(make_targets(xyz))
+    error = [
+        np.linalg.norm(f.joints - draw(people, rows), axis=-1)[fit.ok & alone.ok].mean() for f in (fit, alone)
+    ]
+    assert error[0] < error[1] + 0.001  # nobody is worse off
 
 
 def test_sets_hold_joints_that_tell_little_of_each_other():

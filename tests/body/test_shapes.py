@@ -6,7 +6,7 @@ import torch
 
 from shapepose_fg.body.fitting.weights import fingerprint
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
-from shapepose_fg.body.shapes import SubjectShapes, read_body, statures_m
+from shapepose_fg.body.shapes import SubjectShapes, read_body, recognise, statures_m
 from shapepose_fg.errors import InputError
 
 
@@ -93,3 +93,62 @@ def test_stature_is_that_of_the_mesh():
     found = statures_m(betas, read_body())
     np.testing.assert_allclose(found, tall, atol=1e-5)  # the mesh is float32
     assert found.min() > 1.3 and found.max() < 2.2
+
+
+def drawn(seed: int, people: int, sigma: float) -> tuple[SubjectShapes, SubjectShapes]:
+    """What two recordings told of adults' betas: as of betas that were seen with an error of `sigma`."""
+    rng = np.random.default_rng(seed)
+    betas = rng.normal(size=(people, 10))
+    information = np.tile((1 + sigma**-2) * np.eye(10), (people, 1, 1))
+    names = np.array([f"p{person}" for person in range(people)])
+    recordings = []
+    for _ in range(2):
+        seen = betas + sigma * rng.normal(size=betas.shape)
+        # The prior over adults pulls the estimate to 0.
+        recordings.append(SubjectShapes(names, seen * sigma**-2 / (1 + sigma**-2), information, "a body"))
+    first, second = recordings
+    return first, second
+
+
+def test_who_was_there_before_is_recognised_and_strangers_are_not():
+    first, second = drawn(0, people=8, sigma=0.3)
+    order = np.array([5, 2, 7, 0])
+    whose = recognise(second.rows(order), first.rows(np.arange(6)))  # 7 is new, 1 3 4 are not there
+    assert whose.tolist() == [5, 2, -1, 0]
+    assert recognise(second, SubjectShapes.empty("a body")).tolist() == [-1] * 8
+    assert recognise(SubjectShapes.empty("a body"), first).tolist() == []
+    with pytest.raises(ValueError, match="same body model"):
+        recognise(second, two_shapes("their body"))
+
+
+def test_the_evidence_is_that_of_gaussians():
+    """One known person, worked out: N(m; b, S1 + S2) against N(m; 0, S1 + 1)."""
+    from scipy.stats import multivariate_normal
+
+    first, second = drawn(1, people=1, sigma=0.5)
+    measured = second.betas[0] * (1 + 0.5**-2) / 0.5**-2  # without the prior
+    same = multivariate_normal(first.betas[0], 0.5**2 * np.eye(10) + first.covariance[0]).logpdf(measured)
+    stranger = multivariate_normal(np.zeros(10), (0.5**2 + 1) * np.eye(10)).logpdf(measured)
+    threshold = np.exp(same - stranger)
+    assert recognise(second, first, ratio=0.99 * threshold).tolist() == [0]
+    assert recognise(second, first, ratio=1.01 * threshold).tolist() == [-1]
+
+
+def test_where_nothing_was_seen_nobody_is_recognised():
+    """No information beyond the prior: everybody is as likely as any adult, and exactly so."""
+    first, _ = drawn(2, people=3, sigma=0.3)
+    unseen = SubjectShapes(np.array(["0"]), np.zeros((1, 10)), np.eye(10)[None], "a body")
+    assert recognise(unseen, first).tolist() == [-1]
+    assert recognise(unseen, first, ratio=1.0).tolist() == [-1]
+
+
+def test_how_often_people_are_confused():
+    """40 rooms of six people and three strangers, shapes known to 0.3 sigma: nobody is taken for another."""
+    wrong = missed = 0
+    for seed in range(40):
+        first, second = drawn(seed, people=9, sigma=0.3)
+        whose = recognise(second, first.rows(np.arange(6)))
+        truth = np.array([0, 1, 2, 3, 4, 5, -1, -1, -1])
+        wrong += int(((whose >= 0) & (whose != truth)).sum())
+        missed += int(((whose < 0) & (truth >= 0)).sum())
+    assert wrong <= 2 and missed <= 4  # of 240

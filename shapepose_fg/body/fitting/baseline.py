@@ -119,6 +119,13 @@ class LevenbergMarquardtFitter:
         sequence = SequenceFitter(self._rows, motion, self.config.kernel_scale, config)
         return sequence.fit(targets, groups, time_s, shapes, fixed_shapes=fixed_shapes)
 
+    def arrive(
+        self, targets: WhitenedTargets, variance: Array, start: Tensor | None = None
+    ) -> tuple[Tensor, Held]:
+        """See `Optimiser`: the optimum, with each row's own shape."""
+        body, held = self.first(targets, variance, start)
+        return body.free, held
+
     def first(
         self, targets: WhitenedTargets, variance: Array, start: Tensor | None = None
     ) -> tuple[Evaluated, Held]:

@@ -23,7 +23,7 @@ def longest_bones(skeleton: Skeleton) -> NDArray[np.float64]:
     with a margin. Joints that the body does not have get the longest of all.
     """
     known = [j for j, name in enumerate(skeleton.joints) if name in BODY_POINTS]
-    model = BodyModel.default().with_keypoints([skeleton.joints[j] for j in known])
+    model = BodyModel.default().with_keypoints(tuple(skeleton.joints[j] for j in known))
     rng = np.random.default_rng(0)
     pose = torch.from_numpy(PosePrior.default().sample(rng, _SAMPLES)).to(model.dtype)
     betas = torch.from_numpy(rng.standard_normal((_SAMPLES, 10)).clip(-3, 3)).to(model.dtype)

@@ -1,6 +1,6 @@
 """The way of every fit, whichever optimiser: judge, plan passes, fit them, share shapes, fit again, fill in."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -19,10 +19,16 @@ Array = NDArray[np.float64]
 
 _CHUNK = 128
 """Passes that are fitted at a time: their Hessians stay in the cache, and memory does not grow with the batch."""
+_VOTERS = 24
+"""Rows of a group that agree upon its shape. In a window of some seconds errors last: more tell no more."""
 
 
 class Optimiser(Protocol):
     """How bodies are fitted to some targets; rows are independent."""
+
+    def arrive(self, targets: WhitenedTargets, variance: Array, start: Tensor | None) -> tuple[Tensor, Held]:
+        """Parameters (B, P) from which `again` is short, and what bodies are held by; arguments as of `first`."""
+        ...
 
     def first(self, targets: WhitenedTargets, variance: Array, start: Tensor | None) -> tuple[Evaluated, Held]:
         """Bodies (B) from nowhere, or from `start` (B, P) where that is not NaN, and what they were held by.
@@ -82,6 +88,8 @@ class RowFitter:
                 passes = plan_passes(usable, self.sets, groups[rows], self.evidence)
             else:
                 passes = Passes.whole(groups[rows], count)
+            voters = _evenly(groups[rows], _VOTERS)
+            passes = replace(passes, votes=passes.votes & voters[passes.row])
             self._fit_passes(fit, usable, rows, passes, start)
         if not leave_out:
             fit.prior_xyz[:], fit.prior_covariance[:] = np.nan, np.nan
@@ -145,19 +153,30 @@ class RowFitter:
     def _shapes(
         self, inside: Array, evidence: Evidence, passes: Passes, start: Tensor | None
     ) -> tuple[Tensor, Held]:
-        """All passes alone, then with the shapes at which those of each pool agree: parameters (M, P)."""
-        bodies, holds, precisions = [], [], []
+        """Where all passes start with the shapes at which those of each pool agree: (M, P), and what holds them.
+
+        The shapes are agreed upon by the passes that vote, each of which is fitted alone first.
+        """
+        bodies, holds, places, precisions, settled = [], [], [], [], []
         for chunk in passes.chunks(_CHUNK):
             targets = passes.targets(inside, evidence.root, chunk)
             variance = passes.variance(evidence.variance_m2, chunk)
-            body, held = self.optimiser.first(targets, variance, _part(start, chunk))
-            settled = body.left < self.unfinished
-            bodies.append(torch.cat((body.free, settled[:, None]), 1))
-            precisions.append(shape_precision(body.factor))
-            holds.append(held.for_rows(len(settled)))
-        found, held = torch.cat(bodies), Held.concatenated(holds)
-        free, votes = found[:, :-1], passes.votes & found[:, -1].bool().numpy()
-        betas = pooled_betas(free[:, :10], torch.cat(precisions), passes.pool, votes, held)
+            free, held = self.optimiser.arrive(targets, variance, _part(start, chunk))
+            held = held.for_rows(len(free))
+            voting = torch.from_numpy(np.flatnonzero(passes.votes[chunk]))
+            if len(voting) > 0:
+                body = self.optimiser.again(free[voting], targets[voting], held[voting])
+                free[voting] = body.free
+                places.append(chunk[voting.numpy()])
+                precisions.append(shape_precision(body.factor))
+                settled.append(body.left < self.unfinished)
+            bodies.append(free)
+            holds.append(held)
+        free, held = torch.cat(bodies), Held.concatenated(holds)
+        place = np.concatenate(places)
+        precision, votes = free.new_zeros(len(free), 10, 10), np.zeros(len(free), dtype=bool)
+        precision[torch.from_numpy(place)], votes[place] = torch.cat(precisions), torch.cat(settled).numpy()
+        betas = pooled_betas(free[:, :10], precision, passes.pool, votes, held)
         return torch.cat((betas, free[:, 10:]), 1), held.at_shape(betas, shared(passes.pool, votes))
 
     def _start(self, initial: BodyFit, centre: Array) -> Tensor:
@@ -166,6 +185,17 @@ class RowFitter:
         parts = (initial.betas, initial.global_orient, angles, initial.transl - centre)
         start = np.where(initial.ok[:, None], np.concatenate(parts, axis=1), np.nan)
         return torch.from_numpy(start).float()
+
+
+def _evenly(groups: NDArray[np.intp], count: int) -> NDArray[np.bool_]:
+    """(R,) at most `count` rows of each group (R,), evenly spread over its rows."""
+    order = np.argsort(groups, kind="stable")
+    _, first, size = np.unique(groups[order], return_index=True, return_counts=True)
+    rank = np.arange(len(order)) - np.repeat(first, size)
+    number = rank * count // np.maximum(np.repeat(size, size), count)
+    chosen = np.zeros(len(order), dtype=bool)
+    chosen[order] = (rank == 0) | (np.diff(number, prepend=0) != 0)
+    return chosen
 
 
 def _part(start: Tensor | None, chunk: NDArray[np.intp]) -> Tensor | None:

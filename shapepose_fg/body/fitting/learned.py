@@ -144,12 +144,18 @@ class LearnedFitter:
         sequence = SequenceFitter(self._rows, motion, self.config.kernel_scale, config)
         return sequence.fit(targets, groups, time_s, shapes, fixed_shapes=fixed_shapes)
 
+    def arrive(
+        self, targets: WhitenedTargets, variance: Array, start: Tensor | None = None
+    ) -> tuple[Tensor, Held]:
+        """See `Optimiser`: where the network arrives, and held there."""
+        arrived = self._descend(targets, torch.from_numpy(variance).float())
+        return arrived, Held(arrived[:, :10], torch.ones(len(arrived), 1), arrived[:, 13:-3].clone())
+
     def first(
         self, targets: WhitenedTargets, variance: Array, start: Tensor | None = None
     ) -> tuple[Evaluated, Held]:
-        """See `Optimiser`: held where the network arrived."""
-        arrived = self._descend(targets, torch.from_numpy(variance).float())
-        held = Held(arrived[:, :10], torch.ones(len(arrived), 1), arrived[:, 13:-3])
+        """See `Optimiser`: a short polish from where the network arrived."""
+        arrived, held = self.arrive(targets, variance, start)
         return self.again(arrived, targets, held), held
 
     def again(self, free: Tensor, targets: WhitenedTargets, held: Held) -> Evaluated:

@@ -58,15 +58,20 @@ class PoseEnergy:
 
     def around(self, anchor: Tensor, angles: Tensor) -> PosePull:
         """The quadratic with its minimum at `anchor` (B, A) and the Hessian of there, at `angles` (B, A)."""
-        share, _ = self._shares(self._distances(anchor)[0])
-        hessian, error = self._mixed(share, self._precisions), angles - anchor
-        gradient = (hessian @ error[..., None]).squeeze(-1)
-        return PosePull((gradient * error).sum(-1), gradient, hessian)
+        share, error = self._shares_at(anchor), angles - anchor
+        gradient = (share[..., None] * (error @ self._precisions)).sum(0)
+        return PosePull((gradient * error).sum(-1), gradient, self._mixed(share, self._precisions))
 
     def hidden(self, angles: Tensor) -> Tensor:
         """(B, M) what the prior expects of the invisible angles: its regressions, weighted by the shares."""
-        share, _ = self._shares(self._distances(angles)[0])
-        return (self._mixed(share, self._gains) @ angles[..., None]).squeeze(-1) + share.T @ self._at_zero
+        share = self._shares_at(angles)
+        return (share[..., None] * (angles @ self._gains.mT)).sum(0) + share.T @ self._at_zero
+
+    def _shares_at(self, angles: Tensor) -> Tensor:
+        """Share (K, B) of every component."""
+        if len(self._constant) == 1:
+            return angles.new_ones(1, len(angles))
+        return self._shares(self._distances(angles)[0])[0]
 
     def _distances(self, angles: Tensor) -> tuple[Tensor, Tensor]:
         """Squared Mahalanobis distance (K, B) to every component and its pull P_k (theta - mean_k) (K, B, A)."""
@@ -82,4 +87,6 @@ class PoseEnergy:
     @staticmethod
     def _mixed(share: Tensor, matrices: Tensor) -> Tensor:
         """(B, I, J) the mean of `matrices` (K, I, J) with the weights `share` (K, B)."""
+        if len(matrices) == 1:
+            return matrices.expand(share.shape[1], -1, -1)
         return (share.T @ matrices.flatten(1)).unflatten(1, matrices.shape[1:])

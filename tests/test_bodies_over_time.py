@@ -1,0 +1,63 @@
+"""People recognised from one recording to the next, by shape: their names, and what is known of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from shapepose_fg.bodies_over_time import with_bodies_over_time
+from shapepose_fg.body.fitting.fitters import make_fitter
+from shapepose_fg.body.fitting.learned import LearnedFitter
+from shapepose_fg.body.shapes import SubjectShapes
+from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.simulation import Scene, built_in_scene
+from shapepose_fg.simulation.truth import truth_of
+
+SIGMA_M = 0.003
+"""Joints known so well tell shapes apart in two dozen frames."""
+
+
+def seen(scene: Scene, frames: slice, seed: int) -> Reconstruction:
+    """The scene's people in these frames, taken 2 s apart (each tells of the shape anew), joints with noise."""
+    truth = truth_of(scene)
+    people = truth.rows(np.isin(truth.frame, np.arange(len(scene))[frames]))
+    noise = np.random.default_rng(seed).normal(0, SIGMA_M, people.joints.shape)
+    covariance = np.broadcast_to(SIGMA_M**2 * np.eye(3), people.covariance.shape)
+    return replace(people, time_s=2.0 * people.frame, joints=people.joints + noise, covariance=covariance)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return built_in_scene(people=3, frames=48)
+
+
+@pytest.fixture(scope="module")
+def fitter() -> LearnedFitter:
+    made = make_fitter()
+    assert isinstance(made, LearnedFitter)
+    return made
+
+
+def test_people_keep_their_names_and_strangers_get_free_ones(scene, fitter):
+    first = with_bodies_over_time(seen(scene, slice(0, 24), 0), fitter).shapes
+    assert first.names.tolist() == ["0", "1", "2"]
+    # In the next recording they have other numbers, and one of them was not in the first.
+    people = seen(scene, slice(24, 48), 1)
+    people = people.relabelled(np.array([7, 0, 1])[people.person])
+    known = first.rows(np.array([0, 1])).named(["Ann", "1"])
+    alone = with_bodies_over_time(people, fitter)
+    second = with_bodies_over_time(people, fitter, known)
+    assert second.shapes.names.tolist() == ["1", "2", "Ann"]  # of persons 0, 1, 7: "1" is somebody else's name
+    # What was known counts: shapes of the known are surer than from this recording alone, the stranger's is not.
+    gain = np.linalg.slogdet(second.shapes.information)[1] - np.linalg.slogdet(alone.shapes.information)[1]
+    assert gain[[0, 2]].min() > 1 and abs(gain[1]) < 0.5
+    both = known.updated(second.shapes)
+    assert sorted(both.names.tolist()) == ["1", "2", "Ann"]
+
+
+def test_nobody_and_no_file(scene, fitter):
+    people = seen(scene, slice(0, 4), 0)
+    assert with_bodies_over_time(people.rows(np.zeros(0, int)), fitter).shapes is None
+    other = SubjectShapes.empty("another body")
+    with pytest.raises(ValueError, match="same body model"):
+        with_bodies_over_time(people, fitter, other)
