@@ -57,13 +57,13 @@ def limb_steps(
     """Steps (N, J, 3), metres, that take joints that no view saw, `unseen` (N, J), to where a body can have them.
 
     Motion carries each joint by itself: elbow and wrist, both hidden, drift apart. A body is fitted to all joints as
-    they are known, and an unseen one goes towards the body's, C (C + s² I)^-1 of the way: hardly where it was seen a
-    moment ago, and wholly where its covariance C is large. s is `LIMB_SIGMA_M`. Covariances stay: what the body says
-    of the joint without its views is in them already.
+    they are known, and an unseen one goes towards the body's, C (C + s² I)^-1 of the way: hardly where it was seen
+    a moment ago, and wholly where its covariance C is large. s is `LIMB_SIGMA_M`. Covariances stay: what the body
+    says of the joint without its views is in them already.
     """
-    known = np.isfinite(joints).all(axis=2) & np.isfinite(covariance).all(axis=(2, 3))
+    known = np.asarray(np.isfinite(joints).all(axis=-1) & np.isfinite(covariance).all(axis=(-2, -1)))
     moved = unseen & known
-    rows = np.flatnonzero(moved.any(axis=1))
+    rows = np.flatnonzero(moved.any(axis=-1))
     steps = np.zeros(joints.shape)
     if len(rows) == 0:
         return steps
@@ -73,7 +73,7 @@ def limb_steps(
     body = fitter.fit_whole(targets) if isinstance(fitter, WholeFitter) else fitter.fit(targets)
     share = C @ np.linalg.inv(C + LIMB_SIGMA_M**2 * np.eye(3))
     step = np.einsum("...ij,...j->...i", share, body.joints - joints[rows])
-    steps[rows] = np.where((moved[rows] & body.ok[:, None])[..., None], step, 0.0)
+    steps[rows] = np.where((moved[rows] & np.isfinite(step).all(axis=-1))[..., None], step, 0.0)
     return steps
 
 
@@ -83,4 +83,4 @@ def smoothed_in_time(
     """Values (T, ...) averaged over time with a Gaussian of `width_s`, one sigma."""
     weight = np.exp(-0.5 * ((times_s[:, None] - times_s) / width_s) ** 2)
     weight /= weight.sum(axis=1, keepdims=True)
-    return np.tensordot(weight, values, axes=1)
+    return np.einsum("ts,s...->t...", weight, values)

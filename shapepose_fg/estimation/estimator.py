@@ -132,8 +132,8 @@ class Estimator:
 
         A view that sees one counts from the first round on, then, and windows need no second.
         """
-        unknown = np.isnan(X).any(axis=2)
-        rows = np.flatnonzero(unknown.any(axis=1))
+        unknown = np.asarray(np.isnan(X).any(axis=-1))
+        rows = np.flatnonzero(unknown.any(axis=-1))
         if len(rows) == 0:
             return X
         places, _ = self.draft(observations.rows(rows), views.rows(rows))
@@ -223,9 +223,11 @@ class Estimator:
         windows: Sequence[Window],
         solution: Solution,
     ) -> NDArray[np.float64]:
-        """Joints that no view saw, in windows of several frames, where a body can have them; but none with factors
-        of the user's own. Steps are averaged over time: bodies are fitted frame by frame."""
-        unseen = ~solution.inlier.any(axis=2)
+        """Joints that no view saw, in windows of several frames, where a body can have them.
+
+        Not those with factors of the user's own. Steps are averaged over time: bodies are fitted frame by frame.
+        """
+        unseen = ~np.asarray(solution.inlier.any(axis=-1))
         for window in windows:
             unseen[window.rows] &= window.graph.temporal & ~window.graph.touched
         steps = limb_steps(X, covariance, unseen, self.fitter)

@@ -106,4 +106,5 @@ class MotionModel:
         ):
             raise InputError(f"{path}: densities must be positive; give what scripts/measure_motion.py writes")
         chosen = config.psd_scale * np.array([known.get(name, tuple(table.mean(axis=0))) for name in joints])
-        return cls(*chosen.T, views, body, config.around_s)
+        still, speed, lost = chosen.T
+        return cls(still, speed, lost, views, body, config.around_s)
