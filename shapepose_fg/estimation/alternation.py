@@ -141,7 +141,7 @@ def alternate(
             # Gated anew around the body's place; and the body is fitted again, without what was thrown away.
             there = np.where(wrong[..., None], body.prior_xyz, start)
             evidence = linearise(observed, sigma, there, here, config.observations)
-            again = np.flatnonzero(wrong.any(axis=1))
+            again = np.flatnonzero(wrong.any(axis=-1))
             targets = joint_targets(evidence, enough)
             body = body.with_rows(again, _fit(fitter, targets, body, groups, again))
         said = _message(observed, evidence, body, moving, groups, enough, fitter, config)
@@ -185,7 +185,7 @@ def final_bodies(
     rows = np.concatenate([window.rows for window in chosen])
     rows = rows[solution.fit.ok[rows]]
     xyz, information = solution.joints[rows], np.zeros((len(rows), *covariance.shape[1:]))
-    known = np.isfinite(xyz).all(axis=2) & np.isfinite(covariance[rows]).all(axis=(2, 3))
+    known = np.isfinite(xyz).all(axis=-1) & np.isfinite(covariance[rows]).all(axis=(2, 3))
     information[known] = np.linalg.inv(covariance[rows][known])
     information = (information + information.swapaxes(2, 3)) / 2
     whole = fitter.fit_whole if isinstance(fitter, WholeFitter) else fitter.fit
@@ -214,7 +214,11 @@ def _sigmas_apart(
     """Distance (N, J) of what the views say from `xyz` (N, J, 3) +- `covariance`, standard deviations; NaN
     unknown.
     """
+<<<<<<< HEAD
     known = np.asarray(np.isfinite(xyz).all(axis=2))
+=======
+    known = np.asarray(np.isfinite(xyz).all(axis=-1))
+>>>>>>> h-window
     apart = np.where(known[..., None], np.nan_to_num(evidence.target - xyz), 0.0)
     other = np.where(known[..., None, None], covariance, np.eye(3))
     # (L^-1 + C)^-1 = L (I + C L)^-1, which holds for information L that is singular, too.
@@ -315,7 +319,11 @@ def _solve(
 
 def interpolated(points: NDArray[np.float64], times_s: NDArray[np.float64]) -> NDArray[np.float64]:
     """Points (T, J, 3) with gaps closed in a straight line, and the ends held; joints never known stay NaN."""
+<<<<<<< HEAD
     known = np.asarray(np.isfinite(points).all(axis=2))
+=======
+    known = np.asarray(np.isfinite(points).all(axis=-1))
+>>>>>>> h-window
     result = points.copy()
     for joint in np.flatnonzero(known.any(axis=0) & ~known.all(axis=0)).tolist():
         there = known[:, joint]

@@ -11,6 +11,9 @@ from shapepose_fg.estimation.linearisation import ViewEvidence
 MODEL_SIGMA_M = 0.02
 """How far a detector's joints lie from the body's, metres."""
 
+LIMB_SIGMA_M = 0.03
+"""Sigma of an unseen joint from which on it is more the body's than its own."""
+
 
 @runtime_checkable
 class WholeFitter(BodyFitter, Protocol):
@@ -43,3 +46,41 @@ def drafted(
     place = at + np.einsum("...ij,...j->...i", joint_covariance @ views, apart)
     place = np.where(determined[..., None], place, np.nan)
     return place, np.where(determined[..., None, None], joint_covariance, np.nan)
+
+
+def limb_steps(
+    joints: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+    unseen: NDArray[np.bool_],
+    fitter: BodyFitter,
+) -> NDArray[np.float64]:
+    """Steps (N, J, 3), metres, that take joints that no view saw, `unseen` (N, J), to where a body can have them.
+
+    Motion carries each joint by itself: elbow and wrist, both hidden, drift apart. A body is fitted to all joints as
+    they are known, and an unseen one goes towards the body's, C (C + s² I)^-1 of the way: hardly where it was seen
+    a moment ago, and wholly where its covariance C is large. s is `LIMB_SIGMA_M`. Covariances stay: what the body
+    says of the joint without its views is in them already.
+    """
+    known = np.asarray(np.isfinite(joints).all(axis=-1) & np.isfinite(covariance).all(axis=(-2, -1)))
+    moved = unseen & known
+    rows = np.flatnonzero(moved.any(axis=-1))
+    steps = np.zeros(joints.shape)
+    if len(rows) == 0:
+        return steps
+    C = np.where(known[rows][..., None, None], covariance[rows], np.eye(3))
+    information = np.where(known[rows][..., None, None], np.linalg.inv(C), 0.0)
+    targets = JointTargets(np.nan_to_num(joints[rows]), (information + information.swapaxes(2, 3)) / 2)
+    body = fitter.fit_whole(targets) if isinstance(fitter, WholeFitter) else fitter.fit(targets)
+    share = C @ np.linalg.inv(C + LIMB_SIGMA_M**2 * np.eye(3))
+    step = np.einsum("...ij,...j->...i", share, body.joints - joints[rows])
+    steps[rows] = np.where((moved[rows] & np.isfinite(step).all(axis=-1))[..., None], step, 0.0)
+    return steps
+
+
+def smoothed_in_time(
+    values: NDArray[np.float64], times_s: NDArray[np.float64], width_s: float
+) -> NDArray[np.float64]:
+    """Values (T, ...) averaged over time with a Gaussian of `width_s`, one sigma."""
+    weight = np.exp(-0.5 * ((times_s[:, None] - times_s) / width_s) ** 2)
+    weight /= weight.sum(axis=1, keepdims=True)
+    return np.einsum("ts,s...->t...", weight, values)

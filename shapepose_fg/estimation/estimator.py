@@ -18,7 +18,7 @@ from shapepose_fg.estimation.alternation import (
     final_bodies,
     joint_targets,
 )
-from shapepose_fg.estimation.draft import WholeFitter, drafted
+from shapepose_fg.estimation.draft import WholeFitter, drafted, limb_steps, smoothed_in_time
 from shapepose_fg.estimation.linearisation import linearise, mean_confidence, observation_sigmas, triangulate
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.outcome import Problem, how_known, problems, reported_covariance
@@ -132,8 +132,13 @@ class Estimator:
 
         A view that sees one counts from the first round on, then, and windows need no second.
         """
+<<<<<<< HEAD
         unknown = np.asarray(np.isnan(X).any(axis=2))
         rows = np.flatnonzero(unknown.any(axis=1))
+=======
+        unknown = np.asarray(np.isnan(X).any(axis=-1))
+        rows = np.flatnonzero(unknown.any(axis=-1))
+>>>>>>> h-window
         if len(rows) == 0:
             return X
         places, _ = self.draft(observations.rows(rows), views.rows(rows))
@@ -195,6 +200,7 @@ class Estimator:
                 velocity[rows] = graph.velocity()
                 velocity_covariance[rows] = graph.marginals(graph.velocity_keys)
                 covariance[rows] = reported_covariance(solution, window, covariance[rows], self._motion.views)
+        X = self._limbs_kept(X, covariance, windows, solution)
         fit = final_bodies(solution, covariance, windows, self.fitter)
         final = linearise(observations, sigmas, X, views, self.config.observations)
         wrong = problems(observations, windows, solution, first, covariance)
@@ -214,6 +220,29 @@ class Estimator:
             status=status,
             problems=wrong,
         )
+
+    def _limbs_kept(
+        self,
+        X: NDArray[np.float64],
+        covariance: NDArray[np.float64],
+        windows: Sequence[Window],
+        solution: Solution,
+    ) -> NDArray[np.float64]:
+        """Joints that no view saw, in windows of several frames, where a body can have them.
+
+        Not those with factors of the user's own. Steps are averaged over time: bodies are fitted frame by frame.
+        """
+        unseen = ~np.asarray(solution.inlier.any(axis=-1))
+        for window in windows:
+            unseen[window.rows] &= window.graph.temporal & ~window.graph.touched
+        steps = limb_steps(X, covariance, unseen, self.fitter)
+        for window in windows:
+            steps[window.rows] = smoothed_in_time(steps[window.rows], window.graph.times_s, STEP_S)
+        return X + np.where(unseen[..., None], steps, 0.0)
+
+
+STEP_S = 0.1
+"""Time over which what a body changes of unseen joints is averaged, seconds, one sigma."""
 
 
 def window_rows(observations: Observations, temporal: bool) -> list[NDArray[np.intp]]:

@@ -86,7 +86,7 @@ def weakest_sigma(information: NDArray[np.float64]) -> NDArray[np.float64]:
     return _weakest(np.asarray(np.linalg.eigvalsh(information), dtype=np.float64))
 
 
-def _weakest(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _weakest(values: NDArray[np.floating]) -> NDArray[np.float64]:
     """The same from eigenvalues (..., 3), rising. Under 1e-10 of the strongest is rounding: nothing."""
     weakest = np.where(values[..., 0] > 1e-10 * values[..., 2], values[..., 0], 0.0)
     with np.errstate(divide="ignore"):

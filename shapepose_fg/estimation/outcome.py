@@ -76,8 +76,8 @@ def how_known(solution: Solution, covariance: NDArray[np.float64]) -> NDArray[np
     information = np.where(pulled[..., None, None], solution.body.information, np.eye(3))
     said = np.trace(np.linalg.inv(information), axis1=2, axis2=3)
     carried = ~pulled | (np.trace(covariance, axis1=2, axis2=3) < 0.5 * said)
-    code = np.where(solution.inlier.any(axis=2), Known.SEEN, np.where(carried, Known.MOTION, Known.BODY))
-    return np.where(np.isfinite(solution.joints).all(axis=2), code, Known.UNKNOWN).astype(np.uint8)
+    code = np.where(solution.inlier.any(axis=-1), Known.SEEN, np.where(carried, Known.MOTION, Known.BODY))
+    return np.where(np.isfinite(solution.joints).all(axis=-1), code, Known.UNKNOWN).astype(np.uint8)
 
 
 def problems(
@@ -91,7 +91,11 @@ def problems(
     them.
     """
     X = solution.joints
+<<<<<<< HEAD
     finite = np.asarray(np.isfinite(X).all(axis=2))
+=======
+    finite = np.asarray(np.isfinite(X).all(axis=-1))
+>>>>>>> h-window
     reasons = np.full(finite.shape, "", dtype=object)
     information = solution.views.information + solution.body.information
     pulls = _pull(solution.views, X) + _pull(solution.body, X)

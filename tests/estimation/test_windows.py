@@ -43,7 +43,6 @@ class BesideFitter:
         covariance = np.tile(self.sigma_m**2 * np.eye(3), (*seen.shape, 1, 1))
         return replace(
             failed,
-            joints=np.where(ok[:, None, None], xyz, np.nan),
             prior_xyz=np.where(ok[:, None, None], xyz, np.nan),
             prior_covariance=np.where(ok[:, None, None, None], covariance, np.nan),
         )
