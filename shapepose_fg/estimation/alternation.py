@@ -214,11 +214,7 @@ def _sigmas_apart(
     """Distance (N, J) of what the views say from `xyz` (N, J, 3) +- `covariance`, standard deviations; NaN
     unknown.
     """
-<<<<<<< HEAD
     known = np.asarray(np.isfinite(xyz).all(axis=2))
-=======
-    known = np.asarray(np.isfinite(xyz).all(axis=-1))
->>>>>>> h-window
     apart = np.where(known[..., None], np.nan_to_num(evidence.target - xyz), 0.0)
     other = np.where(known[..., None, None], covariance, np.eye(3))
     # (L^-1 + C)^-1 = L (I + C L)^-1, which holds for information L that is singular, too.
@@ -319,11 +315,7 @@ def _solve(
 
 def interpolated(points: NDArray[np.float64], times_s: NDArray[np.float64]) -> NDArray[np.float64]:
     """Points (T, J, 3) with gaps closed in a straight line, and the ends held; joints never known stay NaN."""
-<<<<<<< HEAD
     known = np.asarray(np.isfinite(points).all(axis=2))
-=======
-    known = np.asarray(np.isfinite(points).all(axis=-1))
->>>>>>> h-window
     result = points.copy()
     for joint in np.flatnonzero(known.any(axis=0) & ~known.all(axis=0)).tolist():
         there = known[:, joint]

@@ -132,13 +132,8 @@ class Estimator:
 
         A view that sees one counts from the first round on, then, and windows need no second.
         """
-<<<<<<< HEAD
         unknown = np.asarray(np.isnan(X).any(axis=2))
         rows = np.flatnonzero(unknown.any(axis=1))
-=======
-        unknown = np.asarray(np.isnan(X).any(axis=-1))
-        rows = np.flatnonzero(unknown.any(axis=-1))
->>>>>>> h-window
         if len(rows) == 0:
             return X
         places, _ = self.draft(observations.rows(rows), views.rows(rows))

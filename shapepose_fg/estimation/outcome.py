@@ -91,11 +91,7 @@ def problems(
     them.
     """
     X = solution.joints
-<<<<<<< HEAD
     finite = np.asarray(np.isfinite(X).all(axis=2))
-=======
-    finite = np.asarray(np.isfinite(X).all(axis=-1))
->>>>>>> h-window
     reasons = np.full(finite.shape, "", dtype=object)
     information = solution.views.information + solution.body.information
     pulls = _pull(solution.views, X) + _pull(solution.body, X)

@@ -69,11 +69,7 @@ class Message:
     @property
     def known(self) -> NDArray[np.bool_]:
         """(T, J) of which joints anything is said."""
-<<<<<<< HEAD
         return np.asarray(self.information.any(axis=(2, 3)))
-=======
-        return np.any(self.information != 0, axis=(-2, -1))
->>>>>>> h-window
 
     def rows(self, index: NDArray[np.intp]) -> "Message":
         """Some of the rows."""
@@ -216,11 +212,7 @@ class WindowGraph:
         a window of several frames that goes for all frames of the joint. `lost` (T, J): where joints are hardly
         seen.
         """
-<<<<<<< HEAD
         self._present = np.asarray(np.isfinite(initial).all(axis=2))
-=======
-        self._present = np.asarray(np.isfinite(initial).all(axis=-1))
->>>>>>> h-window
         if self.temporal:
             self._present &= np.asarray(self._present.all(axis=0))
         of_views = self._present & self.with_offsets
@@ -322,11 +314,7 @@ class WindowGraph:
         share = self._motion.views.white_share if self.temporal else 1.0
         covariances = np.linalg.inv(body.information[known]) * (share / self.config.weight_shape)
         symmetric = (covariances + covariances.swapaxes(1, 2)) / 2
-<<<<<<< HEAD
         return list(body_prior_factors(self.keys[known], body.xyz[known], symmetric))
-=======
-        return [*body_prior_factors(self.keys[known], body.xyz[known], symmetric)]
->>>>>>> h-window
 
     def _lasting(
         self, said: Message, scale: float, errors: Lasting, source: int, chosen: NDArray[np.bool_]
