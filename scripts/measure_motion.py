@@ -32,8 +32,8 @@ def main() -> None:
     table = {
         "format": FORMAT,
         "about": (
-            "scripts/measure_motion.py. joints: m2/s3 at rest, per (m/s)2 of speed, across gaps of 0.4 s; CMU motion"
-            " capture, training subjects, 30 frames a second. views, body: shares and times fitted to the"
+            "scripts/measure_motion.py. joints: m2/s3 at rest, per (m/s)2 of speed, across gaps of 0.4 s; CMU"
+            " motion capture, training subjects, 30 frames a second. views, body: shares and times fitted to the"
             " autocorrelation of errors in simulated recordings (salsa, crossing; split tune). On Shelf, each view"
             " against the others and without annotation, errors correlate by 0.83 after 1 frame, 0.63 after 5 and"
             " 0.40 after 25. kept: chosen on the same simulated recordings."
