@@ -146,7 +146,9 @@ def reconstruct(
         people = Reconstruction.concatenate(parts) if parts else Reconstruction.empty(detections.skeleton.joints)
         if config.temporal:
             with run.stage("follow"):
-                people = _stitched(people, detections.skeleton, config, times.frame_s[list(cuts)])
+                # Between two frames, where no rounding matters.
+                cuts_s = (times.frame_s[list(cuts)] + times.frame_s[[cut - 1 for cut in cuts]]) / 2
+                people = _stitched(people, detections.skeleton, config, cuts_s)
         if config.temporal and isinstance(fitter, SequenceFitting):
             with run.stage("bodies over time"):
                 people = with_bodies_over_time(people, fitter, shapes)

@@ -167,7 +167,10 @@ def stage_two(recording: DetectionSequence, rig: Rig, config: PipelineConfig, fr
     for (file, _, function), row in vars(pstats.Stats(profile))["stats"].items():
         key = Path(file).name, function
         spent[key] = max(spent.get(key, 0.0), row[3])
-    whole = spent["estimator.py", "estimate"] - spent[Path(__file__).name, "fit"]
+    here = Path(__file__).name
+    # Drafts are stage II, too: gates and weights are theirs as well.
+    whole = sum(spent["estimator.py", name] for name in ("estimate", "draft"))
+    whole -= sum(spent.get((here, name), 0.0) for name in ("fit", "fit_whole"))
     shares = {part: spent.get(where, 0.0) / whole for part, where in PARTS.items()}
     return shares | {"the rest": 1.0 - sum(shares.values())}
 

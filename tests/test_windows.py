@@ -1,0 +1,120 @@
+"""Windows over time: seams, cuts, rates, and how much is kept in memory."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from shapepose_fg.detections import Recording
+from shapepose_fg.frame_times import FrameTimes
+from shapepose_fg.pipeline import PipelineConfig, reconstruct
+from shapepose_fg.simulation import built_in_scene, simulate
+from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.windows import WindowConfig
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Four people in close motion before six cameras, 1.6 s."""
+    return built_in_scene(seed=0, frames=40)
+
+
+@pytest.fixture(scope="module")
+def recording(scene):
+    return simulate(scene, seed=0)
+
+
+@pytest.fixture(scope="module")
+def times(scene):
+    return FrameTimes.from_fps(scene.fps, len(scene))
+
+
+@pytest.fixture(scope="module")
+def whole(scene, recording, times):
+    return reconstruct(recording, scene.rig, times=times)
+
+
+def test_identities_last_and_a_body_has_one_shape(scene, whole):
+    assert len(whole) == 4 * 40 and len(np.unique(whole.person)) == 4
+    truth = scene.keypoints
+    apart = np.linalg.norm(whole.joints[:, None] - truth[whole.frame], axis=-1).mean(axis=-1)
+    who = apart.argmin(axis=1)
+    for person in np.unique(whole.person).tolist():
+        assert len(set(who[whole.person == person].tolist())) == 1
+        assert len(np.unique(whole.betas[whole.person == person], axis=0)) == 1
+    assert apart.min(axis=1).mean() < 0.025
+
+
+def test_velocities_are_those_of_the_truth(scene, whole):
+    truth = scene.keypoints
+    true_velocity = np.gradient(truth, 1 / scene.fps, axis=0)
+    apart = np.linalg.norm(whole.joints[:, None] - truth[whole.frame], axis=-1).mean(axis=-1)
+    expected = true_velocity[whole.frame, apart.argmin(axis=1)]
+    error = np.linalg.norm(whole.velocity - expected, axis=-1)
+    # Positions are off by 2 cm, most of it lasting: a tenth of a metre per second is left; people move at 0.5 to
+    # 3.
+    assert np.median(error) < 0.15
+    variance = np.einsum("...ii->...i", whole.velocity_covariance)
+    assert np.mean(np.abs(whole.velocity - expected) < 2 * np.sqrt(variance)) > 0.9
+
+
+def test_the_length_of_windows_moves_joints_by_millimetres_at_seams_and_changes_no_name(
+    scene, recording, times, whole
+):
+    config = PipelineConfig(batch_frames=14)
+    parts = reconstruct(recording, scene.rig, config, times=times)
+    np.testing.assert_array_equal(parts.frame, whole.frame)
+    np.testing.assert_array_equal(parts.person, whole.person)
+    moved = np.linalg.norm(parts.joints - whole.joints, axis=-1)
+    # Windows see other rows, and so settle on other shapes and, now and then, other gates.
+    assert np.median(moved) < 0.002 and np.quantile(moved, 0.95) < 0.01
+
+
+def test_nothing_carries_over_a_cut(scene, recording, times):
+    both = reconstruct(recording, scene.rig, frames=range(10, 30), times=times, cuts=[20])
+    before, after = (set(both.person[side].tolist()) for side in (both.frame < 20, both.frame >= 20))
+    assert len(before) == len(after) == 4 and not before & after
+    alone = reconstruct(recording, scene.rig, frames=range(20, 30), times=times)
+    rows = both.rows(both.frame >= 20)
+    np.testing.assert_allclose(rows.joints, alone.joints, atol=1e-6)
+    assert both.run["cuts"] == [20]
+
+
+def test_twice_the_rate_is_twice_the_speed(scene, recording, whole):
+    slow = reconstruct(recording, scene.rig, times=FrameTimes.from_fps(scene.fps / 2, len(scene)))
+    speeds = [np.linalg.norm(each.velocity, axis=-1) for each in (whole, slow)]
+    assert np.median(speeds[0]) / np.median(speeds[1]) == pytest.approx(2.0, rel=0.1)
+    assert slow.time_s.max() == pytest.approx(39 / (scene.fps / 2))
+
+
+def test_cameras_that_are_not_synchronised_are_refused_for_now(scene, recording):
+    skewed = np.arange(40)[:, None] / scene.fps + np.array([0, 0, 0, 0, 0, 0.02])
+    with pytest.raises(ValueError, match="within 1 ms"):
+        reconstruct(recording, scene.rig, times=FrameTimes(skewed))
+
+
+def test_one_frame_is_what_it_is_without_time(scene, recording, times):
+    one = [
+        reconstruct(
+            recording, scene.rig, replace(PipelineConfig(), temporal=temporal), frames=range(3, 4), times=times
+        )
+        for temporal in (True, False)
+    ]
+    assert len(one[0]) == len(one[1]) == 4
+    gap = np.linalg.norm(one[0].joints[:, None] - one[1].joints[None], axis=-1).mean(axis=-1)
+    assert gap.min(axis=1).max() < 0.005
+
+
+def test_an_empty_recording_and_one_that_begins_empty(scene, recording):
+    from shapepose_fg.detections import Detections
+
+    nothing = [Detections.empty()] * 5
+    assert len(reconstruct(Recording(BODY_25, nothing), scene.rig)) == 0
+    late = Recording(BODY_25, [*nothing, *(recording[t] for t in range(8))])
+    people = reconstruct(late, scene.rig)
+    assert sorted(set(people.frame.tolist())) == list(range(5, 13)) and len(np.unique(people.person)) == 4
+
+
+def test_settings_that_make_no_sense_are_refused():
+    with pytest.raises(ValueError, match="overlap_s must not be negative"):
+        WindowConfig(overlap_s=-0.1)
