@@ -28,8 +28,8 @@ class RefineConfig:
     """N of Algorithm 1: how often the body is fitted and the joints are solved, at the most."""
     window_alternations: int = 1
     """The same for windows of several frames, which start from a draft of all joints (`Estimator.draft`): a second
-    round, at twice the time, changed the mean error by 0.1 to 0.2 mm. Windows with factors of the user's own take as
-    many as frames alone: what such a factor says may be far from what the views said."""
+    round, at twice the time, changed the mean error by 0.1 to 0.2 mm. Windows with factors of the user's own take
+    as many as frames alone: what such a factor says may be far from what the views said."""
     settled_m: float = 0.002
     """A window whose joints all moved less in a round is done: most frames are after one or two. 0: none is."""
     max_sigma_m: float = 0.5
