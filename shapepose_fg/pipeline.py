@@ -30,6 +30,7 @@ from shapepose_fg.estimation.detector_offsets import (
 from shapepose_fg.estimation.estimator import Estimator, ExtraFactors
 from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
+from shapepose_fg.estimation.outcome import Problem
 from shapepose_fg.estimation.window_graph import WindowGraphConfig
 from shapepose_fg.frame_times import FrameTimes, check_cuts, stretches
 from shapepose_fg.observation_table import place_in_view
@@ -137,9 +138,10 @@ def reconstruct(
         if isinstance(fitter, AdjustableFitter) and offsets is not None:
             fitter = fitter.with_keypoint_offsets(offsets)
         engine = _engine(rig, detections.skeleton, config, fitter, extra_factors, run)
-        parts, done = [], 0
+        parts, problems, done = [], list[Problem](), 0
         for solved, count in _solved(engine, config, _inputs(detections, rig, frames, times, run), frames, cuts):
             parts += [_rows(each, rig, detections, config) for each in solved]
+            problems += [problem for each in solved for problem in each.estimates.problems]
             done += count
             if progress is not None:
                 progress(done, len(frames))
@@ -148,11 +150,14 @@ def reconstruct(
             with run.stage("follow"):
                 # Between two frames, where no rounding matters.
                 cuts_s = (times.frame_s[list(cuts)] + times.frame_s[[cut - 1 for cut in cuts]]) / 2
-                people = _stitched(people, detections.skeleton, config, cuts_s)
+                before, people = people.person, _stitched(people, detections.skeleton, config, cuts_s)
+                names = dict(zip(before.tolist(), people.person.tolist(), strict=True))
+                problems = [replace(problem, track=names[problem.track]) for problem in problems]
         if config.temporal and isinstance(fitter, SequenceFitting):
             with run.stage("bodies over time"):
                 people = with_bodies_over_time(people, fitter, shapes)
     summary = run.summary(config, frames, people) | {"time": times.as_dict(), "cuts": list(cuts)}
+    summary["people"]["problems"] = [_named(problem, detections.skeleton) for problem in problems]
     summary |= {"keypoint_offsets": None if offsets is None else offsets.as_dict()}
     return replace(people, run=summary)
 
@@ -300,6 +305,12 @@ def _stitched(
     person = stitch(people.person, people.time_s, people.joints, skeleton, config.stitching, cuts_s.tolist())
     table = None if people.observations is None else replace(people.observations, person=person)
     return replace(people, person=person, observations=table)
+
+
+def _named(problem: Problem, skeleton: Skeleton) -> dict[str, Any]:
+    """A problem as run.json has it: the person (without time, of its batch), frame, joint and what happened."""
+    joint = skeleton.joints[problem.joint]
+    return {"person": problem.track, "frame": problem.frame, "joint": joint, "reason": problem.reason}
 
 
 def _number_in_frame(frame: np.ndarray) -> np.ndarray:

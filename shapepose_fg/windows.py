@@ -152,6 +152,7 @@ class Engine:
                 )
         with self.stage("solve"):
             estimates = self.estimator.estimate(rows, self.extra_factors)
-        own = [frame.frame for frame in given[start:stop]]
-        index = np.flatnonzero(np.isin(rows.frame, own))
-        return Solved(rows.rows(index), estimates.rows(index))
+        own = {frame.frame for frame in given[start:stop]}
+        index = np.flatnonzero(np.isin(rows.frame, list(own)))
+        problems = tuple(problem for problem in estimates.problems if problem.frame in own)
+        return Solved(rows.rows(index), replace(estimates.rows(index), problems=problems))

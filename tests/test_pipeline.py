@@ -163,6 +163,22 @@ def test_factors_of_one_s_own_reach_every_person(scene, recording):
     np.testing.assert_allclose(apart, 0.5, atol=0.005)
 
 
+def test_a_factor_that_throws_a_wrist_away_is_a_status_that_names_it(scene, recording):
+    def throw(window, keys):
+        far = np.array([1000.0, 0.0, 0.0])
+        yield gtsam.PriorFactorPoint3(int(keys[0, WRISTS[0]]), far, isotropic(3, 1e-3))
+
+    result = reconstruct(recording, scene.rig, frames=range(6), extra_factors=throw)
+    failed = result.rows(result.status == Status.NOT_SOLVED)
+    # Motion takes the frames around with it: none of them may pass for solved.
+    assert 0 in failed.frame and len(failed) == len(result)
+    problems = result.run["people"]["problems"]
+    assert {(each["person"], each["frame"], each["joint"]) for each in problems} >= {
+        (person, frame, "RWrist")
+        for person, frame in zip(failed.person.tolist(), failed.frame.tolist(), strict=True)
+    }
+
+
 def test_settings_reach_their_steps(scene, recording):
     strict = PipelineConfig(proposals=ProposalConfig(min_confidence=1.0))
     assert len(find_people(recording[0], scene.rig, BODY_25, strict)) == 0
