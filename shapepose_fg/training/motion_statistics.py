@@ -1,6 +1,4 @@
-"""The motion model's numbers: how joints of recorded people move, and how long errors of detector and body
-last.
-"""
+"""The motion model's numbers: how joints of recorded people move, how long errors of detector and body last."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -55,9 +53,7 @@ class LastingErrors:
 
 
 def recorded_joints(path: Path, split: Split) -> Iterator[tuple[Array, float]]:
-    """BODY_25's joints (T, 25, 3), metres, and frames a second, of recorded people of one part on the mean
-    body.
-    """
+    """BODY_25's joints (T, 25, 3), metres, and frames a second, of one part's people on the mean body."""
     mocap, body = Mocap.load(path), BodyModel.default()
     for index, subject in enumerate(mocap.subjects):
         if split_of(subject) == split:

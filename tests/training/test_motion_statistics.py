@@ -54,5 +54,5 @@ def test_the_shipped_model_holds_what_was_measured():
     model = MotionModel.load(BODY_25.joints)
     slowest, fastest = BODY_25.joints[model.psd_lost.argmin()], BODY_25.joints[model.psd_lost.argmax()]
     assert slowest == "MidHip" and "Toe" in fastest
-    assert 0.2 < model.views.white_share < 0.5 and 0.5 < model.views.correlation_s < 2.0
+    assert 0.2 < model.views.white_share < 0.5 and 0.5 < model.body.correlation_s < 2.0
     assert (model.psd(np.full(25, 2.0)) > 5 * model.psd_still).all()
