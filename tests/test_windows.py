@@ -115,6 +115,21 @@ def test_an_empty_recording_and_one_that_begins_empty(scene, recording):
     assert sorted(set(people.frame.tolist())) == list(range(5, 13)) and len(np.unique(people.person)) == 4
 
 
+def test_people_are_carried_through_frames_in_which_no_camera_sees_anything(scene, recording, times):
+    from shapepose_fg.detections import Detections
+    from shapepose_fg.reconstruction import Known
+
+    gap = range(10, 14)
+    frames = [Detections.empty() if t in gap else recording[t] for t in range(24)]
+    people = reconstruct(Recording(BODY_25, frames), scene.rig, times=FrameTimes(times.time_s[:24]))
+    assert len(people) == 4 * 24 and len(np.unique(people.person)) == 4
+    blind = people.rows(np.isin(people.frame, list(gap)))
+    assert np.isfinite(blind.joints).all() and (blind.known == Known.MOTION).all()
+    apart = np.linalg.norm(blind.joints[:, None] - scene.keypoints[blind.frame], axis=-1).mean(axis=-1).min(axis=1)
+    # Between frames that are known to 2 cm, 0.2 s apart: an acceleration of 10 m/s2 would be 5 cm.
+    assert apart.max() < 0.08
+
+
 def test_settings_that_make_no_sense_are_refused():
     with pytest.raises(ValueError, match="overlap_s must not be negative"):
         WindowConfig(overlap_s=-0.1)

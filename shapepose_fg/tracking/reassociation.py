@@ -36,15 +36,16 @@ def reassociate(
 ) -> Observations:
     """The same rows with the detections around their `joints` (N, J, 3), known to `covariance` (N, J, 3, 3).
 
-    All views and people of a frame at once, one-to-one. With `survival` people may go: those whose detections
+    All views and people of a frame at once, one-to-one. Rows without any joint keep their place, without
+    detections: motion carries them. With `survival` people may go: those who have no joints or whose detections
     belong to others, and doubles. Rows come back sorted by frame.
     """
     sigma_m = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1) / 3)
     parts = []
     for frame in given:
         index = np.flatnonzero(rows.frame == frame.frame)
-        lost = ~np.isfinite(sigma_m[index])
-        index = index[~lost.all(axis=1)]
+        if survival is not None:
+            index = index[np.isfinite(sigma_m[index]).any(axis=1)]
         candidate = _candidates(frame, joints[index], sigma_m[index], skeleton, config)
         while survival is not None and len(index) > 0:
             gone = _gone(candidate, joints[index], skeleton, survival)
