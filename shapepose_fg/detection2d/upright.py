@@ -46,6 +46,8 @@ class UprightView:
     """Left, top, right, bottom edge of the region, pixels of the picture; the centre of the first pixel is 0."""
     cell_px: int
     """Pixels of the input per cell of the output."""
+    turn_deg: float
+    """By how much the picture is turned clockwise, degrees."""
 
     @classmethod
     def of(
@@ -73,7 +75,7 @@ class UprightView:
         stretch = np.diag(size / sides)
         # Edges, not centres, of pixels are scaled: hence the half pixel.
         matrix = np.column_stack([stretch @ turn, -stretch @ low - 0.5])
-        return cls((int(size[0]), int(size[1])), matrix, region, layout.stride)
+        return cls((int(size[0]), int(size[1])), matrix, region, layout.stride, roll_deg)
 
     def input_of(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The network's input (height, width, 3) of a `picture`; what lies outside the region has its mean colour."""
