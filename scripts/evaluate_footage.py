@@ -20,12 +20,12 @@ import cv2
 import numpy as np
 import torch
 from evaluate_time import with_time
+from shapepose_fg.evaluation.overlay import cropped, draw_bodies, draw_skeletons, undistorted
 
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import DetectionSequence
 from shapepose_fg.evaluation.held_out_view import held_out
-from shapepose_fg.evaluation.overlay import cropped, draw_bodies, draw_skeletons, undistorted
 from shapepose_fg.evaluation.shelf import evaluate_shelf, match_actors, read_shelf_ground_truth
 from shapepose_fg.evaluation.shelf_events import identity_switches, lost_limbs, pcp_interval
 from shapepose_fg.evaluation.single_person import FPS, man_of, measure_single_person

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from shapepose_fg.errors import InputError
+from shapepose_fg.options import frame_range, image_size_of
 from shapepose_fg.terminal import note, progress, show
 
 if TYPE_CHECKING:
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from shapepose_fg.io.calibration import Unit
     from shapepose_fg.io.footage.footage import Footage
     from shapepose_fg.io.footage.lockstep import CameraClock, Lockstep
-    from shapepose_fg.io.footage.placement import Placement
 
 # Everything else is imported inside the command: `--help` must not wait for it.
 
@@ -100,8 +100,8 @@ def detect(
     from shapepose_fg.detection2d.network import HeatMapNetwork
     from shapepose_fg.detection2d.recording import DetectionRun, run_detection
     from shapepose_fg.io.calibration import read_rig
+    from shapepose_fg.io.footage.given import per_camera, placements_of
     from shapepose_fg.io.footage.lockstep import align
-    from shapepose_fg.options import frame_range, image_size_of
 
     rig = read_rig(
         calibration,
@@ -113,9 +113,12 @@ def detect(
         file = find_network(network, download=download, address=network_address, progress=fetched)
     loaded = HeatMapNetwork.load(file, layout, cast("Backend", backend))
     footage = _open(videos, rig)
-    placements = _place(image_placement, footage, rig)
-    rates = _per_camera("--fps", fps or [], rig, one_for_all=True)
-    starts = _per_camera("--start", start or [], rig, one_for_all=False)
+    sizes = {name: each.size for name, each in zip(rig.names, footage, strict=True)}
+    placements, concluded = placements_of(image_placement or [], sizes, rig)
+    for each in concluded:
+        note(each)
+    rates = per_camera("--fps", fps or [], rig, one_for_all=True)
+    starts = per_camera("--start", start or [], rig, one_for_all=False)
     clocks, has_clock = _clocks(footage, rates, starts, rig)
     moments = align(clocks, has_clock)
     moments = _part(moments, frame_range(frames, len(moments)))
@@ -123,8 +126,7 @@ def detect(
         note(each)
     config = DetectionConfig(long_side=long_side)
     detectors = [
-        CameraDetector.of(camera, rig.up_vector, placement, loaded, config)
-        for camera, placement in zip(rig.cameras, placements, strict=True)
+        CameraDetector.of(camera, rig.up_vector, placements[camera.name], loaded, config) for camera in rig.cameras
     ]
     run = DetectionRun(rig, footage, detectors, moments, output)
     begin = time.perf_counter()
@@ -142,7 +144,7 @@ def _open(videos: Sequence[str], rig: "Rig") -> "list[Footage]":
     from shapepose_fg.io.footage.footage import open_footage
     from shapepose_fg.io.footage.places import find_footage
 
-    places = find_footage(videos, rig)
+    places = find_footage(videos, rig.names)
     for each in places.notes:
         note(each)
     footage = []
@@ -152,46 +154,6 @@ def _open(videos: Sequence[str], rig: "Rig") -> "list[Footage]":
         for each in footage[-1].notes:
             note(each)
     return footage
-
-
-def _place(
-    given: Sequence[str] | None, footage: "Sequence[Footage]", rig: "Rig"
-) -> "list[Placement]":
-    """Where calibrated pixels lie in each camera's pictures."""
-    from shapepose_fg.io.footage.placement import PlacementKind, place
-
-    words = _per_camera("--image-placement", given or [], rig, one_for_all=True)
-    placements = []
-    for camera, each, word in zip(rig.cameras, footage, words, strict=True):
-        if word is not None and word not in set(PlacementKind):
-            raise InputError(
-                f"--image-placement {word}: must be one of {' '.join(kind for kind in PlacementKind)}"
-            )
-        wanted = None if word is None else PlacementKind(word)
-        placement, concluded = place(camera.name, each.size, camera.image_size, wanted)
-        if concluded is not None:
-            note(concluded)
-        placements.append(placement)
-    return placements
-
-
-def _per_camera(option: str, given: Sequence[str], rig: "Rig", *, one_for_all: bool) -> list[str | None]:
-    """(V,) what an option says of each camera: CAMERA=VALUE, or where it may be one VALUE for all."""
-    values: dict[str, str] = {}
-    rest: str | None = None
-    for text in given:
-        name, separator, value = text.rpartition("=")
-        if not separator and one_for_all and rest is None:
-            rest = text
-        elif not separator:
-            raise InputError(f"{option} {text}: must be CAMERA=VALUE, such as {option} {rig.names[0]}=VALUE")
-        elif name not in rig.names:
-            raise InputError(f"{option} {text}: the calibration has no camera {name!r}; it has {' '.join(rig.names)}")
-        elif name in values:
-            raise InputError(f"{option} {text}: camera {name} is given twice")
-        else:
-            values[name] = value
-    return [values.get(name, rest) for name in rig.names]
 
 
 def _clocks(
@@ -245,7 +207,9 @@ def _start(text: str | None, period: float, has_clock: bool) -> float:
     if match is None:
         raise InputError(f"--start {text}: must be seconds such as 0.2s, or the camera's own frames such as 12f")
     if match[2] == "s" and not has_clock:
-        raise InputError(f"--start {text}: nothing says how many frames a second there are; give --fps, or frames (12f)")
+        raise InputError(
+            f"--start {text}: nothing says how many frames a second there are; give --fps, or frames (12f)"
+        )
     return float(match[1]) * (1.0 if match[2] == "s" else period)
 
 
@@ -263,11 +227,9 @@ def _summary(run: "DetectionRun", report: "DetectionReport", seconds: float) -> 
     from rich.table import Table
 
     table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
-    for name in ("camera", "pictures", "size", "turned", "shown to the network", "candidates a picture"):
+    for name in ("camera", "pictures", "size", "turned", "network", "candidates"):
         table.add_column(name, justify="left" if name == "camera" else "right")
-    for view, (name, footage, detector) in enumerate(
-        zip(run.rig.names, run.footage, run.detectors, strict=True)
-    ):
+    for view, (name, footage, detector) in enumerate(zip(run.rig.names, run.footage, run.detectors, strict=True)):
         pictures = int((run.moments.picture[:, view] >= 0).sum()) - report.unreadable[view]
         turned = detector.view.turn_deg
         table.add_row(
@@ -279,14 +241,14 @@ def _summary(run: "DetectionRun", report: "DetectionReport", seconds: float) -> 
             f"{report.candidates[view] / max(pictures, 1):.1f}",
         )
     total = max(report.moments * len(run.rig), 1)
-    table.caption = (
-        f"{report.moments} frames of {len(run.rig)} cameras in {seconds:.1f} s, {1e3 * seconds / total:.0f} ms a picture"
-    )
+    table.caption = f"{report.moments} frames of {len(run.rig)} cameras in {seconds:.1f} s, {1e3 * seconds / total:.0f} ms a picture"
     table.caption_justify = "left"
     return table
 
 
-def _next_command(run: "DetectionRun", calibration: Path, up: str | None, unit: str | None, size: str | None) -> str:
+def _next_command(
+    run: "DetectionRun", calibration: Path, up: str | None, unit: str | None, size: str | None
+) -> str:
     """How to go on, as a line to copy."""
     import shlex
 

@@ -64,9 +64,9 @@ class Candidates:
 def decode(
     output: NDArray[np.float32], layout: NetworkLayout, config: DecodingConfig = DecodingConfig()
 ) -> Candidates:
-    """Candidates of one picture from the network's `output` (C, H, W); positions in cells, (0, 0) the first's centre.
+    """Candidates of one picture from the network's `output` (C, H, W).
 
-    What is not finite in the output is taken for 0.
+    Positions are in cells of the output; (0, 0) is the centre of the first. What is not finite in the output is taken for 0.
     """
     output = np.nan_to_num(output, nan=0.0, posinf=0.0, neginf=0.0)
     heat = output[layout.first_heat_map : layout.first_heat_map + len(layout.joints)]
@@ -110,7 +110,7 @@ def peaks(
 def _vertex(
     before: NDArray[np.floating], centre: NDArray[np.float64], after: NDArray[np.floating]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Where a Gaussian through three neighbours is highest, -0.5 to 0.5 cells, and the logarithm of how much higher.
+    """Where a Gaussian through three neighbours is highest, -0.5 to 0.5 cells, and the logarithm of its rise.
 
     0 and 0 at the edge of the map.
     """

@@ -47,14 +47,14 @@ def find_network(
         return kept
     if not download:
         raise InputError(
-            f"--network {name}: it has not been fetched yet; add --download to fetch {known.bytes / 1e6:.1f} MB once,"
-            " or give the path of its file"
+            f"--network {name}: it has not been fetched yet; add --download to fetch {known.bytes / 1e6:.1f} MB"
+            " once, or give the path of its file"
         )
     source = address or known.address
     if source is None:
         raise InputError(
-            f"--network {name}: no public address of this file is known; name one with --network-address (what comes is"
-            f" checked: sha256 {known.sha256}), or give the path of the file"
+            f"--network {name}: no public address of this file is known; name one with --network-address"
+            f" (what comes is checked: sha256 {known.sha256}), or give the path of the file"
         )
     content = _fetch(source, known, progress)
     write_atomically(kept, lambda stream: stream.write(content))
@@ -90,7 +90,7 @@ def _fetch(address: str, known: KnownNetwork, progress: Callable[[int, int], Non
     if hashlib.sha256(content).hexdigest() != known.sha256:
         what = f"more than {known.bytes}" if size > known.bytes else str(size)
         raise InputError(
-            f"{address}: what came ({what} bytes) is not the network {known.name}, its checksum differs; nothing was"
-            " kept"
+            f"{address}: what came ({what} bytes) is not the network {known.name}, its checksum differs;"
+            " nothing was kept"
         )
     return content

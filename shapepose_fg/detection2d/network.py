@@ -2,7 +2,7 @@
 
 import hashlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -31,9 +31,7 @@ class HeatMapNetwork:
         self._forward = forward
 
     @classmethod
-    def load(
-        cls, file: str | Path, layout: str | None = None, backend: Backend = "opencv"
-    ) -> "HeatMapNetwork":
+    def load(cls, file: str | Path, layout: str | None = None, backend: Backend = "opencv") -> "HeatMapNetwork":
         """The network in the ONNX `file`. `layout` names one of `layouts()`; without it the file must tell.
 
         InputError where the file is missing, is no ONNX network, or does not fit the layout.
@@ -46,22 +44,24 @@ class HeatMapNetwork:
             shape = forward(np.zeros((1, 3, _TRIAL, _TRIAL), dtype=np.float32)).shape
         except Exception as error:
             raise InputError(
-                f"{file}: the network cannot be run on a {_TRIAL} x {_TRIAL} picture ({_first_line(error)}); give one"
-                " that takes pictures (1, 3, height, width) of any size"
+                f"{file}: the network cannot be run on a {_TRIAL} x {_TRIAL} picture ({_first_line(error)}); give"
+                " one that takes pictures (1, 3, height, width) of any size"
             ) from None
         channels = shape[1] if len(shape) == 4 else None
         found = find_layout(layout, sha256, channels, file)
         cells = _TRIAL // found.stride
         if shape != (1, found.channels, cells, cells):
             raise InputError(
-                f"{file}: of a {_TRIAL} x {_TRIAL} picture the network makes {' x '.join(map(str, shape))} numbers,"
-                f" layout {found.name} expects 1 x {found.channels} x {cells} x {cells}; give the layout of this"
-                " network"
+                f"{file}: of a {_TRIAL} x {_TRIAL} picture the network makes {_words(shape)} numbers, layout"
+                f" {found.name} expects 1 x {found.channels} x {cells} x {cells}; give the layout of this network"
             )
         return cls(found, sha256, forward)
 
     def run(self, picture: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """The output (C, H / stride, W / stride) of a `picture` (H, W, 3), blue green red; sides fit `layout.multiple`."""
+        """The output (C, H / stride, W / stride) of a `picture` (H, W, 3): blue, green, red.
+
+        Its sides are multiples of `layout.multiple`.
+        """
         blob = np.ascontiguousarray(picture.transpose(2, 0, 1)[None], dtype=np.float32)
         if (self.layout.scale, self.layout.offset) != (1.0, 0.0):
             blob = blob * np.float32(self.layout.scale) + np.float32(self.layout.offset)
@@ -118,6 +118,11 @@ def _with_onnxruntime(file: Path, content: bytes) -> _Forward:
         return np.asarray(session.run(None, {name: blob})[0], dtype=np.float32)
 
     return forward
+
+
+def _words(shape: Sequence[int]) -> str:
+    """An array's shape in words."""
+    return " x ".join(map(str, shape))
 
 
 def _first_line(error: BaseException) -> str:

@@ -14,7 +14,7 @@ from shapepose_fg.errors import InputError
 
 @dataclass(frozen=True)
 class NetworkLayout:
-    """What a heat-map network takes and gives: OpenPose's kind, heat maps and part affinity fields in one array."""
+    """What a network takes and gives: of OpenPose's kind, heat maps and part affinity fields in one array."""
 
     name: str
     """What it is called."""

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from shapepose_fg.camera import Rig
 from shapepose_fg.columns import read_npz
-from shapepose_fg.detection2d.decoding import Candidates
 from shapepose_fg.detection2d.detector import CameraDetector
 from shapepose_fg.errors import InputError
 from shapepose_fg.files import read_json, write_atomically
@@ -68,8 +67,8 @@ class DetectionRun:
 def run_detection(run: DetectionRun, progress: Callable[[int, int], None] | None = None) -> "DetectionReport":
     """Detect in all pictures, and write <camera>.txt (4D Association), times.csv and footage.json into the output.
 
-    Blocks that an earlier run of the same settings left are not done again; the files come out the same. `progress`
-    is told how many pictures are done. InputError where the folder holds detections or a run of other settings.
+    Blocks that an earlier run of the same settings left are not done again; the files come out the same.
+    `progress` is told how many pictures are done. InputError where the folder holds detections or a run of other settings.
     """
     unfinished = run.output / _UNFINISHED
     _refuse_others(run, unfinished)
@@ -88,7 +87,9 @@ def run_detection(run: DetectionRun, progress: Callable[[int, int], None] | None
         if progress is not None:
             progress(moments.stop * views, total * views)
     for view, name in enumerate(run.rig.names):
-        write_atomically(run.output / f"{name}.txt", lambda stream, v=view: _write_text(run, v, unfinished, stream))
+        write_atomically(
+            run.output / f"{name}.txt", lambda stream, v=view: _write_text(run, v, unfinished, stream)
+        )
     _write_times(run)
     report = DetectionReport(total, tuple(found.tolist()), tuple(failed.tolist()))
     used = [
@@ -234,16 +235,18 @@ def _refuse_others(run: DetectionRun, unfinished: Path) -> None:
             if before == json.loads(_json(run.settings)):
                 return
             raise InputError(
-                f"{unfinished}: a run with {_difference(before, run)} was stopped here; start it as it was to go on,"
-                " or delete this folder"
+                f"{unfinished}: a run with {_difference(before, run)} was stopped here; start it as it was to go"
+                " on, or delete this folder"
             )
         if any(unfinished.iterdir()):
-            raise InputError(f"{unfinished}: not a run of this program; delete the folder, or give another --output")
+            raise InputError(
+                f"{unfinished}: not a run of this program; delete the folder, or give another --output"
+            )
         return
     there = [name for name in run.rig.names if (run.output / f"{name}.txt").exists()]
     if len(there) > 0:
         raise InputError(
-            f"{run.output / there[0]}.txt: there are detections already; delete the folder, or give another --output"
+            f"{run.output / there[0]}.txt: there are detections already; delete them, or give another --output"
         )
 
 

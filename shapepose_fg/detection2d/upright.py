@@ -1,6 +1,6 @@
 """Pictures turned so that gravity points down, at the size of a network's input, and the way back.
 
-Detectors are trained on people who stand upright in the picture; a rolled camera costs them half of what they find.
+Detectors are trained on people who stand upright in the picture: of others they find half as many.
 """
 
 from dataclasses import dataclass
@@ -15,12 +15,12 @@ from shapepose_fg.detection2d.networks import NetworkLayout
 LEVEL_DEG = 5.0
 """Pictures that are rolled by less stay as they are: people lean by as much, and turning costs corners."""
 _LOOKS_DOWN = 0.17
-"""Where the picture of the vertical is shorter than this (the sine of 10 degrees), the camera looks along it, and no
-direction of the picture is up."""
+"""Where the picture of the vertical is shorter than this (the sine of 10 degrees), the camera looks along it, and
+no direction of the picture is up."""
 
 
 def roll_of(camera: Camera, up: NDArray[np.float64]) -> float:
-    """By how many degrees the picture of `camera` is to be turned clockwise for `up` (3,) to point up in its middle.
+    """How far the picture of `camera` is to be turned for `up` (3,) to point up in its middle: degrees clockwise.
 
     0 where the camera looks straight up or down.
     """
@@ -59,8 +59,8 @@ class UprightView:
     ) -> "UprightView":
         """The view of a `region` turned clockwise by `roll_deg`, about `long_side` pixels along its longer side.
 
-        Rolls under `LEVEL_DEG` from a multiple of 90 degrees are turned by that multiple. Both sides are the nearest
-        multiples of what the network takes, so the axes' scales differ by a few per cent.
+        Rolls under `LEVEL_DEG` from a multiple of 90 degrees are turned by that multiple. Both sides are the
+        nearest multiples of what the network takes, so the axes' scales differ by a few per cent.
         """
         quarter = 90.0 * round(roll_deg / 90.0)
         roll_deg = quarter if abs(roll_deg - quarter) < LEVEL_DEG else roll_deg
@@ -78,7 +78,7 @@ class UprightView:
         return cls((int(size[0]), int(size[1])), matrix, region, layout.stride, roll_deg)
 
     def input_of(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The network's input (height, width, 3) of a `picture`; what lies outside the region has its mean colour."""
+        """The network's input (height, width, 3) of a `picture`; outside the region it has the mean colour."""
         left, top, right, bottom = (round(edge + 0.5) for edge in self.region)
         part = picture[max(top, 0) : bottom, max(left, 0) : right]
         matrix = self.input_from_picture.copy()

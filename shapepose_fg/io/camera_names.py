@@ -9,9 +9,9 @@ _NUMBERS = re.compile(r"\d+")
 def match_names(cameras: Sequence[str], names: Sequence[str]) -> list[int] | None:
     """For each camera the place of its name among `names`, which are longer or written differently.
 
-    A camera is told by its own name as a word in another (`walk_Miqus_1_23087` is camera `23087`), or by the only
-    number in both (`cam01` is camera `int_cam1`). None where it is not so for every camera, or something else could
-    be meant too: then nothing is guessed.
+    A camera is told by its own name as a word in another (`walk_Miqus_1_23087` is camera `23087`), or by the
+    only number in both (`cam01` is camera `int_cam1`). None where it is not so for every camera, or something else
+    could be meant too: then nothing is guessed.
     """
     chosen = _within(cameras, names)
     if chosen is not None:

@@ -1,9 +1,9 @@
 import cv2
 import numpy as np
 import pytest
+from shapepose_fg.evaluation.overlay import cropped, draw_bodies, draw_skeletons, undistorted
 
 from shapepose_fg.camera import Camera
-from shapepose_fg.evaluation.overlay import cropped, draw_bodies, draw_skeletons, undistorted
 from shapepose_fg.simulation import built_in_scene
 
 

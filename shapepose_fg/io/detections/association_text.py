@@ -115,9 +115,7 @@ def _header(stream: _Stream) -> tuple[TextSkeleton, int]:
     return kind, int(values[1])
 
 
-def _layout(
-    stream: _Stream, kind: TextSkeleton, frame_count: int
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _layout(stream: _Stream, kind: TextSkeleton, frame_count: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """How many candidates each joint of each frame has, and where the numbers of each block start.
 
     Returns `counts` (T, J) and `starts` (T, J + 1): the first x of a joint, and in the last column the

@@ -51,8 +51,8 @@ def _read_texts(texts: Sequence[Path], rig: Rig, wanted: Skeleton | None) -> Det
     for text, (_, each) in zip(texts, read, strict=True):
         if each.name != skeleton.name:
             raise InputError(
-                f"{text} has the joints of {each.name}, {texts[0]} those of {skeleton.name}; give the detections of"
-                " one model for all cameras"
+                f"{text} has the joints of {each.name}, {texts[0]} those of {skeleton.name}; give the detections"
+                " of one model for all cameras"
             )
     if wanted is not None and wanted.joints != skeleton.joints:
         raise InputError(f"{texts[0]}: these are joints of {skeleton.name}, not of {wanted.name}")

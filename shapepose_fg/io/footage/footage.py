@@ -26,7 +26,7 @@ _SAFE_READING = (
 )
 """A video is read by these rules: its file alone, and no playlist, which could name other files and addresses."""
 _LARGEST = 16384
-"""No camera has pictures with a longer side, pixels: a file that says so is damaged, or made to fill the memory."""
+"""No camera has pictures with a longer side, pixels: a file that says so is damaged, or meant to do harm."""
 _LAST_NUMBER = re.compile(r"\d+(?=\D*$)")
 
 
@@ -51,7 +51,7 @@ class Footage(Protocol):
         ...
 
     def at(self, place: int) -> Picture | None:
-        """The picture of frame `place` of the N; None where it cannot be read. Frames are read in order fastest."""
+        """The picture of frame `place` of the N; None where it cannot be read. Fastest in rising order."""
         ...
 
 
@@ -85,11 +85,13 @@ class Video:
 
     @classmethod
     def open(cls, path: Path, progress: Progress | None = None) -> "Video":
-        """Look through the video at `path`: every frame is decoded once, so that a cut or damaged file is known."""
+        """Look through the video at `path`: every frame is decoded once, which shows what is cut or damaged."""
         capture = _capture(path)
         size = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
-        if not (0 < min(size) and max(size) <= _LARGEST):
-            raise InputError(f"{path}: the video's pictures would be {size[0]} x {size[1]}; give an undamaged video")
+        if not (min(size) > 0 and max(size) <= _LARGEST):
+            raise InputError(
+                f"{path}: the video's pictures would be {size[0]} x {size[1]}; give an undamaged video"
+            )
         announced = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
         fps = float(capture.get(cv2.CAP_PROP_FPS))
         stamps = []
@@ -104,8 +106,8 @@ class Video:
         # Files tell of a frame or two that players do not show; more is a file that was cut or damaged.
         if announced - len(stamps) > 2:
             notes.append(
-                f"{path}: only {len(stamps)} of the {announced} frames that the file tells of can be read; it was cut"
-                " or is damaged"
+                f"{path}: only {len(stamps)} of the {announced} frames that the file tells of can be read; it was"
+                " cut or is damaged"
             )
         return cls(path, size, time_s, tuple(notes))
 
@@ -151,10 +153,12 @@ class PictureFiles:
             return cls(path, _size(files[0]), tuple(files), np.zeros(1, dtype=np.intp))
         bare = next((each for each, match in zip(files, found, strict=True) if match is None), None)
         if bare is not None:
-            raise InputError(f"{bare}: no number in the name says which frame this is; name pictures by their frames")
+            raise InputError(f"{bare}: no number in its name says which frame this is; number the pictures")
         numbers = np.array([int(match[0]) for match in found if match is not None], dtype=object)
         if max(numbers) > np.iinfo(np.int64).max // 2:
-            raise InputError(f"{path}: a number with {len(str(max(numbers)))} digits is no frame's; number the frames")
+            raise InputError(
+                f"{path}: a number with {len(str(max(numbers)))} digits is no frame's; number the frames"
+            )
         order = np.argsort(numbers.astype(np.int64), kind="stable")
         number = numbers.astype(np.intp)[order]
         twice = np.flatnonzero(np.diff(number) == 0)
@@ -200,7 +204,9 @@ def _times(path: Path, stamp_s: NDArray[np.float64], fps: float) -> tuple[NDArra
     known_rate = np.isfinite(fps) and 0.01 <= fps <= 1e5
     if len(stamp_s) > 1 and not (np.diff(stamp_s) > 0).all():
         if not known_rate:
-            raise InputError(f"{path}: the video says neither times nor rate; give --fps CAMERA=RATE, or convert it")
+            raise InputError(
+                f"{path}: the video says neither times nor rate; give --fps CAMERA=RATE, or convert it"
+            )
         return np.arange(len(stamp_s)) / fps, [
             f"{path}: the frames' times in the file do not rise; its rate of {fps:g} a second was taken instead"
         ]

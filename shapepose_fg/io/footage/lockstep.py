@@ -33,7 +33,7 @@ class Lockstep:
     picture: NDArray[np.intp]
     """(T, V) place of each camera's frame; -1 where it has none within half a frame."""
     time_s: NDArray[np.float64] | None
-    """(T, V) when those frames were taken, seconds; the moment itself where there is none. None without a clock."""
+    """(T, V) when those frames were taken, seconds; the moment where there is none. None without a clock."""
     notes: tuple[str, ...]
     """What was left out, and how far pictures of one moment are apart."""
 
@@ -49,8 +49,8 @@ class Lockstep:
 def align(clocks: Sequence[CameraClock], has_clock: bool) -> Lockstep:
     """The moments that all cameras saw.
 
-    They are those of the slowest camera (of several the one with most frames), from where the last camera starts to
-    where the first one ends. InputError where there are none.
+    They are those of the slowest camera (of several the one with most frames), from where the last camera starts
+    to where the first one ends. InputError where there are none.
     """
     first = max(each.time[0] - each.period / 2 for each in clocks)
     last = min(each.time[-1] + each.period / 2 for each in clocks)
@@ -107,8 +107,8 @@ def _gaps(clock: CameraClock, place: NDArray[np.intp]) -> str | None:
     if len(missing) == 0:
         return None
     return (
-        f"camera {clock.name}: no picture within half a frame of {len(missing)} of {len(place)} moments (the first is"
-        f" frame {missing[0]}); it sees nobody there"
+        f"camera {clock.name}: no picture within half a frame of {len(missing)} of {len(place)} moments (the first"
+        f" is frame {missing[0]}); it sees nobody there"
     )
 
 

@@ -36,7 +36,7 @@ class Placement:
     scale: tuple[float, float]
     """Pixels of the picture per calibrated pixel, x and y."""
     shift: tuple[float, float]
-    """Where the left and the upper edge of the calibrated picture are in the picture, pixels from its own edges."""
+    """Where the left and upper edges of the calibrated picture are in the picture, pixels from its own edges."""
     picture_size: tuple[int, int]
     """(width, height) of the pictures."""
     calibrated_size: tuple[int, int]
@@ -59,7 +59,7 @@ class Placement:
 
     @property
     def region(self) -> tuple[float, float, float, float]:
-        """Left, top, right, bottom edge of what is calibrated and in the picture; the first pixel's centre is 0."""
+        """Left, top, right, bottom edge of what is calibrated and in the picture; 0 is the first pixel's centre."""
         low = np.maximum(self.shift, 0.0)
         high = np.minimum(np.array(self.shift) + np.array(self.scale) * self.calibrated_size, self.picture_size)
         left, top, right, bottom = np.concatenate([low, high]) - 0.5
@@ -80,10 +80,12 @@ def place(
     """How the pictures of camera `name` are placed, and a sentence where that was concluded from their sizes.
 
     Concluded are: equal sizes; a difference of up to 16 pixels, which was cut off or added on the right or at the
-    bottom; and otherwise the same shape at another size, which was resized. InputError for any other size, unless `wanted`
-    says what was done, and where what is wanted is impossible.
+    bottom; and otherwise the same shape at another size, which was resized. InputError for any other size, unless
+    `wanted` says what was done, and where what is wanted is impossible.
     """
-    sizes = f"camera {name}: the pictures are {_words(picture_size)}, the calibration is for {_words(calibrated_size)}"
+    sizes = (
+        f"camera {name}: the pictures are {_words(picture_size)}, the calibration is for {_words(calibrated_size)}"
+    )
     if wanted is not None:
         if wanted is PlacementKind.SAME and picture_size != calibrated_size:
             raise InputError(f"{sizes}: not the same size; give another --image-placement")
@@ -94,8 +96,8 @@ def place(
     if max(abs(width - full_width), abs(height - full_height)) <= _BLOCK:
         cropped = Placement.of(PlacementKind.CROP, picture_size, calibrated_size)
         return cropped, (
-            f"{sizes}: the first column and row are taken to be the calibrated ones (--image-placement {name}=crop);"
-            f" if it was cut on both sides, give {name}=crop-centre; if it was resized, {name}=scale"
+            f"{sizes}: the first column and row are taken to be the calibrated ones (--image-placement"
+            f" {name}=crop); if it was cut on both sides, give {name}=crop-centre; if it was resized, {name}=scale"
         )
     # Of one shape, to within the rounding of both sides to whole pixels.
     if abs(width / full_width - height / full_height) <= 1 / full_width + 1 / full_height:
@@ -106,8 +108,8 @@ def place(
             f"{sizes}: the pictures lie on their side; turn the video by 90 degrees, or calibrate it as it is"
         )
     raise InputError(
-        f"{sizes}; say what was done to them with --image-placement: letterbox (resized, with bars), scale (resized),"
-        " crop or crop-centre (cut)"
+        f"{sizes}; say what was done to them with --image-placement: letterbox (resized, with bars), scale"
+        " (resized), crop or crop-centre (cut)"
     )
 
 

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from shapepose_fg.camera import Rig
 from shapepose_fg.errors import InputError
 from shapepose_fg.io.camera_names import match_names
 
@@ -21,12 +20,12 @@ class FootagePlaces:
     """Where each camera's footage is."""
 
     paths: tuple[Path, ...]
-    """A video, a picture, or a folder of pictures for each camera of the rig, in its order."""
+    """A video, a picture, or a folder of pictures for each camera, in their order."""
     notes: tuple[str, ...] = ()
     """What was taken to be what."""
 
 
-def find_footage(given: Sequence[str], rig: Rig) -> FootagePlaces:
+def find_footage(given: Sequence[str], cameras: Sequence[str]) -> FootagePlaces:
     """Find every camera's footage.
 
     `given` is one folder that holds something named after each camera, or CAMERA=PATH for each of them.
@@ -34,29 +33,29 @@ def find_footage(given: Sequence[str], rig: Rig) -> FootagePlaces:
     """
     pairs = [_pair(text) for text in given]
     if all(pair is None for pair in pairs) and len(given) == 1:
-        return _in_folder(Path(given[0]), rig)
+        return _in_folder(Path(given[0]), cameras)
     named: dict[str, Path] = {}
     for text, pair in zip(given, pairs, strict=True):
         if pair is None:
             raise InputError(f"--videos {text}: give one folder, or CAMERA=PATH for each camera, not both")
         name, path = pair
-        if name not in rig.names:
+        if name not in cameras:
             raise InputError(
-                f"--videos {text}: the calibration has no camera {name!r}; it has {' '.join(rig.names)}"
+                f"--videos {text}: the calibration has no camera {name!r}; it has {' '.join(cameras)}"
             )
         if name in named:
             raise InputError(f"--videos {text}: camera {name} is given twice; give each its own")
         named[name] = path
-    missing = [name for name in rig.names if name not in named]
+    missing = [name for name in cameras if name not in named]
     if len(missing) > 0:
         raise InputError(
-            f"--videos: nothing is given for camera {missing[0]}; add --videos {missing[0]}=PATH, or take the camera"
-            " out of the calibration"
+            f"--videos: nothing is given for camera {missing[0]}; add --videos {missing[0]}=PATH, or take the"
+            " camera out of the calibration"
         )
     for path in named.values():
         if not path.exists():
             raise InputError(f"{path}: there is no such file or folder; check the path")
-    return FootagePlaces(tuple(named[name] for name in rig.names))
+    return FootagePlaces(tuple(named[name] for name in cameras))
 
 
 def _pair(text: str) -> tuple[str, Path] | None:
@@ -65,7 +64,7 @@ def _pair(text: str) -> tuple[str, Path] | None:
     return (name.strip(), Path(path)) if separator and not Path(text).exists() else None
 
 
-def _in_folder(folder: Path, rig: Rig) -> FootagePlaces:
+def _in_folder(folder: Path, cameras: Sequence[str]) -> FootagePlaces:
     """What a folder holds of each camera, told by the names."""
     if folder.is_file():
         raise InputError(
@@ -75,28 +74,30 @@ def _in_folder(folder: Path, rig: Rig) -> FootagePlaces:
         raise InputError(f"{folder}: there is no such folder; check the path of the videos")
     offered = _offered(folder)
     names = [_name(each) for each in offered]
-    exact = [[path for path, name in zip(offered, names, strict=True) if name == camera] for camera in rig.names]
-    for camera, found in zip(rig.names, exact, strict=True):
+    exact = [[path for path, name in zip(offered, names, strict=True) if name == camera] for camera in cameras]
+    for camera, found in zip(cameras, exact, strict=True):
         if len(found) > 1:
             what = " and ".join(path.name for path in found)
-            raise InputError(f"{folder}: {what} could all be camera {camera}'s; give --videos {camera}=PATH for each")
+            raise InputError(
+                f"{folder}: {what} could all be camera {camera}'s; give --videos {camera}=PATH for each"
+            )
     if all(len(found) == 1 for found in exact):
         return FootagePlaces(tuple(found[0] for found in exact))
     if all(len(found) == 0 for found in exact):
-        chosen = match_names(rig.names, names)
+        chosen = match_names(cameras, names)
         if chosen is not None:
             paths = tuple(offered[index] for index in chosen)
-            told = ", ".join(f"{camera} is {path.name}" for camera, path in zip(rig.names, paths, strict=True))
+            told = ", ".join(f"{camera} is {path.name}" for camera, path in zip(cameras, paths, strict=True))
             return FootagePlaces(paths, (f"{folder}: cameras were told by parts of the names: {told}",))
         inner = [folder / name for name in _INNER if (folder / name).is_dir()]
         if len(inner) == 1:
-            return _in_folder(inner[0], rig)
-    missing = next(camera for camera, found in zip(rig.names, exact, strict=True) if len(found) == 0)
+            return _in_folder(inner[0], cameras)
+    missing = next(camera for camera, found in zip(cameras, exact, strict=True) if len(found) == 0)
     holds = " ".join(path.name for path in offered[:8]) or "no video, picture or folder of pictures"
     more = f" and {len(offered) - 8} more" if len(offered) > 8 else ""
     raise InputError(
-        f"{folder}: nothing here is named after camera {missing}, it holds {holds}{more}; name a video or a folder of"
-        f" pictures after each camera, or give --videos {missing}=PATH for each"
+        f"{folder}: nothing here is named after camera {missing}, it holds {holds}{more}; name a video or a folder"
+        f" of pictures after each camera, or give --videos {missing}=PATH for each"
     )
 
 

@@ -76,12 +76,16 @@ def read_used_footage(file: Path) -> list[CameraFootage]:
         where, problem = first_problem(error)
         raise InputError(f"{file}: {key_text(where)} {problem}; run shapepose-fg detect again") from None
     if parsed.format != _FORMAT:
-        raise InputError(f"{file}: format must be {_FORMAT!r}, got {parsed.format[:40]!r}; run shapepose-fg detect again")
+        raise InputError(
+            f"{file}: format must be {_FORMAT!r}, got {parsed.format[:40]!r}; run shapepose-fg detect again"
+        )
     found = []
     for camera in parsed.cameras:
         sizes = camera.picture_size, camera.calibrated_size
         if min(*sizes[0], *sizes[1]) < 1:
-            raise InputError(f"{file}: camera {camera.name}: sizes must be positive; run shapepose-fg detect again")
+            raise InputError(
+                f"{file}: camera {camera.name}: sizes must be positive; run shapepose-fg detect again"
+            )
         placement = Placement.of(camera.placement, *sizes)
         places = np.array(camera.pictures, dtype=np.intp)
         found.append(CameraFootage(camera.name, Path(camera.path), placement, places))
