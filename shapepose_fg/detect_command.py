@@ -241,7 +241,8 @@ def _summary(run: "DetectionRun", report: "DetectionReport", seconds: float) -> 
             f"{report.candidates[view] / max(pictures, 1):.1f}",
         )
     total = max(report.moments * len(run.rig), 1)
-    table.caption = f"{report.moments} frames of {len(run.rig)} cameras in {seconds:.1f} s, {1e3 * seconds / total:.0f} ms a picture"
+    speed = f"{seconds:.1f} s, {1e3 * seconds / total:.0f} ms a picture"
+    table.caption = f"{report.moments} frames of {len(run.rig)} cameras in {speed}"
     table.caption_justify = "left"
     return table
 

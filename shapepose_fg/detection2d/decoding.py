@@ -66,7 +66,8 @@ def decode(
 ) -> Candidates:
     """Candidates of one picture from the network's `output` (C, H, W).
 
-    Positions are in cells of the output; (0, 0) is the centre of the first. What is not finite in the output is taken for 0.
+    Positions are in cells of the output; (0, 0) is the centre of the first. What is not finite in
+    the output is taken for 0.
     """
     output = np.nan_to_num(output, nan=0.0, posinf=0.0, neginf=0.0)
     heat = output[layout.first_heat_map : layout.first_heat_map + len(layout.joints)]

@@ -48,7 +48,7 @@ class CameraDetector:
     ) -> "CameraDetector":
         """The detector for `camera` in a world where `up` (3,) points up."""
         roll_deg = roll_of(camera, up)
-        view = UprightView.of(placement.region, roll_deg, config.long_side, network.layout)
+        view = UprightView.of(placement.region, roll_deg, config.long_side, network.layout, network.only_size)
         return cls(network, placement, roll_deg, view, config)
 
     def detect(self, picture: NDArray[np.uint8]) -> Candidates:

@@ -3,6 +3,7 @@
 import hashlib
 import os
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
@@ -23,11 +24,15 @@ _TRIAL = 64
 class HeatMapNetwork:
     """A network that makes heat maps and part affinity fields of a picture."""
 
-    def __init__(self, layout: NetworkLayout, sha256: str, forward: _Forward) -> None:
+    def __init__(
+        self, layout: NetworkLayout, sha256: str, forward: _Forward, only_size: tuple[int, int] | None = None
+    ) -> None:
         self.layout = layout
         """How its output is to be read."""
         self.sha256 = sha256
         """Checksum of its file."""
+        self.only_size = only_size
+        """(width, height) of the pictures that it takes; None where it takes any."""
         self._forward = forward
 
     @classmethod
@@ -39,23 +44,24 @@ class HeatMapNetwork:
         file = Path(file)
         content = _read(file)
         sha256 = hashlib.sha256(content).hexdigest()
-        forward = (_with_onnxruntime if backend == "onnxruntime" else _with_opencv)(file, content)
+        forward, only_size = (_with_onnxruntime if backend == "onnxruntime" else _with_opencv)(file, content)
+        width, height = only_size or (_TRIAL, _TRIAL)
         try:
-            shape = forward(np.zeros((1, 3, _TRIAL, _TRIAL), dtype=np.float32)).shape
+            shape = forward(np.zeros((1, 3, height, width), dtype=np.float32)).shape
         except Exception as error:
             raise InputError(
-                f"{file}: the network cannot be run on a {_TRIAL} x {_TRIAL} picture ({_first_line(error)}); give"
-                " one that takes pictures (1, 3, height, width) of any size"
+                f"{file}: the network cannot be run on a picture of {width} x {height} ({_first_line(error)}); give one"
+                " that takes pictures (1, 3, height, width)"
             ) from None
         channels = shape[1] if len(shape) == 4 else None
         found = find_layout(layout, sha256, channels, file)
-        cells = _TRIAL // found.stride
-        if shape != (1, found.channels, cells, cells):
+        wanted = (1, found.channels, height // found.stride, width // found.stride)
+        if shape != wanted:
             raise InputError(
-                f"{file}: of a {_TRIAL} x {_TRIAL} picture the network makes {_words(shape)} numbers, layout"
-                f" {found.name} expects 1 x {found.channels} x {cells} x {cells}; give the layout of this network"
+                f"{file}: of a picture of {width} x {height} the network makes {_words(shape)} numbers, layout"
+                f" {found.name} expects {_words(wanted)}; give the layout of this network"
             )
-        return cls(found, sha256, forward)
+        return cls(found, sha256, forward, only_size)
 
     def run(self, picture: NDArray[np.uint8]) -> NDArray[np.float32]:
         """The output (C, H / stride, W / stride) of a `picture` (H, W, 3): blue, green, red.
@@ -78,8 +84,8 @@ def _read(file: Path) -> bytes:
         raise InputError(f"{file}: cannot be read ({error.strerror}); give the ONNX file of a network") from None
 
 
-def _with_opencv(file: Path, content: bytes) -> _Forward:
-    """The network run by OpenCV's dnn."""
+def _with_opencv(file: Path, content: bytes) -> tuple[_Forward, None]:
+    """The network run by OpenCV's dnn, which takes pictures of any size."""
     import cv2
 
     try:
@@ -94,15 +100,15 @@ def _with_opencv(file: Path, content: bytes) -> _Forward:
         net.setInput(blob)
         return np.asarray(net.forward(), dtype=np.float32)
 
-    return forward
+    return forward, None
 
 
-def _with_onnxruntime(file: Path, content: bytes) -> _Forward:
-    """The network run by onnxruntime, on as many threads as OpenCV has."""
+def _with_onnxruntime(file: Path, content: bytes) -> tuple[_Forward, tuple[int, int] | None]:
+    """The network run by onnxruntime, on as many threads as OpenCV has, and the size that its file fixes."""
     import cv2
 
     try:
-        import onnxruntime
+        onnxruntime: Any = import_module("onnxruntime")
     except ImportError:
         raise InputError('--backend onnxruntime needs a package: pip install "shapepose-fg[detect]"') from None
     options: Any = onnxruntime.SessionOptions()
@@ -112,12 +118,14 @@ def _with_onnxruntime(file: Path, content: bytes) -> _Forward:
         session: Any = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
     except Exception as error:
         raise InputError(f"{file}: not an ONNX network that onnxruntime can read ({_first_line(error)})") from None
-    name = session.get_inputs()[0].name
+    takes = session.get_inputs()[0]
+    fixed = list(takes.shape)[2:] if len(takes.shape) == 4 else []
+    only_size = (int(fixed[1]), int(fixed[0])) if len(fixed) == 2 and all(type(n) is int for n in fixed) else None
 
     def forward(blob: NDArray[np.float32]) -> NDArray[np.float32]:
-        return np.asarray(session.run(None, {name: blob})[0], dtype=np.float32)
+        return np.asarray(session.run(None, {takes.name: blob})[0], dtype=np.float32)
 
-    return forward
+    return forward, only_size
 
 
 def _words(shape: Sequence[int]) -> str:

@@ -22,7 +22,7 @@ from shapepose_fg.io.footage.lockstep import Lockstep
 from shapepose_fg.io.footage.used import FOOTAGE, CameraFootage, write_used_footage
 from shapepose_fg.io.write_detections import association_lines
 
-BLOCK = 32
+BLOCK = 16
 """Moments that are kept together: what a run that is killed loses at most."""
 _UNFINISHED = "unfinished"
 _SETTINGS = "settings.json"
@@ -53,7 +53,7 @@ class DetectionRun:
                 "path": str(footage.path.resolve()),
                 "state": _state(footage.path),
                 "placement": str(detector.placement.kind),
-                "input_from_picture": detector.view.input_from_picture.tolist(),
+                "roll_deg": detector.roll_deg,
                 "frames": self.moments.picture[:, view].tolist(),
             }
             for view, (name, footage, detector) in enumerate(
@@ -68,7 +68,8 @@ def run_detection(run: DetectionRun, progress: Callable[[int, int], None] | None
     """Detect in all pictures, and write <camera>.txt (4D Association), times.csv and footage.json into the output.
 
     Blocks that an earlier run of the same settings left are not done again; the files come out the same.
-    `progress` is told how many pictures are done. InputError where the folder holds detections or a run of other settings.
+    `progress` is told how many pictures are done. InputError where the folder holds detections, or a run
+    of other settings.
     """
     unfinished = run.output / _UNFINISHED
     _refuse_others(run, unfinished)

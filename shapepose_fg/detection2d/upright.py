@@ -56,11 +56,13 @@ class UprightView:
         roll_deg: float,
         long_side: int,
         layout: NetworkLayout,
+        only_size: tuple[int, int] | None = None,
     ) -> "UprightView":
         """The view of a `region` turned clockwise by `roll_deg`, about `long_side` pixels along its longer side.
 
         Rolls under `LEVEL_DEG` from a multiple of 90 degrees are turned by that multiple. Both sides are the
-        nearest multiples of what the network takes, so the axes' scales differ by a few per cent.
+        nearest multiples of what the network takes, so the axes' scales differ by a few per cent. A network that
+        takes pictures of `only_size` (width, height) gets the region in the middle of such a picture.
         """
         quarter = 90.0 * round(roll_deg / 90.0)
         roll_deg = quarter if abs(roll_deg - quarter) < LEVEL_DEG else roll_deg
@@ -70,11 +72,14 @@ class UprightView:
         corners = np.array([[left, top], [right, top], [right, bottom], [left, bottom]]) @ turn.T
         low, high = corners.min(axis=0), corners.max(axis=0)
         sides = high - low
-        scale = long_side / sides.max()
-        size = np.maximum(np.round(sides * scale / layout.multiple), 1) * layout.multiple
-        stretch = np.diag(size / sides)
+        if only_size is None:
+            size = np.maximum(np.round(sides * long_side / sides.max() / layout.multiple), 1) * layout.multiple
+            stretch = np.diag(size / sides)
+        else:
+            size = np.array(only_size)
+            stretch = np.eye(2) * (size / sides).min()
         # Edges, not centres, of pixels are scaled: hence the half pixel.
-        matrix = np.column_stack([stretch @ turn, -stretch @ low - 0.5])
+        matrix = np.column_stack([stretch @ turn, (size - stretch @ (low + high)) / 2 - 0.5])
         return cls((int(size[0]), int(size[1])), matrix, region, layout.stride, roll_deg)
 
     def input_of(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:

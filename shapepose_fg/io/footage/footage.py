@@ -182,11 +182,14 @@ def _capture(path: Path) -> Any:
     """The video at `path`, opened by FFmpeg and by the rules for files that nobody vouches for."""
     if not path.is_file():
         raise InputError(f"{path}: there is no such video; check the path")
-    before = os.environ.get(_READ_OPTIONS)
+    before, level = os.environ.get(_READ_OPTIONS), cv2.utils.logging.getLogLevel()
     os.environ[_READ_OPTIONS] = _SAFE_READING
+    # What OpenCV would say of a damaged file on stderr is said below.
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
     finally:
+        cv2.utils.logging.setLogLevel(level)
         if before is None:
             del os.environ[_READ_OPTIONS]
         else:

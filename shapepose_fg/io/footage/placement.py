@@ -55,11 +55,12 @@ class Placement:
             scale = np.full(2, (picture / calibrated).min())
         centred = kind in (PlacementKind.LETTERBOX, PlacementKind.CROP_CENTRE)
         shift = (picture - scale * calibrated) / 2 if centred else np.zeros(2)
-        return cls(kind, tuple(scale.tolist()), tuple(shift.tolist()), picture_size, calibrated_size)
+        (scale_x, scale_y), (shift_x, shift_y) = scale.tolist(), shift.tolist()
+        return cls(kind, (scale_x, scale_y), (shift_x, shift_y), picture_size, calibrated_size)
 
     @property
     def region(self) -> tuple[float, float, float, float]:
-        """Left, top, right, bottom edge of what is calibrated and in the picture; 0 is the first pixel's centre."""
+        """Left, top, right, bottom edge of what is calibrated and in the picture; 0 is a pixel's centre."""
         low = np.maximum(self.shift, 0.0)
         high = np.minimum(np.array(self.shift) + np.array(self.scale) * self.calibrated_size, self.picture_size)
         left, top, right, bottom = np.concatenate([low, high]) - 0.5
