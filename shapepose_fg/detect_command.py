@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from shapepose_fg.camera import Axis, Rig
+    from shapepose_fg.detection2d.detector import CameraDetector
     from shapepose_fg.detection2d.network import Backend
     from shapepose_fg.detection2d.recording import DetectionReport, DetectionRun
     from shapepose_fg.io.calibration import Unit
@@ -128,6 +129,8 @@ def detect(
     detectors = [
         CameraDetector.of(camera, rig.up_vector, placements[camera.name], loaded, config) for camera in rig.cameras
     ]
+    if loaded.only_size is not None:
+        note(_shown_small(detectors, loaded.only_size))
     run = DetectionRun(rig, footage, detectors, moments, output)
     begin = time.perf_counter()
     with progress("detecting", "pictures") as done:
@@ -211,6 +214,15 @@ def _start(text: str | None, period: float, has_clock: bool) -> float:
             f"--start {text}: nothing says how many frames a second there are; give --fps, or frames (12f)"
         )
     return float(match[1]) * (1.0 if match[2] == "s" else period)
+
+
+def _shown_small(detectors: "Sequence[CameraDetector]", size: tuple[int, int]) -> str:
+    """How large a network that takes one size only is shown the pictures."""
+    smallest = min(detector.view.scale for detector in detectors)
+    return (
+        f"here the network takes pictures of {size[0]} x {size[1]} only, so they are shown to it at down to"
+        f" {100 * smallest:.0f} % of their size; --backend opencv takes any"
+    )
 
 
 def _part(moments: "Lockstep", span: range) -> "Lockstep":

@@ -88,12 +88,11 @@ def peaks(
     A maximum is no lower than its eight neighbours. Between cells its place and height are those of a Gaussian
     through it and its neighbours, along each axis.
     """
-    height, width = heat.shape[1:]
-    padded = np.pad(heat, ((0, 0), (1, 1), (1, 1)), constant_values=-1.0)
+    padded = np.pad(heat, ((0, 0), (1, 1), (1, 1)), constant_values=-np.inf)
     stack = padded.transpose(1, 2, 0)  # OpenCV filters all channels of a picture at once
-    largest = cv2.dilate(np.ascontiguousarray(stack), np.ones((3, 3), np.uint8))
+    largest = cv2.dilate(np.ascontiguousarray(stack), np.ones((3, 3), np.uint8)).reshape(stack.shape)
     is_peak = (stack >= largest) & (stack >= min_score)
-    row, column, joint = np.nonzero(is_peak.reshape(height + 2, width + 2, -1))
+    row, column, joint = np.nonzero(is_peak)
     order = np.lexsort((column, row, joint))
     joint, row, column = joint[order], row[order], column[order]
     # Of a plateau of equal cells only the first is kept.
@@ -120,7 +119,7 @@ def _vertex(
     bend = low - 2 * mid + high
     safe = np.where(bend < -1e-9, bend, -np.inf)
     shift = np.clip(0.5 * (low - high) / safe, -0.5, 0.5)
-    shift = np.where((before < 0) & (before <= -1) | (after <= -1), 0.0, shift)
+    shift = np.where(np.isinf(before) | np.isinf(after), 0.0, shift)
     return shift, -0.25 * (low - high) * shift
 
 

@@ -82,9 +82,9 @@ def _fetch(address: str, known: KnownNetwork, progress: Callable[[int, int], Non
                 if progress is not None:
                     progress(min(size, known.bytes), known.bytes)
     except (OSError, urllib.error.URLError, ValueError) as error:
-        reason = getattr(error, "reason", None) or error
+        told = error if isinstance(error, urllib.error.HTTPError) else getattr(error, "reason", error)
         raise InputError(
-            f"{address}: the network {known.name} cannot be fetched ({reason}); fetch it by hand and give its path"
+            f"{address}: the network {known.name} cannot be fetched ({told}); fetch it by hand and give its path"
         ) from None
     content = b"".join(parts)
     if hashlib.sha256(content).hexdigest() != known.sha256:

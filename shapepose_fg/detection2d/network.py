@@ -50,8 +50,8 @@ class HeatMapNetwork:
             shape = forward(np.zeros((1, 3, height, width), dtype=np.float32)).shape
         except Exception as error:
             raise InputError(
-                f"{file}: the network cannot be run on a picture of {width} x {height} ({_first_line(error)}); give one"
-                " that takes pictures (1, 3, height, width)"
+                f"{file}: the network cannot be run on a picture of {width} x {height} ({_first_line(error)});"
+                " give one that takes pictures (1, 3, height, width)"
             ) from None
         channels = shape[1] if len(shape) == 4 else None
         found = find_layout(layout, sha256, channels, file)

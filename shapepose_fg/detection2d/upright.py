@@ -49,6 +49,11 @@ class UprightView:
     turn_deg: float
     """By how much the picture is turned clockwise, degrees."""
 
+    @property
+    def scale(self) -> float:
+        """Pixels of the input per pixel of the picture."""
+        return float(np.sqrt(abs(np.linalg.det(self.input_from_picture[:, :2]))))
+
     @classmethod
     def of(
         cls,
@@ -89,7 +94,7 @@ class UprightView:
         matrix = self.input_from_picture.copy()
         matrix[:, 2] += matrix[:, :2] @ (max(left, 0), max(top, 0))
         # Halves first: sampling a picture that is much too large would pass over most of its pixels.
-        shrink = np.sqrt(abs(np.linalg.det(matrix[:, :2])))
+        shrink = self.scale
         size = np.maximum(np.round(np.array(part.shape[1::-1]) * shrink), 1).astype(int)
         if shrink < 1:
             small = cv2.resize(part, size.tolist(), interpolation=cv2.INTER_AREA)

@@ -133,7 +133,8 @@ def draw_detections(
         if good:
             box = ((x - arm, y - arm), (x + arm, y + arm))
             cv2.rectangle(picture, *box, _DARK, 3, cv2.LINE_AA, _FINE)
-            cv2.rectangle(picture, *box, colour, 1, cv2.LINE_AA, _FINE)
+            light = tuple((np.asarray(colour) + 255) / 2)
+            cv2.rectangle(picture, *box, light, 1, cv2.LINE_AA, _FINE)
         else:
             arm = round(1.5 * arm)
             for width, paint in ((max(3, reach), _DARK), (max(1, reach // 2), GATED)):

@@ -184,6 +184,7 @@ def _capture(path: Path) -> Any:
         raise InputError(f"{path}: there is no such video; check the path")
     before, level = os.environ.get(_READ_OPTIONS), cv2.utils.logging.getLogLevel()
     os.environ[_READ_OPTIONS] = _SAFE_READING
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # silent; read when the first video is opened
     # What OpenCV would say of a damaged file on stderr is said below.
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
