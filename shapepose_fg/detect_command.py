@@ -134,7 +134,11 @@ def detect(
     run = DetectionRun(rig, footage, detectors, moments, output)
     begin = time.perf_counter()
     with progress("detecting", "pictures") as done:
-        report = run_detection(run, done)
+        try:
+            report = run_detection(run, done)
+        except KeyboardInterrupt:
+            note("stopped; the same command goes on from here")
+            raise
     for name, failed in zip(rig.names, report.unreadable, strict=True):
         if failed > 0:
             note(f"camera {name}: {failed} of {report.moments} pictures cannot be read; it sees nobody there")
