@@ -40,7 +40,7 @@ STAGES = (
 PARTS = {
     "graphs built": ("estimator.py", "_windows"),
     "graphs solved": ("alternation.py", "_solve"),
-    "covariances": ("window_graph.py", "marginals"),
+    "covariances": ("state_covariances.py", "state_covariances"),
     "gates and weights": ("linearisation.py", "linearise"),
 }
 """Parts of stage II beside the body fits, and the function whose time is taken for each."""
