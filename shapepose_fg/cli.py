@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import typer
 
 from shapepose_fg.errors import InputError
+from shapepose_fg.export_command import export
 from shapepose_fg.tracks_command import tracks
 
 if TYPE_CHECKING:
@@ -40,6 +41,7 @@ app = typer.Typer(
 evaluate = typer.Typer(help="Score a reconstruction against an annotation.")
 app.add_typer(evaluate, name="evaluate")
 app.add_typer(tracks, name="tracks")
+app.command()(export)
 
 _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
 """What typer raises for a wrong command line; older and newer versions keep the class in different places."""
