@@ -1,5 +1,6 @@
 """GLB, binary glTF 2.0: every person's skinned mesh with its motion, by pygltflib; y up, metres, seconds."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,8 @@ from shapepose_fg.rendering import vertex_normals
 from shapepose_fg.skeleton import SMPL_24
 from shapepose_fg.viewer.palette import colour_of
 
-INFLUENCES = 4
-"""Bones that move a vertex: what every program that reads glTF can do."""
+_SET = 4
+"""Bones in a set of influences. Every program reads the first set, Blender all of them."""
 
 
 def write_glb(job: Job) -> Written:
@@ -48,18 +49,17 @@ def glb_bytes(motions: dict[int, Motion], arrays: SmplArrays, times_s: NDArray[n
     """
     gltf = optional("pygltflib", "export")
     file, buffers = gltf.GLTF2(), Buffers()
-    joints, weights = four_influences(arrays.weights)
-    shared = {
-        "indices": buffers.indices(arrays.faces.reshape(-1).astype(np.uint32)),
-        "JOINTS_0": buffers.vertices(joints),
-        "WEIGHTS_0": buffers.vertices(weights.astype(np.float32)),
-    }
+    sets: dict[str, int] = {}
+    for number, (joints, weights) in enumerate(influences(arrays.weights)):
+        sets[f"JOINTS_{number}"] = buffers.vertices(joints)
+        sets[f"WEIGHTS_{number}"] = buffers.vertices(weights)
+    skin = _Skin(buffers.indices(arrays.faces.reshape(-1).astype(np.uint32)), sets)
     animation = gltf.Animation(name="motion")
     times = times_s - times_s[0]
     roots = []
     for who, motion in motions.items():
         first = len(file.nodes)
-        _add_person(gltf, file, buffers, who, motion, shared)
+        _add_person(gltf, file, buffers, who, motion, skin)
         _animate(gltf, animation, buffers, first, motion, times)
         roots.append(first)
     file.asset = gltf.Asset(version="2.0", generator="shapepose-fg")
@@ -71,15 +71,33 @@ def glb_bytes(motions: dict[int, Motion], arrays: SmplArrays, times_s: NDArray[n
     return b"".join(file.save_to_bytes())
 
 
-def four_influences(weights: NDArray[np.float64]) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """(Nv, 4) bones that move each vertex most, and (Nv, 4) their weights, which sum to 1 again."""
-    joints = np.argsort(-weights, axis=1, kind="stable")[:, :INFLUENCES]
-    kept = np.take_along_axis(weights, joints, axis=1)
-    kept = kept / kept.sum(axis=1, keepdims=True)
-    return np.where(kept > 0, joints, 0).astype(np.uint8), kept
+def influences(weights: NDArray[np.float64]) -> list[tuple[NDArray[np.uint8], NDArray[np.float32]]]:
+    """The bones (Nv, 4) that move each vertex most with their weights (Nv, 4), then the next four, while there are.
+
+    All sets together are the weights (Nv, 24) themselves. A program that reads the first set alone and makes it sum
+    to 1 again draws 1 in 100 vertices of the open body, at neck and shoulders, more than 1 mm elsewhere.
+    """
+    order = np.argsort(-weights, axis=1, kind="stable")
+    sorted_weights = np.take_along_axis(weights, order, axis=1).astype(np.float32)
+    most = int((sorted_weights > 0).sum(axis=1).max())
+    sets = []
+    for start in range(0, most, _SET):
+        part = slice(start, start + _SET)
+        # glTF wants 0 for a bone without weight.
+        joints = np.where(sorted_weights[:, part] > 0, order[:, part], 0).astype(np.uint8)
+        sets.append((joints, np.ascontiguousarray(sorted_weights[:, part])))
+    return sets
 
 
-def _add_person(gltf: Any, file: Any, buffers: Buffers, who: int, motion: Motion, shared: dict[str, int]) -> None:
+@dataclass(frozen=True)
+class _Skin:
+    """What the skins of all people share: numbers of accessors."""
+
+    triangles: int
+    influences: dict[str, int]
+
+
+def _add_person(gltf: Any, file: Any, buffers: Buffers, who: int, motion: Motion, skin: "_Skin") -> None:
     """Nodes of a person in the pose of its first frame, with mesh, material and skin."""
     first, rest = len(file.nodes), motion.rest
     name = f"person_{who}"
@@ -103,10 +121,9 @@ def _add_person(gltf: Any, file: Any, buffers: Buffers, who: int, motion: Motion
     attributes = gltf.Attributes(
         POSITION=buffers.vertices(rest.vertices.astype(np.float32), bounds=True),
         NORMAL=buffers.vertices(normals.astype(np.float32)),
-        JOINTS_0=shared["JOINTS_0"],
-        WEIGHTS_0=shared["WEIGHTS_0"],
+        **skin.influences,
     )
-    primitive = gltf.Primitive(attributes=attributes, indices=shared["indices"], material=len(file.materials))
+    primitive = gltf.Primitive(attributes=attributes, indices=skin.triangles, material=len(file.materials))
     file.meshes.append(gltf.Mesh(name=name, primitives=[primitive]))
     surface = gltf.PbrMetallicRoughness(baseColorFactor=[*_linear(colour_of(who)), 1.0], metallicFactor=0.0)
     file.materials.append(gltf.Material(name=name, pbrMetallicRoughness=surface))
