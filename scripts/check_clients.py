@@ -90,7 +90,7 @@ def make(folder: Path) -> None:
     people.save(folder / "results")
     write_rig(scene.rig, folder / "results" / "cameras.json")
     try:
-        shapepose(["export", str(folder / "results"), *"amass trc c3d bvh glb csv".split(), "--output", str(folder / "export")])
+        shapepose(["export", str(folder / "results"), "all", "--output", str(folder / "export")])
     except SystemExit as end:
         if end.code:
             raise

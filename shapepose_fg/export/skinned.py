@@ -35,8 +35,7 @@ class RestBody:
     @property
     def offsets(self) -> NDArray[np.float64]:
         """(24, 3) each joint from its parent; the pelvis from the origin."""
-        parents = np.array(SMPL_PARENTS[1:])
-        return np.concatenate([self.joints[:1], self.joints[1:] - self.joints[parents]])
+        return _offsets(self.joints[None])[0]
 
     def tips(self) -> dict[int, NDArray[np.float64]]:
         """(3,) from each joint without children to the end of its bone: as far as its skin goes on."""
@@ -71,18 +70,6 @@ class Motion:
         """(F, 24, 3) the joints in the world, metres."""
         return pose_joints(self.rest.offsets[None], self.rotations, self.pelvis)
 
-    def world_rotations(self) -> NDArray[np.float64]:
-        """(F, 24, 3, 3) world from bone."""
-        return _accumulated(self.rotations)
-
-    def vertices(self) -> NDArray[np.float64]:
-        """(F, Nv, 3) the skin in the world, metres, without pose-dependent corrections."""
-        turn, place = self.world_rotations(), self.joints()
-        shift = place - (turn @ self.rest.joints[..., None])[..., 0]
-        transforms = np.concatenate([turn, shift[..., None]], axis=-1).reshape(len(turn), BONES, 12)
-        blended = (self.rest.arrays.weights @ transforms).reshape(len(turn), -1, 3, 4)
-        return (blended[..., :3] @ self.rest.vertices[..., None])[..., 0] + blended[..., 3]
-
 
 def motion_of(take: Take, person: int, arrays: SmplArrays, axes: NDArray[np.float64]) -> Motion | None:
     """The body of one person in the world turned by `axes` (3, 3); None for somebody without a body."""
@@ -104,9 +91,7 @@ def motion_of(take: Take, person: int, arrays: SmplArrays, axes: NDArray[np.floa
     motion = Motion(rest, index, quaternions, pelvis, 0.0)
     if (betas == betas[0]).all():
         return motion
-    parents = np.array(SMPL_PARENTS[1:])
-    offsets = np.concatenate([own[:, :1], own[:, 1:] - own[:, parents]], axis=1)
-    apart = np.linalg.norm(pose_joints(offsets, quaternions, pelvis) - motion.joints(), axis=-1)
+    apart = np.linalg.norm(pose_joints(_offsets(own), quaternions, pelvis) - motion.joints(), axis=-1)
     return Motion(rest, index, quaternions, pelvis, float(apart.max()))
 
 
@@ -115,6 +100,27 @@ def rest_joints(arrays: SmplArrays, betas: NDArray[np.float64]) -> NDArray[np.fl
     mean = arrays.joint_regressor @ arrays.template
     shapes = np.einsum("jv,vxn->jxn", arrays.joint_regressor, arrays.shapes, optimize=True)
     return mean + np.einsum("jxn,bn->bjx", shapes, betas)
+
+
+def skin(
+    arrays: SmplArrays,
+    betas: NDArray[np.float64],
+    rotations: NDArray[np.float64],
+    pelvis: NDArray[np.float64],
+    only: NDArray[np.intp],
+) -> NDArray[np.float64]:
+    """(F, M, 3) the vertices `only` (M,) of bodies (F, 10), turned (F, 24, 4) and placed (F, 3); metres.
+
+    Without the corrections of the skin that depend on the pose, which the open body does not have.
+    """
+    rest = rest_joints(arrays, betas)
+    turn = _accumulated(rotations)
+    place = pose_joints(_offsets(rest), rotations, pelvis)
+    shift = place - (turn @ rest[..., None])[..., 0]
+    transforms = np.concatenate([turn, shift[..., None]], axis=-1).reshape(len(turn), BONES, 12)
+    blended = (arrays.weights[only] @ transforms).reshape(len(turn), -1, 3, 4)
+    shaped = arrays.template[only] + np.einsum("vxn,fn->fvx", arrays.shapes[only], betas)
+    return (blended[..., :3] @ shaped[..., None])[..., 0] + blended[..., 3]
 
 
 def pose_joints(
@@ -126,6 +132,11 @@ def pose_joints(
     for joint, parent in enumerate(SMPL_PARENTS[1:], start=1):
         places.append(places[parent] + (turn[:, parent] @ offsets[:, joint, :, None])[..., 0])
     return np.stack(places, axis=1)
+
+
+def _offsets(rest: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(B, 24, 3) joints in the T-pose from their parents; the pelvis from the origin."""
+    return np.concatenate([rest[:, :1], rest[:, 1:] - rest[:, np.array(SMPL_PARENTS[1:])]], axis=1)
 
 
 def _accumulated(rotations: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,0 +1,34 @@
+"""RRD, a recording for the rerun viewer, by rerun-sdk: the recording's own axes, metres; what is missing is not drawn."""
+
+import shutil
+import tempfile
+from pathlib import Path
+
+from shapepose_fg.errors import InputError
+from shapepose_fg.export.job import Job, Written
+from shapepose_fg.export.rerun_scene import layout, log_take, new_stream
+from shapepose_fg.files import write_atomically
+
+
+def write_rrd(job: Job) -> Written:
+    """`people.rrd`; without bodies where the body model is not there any more."""
+    written, take = Written(), job.take
+    stream = new_stream()
+    try:
+        arrays = job.arrays
+    except InputError as error:
+        arrays = None
+        written.notes.append(f"rrd: no bodies ({error})")
+    if take.rig is None:
+        written.notes.append("rrd: no cameras, for there is no cameras.json")
+    path = job.folder / "people.rrd"
+    with tempfile.TemporaryDirectory() as folder:  # rerun writes to a path only
+        draft = Path(folder) / "people.rrd"
+        stream.save(draft, default_blueprint=layout(take))
+        log_take(stream, take, arrays)
+        stream.flush()
+        stream.disconnect()
+        with draft.open("rb") as source:
+            write_atomically(path, lambda target: shutil.copyfileobj(source, target))
+    written.files.append(path)
+    return written
