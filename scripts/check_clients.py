@@ -19,10 +19,12 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
+import cv2
 import numpy as np
 
 CLIENTS = ("blender", "opensim", "rerun")
@@ -233,8 +235,14 @@ def _read_markers(osim, path: Path) -> tuple[np.ndarray, list[str], np.ndarray]:
     """Times, names and places of a file's markers as OpenSim reads them."""
     table = osim.TimeSeriesTableVec3(str(path))
     flat = table.flatten()
-    values = np.array([[row[c] for c in range(row.size())] for row in map(flat.getRowAtIndex, range(flat.getNumRows()))])
-    return np.array(table.getIndependentColumn()), list(table.getColumnLabels()), values.reshape(len(values), -1, 3)
+    values = np.array(
+        [[row[c] for c in range(row.size())] for row in map(flat.getRowAtIndex, range(flat.getNumRows()))]
+    )
+    return (
+        np.array(table.getIndependentColumn()),
+        list(table.getColumnLabels()),
+        values.reshape(len(values), -1, 3),
+    )
 
 
 def _inverse_kinematics(osim, folder: Path, setup: Path, trc: str) -> None:
@@ -271,7 +279,9 @@ def _inverse_kinematics(osim, folder: Path, setup: Path, trc: str) -> None:
     check(motion.getNumRows() == len(times), f"inverse kinematics of {trc}: {motion.getNumRows()} frames")
     # Joints of a detector are not the model's: a few centimetres. A wrong axis or unit is decimetres and more.
     words = f"markers {np.nanmedian(rms):.0f} mm from the model (median of frames' RMS), pelvis tilt"
-    check(float(np.nanmedian(rms)) < 60, f"{words} {np.median(tilt):.0f} degrees, right knee {np.median(knee):.0f}")
+    check(
+        float(np.nanmedian(rms)) < 60, f"{words} {np.median(tilt):.0f} degrees, right knee {np.median(knee):.0f}"
+    )
 
 
 def _found(tree: ElementTree.ElementTree, path: str) -> ElementTree.Element:
@@ -289,7 +299,36 @@ def _set(element: ElementTree.Element, **texts: str) -> None:
 
 
 def rerun(folder: Path) -> None:
-    """Filled in below."""
+    """The recording verified by rerun, joints read back from it, and opened in its viewer without a window."""
+    import rerun as rr
+
+    from shapepose_fg.export.rerun_scene import viewer_file
+
+    path = folder / "export" / "people.rrd"
+    done = subprocess.run(
+        [sys.executable, "-m", "rerun", "rrd", "verify", str(path)], capture_output=True, check=False
+    )
+    check(done.returncode == 0, f"rerun verifies {path.name}, {path.stat().st_size / 1e6:.1f} MB")
+    truth = np.load(folder / "truth.npz")
+    parts = [chunk for chunk in rr.chunk.RrdReader(path).stream() if chunk.entity_path == "/world/people/1/joints"]
+    columns = [chunk.to_record_batch().to_pydict() for chunk in parts]
+    frames = np.concatenate([column["frame"] for column in columns]).astype(int)
+    points = np.concatenate([column["Points3D:positions"] for column in columns])
+    truly = truth["keypoints"][truth["person"] == 1]
+    same = np.array_equal(np.sort(frames), np.setdiff1d(np.arange(FRAMES), HIDDEN))
+    check(same, f"person 1 is there in {len(frames)} frames and not in the others")
+    _check_mm("joints of person 1", np.linalg.norm(points[np.argsort(frames)] - truly, axis=-1).ravel())
+    picture = folder / "viewer.png"
+    with rr.experimental.ViewerClient.spawn(
+        headless=True, port=9911, detach_process=False, executable_path=viewer_file()
+    ) as viewer:
+        viewer.open(str(path))
+        time.sleep(5)
+        viewer.save_screenshot(str(picture))
+        errors = [entry for entry in viewer.get_logs() if "ERROR" in str(entry.level).upper()]
+        viewer.quit()
+    seen = cv2.imread(str(picture))
+    check(seen is not None and len(errors) == 0, f"the viewer opens it without an error: {picture}")
 
 
 if __name__ == "__main__":

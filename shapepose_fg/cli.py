@@ -16,6 +16,7 @@ import typer
 from shapepose_fg.errors import InputError
 from shapepose_fg.export_command import export
 from shapepose_fg.tracks_command import tracks
+from shapepose_fg.view_command import view
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -42,6 +43,7 @@ evaluate = typer.Typer(help="Score a reconstruction against an annotation.")
 app.add_typer(evaluate, name="evaluate")
 app.add_typer(tracks, name="tracks")
 app.command()(export)
+app.command()(view)
 
 _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
 """What typer raises for a wrong command line; older and newer versions keep the class in different places."""

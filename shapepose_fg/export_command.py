@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 def export(
     results: Annotated[Path, typer.Argument(metavar="RESULTS", help="Folder of a reconstruction.")],
     formats: Annotated[
-        list[str], typer.Argument(metavar="FORMAT...", help="One or more of amass trc c3d bvh glb csv rrd, or all.")
+        list[str],
+        typer.Argument(metavar="FORMAT...", help="One or more of amass trc c3d bvh glb csv rrd, or all."),
     ],
     output: Annotated[
         Path | None, typer.Option(help="Folder for the files; by default `export` in RESULTS.", show_default=False)
@@ -52,8 +53,6 @@ def export(
 
     if markers not in set(MarkerSet):
         raise InputError(f"--markers {markers}: must be one of {' '.join(MarkerSet)}")
-    if fps is not None and not 0.01 <= fps <= 1e5:
-        raise InputError(f"--fps {fps:g}: must be a number of frames a second, such as 25")
     if not 0 <= fill_gaps <= 3600:
         raise InputError(f"--fill-gaps {fill_gaps:g}: must be seconds, 0 or more")
     wanted = list(FORMATS.values()) if "all" in formats else chosen(formats)
@@ -62,7 +61,7 @@ def export(
         wanted,
         results_folder(results) / "export" if output is None else output,
         up=cast("Axis | None", up),
-        fps=fps,
+        fps=checked_fps(fps),
         seen_only=seen_only,
         frames=frame_range(frames),
         persons=tuple(person) if person else None,
@@ -73,12 +72,19 @@ def export(
     for file in (file for written in done.values() for file in written.files):
         print(file)
     for note in (note for written in done.values() for note in written.notes):
-        _note(note)
+        say(note)
 
 
 def results_folder(results: Path) -> Path:
     """The folder of a result, which may be given as its people.npz too."""
     return results.parent if results.name == "people.npz" else results
+
+
+def checked_fps(fps: float | None) -> float | None:
+    """Frames a second that make sense."""
+    if fps is not None and not 0.01 <= fps <= 1e5:
+        raise InputError(f"--fps {fps:g}: must be a number of frames a second, such as 25")
+    return fps
 
 
 def frame_range(text: str | None) -> range | None:
@@ -91,7 +97,7 @@ def frame_range(text: str | None) -> range | None:
     return range(int(match[1] or 0), int(match[2] or 10**12))
 
 
-def _note(message: str) -> None:
+def say(message: str) -> None:
     """Say on stderr, in one line, what is not in the files."""
     from rich.console import Console
     from rich.text import Text

@@ -29,9 +29,9 @@ LEVELS = (
     "pipeline",
     "io solving",
     "simulation viewer",
-    "training",
+    "training export",
     "evaluation",
-    "demo tracks_command",
+    "demo tracks_command export_command view_command",
     "cli",
 )
 """Each level imports only from those before it; a package may import its own modules too."""

@@ -35,9 +35,7 @@ def write_bvh(job: Job) -> Written:
     return written
 
 
-def bvh_text(
-    rest: RestBody, rotations: NDArray[np.float64], pelvis: NDArray[np.float64], fps: float
-) -> str:
+def bvh_text(rest: RestBody, rotations: NDArray[np.float64], pelvis: NDArray[np.float64], fps: float) -> str:
     """A BVH file: the T-pose of `rest`, and per frame rotations (F, 24, 4) as x y z w and the pelvis (F, 3), metres.
 
     The pelvis' own offset is zero: some programs add it to the place of a frame, others do not.
@@ -86,7 +84,12 @@ def _joint(joint: int, rest: RestBody, indent: str) -> Iterator[str]:
     for child in children:
         yield from _joint(child, rest, inside)
     if len(children) == 0:
-        yield from (f"{inside}End Site", inside + "{", f"{inside}\tOFFSET {_vector(rest.tips()[joint])}", inside + "}")
+        yield from (
+            f"{inside}End Site",
+            inside + "{",
+            f"{inside}\tOFFSET {_vector(rest.tips()[joint])}",
+            inside + "}",
+        )
     yield indent + "}"
 
 

@@ -32,8 +32,9 @@ def write_c3d(job: Job) -> Written:
 def c3d_bytes(markers: Markers, first_frame: int, fps: float, part: slice = slice(None)) -> bytes:
     """A C3D file of the frames `part`; `first_frame`, counted from 0, is in its header, where frames count from 1.
 
-    A point's residual is the standard deviation of its place in millimetres, 0 where that is not known (C3D's word
-    for a point that was computed), and -1 where the point is missing.
+    A point's residual is the standard deviation of its place in whole millimetres, which the format keeps in a
+    byte: 1 to 255, where 255 is more, too. It is 0 where it is not known (C3D's word for a point that was
+    computed), and -1 where the point is missing.
     """
     ezc3d = optional("ezc3d", "export")
     xyz, sigma = markers.xyz[part], markers.sigma_m[part]
@@ -49,7 +50,9 @@ def c3d_bytes(markers: Markers, first_frame: int, fps: float, part: slice = slic
     file.add_parameter("POINT", "Y_SCREEN", "+Y")
     points = np.ones((4, xyz.shape[1], len(xyz)))
     points[:3] = 1e3 * np.where(there[..., None], xyz, 0).transpose(2, 1, 0)
-    residuals = np.where(there, 1e3 * np.where(np.isfinite(sigma), sigma, 0), -1)
+    known = np.isfinite(sigma)
+    residuals = np.where(known, np.clip(np.rint(1e3 * np.where(known, sigma, 0)), 1, 255), 0)
+    residuals = np.where(there, residuals, -1)
     file["data"]["points"] = points
     file["data"]["meta_points"]["residuals"] = residuals.T[None]
     file["data"]["meta_points"]["camera_masks"] = np.zeros((7, xyz.shape[1], len(xyz)), dtype=bool)

@@ -52,7 +52,9 @@ def log_people(rr: ModuleType, stream: Any, take: Take, arrays: SmplArrays | Non
 def bones_of(joint_names: tuple[str, ...]) -> NDArray[np.intp]:
     """(B, 2) joints that a line joins: each of BODY_25 and the nearest joint towards the hip that is there."""
     parents = {
-        name: BODY_25.joints[parent] for name, parent in zip(BODY_25.joints, BODY_25.parents, strict=True) if parent >= 0
+        name: BODY_25.joints[parent]
+        for name, parent in zip(BODY_25.joints, BODY_25.parents, strict=True)
+        if parent >= 0
     }
     parents["Head"] = "Neck"
     pairs = []
@@ -77,7 +79,8 @@ def _log_person(
         if row < 0:
             if there_before:
                 set_time(stream, take, index)
-                stream.log(path, rr.Clear(recursive=True))
+                for gone in (path, f"plots/sigma/person_{who}"):
+                    stream.log(gone, rr.Clear(recursive=True))
             there_before = False
             continue
         there_before = True

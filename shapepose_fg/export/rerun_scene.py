@@ -1,16 +1,21 @@
 """A take as a rerun recording, for a file and for the viewer alike: what is logged, and how it is laid out."""
 
+import shutil
+import sysconfig
 from typing import Any
 
 import numpy as np
 
 from shapepose_fg.body.model.smpl_file import SmplArrays
-from shapepose_fg.export.job import optional
+from shapepose_fg.errors import InputError
+from shapepose_fg.export.job import Job, optional
 from shapepose_fg.export.rerun_people import log_people, person_path
 from shapepose_fg.export.rerun_views import camera_path, log_cameras, log_observations
 from shapepose_fg.export.take import Take
 
 APPLICATION = "shapepose-fg"
+_CONNECT_S = 10.0
+"""How long a viewer may take to answer."""
 _UP = {
     "x": "RIGHT_HAND_X_UP", "-x": "RIGHT_HAND_X_DOWN", "y": "RIGHT_HAND_Y_UP",
     "-y": "RIGHT_HAND_Y_DOWN", "z": "RIGHT_HAND_Z_UP", "-z": "RIGHT_HAND_Z_DOWN",
@@ -24,6 +29,33 @@ def new_stream() -> Any:
     rr.set_log_time_enabled(False, recording=stream)
     rr.set_log_tick_enabled(False, recording=stream)
     return stream
+
+
+def open_viewer(stream: Any, take: Take, url: str | None) -> None:
+    """Send a recording to the viewer at `url`, or to one that is started; InputError where that fails."""
+    rr = optional("rerun", "view")
+    try:
+        if url is not None:
+            stream.connect_grpc(url, default_blueprint=layout(take))
+            stream.flush(timeout_sec=_CONNECT_S)
+            return
+        rr.spawn(recording=stream, default_blueprint=layout(take), executable_path=viewer_file())
+    except (RuntimeError, ValueError, OSError) as error:
+        place = "started" if url is None else f"reached at {url}"
+        raise InputError(f"the rerun viewer cannot be {place}: {' '.join(str(error).split())}") from None
+
+
+def viewer_file() -> str | None:
+    """The viewer that was installed with rerun-sdk, also where its folder is not on the PATH; None for any other."""
+    return shutil.which("rerun", path=sysconfig.get_path("scripts"))
+
+
+def body_if_there(job: Job) -> tuple[SmplArrays | None, str | None]:
+    """The body model, or a sentence where its file is not there any more: the rest can be looked at without it."""
+    try:
+        return job.arrays, None
+    except InputError as error:
+        return None, f"no bodies are drawn ({error})"
 
 
 def log_take(stream: Any, take: Take, arrays: SmplArrays | None) -> None:
@@ -66,7 +98,11 @@ def layout(take: Take) -> Any:
         )
         for camera in cameras
     ]
-    beside = rrb.Vertical(rrb.Grid(*views), rrb.Horizontal(*plots), row_shares=[3, 1]) if views else rrb.Vertical(*plots)
+    beside = (
+        rrb.Vertical(rrb.Grid(*views), rrb.Horizontal(*plots), row_shares=[3, 1])
+        if views
+        else rrb.Vertical(*plots)
+    )
     return rrb.Blueprint(
         rrb.Horizontal(world, beside, column_shares=[1, 1]),
         rrb.TimePanel(timeline="time", state="collapsed"),

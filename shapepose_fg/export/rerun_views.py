@@ -76,7 +76,11 @@ def log_observations(rr: ModuleType, stream: Any, take: Take) -> None:
             stream.log(
                 f"{path}/used",
                 rr.Points2D(
-                    points, colors=colours[rows[row]], radii=_USED_DOT, labels=_names(names, joint), show_labels=False
+                    points,
+                    colors=colours[rows[row]],
+                    radii=_USED_DOT,
+                    labels=_names(names, joint),
+                    show_labels=False,
                 ),
             )
             row, joint = np.nonzero(seen[rows, :, view] & ~used[rows, :, view])

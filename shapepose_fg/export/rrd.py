@@ -4,9 +4,8 @@ import shutil
 import tempfile
 from pathlib import Path
 
-from shapepose_fg.errors import InputError
 from shapepose_fg.export.job import Job, Written
-from shapepose_fg.export.rerun_scene import layout, log_take, new_stream
+from shapepose_fg.export.rerun_scene import body_if_there, layout, log_take, new_stream
 from shapepose_fg.files import write_atomically
 
 
@@ -14,11 +13,8 @@ def write_rrd(job: Job) -> Written:
     """`people.rrd`; without bodies where the body model is not there any more."""
     written, take = Written(), job.take
     stream = new_stream()
-    try:
-        arrays = job.arrays
-    except InputError as error:
-        arrays = None
-        written.notes.append(f"rrd: no bodies ({error})")
+    arrays, note = body_if_there(job)
+    written.notes += [] if note is None else [f"rrd: {note}"]
     if take.rig is None:
         written.notes.append("rrd: no cameras, for there is no cameras.json")
     path = job.folder / "people.rrd"

@@ -157,5 +157,3 @@ def _fps_of(people: Reconstruction) -> float:
     if fps is None or not fps > 0:
         raise ValueError("one frame does not say how many there are a second; give --fps")
     return float(fps)
-
-
