@@ -1,4 +1,6 @@
-"""Exports opened by the programs that users open them with: python scripts/check_clients.py [blender opensim rerun].
+"""Exports opened by the programs that users open them with.
+
+    python scripts/check_clients.py [blender opensim rerun]
 
 A recording of three people is simulated and reconstructed; one of them is taken away for half a second. Then
 
@@ -13,6 +15,7 @@ Every client runs in a process of its own. Needs `pip install -e ".[export,view]
 """
 
 import argparse
+import importlib
 import importlib.util
 import json
 import shutil
@@ -22,6 +25,7 @@ import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import cv2
@@ -117,12 +121,12 @@ def check(holds: bool, words: str) -> None:
         sys.exit(1)
 
 
-# Blender ----------------------------------------------------------------------------------------------------------
+# Blender
 
 
 def blender(folder: Path) -> None:
     """Bones and skin in Blender's world, which is z up as the simulated one is, against the body model."""
-    import bpy  # pyright: ignore[reportMissingImports]
+    bpy: Any = importlib.import_module("bpy")
 
     truth = np.load(folder / "truth.npz")
     names = truth["joint_names"].tolist()
@@ -180,12 +184,12 @@ def _check_mm(what: str, metres: np.ndarray) -> None:
     check(float(mm.max()) <= LIMIT_MM, words)
 
 
-# OpenSim and rerun ------------------------------------------------------------------------------------------------
+# OpenSim and rerun
 
 
 def opensim(folder: Path) -> None:
     """Markers read back by OpenSim, and its inverse kinematics on them with Pose2Sim's scaled model."""
-    import opensim as osim  # pyright: ignore[reportMissingImports]
+    osim: Any = importlib.import_module("opensim")
 
     osim.Logger.setLevelString("Error")
     truth = np.load(folder / "truth.npz")
@@ -200,8 +204,8 @@ def opensim(folder: Path) -> None:
             times, xyz = times[~np.isnan(xyz).all(axis=(1, 2))], xyz[~np.isnan(xyz).all(axis=(1, 2))]
         same = bool((np.rint(times * FPS).astype(int) == frames).all()) and "CHip" in names
         apart = 1e3 * np.linalg.norm(unit * xyz - truly, axis=-1)
-        check(same and float(apart.max()) < 0.01, f"{path.name}: {len(times)} frames of {len(names)} markers, largest "
-              f"difference {apart.max():.4f} mm")  # fmt: skip
+        words = f"{path.name}: {len(times)} frames of {len(names)} markers, largest difference"
+        check(same and float(apart.max()) < 0.01, f"{words} {apart.max():.4f} mm")
     if "c3d" not in kinds:
         _c3d_as_opensim_would(folder)
     setup = json.loads((folder / "pose2sim.json").read_text())
@@ -211,9 +215,9 @@ def opensim(folder: Path) -> None:
 
 
 def _c3d_as_opensim_would(folder: Path) -> None:
-    """OpenSim reads C3D by ezc3d. Its package on PyPI is built without: then ezc3d itself reads, and TRC compares."""
-    import ezc3d  # pyright: ignore[reportMissingImports]
-    import opensim as osim  # pyright: ignore[reportMissingImports]
+    """OpenSim reads C3D by ezc3d, but its package on PyPI is built without: here ezc3d reads, and TRC compares."""
+    ezc3d: Any = importlib.import_module("ezc3d")
+    osim: Any = importlib.import_module("opensim")
 
     for path in sorted((folder / "export").glob("*.c3d")):
         file = ezc3d.c3d(str(path))
@@ -231,7 +235,7 @@ def _opensim_axes(xyz: np.ndarray) -> np.ndarray:
     return xyz[..., [1, 2, 0]]
 
 
-def _read_markers(osim, path: Path) -> tuple[np.ndarray, list[str], np.ndarray]:
+def _read_markers(osim: Any, path: Path) -> tuple[np.ndarray, list[str], np.ndarray]:
     """Times, names and places of a file's markers as OpenSim reads them."""
     table = osim.TimeSeriesTableVec3(str(path))
     flat = table.flatten()
@@ -245,7 +249,7 @@ def _read_markers(osim, path: Path) -> tuple[np.ndarray, list[str], np.ndarray]:
     )
 
 
-def _inverse_kinematics(osim, folder: Path, setup: Path, trc: str) -> None:
+def _inverse_kinematics(osim: Any, folder: Path, setup: Path, trc: str) -> None:
     """Scale Pose2Sim's model to a person's markers and follow them with it, with Pose2Sim's own settings."""
     work, stem = folder / "opensim", Path(trc).stem
     work.mkdir(exist_ok=True)
@@ -256,17 +260,17 @@ def _inverse_kinematics(osim, folder: Path, setup: Path, trc: str) -> None:
     model.initSystem()
     model.printToXML(str(work / "model.osim"))
     scaling = ElementTree.parse(setup / "Scaling_Setup_Pose2Sim_Body25.xml")
-    scaler = _found(scaling, ".//ModelScaler")
-    _set(_found(scaling, ".//GenericModelMaker"), model_file="model.osim")
+    scaler = _found(scaling.getroot(), ".//ModelScaler")
+    _set(_found(scaling.getroot(), ".//GenericModelMaker"), model_file="model.osim")
     measured = f"{times[0]} {times[np.flatnonzero(np.isfinite(xyz).all(axis=(1, 2)))[9]]}"
     _set(scaler, marker_file=trc, time_range=measured, scaling_order="measurements")
     _set(scaler, output_model_file=f"{stem}.osim")
-    _set(_found(scaling, ".//MarkerPlacer"), apply="false")
+    _set(_found(scaling.getroot(), ".//MarkerPlacer"), apply="false")
     scaling.write(work / f"{stem}_scaling.xml")
     osim.ScaleTool(str(work / f"{stem}_scaling.xml")).run()  # says false where no marker is placed
     check((work / f"{stem}.osim").exists(), f"Pose2Sim's model scaled to {trc}")
     tracking = ElementTree.parse(setup / "IK_Setup_Pose2Sim_Body25.xml")
-    tool = _found(tracking, ".//InverseKinematicsTool")
+    tool = _found(tracking.getroot(), ".//InverseKinematicsTool")
     _set(tool, model_file=str((work / f"{stem}.osim").resolve()), marker_file=str((work / trc).resolve()))
     _set(tool, time_range=f"{times[0]} {times[-1]}", results_directory=str(work.resolve()))
     _set(tool, output_motion_file=str((work / f"{stem}.mot").resolve()), report_errors="true")
@@ -284,9 +288,9 @@ def _inverse_kinematics(osim, folder: Path, setup: Path, trc: str) -> None:
     )
 
 
-def _found(tree: ElementTree.ElementTree, path: str) -> ElementTree.Element:
+def _found(root: ElementTree.Element, path: str) -> ElementTree.Element:
     """An element that must be there."""
-    element = tree.find(path)
+    element = root.find(path)
     assert element is not None, path
     return element
 
@@ -319,9 +323,8 @@ def rerun(folder: Path) -> None:
     check(same, f"person 1 is there in {len(frames)} frames and not in the others")
     _check_mm("joints of person 1", np.linalg.norm(points[np.argsort(frames)] - truly, axis=-1).ravel())
     picture = folder / "viewer.png"
-    with rr.experimental.ViewerClient.spawn(
-        headless=True, port=9911, detach_process=False, executable_path=viewer_file()
-    ) as viewer:
+    client = rr.experimental.ViewerClient
+    with client.spawn(headless=True, port=9911, detach_process=False, executable_path=viewer_file()) as viewer:
         viewer.open(str(path))
         time.sleep(5)
         viewer.save_screenshot(str(picture))

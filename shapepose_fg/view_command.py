@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
+from shapepose_fg.result_options import checked_fps, frame_range, say
+
 if TYPE_CHECKING:
     from shapepose_fg.camera import Axis
 
@@ -40,7 +42,6 @@ def view(
     from shapepose_fg.export.job import Job
     from shapepose_fg.export.reading import body_file, read_take
     from shapepose_fg.export.rerun_scene import body_if_there, log_take, new_stream, open_viewer
-    from shapepose_fg.export_command import checked_fps, frame_range, say
 
     take = read_take(
         results,

@@ -36,7 +36,7 @@ def write_bvh(job: Job) -> Written:
 
 
 def bvh_text(rest: RestBody, rotations: NDArray[np.float64], pelvis: NDArray[np.float64], fps: float) -> str:
-    """A BVH file: the T-pose of `rest`, and per frame rotations (F, 24, 4) as x y z w and the pelvis (F, 3), metres.
+    """A BVH file: the T-pose of `rest`, and per frame quaternions (F, 24, 4) and pelvis (F, 3), metres.
 
     The pelvis' own offset is zero: some programs add it to the place of a frame, others do not.
     """

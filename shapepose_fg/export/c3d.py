@@ -18,10 +18,10 @@ def write_c3d(job: Job) -> Written:
     written.note_rate(lost, take.fps)
     for person, who in enumerate(take.persons.tolist()):
         markers = markers_of(take, person, job.markers, job.marker_body)
-        part = take.part(person, np.isfinite(markers.xyz).all(axis=2).any(axis=1))
-        if part.start == part.stop:
+        if len(markers.frames) == 0:
             written.notes.append(f"c3d: person {who} has no marker in any frame")
             continue
+        part = slice(int(markers.frames[0]), int(markers.frames[-1]) + 1)
         path = job.folder / f"person_{who}.c3d"
         content = c3d_bytes(markers, int(take.frames[part.start]), take.fps, part)
         write_atomically(path, lambda stream, content=content: stream.write(content))
@@ -37,8 +37,7 @@ def c3d_bytes(markers: Markers, first_frame: int, fps: float, part: slice = slic
     computed), and -1 where the point is missing.
     """
     ezc3d = optional("ezc3d", "export")
-    xyz, sigma = markers.xyz[part], markers.sigma_m[part]
-    there = np.isfinite(xyz).all(axis=2)
+    xyz, sigma, there = markers.xyz[part], markers.sigma_m[part], markers.there[part]
     file = ezc3d.c3d()
     file["header"]["points"]["first_frame"] = first_frame
     point = file["parameters"]["POINT"]

@@ -45,7 +45,8 @@ def glb_bytes(motions: dict[int, Motion], arrays: SmplArrays, times_s: NDArray[n
     """A GLB file of people by their numbers, in frames taken at `times_s` (T,); the file's time 0 is the first.
 
     A person is a node with a tree of 24 joints and a skinned mesh below it. Where a person is not there, its node
-    is scaled to zero: glTF's way to hide things. Rotations are interpolated along the sphere, the pelvis on a line.
+    is scaled to zero, glTF's way to hide things. Rotations are interpolated along the sphere, the pelvis on a
+    line.
     """
     gltf = optional("pygltflib", "export")
     file, buffers = gltf.GLTF2(), Buffers()
@@ -72,10 +73,10 @@ def glb_bytes(motions: dict[int, Motion], arrays: SmplArrays, times_s: NDArray[n
 
 
 def influences(weights: NDArray[np.float64]) -> list[tuple[NDArray[np.uint8], NDArray[np.float32]]]:
-    """The bones (Nv, 4) that move each vertex most with their weights (Nv, 4), then the next four, while there are.
+    """The bones (Nv, 4) that move each vertex most, with their weights (Nv, 4); then the next four, if there are.
 
-    All sets together are the weights (Nv, 24) themselves. A program that reads the first set alone and makes it sum
-    to 1 again draws 1 in 100 vertices of the open body, at neck and shoulders, more than 1 mm elsewhere.
+    All sets together are the weights (Nv, 24) themselves. A program that reads the first set alone and makes it
+    sum to 1 again draws 1 in 100 vertices of the open body, at neck and shoulders, more than 1 mm elsewhere.
     """
     order = np.argsort(-weights, axis=1, kind="stable")
     sorted_weights = np.take_along_axis(weights, order, axis=1).astype(np.float32)

@@ -35,6 +35,16 @@ class Markers:
     sigma_m: NDArray[np.float64]
     """(T, M) standard deviation, root mean square over the axes, metres; NaN where it is not known."""
 
+    @property
+    def there(self) -> NDArray[np.bool_]:
+        """(T, M) where a marker is not missing."""
+        return np.asarray(np.isfinite(self.xyz).all(axis=2))
+
+    @property
+    def frames(self) -> NDArray[np.intp]:
+        """(F,) the frames with a marker."""
+        return np.flatnonzero(self.there.sum(axis=1))
+
 
 def markers_of(take: Take, person: int, kind: MarkerSet, arrays: SmplArrays | None = None) -> Markers:
     """The markers of one person; `arrays` is the body model, for `MarkerSet.BODY` only."""

@@ -60,7 +60,7 @@ def _covered(people: Reconstruction, frames: range) -> list[list[int]]:
 
 
 def body_file(take: Take, given: Path | None) -> Path | None:
-    """The body model's file that a result was made with, or the one that is `given`; None for the one that ships."""
+    """File of the body model that a result was made with, or the one `given`; None for the one that ships."""
     named = take.people.run.get("body")
     if given is not None or named is None:
         return given

@@ -46,7 +46,7 @@ def open_viewer(stream: Any, take: Take, url: str | None) -> None:
 
 
 def viewer_file() -> str | None:
-    """The viewer that was installed with rerun-sdk, also where its folder is not on the PATH; None for any other."""
+    """The viewer that came with rerun-sdk, also where its folder is not on the PATH; None for any other."""
     return shutil.which("rerun", path=sysconfig.get_path("scripts"))
 
 

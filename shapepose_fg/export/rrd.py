@@ -1,4 +1,4 @@
-"""RRD, a recording for the rerun viewer, by rerun-sdk: the recording's own axes, metres; what is missing is not drawn."""
+"""RRD, a recording for the rerun viewer: the recording's own axes, metres; what is missing is not drawn."""
 
 import shutil
 import tempfile

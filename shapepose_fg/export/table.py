@@ -13,7 +13,8 @@ from shapepose_fg.files import write_atomically
 from shapepose_fg.reconstruction import Known
 
 COLUMNS = (
-    "frame time_s person joint x_m y_m z_m sigma_m sigma_x_m sigma_y_m sigma_z_m vx_m_s vy_m_s vz_m_s known confidence"
+    "frame time_s person joint x_m y_m z_m sigma_m sigma_x_m sigma_y_m sigma_z_m vx_m_s vy_m_s vz_m_s"
+    " known confidence"
 ).split()
 """The first line."""
 

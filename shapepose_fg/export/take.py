@@ -106,11 +106,6 @@ class Take:
         times = self.times_s[0] + numbers / self.fps
         return replace(self, rows=rows, frames=self.frames[0] + numbers, times_s=times), len(place) - len(kept)
 
-    def part(self, person: int, has: NDArray[np.bool_]) -> slice:
-        """From the first to the last frame of those that `has` (T,) marks; an empty slice where it marks none."""
-        where = np.flatnonzero(has)
-        return slice(int(where[0]), int(where[-1]) + 1) if len(where) > 0 else slice(0, 0)
-
 
 def _seen(people: Reconstruction) -> Reconstruction:
     """The people without what no view saw."""

@@ -16,8 +16,7 @@ def write_trc(job: Job) -> Written:
     take, written = job.take, Written()
     for person, who in enumerate(take.persons.tolist()):
         markers = markers_of(take, person, job.markers, job.marker_body)
-        there = np.isfinite(markers.xyz).all(axis=2).any(axis=1)
-        if not there.any():
+        if len(markers.frames) == 0:
             written.notes.append(f"trc: person {who} has no marker in any frame")
             continue
         path = job.folder / f"person_{who}.trc"
@@ -39,11 +38,10 @@ def trc_text(
     A frame without any marker has no row, for OpenSim's inverse kinematics stops at one. The rows' own numbers and
     times say what is missing; `fps` is for readers that want a rate. ValueError where no frame has a marker.
     """
-    there = np.isfinite(markers.xyz).all(axis=2)
-    rows = np.flatnonzero(there.any(axis=1))
+    rows = markers.frames
     if len(rows) == 0:
         raise ValueError(f"{name}: no frame has a marker")
-    xyz, there, frames, times = markers.xyz[rows], there[rows], frames[rows], times_s[rows]
+    xyz, there, frames, times = markers.xyz[rows], markers.there[rows], frames[rows], times_s[rows]
     rate = f"{fps:.6g}"
     numbers = range(1, len(markers.names) + 1)
     lines = [

@@ -191,8 +191,11 @@ class Glb:
 
     def posed(self, time: float) -> list[np.ndarray]:
         """(4, 4) world from node, of all nodes."""
-        values = {index: {"translation": node.translation or [0, 0, 0], "rotation": node.rotation or [0, 0, 0, 1],
-                          "scale": node.scale or [1, 1, 1]} for index, node in enumerate(self.file.nodes)}  # fmt: skip
+        still = {"translation": [0, 0, 0], "rotation": [0, 0, 0, 1], "scale": [1, 1, 1]}
+        values = {
+            index: {name: getattr(node, name) or none for name, none in still.items()}
+            for index, node in enumerate(self.file.nodes)
+        }
         (animation,) = self.file.animations
         for channel in animation.channels:
             sampler = animation.samplers[channel.sampler]

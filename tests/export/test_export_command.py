@@ -150,7 +150,8 @@ def test_view_without_rerun_names_the_command(copied, capsys, monkeypatch):
 
 
 def test_commands_load_no_torch(copied):
-    code = f"import sys; from shapepose_fg.cli import main\ntry:\n    main(['export', {str(copied)!r}, 'trc', 'bvh', 'glb'])\n"
+    call = f"main(['export', {str(copied)!r}, 'trc', 'bvh', 'glb'])"
+    code = f"import sys; from shapepose_fg.cli import main\ntry:\n    {call}\n"
     code += "except SystemExit as end:\n    assert not end.code and 'torch' not in sys.modules"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
