@@ -34,6 +34,7 @@ def write_amass(job: Job) -> Written:
         if motion is None:
             written.notes.append(f"amass: person {who} has no body in any frame")
             continue
+        written.note_shape("amass", who, motion.spread_m)
         for stretch in stretches(motion, job.longest_hole(take.fps)):
             frames, times = take.frames[stretch.index], take.times_s[stretch.index]
             path = job.folder / f"person_{who}_frames_{frames[0]}-{frames[-1]}_amass.npz"

@@ -26,6 +26,7 @@ def write_bvh(job: Job) -> Written:
         if motion is None:
             written.notes.append(f"bvh: person {who} has no body in any frame")
             continue
+        written.note_shape("bvh", who, motion.spread_m)
         for stretch in stretches(motion, job.longest_hole(take.fps)):
             first, last = take.frames[stretch.index[[0, -1]]].tolist()
             path = job.folder / f"person_{who}_frames_{first}-{last}.bvh"

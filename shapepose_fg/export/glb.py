@@ -29,6 +29,7 @@ def write_glb(job: Job) -> Written:
         if motion is None:
             written.notes.append(f"glb: person {who} has no body in any frame")
         else:
+            written.note_shape("glb", who, motion.spread_m)
             motions[who] = motion
     if len(motions) == 0:
         return written

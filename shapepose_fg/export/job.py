@@ -12,6 +12,9 @@ from shapepose_fg.errors import InputError
 from shapepose_fg.export.markers import MarkerSet
 from shapepose_fg.export.take import Take
 
+_VISIBLE_M = 1e-3
+"""Differences below this are nobody's concern."""
+
 
 @dataclass(frozen=True)
 class Job:
@@ -64,6 +67,14 @@ class Written:
         """Say how many frames have no place at one rate."""
         if lost > 0:
             self.notes.append(f"{lost} frames left out: at {fps:g} a second others are nearer to their place")
+
+    def note_shape(self, kind: str, who: int, spread_m: float) -> None:
+        """Say where a person has several shapes, of which a file can have one."""
+        if spread_m > _VISIBLE_M:
+            self.notes.append(
+                f"{kind}: person {who} has several shapes, and the mean of them in the file: joints are up to"
+                f" {1e3 * spread_m:.0f} mm from where they were"
+            )
 
 
 def optional(module: str, extra: str) -> ModuleType:

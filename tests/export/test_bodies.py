@@ -298,12 +298,17 @@ def test_influences_of_a_body_with_four_bones_a_vertex_are_one_set():
 # Bodies themselves
 
 
-def test_several_shapes_become_one_and_it_is_known_how_far_that_is_off(result, arrays):
+def test_several_shapes_become_one_and_it_is_said_how_far_that_is_off(result, arrays, tmp_path):
     """Two halves of a recording, one standard deviation of stature apart, have one body in a file."""
     alone = result.rows(result.person == 3)
     betas = alone.betas + np.where(alone.frame[:, None] > 110, 1.0, 0.0) * np.eye(10)[0]
-    motion = motion_of(Take.of(replace(alone, betas=betas), "z"), 0, arrays, np.eye(3))
+    take = Take.of(replace(alone, betas=betas), "z")
+    motion = motion_of(take, 0, arrays, np.eye(3))
     assert motion is not None
     assert 0.01 < motion.spread_m < 0.1
     same = motion_of(Take.of(alone, "z"), 0, arrays, np.eye(3))
     assert same is not None and same.spread_m < 1e-9
+    said = f"several shapes, and the mean of them in the file: joints are up to {1e3 * motion.spread_m:.0f} mm"
+    for write in (write_amass, write_bvh, write_glb):
+        assert any(said in note for note in write(Job(take, tmp_path)).notes)
+        assert not any("several shapes" in note for note in write(Job(Take.of(alone, "z"), tmp_path)).notes)
