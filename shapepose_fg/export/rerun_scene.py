@@ -39,7 +39,12 @@ def open_viewer(stream: Any, take: Take, url: str | None) -> None:
             stream.connect_grpc(url, default_blueprint=layout(take))
             stream.flush(timeout_sec=_CONNECT_S)
             return
-        rr.spawn(recording=stream, default_blueprint=layout(take), executable_path=viewer_file())
+        rr.spawn(
+            recording=stream,
+            default_blueprint=layout(take),
+            executable_path=viewer_file(),
+            hide_welcome_screen=True,  # it would ask the network for examples
+        )
     except (RuntimeError, ValueError, OSError) as error:
         place = "started" if url is None else f"reached at {url}"
         raise InputError(f"the rerun viewer cannot be {place}: {' '.join(str(error).split())}") from None
