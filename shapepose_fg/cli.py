@@ -14,7 +14,9 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import typer
 
 from shapepose_fg.errors import InputError
+from shapepose_fg.export_command import export
 from shapepose_fg.tracks_command import tracks
+from shapepose_fg.view_command import view
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -40,6 +42,8 @@ app = typer.Typer(
 evaluate = typer.Typer(help="Score a reconstruction against an annotation.")
 app.add_typer(evaluate, name="evaluate")
 app.add_typer(tracks, name="tracks")
+app.command()(export)
+app.command()(view)
 
 _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
 """What typer raises for a wrong command line; older and newer versions keep the class in different places."""

@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 LEVELS = (
     "factors errors",
     "camera skeleton",
-    "files provenance rendering run_summary columns workers body.threads",
+    "files provenance result_options rendering run_summary columns workers body.threads",
     "body.model",
     "body.fitting body.shapes",
     "body.offsets",
@@ -29,9 +29,9 @@ LEVELS = (
     "pipeline",
     "io solving",
     "simulation viewer",
-    "training",
+    "training export",
     "evaluation",
-    "demo tracks_command",
+    "demo tracks_command export_command view_command",
     "cli",
 )
 """Each level imports only from those before it; a package may import its own modules too."""
