@@ -47,6 +47,8 @@ class Estimates:
     """(N, J) w_i of Eq. 4, mean confidence over all views of the observations that were kept."""
     inlier: NDArray[np.bool_]
     """(N, J, V) delta_ij of Eq. 2: which observations were kept."""
+    contradicts: NDArray[np.bool_]
+    """(N, J) joints whose views the body contradicts."""
     residual_px: NDArray[np.float64]
     """(N, J, V, 2) projection of the joint minus observation; NaN where unseen or unknown."""
     known: NDArray[np.uint8]
@@ -69,7 +71,9 @@ class Estimates:
         return Estimates(**kept, fit=self.fit.rows(index), problems=tuple(problems))
 
 
-_COLUMNS = "joints covariance velocity velocity_covariance confidence inlier residual_px known status".split()
+_COLUMNS = (
+    "joints covariance velocity velocity_covariance confidence inlier contradicts residual_px known status".split()
+)
 """The arrays of `Estimates`."""
 
 
@@ -212,6 +216,7 @@ class Estimator:
             velocity_covariance=velocity_covariance,
             confidence=mean_confidence(observations, solution.inlier),
             inlier=solution.inlier,
+            contradicts=solution.contradicts,
             residual_px=final.residual_px,
             known=how_known(solution, covariance),
             fit=fit,

@@ -16,7 +16,7 @@ from shapepose_fg.observations import Observations
 class ObservationConfig:
     """How far a 2D observation is trusted."""
 
-    sigma_m: float = 0.0102
+    sigma_m: float = 0.0105
     """How far a detection of confidence 1 is from the joint, one sigma per axis, as a length at the joint's
     depth: a person's image shrinks with distance, and so does the detector's error."""
     confidence_power: float = 5.0

@@ -15,9 +15,11 @@ from shapepose_fg.estimation.alternation import EstimatorConfig, RefineConfig
 from shapepose_fg.estimation.estimator import Estimates, Estimator
 from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas, triangulate
 from shapepose_fg.estimation.window_graph import WindowGraph, WindowGraphConfig
+from shapepose_fg.observation_table import Gate
 from shapepose_fg.observations import Observations
 from shapepose_fg.reconstruction import Status
 from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.solved_rows import result_rows
 
 WRIST, ELBOW, KNEE = 4, 3, 13
 
@@ -238,6 +240,11 @@ def test_views_that_contradict_the_body_are_gated_anew_around_it(five_cameras, t
     np.testing.assert_allclose(result.joints, two_people, atol=0.03)
     assert np.argwhere(~result.inlier.any(axis=-1)).tolist() == [[0, KNEE]]
     assert result.confidence[0, KNEE] == 0
+    place = np.zeros(seen.confidence.shape, dtype=np.int32)
+    rows = result_rows(seen, result, place, five_cameras, BODY_25.joints, np.arange(2))
+    assert rows.observations is not None
+    dropped = np.argwhere(rows.observations.gate == Gate.CONTRADICTS_BODY)
+    assert dropped.tolist() == [[0, KNEE, 0], [0, KNEE, 1]] and rows.observations.reasons()["too far"] == 0
     alone = run(seen, five_cameras, FakeFitter(two_people, fails=True))
     np.testing.assert_allclose(alone.joints[0, KNEE], elsewhere[0, KNEE], atol=0.01)
 
