@@ -176,7 +176,8 @@ class Engine:
     def _next(self, decided: Sequence[Decided], before: int, last: bool) -> tuple[int, int] | None:
         """Where the next window's own frames stop, and where it ends; None where there is too little."""
         stop = before + self.frames
-        if stop < len(decided):
+        # A window of a few frames at the end would know its people less well than the others do.
+        if stop + self.frames // 2 < len(decided):
             end = self._overlap(decided, stop, 1)
             if end < len(decided) or last:
                 return stop, end
