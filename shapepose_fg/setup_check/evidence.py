@@ -23,7 +23,7 @@ _LAG_ANCHORS = 16
 """Of a longer one the neighbours of so many frames are."""
 MOST_LAG = 60
 """Largest offset in time that is looked for, frames; less in a short recording."""
-_MOST_PAIRS = 60_000
+_MOST_PAIRS = 25_000
 """Pairs of sightings that are compared at most: with more people and cameras fewer frames are looked at."""
 
 

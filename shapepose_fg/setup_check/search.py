@@ -12,8 +12,8 @@ GOOD = 0.45
 """A camera that matches the others' people so well is where it is said to be, but for small errors."""
 _GAIN = 0.25
 """What a change must bring of a camera's score to be named."""
-_MIN_AGREEMENT = 0.1
-_MIN_LAG_GAIN = 0.003
+_MIN_AGREEMENT = 0.12
+_MIN_LAG_GAIN = 0.004
 """An offset in time is named if it takes away a third of what people move in it, and half a centimetre on average."""
 
 

@@ -39,8 +39,12 @@ class SmallErrors:
     """(V,) each focal length over that of the calibration."""
     views: Views
     """The cameras after the changes."""
-    turned_deg: Array
-    """(V,) the shift of the principal point and the roll together, as a turn of the camera."""
+    shift_deg: Array
+    """(V,) the shift of the principal point as a turn of the camera."""
+    roll_sigma_deg: Array
+    """(V,) how far the roll is known, all other small errors being free."""
+    focal_sigma: Array
+    """(V,) the same of the focal length, as a part of it."""
     median_px: tuple[Array, Array]
     """(V,) median residual before and after, pixels."""
     cost: float
@@ -68,8 +72,11 @@ def small_errors(look: Look, parts: Parts = ALL) -> SmallErrors:
     views, seen = look.setup.views, _seen(look)
     total = np.zeros(len(views) * Q)
     structure = first = triangulate(*seen, views, 5)
-    for _ in range(_ROUNDS):
-        step_taken = _sparse_step(normal_equations(structure, views), structure, total, parts)
+    normal = normal_equations(structure, views)
+    roll_sigma, focal_sigma = _sigmas(normal, len(views))
+    for number in range(_ROUNDS):
+        normal = normal if number == 0 else normal_equations(structure, views)
+        step_taken = _sparse_step(normal, structure, total, parts)
         total = total + step_taken
         views = changed(views, step_taken.reshape(-1, Q))
         structure = triangulate(*seen, views, 4)
@@ -77,7 +84,26 @@ def small_errors(look: Look, parts: Parts = ALL) -> SmallErrors:
     cost = _cost(structure) / max(_cost(first), 1e-12)
     medians = (_median_px(first), _median_px(structure))
     shift, roll = np.rad2deg(np.hypot(*change[:, CENTRE].T) / views.focal_px), np.rad2deg(change[:, 2])
-    return SmallErrors(change[:, CENTRE], roll, np.exp(change[:, 8]), views, np.hypot(shift, roll), medians, cost)
+    return SmallErrors(
+        change[:, CENTRE],
+        roll,
+        np.exp(change[:, 8]),
+        views,
+        shift,
+        np.rad2deg(roll_sigma),
+        focal_sigma,
+        medians,
+        cost,
+    )
+
+
+def _sigmas(normal: Normal, views: int) -> tuple[Array, Array]:
+    """(V,) sigma of each camera's roll, radians, and of the logarithm of its focal length."""
+    columns = np.array([view * Q + c for view in range(views) for c in (2, *CENTRE, 8)])
+    prior = np.tile([np.deg2rad(1.0), 20.0, 20.0, 0.03], views) ** -2.0
+    H = _PRIOR * normal.H[np.ix_(columns, columns)] + np.diag(prior)
+    sigma = np.sqrt(np.diag(np.linalg.inv(H))).reshape(views, 4)
+    return sigma[:, 0], sigma[:, 3]
 
 
 def other_pose(look: Look) -> OtherPose:
