@@ -2,9 +2,10 @@
 
 Reconstructs the Shelf recording (or another one, or the built-in scene where there is no recording) both ways,
 alternately in one run, and prints the time of every stage, the processor's time and the clock's, their ratios, and
-where stage II's time goes. Then a cheap recording (two people, four cameras) of rising `--lengths`: time a frame
-must not grow, nor memory beyond the rows of the result. `--stretch NAME:A:B` takes frames of a simulated recording
-instead, `--simulate NAME` times the simulator, with one worker and two. On a machine that does nothing else.
+where stage II's time goes; then the clock with worker processes. Then a cheap recording (two people, four cameras)
+of rising `--lengths`: time a frame must not grow, nor memory beyond the rows of the result. `--stretch NAME:A:B`
+takes frames of a simulated recording instead, `--simulate NAME` times the simulator, with one worker and two. On a
+machine that does nothing else.
 """
 
 import argparse
@@ -54,6 +55,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, help="the first frames only (default: all)")
     parser.add_argument("--threads", type=int, default=PipelineConfig().threads, help="threads of torch")
     parser.add_argument("--rounds", type=int, default=2, help="runs of each mode, the best counts; 0: none")
+    parser.add_argument("--workers", type=int, nargs="*", default=[2], help="processes, beside one")
     parser.add_argument("--lengths", type=int, nargs="*", default=[300, 3000], help="of the cheap recording")
     parser.add_argument(
         "--simulate", metavar="NAME", choices=NAMES, help="time the simulator on this scene instead"
@@ -73,6 +75,8 @@ def main() -> None:
         best = compare(recording, config, frames, arguments.rounds)
         shares = stage_two(recording.detections, recording.rig, config, frames[:96])
         console.print(_stage_table(recording, best, shares))
+        for line in side_by_side(recording, config, len(frames), arguments.workers):
+            console.print(line, highlight=False)
     for line in linearity(config, sorted(arguments.lengths)):
         console.print(line, highlight=False)
 
@@ -87,6 +91,22 @@ def compare(recording: Timed, config: PipelineConfig, frames: range, rounds: int
             if temporal not in best or now.cpu_s < best[temporal].cpu_s:
                 best[temporal] = now
     return best
+
+
+def side_by_side(recording: Timed, config: PipelineConfig, count: int, workers: list[int]):
+    """Lines about the clock with more processes: the recording as it is, and played four times over.
+
+    Starting the processes is in the time; of a longer recording it is less.
+    """
+    for length in (count, 4 * count) if len(workers) > 0 else ():
+        played = BackAndForth(recording.detections, length)
+        alone = spend(played, recording.rig, config, range(length))
+        for number in workers:
+            now = spend(played, recording.rig, config, range(length), number)
+            yield (
+                f"{length} frames, {number} workers: clock {now.wall_ms:.1f} ms a frame,"
+                f" {alone.wall_ms:.1f} with one, ratio {alone.wall_ms / now.wall_ms:.2f}"
+            )
 
 
 def linearity(config: PipelineConfig, lengths: list[int]):

@@ -216,7 +216,8 @@ class Rig:
     @cached_property
     def cTw(self) -> NDArray[np.float64]:
         """(V, 3, 4) camera-from-world matrices."""
-        return np.stack([camera.cTw for camera in self.cameras])
+        # The order in memory is that of a copy in another process, so that both round alike.
+        return np.ascontiguousarray(np.stack([camera.cTw for camera in self.cameras]))
 
     @cached_property
     def centres(self) -> NDArray[np.float64]:

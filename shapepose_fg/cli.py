@@ -104,6 +104,9 @@ def reconstruct(
     shapes: Annotated[
         Path | None, typer.Option(help="File (.npz) of people's shapes: read where it is there, kept up to date.")
     ] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="Processes that solve; by default as many as pay. They change no byte.")
+    ] = None,
 ) -> None:
     """Reconstruct the people of a recording: 3D joints with covariances, and bodies."""
     from shapepose_fg.io.calibration import read_rig, write_rig
@@ -113,6 +116,7 @@ def reconstruct(
     from shapepose_fg.io.solved_setup import CAMERAS
     from shapepose_fg.provenance import checksums
 
+    _check_workers(workers)
     size = _image_size(image_size)
     rig = read_rig(calibration, up=cast("Axis | None", up), unit=cast("Unit | None", unit), image_size=size)
     recording = read_detections(detections, rig, skeleton)
@@ -123,8 +127,9 @@ def reconstruct(
     first_frames = _cuts(cuts, len(recording))
     refuse_corrected(output)
     _prepare(output)
-    from shapepose_fg.pipeline import PipelineConfig
+    from shapepose_fg.pipeline import FRAMES_WORTH_A_WORKER, PipelineConfig
     from shapepose_fg.pipeline import reconstruct as run_pipeline
+    from shapepose_fg.workers import suitable_workers
 
     settings = PipelineConfig() if config is None else read_config(config, PipelineConfig)
     settings = settings if temporal is None else replace(settings, temporal=temporal)
@@ -144,6 +149,7 @@ def reconstruct(
             cuts=first_frames,
             shapes=known,
             progress=progress,
+            workers=suitable_workers(len(span), FRAMES_WORTH_A_WORKER) if workers is None else workers,
         )
     seconds = time.perf_counter() - start
     source = settings.offsets.source
@@ -227,13 +233,13 @@ def simulate(
         raise InputError(f"--format {format}: must be association or openpose")
     if seed < 0:
         raise InputError(f"--seed {seed}: must be 0 or more")
-    if workers is not None and not 1 <= workers <= 64:
-        raise InputError(f"--workers {workers}: must be 1 to 64; leave it out for one a core")
+    _check_workers(workers)
     _prepare(output)
     from shapepose_fg.simulation import DetectorConfig
     from shapepose_fg.simulation import simulate as run_detector
     from shapepose_fg.simulation.files import check_output, cut, cuts_of, named_scene, write_simulated
-    from shapepose_fg.simulation.lookout import suitable_workers
+    from shapepose_fg.simulation.lookout import FRAMES_WORTH_A_WORKER
+    from shapepose_fg.workers import suitable_workers
 
     last = re.search(r":\s*(\d{1,6})\s*$", frames or "")
     scene = named_scene(
@@ -248,7 +254,7 @@ def simulate(
     span = _frame_range(frames, len(scene))
     part = cut(scene, span)
     check_output(part, output, cast("Format", format))
-    workers = suitable_workers(len(span)) if workers is None else workers
+    workers = suitable_workers(len(span), FRAMES_WORTH_A_WORKER) if workers is None else workers
     start = time.perf_counter()
     with _progress("simulating") as progress:
         detections = run_detector(part, DetectorConfig(), seed, workers=workers, progress=progress)
@@ -295,6 +301,11 @@ def _image_size(text: str | None) -> tuple[int, int] | None:
     if match is None:
         raise InputError(f"--image-size {text}: must be WIDTHxHEIGHT in pixels, such as 1920x1080")
     return int(match[1]), int(match[2])
+
+
+def _check_workers(workers: int | None) -> None:
+    if workers is not None and not 1 <= workers <= 64:
+        raise InputError(f"--workers {workers}: must be 1 to 64; leave it out for as many as pay")
 
 
 def _frame_range(text: str | None, count: int) -> range:

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from shapepose_fg.bodies_over_time import SequenceFitting, with_bodies_over_time
+from shapepose_fg.bodies_over_time import Person, SequenceFitting, with_bodies_over_time
+from shapepose_fg.body.fitting.body_sequence import SequenceFit
 from shapepose_fg.body.fitting.bone_reach import longest_bones
 from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.fitting.fitters import BodyConfig, make_fitter
@@ -45,10 +46,15 @@ from shapepose_fg.solved_rows import result_rows
 from shapepose_fg.tracking.following import FollowingConfig, Input
 from shapepose_fg.tracking.stitching import StitchingConfig, stitch
 from shapepose_fg.tracking.tracker import BodyScale, Tracker, TrackingConfig
-from shapepose_fg.windows import Engine, Solved, WindowConfig
+from shapepose_fg.windows import Engine, Solved, Span, WindowConfig, WindowSolver
+from shapepose_fg.workers import Workers
 
 FAST_M_S = 3.0
 """The tracker predicts joints as if they moved so fast: a hand that is thrown up or strikes."""
+
+FRAMES_WORTH_A_WORKER = 200
+"""A recording must have this many for each worker: starting one takes some seconds of a core, and a window is a
+hundred frames."""
 
 Progress = Callable[[int, int], None]
 """Called with the number of frames that are done and the number of all."""
@@ -110,6 +116,7 @@ def reconstruct(
     cuts: Sequence[int] = (),
     shapes: SubjectShapes | None = None,
     progress: Progress | None = None,
+    workers: int = 1,
 ) -> Reconstruction:
     """Reconstruct the people of a recording over time; with `config.temporal` false, every frame by itself.
 
@@ -117,8 +124,9 @@ def reconstruct(
     `extra_factors` adds factors of your own to every person's window. In the result `person` is an identity over
     time (without time, the number of a person within the frame). `times` says when the frames were taken; without
     it 30 frames a second are assumed, and `run` says so. `cuts` are first frames of what follows a cut: nothing
-    carries over to them, identities least of all. `shapes` are people known from other recordings. `run` of the
-    result holds the configuration, versions, seconds per stage, how many people were found and dropped, with
+    carries over to them, identities least of all. `shapes` are people known from other recordings. `workers`
+    processes solve (1: this one does); they change no byte of the result. `run` of the result holds the
+    configuration, versions, seconds per stage (over all processes), how many people were found and dropped, with
     reasons, and where the detector's joints lie on the body. That is learnt from frames spread over the whole
     recording, whatever `frames` picks; a fitter of your own takes part if it is an `AdjustableFitter`.
     """
@@ -138,24 +146,29 @@ def reconstruct(
         if isinstance(fitter, AdjustableFitter) and offsets is not None:
             fitter = fitter.with_keypoint_offsets(offsets)
         engine = _engine(rig, detections.skeleton, config, fitter, extra_factors, run)
+        spans = _spans(engine, config, _inputs(detections, rig, frames, times, run), frames, cuts, run)
         parts, problems, done = [], list[Problem](), 0
-        for solved, count in _solved(engine, config, _inputs(detections, rig, frames, times, run), frames, cuts):
-            parts += [_rows(each, rig, detections, config) for each in solved]
-            problems += [problem for each in solved for problem in each.estimates.problems]
-            done += count
-            if progress is not None:
-                progress(done, len(frames))
-        people = Reconstruction.concatenate(parts) if parts else Reconstruction.empty(detections.skeleton.joints)
-        if config.temporal:
-            with run.stage("follow"):
-                # Between two frames, where no rounding matters.
-                cuts_s = (times.frame_s[list(cuts)] + times.frame_s[[cut - 1 for cut in cuts]]) / 2
-                before, people = people.person, _stitched(people, detections.skeleton, config, cuts_s)
-                names = dict(zip(before.tolist(), people.person.tolist(), strict=True))
-                problems = [replace(problem, track=names[problem.track]) for problem in problems]
-        if config.temporal and isinstance(fitter, SequenceFitting):
-            with run.stage("bodies over time"):
-                people = with_bodies_over_time(people, fitter, shapes)
+        with Workers(workers, engine.solver) as pool:
+            for solved in pool.map(WindowSolver.solve, spans):
+                parts.append(_rows(solved, rig, detections, config))
+                problems += solved.estimates.problems
+                run.add(solved.seconds)
+                done += solved.frames
+                if progress is not None:
+                    progress(done, len(frames))
+            people = (
+                Reconstruction.concatenate(parts) if parts else Reconstruction.empty(detections.skeleton.joints)
+            )
+            if config.temporal:
+                with run.stage("follow"):
+                    # Between two frames, where no rounding matters.
+                    cuts_s = (times.frame_s[list(cuts)] + times.frame_s[[cut - 1 for cut in cuts]]) / 2
+                    before, people = people.person, _stitched(people, detections.skeleton, config, cuts_s)
+                    names = dict(zip(before.tolist(), people.person.tolist(), strict=True))
+                    problems = [replace(problem, track=names[problem.track]) for problem in problems]
+            if config.temporal and isinstance(fitter, SequenceFitting):
+                with run.stage("bodies over time"):
+                    people = with_bodies_over_time(people, fitter, shapes, lambda jobs: pool.map(_bodies, jobs))
     summary = run.summary(config, frames, people) | {"time": times.as_dict(), "cuts": list(cuts)}
     summary["people"]["problems"] = [_named(problem, detections.skeleton) for problem in problems]
     summary |= {"keypoint_offsets": None if offsets is None else offsets.as_dict()}
@@ -223,13 +236,15 @@ def _engine(
     settings = EstimatorConfig(config.observations, config.window_graph, config.refine, config.motion)
     return Engine(
         Tracker(skeleton, scale, find, config.tracking, config.observations, weak_births=config.temporal),
-        Estimator(rig, fitter, skeleton.joints, settings),
         config.following,
-        config.windows,
+        WindowSolver(
+            Estimator(rig, fitter, skeleton.joints, settings),
+            skeleton,
+            config.tracking.assignment,
+            config.windows,
+            extra_factors,
+        ),
         frames=config.batch_frames,
-        temporal=config.temporal,
-        extra_factors=extra_factors,
-        stage=run.stage,
     )
 
 
@@ -246,22 +261,36 @@ def _inputs(
     return read
 
 
-def _solved(
-    engine: Engine, config: PipelineConfig, read: Callable[[int], Input], frames: range, cuts: Sequence[int]
-) -> Iterator[tuple[list[Solved], int]]:
-    """Rows that are done, and how many frames have been read for them."""
+def _spans(
+    engine: Engine,
+    config: PipelineConfig,
+    read: Callable[[int], Input],
+    frames: range,
+    cuts: Sequence[int],
+    run: "_Run",
+) -> Iterator[Span]:
+    """The windows of a recording, one after the other, as far as their people have been followed."""
     next_id = 0
     for stretch in stretches(frames, cuts):
         state = engine.start(next_id)
         for start in range(stretch.start, stretch.stop, config.batch_frames):
             batch = stretch[start - stretch.start : start - stretch.start + config.batch_frames]
             given = [read(frame) for frame in batch]
-            if config.temporal:
-                done, state = engine.advance(state, given, last=batch.stop == stretch.stop)
-                next_id = state.follow.tracker.next_id
-            else:
-                done = [engine.alone(given)]
-            yield done, len(batch)
+            with run.stage("follow"):
+                if config.temporal:
+                    spans, state = engine.follow(state, given, last=batch.stop == stretch.stop)
+                    next_id = state.follow.tracker.next_id
+                else:
+                    spans = [engine.alone(given)]
+            yield from spans
+
+
+def _bodies(solver: WindowSolver, person: Person) -> SequenceFit:
+    """One person's bodies, in whatever process."""
+    fitter = solver.estimator.fitter
+    if not isinstance(fitter, SequenceFitting):
+        raise TypeError(f"{type(fitter).__name__} does not fit bodies over time")
+    return person.fitted(fitter)
 
 
 def _offsets(
@@ -334,6 +363,11 @@ class _Run:
         whole = time.perf_counter() - start
         self.seconds[name] += whole - self._inner
         self._inner = outside + whole
+
+    def add(self, seconds: dict[str, float]) -> None:
+        """Add what a window took, wherever it was solved."""
+        for name, spent in seconds.items():
+            self.seconds[name] += spent
 
     def summary(self, config: PipelineConfig, frames: range, people: Reconstruction) -> dict[str, Any]:
         """The contents of `Reconstruction.run`."""

@@ -1,10 +1,12 @@
 """Frames in, solved rows out: people are followed, and solved in windows of frames that overlap.
 
-One function, `advance`, from (frames, state) to (rows, state): memory does not grow with the recording.
+One function, `advance`, from (frames, state) to (rows, state): memory does not grow with the recording. Its first
+half follows people and is quick; its second half solves windows that know nothing of each other, here or in other
+processes.
 """
 
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,6 +17,7 @@ from shapepose_fg.skeleton import Skeleton
 from shapepose_fg.tracking.following import Decided, FollowingConfig, FollowState, Input, finish, follow
 from shapepose_fg.tracking.reassociation import Survival, reassociate
 from shapepose_fg.tracking.tracker import Tracker, TrackerState
+from shapepose_fg.tracking.view_assignment import AssignmentConfig
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,20 @@ class WindowConfig:
 
 
 @dataclass(frozen=True)
+class Span:
+    """Frames whose people are known, and wait to be solved; nothing else is needed for it."""
+
+    decided: tuple[Decided, ...]
+    """The frames with their rows, and before and after them those that a window overlaps."""
+    start: int
+    """The first of `decided` whose rows are to be returned."""
+    stop: int
+    """The one after the last."""
+    alone: bool = False
+    """Whether every frame is a recording of its own."""
+
+
+@dataclass(frozen=True)
 class Solved:
     """Rows that are done."""
 
@@ -43,6 +60,49 @@ class Solved:
     """Who, when, and from what."""
     estimates: Estimates
     """Joints and bodies."""
+    frames: int
+    """How many frames they are of."""
+    seconds: dict[str, float]
+    """What it took, by stage."""
+
+
+@dataclass(frozen=True)
+class WindowSolver:
+    """From frames whose people are known to solved rows: plain data, which can be sent to another process."""
+
+    estimator: Estimator
+    """Stage II."""
+    skeleton: Skeleton
+    """The detector's joints."""
+    assignment: AssignmentConfig
+    """How detections are given out."""
+    windows: WindowConfig
+    """How often they are."""
+    extra_factors: ExtraFactors | None = None
+    """The user's own factors."""
+
+    def solve(self, span: Span) -> Solved:
+        """One window."""
+        given = [frame for frame, _ in span.decided]
+        rows = Observations.concatenate([part for _, part in span.decided])
+        again, survival = self.windows.again_over_time, None
+        if span.alone:
+            again, survival = self.windows.again_alone, Survival()
+        began = time.perf_counter()
+        for _ in range(again if len(rows) > 0 else 0):
+            joints, covariance = self.estimator.draft(rows)
+            rows = reassociate(given, rows, joints, covariance, self.skeleton, self.assignment, survival)
+        associated = time.perf_counter()
+        estimates = self.estimator.estimate(rows, self.extra_factors)
+        own = {frame.frame for frame in given[span.start : span.stop]}
+        index = np.flatnonzero(np.isin(rows.frame, list(own)))
+        problems = tuple(problem for problem in estimates.problems if problem.frame in own)
+        return Solved(
+            rows.rows(index),
+            replace(estimates.rows(index), problems=problems),
+            frames=span.stop - span.start,
+            seconds={"associate again": associated - began, "solve": time.perf_counter() - associated},
+        )
 
 
 @dataclass(frozen=True)
@@ -63,63 +123,55 @@ class Engine:
 
     tracker: Tracker
     """Follows people; finds new ones."""
-    estimator: Estimator
-    """Stage II."""
     following: FollowingConfig
     """What becomes of tracks."""
-    windows: WindowConfig
-    """How frames are cut."""
+    solver: WindowSolver
+    """Solves windows."""
     frames: int
     """Frames that a window returns."""
-    temporal: bool
-    """Whether frames hang together; if not, every frame is a recording of its own."""
-    extra_factors: ExtraFactors | None = None
-    """The user's own factors."""
-    stage: Callable[[str], AbstractContextManager[None]] = lambda name: nullcontext()
-    """Takes the time of a stage, by its name."""
-
-    @property
-    def skeleton(self) -> Skeleton:
-        """The detector's joints."""
-        return self.tracker.skeleton
 
     def start(self, next_id: int = 0) -> StreamState:
         """Before the first frame, or after a cut; identities count from `next_id`."""
-        return StreamState(FollowState(TrackerState.start(self.skeleton, next_id)))
+        return StreamState(FollowState(TrackerState.start(self.tracker.skeleton, next_id)))
 
     def advance(
         self, state: StreamState, frames: Sequence[Input], *, last: bool = False
     ) -> tuple[list[Solved], StreamState]:
         """Take in `frames`; returns the rows that are done. With `last` the recording ends, or is cut, there."""
+        spans, state = self.follow(state, frames, last=last)
+        return [self.solver.solve(span) for span in spans], state
+
+    def follow(
+        self, state: StreamState, frames: Sequence[Input], *, last: bool = False
+    ) -> tuple[list[Span], StreamState]:
+        """The first half of `advance`: the windows that can be solved now, each by itself, in any process."""
         following, decided = state.follow, list(state.decided)
-        with self.stage("follow"):
-            for frame in frames:
-                following, more = follow(self.tracker, following, frame, self.following)
-                decided += more
-            if last:
-                following, more = finish(following, self.following)
-                decided += more
-        before, done = state.before, list[Solved]()
+        for frame in frames:
+            following, more = follow(self.tracker, following, frame, self.following)
+            decided += more
+        if last:
+            following, more = finish(following, self.following)
+            decided += more
+        before, spans = state.before, list[Span]()
         while (cut := self._next(decided, before, last)) is not None:
             stop, end = cut
-            done.append(self._solve(decided[:end], before, stop, None, self.windows.again_over_time))
+            spans.append(Span(tuple(decided[:end]), before, stop))
             keep = self._overlap(decided, stop, -1)
             decided, before = decided[keep:], stop - keep
-        return done, StreamState(following, tuple(decided), before)
+        return spans, StreamState(following, tuple(decided), before)
 
-    def alone(self, frames: Sequence[Input]) -> Solved:
-        """Frames that have nothing to do with each other, solved together because bodies are fitted fastest so."""
+    def alone(self, frames: Sequence[Input]) -> Span:
+        """Frames that have nothing to do with each other, in one window because bodies are fitted fastest so."""
         decided = list[Decided]()
-        with self.stage("follow"):
-            for frame in frames:
-                first, _ = follow(self.tracker, self.start().follow, frame, self.following)
-                decided += finish(first, self.following)[1]
+        for frame in frames:
+            first, _ = follow(self.tracker, self.start().follow, frame, self.following)
+            decided += finish(first, self.following)[1]
         numbered = np.cumsum([0, *(len(rows) for _, rows in decided)])
-        decided = [
+        numbered = [
             (frame, replace(rows, track=first + np.arange(len(rows))))
             for (frame, rows), first in zip(decided, numbered.tolist(), strict=False)
         ]
-        return self._solve(decided, 0, len(decided), Survival(), self.windows.again_alone)
+        return Span(tuple(numbered), 0, len(numbered), alone=True)
 
     def _next(self, decided: Sequence[Decided], before: int, last: bool) -> tuple[int, int] | None:
         """Where the next window's own frames stop, and where it ends; None where there is too little."""
@@ -134,24 +186,5 @@ class Engine:
         """The frame `overlap_s` before or after the border at `at`."""
         times = np.array([frame.time_s.mean() for frame, _ in decided])
         border = times[min(at, len(times) - 1)]
-        near = np.abs(times - border) <= self.windows.overlap_s
+        near = np.abs(times - border) <= self.solver.windows.overlap_s
         return int(np.flatnonzero(near)[0]) if direction < 0 else int(np.flatnonzero(near)[-1]) + 1
-
-    def _solve(
-        self, decided: Sequence[Decided], start: int, stop: int, survival: Survival | None, again: int
-    ) -> Solved:
-        """One window; the rows of its frames `start` to `stop` are returned."""
-        given = [frame for frame, _ in decided]
-        rows = Observations.concatenate([part for _, part in decided])
-        for _ in range(again if len(rows) > 0 else 0):
-            with self.stage("associate again"):
-                joints, covariance = self.estimator.draft(rows)
-                rows = reassociate(
-                    given, rows, joints, covariance, self.skeleton, self.tracker.config.assignment, survival
-                )
-        with self.stage("solve"):
-            estimates = self.estimator.estimate(rows, self.extra_factors)
-        own = {frame.frame for frame in given[start:stop]}
-        index = np.flatnonzero(np.isin(rows.frame, list(own)))
-        problems = tuple(problem for problem in estimates.problems if problem.frame in own)
-        return Solved(rows.rows(index), replace(estimates.rows(index), problems=problems))

@@ -42,9 +42,9 @@ def pipeline(monkeypatch) -> dict:
     """Replace the pipeline by one that finds two people in every frame; returns what it was called with."""
     called: dict = {}
 
-    def fake(detections, rig, config, *, frames, fitter, times, cuts, shapes, progress):
+    def fake(detections, rig, config, *, frames, fitter, times, cuts, shapes, progress, workers):
         called.update(detections=detections, rig=rig, config=config, frames=frames, fitter=fitter)
-        called.update(times=times, cuts=cuts, shapes=shapes)
+        called.update(times=times, cuts=cuts, shapes=shapes, workers=workers)
         progress(len(frames), len(frames))
         N = 2 * len(frames)
         return Reconstruction(

@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 LEVELS = (
     "factors errors",
     "camera skeleton",
-    "files provenance rendering run_summary columns body.threads",
+    "files provenance rendering run_summary columns workers body.threads",
     "body.model",
     "body.fitting body.shapes",
     "body.offsets",

@@ -96,6 +96,26 @@ def test_the_same_input_gives_the_same_bytes(scene, recording):
         assert getattr(one, name).tobytes() == getattr(other, name).tobytes(), name
 
 
+def test_workers_change_no_byte(scene, recording):
+    """Windows of 8 frames, so that there are several; everything in the result, gates and shapes included."""
+    config = PipelineConfig(batch_frames=8)
+    counts = list[int]()
+    alone = reconstruct(recording, scene.rig, config)
+    helped = reconstruct(recording, scene.rig, config, workers=2, progress=lambda done, _: counts.append(done))
+    assert counts == [8, 16]
+    for name in Reconstruction.ROWS:
+        assert getattr(alone, name).tobytes() == getattr(helped, name).tobytes(), name
+    assert alone.observations is not None and helped.observations is not None
+    assert bytes(alone.observations.to_bytes()) == bytes(helped.observations.to_bytes())
+    assert alone.shapes is not None and helped.shapes is not None
+    assert alone.shapes.betas.tobytes() == helped.shapes.betas.tobytes()
+
+
+def test_factors_that_cannot_be_sent_to_workers_are_refused(scene, recording):
+    with pytest.raises(ValueError, match="at the top of a module, or use workers=1"):
+        reconstruct(recording, scene.rig, workers=2, extra_factors=lambda window, keys: ())
+
+
 def test_progress_counts_frames_and_torch_gets_its_threads_back(scene, recording):
     before, seen = torch.get_num_threads(), []
     reconstruct(

@@ -22,6 +22,7 @@ from shapepose_fg.estimation.draft import WholeFitter, drafted, limb_steps, smoo
 from shapepose_fg.estimation.linearisation import linearise, mean_confidence, observation_sigmas, triangulate
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.outcome import Problem, how_known, problems, reported_covariance
+from shapepose_fg.estimation.state_covariances import state_covariances
 from shapepose_fg.estimation.window_graph import WindowGraph
 from shapepose_fg.observations import Observations
 from shapepose_fg.reconstruction import Status
@@ -188,12 +189,13 @@ class Estimator:
         X = solution.joints
         covariance, velocity_covariance = (np.full((*X.shape, 3), np.nan) for _ in range(2))
         velocity = np.full(X.shape, np.nan)
-        for window in windows:
+        found = state_covariances([window.graph for window in windows])
+        for window, (of_positions, of_velocities) in zip(windows, found, strict=True):
             graph, rows = window.graph, window.rows
-            covariance[rows] = graph.marginals(graph.keys)
+            covariance[rows] = of_positions
             if graph.temporal:
                 velocity[rows] = graph.velocity()
-                velocity_covariance[rows] = graph.marginals(graph.velocity_keys)
+                velocity_covariance[rows] = of_velocities
                 covariance[rows] = reported_covariance(solution, window, covariance[rows], self._motion.views)
         X = self._limbs_kept(X, covariance, windows, solution)
         fit = final_bodies(solution, covariance, windows, self.fitter)

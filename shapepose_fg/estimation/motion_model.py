@@ -106,5 +106,5 @@ class MotionModel:
         ):
             raise InputError(f"{path}: densities must be positive; give what scripts/measure_motion.py writes")
         chosen = config.psd_scale * np.array([known.get(name, tuple(table.mean(axis=0))) for name in joints])
-        still, speed, lost = chosen.T
+        still, speed, lost = np.ascontiguousarray(chosen.T)
         return cls(still, speed, lost, views, body, config.around_s)

@@ -31,6 +31,8 @@ from shapepose_fg.estimation.motion_model import Lasting, MotionModel
 
 _OF_VIEWS, _OF_BODY = 0, 1
 """Sources of messages about joints, for the keys of their offsets."""
+UNDETERMINED_M = 10.0
+"""A variable that the problem leaves less certain than this, metres or m/s, is not determined."""
 
 
 @dataclass(frozen=True)
@@ -158,6 +160,18 @@ class WindowGraph:
         return len(self.frames)
 
     @property
+    def states(self) -> NDArray[np.int64]:
+        """(T, J, 4) keys of all that belongs to a joint in a frame: position, velocity, offset of the views and
+        offset of the body; not all of them are in every problem.
+        """
+        return np.stack([self.keys, self.velocity_keys, *self._offset_keys], axis=-1)
+
+    @property
+    def present(self) -> NDArray[np.bool_]:
+        """(T, J) which joints were in the last problem."""
+        return self._present
+
+    @property
     def temporal(self) -> bool:
         """Whether there is more than one frame: then joints have velocities and motion factors."""
         return len(self) > 1
@@ -219,7 +233,7 @@ class WindowGraph:
         of_body = of_views
         if self.temporal and lost is not None:
             of_body = self._present & (self.with_offsets | near_in_time(lost, self.times_s, self._motion.around_s))
-        self.values = self._start(initial, np.stack([of_views, of_body]))
+        self.values = self._start(initial, np.stack([spanned(of_views), spanned(of_body)]))
         self.graph = gtsam.NonlinearFactorGraph()
         self._push(self._seen(inlier & (self._present & ~of_views)[..., None]))
         self._push(self._priors(body, self._present & ~of_body))
@@ -282,7 +296,7 @@ class WindowGraph:
                 result[n] = found.marginalCovariance(key)
         except RuntimeError:
             return np.full((count, 3, 3), np.nan)
-        lost = ~(np.trace(result, axis1=1, axis2=2) < 10.0**2)
+        lost = ~(np.trace(result, axis1=1, axis2=2) < UNDETERMINED_M**2)
         result[lost] = np.nan
         return result
 
@@ -323,8 +337,10 @@ class WindowGraph:
         known, keys = said.known & chosen, self._offset_keys[source]
         roots = symmetric_roots(said.information[known] / scale)
         factors = lasting_prior_factors(self.keys[known], keys[known], said.xyz[known], roots, errors.white_share)
-        for joint in np.flatnonzero(chosen.any(axis=0)).tolist():
-            there = chosen[:, joint]
+        # An offset in every frame between two, so that a joint's states are a chain (`state_covariances`).
+        chain = spanned(chosen)
+        for joint in np.flatnonzero(chain.any(axis=0)).tolist():
+            there = chain[:, joint]
             factors += offset_factors(keys[there, joint], self.times_s[there], errors.correlation_s)
         return factors
 
@@ -391,6 +407,11 @@ def near_in_time(marked: NDArray[np.bool_], times_s: NDArray[np.float64], within
     last = np.searchsorted(times_s, times_s + within_s, side="right")
     count = np.concatenate([np.zeros((1, marked.shape[1]), dtype=int), np.cumsum(marked, axis=0)])
     return count[last] > count[first]
+
+
+def spanned(marked: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(T, J) which frames lie between the first and the last that are `marked` (T, J), these two included."""
+    return np.maximum.accumulate(marked, axis=0) & np.maximum.accumulate(marked[::-1], axis=0)[::-1]
 
 
 def symmetric_roots(information: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -40,7 +40,7 @@ STAGES = (
 PARTS = {
     "graphs built": ("estimator.py", "_windows"),
     "graphs solved": ("alternation.py", "_solve"),
-    "covariances": ("window_graph.py", "marginals"),
+    "covariances": ("state_covariances.py", "state_covariances"),
     "gates and weights": ("linearisation.py", "linearise"),
 }
 """Parts of stage II beside the body fits, and the function whose time is taken for each."""
@@ -143,11 +143,16 @@ class BackAndForth:
         return self.sequence[place if turn % 2 == 0 else count - 1 - place]
 
 
-def spend(recording: DetectionSequence, rig: Rig, config: PipelineConfig, frames: range) -> Spent:
-    """Reconstruct, and look at the clocks before and after; loading the body counts for nothing."""
+def spend(
+    recording: DetectionSequence, rig: Rig, config: PipelineConfig, frames: range, workers: int = 1
+) -> Spent:
+    """Reconstruct, and look at the clocks before and after; loading the body counts for nothing.
+
+    With several `workers` the fitter's own time is not known: it passes in other processes.
+    """
     fitter = TimedFitter(make_fitter(config.body, BodyModel.default().with_keypoints(recording.skeleton.joints)))
     before, start = os.times(), time.perf_counter()
-    people = reconstruct(recording, rig, config, frames=frames, fitter=fitter)
+    people = reconstruct(recording, rig, config, frames=frames, fitter=fitter, workers=workers)
     wall_s, after = time.perf_counter() - start, os.times()
     seconds = dict(people.run["seconds"])
     return Spent(

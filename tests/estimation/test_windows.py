@@ -12,14 +12,15 @@ from shapepose_fg.errors import InputError
 from shapepose_fg.estimation.alternation import EstimatorConfig, RefineConfig, interpolated
 from shapepose_fg.estimation.estimator import Estimates, Estimator, window_rows
 from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
-from shapepose_fg.estimation.window_graph import near_in_time
+from shapepose_fg.estimation.state_covariances import Chains, state_covariances
+from shapepose_fg.estimation.window_graph import WindowGraph, near_in_time
 from shapepose_fg.observations import Observations
 from shapepose_fg.reconstruction import Known, Status
 from shapepose_fg.skeleton import BODY_25
 
 FPS = 25.0
 FRAMES = 30
-WRIST, OTHER_WRIST = BODY_25.index("RWrist"), BODY_25.index("LWrist")
+WRIST, OTHER_WRIST, NOSE = (BODY_25.index(name) for name in ("RWrist", "LWrist", "Nose"))
 
 
 class BesideFitter:
@@ -282,3 +283,73 @@ def test_the_motion_model_is_read_by_name_and_checked(tmp_path):
         MotionConfig(psd_scale=0.0)
     with pytest.raises(ValueError, match="window_alternations must be positive"):
         RefineConfig(window_alternations=0)
+
+
+def nothing(window, keys):
+    return ()
+
+
+def steady(window, keys):
+    for before, after in zip(keys[:-1, WRIST].tolist(), keys[1:, WRIST].tolist(), strict=True):
+        yield gtsam.BetweenFactorPoint3(before, after, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 0.01))
+
+
+def far_apart(window, keys):
+    yield gtsam.BetweenFactorPoint3(
+        int(keys[0, WRIST]), int(keys[-1, WRIST]), np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 0.01)
+    )
+
+
+@pytest.mark.parametrize(
+    ("factors", "calls"),
+    [(nothing, 0), (steady, 0), (box, 2), (far_apart, 2)],
+    ids=["no factors", "a chain", "two joints tied", "frames far apart tied"],
+)
+def test_chains_have_the_covariances_of_gtsam(walk, five_cameras, two_people, monkeypatch, factors, calls):
+    """A wrist lost twice, frames missing, one person in fewer frames, a joint that no view sees: the same numbers,
+    to rounding. GTSAM is asked, once for positions and once for velocities, only where factors make no chain."""
+    observations, _ = walk
+    gone = (observations.track == 1) & (observations.frame > 20) | np.isin(observations.frame, [7, 8])
+    observations = observations.rows(np.flatnonzero(~gone))
+    lost = np.isin(observations.frame, [4, 5, 24]) & (observations.track == 0)
+    observations = hidden(hidden(observations, np.flatnonzero(lost), WRIST), slice(None), NOSE)
+    graphs = list[WindowGraph]()
+
+    def captured(window, keys):
+        graphs.append(window)
+        yield from factors(window, keys) if window.track == 0 else ()
+
+    beside = BesideFitter(two_people[0], (0.0, 0.05, 0.0))
+    solve(observations, five_cameras, beside, captured, around_s=0.1)
+    expected = [(graph.marginals(graph.keys), graph.marginals(graph.velocity_keys)) for graph in graphs]
+    asked = list[int]()
+    whole = WindowGraph.marginals
+    monkeypatch.setattr(WindowGraph, "marginals", lambda self, keys: (asked.append(1), whole(self, keys))[1])
+    found = state_covariances(graphs)
+    assert [len(graph) for graph in graphs] == [28, 19] and len(asked) == calls
+    for (positions, velocities), (of_positions, of_velocities) in zip(found, expected, strict=True):
+        assert np.isfinite(positions[:, WRIST]).all()
+        # Of variances of 1e-4 m² and 1e-2 m²/s².
+        np.testing.assert_allclose(positions, of_positions, rtol=1e-6, atol=1e-11)
+        np.testing.assert_allclose(velocities, of_velocities, rtol=1e-6, atol=1e-9)
+
+
+def test_what_nothing_determines_raises():
+    """A chain whose last state hangs on nothing."""
+    diagonal = np.tile(np.eye(3), (1, 3, 1, 1))
+    diagonal[0, 2] = 0.0
+    with pytest.raises(np.linalg.LinAlgError):
+        Chains(diagonal, np.zeros((1, 2, 3, 3))).covariances()
+
+
+def test_a_chain_is_the_inverse_of_its_matrix():
+    """Seven states of four numbers against the dense inverse."""
+    rng = np.random.default_rng(0)
+    A = rng.normal(size=(2, 60, 28))
+    band = np.abs(np.arange(28)[:, None] // 4 - np.arange(28) // 4) <= 1
+    H = A.swapaxes(1, 2) @ A * band + 40 * np.eye(28)
+    blocks = H.reshape(2, 7, 4, 7, 4).swapaxes(2, 3)
+    steps = np.arange(7)
+    found = Chains(blocks[:, steps, steps], blocks[:, steps[1:], steps[:-1]]).covariances()
+    dense = np.linalg.inv(H).reshape(2, 7, 4, 7, 4).swapaxes(2, 3)
+    np.testing.assert_allclose(found, dense[:, steps, steps], rtol=1e-9, atol=1e-12)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from shapepose_fg.simulation import DetectorConfig, Scene, built_in_scene, simulate
-from shapepose_fg.simulation.lookout import _AHEAD, Lookout, People, _what_workers_inherit, suitable_workers
+from shapepose_fg.simulation.lookout import AHEAD, Lookout, People
 from shapepose_fg.simulation.visibility import Skin
 
 CONFIG = DetectorConfig().visibility
@@ -71,7 +71,7 @@ def test_frames_are_taken_as_they_are_needed_and_closing_ends_the_processes(
         first, second = next(seen), next(seen)
         assert len(multiprocessing.active_children()) == 2
         assert same_bytes(first, lookout.look(people[1])) and same_bytes(second, lookout.look(people[2]))
-        assert len(taken) == 2 * _AHEAD + 1
+        assert len(taken) == 2 * AHEAD + 1
     assert multiprocessing.active_children() == []
 
 
@@ -96,21 +96,6 @@ def test_no_workers_are_refused(lookout: Lookout, scene: Scene, workers: int):
         list(lookout.watch([], workers))
     with pytest.raises(ValueError, match="workers must be 1"):
         simulate(scene, workers=workers)
-
-
-def test_workers_pay_for_long_recordings_only(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(8), raising=False)
-    assert [suitable_workers(frames) for frames in (0, 1, 60, 300, 3000)] == [1, 1, 1, 3, 8]
-
-
-def test_what_workers_inherit_is_put_back(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv("OMP_NUM_THREADS", "7")
-    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
-    with _what_workers_inherit():
-        assert os.environ["OMP_NUM_THREADS"] == os.environ["OPENBLAS_NUM_THREADS"] == "1"
-        assert signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])
-    assert os.environ["OMP_NUM_THREADS"] == "7" and "OPENBLAS_NUM_THREADS" not in os.environ
-    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
 
 
 INTERRUPTED = """

@@ -1,0 +1,124 @@
+"""Covariances of all joints of solved windows at once: each joint is a chain of states, and chains go together.
+
+GTSAM's `Marginals` gives the same numbers for any graph, one variable a call (`WindowGraph.marginals`), at four
+times the cost. It is asked for frames that stand alone, and where a factor of the user's own ties joints, or
+frames that do not follow each other.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from shapepose_fg.estimation.window_graph import UNDETERMINED_M, WindowGraph
+
+
+@dataclass(frozen=True)
+class Chains:
+    """The information of C chains of T states with n numbers each; the states of a chain hang on their neighbours
+    only.
+    """
+
+    diagonal: NDArray[np.float64]
+    """(C, T, n, n) of each state with itself."""
+    below: NDArray[np.float64]
+    """(C, T - 1, n, n) of each state, rows, with the one before it, columns."""
+
+    def covariances(self) -> NDArray[np.float64]:
+        """(C, T, n, n) marginal covariance of each state; LinAlgError where a chain is not determined.
+
+        Block Cholesky down the chains, and the blocks on the diagonal of the inverse on the way back, for all
+        chains together.
+        """
+        steps = self.diagonal.shape[1]
+        inverse, gain = np.empty_like(self.diagonal), np.empty_like(self.below)
+        for t in range(steps):
+            pivot = self.diagonal[:, t]
+            if t > 0:
+                gain[:, t - 1] = inverse[:, t - 1] @ self.below[:, t - 1].swapaxes(1, 2)
+                pivot = pivot - self.below[:, t - 1] @ gain[:, t - 1]
+            root = np.linalg.inv(np.linalg.cholesky((pivot + pivot.swapaxes(1, 2)) / 2))
+            inverse[:, t] = root.swapaxes(1, 2) @ root
+        for t in range(steps - 2, -1, -1):
+            inverse[:, t] += gain[:, t] @ inverse[:, t + 1] @ gain[:, t].swapaxes(1, 2)
+        return inverse
+
+
+def state_covariances(
+    graphs: Sequence[WindowGraph],
+) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """For each solved graph of T frames the covariances (T, J, 3, 3) of positions, m², and of velocities, m²/s².
+
+    NaN where a variable is not in the problem, and where the problem leaves it undetermined.
+    """
+    result: list[tuple[NDArray[np.float64], NDArray[np.float64]] | None] = [None] * len(graphs)
+    alike: dict[tuple[int, int], list[tuple[int, Chains]]] = {}
+    for n, graph in enumerate(graphs):
+        chains = _chains(graph) if graph.temporal and not graph.failure else None
+        if chains is not None:
+            alike.setdefault(chains.diagonal.shape[1::2], []).append((n, chains))
+    for members in alike.values():
+        together = Chains(
+            *(np.concatenate(parts) for parts in zip(*(_arrays(c) for _, c in members), strict=True))
+        )
+        try:
+            found = np.split(together.covariances(), len(members))
+        except np.linalg.LinAlgError:
+            continue
+        for (n, _), covariance in zip(members, found, strict=True):
+            result[n] = _of_present(graphs[n], covariance.swapaxes(0, 1))
+    return [
+        (graph.marginals(graph.keys), graph.marginals(graph.velocity_keys)) if each is None else each
+        for graph, each in zip(graphs, result, strict=True)
+    ]
+
+
+def _arrays(chains: Chains) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    return chains.diagonal, chains.below
+
+
+def _chains(graph: WindowGraph) -> Chains | None:
+    """The linearised problem of a graph, joint by joint; None where it is more than a chain of each joint."""
+    states = graph.states
+    T, J, S = states.shape
+    present = np.array([graph.values.exists(key) for key in states.ravel().tolist()], dtype=bool).reshape(T, J, S)
+    if not present.any():
+        return None
+    used = np.flatnonzero(present.any(axis=(0, 1)))
+    states, present = states[..., used], present[..., used]
+    n = 3 * len(used)
+    # GTSAM's columns: variables in the order of their keys, three numbers each, and the right-hand side.
+    order = np.argsort(states[present])
+    frame, joint, part = (index[order] for index in np.nonzero(present))
+    row, column, value = graph.graph.linearize(graph.values).sparseJacobian_()
+    inside = column <= 3 * len(order)
+    shape = (int(row.max()), 3 * len(order))
+    A = scipy.sparse.csr_array((value[inside], (row[inside] - 1, column[inside] - 1)), shape=shape)
+    H = (A.T @ A).tocoo()
+    (first, at), (second, other) = (np.divmod(index, 3) for index in H.coords)
+    step = frame[first] - frame[second]
+    if np.any(joint[first] != joint[second]) or np.any(np.abs(step) > 1):
+        return None
+    at, other = at + 3 * part[first], other + 3 * part[second]
+    diagonal, below = np.zeros((J, T, n, n)), np.zeros((J, T - 1, n, n))
+    here, after = step == 0, step == 1
+    diagonal[joint[first[here]], frame[first[here]], at[here], other[here]] = H.data[here]
+    below[joint[first[after]], frame[second[after]], at[after], other[after]] = H.data[after]
+    absent = np.repeat(~present, 3, axis=2).swapaxes(0, 1)
+    diagonal[absent[..., None] & np.eye(n, dtype=bool)] = 1.0
+    return Chains(diagonal, below)
+
+
+def _of_present(
+    graph: WindowGraph, covariance: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Positions' and velocities' (T, J, 3, 3) from those of the states (T, J, n, n)."""
+    placed = graph.present
+    position, velocity = (np.full((*placed.shape, 3, 3), np.nan) for _ in range(2))
+    for result, first in ((position, 0), (velocity, 3)):
+        part = covariance[..., first : first + 3, first : first + 3]
+        determined = placed & (np.trace(part, axis1=2, axis2=3) < UNDETERMINED_M**2)
+        result[determined] = part[determined]
+    return position, velocity

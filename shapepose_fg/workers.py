@@ -1,0 +1,143 @@
+"""Worker processes: the same work for many items, here or side by side, in order, with the same result."""
+
+import os
+import pickle
+import signal
+import sys
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing import get_context, parent_process
+from typing import Any, Generic, TypeVar
+
+Shared = TypeVar("Shared")
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+class Workers(Generic[Shared]):
+    """So many processes, each of which has `shared`; a count of 1 is none but this one.
+
+    A context: the processes start when it is entered and end when it is left, whatever happens in between.
+    """
+
+    def __init__(self, count: int, shared: Shared, ahead: int = 2) -> None:
+        """`ahead` items a worker are under way, so that none waits and memory stays bounded.
+
+        ValueError for a count under 1, and for something shared that cannot be sent to another process.
+        """
+        if count < 1:
+            raise ValueError(f"workers must be 1 (no further process) or more, got {count}")
+        self.count = count
+        self._shared = shared
+        self._ahead = ahead
+        self._pool: ProcessPoolExecutor | None = None
+
+    def __enter__(self) -> "Workers[Shared]":
+        if self.count > 1:
+            try:
+                content = pickle.dumps(self._shared)
+            except (pickle.PicklingError, AttributeError, TypeError) as error:
+                raise ValueError(
+                    f"this cannot be sent to worker processes ({error}): define functions and classes of your own"
+                    " at the top of a module, or use workers=1"
+                ) from error
+            spawn = get_context("spawn")
+            self._pool = ProcessPoolExecutor(self.count, spawn, initializer=_begin, initargs=(content,))
+            with _what_workers_inherit():
+                for _ in range(self.count):  # the pool starts a process for each of its first jobs
+                    self._pool.submit(_nothing)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+            self._pool = None
+
+    def map(self, work: Callable[[Shared, Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+        """`work(shared, item)` for each item, in order; `items` are taken as they are needed.
+
+        RuntimeError where a process dies.
+        """
+        if self._pool is None:
+            yield from (work(self._shared, item) for item in items)
+            return
+        waiting: deque[Future[Result]] = deque()
+        try:
+            for item in items:
+                waiting.append(self._pool.submit(_work, work, item))
+                if len(waiting) >= self._ahead * self.count:
+                    yield waiting.popleft().result()
+            while len(waiting) > 0:
+                yield waiting.popleft().result()
+        except BrokenProcessPool as error:
+            raise RuntimeError(
+                "a worker process ended before its work: there may be too little memory for so many; in a script,"
+                " call what takes `workers` below `if __name__ == '__main__':`"
+            ) from error
+
+
+def suitable_workers(items: int, worth: int) -> int:
+    """One for each core that this process may use, but no more than pay: `worth` items each."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, min(cores, items // worth))
+
+
+@contextmanager
+def _what_workers_inherit() -> Iterator[None]:
+    """Processes that start now have one thread each for linear algebra, and are deaf to ctrl-C.
+
+    The terminal sends it to all of them; it is this process that ends them.
+    """
+    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
+    can_block = hasattr(signal, "pthread_sigmask")
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if can_block else set()
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+        if can_block:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+
+
+_shared: Any = None
+"""In a worker process: what all its work shares."""
+
+
+def _begin(content: bytes) -> None:
+    """What a worker does first."""
+    global _shared
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    _shared = pickle.loads(content)  # made by this program a moment ago
+    if "cv2" in sys.modules:
+        sys.modules["cv2"].setNumThreads(1)
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(1)
+
+
+def _end_with_parent() -> None:
+    """End this process when the one that started it has been killed: nobody else would."""
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _work(work: Callable[[Any, Item], Result], item: Item) -> Result:
+    """One item, in a worker."""
+    return work(_shared, item)
+
+
+def _nothing() -> None:
+    """The job that starts a worker."""

@@ -1,0 +1,52 @@
+"""Worker processes: work in order, errors that come through, and nobody who waits for ever."""
+
+import os
+import signal
+
+import pytest
+
+from shapepose_fg.workers import Workers, _what_workers_inherit, suitable_workers
+
+
+def times(shared: int, item: int) -> int:
+    if item == 13:
+        raise ValueError("thirteen")
+    return shared * item
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_results_come_in_order_wherever_they_are_made(count):
+    with Workers(count, 10) as workers:
+        assert list(workers.map(times, range(12))) == list(range(0, 120, 10))
+        assert list(workers.map(times, [])) == []
+        with pytest.raises(ValueError, match="thirteen"):
+            list(workers.map(times, [1, 13]))
+        assert list(workers.map(times, [5])) == [50], "an error ends no worker"
+
+
+def test_what_cannot_be_sent_is_said_before_anything_starts():
+    with pytest.raises(ValueError, match="at the top of a module, or use workers=1"), Workers(2, lambda: None):
+        pass
+    with Workers(1, lambda: None) as here:
+        assert list(here.map(lambda _, item: item, [1])) == [1]
+
+
+@pytest.mark.parametrize("count", [0, -1])
+def test_no_workers_are_refused(count):
+    with pytest.raises(ValueError, match="workers must be 1"):
+        Workers(count, None)
+
+
+def test_workers_pay_for_much_work_only(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(8), raising=False)
+    assert [suitable_workers(items, 100) for items in (0, 1, 60, 300, 3000)] == [1, 1, 1, 3, 8]
+
+
+def test_what_workers_inherit_is_put_back(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    with _what_workers_inherit():
+        assert os.environ["OMP_NUM_THREADS"] == os.environ["OPENBLAS_NUM_THREADS"] == "1"
+        assert signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+    assert os.environ["OMP_NUM_THREADS"] == "7" and "OPENBLAS_NUM_THREADS" not in os.environ
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
