@@ -23,11 +23,12 @@ _UNFIT = 0.15
 """A camera that fits the others' people no better, and nothing explains it, does not fit."""
 MIN_SIGHTINGS = 20
 """With fewer people seen, nothing is said of a camera."""
-_OFF_DEG, _OFF_ROLL_DEG, _OFF_FOCAL = 0.45, 0.6, 0.04
-"""Small errors that are named: sideways or up, about the axis, and of the focal length. In simulated recordings
-without any they stay below (docs/setup_checks.md)."""
-_SIGMAS = 2.2
-"""A roll and a focal length must be so many times what people leave open."""
+_OFF_DEG, _OFF_FOCAL = 0.45, 0.04
+"""Turns and focal lengths that are named where people tell them surely. In simulated recordings without any error
+few come out larger (docs/setup_checks.md)."""
+_SURE, _SIGMAS = 1.2, 2.2
+"""How many sigmas make sure of a turn (the sparse prior shrinks it; a roll needs twice as many: a detector's errors
+left and right of a body look like one), and of a focal length."""
 _MOST_COST = 0.86
 """Small errors that leave more than this of the residuals' cost are the detector's."""
 _OUTLIER_DEG, _OUTLIER_RATIO = 0.8, 1.5
@@ -38,6 +39,8 @@ _POSE_GAIN = 0.04
 errors of all cameras do."""
 _SINGLE = 0.7
 """One camera is said to be turned where it alone explains so much of what small errors of all cameras explain."""
+_TURN_DEG = 0.6
+"""Less is said of the principal point: of a calibration, and not of a camera that was knocked."""
 _LAG_ROUNDS, _LAG_NEAR = 6, 8
 _PLAIN_TURN_DEG = 3.0
 """A camera that is turned by more is called turned, wherever it is."""
@@ -188,8 +191,9 @@ def _small_findings(look: Look, small: SmallErrors, known: set[int]) -> list[Fin
             return []
         if focal[view]:
             return [Finding(Kind.FOCAL, (view,), float(1 / small.focal[view]))]
+        found = _turned(small, view)
         if pose.view == view and 1 - pose.cost > _SINGLE * (1 - small.cost):
-            return [_turned(small, view)]
+            return [found if found.amount > _TURN_DEG else replace(found, kind=Kind.PRINCIPAL_POINT)]
     if shifted.cost > _MOST_COST:
         return []
     shift = np.where(_known(known, look), 0.0, shifted.shift_deg)
@@ -208,10 +212,12 @@ def _small_findings(look: Look, small: SmallErrors, known: set[int]) -> list[Fin
 
 def _off(small: SmallErrors, shifted: SmallErrors) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """(V,) whether each camera is turned, and whether its focal length is wrong, beyond what people can tell."""
-    roll = (np.abs(small.roll_deg) > _OFF_ROLL_DEG) & (np.abs(small.roll_deg) > _SIGMAS * small.roll_sigma_deg)
-    shift = (small.shift_deg > _OFF_DEG) & (shifted.cost < _MOST_COST)
+    roll = np.abs(small.roll_deg)
+    sure = np.hypot(small.shift_deg / small.shift_sigma_deg, roll / (2 * small.roll_sigma_deg)) > _SURE
+    turned = (np.hypot(small.shift_deg, roll) > _OFF_DEG) & sure
+    turned |= (small.shift_deg > _OFF_DEG) & (shifted.cost < _MOST_COST)
     log = np.abs(np.log(small.focal))
-    return roll | shift, (log > _OFF_FOCAL) & (log > _SIGMAS * small.focal_sigma)
+    return turned, (log > _OFF_FOCAL) & (log > _SIGMAS * small.focal_sigma)
 
 
 def _known(known: set[int], look: Look) -> NDArray[np.bool_]:

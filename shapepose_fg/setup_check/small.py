@@ -41,8 +41,10 @@ class SmallErrors:
     """The cameras after the changes."""
     shift_deg: Array
     """(V,) the shift of the principal point as a turn of the camera."""
+    shift_sigma_deg: Array
+    """(V,) how far the shift is known, all other small errors being free."""
     roll_sigma_deg: Array
-    """(V,) how far the roll is known, all other small errors being free."""
+    """(V,) the same of the roll."""
     focal_sigma: Array
     """(V,) the same of the focal length, as a part of it."""
     median_px: tuple[Array, Array]
@@ -73,7 +75,7 @@ def small_errors(look: Look, parts: Parts = ALL) -> SmallErrors:
     total = np.zeros(len(views) * Q)
     structure = first = triangulate(*seen, views, 5)
     normal = normal_equations(structure, views)
-    roll_sigma, focal_sigma = _sigmas(normal, len(views))
+    roll_sigma, shift_sigma, focal_sigma = _sigmas(normal, len(views))
     for number in range(_ROUNDS):
         normal = normal if number == 0 else normal_equations(structure, views)
         step_taken = _sparse_step(normal, structure, total, parts)
@@ -90,6 +92,7 @@ def small_errors(look: Look, parts: Parts = ALL) -> SmallErrors:
         np.exp(change[:, 8]),
         views,
         shift,
+        np.rad2deg(shift_sigma / views.focal_px),
         np.rad2deg(roll_sigma),
         focal_sigma,
         medians,
@@ -97,13 +100,13 @@ def small_errors(look: Look, parts: Parts = ALL) -> SmallErrors:
     )
 
 
-def _sigmas(normal: Normal, views: int) -> tuple[Array, Array]:
-    """(V,) sigma of each camera's roll, radians, and of the logarithm of its focal length."""
+def _sigmas(normal: Normal, views: int) -> tuple[Array, Array, Array]:
+    """(V,) sigma of each camera's roll, radians, of its shift, pixels, and of the logarithm of its focal length."""
     columns = np.array([view * Q + c for view in range(views) for c in (2, *CENTRE, 8)])
     prior = np.tile([np.deg2rad(1.0), 20.0, 20.0, 0.03], views) ** -2.0
     H = _PRIOR * normal.H[np.ix_(columns, columns)] + np.diag(prior)
     sigma = np.sqrt(np.diag(np.linalg.inv(H))).reshape(views, 4)
-    return sigma[:, 0], sigma[:, 3]
+    return sigma[:, 0], np.hypot(sigma[:, 1], sigma[:, 2]), sigma[:, 3]
 
 
 def other_pose(look: Look) -> OtherPose:
