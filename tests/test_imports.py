@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 LEVELS = (
     "factors errors",
     "camera skeleton",
-    "files provenance rendering run_summary columns workers body.threads",
+    "files provenance rendering run_summary columns workers body.threads options terminal",
     "body.model",
     "body.fitting body.shapes",
     "body.offsets",
@@ -28,10 +28,11 @@ LEVELS = (
     "windows bodies_over_time solved_rows",
     "pipeline",
     "io solving",
-    "simulation viewer",
+    "simulation viewer detection2d",
+    "overlay",
     "training",
     "evaluation",
-    "demo tracks_command",
+    "demo tracks_command detect_command overlay_command",
     "cli",
 )
 """Each level imports only from those before it; a package may import its own modules too."""
