@@ -14,11 +14,13 @@ import typer
 
 from shapepose_fg.detect_command import detect
 from shapepose_fg.errors import InputError
+from shapepose_fg.export_command import export
 from shapepose_fg.options import frame_range, image_size_of
 from shapepose_fg.overlay_command import overlay
 from shapepose_fg.terminal import note, show
 from shapepose_fg.terminal import progress as progress_bar
 from shapepose_fg.tracks_command import tracks
+from shapepose_fg.view_command import view
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -45,6 +47,8 @@ app.add_typer(evaluate, name="evaluate")
 app.add_typer(tracks, name="tracks")
 app.command()(detect)
 app.command()(overlay)
+app.command()(export)
+app.command()(view)
 
 _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
 """What typer raises for a wrong command line; older and newer versions keep the class in different places."""

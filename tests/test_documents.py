@@ -90,11 +90,14 @@ def wrists_apart(people: Reconstruction) -> float:
 def test_readme_in_the_shell(recording, tmp_path, capsys):
     lines = [line.split("  #")[0] for block in blocks(ROOT / "README.md", "bash") for line in block.splitlines()]
     commands = [line for line in lines if line.startswith("shapepose-fg") and "SMPL" not in line]
-    assert len(commands) == 1
-    with pytest.raises(SystemExit) as end:
-        main(shlex.split(commands[0])[1:])
-    assert end.value.code == 0
+    assert [command.split()[1] for command in commands] == ["reconstruct", "export"]
+    for command in commands:
+        with pytest.raises(SystemExit) as end:
+            main(shlex.split(command)[1:])
+        assert end.value.code == 0
     assert joint_metrics(Reconstruction.load(tmp_path / "results"), recording.keypoints).everyone_once
+    kinds = {path.suffix for path in (tmp_path / "results" / "export").iterdir()}
+    assert kinds == {".npz", ".trc", ".c3d", ".bvh", ".glb", ".csv"}
 
 
 def test_extending(tmp_path, monkeypatch):

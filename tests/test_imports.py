@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 LEVELS = (
     "factors errors",
     "camera skeleton",
-    "files provenance rendering run_summary columns workers body.threads options terminal",
+    "files provenance result_options rendering run_summary columns workers body.threads options terminal",
     "body.model",
     "body.fitting body.shapes",
     "body.offsets",
@@ -29,10 +29,10 @@ LEVELS = (
     "pipeline",
     "io solving",
     "simulation viewer detection2d",
-    "overlay",
-    "training",
+    "overlay setup_check",
+    "training export",
     "evaluation",
-    "demo tracks_command detect_command overlay_command",
+    "demo tracks_command detect_command overlay_command export_command view_command setup_command",
     "cli",
 )
 """Each level imports only from those before it; a package may import its own modules too."""

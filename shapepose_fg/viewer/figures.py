@@ -11,14 +11,13 @@ from shapepose_fg.reconstruction import Reconstruction, Status
 from shapepose_fg.rendering import look_at, render_depth, zoom
 from shapepose_fg.skeleton import BODY_25
 from shapepose_fg.viewer.floor import Floor
+from shapepose_fg.viewer.palette import PALETTE, rgb
 
 if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel
 
 Array = NDArray[np.float64]
 
-PALETTE = ("#3f7fb8", "#e0962f", "#2f9e80", "#c06c9c", "#6cb6dd", "#c8623f", "#7d70b8", "#a8a03c")
-"""One colour per person, after Okabe and Ito's: apart for every kind of colour vision."""
 _SOLE_M = 0.015
 """How far the lowest keypoint of a foot is above its sole, metres."""
 _CLAY = np.array([0.74, 0.74, 0.75])
@@ -68,7 +67,7 @@ class Figures:
     def of(cls, people: Reconstruction, body: "BodyModel") -> "Figures":
         """The rows of one frame, coloured in the order of their identities."""
         people = people.rows(np.argsort(people.person, kind="stable"))
-        colours = np.array([_rgb(PALETTE[index % len(PALETTE)]) for index in range(len(people))]).reshape(-1, 3)
+        colours = np.array([rgb(PALETTE[index % len(PALETTE)]) for index in range(len(people))]).reshape(-1, 3)
         names = ("betas", "global_orient", "body_pose", "transl")
         has_body = people.status == str(Status.OK)
         for name in names:
@@ -165,8 +164,3 @@ def free_viewpoint(rig: Rig, points: Array, floor: Floor, size: tuple[int, int])
     middle = np.array(size) / 2 - focal * (low + high) / 2
     K = np.array([[focal, 0.0, middle[0]], [0.0, focal, middle[1]], [0.0, 0.0, 1.0]])
     return Camera("free", K, pose, size)
-
-
-def _rgb(text: str) -> tuple[float, float, float]:
-    red, green, blue = (int(text[at : at + 2], 16) / 255 for at in (1, 3, 5))
-    return red, green, blue

@@ -1,0 +1,49 @@
+"""A result written in several formats."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from shapepose_fg.camera import Axis
+from shapepose_fg.errors import InputError
+from shapepose_fg.export.job import Job, Written
+from shapepose_fg.export.markers import MarkerSet
+from shapepose_fg.export.reading import body_file, read_take
+from shapepose_fg.export.registry import Format
+
+
+def export_result(
+    results: Path,
+    formats: Sequence[Format],
+    folder: Path,
+    *,
+    up: Axis | None = None,
+    fps: float | None = None,
+    seen_only: bool = False,
+    frames: range | None = None,
+    persons: tuple[int, ...] | None = None,
+    markers: MarkerSet = MarkerSet.OPENSIM,
+    fill_gaps_s: float = 0.2,
+    body: Path | None = None,
+) -> dict[str, Written]:
+    """What was written of each format into `folder`, by its name; InputError where a result does not allow it.
+
+    The options are those of `read_take` and `Job`; `body` is where the body model's file is now. Files that are
+    there already are replaced. A format of which no file came out is an InputError too.
+    """
+    identities = any(each.identities for each in formats)
+    take = read_take(
+        results,
+        up=up,
+        fps=fps,
+        seen_only=seen_only,
+        frames=frames,
+        persons=persons,
+        identities=identities,
+    )
+    job = Job(take, folder, body_file(take, body), markers, fill_gaps_s)
+    done = {}
+    for each in formats:
+        done[each.name] = each.write(job)
+        if len(done[each.name].files) == 0:
+            raise InputError(f"{results}: {'; '.join(done[each.name].notes)}; leave out {each.name}")
+    return done

@@ -1,0 +1,78 @@
+"""A saved result as what is exported: with its cameras, its up axis and its body model."""
+
+from pathlib import Path
+
+import numpy as np
+
+from shapepose_fg.camera import Axis, Rig
+from shapepose_fg.errors import InputError
+from shapepose_fg.export.take import Take
+from shapepose_fg.io.calibration import read_rig
+from shapepose_fg.io.solved_setup import CAMERAS
+from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.run_summary import covered_frames
+
+
+def read_result(path: Path) -> tuple[Path, Reconstruction]:
+    """The folder of a result, which may be given as its people.npz too, and what is in it."""
+    people = Reconstruction.load(path)
+    return (path if path.is_dir() else path.parent), people
+
+
+def read_take(
+    path: Path,
+    *,
+    up: Axis | None = None,
+    fps: float | None = None,
+    seen_only: bool = False,
+    frames: range | None = None,
+    persons: tuple[int, ...] | None = None,
+    identities: bool = True,
+) -> Take:
+    """What of the result at `path` is exported; InputError, one sentence, where it cannot be.
+
+    `up` is asked for where there is no cameras.json beside people.npz. `frames` and `persons` choose rows.
+    """
+    folder, people = read_result(path)
+    cameras = folder / CAMERAS
+    rig = read_rig(cameras) if cameras.is_file() else None
+    axis = _up(up, rig, cameras)
+    if persons is not None:
+        strangers = sorted(set(persons) - set(people.person.tolist()))
+        if strangers:
+            there = " ".join(map(str, np.unique(people.person).tolist()))
+            raise InputError(f"--person {strangers[0]}: {path} has no such person; it has {there}")
+        people = people.rows(np.isin(people.person, persons))
+    if frames is not None:
+        inside = (people.frame >= frames.start) & (people.frame < frames.stop)
+        people = people.rows(inside).with_run(frames=_covered(people, frames))
+    try:
+        return Take.of(people, axis, rig=rig, fps=fps, seen_only=seen_only, identities=identities)
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def _covered(people: Reconstruction, frames: range) -> list[list[int]]:
+    """The part of the frames that were reconstructed that lies in `frames`."""
+    spans = covered_frames(people.run) or []
+    cut = [[max(span.start, frames.start), min(span.stop, frames.stop)] for span in spans]
+    return [[start, stop] for start, stop in cut if start < stop]
+
+
+def body_file(take: Take, given: Path | None) -> Path | None:
+    """File of the body model that a result was made with, or the one `given`; None for the one that ships."""
+    named = take.people.run.get("body")
+    if given is not None or named is None:
+        return given
+    return Path(str(named))
+
+
+def _up(up: Axis | None, rig: Rig | None, cameras: Path) -> Axis:
+    """The axis of the world that points up, as the user or the cameras say it."""
+    if up is not None:
+        if up not in ("x", "-x", "y", "-y", "z", "-z"):
+            raise InputError(f"--up {up}: must be one of x -x y -y z -z")
+        return up
+    if rig is None:
+        raise InputError(f"{cameras}: it is not there to say which axis is up; give --up, such as --up z")
+    return rig.up

@@ -1,0 +1,61 @@
+"""The command `view`: a result in the rerun viewer."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, cast
+
+import typer
+
+from shapepose_fg.result_options import checked_fps, frame_range, say
+
+if TYPE_CHECKING:
+    from shapepose_fg.camera import Axis
+
+# Everything else is imported inside the command: `--help` must not wait for it.
+
+
+def view(
+    results: Annotated[Path, typer.Argument(metavar="RESULTS", help="Folder of a reconstruction.")],
+    frames: Annotated[
+        str | None, typer.Option(metavar="A:B", help="Frames A to B-1; either may be left out.")
+    ] = None,
+    person: Annotated[
+        list[int] | None, typer.Option(help="Only this person; may be given several times.", show_default=False)
+    ] = None,
+    seen_only: Annotated[
+        bool, typer.Option("--seen-only", help="Leave out joints that no view saw in that frame.")
+    ] = False,
+    fps: Annotated[float | None, typer.Option(help="Frames a second, in place of the result's own times.")] = None,
+    up: Annotated[
+        str | None, typer.Option(metavar="AXIS", help="Axis that points up, where cameras.json is not there.")
+    ] = None,
+    body: Annotated[
+        Path | None, typer.Option(help="The body model of the result, where its file has moved.")
+    ] = None,
+    connect: Annotated[
+        str | None,
+        typer.Option(
+            metavar="URL", help="A viewer that runs already: rerun+http://HOST:9876/proxy.", show_default=False
+        ),
+    ] = None,
+) -> None:
+    """Show a result in the rerun viewer: people, cameras, and what was used of what they saw, on a timeline."""
+    from shapepose_fg.export.job import Job
+    from shapepose_fg.export.reading import body_file, read_take
+    from shapepose_fg.export.rerun_scene import body_if_there, log_take, new_stream, open_viewer
+
+    take = read_take(
+        results,
+        up=cast("Axis | None", up),
+        fps=checked_fps(fps),
+        seen_only=seen_only,
+        frames=frame_range(frames),
+        persons=tuple(person) if person else None,
+        identities=False,
+    )
+    stream = new_stream()
+    open_viewer(stream, take, connect)
+    arrays, note = body_if_there(Job(take, results, body_file(take, body)))
+    if note is not None:
+        say(note)
+    log_take(stream, take, arrays)
+    stream.flush()

@@ -1,0 +1,157 @@
+"""`shapepose-fg export`: several formats in one call, and one sentence for what does not fit."""
+
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from shapepose_fg.cli import main
+from shapepose_fg.export.light_mesh import thinned
+from shapepose_fg.export.registry import FORMATS
+from shapepose_fg.export.rerun_people import bones_of
+from shapepose_fg.skeleton import BODY_25, COCO_17
+
+from .conftest import AWAY, FIRST, FRAMES
+
+
+def run(*arguments: object) -> int:
+    """Exit code of a command line."""
+    with pytest.raises(SystemExit) as caught:
+        main([str(word) for word in arguments])
+    return int(caught.value.code or 0)
+
+
+@pytest.fixture
+def copied(saved, tmp_path):
+    return shutil.copytree(saved, tmp_path / "results")
+
+
+def test_several_formats_in_one_call(copied, capsys):
+    assert run("export", copied, "trc", "csv", "trc", "amass") == 0
+    printed = capsys.readouterr()
+    files = [line.rsplit(os.sep, 1)[1] for line in printed.out.splitlines()]
+    assert files[:3] == ["person_3.trc", "person_7.trc", "joints.csv"] and len(files) == 6
+    assert sorted(path.name for path in (copied / "export").iterdir()) == sorted(files)
+    assert "note: amass: betas are those of the open body" in printed.err
+
+
+def test_options(copied, tmp_path, capsys):
+    options = "--person 3 --frames 104:110 --fps 50 --markers joints --seen-only".split()
+    assert run("export", copied / "people.npz", "trc", "--output", tmp_path / "elsewhere", *options) == 0
+    (path,) = (tmp_path / "elsewhere").iterdir()
+    lines = path.read_text().splitlines()
+    assert lines[2].split("\t")[:3] == ["50", "50", "6"]
+    assert "MidHip" in lines[3] and lines[5].startswith("104\t2.080000\t")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["fbx"], "format fbx: there is none of this name; there are amass trc c3d bvh glb csv rrd"),
+        (["trc", "--markers", "skin"], "--markers skin: must be one of opensim joints body"),
+        (["trc", "--frames", "9:3"], "--frames 9:3: must be A:B"),
+        (["trc", "--frames", "500:600"], "nobody was found, so there is nothing to export"),
+        (["trc", "--person", "4"], "has no such person; it has 3 7"),
+        (["trc", "--fps", "0"], "--fps 0: must be a number of frames a second"),
+        (["bvh", "--fill-gaps", "-1"], "--fill-gaps -1: must be seconds"),
+        (["glb", "--body", "gone.npz"], "gone.npz"),
+    ],
+)
+def test_what_does_not_fit_is_one_sentence(copied, capsys, words, message):
+    assert run("export", copied, *words) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+    assert not (copied / "export").exists()
+
+
+def test_results_that_are_missing_or_damaged(tmp_path, capsys):
+    assert run("export", tmp_path / "nowhere", "trc") == 2
+    assert "there is no such file" in capsys.readouterr().err
+    (tmp_path / "people.npz").write_bytes(b"PK\x03\x04 half a file")
+    assert run("export", tmp_path, "trc") == 2
+    assert "cannot be read as an .npz file" in capsys.readouterr().err
+
+
+def test_people_without_a_body_have_no_skeleton_to_export(result, copied, capsys):
+    bare = replace(result, **{name: getattr(result, name) * np.nan for name in ("betas", "transl")})
+    bare.save(copied)
+    assert run("export", copied, "bvh") == 2
+    assert "bvh: person 3 has no body in any frame" in capsys.readouterr().err
+    assert run("export", copied, "trc", "csv") == 0
+
+
+def test_frames_that_stand_alone_go_into_tables_only(result, copied, capsys):
+    replace(result, run=result.run | {"configuration": {"temporal": False}}).save(copied)
+    assert run("export", copied, "csv", "trc") == 2
+    assert "nobody can be followed; reconstruct with --temporal, or export csv or rrd" in capsys.readouterr().err
+    assert run("export", copied, "csv") == 0
+
+
+def test_help_names_every_format(capsys):
+    assert run("export", "--help") == 0
+    words = capsys.readouterr().out
+    assert all(name in words for name in FORMATS)
+
+
+def test_a_recording_for_rerun_read_back(copied, result, capfd):
+    rerun = pytest.importorskip("rerun")
+    assert run("export", copied, "rrd", "--frames", f"{FIRST}:{FIRST + FRAMES}") == 0
+    assert "WARN" not in capfd.readouterr().err
+    path = copied / "export" / "people.rrd"
+    chunks = [chunk for chunk in rerun.chunk.RrdReader(path).stream()]
+    paths = {chunk.entity_path for chunk in chunks}
+    assert {
+        f"/world/people/{who}/{part}" for who in (3, 7) for part in ("joints", "bones", "uncertainty", "body")
+    } < paths
+    assert {"/world/cameras/cam0", "/world/cameras/cam0/seen/not_used", "/plots/residual/cam0"} < paths
+    tables = [chunk.to_record_batch() for chunk in chunks if chunk.entity_path == "/world/people/7/joints"]
+    rows = [row for table in tables for row in table.to_pylist()]
+    frames = sorted(row["frame"] for row in rows)
+    assert frames == [frame for frame in range(FIRST, FIRST + FRAMES) if frame not in AWAY]
+    first = next(row for row in rows if row["frame"] == FIRST)
+    truly = result.rows((result.frame == FIRST) & (result.person == 7)).joints[0]
+    np.testing.assert_allclose(first["Points3D:positions"], truly, atol=1e-6)
+
+
+def test_bones_bridge_joints_that_a_detector_lacks():
+    without_neck = tuple(name for name in BODY_25.joints if name != "Neck")
+    pairs = {(without_neck[a], without_neck[b]) for a, b in bones_of(without_neck).tolist()}
+    assert ("MidHip", "RShoulder") in pairs and ("RShoulder", "RElbow") in pairs
+    assert len(bones_of(COCO_17.joints)) == len(COCO_17) - 1
+
+
+def test_a_thinned_skin_is_the_same_body(arrays):
+    kept, faces = thinned(arrays.template, arrays.faces)
+    assert len(kept) < 0.4 * len(arrays.template)
+    assert faces.max() == len(kept) - 1 and len(np.unique(kept)) == len(kept)
+
+    def area(vertices: np.ndarray, triangles: np.ndarray) -> float:
+        a, b, c = (vertices[triangles[:, k]] for k in range(3))
+        return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+
+    # Cells of 2 cm flatten fingers and ears, no more.
+    assert area(arrays.template[kept], faces) == pytest.approx(area(arrays.template, arrays.faces), rel=0.08)
+
+
+def test_view_without_a_viewer_is_one_sentence(copied, capfd):
+    pytest.importorskip("rerun")
+    assert run("view", copied, "--connect", "nonsense") == 2
+    assert "the rerun viewer cannot be reached at nonsense" in capfd.readouterr().err
+
+
+def test_view_without_rerun_names_the_command(copied, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    assert run("view", copied) == 2
+    assert 'rerun is not installed; pip install "shapepose-fg[view]"' in capsys.readouterr().err
+
+
+def test_commands_load_no_torch(copied):
+    call = f"main(['export', {str(copied)!r}, 'trc', 'bvh', 'glb'])"
+    code = f"import sys; from shapepose_fg.cli import main\ntry:\n    {call}\n"
+    code += "except SystemExit as end:\n    assert not end.code and 'torch' not in sys.modules"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
