@@ -17,6 +17,7 @@ from shapepose_fg.errors import InputError
 from shapepose_fg.export_command import export
 from shapepose_fg.options import frame_range, image_size_of
 from shapepose_fg.overlay_command import overlay
+from shapepose_fg.setup_command import check_calibration
 from shapepose_fg.terminal import note, show
 from shapepose_fg.terminal import progress as progress_bar
 from shapepose_fg.tracks_command import tracks
@@ -46,6 +47,7 @@ evaluate = typer.Typer(help="Score a reconstruction against an annotation.")
 app.add_typer(evaluate, name="evaluate")
 app.add_typer(tracks, name="tracks")
 app.command()(detect)
+app.command("check-calibration")(check_calibration)
 app.command()(overlay)
 app.command()(export)
 app.command()(view)

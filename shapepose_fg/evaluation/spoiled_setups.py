@@ -2,12 +2,11 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-
-from typing import get_args
 
 from shapepose_fg.camera import Axis, Camera, Rig
 from shapepose_fg.detections import Detections, DetectionSequence, Recording
@@ -47,9 +46,7 @@ def spoiled(detections: DetectionSequence, rig: Rig, seed: int = 0) -> Iterator[
     for view in everybody:
         for degrees in (1, 5, 30, 180):
             axis = rng.normal(size=3)
-            yield Spoiled(
-                f"turned {degrees}", detections, turned(rig, view, degrees, axis), Kind.TURNED, (view,)
-            )
+            yield Spoiled(f"turned {degrees}", detections, turned(rig, view, degrees, axis), Kind.TURNED, (view,))
         for frames in (6, 10, -8):
             late = delayed(detections, view, frames)
             yield Spoiled("late 6 to 10 frames", late, rig, Kind.LATE, (view,), frames)

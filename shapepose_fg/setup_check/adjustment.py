@@ -43,7 +43,7 @@ def derivatives(structure: Structure, views: Views) -> Array:
 
 
 def camera_derivatives(at: Array, K: Array) -> Array:
-    """(..., 2, Q) how a camera's parameters move the pixels of points `at` (..., 3) in its frame; NaN behind it."""
+    """(..., 2, Q) how a camera's parameters move the pixels of points `at` (..., 3) in its frame; NaN behind."""
     fx, fy = K[..., 0, 0], K[..., 1, 1]
     X, Y = at[..., 0], at[..., 1]
     Z = np.where(at[..., 2] > 0, at[..., 2], np.nan)

@@ -46,6 +46,7 @@ class Kind(StrEnum):
     UP = "up axis"
     NOBODY = "nobody"
     UNFIT = "does not fit"
+    PICTURE_SIZE = "size of the pictures"
 
 
 @dataclass(frozen=True)
@@ -99,9 +100,7 @@ def of_one(look: Look, view: int, rng: np.random.Generator) -> Iterator[Change]:
         score = match(others, seen, best).score
         turn, move = difference(camera.cTw, best.cTw)
         amount = turn if kind in (Kind.TURNED, Kind.MOVED) else float(best.K[0, 0] / camera.K[0, 0])
-        yield Change(
-            kind, (view,), look.setup.with_camera(view, best), score, max(len(columns), 1), amount, move
-        )
+        yield Change(kind, (view,), look.setup.with_camera(view, best), score, max(len(columns), 1), amount, move)
 
 
 def of_two(look: Look, first: int, second: int) -> Change | None:
@@ -164,4 +163,3 @@ def _best(
         if score > most:
             best, most = tried, score
     return best
-

@@ -13,7 +13,6 @@ from shapepose_fg.setup_check.evidence import Evidence, Look, Setup, gather
 from shapepose_fg.setup_check.people import Build, build_of
 from shapepose_fg.setup_check.search import Lag, gross_mistake, lag_of, lags, latest
 from shapepose_fg.setup_check.small import SHIFT, SmallErrors, other_pose, small_errors, with_small_errors
-from shapepose_fg.skeleton import Skeleton
 
 Array = NDArray[np.float64]
 
@@ -27,12 +26,12 @@ _OFF_DEG, _OFF_FOCAL = 0.45, 0.04
 """Turns and focal lengths that are named where people tell them surely. In simulated recordings without any error
 few come out larger (docs/setup_checks.md)."""
 _SURE, _SIGMAS = 1.2, 2.2
-"""How many sigmas make sure of a turn (the sparse prior shrinks it; a roll needs twice as many: a detector's errors
-left and right of a body look like one), and of a focal length."""
+"""How many sigmas make sure of a turn (the sparse prior shrinks it; a roll needs twice as many: a detector's
+errors left and right of a body look like one), and of a focal length."""
 _MOST_COST = 0.86
 """Small errors that leave more than this of the residuals' cost are the detector's."""
 _OUTLIER_DEG, _OUTLIER_RATIO = 0.8, 1.5
-"""Where several cameras have small errors, one that is off by so much, and by so many times the next, is turned."""
+"""Where several cameras have small errors, one that is off by so much, and so many times the next, is turned."""
 _NOTABLE_DEG = 0.25
 _POSE_GAIN = 0.04
 """Another pose of one camera, six numbers, is named where it leaves so much less of the residuals' cost than small
@@ -122,7 +121,7 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
 
 
 def _twice(look: Look, rig: Rig) -> tuple[list[Finding], Evidence]:
-    """Cameras that are listed twice, and what was seen without one of each two: that which fits the others less."""
+    """Cameras that are listed twice, and what was seen without one of each two, which fits the others less."""
     findings, evidence = list[Finding](), look.evidence
     gone: set[int] = set()
     for pair in duplicates(rig, evidence):

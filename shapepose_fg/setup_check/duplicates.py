@@ -13,7 +13,7 @@ _SAME_PX = 0.6
 """Detections of one picture, stored with a pixel's accuracy, lie no farther apart."""
 _SAME_SHARE = 0.8
 _SAME_PLACE, _SAME_ANGLE_DEG = 0.002, 0.05
-"""Poses that differ by less, of the cameras' mean distance and in degrees, are one: no stand is put up so exactly."""
+"""Poses that differ by less, of the cameras' mean distance and in degrees, are one: no stand is so exact."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What the check looks at: people seen at some frames of a recording, and the cameras as they are thought to be."""
+"""What the check looks at: people seen at some frames of a recording, and the cameras as they are taken to be."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -83,9 +83,7 @@ def gather(detections: DetectionSequence, frames: range) -> Evidence:
         spread = np.unique(np.linspace(frames.start, frames.stop - 1, min(count, ANCHORS)).astype(np.intp))
     else:
         most = MOST_LAG
-        spread = np.unique(
-            np.linspace(frames.start + most, frames.stop - 1 - most, ANCHORS).astype(np.intp)
-        )
+        spread = np.unique(np.linspace(frames.start + most, frames.stop - 1 - most, ANCHORS).astype(np.intp))
         around = spread[:: max(1, ANCHORS // _LAG_ANCHORS)]
         wanted = np.unique(np.concatenate([spread, *(np.arange(t - most, t + most + 1) for t in around)]))
     sightings = sightings_of(detections, wanted.tolist())

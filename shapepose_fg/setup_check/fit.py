@@ -61,7 +61,7 @@ class Match:
 
     @property
     def score(self) -> float:
-        """How much of what could be matched is: 1 where all is without error, 0 where nothing is within the gate."""
+        """How much of what could be matched is: 1 where all is without error, 0 where nothing is near."""
         return float((1 - self.error / GATE).sum() / max(self.possible, 1))
 
 

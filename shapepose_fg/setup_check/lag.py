@@ -26,8 +26,8 @@ class Lag:
     gain: float
     """By how much the joints' errors fall, as a part of the people's size: mean over all joints."""
     agreement: float
-    """The same, over how far the joints move within the offset: near 1 if it is the offset, near -1 if there is none,
-    0 where nobody moves."""
+    """The same, over how far the joints move within the offset: near 1 if it is the offset, near -1 if there is
+    none, 0 where nobody moves."""
 
 
 def find_lag(others: Others, seen: Sightings, camera: Pinhole, most: int) -> Lag:

@@ -92,7 +92,7 @@ def same_frame_pairs(sightings: Sightings) -> tuple[Index, Index]:
 
 
 def _meeting(sightings: Sightings, views: Views, first: Index, second: Index) -> tuple[Array, Array]:
-    """How far the rays of pairs miss each other (M,), as a part of the people's size, and where they meet (M, J, 3).
+    """How far the rays of pairs miss each other (M,), as a part of people's sizes, and where they meet (M, J, 3).
 
     The middle of the shortest line between two rays. Infinite where the rays meet behind a camera, are almost
     parallel, or have fewer than MIN_JOINTS joints in common.
@@ -109,9 +109,7 @@ def _meeting(sightings: Sightings, views: Views, first: Index, second: Index) ->
     half_gap = np.linalg.norm(on_a - on_b, axis=-1) / 2
     focal, size = views.focal_px[sightings.view], sightings.size_px
     with np.errstate(divide="ignore", invalid="ignore"):
-        error = np.maximum(
-            half_gap / s * (focal / size)[first, None], half_gap / t * (focal / size)[second, None]
-        )
+        error = np.maximum(half_gap / s * (focal / size)[first, None], half_gap / t * (focal / size)[second, None])
     both = np.isfinite(half_gap)
     error = np.where(both & ((s <= 0) | (t <= 0)), np.inf, error)
     angle = _median(np.arcsin(np.minimum(np.sqrt(sine2), 1.0)), both)

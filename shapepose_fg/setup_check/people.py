@@ -10,7 +10,12 @@ from shapepose_fg.skeleton import Skeleton
 
 Array = NDArray[np.float64]
 
-_BONES = (("Hip", "Knee", 0.245), ("Knee", "Ankle", 0.246), ("Shoulder", "Elbow", 0.186), ("Elbow", "Wrist", 0.146))
+_BONES = (
+    ("Hip", "Knee", 0.245),
+    ("Knee", "Ankle", 0.246),
+    ("Shoulder", "Elbow", 0.186),
+    ("Elbow", "Wrist", 0.146),
+)
 """Lengths of bones as parts of the stature of adults (Drillis and Contini 1966, as in Winter's "Biomechanics and
 Motor Control of Human Movement")."""
 AXES: tuple[Axis, ...] = ("x", "-x", "y", "-y", "z", "-z")
@@ -23,7 +28,7 @@ class Build:
     stature: float
     """Median stature that their bones say, the calibration's unit; NaN where too few are seen."""
     up: Array
-    """(3,) mean direction from their hips to their necks; its length is 1 where all stand alike, 0 where none does."""
+    """(3,) mean direction from their hips to their necks; its length is 1 where all stand alike, else less."""
     count: int
     """People and frames that it is made of."""
 

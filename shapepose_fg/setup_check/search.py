@@ -14,7 +14,7 @@ _GAIN = 0.25
 """What a change must bring of a camera's score to be named."""
 _MIN_AGREEMENT = 0.12
 _MIN_LAG_GAIN = 0.004
-"""An offset in time is named if it takes away a third of what people move in it, and half a centimetre on average."""
+"""An offset in time is named if it takes away enough of what people move in it, and 7 mm on average."""
 
 
 def gross_mistake(look: Look, rng: np.random.Generator) -> Change | None:

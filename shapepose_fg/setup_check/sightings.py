@@ -17,7 +17,7 @@ Index = NDArray[np.intp]
 MIN_JOINTS = 5
 """A person of whom a camera sees fewer of the core joints says too little about the camera."""
 _STATURE_PER_SPREAD = 3.4
-"""Stature of a standing person over the root of the joints' summed variances: 1 / 0.29 for points spread evenly."""
+"""Stature of somebody who stands over the root of the joints' summed variances: 1 / 0.29 if spread evenly."""
 
 
 @dataclass(frozen=True)
@@ -54,12 +54,13 @@ def sightings_of(detections: DetectionSequence, frames: Iterable[int]) -> Sighti
     """
     parts = [_of_frame(detections[frame], frame, detections.skeleton) for frame in frames]
     joints = len(detections.skeleton.core)
-    none = Sightings(
-        np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros((0, joints, 2)), np.zeros((0, joints))
-    )
+    none = Sightings(np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros((0, joints, 2)), np.zeros((0, joints)))
     parts = [none, *parts]
     return Sightings(
-        *(np.concatenate([getattr(part, name) for part in parts]) for name in ("frame", "view", "xy", "confidence"))
+        *(
+            np.concatenate([getattr(part, name) for part in parts])
+            for name in ("frame", "view", "xy", "confidence")
+        )
     )
 
 

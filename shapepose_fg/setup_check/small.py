@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.camera import Views
-from shapepose_fg.setup_check.adjustment import CENTRE, FOCAL, POSE, Q, Normal, changed, normal_equations
+from shapepose_fg.setup_check.adjustment import CENTRE, FOCAL, POSE, Normal, Q, changed, normal_equations
 from shapepose_fg.setup_check.evidence import Look
 from shapepose_fg.setup_check.fit import difference
 from shapepose_fg.setup_check.matching import Groups
@@ -18,11 +18,11 @@ _ROLL = [2]
 Parts = tuple[tuple[tuple[int, ...], float], ...]
 SHIFT: Parts = ((tuple(CENTRE), 10.0),)
 ALL: Parts = (*SHIFT, (tuple(_ROLL), np.deg2rad(0.4)), (tuple(FOCAL), 0.02))
-"""What a camera may have wrong, each with its unit of size: 10 px, 0.4 degrees, 2 percent. Turns sideways and up are
-not among them: to people in the middle of the picture they are a shift of the principal point."""
+"""What a camera may have wrong, each with its unit of size: 10 px, 0.4 degrees, 2 percent. Turns sideways and up
+are not among them: to people in the middle of the picture they are a shift of the principal point."""
 _PRIOR = 0.05
-"""The weight of not changing a camera, against all that it saw. Joints of one person, and of frames that follow each
-other, err alike: of twenty one is independent."""
+"""The weight of not changing a camera, against all that it saw. Joints of one person, and of frames that follow
+each other, err alike: of twenty one is independent."""
 _ROUNDS, _SPARSE_STEPS = 3, 12
 _MOST_PEOPLE = 160
 
@@ -101,7 +101,7 @@ def small_errors(look: Look, parts: Parts = ALL) -> SmallErrors:
 
 
 def _sigmas(normal: Normal, views: int) -> tuple[Array, Array, Array]:
-    """(V,) sigma of each camera's roll, radians, of its shift, pixels, and of the logarithm of its focal length."""
+    """(V,) sigma of each camera's roll, radians, of its shift, pixels, and of its focal length (logarithm)."""
     columns = np.array([view * Q + c for view in range(views) for c in (2, *CENTRE, 8)])
     prior = np.tile([np.deg2rad(1.0), 20.0, 20.0, 0.03], views) ** -2.0
     H = _PRIOR * normal.H[np.ix_(columns, columns)] + np.diag(prior)
@@ -134,7 +134,7 @@ def _seen(look: Look) -> tuple[Array, Array, Array]:
 
 
 def _sparse_step(normal: Normal, structure: Structure, total: Array, parts: Parts) -> Array:
-    """The step (V Q,) of all cameras whose sum with `total` is small, in few of the groups (iterated reweighting)."""
+    """The step (V Q,) of all cameras whose sum with `total` is small in most groups (iterated reweighting)."""
     V = structure.xy.shape[2]
     count = (structure.weight > 0).sum(axis=(0, 1))
     columns = np.array([view * Q + c for view in range(V) for names, _ in parts for c in names])
