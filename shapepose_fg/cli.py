@@ -18,7 +18,7 @@ from shapepose_fg.export_command import export
 from shapepose_fg.options import frame_range, image_size_of
 from shapepose_fg.overlay_command import overlay
 from shapepose_fg.setup_command import check_calibration
-from shapepose_fg.terminal import note, show
+from shapepose_fg.terminal import note, show, warn
 from shapepose_fg.terminal import progress as progress_bar
 from shapepose_fg.tracks_command import tracks
 from shapepose_fg.view_command import view
@@ -31,8 +31,10 @@ if TYPE_CHECKING:
     from shapepose_fg.camera import Axis, Rig
     from shapepose_fg.frame_times import FrameTimes
     from shapepose_fg.io.calibration import Unit
+    from shapepose_fg.io.detection_table import DetectionTable
     from shapepose_fg.pipeline import PipelineConfig
     from shapepose_fg.reconstruction import Reconstruction
+    from shapepose_fg.setup_check.in_result import ResultCheck
     from shapepose_fg.simulation.files import Format
 
 # Everything else is imported inside the commands: `--help` must not wait for torch.
@@ -118,6 +120,9 @@ def reconstruct(
     workers: Annotated[
         int | None, typer.Option(help="Processes that solve; by default as many as pay. They change no byte.")
     ] = None,
+    check: Annotated[
+        bool, typer.Option("--check/--no-check", help="Whether cameras and detections fit, and what is wrong.")
+    ] = True,
 ) -> None:
     """Reconstruct the people of a recording: 3D joints with covariances, and bodies."""
     from shapepose_fg.io.calibration import read_rig, write_rig
@@ -169,7 +174,9 @@ def reconstruct(
     inputs = [
         path for path in (*read, shapes if known is not None and len(known) > 0 else None) if path is not None
     ]
-    people.with_run(inputs=checksums(inputs), notes=list(recording.notes), body=body).save(output)
+    people = people.with_run(inputs=checksums(inputs), notes=list(recording.notes), body=body)
+    checked = _checked(recording, rig, span, people) if check else None
+    (people if checked is None else people.with_run(**checked.as_run())).save(output)
     # What the observations were seen with: to solve or draw them anew.
     if not (output / CAMERAS).exists() or not (output / CAMERAS).samefile(calibration):
         write_rig(rig, output / CAMERAS)
@@ -178,6 +185,8 @@ def reconstruct(
         known.updated(people.shapes).save(shapes)
         summary.add_row("", f"{shapes}  shapes of {len(people.shapes)} people")
     show(summary)
+    if checked is not None:
+        _show_check(checked)
 
 
 @evaluate.command("shelf")
@@ -399,7 +408,8 @@ def _summary(people: "Reconstruction", span: range, camera_count: int, seconds: 
     for status, count in zip(*np.unique(people.status, return_counts=True), strict=True):
         table.add_row("", f"{count} {status}", style="green" if status == "ok" else "yellow")
     for reason, count in people.run.get("people", {}).get("dropped", {}).items():
-        table.add_row("", f"{count} dropped: {reason}", style="dim")
+        where = _frames_words(people.run.get("dropped_frames", {}).get(reason, []))
+        table.add_row("", f"{count} dropped: {reason}{where}", style="dim")
     if len(people) > 0:
         table.add_row("joints", _joints(people))
     # Loading torch and the body takes a second or two, once; it says nothing about the time of a frame.
@@ -413,6 +423,36 @@ def _summary(people: "Reconstruction", span: range, camera_count: int, seconds: 
         table.add_row("", str(output / "observations.npz"))
     table.add_row("", str(output / CAMERAS))
     return table
+
+
+def _frames_words(spans: list[list[int]]) -> str:
+    """In which frames, as far as there is room: run.json has all."""
+    told = [f"{start}" if stop == start + 1 else f"{start}-{stop - 1}" for start, stop in spans[:4]]
+    more = " ..." if len(spans) > len(told) else ""
+    return f" (frames {' '.join(told)}{more})" if told else ""
+
+
+def _checked(recording: "DetectionTable", rig: "Rig", span: range, people: "Reconstruction") -> "ResultCheck":
+    """Whether cameras and detections fit."""
+    from shapepose_fg.setup_check.in_result import result_check
+    from shapepose_fg.setup_check.report import check_setup
+
+    return result_check(check_setup(recording, rig, span), people, recording, rig, span)
+
+
+def _show_check(checked: "ResultCheck") -> None:
+    """How far each camera is from the result, and on stderr what looks wrong."""
+    from shapepose_fg.setup_check.camera_use import use_table
+
+    if len(checked.cameras) > 0:
+        print()
+        show(use_table(checked.cameras))
+        show(
+            "[dim]error: median / 90 % of all detections given to people; used: of those that passed the gates;[/]"
+        )
+        show("[dim]left out: median, from where the other cameras alone put the joint[/]")
+    for each in checked.warnings:
+        warn(each)
 
 
 def _joints(people: "Reconstruction") -> str:

@@ -1,6 +1,6 @@
 """Recordings with one mistake in their set-up, made on purpose: does the check name it, and nothing else?"""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import get_args
 
@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from shapepose_fg.camera import Axis, Camera, Rig
 from shapepose_fg.detections import Detections, DetectionSequence, Recording
 from shapepose_fg.setup_check.changes import Kind
-from shapepose_fg.setup_check.diagnosis import Diagnosis
+from shapepose_fg.setup_check.diagnosis import Finding
 
 
 @dataclass(frozen=True)
@@ -29,13 +29,13 @@ class Spoiled:
     amount: float | None = None
     """Frames that should be named, within one."""
 
-    def named_by(self, diagnosis: Diagnosis) -> bool:
+    def named_by(self, findings: Sequence[Finding]) -> bool:
         """Whether a finding names the kind, the cameras, and the frames within one."""
         return any(
             finding.kind == self.kind
             and (len(self.cameras) == 0 or finding.cameras == self.cameras)
             and (self.amount is None or abs(finding.amount - self.amount) <= 1)
-            for finding in diagnosis.findings
+            for finding in findings
         )
 
 

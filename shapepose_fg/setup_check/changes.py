@@ -113,6 +113,13 @@ def of_two(look: Look, first: int, second: int) -> Change | None:
     return Change(Kind.EXCHANGED, (first, second), setup, min(scores), 0)
 
 
+def of_pose(look: Look, view: int) -> Iterator[Change]:
+    """Misunderstandings of one camera's pose, by how well all fits: for a rig of two."""
+    for kind, other in known_forms(look.setup.camera(view)):
+        setup = look.setup.with_camera(view, other)
+        yield Change(kind, (view,), setup, Look(look.evidence, setup).total, 0)
+
+
 def of_all(look: Look) -> Iterator[Change]:
     """Mistakes that all cameras share."""
     setup, everybody = look.setup, tuple(range(look.view_count))

@@ -91,7 +91,8 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
     findings, evidence = _twice(given, rig)
     look = Look(evidence, given.setup)
     if len(rig) < 2 or len(look.sightings) < MIN_SIGHTINGS:
-        return Diagnosis((*findings, *([] if findings else _nobody(look))), given, look, None)
+        return Diagnosis((*findings, *_blind(given)), given, look, None)
+    findings += _blind(given)
     rng = np.random.default_rng(0)
     while len(findings) < _MOST_FINDINGS:
         change = gross_mistake(look, rng)
@@ -100,7 +101,8 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
         findings.append(_finding(change))
         look = Look(evidence, change.setup)
     if len(look.groups()) < MIN_SIGHTINGS // 2:
-        return Diagnosis((*findings, *_nobody(look)), given, look, None)
+        alone = look.cameras_used < 2
+        return Diagnosis((*findings, *([] if alone else _nobody(look))), given, look, None)
     small = small_errors(look)
     refined = with_small_errors(look, small)
     found = lags(refined)
@@ -133,6 +135,15 @@ def _twice(look: Look, rig: Rig) -> tuple[list[Finding], Evidence]:
         seen = evidence.sightings
         evidence = replace(evidence, sightings=seen.only(~np.isin(seen.view, list(gone))))
     return findings, evidence
+
+
+def _blind(look: Look) -> list[Finding]:
+    """Cameras that see nobody, where others do; or that nobody sees anybody."""
+    seen = np.bincount(look.sightings.view, minlength=look.view_count)
+    if seen.sum() == 0:
+        return _nobody(look)
+    gone = [] if seen.sum() < MIN_SIGHTINGS else np.flatnonzero(seen == 0).tolist()
+    return [Finding(Kind.NOBODY, tuple(gone))] if gone else []
 
 
 def _nobody(look: Look) -> list[Finding]:

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from shapepose_fg.camera import Rig, Views
 from shapepose_fg.detections import DetectionSequence
-from shapepose_fg.setup_check.fit import Others, Pinhole, match
-from shapepose_fg.setup_check.matching import GATE, Groups, Pairs, group, pair_up
+from shapepose_fg.setup_check.fit import Others, Pinhole, match, possible_matches
+from shapepose_fg.setup_check.matching import GATE, Groups, Pairs, errors_of, group, pair_up
 from shapepose_fg.setup_check.sightings import Sightings, sightings_of
 from shapepose_fg.setup_check.structure import Structure, observed, triangulate
 
@@ -154,7 +154,19 @@ class Look:
     def scores(self) -> Array:
         """(V,) how well each camera fits the people whom the others see (`Match.score`)."""
         views = range(self.view_count)
+        if self.cameras_used < 3:
+            return np.full(self.view_count, self._pair_score)
         return np.array([match(self.others(v), self.seen_by(v), self.setup.camera(v)).score for v in views])
+
+    @property
+    def _pair_score(self) -> float:
+        """How well two cameras fit each other, where there are no more."""
+        views = tuple(np.unique(self.sightings.view).tolist())
+        if len(views) < 2:
+            return 0.0
+        possible = possible_matches(*(self.seen_by(view).frame for view in views))
+        error = errors_of(self.pairs, group(self.pairs, len(self.sightings), views), *views)
+        return float((1 - error / GATE).sum() / max(possible, 1))
 
     @cached_property
     def total(self) -> float:

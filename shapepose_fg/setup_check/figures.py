@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from shapepose_fg.camera import Rig
 from shapepose_fg.setup_check.diagnosis import Diagnosis
 from shapepose_fg.setup_check.evidence import Look
-from shapepose_fg.setup_check.fit import match
-from shapepose_fg.setup_check.matching import group, residuals
+from shapepose_fg.setup_check.fit import match, possible_matches
+from shapepose_fg.setup_check.lag import is_offset
+from shapepose_fg.setup_check.matching import errors_of, group, residuals
 
 Array = NDArray[np.float64]
 
@@ -108,21 +109,16 @@ def pair_figures(look: Look, names: Sequence[str]) -> tuple[PairFigures, ...]:
 def _pair_figures(look: Look, names: Sequence[str], first: int, second: int) -> PairFigures:
     groups = group(look.pairs, len(look.sightings), (first, second))
     seen = look.sightings
-    frames = [np.unique(seen.frame[seen.view == view], return_counts=True) for view in (first, second)]
-    _, i, j = np.intersect1d(frames[0][0], frames[1][0], return_indices=True)
-    possible = int(np.minimum(frames[0][1][i], frames[1][1][j]).sum())
+    possible = possible_matches(*(seen.frame[seen.view == view] for view in (first, second)))
     if possible == 0:
         return PairFigures(names[first], names[second], None, None)
-    of_pair = (look.pairs.views == (first, second)).all(axis=1)
-    key = {(a, b): k for k, (a, b) in enumerate(look.pairs.members[of_pair].tolist())}
-    rows = np.array([key[a, b] for a, b in groups.member[:, [first, second]].tolist()], dtype=np.intp)
-    miss = look.pairs.error[of_pair][rows] * seen.size_px[groups.member[:, first]]
+    miss = errors_of(look.pairs, groups, first, second) * seen.size_px[groups.member[:, first]]
     return PairFigures(names[first], names[second], len(groups) / possible, _quantile(miss, 0.5))
 
 
 def _late(diagnosis: Diagnosis, views: int) -> list[int]:
     """Frames by which each camera is late, what was found and what remains together."""
-    left = [lag.frames for lag in diagnosis.lags] or [0] * views
+    left = [lag.frames if is_offset(lag) else 0 for lag in diagnosis.lags] or [0] * views
     return [int(found) + more for found, more in zip(diagnosis.corrected.setup.lag.tolist(), left, strict=True)]
 
 

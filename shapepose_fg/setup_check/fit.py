@@ -72,10 +72,10 @@ def match(others: Others, seen: Sightings, camera: Pinhole, lag: int = 0) -> Mat
     np.minimum.at(best_of_person, person, error)
     np.minimum.at(best_of_sighting, sighting, error)
     keep = (error <= best_of_person[person]) & (error <= best_of_sighting[sighting]) & (error < GATE)
-    return Match(person[keep], sighting[keep], error[keep], _possible(others.frame, seen.frame - lag))
+    return Match(person[keep], sighting[keep], error[keep], possible_matches(others.frame, seen.frame - lag))
 
 
-def _possible(first: Index, second: Index) -> int:
+def possible_matches(first: Index, second: Index) -> int:
     """Pairs that there can be: in every frame the smaller count."""
     frames, counts = np.unique(first, return_counts=True)
     other, other_counts = np.unique(second, return_counts=True)

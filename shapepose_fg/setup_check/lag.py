@@ -11,6 +11,9 @@ from shapepose_fg.setup_check.sightings import MIN_JOINTS, Sightings
 
 Array = NDArray[np.float64]
 
+_MIN_AGREEMENT = 0.12
+_MIN_LAG_GAIN = 0.004
+"""An offset in time is named if it takes away enough of what people move in it, and 7 mm on average."""
 _STRIDE = 4
 """Offsets are tried at every fourth frame first."""
 _MOST_PEOPLE = 100
@@ -30,6 +33,11 @@ class Lag:
     none, 0 where nobody moves."""
 
 
+def is_offset(lag: Lag) -> bool:
+    """Whether an offset is more than chance."""
+    return lag.agreement > _MIN_AGREEMENT and lag.gain > _MIN_LAG_GAIN
+
+
 def find_lag(others: Others, seen: Sightings, camera: Pinhole, most: int) -> Lag:
     """The offset within `most` frames at which `seen`, the camera's sightings at all frames, fit people best."""
     step = max(1, len(others) // _MOST_PEOPLE)
@@ -44,7 +52,8 @@ def find_lag(others: Others, seen: Sightings, camera: Pinhole, most: int) -> Lag
     first = {lag: tried(lag) for lag in range(-(most // _STRIDE) * _STRIDE, most + 1, _STRIDE)}
     best = max(first.values(), key=lambda lag: lag.gain)
     near = [tried(best.frames + d) for d in range(1 - _STRIDE, _STRIDE) if d != 0 and abs(best.frames + d) <= most]
-    return max([best, *near], key=lambda lag: lag.gain)
+    best = max([best, *near], key=lambda lag: lag.gain)
+    return best if best.gain > 0 else Lag(0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)

@@ -4,17 +4,14 @@ from itertools import combinations
 
 import numpy as np
 
-from shapepose_fg.setup_check.changes import Change, Kind, of_all, of_one, of_two, worth
+from shapepose_fg.setup_check.changes import Change, Kind, of_all, of_one, of_pose, of_two, worth
 from shapepose_fg.setup_check.evidence import Look
-from shapepose_fg.setup_check.lag import Lag, find_lag
+from shapepose_fg.setup_check.lag import Lag, find_lag, is_offset
 
 GOOD = 0.45
 """A camera that matches the others' people so well is where it is said to be, but for small errors."""
 _GAIN = 0.25
 """What a change must bring of a camera's score to be named."""
-_MIN_AGREEMENT = 0.12
-_MIN_LAG_GAIN = 0.004
-"""An offset in time is named if it takes away enough of what people move in it, and 7 mm on average."""
 
 
 def gross_mistake(look: Look, rng: np.random.Generator) -> Change | None:
@@ -35,6 +32,8 @@ def gross_mistake(look: Look, rng: np.random.Generator) -> Change | None:
         elif look.view_count == 3:
             change = Change(Kind.EXCHANGED, (first, second), look.setup.exchanged(first, second), 1.0, 0)
             found.append((_judged(look, change), change))
+    if look.view_count == 2:
+        found += [(change.score - look.total, change) for view in (0, 1) for change in of_pose(look, view)]
     if len(weak) > look.view_count / 2:
         found += [(change.score - look.total, change) for change in of_all(look)]
     found = [(gain, change) for gain, change in found if gain > _GAIN / look.view_count]
@@ -59,11 +58,7 @@ def lags(look: Look) -> list[Lag]:
 
 def latest(look: Look, found: list[Lag]) -> Change | None:
     """The camera whose offset in time explains most; None where there is no offset."""
-    named = [
-        view
-        for view, lag in enumerate(found)
-        if abs(lag.frames) >= 2 and lag.agreement > _MIN_AGREEMENT and lag.gain > _MIN_LAG_GAIN
-    ]
+    named = [view for view, lag in enumerate(found) if abs(lag.frames) >= 2 and is_offset(lag)]
     if len(named) == 0:
         return None
     view = max(named, key=lambda view: found[view].gain)

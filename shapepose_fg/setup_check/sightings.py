@@ -39,12 +39,21 @@ class Sightings:
     @cached_property
     def size_px(self) -> Array:
         """(S,) how large a person is in the picture, about the height of one who stands, pixels."""
-        variance = np.nanvar(self.xy, axis=1).sum(axis=1)
-        return np.maximum(_STATURE_PER_SPREAD * np.sqrt(variance), 1.0)
+        return size_of(self.xy)
 
     def only(self, keep: NDArray[np.bool_] | Index) -> "Sightings":
         """Some of the sightings."""
         return Sightings(self.frame[keep], self.view[keep], self.xy[keep], self.confidence[keep])
+
+
+def size_of(xy: Array) -> Array:
+    """(...) size of people whose joints xy (..., J, 2) lie so, pixels; 1 where nothing is seen."""
+    seen = ~np.isnan(xy[..., :1])
+    count = np.maximum(seen.sum(axis=-2), 1)
+    here = np.where(seen, xy, 0.0)
+    mean = here.sum(axis=-2) / count
+    variance = (np.where(seen, (here - mean[..., None, :]) ** 2, 0.0).sum(axis=-2) / count).sum(axis=-1)
+    return np.asarray(np.maximum(_STATURE_PER_SPREAD * np.sqrt(variance), 1.0))
 
 
 def sightings_of(detections: DetectionSequence, frames: Iterable[int]) -> Sightings:

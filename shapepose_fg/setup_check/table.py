@@ -7,11 +7,9 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
+from shapepose_fg.setup_check.camera_use import short
 from shapepose_fg.setup_check.figures import CameraFigures, PairFigures
 from shapepose_fg.setup_check.report import SetupReport
-
-_WIDE = 12
-"""Longest name of a camera that is written out; of a longer one the end is, which tells cameras apart."""
 
 
 def setup_report(report: SetupReport) -> RenderableType:
@@ -30,7 +28,7 @@ def _sentences(report: SetupReport) -> RenderableType:
     table.add_column(style="bold yellow")
     table.add_column()
     for number, words in enumerate(report.warnings, start=1):
-        table.add_row(f"{number}.", f"{words[0].upper()}{words[1:]}.")
+        table.add_row(f"{number}.", f"{words}.")
     return table
 
 
@@ -53,8 +51,8 @@ def _cameras(cameras: Sequence[CameraFigures]) -> RenderableType:
         )
     note = (
         "people: seen in the frames that were looked at; shared: with another camera; error: median / 90 % of"
-        " joints, from where all cameras together put them; left out: median, from where the others alone put them; fits:"
-        " people of the others who are matched so; late: frames."
+        " joints, from where all cameras together put them; left out: median, from where the others alone put"
+        " them; fits: people of the others who are matched so; late: frames."
     )
     return Group(table, Padding(Text(note, style="dim"), (0, 0, 0, 0)))
 
@@ -79,11 +77,6 @@ def _cell(pair: PairFigures) -> Text:
     if pair.miss_px is not None and pair.matched > 0:
         words += f" {pair.miss_px:.0f}"
     return Text(words, style="" if pair.matched > 0.5 else "yellow")
-
-
-def short(name: str) -> str:
-    """A camera's name, its end where it is long."""
-    return name if len(name) <= _WIDE else f"…{name[1 - _WIDE :]}"
 
 
 def _number(value: float | None) -> str:

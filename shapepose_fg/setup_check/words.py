@@ -15,7 +15,8 @@ _UNITS = ((1e-3, "m, and was read as mm"), (1e-2, "m, and was read as cm"), (1e-
 
 def sentence(finding: Finding, rig: Rig) -> str:
     """What was found, as it is printed."""
-    return _WORDS[finding.kind](finding, rig)
+    words = _WORDS[finding.kind](finding, rig)
+    return words if words.startswith(rig.names) else f"{words[0].upper()}{words[1:]}"
 
 
 def _names(finding: Finding, rig: Rig) -> str:
@@ -152,6 +153,9 @@ def _up(finding: Finding, rig: Rig) -> str:
 
 
 def _nobody(finding: Finding, rig: Rig) -> str:
+    if len(finding.cameras) > 0:
+        sees = "sees" if len(finding.cameras) == 1 else "see"
+        return f"{_names(finding, rig)} {sees} nobody in the frames that were looked at; check the detections"
     if finding.amount < 1:
         return "no camera sees a person in the frames that were looked at; check the detections"
     return (
