@@ -1,7 +1,7 @@
 """Recordings spoiled on purpose, and what the check of the set-up says: python scripts/evaluate_setup_checks.py.
 
-Every silent mistake (`evaluation/spoiled_setups.py`) is made on every camera of each recording; a mistake counts as
-named where kind and camera are right, and frames within one. `shelf` and `single` are real recordings (`--data
+Every silent mistake (`evaluation/spoiled_setups.py`) is made on every camera of each recording; it counts as named
+where kind and camera are right, and frames within one. `shelf` and `single` are real recordings (`--data
 FOLDER`, or SHAPEPOSE_DATA), `simulated` the built-in scene with one to four people before four to seven cameras,
 and `clean` many simulated recordings without any mistake, of which nothing should be said.
 

@@ -447,9 +447,7 @@ def _show_check(checked: "ResultCheck") -> None:
     if len(checked.cameras) > 0:
         print()
         show(use_table(checked.cameras))
-        show(
-            "[dim]error: median / 90 % of all detections given to people; used: of those that passed the gates;[/]"
-        )
+        show("[dim]error: median / 90 % of all detections given to people; used: of those within the gates;[/]")
         show("[dim]left out: median, from where the other cameras alone put the joint[/]")
     for each in checked.warnings:
         warn(each)

@@ -147,15 +147,16 @@ def listed_twice(detections: DetectionSequence, rig: Rig, view: int) -> tuple[Re
 
 def _together(first: Detections, second: Detections) -> Detections:
     """The candidates of both, sorted by view."""
-    names = ("view", "joint", "xy", "confidence")
-    columns = [np.concatenate([getattr(first, name), getattr(second, name)]) for name in names]
-    order = np.argsort(columns[0], kind="stable")
+    view, joint, xy, confidence = (
+        np.concatenate([getattr(first, name), getattr(second, name)])
+        for name in ("view", "joint", "xy", "confidence")
+    )
+    order = np.argsort(view, kind="stable")
     place = np.empty_like(order)
     place[order] = np.arange(len(order))
     pairs = place[np.concatenate([first.pairs, second.pairs + len(first)])]
-    return Detections(
-        *(column[order] for column in columns), pairs, np.concatenate([first.affinity, second.affinity])
-    )
+    affinity = np.concatenate([first.affinity, second.affinity])
+    return Detections(view[order], joint[order], xy[order], confidence[order], pairs, affinity)
 
 
 def _each(detections: DetectionSequence, change: Callable[[Detections], Detections]) -> Recording:

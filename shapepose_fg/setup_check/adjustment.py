@@ -33,7 +33,7 @@ class Normal:
     def solve(self, columns: NDArray[np.intp], information: Array | float = 0.0) -> Array:
         """The change (n,) of some parameters that lowers the squares most; `information` (n,) holds it at 0."""
         H = self.H[np.ix_(columns, columns)] + np.diag(np.broadcast_to(information, len(columns)))
-        return -np.linalg.lstsq(H, self.g[columns], rcond=1e-10)[0]
+        return np.asarray(-np.linalg.lstsq(H, self.g[columns], rcond=1e-10)[0], dtype=np.float64)
 
 
 def derivatives(structure: Structure, views: Views) -> Array:

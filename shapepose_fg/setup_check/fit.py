@@ -115,7 +115,7 @@ def posed_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
     ok, turn, move = cv2.solvePnP((points - middle) / scale, xy, camera.K, np.zeros(4), flags=cv2.SOLVEPNP_SQPNP)
     if not ok or not (np.isfinite(turn).all() and np.isfinite(move).all()):
         return None
-    R = cv2.Rodrigues(turn)[0]
+    R = np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64)
     return Pinhole(camera.K, np.column_stack([R, scale * move[:, 0] - R @ middle]))
 
 

@@ -211,10 +211,9 @@ def group(pairs: Pairs, count: int, views: tuple[int, ...]) -> Groups:
 def errors_of(pairs: Pairs, groups: Groups, first: int, second: int) -> Array:
     """(P,) by how much the rays of two cameras miss each other, of people who were grouped by these two alone."""
     of_pair = (pairs.views == (first, second)).all(axis=1)
-    rows = {
-        (a, b): error for (a, b), error in zip(pairs.members[of_pair].tolist(), pairs.error[of_pair], strict=True)
-    }
-    return np.array([rows[a, b] for a, b in groups.member[:, [first, second]].tolist()])
+    members = pairs.members[of_pair].tolist()
+    error = {(a, b): miss for (a, b), miss in zip(members, pairs.error[of_pair].tolist(), strict=True)}
+    return np.array([error[a, b] for a, b in groups.member[:, [first, second]].tolist()])
 
 
 def _median(values: Array, valid: Mask) -> Array:
