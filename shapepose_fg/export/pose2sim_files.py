@@ -1,4 +1,4 @@
-"""TRC and C3D where Pose2Sim's next steps look for them: pose-3d/NAME_A-B.trc, with its names and frame numbers."""
+"""TRC and C3D where Pose2Sim's next steps look for them: pose-3d/NAME_A-B.trc, with its frame numbers."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -35,8 +35,8 @@ def write_pose2sim_files(people: Reconstruction, up: Axis, project: Pose2SimProj
     left = sorted(before - {each.name for each in written.files})
     if len(left) > 0:
         written.notes.append(
-            f"{project.pose_3d} also has {' '.join(left[:4])}{' ...' if len(left) > 4 else ''} of before; take out what"
-            " the next steps are not to read"
+            f"{project.pose_3d} also has {' '.join(left[:4])}{' ...' if len(left) > 4 else ''} of before; take"
+            " out what the next steps are not to read"
         )
     return written
 

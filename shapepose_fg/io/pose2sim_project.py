@@ -69,8 +69,8 @@ class Pose2SimProject:
         if start >= stop:
             last = self.first_number + count
             raise InputError(
-                f"{self.folder / CONFIG}: project.frame_range is {list(self.frames)}, and the detections have frames"
-                f" {self.first_number} to {last - 1}; correct it, or write 'all'"
+                f"{self.folder / CONFIG}: project.frame_range is {list(self.frames)}, and the detections have"
+                f" frames {self.first_number} to {last - 1}; correct it, or write 'all'"
             )
         return range(start, stop)
 
@@ -163,8 +163,8 @@ def _whole_folder(room: Path) -> Path:
         return room
     there = " ".join(sorted(each.name for each in room.iterdir())[:8]) or "nothing"
     raise InputError(
-        f"{room}: no calibration that is known here, only {there}; run Pose2Sim's calibration, or put a file of one of"
-        " the formats of docs/conventions.md there"
+        f"{room}: no calibration that is known here, only {there}; run Pose2Sim's calibration, or put a file of one"
+        " of the formats of docs/conventions.md there"
     )
 
 
@@ -244,8 +244,8 @@ def _frame_range(given: Any, folder: Path) -> tuple[int, int] | None:
     whole = isinstance(given, list) and len(given) == 2 and all(type(number) is int for number in given)
     if not whole or not 0 <= given[0] < given[1]:
         raise InputError(
-            f"{folder / CONFIG}: project.frame_range must be 'auto', 'all', or two frame numbers such as [10, 300],"
-            f" got {given!r}; correct it"
+            f"{folder / CONFIG}: project.frame_range must be 'auto', 'all', or two frame numbers such as [10,"
+            f" 300], got {given!r}; correct it"
         )
     return given[0], given[1]
 

@@ -23,6 +23,7 @@ from shapepose_fg.setup_check.fit import (
     turned_to,
     zoomed_to,
 )
+from shapepose_fg.setup_check.lag import Lag, find_lag
 from shapepose_fg.setup_check.sightings import Sightings
 
 Array = NDArray[np.float64]
@@ -85,6 +86,9 @@ def of_one(look: Look, view: int, rng: np.random.Generator) -> Iterator[Change]:
     for kind, other in known_forms(camera):
         score = match(others, seen, other).score
         yield Change(kind, (view,), look.setup.with_camera(view, other), score, 0)
+    lag = lag_of(look, view)
+    late = match(others, look.seen_by(view, every_frame=True), camera, lag.frames).score
+    yield Change(Kind.LATE, (view,), look.setup.later(view, lag.frames), late, 1, lag.frames)
     families = (
         (Kind.TURNED, turned_to, TURN),
         (Kind.MOVED, posed_to, POSE),
@@ -101,6 +105,12 @@ def of_one(look: Look, view: int, rng: np.random.Generator) -> Iterator[Change]:
         turn, move = difference(camera.cTw, best.cTw)
         amount = turn if kind in (Kind.TURNED, Kind.MOVED) else float(best.K[0, 0] / camera.K[0, 0])
         yield Change(kind, (view,), look.setup.with_camera(view, best), score, max(len(columns), 1), amount, move)
+
+
+def lag_of(look: Look, view: int, most: int | None = None) -> Lag:
+    """A camera's offset in time against the others, up to `most` frames."""
+    limit = look.evidence.most_lag if most is None else min(most, look.evidence.most_lag)
+    return find_lag(look.others(view), look.seen_by(view, every_frame=True), look.setup.camera(view), limit)
 
 
 def of_two(look: Look, first: int, second: int) -> Change | None:

@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import DetectionSequence
-from shapepose_fg.setup_check.changes import Change, Kind
+from shapepose_fg.setup_check.changes import Change, Kind, lag_of
 from shapepose_fg.setup_check.duplicates import Duplicate, duplicates
 from shapepose_fg.setup_check.evidence import Evidence, Look, Setup, gather
 from shapepose_fg.setup_check.people import Build, build_of
-from shapepose_fg.setup_check.search import Lag, gross_mistake, lag_of, lags, latest
+from shapepose_fg.setup_check.search import Lag, gross_mistake, lags, latest
 from shapepose_fg.setup_check.small import SHIFT, SmallErrors, other_pose, small_errors, with_small_errors
 
 Array = NDArray[np.float64]
@@ -40,6 +40,8 @@ _SINGLE = 0.7
 """One camera is said to be turned where it alone explains so much of what small errors of all cameras explain."""
 _TURN_DEG = 0.6
 """Less is said of the principal point: of a calibration, and not of a camera that was knocked."""
+_NOBODY = 0.05
+"""With fewer people than this for each sighting, cameras see nobody in common."""
 _LAG_ROUNDS, _LAG_NEAR = 6, 8
 _PLAIN_TURN_DEG = 3.0
 """A camera that is turned by more is called turned, wherever it is."""
@@ -101,8 +103,8 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
         findings.append(_finding(change))
         look = Look(evidence, change.setup)
     if len(look.groups()) < MIN_SIGHTINGS // 2:
-        alone = look.cameras_used < 2
-        return Diagnosis((*findings, *([] if alone else _nobody(look))), given, look, None)
+        none = look.cameras_used > 1 and len(look.groups()) < _NOBODY * len(look.sightings)
+        return Diagnosis((*findings, *(_nobody(look) if none else [])), given, look, None)
     small = small_errors(look)
     refined = with_small_errors(look, small)
     found = lags(refined)

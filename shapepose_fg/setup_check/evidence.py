@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from shapepose_fg.camera import Rig, Views
 from shapepose_fg.detections import DetectionSequence
 from shapepose_fg.setup_check.fit import Others, Pinhole, match, possible_matches
-from shapepose_fg.setup_check.matching import GATE, Groups, Pairs, errors_of, group, pair_up
+from shapepose_fg.setup_check.matching import GATE, Groups, Pairs, errors_of, group, median_of, pair_up
 from shapepose_fg.setup_check.sightings import Sightings, sightings_of
 from shapepose_fg.setup_check.structure import Structure, observed, triangulate
 
@@ -173,7 +173,6 @@ class Look:
         """How well everything fits: 1 if every sighting is a person without error, 0 if none is anybody."""
         groups, structure = self.structure(steps=3)
         error = np.linalg.norm(structure.residual, axis=-1) / structure.size_px[:, None]
-        with np.errstate(invalid="ignore"):
-            worth = 1 - np.nanmedian(np.where(np.isinf(error), 1e9, error), axis=1) / GATE
-        worth = np.maximum(np.nan_to_num(worth, nan=0.0), 0.0)
+        median = median_of(np.moveaxis(error, 1, 2), ~np.isnan(np.moveaxis(error, 1, 2)))
+        worth = np.maximum(1 - median / GATE, 0.0)
         return float(worth[groups.member >= 0].sum() / max(len(self.sightings), 1))

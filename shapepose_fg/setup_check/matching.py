@@ -112,8 +112,8 @@ def _meeting(sightings: Sightings, views: Views, first: Index, second: Index) ->
         error = np.maximum(half_gap / s * (focal / size)[first, None], half_gap / t * (focal / size)[second, None])
     both = np.isfinite(half_gap)
     error = np.where(both & ((s <= 0) | (t <= 0)), np.inf, error)
-    angle = _median(np.arcsin(np.minimum(np.sqrt(sine2), 1.0)), both)
-    median = np.where((both.sum(axis=1) >= MIN_JOINTS) & (angle > _MIN_ANGLE), _median(error, both), np.inf)
+    angle = median_of(np.arcsin(np.minimum(np.sqrt(sine2), 1.0)), both)
+    median = np.where((both.sum(axis=1) >= MIN_JOINTS) & (angle > _MIN_ANGLE), median_of(error, both), np.inf)
     points = centres[sightings.view[first]][:, None] + (on_a + on_b) / 2
     return median, points
 
@@ -150,7 +150,7 @@ def distances(
     residual = residuals(points[person], seen.xy[sighting], K, cTw)
     error = np.linalg.norm(residual, axis=-1)
     both = ~np.isnan(error)
-    median = np.where(both.sum(axis=1) >= MIN_JOINTS, _median(error, both), np.inf)
+    median = np.where(both.sum(axis=1) >= MIN_JOINTS, median_of(error, both), np.inf)
     return person, sighting, median / seen.size_px[sighting]
 
 
@@ -216,9 +216,9 @@ def errors_of(pairs: Pairs, groups: Groups, first: int, second: int) -> Array:
     return np.array([error[a, b] for a, b in groups.member[:, [first, second]].tolist()])
 
 
-def _median(values: Array, valid: Mask) -> Array:
-    """Median of each row's valid values (M,), lower of the two middles; inf for a row without."""
+def median_of(values: Array, valid: Mask) -> Array:
+    """(...) median of the valid values of the last axis, lower of the two middles; inf where there is none."""
     ordered = np.sort(np.where(valid, values, np.nan), axis=-1)  # NaN last
     middle = np.maximum(valid.sum(axis=-1) - 1, 0) // 2
-    median = np.take_along_axis(ordered, middle[:, None], axis=-1)[:, 0]
+    median = np.take_along_axis(ordered, middle[..., None], axis=-1)[..., 0]
     return np.where(np.isnan(median), np.inf, median)

@@ -4,9 +4,9 @@ from itertools import combinations
 
 import numpy as np
 
-from shapepose_fg.setup_check.changes import Change, Kind, of_all, of_one, of_pose, of_two, worth
+from shapepose_fg.setup_check.changes import Change, Kind, lag_of, of_all, of_one, of_pose, of_two, worth
 from shapepose_fg.setup_check.evidence import Look
-from shapepose_fg.setup_check.lag import Lag, find_lag, is_offset
+from shapepose_fg.setup_check.lag import Lag, is_offset
 
 GOOD = 0.45
 """A camera that matches the others' people so well is where it is said to be, but for small errors."""
@@ -45,15 +45,9 @@ def _judged(look: Look, change: Change) -> float:
     return Look(look.evidence, change.setup).total - look.total - 0.02 * change.freedom / look.view_count
 
 
-def lag_of(look: Look, view: int, most: int) -> Lag:
-    """A camera's offset in time against the others, up to `most` frames."""
-    seen = look.seen_by(view, every_frame=True)
-    return find_lag(look.others(view), seen, look.setup.camera(view), min(most, look.evidence.most_lag))
-
-
 def lags(look: Look) -> list[Lag]:
     """Each camera's offset in time against the others."""
-    return [lag_of(look, view, look.evidence.most_lag) for view in range(look.view_count)]
+    return [lag_of(look, view) for view in range(look.view_count)]
 
 
 def latest(look: Look, found: list[Lag]) -> Change | None:
