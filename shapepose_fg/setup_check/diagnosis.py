@@ -33,6 +33,8 @@ _MOST_COST = 0.86
 _OUTLIER_DEG, _OUTLIER_RATIO = 0.8, 1.5
 """Where several cameras have small errors, one that is off by so much, and so many times the next, is turned."""
 _NOTABLE_DEG = 0.25
+_LEAST_GAIN = 0.02
+"""Where no pose of one camera takes away so much of the residuals' cost, none is tried."""
 _POSE_GAIN = 0.04
 """Another pose of one camera, six numbers, is named where it leaves so much less of the residuals' cost than small
 errors of all cameras do."""
@@ -187,8 +189,10 @@ def _with_late(findings: list[Finding], view: int, frames: int) -> list[Finding]
 
 def _small_findings(look: Look, small: SmallErrors, known: set[int]) -> list[Finding]:
     """Small errors that are worth naming: of one camera, or of several."""
-    pose = other_pose(look)
-    shifted = small_errors(look, SHIFT)
+    largest = float(np.hypot(small.shift_deg, small.roll_deg).max())
+    if largest < _OFF_DEG and np.abs(np.log(small.focal)).max() < _OFF_FOCAL and small.pose_gain < _LEAST_GAIN:
+        return []
+    pose, shifted = other_pose(look), small_errors(look, SHIFT)
     if pose.cost < min(small.cost, shifted.cost) - _POSE_GAIN and pose.view not in known:
         kind = Kind.TURNED if pose.turned_deg > 1 else Kind.MOVED
         return [Finding(kind, (pose.view,), pose.turned_deg, moved=pose.moved)]

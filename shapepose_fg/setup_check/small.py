@@ -51,6 +51,8 @@ class SmallErrors:
     """(V,) median residual before and after, pixels."""
     cost: float
     """What remains of the robust cost of all residuals, as a part of what it was."""
+    pose_gain: float
+    """At least so much of the cost another pose of one camera alone would take away."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,7 @@ def small_errors(look: Look, parts: Parts = ALL) -> SmallErrors:
     structure = first = triangulate(*seen, views, 5)
     normal = normal_equations(structure, views)
     roll_sigma, shift_sigma, focal_sigma = _sigmas(normal, len(views))
+    pose_gain = float(_pose_gains(normal, len(views)).max() / max(_cost(first), 1e-12))
     for number in range(_ROUNDS):
         normal = normal if number == 0 else normal_equations(structure, views)
         step_taken = _sparse_step(normal, structure, total, parts)
@@ -97,7 +100,14 @@ def small_errors(look: Look, parts: Parts = ALL) -> SmallErrors:
         focal_sigma,
         medians,
         cost,
+        pose_gain,
     )
+
+
+def _pose_gains(normal: Normal, views: int) -> Array:
+    """(V,) by how much another pose of each camera lowers the weighted squares: the robust cost falls by more."""
+    blocks = [np.array(POSE) + Q * view for view in range(views)]
+    return np.array([-normal.g[block] @ normal.solve(block) for block in blocks])
 
 
 def _sigmas(normal: Normal, views: int) -> tuple[Array, Array, Array]:
@@ -114,11 +124,12 @@ def other_pose(look: Look) -> OtherPose:
     views, seen = look.setup.views, _seen(look)
     structure = first = triangulate(*seen, views, 5)
     normal = normal_equations(structure, views)
-    blocks = [np.array(POSE) + Q * view for view in range(len(views))]
-    view = int(np.argmax([-normal.g[block] @ normal.solve(block) for block in blocks]))
-    for _ in range(_ROUNDS):
+    view = int(np.argmax(_pose_gains(normal, len(views))))
+    columns = np.array(POSE) + Q * view
+    for number in range(_ROUNDS):
+        normal = normal if number == 0 else normal_equations(structure, views)
         step = np.zeros(len(views) * Q)
-        step[blocks[view]] = normal_equations(structure, views).solve(blocks[view])
+        step[columns] = normal.solve(columns)
         views = changed(views, step.reshape(-1, Q))
         structure = triangulate(*seen, views, 4)
     given = look.setup.views
