@@ -13,7 +13,7 @@ from shapepose_fg.setup_check.diagnosis import Diagnosis
 from shapepose_fg.setup_check.evidence import Look
 from shapepose_fg.setup_check.fit import match, possible_matches
 from shapepose_fg.setup_check.lag import is_offset
-from shapepose_fg.setup_check.matching import errors_of, group, residuals
+from shapepose_fg.setup_check.matching import GATE, errors_of, group, residuals
 
 Array = NDArray[np.float64]
 
@@ -112,8 +112,11 @@ def _pair_figures(look: Look, names: Sequence[str], first: int, second: int) -> 
     possible = possible_matches(*(seen.frame[seen.view == view] for view in (first, second)))
     if possible == 0:
         return PairFigures(names[first], names[second], None, None)
-    miss = errors_of(look.pairs, groups, first, second) * seen.size_px[groups.member[:, first]]
-    return PairFigures(names[first], names[second], len(groups) / possible, _quantile(miss, 0.5))
+    error = errors_of(look.pairs, groups, first, second)
+    miss = error * seen.size_px[groups.member[:, first]]
+    return PairFigures(
+        names[first], names[second], float((error < GATE / 2).sum() / possible), _quantile(miss, 0.5)
+    )
 
 
 def _late(diagnosis: Diagnosis, views: int) -> list[int]:
