@@ -359,7 +359,8 @@ def _places(
     options = {"--calibration": calibration, "--detections": detections, "--output": output}
     missing = [name for name, value in options.items() if value is None]
     if calibration is None or detections is None or output is None:
-        raise InputError(f"{' and '.join(missing)}: missing; give all three, or --project with a Pose2Sim project")
+        listed = " and ".join([", ".join(missing[:-1]), missing[-1]] if len(missing) > 1 else missing)
+        raise InputError(f"{listed}: missing; give them, or --project with the folder of a Pose2Sim project")
     return calibration, detections, output
 
 
