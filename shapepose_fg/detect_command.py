@@ -1,6 +1,5 @@
 """The command `detect`: videos or pictures of calibrated cameras to 2D detections."""
 
-import re
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
     from shapepose_fg.detection2d.recording import DetectionReport, DetectionRun
     from shapepose_fg.io.calibration import Unit
     from shapepose_fg.io.footage.footage import Footage
-    from shapepose_fg.io.footage.lockstep import CameraClock, Lockstep
+    from shapepose_fg.io.footage.lockstep import Lockstep
 
 # Everything else is imported inside the command: `--help` must not wait for it.
 
@@ -101,7 +100,7 @@ def detect(
     from shapepose_fg.detection2d.network import HeatMapNetwork
     from shapepose_fg.detection2d.recording import DetectionRun, run_detection
     from shapepose_fg.io.calibration import read_rig
-    from shapepose_fg.io.footage.given import per_camera, placements_of
+    from shapepose_fg.io.footage.given import clocks_of, per_camera, placements_of
     from shapepose_fg.io.footage.lockstep import align
 
     rig = read_rig(
@@ -120,7 +119,7 @@ def detect(
         note(each)
     rates = per_camera("--fps", fps or [], rig, one_for_all=True)
     starts = per_camera("--start", start or [], rig, one_for_all=False)
-    clocks, has_clock = _clocks(footage, rates, starts, rig)
+    clocks, has_clock = clocks_of(footage, rates, starts, rig)
     moments = align(clocks, has_clock)
     moments = _part(moments, frame_range(frames, len(moments)))
     for each in moments.notes:
@@ -134,7 +133,11 @@ def detect(
     run = DetectionRun(rig, footage, detectors, moments, output)
     begin = time.perf_counter()
     with progress("detecting", "pictures") as done:
-        report = run_detection(run, done)
+        try:
+            report = run_detection(run, done)
+        except KeyboardInterrupt:
+            note("stopped; the same command goes on from here")
+            raise
     for name, failed in zip(rig.names, report.unreadable, strict=True):
         if failed > 0:
             note(f"camera {name}: {failed} of {report.moments} pictures cannot be read; it sees nobody there")
@@ -157,63 +160,6 @@ def _open(videos: Sequence[str], rig: "Rig") -> "list[Footage]":
         for each in footage[-1].notes:
             note(each)
     return footage
-
-
-def _clocks(
-    footage: "Sequence[Footage]", rates: Sequence[str | None], starts: Sequence[str | None], rig: "Rig"
-) -> "tuple[list[CameraClock], bool]":
-    """When each camera took its frames, and whether in seconds: without any rate frames are counted."""
-    import numpy as np
-
-    from shapepose_fg.io.footage.lockstep import CameraClock
-
-    fps = [_rate(text) for text in rates]
-    timed = [rate is not None or each.time_s is not None for rate, each in zip(fps, footage, strict=True)]
-    has_clock = any(timed)
-    if has_clock and not all(timed):
-        name = rig.names[timed.index(False)]
-        raise InputError(f"camera {name}: pictures do not say when they were taken; give --fps {name}=RATE")
-    # Pictures of one number belong together: all are counted from the first number that any camera has.
-    first = min((each.number[0] for each in footage if each.time_s is None), default=0)
-    clocks = []
-    for name, each, rate, text in zip(rig.names, footage, fps, starts, strict=True):
-        number = each.number - (first if each.time_s is None else 0)
-        if rate is not None:
-            taken, period = number / rate, 1 / rate
-        elif each.time_s is not None:
-            taken = each.time_s
-            period = float(np.median(np.diff(taken))) if len(taken) > 1 else 1 / 30
-        else:
-            taken, period = number.astype(np.float64), 1.0
-        clocks.append(CameraClock(name, taken + _start(text, period, has_clock), period))
-    return clocks, has_clock
-
-
-def _rate(text: str | None) -> float | None:
-    """Frames a second."""
-    if text is None:
-        return None
-    try:
-        rate = float(text)
-    except ValueError:
-        rate = 0.0
-    if not 0.01 <= rate <= 1e5:
-        raise InputError(f"--fps {text}: must be a number of frames a second, such as 25")
-    return rate
-
-
-def _start(text: str | None, period: float, has_clock: bool) -> float:
-    """When a camera's first frame was taken, in seconds, or in frames where there is no clock."""
-    if text is None:
-        return 0.0
-    match = re.fullmatch(r"([-+]?(?:\d+\.?\d*|\.\d+))\s*([sf])", text.strip())
-    if match is None:
-        raise InputError(f"--start {text}: must be seconds such as 0.2s, or the camera's own frames such as 12f")
-    if match[2] == "s" and not has_clock:
-        raise InputError(
-            f"--start {text}: nothing says how many frames a second there are; give --fps, or frames (12f)"
-        )
-    return float(match[1]) * (1.0 if match[2] == "s" else period)
 
 
 def _shown_small(detectors: "Sequence[CameraDetector]", size: tuple[int, int]) -> str:

@@ -11,6 +11,7 @@ import typer
 from shapepose_fg.errors import InputError
 from shapepose_fg.frame_times import ASSUMED_FPS
 from shapepose_fg.options import frame_range
+from shapepose_fg.result_options import results_folder
 from shapepose_fg.terminal import note, progress
 
 if TYPE_CHECKING:
@@ -78,7 +79,7 @@ def overlay(
     from shapepose_fg.overlay.frames import Overlay, OverlayContent
     from shapepose_fg.reconstruction import Reconstruction
 
-    folder = results.parent if results.name == "people.npz" else results
+    folder = results_folder(results)
     people = Reconstruction.load(folder)
     rig = read_rig(folder / CAMERAS)
     pictures = _pictures(

@@ -29,8 +29,9 @@ class WindowConfig:
     frames. Windows of other lengths move joints by under 2 mm in the median (tests/test_windows.py)."""
     again_over_time: int = 2
     """How often detections are given out again around a draft of a window."""
-    again_alone: int = 2
-    """The same for frames that stand alone."""
+    again_alone: int = 5
+    """The same for frames that stand alone. From time to time more is asked of who stays (`Survival`): whoever
+    goes leaves detections to others, so the least goes first."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -85,12 +86,11 @@ class WindowSolver:
         """One window."""
         given = [frame for frame, _ in span.decided]
         rows = Observations.concatenate([part for _, part in span.decided])
-        again, survival = self.windows.again_over_time, None
-        if span.alone:
-            again, survival = self.windows.again_alone, Survival()
+        again = self.windows.again_alone if span.alone else self.windows.again_over_time
         began = time.perf_counter()
-        for _ in range(again if len(rows) > 0 else 0):
+        for n in range(again if len(rows) > 0 else 0):
             joints, covariance = self.estimator.draft(rows)
+            survival = Survival().at(n / max(again - 1, 1)) if span.alone else None
             rows = reassociate(given, rows, joints, covariance, self.skeleton, self.assignment, survival)
         associated = time.perf_counter()
         estimates = self.estimator.estimate(rows, self.extra_factors)

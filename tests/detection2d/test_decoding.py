@@ -15,7 +15,7 @@ def gaussians(places: np.ndarray, size: tuple[int, int], sigma: float = 1.1) -> 
 
 
 def people_output(people: np.ndarray, layout: NetworkLayout, size: tuple[int, int] = (60, 40)) -> np.ndarray:
-    """(C, H, W) what a perfect network gives of people (P, J, 2) in cells: 0.9 peaks, fields one cell and a half wide."""
+    """(C, H, W) what a perfect network gives of people (P, J, 2), cells: peaks of 0.9, fields 3 cells wide."""
     output = np.zeros((layout.channels, size[1], size[0]), dtype=np.float32)
     x, y = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
     for joint in range(len(layout.joints)):
@@ -61,7 +61,7 @@ def test_two_people_are_linked_to_themselves_alone(name):
     layout = layouts()[name]
     rng = np.random.default_rng(3)
     one = np.column_stack([rng.uniform(6, 24, len(layout.joints)), rng.permutation(len(layout.joints)) * 1.4 + 2])
-    people = np.stack([one, one + [30.0, 1.0]])
+    people = one + np.array([[[0.0, 0.0]], [[30.0, 1.0]]])
     found = decode(people_output(people, layout), layout)
     truth = people[:, found.joint]
     whose = np.linalg.norm(truth - found.xy, axis=-1).argmin(axis=0)
@@ -81,9 +81,7 @@ def test_a_line_across_the_field_has_no_affinity():
     fields[0] = 1.0
     limb = np.zeros(3, dtype=np.intp)
     start, end = np.array([[2.0, 5], [5, 2], [15, 5]]), np.array([[15.0, 5], [5, 15], [2, 5]])
-    np.testing.assert_allclose(
-        line_integrals(fields, start, end, limb, DecodingConfig()), [1, 0, 0], atol=1e-6
-    )
+    np.testing.assert_allclose(line_integrals(fields, start, end, limb, DecodingConfig()), [1, 0, 0], atol=1e-6)
 
 
 def test_what_is_no_number_and_an_empty_output_give_nobody():

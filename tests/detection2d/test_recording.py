@@ -95,7 +95,7 @@ class Stopped(Exception):
     pass
 
 
-def test_a_stopped_run_goes_on_and_comes_out_the_same(rolled_rig, pictures, tmp_path, painted_network, monkeypatch):
+def test_a_stopped_run_goes_on_to_the_same_end(rolled_rig, pictures, tmp_path, painted_network, monkeypatch):
     monkeypatch.setattr(recording, "BLOCK", 2)
     whole, parted = tmp_path / "whole", tmp_path / "parted"
     run_detection(run_of(rolled_rig, pictures, whole, painted_network))
@@ -124,7 +124,7 @@ def test_runs_do_not_mix(rolled_rig, pictures, tmp_path, painted_network):
 
     with pytest.raises(Stopped):
         run_detection(run_of(rolled_rig, pictures, tmp_path, painted_network), stop)
-    with pytest.raises(InputError, match="a run with other settings was stopped here; start it as it was to go on"):
+    with pytest.raises(InputError, match="a run with other settings was stopped here; start it as it was"):
         run_detection(run_of(rolled_rig, pictures, tmp_path, painted_network, long_side=320))
     moved = tmp_path / "moved"
     shutil.copytree(pictures, moved)
@@ -140,7 +140,7 @@ def test_runs_do_not_mix(rolled_rig, pictures, tmp_path, painted_network):
     assert (tmp_path / "other" / "unfinished" / "thesis.txt").read_text() == "mine"
 
 
-def test_a_picture_that_cannot_be_read_is_a_camera_that_sees_nobody(rolled_rig, pictures, tmp_path, painted_network):
+def test_where_a_picture_cannot_be_read_nobody_is_seen(rolled_rig, pictures, tmp_path, painted_network):
     spoilt = tmp_path / "spoilt"
     shutil.copytree(pictures, spoilt)
     (spoilt / "b" / "002.png").write_bytes(b"\x89PNG but no more")
