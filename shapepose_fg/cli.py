@@ -194,7 +194,9 @@ def reconstruct(
         path for path in (*read, shapes if known is not None and len(known) > 0 else None) if path is not None
     ]
     people = people.with_run(inputs=checksums(inputs), notes=list(recording.notes), body=body)
-    videos = None if whole is None else whole.folder / "videos"
+    # Of its own detections `detect` knows which pictures they are of.
+    own = (detections / "footage.json").is_file()
+    videos = None if whole is None or own else whole.folder / "videos"
     checked = _checked(recording, rig, span, people, videos) if check else None
     (people if checked is None else people.with_run(**checked.as_run())).save(output)
     # What the observations were seen with: to solve or draw them anew.
@@ -515,7 +517,7 @@ def _show_check(checked: "ResultCheck") -> None:
     if len(checked.cameras) > 0:
         print()
         show(use_table(checked.cameras))
-        show("[dim]error: median / 90 % of all detections given to people; used: of those used;[/]")
+        show("[dim]error: median / 90 % of all detections given to people, before gates; used: after;[/]")
         show("[dim]left out: median, from where the other cameras alone put the joint[/]")
     for each in checked.warnings:
         warn(each)

@@ -163,7 +163,7 @@ def _whole_folder(room: Path) -> Path:
         return room
     there = " ".join(sorted(each.name for each in room.iterdir())[:8]) or "nothing"
     raise InputError(
-        f"{room}: no calibration that is known here, only {there}; run Pose2Sim's calibration, or put a file of one"
+        f"{room}: no calibration that is known here, only {there}; run Pose2Sim's calibration, or put one"
         " of the formats of docs/conventions.md there"
     )
 
