@@ -216,7 +216,7 @@ def _small_findings(look: Look, small: SmallErrors, known: set[int]) -> list[Fin
     order = np.argsort(-shift)
     first, second = shift[order[0]], shift[order[1]]
     findings = []
-    if first > _OUTLIER_DEG and first > _OUTLIER_RATIO * second:
+    if look.cameras_used > 3 and first > _OUTLIER_DEG and first > _OUTLIER_RATIO * second:
         findings.append(_turned(shifted, int(order[0])))
         shift[order[0]] = 0.0
     rest = np.flatnonzero(shift > _NOTABLE_DEG)
