@@ -111,8 +111,8 @@ def _principal_point(finding: Finding, rig: Rig) -> str:
         for view, (x, y) in zip(finding.cameras, finding.shift_px, strict=True)
     )
     return (
-        f"principal points look off, they should lie {by} (no more than a turn of {finding.amount:.1f} degrees)"
-        "; check that the pictures have the calibrated sizes and were not cropped, or calibrate the intrinsics again"
+        f"principal points look off, they should lie {by} (at most a turn of {finding.amount:.1f} degrees);"
+        " check that pictures have the calibrated sizes and are not cropped, or calibrate the intrinsics again"
     )
 
 
