@@ -87,6 +87,7 @@ class Estimator:
         self.rig = rig
         self.fitter = fitter
         self.config = EstimatorConfig() if config is None else config
+        self.joints = joints
         self._motion = MotionModel.load(joints, self.config.motion)
 
     def estimate(
@@ -106,7 +107,7 @@ class Estimator:
         X = triangulate(observations, views, config.observations)
         if config.motion.temporal and len(np.unique(observations.track)) < len(observations):
             X = self._completed(X, observations, views)
-        sigmas = observation_sigmas(observations, X, views, config.observations)
+        sigmas = observation_sigmas(observations, X, views, config.observations, self.joints)
         windows = self._windows(observations, sigmas, views, extra_factors)
         solution = alternate(observations, views, sigmas, X, windows, self.fitter, config)
         return self._estimates(observations, sigmas, views, windows, X, solution)
@@ -122,7 +123,7 @@ class Estimator:
         config = self.config
         views = Views.of(self.rig) if views is None else views
         X = triangulate(observations, views, config.observations)
-        sigmas = observation_sigmas(observations, X, views, config.observations)
+        sigmas = observation_sigmas(observations, X, views, config.observations, self.joints)
         evidence = linearise(observations, sigmas, X, views, config.observations)
         enough = (evidence.sigma_m <= config.refine.max_sigma_m).sum(axis=1) >= config.refine.min_joints
         whole = self.fitter.fit_whole if isinstance(self.fitter, WholeFitter) else self.fitter.fit

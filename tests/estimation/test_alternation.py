@@ -133,7 +133,7 @@ def test_the_fitter_is_told_what_the_views_alone_say(five_cameras, two_people, d
     run(doubtful_wrist, five_cameras, fitter, kernel, alternations=3)
     config = ObservationConfig(kernel=kernel)
     views = Views.of(five_cameras)
-    sigmas = observation_sigmas(doubtful_wrist, doubtful_wrist.initial, views, config)
+    sigmas = observation_sigmas(doubtful_wrist, doubtful_wrist.initial, views, config, BODY_25.joints)
     X = doubtful_wrist.initial
     for n, targets in enumerate(fitter.targets):
         if n > 0:
@@ -145,15 +145,15 @@ def test_the_fitter_is_told_what_the_views_alone_say(five_cameras, two_people, d
 
 def test_a_prior_does_not_come_back_through_the_body(five_cameras, two_people, doubtful_wrist):
     """The prior pulls the wrist by centimetres; where the fitter is told to put it stays where the views say."""
-    fitter = FakeFitter(two_people + 0.1)
+    fitter = FakeFitter(two_people + 0.1, sigma_m=0.035)
     pulled = run(doubtful_wrist, five_cameras, fitter)
     alone = run(doubtful_wrist, five_cameras, FakeFitter(two_people, fails=True))
     moved = np.linalg.norm(pulled.joints[:, WRIST] - alone.joints[:, WRIST], axis=-1)
     assert (moved > 0.03).all()
     # One Gauss-Newton step from up to 20 cm off: to the second order of that at 3.5 m.
     np.testing.assert_allclose(fitter.targets[-1].xyz, alone.joints, atol=0.012)
-    # The information changes with the point of linearisation by a few per cent, a prior would add 3 / 0.1² to
-    # the 3 / 0.06² or so of five views of confidence 0.1.
+    # The information changes with the point of linearisation by a few per cent, a prior would add 3 / 0.035² to
+    # the 3 / 0.018² or so of five views of confidence 0.1.
     before, after = fitter.targets[0].information, fitter.targets[-1].information
     np.testing.assert_allclose(np.trace(after, axis1=2, axis2=3), np.trace(before, axis1=2, axis2=3), rtol=0.1)
 
