@@ -55,6 +55,14 @@ def frame_files(folder: Path) -> list[Path]:
     return sorted(each for each in folder.iterdir() if _FILE.search(each.name) is not None and each.is_file())
 
 
+def frame_number(file: Path) -> int:
+    """The number of the frame that a file is named after."""
+    match = _FILE.search(file.name)
+    if match is None:
+        raise ValueError(f"{file.name} is not named after a frame")
+    return int(match[1])
+
+
 def read_frame_files(folder: Path) -> CameraPeople:
     """Read the frames that one camera saw; InputError naming file, key and cure.
 
