@@ -15,6 +15,7 @@ import typer
 
 from shapepose_fg.errors import InputError
 from shapepose_fg.export_command import export
+from shapepose_fg.report_command import report as report_command
 from shapepose_fg.tracks_command import tracks
 from shapepose_fg.view_command import view
 
@@ -43,6 +44,7 @@ evaluate = typer.Typer(help="Score a reconstruction against an annotation.")
 app.add_typer(evaluate, name="evaluate")
 app.add_typer(tracks, name="tracks")
 app.command()(export)
+app.command("report")(report_command)
 app.command()(view)
 
 _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
@@ -111,6 +113,9 @@ def reconstruct(
     workers: Annotated[
         int | None, typer.Option(help="Processes that solve; by default as many as pay. They change no byte.")
     ] = None,
+    report: Annotated[
+        bool, typer.Option("--report/--no-report", help="Leave report.html, the result as a page to look at.")
+    ] = True,
 ) -> None:
     """Reconstruct the people of a recording: 3D joints with covariances, and bodies."""
     from shapepose_fg.io.calibration import read_rig, write_rig
@@ -162,14 +167,18 @@ def reconstruct(
     inputs = [
         path for path in (*read, shapes if known is not None and len(known) > 0 else None) if path is not None
     ]
-    people.with_run(inputs=checksums(inputs), notes=list(recording.notes), body=body).save(output)
+    people = people.with_run(inputs=checksums(inputs), notes=list(recording.notes), body=body)
+    people.save(output)
     # What the observations were seen with: to solve or draw them anew.
     if not (output / CAMERAS).exists() or not (output / CAMERAS).samefile(calibration):
         write_rig(rig, output / CAMERAS)
+    page = _report(people, rig, output) if report else _no_report(output)
     summary = _summary(people, span, len(rig), seconds, output)
     if shapes is not None and known is not None and people.shapes is not None:
         known.updated(people.shapes).save(shapes)
         summary.add_row("", f"{shapes}  shapes of {len(people.shapes)} people")
+    if page is not None:
+        summary.add_row("", f"{page}  to look at, in a browser")
     _print(summary)
 
 
@@ -193,12 +202,15 @@ def evaluate_shelf_command(
 _DEMO = """\
 Built-in scene: 4 people in close motion, 6 cameras, 60 frames. A simulated
 detector sees them with noise, misses, false candidates and occlusion; from what
-it saw the people are reconstructed, every frame by itself."""
+it saw the people are reconstructed, over time."""
 
 
 @app.command()
 def demo(
     output: Annotated[Path, typer.Option(help="Folder for the result and the picture.")] = Path("demo"),
+    report: Annotated[
+        bool, typer.Option("--report/--no-report", help="Leave report.html, the result as a page to look at.")
+    ] = True,
 ) -> None:
     """Reconstruct a built-in scene of four people, compare it with the truth, and draw it."""
     _prepare(output)
@@ -209,7 +221,7 @@ def demo(
         result = run_demo(progress)
     _print(result.tables())
     print()
-    for line in result.save(output):
+    for line in result.save(output, report=report):
         print(line)
 
 
@@ -415,6 +427,20 @@ def _progress(what: str) -> Iterator[Callable[[int, int], None]]:
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(what, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def _report(people: "Reconstruction", rig: "Rig", output: Path) -> Path:
+    """The result as a page."""
+    from shapepose_fg.report.writing import write_report
+
+    return write_report(output, people, rig)
+
+
+def _no_report(output: Path) -> None:
+    """A page of an earlier result would say what is no longer true."""
+    from shapepose_fg.report.writing import REPORT
+
+    (output / REPORT).unlink(missing_ok=True)
 
 
 def _summary(people: "Reconstruction", span: range, camera_count: int, seconds: float, output: Path) -> "Table":

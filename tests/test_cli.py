@@ -336,8 +336,10 @@ def test_demo_without_matplotlib_says_what_to_install(short_scene, tmp_path, mon
     assert run("demo", "--output", str(tmp_path / "out")) == 0
     assert "no picture: the picture needs matplotlib: pip install shapepose-fg[viewer]" in capsys.readouterr().out
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        "cameras.json",
         "observations.npz",
         "people.npz",
+        "report.html",
         "run.json",
     ]
 

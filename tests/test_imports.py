@@ -30,8 +30,9 @@ LEVELS = (
     "io solving",
     "simulation viewer",
     "training export",
+    "report",
     "evaluation",
-    "demo tracks_command export_command view_command",
+    "demo tracks_command export_command report_command view_command",
     "cli",
 )
 """Each level imports only from those before it; a package may import its own modules too."""

@@ -11,8 +11,6 @@ from shapepose_fg.body.model.smpl_file import SMPL_PARENTS, SmplArrays
 from shapepose_fg.export.take import Take
 
 BONES = len(SMPL_PARENTS)
-LEAVES = tuple(sorted(set(range(BONES)) - set(SMPL_PARENTS)))
-"""Joints without children: head, hands and feet."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +39,10 @@ class RestBody:
 
     def tips(self) -> dict[int, NDArray[np.float64]]:
         """(3,) from each joint without children to the end of its bone: as far as its skin goes on."""
+        leaves = set(range(BONES)) - set(SMPL_PARENTS)
         bone_of = self.arrays.weights.argmax(axis=1)
         tips = {}
-        for leaf in LEAVES:
+        for leaf in leaves:
             along = self.joints[leaf] - self.joints[SMPL_PARENTS[leaf]]
             along /= np.linalg.norm(along)
             # A mesh may give a bone no skin of its own; then it ends 1 cm on, for a bone needs a length.
@@ -70,11 +69,6 @@ class Motion:
     def joints(self) -> NDArray[np.float64]:
         """(F, 24, 3) the joints in the world, metres."""
         return pose_joints(self.rest.offsets[None], self.rotations, self.pelvis)
-
-    def tips(self) -> NDArray[np.float64]:
-        """(F, 5, 3) where the bones of `LEAVES` end in the world, metres."""
-        joints, turn, tips = self.joints(), _accumulated(self.rotations), self.rest.tips()
-        return np.stack([joints[:, leaf] + turn[:, leaf] @ tips[leaf] for leaf in LEAVES], axis=1)
 
 
 def motion_of(take: Take, person: int, arrays: SmplArrays, axes: NDArray[np.float64]) -> Motion | None:

@@ -27,7 +27,7 @@ from shapepose_fg.report.sections import (
 )
 from shapepose_fg.tracking.listing import TrackSummary
 
-_SCRIPTS = ("geometry.js", "drawing.js", "page.js")
+_SCRIPTS = ("geometry.js", "skin.js", "drawing.js", "page.js")
 """In the order in which they are loaded."""
 
 
@@ -173,7 +173,7 @@ def _scene(content: Content) -> Element | None:
         return None
     frames = 0 if content.thinning is None else content.thinning.kept
     cameras = [element("option", f"camera {each['name']}", value=str(index)) for index, each in enumerate(content.scene["cameras"])]  # fmt: skip
-    layers = [("bodies", "Bodies", "body" in content.scene), ("bones", "Skeletons", True)]
+    layers = [("bodies", "Bodies", "mesh" in content.scene), ("bones", "Skeletons", True)]
     layers += [("sigma", "Uncertainty", True), ("trails", "Paths", True), ("cameras", "Cameras", len(cameras) > 0)]
     boxes = [
         element("label", _checkbox(name, name not in ("sigma",)), words, title=_LAYERS[name])
@@ -226,7 +226,7 @@ def _scene(content: Content) -> Element | None:
 
 
 _LAYERS = {
-    "bodies": "The fitted bodies, as bones with the width of the skin",
+    "bodies": "The fitted bodies, with a vertex per 5 cm of skin",
     "bones": "The joints and what joins them; rings are joints that no camera saw in this frame",
     "sigma": "Spheres that hold a joint's true place with 95 % probability, by the mean of its sigmas",
     "trails": "Where people walked in the last two seconds",

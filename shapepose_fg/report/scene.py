@@ -12,9 +12,8 @@ from shapepose_fg.camera import Camera
 from shapepose_fg.export.axes import z_up
 from shapepose_fg.export.bones import bones_of
 from shapepose_fg.export.markers import sigma_m
-from shapepose_fg.export.skinned import motion_of
 from shapepose_fg.export.take import Take
-from shapepose_fg.report.limbs import ENDS, STARTS, widths
+from shapepose_fg.report.skins import ROW_BYTES, TURN, Skins, skins_of
 from shapepose_fg.viewer.palette import PALETTE
 
 _MISSING = -32768
@@ -45,7 +44,7 @@ def scene_of(take: Take, arrays: SmplArrays | None, most_bytes: int) -> tuple[di
     The page's axes are those of the world turned so that z is up. Bodies where `arrays`, the body model, is given.
     """
     J = len(take.people.joint_names)
-    row_bytes = 4 / 3 * (6 * J + J + 2 + (6 * ENDS if arrays is not None else 0))
+    row_bytes = 4 / 3 * (6 * J + J + 2 + (ROW_BYTES if arrays is not None else 0))
     every = max(1, int(np.ceil(len(take.people) * row_bytes / most_bytes)))
     index = np.arange(0, len(take.frames), every)
     axes = z_up(take.up)
@@ -76,7 +75,7 @@ def scene_of(take: Take, arrays: SmplArrays | None, most_bytes: int) -> tuple[di
         "view": _view(joints, centres),
     }
     if arrays is not None:
-        scene |= _bodies(take, arrays, axes, pack, index, frame, person)
+        scene |= _bodies(skins_of(take, arrays, axes, index[frame], person), pack)
     return scene, Thinning(every, len(index), len(take.frames))
 
 
@@ -151,30 +150,16 @@ def _camera(camera: Camera, axes: NDArray[np.float64]) -> dict[str, Any]:
     }
 
 
-def _bodies(
-    take: Take,
-    arrays: SmplArrays,
-    axes: NDArray[np.float64],
-    pack: _Packing,
-    index: NDArray[np.intp],
-    frame: NDArray[np.intp],
-    person: NDArray[np.intp],
-) -> dict[str, Any]:
-    """People's bodies as bones with the width of the skin around them."""
-    places = np.full((len(frame), ENDS, 3), np.nan)
-    radii = []
-    for each in range(len(take.persons)):
-        motion = motion_of(take, each, arrays, axes)
-        if motion is None:
-            radii.append([0.0] * ENDS)
-            continue
-        whole = np.full((len(take.frames), ENDS, 3), np.nan)
-        whole[motion.index] = np.concatenate([motion.joints(), motion.tips()], axis=1)
-        mine = person == each
-        places[mine] = whole[index[frame[mine]]]
-        radii.append(widths(motion.rest))
-    bones = [[start, end] for end, start in enumerate(STARTS) if start >= 0]
-    return {"body": _base64(pack(places), "<i2"), "body_bones": bones, "radii": np.round(radii, 3).tolist()}
+def _bodies(skins: Skins, pack: _Packing) -> dict[str, Any]:
+    """People's bodies as the page's script reads them."""
+    millimetres = _Packing(np.zeros(3), 1e-3)
+    return {
+        "mesh": {name: _base64(values, "u1" if name == "weights" else "<i2") for name, values in skins.mesh.items()},
+        "rest": _base64(millimetres(skins.rest), "<i2"),
+        "rest_joints": _base64(millimetres(skins.joints), "<i2"),
+        "turns": _base64(np.rint(TURN * np.nan_to_num(skins.turns)), "<i2"),
+        "pelvis": _base64(pack(skins.pelvis), "<i2"),
+    }
 
 
 def _base64(values: NDArray[Any], kind: str) -> str:

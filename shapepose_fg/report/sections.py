@@ -232,9 +232,9 @@ def _ratio(value: float | None, most: float) -> float:
 def _share(count: int, total: int) -> str:
     """A share that is neither 0 nor 1 is not shown as if it were."""
     percent = 100 * count / max(total, 1)
-    if 0 < percent < 0.1:
-        return "under 0.1 %"
-    return f"{min(percent, 99.9) if count < total else percent:.1f} %".replace("100.0", "100").replace(" 0.0", " 0")
+    if count in (0, total):
+        return f"{percent:.0f} %"
+    return "under 0.1 %" if percent < 0.05 else f"{min(percent, 99.9):.1f} %"
 
 
 def _percent(count: int, total: int) -> str:
