@@ -11,14 +11,10 @@ Run = Mapping[str, Any]
 
 
 def changed_settings(run: Run) -> list[tuple[str, str, str]]:
-    """Settings that are not the default: dotted name, value, default; both are a dash where they are not there."""
-    given, usual = (dict(_flat(each)) for each in (run.get("configuration", {}), asdict(PipelineConfig())))
-    names = dict.fromkeys((*usual, *given)) if given else {}
-    return [
-        (name, _text(given.get(name, "–")), _text(usual.get(name, "–")))
-        for name in names
-        if _text(given.get(name, "–")) != _text(usual.get(name, "–"))
-    ]
+    """Settings that are not the default: dotted name, value, default; a dash where there is no such setting now."""
+    usual = dict(_flat(asdict(PipelineConfig())))
+    given = {name: (_text(value), _text(usual.get(name, "–"))) for name, value in _flat(run.get("configuration"))}
+    return [(name, value, default) for name, (value, default) in given.items() if value != default]
 
 
 def dropped(run: Run) -> list[tuple[str, int, str]]:

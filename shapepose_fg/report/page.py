@@ -113,7 +113,11 @@ def _header(content: Content) -> Element:
 def _sentence(content: Content) -> str:
     people, frames = content.people, len(covered(content.people))
     count = len(content.tracks)
-    who = f"{count} {'person' if count == 1 else 'people'}" if _over_time(people) else f"{len(people)} rows of people"
+    who = (
+        f"{count} {'person' if count == 1 else 'people'}"
+        if _over_time(people)
+        else f"{len(people)} rows of people"
+    )
     fps, source = facts.rate(people.run)
     told = ""
     if fps is not None and fps > 0:
@@ -190,7 +194,16 @@ def _scene(content: Content) -> Element | None:
     controls = element(
         "div",
         element("button", "Play", id="play", type="button", aria_label="Play"),
-        element("input", type="range", id="frame", min="0", max=str(max(frames - 1, 0)), value="0", step="1", aria_label="Frame"),  # fmt: skip
+        element(
+            "input",
+            type="range",
+            id="frame",
+            min="0",
+            max=str(max(frames - 1, 0)),
+            value="0",
+            step="1",
+            aria_label="Frame",
+        ),  # fmt: skip
         element("output", id="clock", for_="frame"),
         element("label", "speed ", element("select", *speeds, id="speed"), class_="speed"),
         class_="controls",
@@ -216,11 +229,17 @@ def _scene(content: Content) -> Element | None:
         stage,
         controls,
         strip,
-        element("p", "One row a person: how high it is filled says how many joints are seen. Click to go there.", class_="lead strip-words"),  # fmt: skip
+        element(
+            "p",
+            "One row a person: how high it is filled says how many joints are seen. Click to go there.",
+            class_="lead strip-words",
+        ),  # fmt: skip
     ]
     if content.thinning is not None and content.thinning.every > 1:
         thin = content.thinning
-        words = f"Drawn here is one frame in {thin.every} ({thin.kept} of {thin.of}), so that the page stays small; "
+        words = (
+            f"Drawn here is one frame in {thin.every} ({thin.kept} of {thin.of}), so that the page stays small; "
+        )
         parts.append(element("p", words + "all figures below are of every frame.", class_="lead"))
     return element("section", element("h2", "Scene", class_="visually-hidden", id="scene-title"), *parts, id="scene", aria_labelledby="scene-title")  # fmt: skip
 

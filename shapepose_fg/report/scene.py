@@ -126,16 +126,24 @@ def _floor(joints: NDArray[np.float64]) -> float:
 
 
 def _view(joints: NDArray[np.float64], centres: NDArray[np.float64]) -> dict[str, Any]:
-    """Where the people are, for the first look: their middle, how far they reach, and the cameras too."""
+    """Where the people are, for the first look: the box around them, and how far they and the cameras reach."""
     points = joints.reshape(-1, 3)
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) == 0:
         points = np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 1.8]])
-    low, high = np.quantile(points, [0.01, 0.99], axis=0)
+    # A joint that ran away is not looked at.
+    low, high = np.quantile(points, [0.003, 0.997], axis=0)
+    low, high = np.minimum(low, high - 1.0), np.maximum(high, low + 1.0)
     middle = (low + high) / 2
     reach = float(np.linalg.norm(high - low)) / 2
     away = np.linalg.norm((centres - middle)[:, :2], axis=1).max(initial=0.0)
-    return {"middle": middle.tolist(), "reach": max(reach, 1.0), "cameras": float(away)}
+    return {
+        "low": low.tolist(),
+        "high": high.tolist(),
+        "middle": middle.tolist(),
+        "reach": max(reach, 1.0),
+        "cameras": float(away),
+    }
 
 
 def _camera(camera: Camera, axes: NDArray[np.float64]) -> dict[str, Any]:
@@ -154,7 +162,9 @@ def _bodies(skins: Skins, pack: _Packing) -> dict[str, Any]:
     """People's bodies as the page's script reads them."""
     millimetres = _Packing(np.zeros(3), 1e-3)
     return {
-        "mesh": {name: _base64(values, "u1" if name == "weights" else "<i2") for name, values in skins.mesh.items()},
+        "mesh": {
+            name: _base64(values, "u1" if name == "weights" else "<i2") for name, values in skins.mesh.items()
+        },
         "rest": _base64(millimetres(skins.rest), "<i2"),
         "rest_joints": _base64(millimetres(skins.joints), "<i2"),
         "turns": _base64(np.rint(TURN * np.nan_to_num(skins.turns)), "<i2"),

@@ -47,7 +47,16 @@ def people_section(people: Reconstruction, tracks: Sequence[TrackSummary], over_
         return section("people", "People", element("p", "Nobody was found."))
     persons = np.array([each.person for each in tracks])
     counts = known_counts(people, np.searchsorted(persons, people.person))
-    head: list[Child] = ["person", "frames", "in", "gaps", "height", "walked", "confidence", "how joints are known"]
+    head: list[Child] = [
+        "person",
+        "from – to",
+        "frames",
+        "gaps",
+        "height",
+        "walked",
+        "confidence",
+        "how joints are known",
+    ]
     rows: list[list[Child]] = [
         [
             swatch(each.person),

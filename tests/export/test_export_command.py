@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from shapepose_fg.cli import main
+from shapepose_fg.export.bones import bones_of
 from shapepose_fg.export.light_mesh import thinned
 from shapepose_fg.export.registry import FORMATS
-from shapepose_fg.export.bones import bones_of
 from shapepose_fg.skeleton import BODY_25, COCO_17
 
 from .conftest import AWAY, FIRST, FRAMES

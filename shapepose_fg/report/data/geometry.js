@@ -74,13 +74,18 @@ class Eye {
     this.reset();
   }
   reset() {
-    this.azimuth = -1.1;
-    this.elevation = 0.36;
+    this.azimuth = Eye.AZIMUTH;
+    this.elevation = Eye.ELEVATION;
     this.target = [...this.view.middle];
     this.through = null;
     this.zoom = 1;
+    this.fit = null;
   }
-  resize(width, height) { this.width = width; this.height = height; }
+  resize(width, height) {
+    this.width = width;
+    this.height = height;
+    this.fit = null;
+  }
   turn(dx, dy) {
     this.leave();
     this.azimuth -= dx;
@@ -97,7 +102,23 @@ class Eye {
   }
   /** Away from a camera, to the free view. */
   leave() { this.through = null; }
-  get distance() { return this.focal * this.view.reach / (0.41 * Math.min(this.width, this.height * 1.25)) / this.zoom; }
+  /** How far the eye is from its target, metres. */
+  get distance() {
+    this.fit ??= this.fitting();
+    return this.fit / this.zoom;
+  }
+  /** The distance at which the box around all people just fits on the screen, in the first view. */
+  fitting() {
+    const { low, high, middle } = this.view, [forward, right, up] = Eye.axes(Eye.AZIMUTH, Eye.ELEVATION);
+    let distance = 1;
+    for (let corner = 0; corner < 8; corner++) {
+      const at = sub([0, 1, 2].map((axis) => (corner >> axis & 1 ? high : low)[axis]), middle);
+      const wide = Math.abs(dot(at, right)) * this.focal / (0.46 * this.width);
+      const tall = Math.abs(dot(at, up)) * this.focal / (0.42 * this.height);
+      distance = Math.max(distance, Math.max(wide, tall) - dot(at, forward));
+    }
+    return distance;
+  }
   /** Bring position and axes up to date before drawing. */
   settle() {
     this.frameBox = null;
@@ -117,13 +138,10 @@ class Eye {
       this.frameBox = [x, y, s * w, s * h];
       return;
     }
-    const c = Math.cos(this.elevation);
     this.focal = this.fx = this.fy = 1.9 * Math.max(this.height, 0.6 * this.width);
     this.cx = this.width / 2;
     this.cy = this.height / 2;
-    this.forward = [-c * Math.cos(this.azimuth), -c * Math.sin(this.azimuth), -Math.sin(this.elevation)];
-    this.right = unit(cross(this.forward, [0, 0, 1]));
-    this.up = cross(this.right, this.forward);
+    [this.forward, this.right, this.up] = Eye.axes(this.azimuth, this.elevation);
     this.position = add(this.target, this.forward, -this.distance);
   }
   depth(p) { return dot(sub(p, this.position), this.forward); }
@@ -143,3 +161,11 @@ class Eye {
   }
 }
 Eye.NEAR = 0.08;
+Eye.AZIMUTH = -1.1;
+Eye.ELEVATION = 0.36;
+/** Forward, right and up of an eye that looks from a direction, radians. */
+Eye.axes = (azimuth, elevation) => {
+  const c = Math.cos(elevation), forward = [-c * Math.cos(azimuth), -c * Math.sin(azimuth), -Math.sin(elevation)];
+  const right = unit(cross(forward, [0, 0, 1]));
+  return [forward, right, cross(right, forward)];
+};
