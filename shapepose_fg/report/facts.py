@@ -11,7 +11,7 @@ Run = Mapping[str, Any]
 
 
 def changed_settings(run: Run) -> list[tuple[str, str, str]]:
-    """Settings that are not the default: dotted name, value, default; a dash where there is no such setting now."""
+    """Settings that are not the default: dotted name, value, default; a dash where there is none any more."""
     usual = dict(_flat(asdict(PipelineConfig())))
     given = {name: (_text(value), _text(usual.get(name, "–"))) for name, value in _flat(run.get("configuration"))}
     return [(name, value, default) for name, (value, default) in given.items() if value != default]

@@ -60,10 +60,7 @@ def _facts(people: Reconstruction) -> list[Element]:
     spent = facts.stages(run)
     if len(spent) > 0:
         total = sum(seconds for _, seconds in spent)
-        listed = ", ".join(
-            f"{name} {seconds:.1f}"
-            for name, seconds in sorted(spent, key=lambda each: -each[1])
-            if seconds >= 0.05
-        )
+        longest = sorted((each for each in spent if each[1] >= 0.05), key=lambda each: -each[1])
+        listed = ", ".join(f"{name} {seconds:.1f}" for name, seconds in longest)
         entries.append(("time", f"{total:.1f} s of processors: {listed}"))
     return [part for name, value in entries for part in (element("dt", name), element("dd", value))]

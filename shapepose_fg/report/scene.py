@@ -27,19 +27,21 @@ _FLOOR_M = 0.3
 
 
 @dataclass(frozen=True)
-class Thinning:
-    """Which of a recording's frames are on the page."""
+class Scene:
+    """What a page draws, and which of a recording's frames that is."""
 
+    data: dict[str, Any]
+    """What the page's script reads: plain values for JSON."""
     every: int
-    """One frame in so many."""
+    """One frame in so many is there."""
     kept: int
     """How many that is."""
-    of: int
-    """How many there are."""
+    frames: int
+    """How many the recording has."""
 
 
-def scene_of(take: Take, arrays: SmplArrays | None, most_bytes: int) -> tuple[dict[str, Any], Thinning]:
-    """The scene as the page's script reads it, in at most about `most_bytes`, and how it was thinned for that.
+def scene_of(take: Take, arrays: SmplArrays | None, most_bytes: int) -> Scene:
+    """The scene in at most about `most_bytes`, for which every second, third ... frame is taken if need be.
 
     The page's axes are those of the world turned so that z is up. Bodies where `arrays`, the body model, is given.
     """
@@ -76,7 +78,7 @@ def scene_of(take: Take, arrays: SmplArrays | None, most_bytes: int) -> tuple[di
     }
     if arrays is not None:
         scene |= _bodies(skins_of(take, arrays, axes, index[frame], person), pack)
-    return scene, Thinning(every, len(index), len(take.frames))
+    return Scene(scene, every, len(index), len(take.frames))
 
 
 @dataclass(frozen=True)
@@ -137,13 +139,8 @@ def _view(joints: NDArray[np.float64], centres: NDArray[np.float64]) -> dict[str
     middle = (low + high) / 2
     reach = float(np.linalg.norm(high - low)) / 2
     away = np.linalg.norm((centres - middle)[:, :2], axis=1).max(initial=0.0)
-    return {
-        "low": low.tolist(),
-        "high": high.tolist(),
-        "middle": middle.tolist(),
-        "reach": max(reach, 1.0),
-        "cameras": float(away),
-    }
+    box = {"low": low.tolist(), "high": high.tolist(), "middle": middle.tolist()}
+    return box | {"reach": max(reach, 1.0), "cameras": float(away)}
 
 
 def _camera(camera: Camera, axes: NDArray[np.float64]) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from shapepose_fg.io.solved_setup import CAMERAS
 from shapepose_fg.reconstruction import Reconstruction
 from shapepose_fg.report.figures import camera_figures
 from shapepose_fg.report.page import Content, page_text
-from shapepose_fg.report.scene import Thinning, scene_of
+from shapepose_fg.report.scene import Scene, scene_of
 from shapepose_fg.result_options import results_folder
 from shapepose_fg.tracking.listing import list_tracks
 
@@ -49,17 +49,16 @@ def write_report(
         remarks.append(f"{CAMERAS} is not there: no cameras are drawn, and {up} is taken to be up")
     else:
         up = rig.up
-    scene: dict | None = None
-    thinning: Thinning | None = None
+    scene: Scene | None = None
     if len(people) > 0:
         try:
             take = Take.of(people, up, rig=rig, fps=_fps(people, fps), identities=False)
         except ValueError as error:
             raise InputError(f"{folder}: {error}") from None
-        scene, thinning = scene_of(take, arrays, scene_bytes)
+        scene = scene_of(take, arrays, scene_bytes)
     title = folder.resolve().name or str(folder)
     tracks = list_tracks(people, arrays)
-    text = page_text(Content(title, people, tracks, camera_figures(people), scene, thinning, remarks))
+    text = page_text(Content(title, people, tracks, camera_figures(people), scene, remarks))
     file = folder / REPORT
     # A name may hold half of a pair of surrogates, which no file can.
     write_atomically(file, lambda stream: stream.write(text.encode("utf-8", "replace")))
