@@ -37,11 +37,18 @@ def view(
             metavar="URL", help="A viewer that runs already: rerun+http://HOST:9876/proxy.", show_default=False
         ),
     ] = None,
+    statistics: Annotated[
+        bool,
+        typer.Option(
+            "--statistics", help="Leave rerun's statistics of use, sent to its makers, as they are set: not off."
+        ),
+    ] = False,
 ) -> None:
     """Show a result in the rerun viewer: people, cameras, and what was used of what they saw, on a timeline."""
     from shapepose_fg.export.job import Job
     from shapepose_fg.export.reading import body_file, read_take
-    from shapepose_fg.export.rerun_scene import body_if_there, log_take, new_stream, open_viewer
+    from shapepose_fg.export.rerun_scene import body_if_there, log_take, new_stream, open_viewer, viewer_file
+    from shapepose_fg.export.rerun_statistics import switch_off
 
     take = read_take(
         results,
@@ -53,6 +60,11 @@ def view(
         identities=False,
     )
     stream = new_stream()
+    viewer = viewer_file()
+    if connect is None and not statistics and viewer is not None and switch_off(viewer):
+        say(
+            "rerun's statistics of use were on and are switched off now; `rerun analytics enable` switches them on"
+        )
     open_viewer(stream, take, connect)
     arrays, note = body_if_there(Job(take, results, body_file(take, body)))
     if note is not None:

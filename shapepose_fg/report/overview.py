@@ -107,7 +107,7 @@ def over_time(people: Reconstruction) -> bool:
     return bool(people.run.get("configuration", {}).get("temporal", True))
 
 
-def _covered(people: Reconstruction) -> NDArray[np.int64]:
+def _covered(people: Reconstruction) -> NDArray[np.integer]:
     """(T,) all frames that were reconstructed, those without people too."""
     spans = covered_frames(people.run) or []
     return np.unique(np.concatenate([people.frame, *(np.arange(span.start, span.stop) for span in spans)]))

@@ -75,8 +75,9 @@ def _stage() -> Element:
         role="img",
         aria_label="People in 3D, with the cameras. Arrow keys turn the view, plus and minus zoom, space plays.",
     )
-    hint = element("p", "Drag to turn · right button or two fingers to move · wheel to zoom", class_="hint")
-    return element("div", canvas, hint, element("div", id="key", class_="key"), class_="stage")
+    hint = element("span", "Drag to turn · right button or two fingers to move · wheel to zoom", class_="hint")
+    under = element("div", element("span", id="key"), hint, class_="under")
+    return element("div", element("div", canvas, class_="stage"), under)
 
 
 def _controls(frames: int) -> Element:
@@ -86,11 +87,12 @@ def _controls(frames: int) -> Element:
         element("option", f"{speed:g}×", value=f"{speed:g}", selected="selected" if speed == 1 else None)
         for speed in _SPEEDS
     ]
+    speed = element("select", *speeds, id="speed", aria_label="Speed")
     return element(
         "div",
         element("button", "Play", id="play", type="button", aria_label="Play"),
         element("input", type="range", id="frame", min="0", max=last, value="0", step="1", aria_label="Frame"),
         element("output", id="clock", for_="frame"),
-        element("label", "speed ", element("select", *speeds, id="speed"), class_="speed"),
+        element("label", element("span", "speed ", class_="word"), speed, class_="speed"),
         class_="controls",
     )

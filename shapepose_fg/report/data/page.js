@@ -87,7 +87,6 @@
   canvas.addEventListener("contextmenu", (event) => event.preventDefault());
   canvas.addEventListener("pointerdown", (event) => {
     canvas.setPointerCapture(event.pointerId);
-    canvas.parentElement.classList.add("used");
     pointers.set(event.pointerId, [event.clientX, event.clientY, event.button === 2 || event.shiftKey]);
   });
   canvas.addEventListener("pointermove", (event) => {
