@@ -45,7 +45,7 @@ def _sentence(people: Reconstruction, cameras: int) -> str:
     told = ""
     if fps is not None and fps > 0:
         assumed = ", a rate that is assumed because none was given" if source == "assumed" else ""
-        told = f", {frames / fps:.1f} s at {fps:.4g} a second{assumed}"
+        told = f", {frames / fps:.1f}\u00a0s at {fps:.4g} a second{assumed}"
     by = f" of {cameras} cameras" if cameras > 0 else ""
     return f"{who if len(people) > 0 else 'Nobody was found'} in {_plural(frames, 'frame', 'frames')}{by}{told}."
 
