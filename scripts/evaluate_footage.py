@@ -2,12 +2,11 @@
 
 `shelf` scores the Shelf recording against its annotation: Avg PCP with an interval over blocks of frames, every
 lost limb as one event, identities that change. `views` leaves out each of its cameras and asks how much of what it
-saw lies in the 95 % region of the rest. `single` measures Pose2Sim's demo recording, which has no truth;
-`--pictures FOLDER` draws joints and bodies over its videos. Needs the recordings (`--data FOLDER`, or
+saw lies in the 95 % region of the rest. `single` measures Pose2Sim's demo recording, which has no truth. It
+needs the recordings (`--data FOLDER`, or
 SHAPEPOSE_DATA).
 
     python scripts/evaluate_footage.py shelf --no-temporal
-    python scripts/evaluate_footage.py single --pictures overlays --draw 16:31
 """
 
 import argparse
@@ -16,19 +15,15 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-import cv2
-import numpy as np
 import torch
 from evaluate_time import with_time
 
-from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import DetectionSequence
 from shapepose_fg.evaluation.held_out_view import held_out
-from shapepose_fg.evaluation.overlay import cropped, draw_bodies, draw_skeletons, undistorted
 from shapepose_fg.evaluation.shelf import evaluate_shelf, match_actors, read_shelf_ground_truth
 from shapepose_fg.evaluation.shelf_events import identity_switches, lost_limbs, pcp_interval
-from shapepose_fg.evaluation.single_person import FPS, man_of, measure_single_person
+from shapepose_fg.evaluation.single_person import FPS, measure_single_person
 from shapepose_fg.frame_times import FrameTimes
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
@@ -49,8 +44,6 @@ def main() -> None:
     parser.add_argument(
         "--temporal", action=argparse.BooleanOptionalAction, help="with time or without; else as configured"
     )
-    parser.add_argument("--pictures", type=Path, help="single: folder for pictures")
-    parser.add_argument("--draw", metavar="A:B", default="0:100", help="single: frames to draw")
     arguments = parser.parse_args()
     if not set(arguments.parts) <= set(PARTS):
         parser.error(f"parts are {' '.join(PARTS)}")
@@ -60,8 +53,7 @@ def main() -> None:
     if "shelf" in parts or "views" in parts:
         shelf(arguments.data / "data" / "shelf", config, parts)
     if "single" in parts:
-        first, last = map(int, arguments.draw.split(":"))
-        single(arguments.data / "data" / "pose2sim_single", config, arguments.pictures, range(first, last))
+        single(arguments.data / "data" / "pose2sim_single", config)
 
 
 def shelf(folder: Path, config: PipelineConfig, parts: Sequence[str]) -> None:
@@ -90,37 +82,13 @@ def views(recording: DetectionSequence, rig: Rig, people: Reconstruction, config
         )
 
 
-def single(folder: Path, config: PipelineConfig, pictures: Path | None, frames: range) -> None:
+def single(folder: Path, config: PipelineConfig) -> None:
     """Pose2Sim's recording."""
     rig = read_rig(folder / "rig.json")
     recording = read_detections(folder / "openpose", rig)
     people = reconstruct(recording, rig, config, times=FrameTimes.from_fps(FPS, len(recording)))
     for name, value in measure_single_person(people, recording, rig).as_dict().items():
         print(f"{name:<22}{value}")
-    if pictures is not None:
-        pictures.mkdir(parents=True, exist_ok=True)
-        draw(people, rig, folder, frames, pictures)
-
-
-def draw(people: Reconstruction, rig: Rig, folder: Path, frames: range, pictures: Path) -> None:
-    """All views of each frame side by side, around the man: bodies above, joints below."""
-    body = BodyModel.default()
-    videos = [cv2.VideoCapture(str(folder / f"{name}.mp4")) for name in rig.names]
-    for frame in range(frames.stop):
-        taken = [video.read()[1] for video in videos]
-        rows = people.at(frame)
-        if frame not in frames or len(man_of(rows, rig)) == 0 or any(picture is None for picture in taken):
-            continue
-        man = rows.rows(man_of(rows, rig))
-        parts = (rows.betas, rows.global_orient, rows.body_pose, rows.transl)
-        vertices = body.vertices(BodyParameters(*(torch.from_numpy(part).float() for part in parts))).numpy()
-        vertices = vertices[np.isfinite(vertices).all(axis=(1, 2))]
-        strip = []
-        for picture, camera in zip(taken, rig.cameras, strict=True):
-            plain = undistorted(np.asarray(picture, dtype=np.uint8), camera)
-            both = draw_bodies(plain, camera, vertices, body.faces), draw_skeletons(plain, camera, rows.joints)
-            strip.append(np.vstack([cropped(each, camera, man.joints[0], (480, 480)) for each in both]))
-        cv2.imwrite(str(pictures / f"frame_{frame:04d}.png"), np.hstack(strip))
 
 
 if __name__ == "__main__":

@@ -5,22 +5,25 @@ import os
 import re
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
+from shapepose_fg.detect_command import detect
 from shapepose_fg.errors import InputError
 from shapepose_fg.export_command import export
+from shapepose_fg.options import frame_range, image_size_of
+from shapepose_fg.overlay_command import overlay
 from shapepose_fg.report_command import report as report_command
+from shapepose_fg.terminal import note, show
+from shapepose_fg.terminal import progress as progress_bar
 from shapepose_fg.tracks_command import tracks
 from shapepose_fg.view_command import view
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
     from rich.table import Table
 
     from shapepose_fg.body.fitting.fitter import BodyFitter
@@ -43,6 +46,8 @@ app = typer.Typer(
 evaluate = typer.Typer(help="Score a reconstruction against an annotation.")
 app.add_typer(evaluate, name="evaluate")
 app.add_typer(tracks, name="tracks")
+app.command()(detect)
+app.command()(overlay)
 app.command()(export)
 app.command("report")(report_command)
 app.command()(view)
@@ -126,12 +131,12 @@ def reconstruct(
     from shapepose_fg.provenance import checksums
 
     _check_workers(workers)
-    size = _image_size(image_size)
+    size = image_size_of(image_size)
     rig = read_rig(calibration, up=cast("Axis | None", up), unit=cast("Unit | None", unit), image_size=size)
     recording = read_detections(detections, rig, skeleton)
-    for note in recording.notes:
-        _note(note)
-    span = _frame_range(frames, len(recording))
+    for each in recording.notes:
+        note(each)
+    span = frame_range(frames, len(recording))
     times = _times(fps, timestamps, rig, len(recording))
     first_frames = _cuts(cuts, len(recording))
     refuse_corrected(output)
@@ -147,7 +152,7 @@ def reconstruct(
     fitter = _fitter(body, settings, recording.skeleton.joints)
     known = None if shapes is None else _known_shapes(shapes, body)
     start = time.perf_counter()
-    with _progress("reconstructing") as progress:
+    with progress_bar("reconstructing") as progress:
         people = run_pipeline(
             recording,
             rig,
@@ -179,7 +184,7 @@ def reconstruct(
         summary.add_row("", f"{shapes}  shapes of {len(people.shapes)} people")
     if page is not None:
         summary.add_row("", f"{page}  to look at, in a browser")
-    _print(summary)
+    show(summary)
 
 
 @evaluate.command("shelf")
@@ -196,7 +201,7 @@ def evaluate_shelf_command(
     if as_json:
         print(json.dumps(score.as_dict(), indent=2, allow_nan=False))
     else:
-        _print(score.table())
+        show(score.table())
 
 
 _DEMO = """\
@@ -217,9 +222,9 @@ def demo(
     print(_DEMO, flush=True)
     from shapepose_fg.demo import run_demo
 
-    with _progress("reconstructing") as progress:
+    with progress_bar("reconstructing") as progress:
         result = run_demo(progress)
-    _print(result.tables())
+    show(result.tables())
     print()
     for line in result.save(output, report=report):
         print(line)
@@ -267,12 +272,12 @@ def simulate(
         seed=seed,
         mocap=mocap,
     )
-    span = _frame_range(frames, len(scene))
+    span = frame_range(frames, len(scene))
     part = cut(scene, span)
     check_output(part, output, cast("Format", format))
     workers = suitable_workers(len(span), FRAMES_WORTH_A_WORKER) if workers is None else workers
     start = time.perf_counter()
-    with _progress("simulating") as progress:
+    with progress_bar("simulating") as progress:
         detections = run_detector(part, DetectorConfig(), seed, workers=workers, progress=progress)
     seconds = time.perf_counter() - start
     about = {"name": name, "seed": seed, "first_frame": span.start, "detector": DetectorConfig().as_dict()}
@@ -309,34 +314,9 @@ def version() -> None:
         print(name, number)
 
 
-def _image_size(text: str | None) -> tuple[int, int] | None:
-    """Width and height of `WxH`."""
-    if text is None:
-        return None
-    match = re.fullmatch(r"\s*(\d+)\s*[x×,]\s*(\d+)\s*", text)
-    if match is None:
-        raise InputError(f"--image-size {text}: must be WIDTHxHEIGHT in pixels, such as 1920x1080")
-    return int(match[1]), int(match[2])
-
-
 def _check_workers(workers: int | None) -> None:
     if workers is not None and not 1 <= workers <= 64:
         raise InputError(f"--workers {workers}: must be 1 to 64; leave it out for as many as pay")
-
-
-def _frame_range(text: str | None, count: int) -> range:
-    """Frames that `A:B` selects of a recording of `count` frames: half-open, either end optional."""
-    if text is None:
-        return range(count)
-    match = re.fullmatch(r"(\d*):(\d*)", text.strip())
-    if match is None:
-        raise InputError(f"--frames {text}: must be A:B, two frame numbers with a colon between, such as 0:100")
-    start, stop = int(match[1] or 0), int(match[2] or count)
-    if not start < stop <= count:
-        raise InputError(
-            f"--frames {text}: not in the recording, which has {count} frames; give A:B with 0 <= A < B <= {count}"
-        )
-    return range(start, stop)
 
 
 def _times(fps: float | None, timestamps: Path | None, rig: "Rig", frames: int) -> "FrameTimes | None":
@@ -407,28 +387,6 @@ def _fitter(body: Path | None, settings: "PipelineConfig", joints: tuple[str, ..
     return make_fitter(settings.body, BodyModel.load(body).with_keypoints(joints))
 
 
-@contextmanager
-def _progress(what: str) -> Iterator[Callable[[int, int], None]]:
-    """A progress bar on stderr while the block runs: a function of frames done and frames in all.
-
-    Nothing is shown where stderr is not a terminal.
-    """
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("frames"),
-        TimeRemainingColumn(compact=True),
-    )
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(what, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
-
-
 def _report(people: "Reconstruction", rig: "Rig", output: Path) -> Path:
     """The result as a page."""
     from shapepose_fg.report.writing import write_report
@@ -493,21 +451,6 @@ def _joints(people: "Reconstruction") -> str:
     variance = variance[np.isfinite(variance) & (variance >= 0)]
     sigma = f"; median sigma {1e3 * np.sqrt(np.median(variance)):.0f} mm" if len(variance) > 0 else ""
     return shares + sigma
-
-
-def _print(content: "RenderableType") -> None:
-    """Print on stdout; with colours on a terminal only."""
-    from rich.console import Console
-
-    Console().print(content)
-
-
-def _note(message: str) -> None:
-    """Say on stderr, in one line, what was made of the input."""
-    from rich.console import Console
-    from rich.text import Text
-
-    Console(stderr=True).print(Text.assemble(("note: ", "bold"), message), soft_wrap=True)
 
 
 def _fail(message: str) -> int:

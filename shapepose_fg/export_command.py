@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from shapepose_fg.errors import InputError
-from shapepose_fg.result_options import checked_fps, frame_range, results_folder, say
+from shapepose_fg.result_options import checked_fps, frame_range, results_folder
+from shapepose_fg.terminal import note
 
 if TYPE_CHECKING:
     from shapepose_fg.camera import Axis
@@ -71,5 +72,5 @@ def export(
     )
     for file in (file for written in done.values() for file in written.files):
         print(file)
-    for note in (note for written in done.values() for note in written.notes):
-        say(note)
+    for each in (told for written in done.values() for told in written.notes):
+        note(each)

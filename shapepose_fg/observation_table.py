@@ -29,12 +29,10 @@ class Gate(IntEnum):
     TOO_FAR = 2
     """Farther than rho_2D from the projected joint (delta_ij = 0 in Eq. 2)."""
     CONTRADICTS_BODY = 3
-    """Too far from where the rest of the body puts the joint."""
-    CONTRADICTS_MOTION = 4
-    """Too far from where the frames before and after put the joint."""
-    BEHIND_CAMERA = 5
+    """Views agree on a place where the rest of the body cannot have the joint: they saw somebody else's."""
+    BEHIND_CAMERA = 4
     """The joint is behind this camera, or nearer than `min_depth_m`."""
-    NOT_PLACED = 6
+    NOT_PLACED = 5
     """The joint itself could not be placed: there is nothing to compare the detection with."""
 
 

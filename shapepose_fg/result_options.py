@@ -26,11 +26,3 @@ def frame_range(text: str | None) -> range | None:
     if match is None or (match[2] and int(match[1] or 0) >= int(match[2])):
         raise InputError(f"--frames {text}: must be A:B, two frame numbers with a colon between, such as 0:100")
     return range(int(match[1] or 0), int(match[2] or 10**12))
-
-
-def say(message: str) -> None:
-    """Say on stderr, in one line, what is not in the files."""
-    from rich.console import Console
-    from rich.text import Text
-
-    Console(stderr=True).print(Text.assemble(("note: ", "bold"), message), soft_wrap=True)

@@ -28,11 +28,12 @@ def result_rows(
     body = {name: getattr(fit, name).copy() for name in ("betas", "global_orient", "body_pose", "transl")}
     for values in body.values():
         values[~fit.ok] = np.nan
+    dropped = np.where(estimates.contradicts[..., None], Gate.CONTRADICTS_BODY, Gate.TOO_FAR)
     table = ObservationTable.of(
         observations,
         place,
         estimates.joints,
-        np.where(estimates.inlier, Gate.USED, Gate.TOO_FAR),
+        np.where(estimates.inlier, Gate.USED, dropped),
         rig,
         frame=observations.frame,
         person=person,

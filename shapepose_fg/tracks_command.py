@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from shapepose_fg.errors import InputError
+from shapepose_fg.terminal import show
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -51,7 +52,7 @@ def list_people(
 
     people = Reconstruction.load(context.obj)
     if not as_json:
-        _print(_tracks_table(context.obj, people))
+        show(_tracks_table(context.obj, people))
         return
     listed = [asdict(track) for track in list_tracks(people, _body_of(people))]
     plain = [{name: None if value != value else value for name, value in track.items()} for track in listed]
@@ -103,7 +104,7 @@ def undo_correction(context: typer.Context) -> None:
     folder = _folder(context.obj)
     edit, people = take_back(folder, _solver(folder))
     print(f"taken back: {edit}")
-    _print(_tracks_table(context.obj, people))
+    show(_tracks_table(context.obj, people))
     _renew_report(folder)
 
 
@@ -174,7 +175,7 @@ def _correct(context: typer.Context, action: str, person: int, **more: int | Non
     solve = _solver(folder)
     edited = correct(folder, edit, solve)
     print(f"done: {edit}{_solved_words(edited, solve)}")
-    _print(_tracks_table(context.obj, edited.people))
+    show(_tracks_table(context.obj, edited.people))
     print(f"take it back: shapepose-fg tracks {context.obj} undo")
     _renew_report(folder)
 
@@ -232,10 +233,3 @@ def _solved_words(edited: "Edited", solve: "Solve | None") -> str:
     if solve is None:
         return "; joints and bodies stay as they were solved"
     return f"; solved anew: {' '.join(map(str, sorted(edited.changed)))}"
-
-
-def _print(content: "RenderableType") -> None:
-    """Print on stdout; with colours on a terminal only."""
-    from rich.console import Console
-
-    Console().print(content)

@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from shapepose_fg.result_options import checked_fps, frame_range, say
+from shapepose_fg.result_options import checked_fps, frame_range
+from shapepose_fg.terminal import note
 
 if TYPE_CHECKING:
     from shapepose_fg.camera import Axis
@@ -66,8 +67,8 @@ def view(
             "rerun's statistics of use were on and are switched off now; `rerun analytics enable` switches them on"
         )
     open_viewer(stream, take, connect)
-    arrays, note = body_if_there(Job(take, results, body_file(take, body)))
-    if note is not None:
-        say(note)
+    arrays, missing = body_if_there(Job(take, results, body_file(take, body)))
+    if missing is not None:
+        note(missing)
     log_take(stream, take, arrays)
     stream.flush()

@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 LEVELS = (
     "factors errors",
     "camera skeleton",
-    "files provenance result_options rendering run_summary columns workers body.threads",
+    "files provenance result_options rendering run_summary columns workers body.threads options terminal",
     "body.model",
     "body.fitting body.shapes",
     "body.offsets",
@@ -28,11 +28,12 @@ LEVELS = (
     "windows bodies_over_time solved_rows",
     "pipeline",
     "io solving",
-    "simulation viewer",
+    "simulation viewer detection2d",
+    "overlay",
     "training export",
     "report",
     "evaluation",
-    "demo tracks_command export_command report_command view_command",
+    "demo tracks_command export_command report_command view_command detect_command overlay_command",
     "cli",
 )
 """Each level imports only from those before it; a package may import its own modules too."""

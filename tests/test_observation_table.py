@@ -58,7 +58,7 @@ def test_rows_and_back_together():
 @pytest.mark.parametrize(
     ("column", "value", "message"),
     [
-        ("gate", np.full((2, 2, 2), 7), "gate must hold codes below 7, got 7"),
+        ("gate", np.full((2, 2, 2), 7), "gate must hold codes below 6, got 7"),
         (
             "gate",
             np.ones((2, 2, 2), int),

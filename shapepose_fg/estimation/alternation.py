@@ -82,6 +82,8 @@ class Solution:
     """(N, J, 3) X, metres; NaN where unknown."""
     inlier: NDArray[np.bool_]
     """(N, J, V) delta_ij of Eq. 2: which observations were kept."""
+    contradicts: NDArray[np.bool_]
+    """(N, J) joints whose views the body contradicts (`disagreement`): gated anew from the body's place."""
     views: Message
     """What the views alone say of N rows, all of the error in it."""
     body: Message
@@ -101,7 +103,8 @@ class Solution:
 
         none = np.zeros(N, dtype=bool)
         fit = BodyFit.failed(np.full(N, FitStatus.TOO_FEW_JOINTS), J)
-        return cls(X.copy(), np.zeros((N, J, views), dtype=bool), nothing(), nothing(), none, fit)
+        seen, wrong = np.zeros((N, J, views), dtype=bool), np.zeros((N, J), dtype=bool)
+        return cls(X.copy(), seen, wrong, nothing(), nothing(), none, fit)
 
 
 def alternate(
@@ -148,6 +151,7 @@ def alternate(
         said = _message(observed, evidence, body, moving, groups, enough, fitter, config)
         X_new = _solve(moving, evidence, said, config)
         solution.joints[rows], solution.inlier[rows] = X_new, evidence.inlier
+        solution.contradicts[rows] |= wrong
         for kept, new in ((solution.views, Message(evidence.target, evidence.information)), (solution.body, said)):
             kept.xyz[rows], kept.information[rows] = new.xyz, new.information
         solution.fit = solution.fit.with_rows(rows, body)

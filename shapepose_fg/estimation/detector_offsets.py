@@ -12,6 +12,7 @@ from shapepose_fg.body.offsets.estimation import OffsetPrior
 from shapepose_fg.camera import Rig, Views
 from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas, triangulate
 from shapepose_fg.observations import Observations
+from shapepose_fg.skeleton import BODY_25
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ def confident_targets(
     """
     views = Views.of(rig)
     points = triangulate(observations, views, observation_config)
-    sigmas = observation_sigmas(observations, points, views, observation_config)
+    sigmas = observation_sigmas(observations, points, views, observation_config, BODY_25.joints)
     evidence = linearise(observations, sigmas, points, views, observation_config)
     evidence = linearise(observations, sigmas, evidence.target, views, observation_config)
     sure = (evidence.inlier & (observations.confidence >= config.min_confidence)).sum(axis=-1) >= config.min_views

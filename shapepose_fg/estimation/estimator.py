@@ -47,6 +47,8 @@ class Estimates:
     """(N, J) w_i of Eq. 4, mean confidence over all views of the observations that were kept."""
     inlier: NDArray[np.bool_]
     """(N, J, V) delta_ij of Eq. 2: which observations were kept."""
+    contradicts: NDArray[np.bool_]
+    """(N, J) joints whose views the body contradicts."""
     residual_px: NDArray[np.float64]
     """(N, J, V, 2) projection of the joint minus observation; NaN where unseen or unknown."""
     known: NDArray[np.uint8]
@@ -69,7 +71,9 @@ class Estimates:
         return Estimates(**kept, fit=self.fit.rows(index), problems=tuple(problems))
 
 
-_COLUMNS = "joints covariance velocity velocity_covariance confidence inlier residual_px known status".split()
+_COLUMNS = (
+    "joints covariance velocity velocity_covariance confidence inlier contradicts residual_px known status".split()
+)
 """The arrays of `Estimates`."""
 
 
@@ -87,6 +91,7 @@ class Estimator:
         self.rig = rig
         self.fitter = fitter
         self.config = EstimatorConfig() if config is None else config
+        self.joints = joints
         self._motion = MotionModel.load(joints, self.config.motion)
 
     def estimate(
@@ -106,7 +111,7 @@ class Estimator:
         X = triangulate(observations, views, config.observations)
         if config.motion.temporal and len(np.unique(observations.track)) < len(observations):
             X = self._completed(X, observations, views)
-        sigmas = observation_sigmas(observations, X, views, config.observations)
+        sigmas = observation_sigmas(observations, X, views, config.observations, self.joints)
         windows = self._windows(observations, sigmas, views, extra_factors)
         solution = alternate(observations, views, sigmas, X, windows, self.fitter, config)
         return self._estimates(observations, sigmas, views, windows, X, solution)
@@ -122,7 +127,7 @@ class Estimator:
         config = self.config
         views = Views.of(self.rig) if views is None else views
         X = triangulate(observations, views, config.observations)
-        sigmas = observation_sigmas(observations, X, views, config.observations)
+        sigmas = observation_sigmas(observations, X, views, config.observations, self.joints)
         evidence = linearise(observations, sigmas, X, views, config.observations)
         enough = (evidence.sigma_m <= config.refine.max_sigma_m).sum(axis=1) >= config.refine.min_joints
         whole = self.fitter.fit_whole if isinstance(self.fitter, WholeFitter) else self.fitter.fit
@@ -211,6 +216,7 @@ class Estimator:
             velocity_covariance=velocity_covariance,
             confidence=mean_confidence(observations, solution.inlier),
             inlier=solution.inlier,
+            contradicts=solution.contradicts,
             residual_px=final.residual_px,
             known=how_known(solution, covariance),
             fit=fit,

@@ -1,5 +1,6 @@
 """What the views saw of each person, and what that says of each joint: gates, weights, information."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,13 +16,16 @@ from shapepose_fg.observations import Observations
 class ObservationConfig:
     """How far a 2D observation is trusted."""
 
-    sigma_m: float = 0.013
+    sigma_m: float = 0.0105
     """How far a detection of confidence 1 is from the joint, one sigma per axis, as a length at the joint's
-    depth: a person's image shrinks with distance, and so does the detector's error. Measured on real detections
-    without any annotation, each view against where the others see the joint (docs/evaluation.md)."""
-    confidence_power: float = 2.0
-    """w_ij of Eq. 1 is the confidence to this power. The paper's weight is the confidence itself; measured, sigma
-    falls faster than its square root, nearly as 1 / confidence."""
+    depth: a person's image shrinks with distance, and so does the detector's error."""
+    confidence_power: float = 5.0
+    """p of w_ij, the weight in Eq. 1 of an observation of confidence c: w_ij = (c^p + w_0) / (1 + w_0). The
+    paper's weight is the confidence itself. Measured, sigma at 0.95 is a third of what it is under 0.4."""
+    least_weight: float = 0.077
+    """w_0 in it: what the least confident observation weighs."""
+    by_joint: bool = True
+    """Whether sigma differs from joint to joint (`JOINT_SCATTER`): a detector knows an eye better than a hip."""
     floor_px: float = 1.0
     """What the detector's grid costs at any size."""
     rho_2d_m: float = 0.15
@@ -36,8 +40,32 @@ class ObservationConfig:
         for name in ("sigma_m", "confidence_power", "rho_2d_m", "min_depth_m"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        if self.floor_px < 0:
-            raise ValueError(f"floor_px must not be negative, got {self.floor_px}")
+        for name in ("least_weight", "floor_px"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
+
+    def weight(self, confidence: NDArray[np.float64]) -> NDArray[np.float64]:
+        """w_ij of Eq. 1 for observations of this confidence."""
+        return (confidence**self.confidence_power + self.least_weight) / (1.0 + self.least_weight)
+
+    def scatter(self, joints: Sequence[str]) -> NDArray[np.float64]:
+        """(J,) what sigma is multiplied with for each joint; 1 for names that are not known."""
+        return np.array([JOINT_SCATTER.get(name, 1.0) if self.by_joint else 1.0 for name in joints])
+
+
+def _both(joint: str, scatter: float) -> dict[str, float]:
+    return {f"R{joint}": scatter, f"L{joint}": scatter}
+
+
+JOINT_SCATTER = {
+    "Nose": 0.65, **_both("Eye", 0.67), **_both("Ear", 0.68), "Neck": 1.05, **_both("Shoulder", 1.08),
+    **_both("Elbow", 0.88), **_both("Wrist", 0.90), "MidHip": 1.33, **_both("Hip", 1.28), **_both("Knee", 1.18),
+    **_both("Ankle", 1.00), **_both("BigToe", 0.90), **_both("SmallToe", 0.96), **_both("Heel", 1.02),
+}  # fmt: skip
+"""How much farther than the mean a detection of a joint is from it at the same confidence. As sigma by confidence,
+measured where simulated detections of the `tune` sequences lie beside the truth; the simulated detector draws from
+statistics of real ones, and these, each view of Shelf against the others, give the same within a few per cent
+(docs/evaluation.md)."""
 
 
 @dataclass(frozen=True)
@@ -94,11 +122,16 @@ def _weakest(values: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def observation_sigmas(
-    observations: Observations, points: NDArray[np.float64], views: Views, config: ObservationConfig
+    observations: Observations,
+    points: NDArray[np.float64],
+    views: Views,
+    config: ObservationConfig,
+    joints: Sequence[str],
 ) -> NDArray[np.float64]:
     """Sigma (N, J, V) in pixels of every observation, for joints near `points` (N, J, 3); 0 where unseen.
 
-    A joint whose place is not known takes the mean depth of the person's known ones.
+    `joints` are the J joints' names: some are seen more sharply than others. A joint whose place is not known
+    takes the mean depth of the person's known ones.
     """
     _, depth, _ = views.project(points)
     usable = depth >= config.min_depth_m
@@ -107,8 +140,9 @@ def observation_sigmas(
     seen = observations.seen
     sigmas = np.zeros(observations.confidence.shape)
     focal = _per_joint(views.focal_px, sigmas.shape)
+    scatter = np.broadcast_to(config.scatter(joints)[:, None], seen.shape)
     sigmas[seen] = sigma_px(
-        observations.confidence[seen] ** config.confidence_power,
+        config.weight(observations.confidence[seen]) / scatter[seen] ** 2,
         depth[seen],
         focal[seen],
         sigma_m=config.sigma_m,

@@ -111,6 +111,7 @@ def compare_view(
         confidence[ours, joint],
         without.joints[theirs, joint],
         without.covariance[theirs, joint],
+        config.scatter(people.joint_names.tolist())[joint],
         config,
     )
     known = np.isfinite(squared)
@@ -118,20 +119,26 @@ def compare_view(
 
 
 def squared_distances(
-    camera: Camera, xy: Array, confidence: Array, points: Array, covariance: Array, config: ObservationConfig
+    camera: Camera,
+    xy: Array,
+    confidence: Array,
+    points: Array,
+    covariance: Array,
+    scatter: Array,
+    config: ObservationConfig,
 ) -> Array:
     """(M,) squared Mahalanobis distances of detections `xy` (M, 2), undistorted pixels, from projected `points`.
 
     `points` (M, 3) in metres with `covariance` (M, 3, 3), m², were found without them. S = J C J^T + sigma² I
     has the joint's uncertainty in the image and the noise that the graph gives a detection of that `confidence`
-    (M,). NaN behind the camera.
+    (M,) and of a joint with that `scatter` (M,). NaN behind the camera.
     """
     count = len(points)
     projected, depth, J = project_with_jacobian(points, camera.K, camera.cTw)
     ahead = depth >= config.min_depth_m
     sigma = np.full(count, np.nan)
     sigma[ahead] = sigma_px(
-        confidence[ahead] ** config.confidence_power,
+        config.weight(confidence[ahead]) / scatter[ahead] ** 2,
         depth[ahead],
         np.full(ahead.sum(), _focal(camera)),
         sigma_m=config.sigma_m,

@@ -19,6 +19,7 @@ from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.observations import Observations
 from shapepose_fg.pipeline import PipelineConfig, find_people, reconstruct
+from shapepose_fg.skeleton import BODY_25
 
 CONFIG = replace(PipelineConfig(), temporal=False)
 """Every frame by itself."""
@@ -142,7 +143,12 @@ def shelf_observations(folder: Path) -> tuple[Rig, Observations, NDArray[np.floa
     observations = Observations.concatenate(found)
     views = Views.of(rig)
     points = triangulate(observations, views, CONFIG.observations)
-    return rig, observations, observation_sigmas(observations, points, views, CONFIG.observations), points
+    return (
+        rig,
+        observations,
+        observation_sigmas(observations, points, views, CONFIG.observations, BODY_25.joints),
+        points,
+    )
 
 
 def _rule(columns: int) -> str:

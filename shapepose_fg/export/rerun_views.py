@@ -18,7 +18,6 @@ CAMERAS = "world/cameras"
 _GATES = {
     Gate.TOO_FAR: (213, 43, 43),
     Gate.CONTRADICTS_BODY: (214, 39, 190),
-    Gate.CONTRADICTS_MOTION: (245, 205, 30),
     Gate.BEHIND_CAMERA: (90, 90, 90),
     Gate.NOT_PLACED: (150, 150, 150),
 }

@@ -15,15 +15,11 @@ from shapepose_fg.detections import Detections, DetectionSequence
 from shapepose_fg.errors import InputError
 from shapepose_fg.files import write_atomically
 from shapepose_fg.io.detection_table import MARGIN
+from shapepose_fg.io.detections.association_skeletons import TEXT_SKELETONS, TextSkeleton
 from shapepose_fg.skeleton import BODY_25
 
 SMALLEST_PERSON = 3
 """Groups of fewer joints are nobody, as in OpenPose's default settings."""
-_BODY_25 = 4
-"""The number of BODY_25 among the format's skeletons."""
-_LIMBS = np.array(BODY_25.limbs)
-_LIMB_OF = np.full((len(BODY_25), len(BODY_25)), -1, dtype=np.intp)
-_LIMB_OF[tuple(_LIMBS.T)] = np.arange(len(_LIMBS))
 
 
 def write_association(recording: DetectionSequence, rig: Rig, folder: str | Path) -> None:
@@ -45,7 +41,7 @@ def write_association(recording: DetectionSequence, rig: Rig, folder: str | Path
     folder = Path(folder)
     calibration = {camera.name: _calibration(camera) for camera in rig.cameras}
     _write(folder / "calibration.json", json.dumps(calibration, indent=1, allow_nan=False))
-    texts = [[f"{_BODY_25} {len(recording)}"] for _ in rig.cameras]
+    texts = [[f"{TEXT_SKELETONS[BODY_25.name].number} {len(recording)}"] for _ in rig.cameras]
     for frame in range(len(recording)):
         found = recording[frame]
         for view, camera in enumerate(rig.cameras):
@@ -122,28 +118,54 @@ def _calibration(camera: Camera) -> dict[str, list[float] | list[int]]:
 
 
 def _frame_lines(found: Detections, view: int, camera: Camera) -> Iterable[str]:
-    """The lines of one frame of one camera: candidates joint by joint, then affinities limb by limb."""
+    """The lines of one frame of one camera."""
     size = np.array(camera.image_size, dtype=np.float64)
     rows = np.flatnonzero(found.view == view)
     xy = camera.distort(found.xy[rows])
     near = np.all((xy > -MARGIN * size) & (xy < (1 + MARGIN) * size), axis=1)
     rows, xy = rows[near], xy[near]
-    order = np.argsort(found.joint[rows], kind="stable")
-    rows, (x, y) = rows[order], (xy[order] / (size - 1)).T
-    counts = np.bincount(found.joint[rows], minlength=len(BODY_25))
+    place = np.full(len(found), -1, dtype=np.intp)
+    place[rows] = np.arange(len(rows))
+    pairs = place[found.pairs]
+    kept = np.all(pairs >= 0, axis=1)
+    return association_lines(
+        TEXT_SKELETONS[BODY_25.name],
+        found.joint[rows],
+        xy / (size - 1),
+        found.confidence[rows],
+        pairs[kept],
+        found.affinity[kept],
+    )
+
+
+def association_lines(
+    kind: TextSkeleton,
+    joint: NDArray[np.intp],
+    fractions: NDArray[np.float64],
+    confidence: NDArray[np.float64],
+    pairs: NDArray[np.intp],
+    affinity: NDArray[np.float64],
+) -> Iterable[str]:
+    """The lines of one frame: candidates joint by joint, then affinities limb by limb.
+
+    `joint` (D,), `fractions` (D, 2) parts of the picture's size, `confidence` (D,), `pairs` (E, 2) candidates,
+    the limb's first joint first, `affinity` (E,).
+    """
+    order = np.argsort(joint, kind="stable")
+    x, y = fractions[order].T
+    score = confidence[order]
+    counts = np.bincount(joint, minlength=len(kind.joints))
     ends = np.cumsum(counts)
     for n, end in zip(counts.tolist(), ends.tolist(), strict=True):
         yield str(n)
         if n > 0:
             block = slice(end - n, end)
-            yield from (_numbers(x[block], 7), _numbers(y[block], 7), _numbers(found.confidence[rows[block]], 6))
-    place = np.full(len(found), -1, dtype=np.intp)
-    place[rows] = np.arange(len(rows)) - (ends - counts)[found.joint[rows]]
-    first, second = found.pairs.T
-    kept = (place[first] >= 0) & (place[second] >= 0)
-    first, second, affinity = first[kept], second[kept], found.affinity[kept]
-    limb = _LIMB_OF[found.joint[first], found.joint[second]]
-    for index, (a, b) in enumerate(BODY_25.limbs):
+            yield from (_numbers(x[block], 7), _numbers(y[block], 7), _numbers(score[block], 6))
+    place = np.empty(len(joint), dtype=np.intp)
+    place[order] = np.arange(len(joint)) - (ends - counts)[joint[order]]
+    first, second = pairs.T
+    limb = kind.limb_of[joint[first], joint[second]]
+    for index, (a, b) in enumerate(kind.limbs):
         scores = np.zeros((counts[a], counts[b]))
         mine = limb == index
         scores[place[first[mine]], place[second[mine]]] = affinity[mine]

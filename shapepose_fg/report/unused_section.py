@@ -12,7 +12,6 @@ from shapepose_fg.report.sections import count_words, percent, section
 _REASON_WORDS = {
     Gate.TOO_FAR: ("too far", "farther from the projected joint than the gate (observations.rho_2d_m) allows"),
     Gate.CONTRADICTS_BODY: ("against the body", "too far from where the rest of the body puts the joint"),
-    Gate.CONTRADICTS_MOTION: ("against motion", "too far from where the frames before and after put the joint"),
     Gate.BEHIND_CAMERA: ("behind camera", "the joint lies behind this camera"),
     Gate.NOT_PLACED: ("joint not placed", "there is no place to compare the detection with"),
 }

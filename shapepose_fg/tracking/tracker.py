@@ -251,7 +251,7 @@ class Tracker:
             return joints, candidate
         seen = Observations.of(candidate, detections, np.where(lost[..., None], np.nan, joints.position))
         views = Views.of(rig)
-        sigmas = observation_sigmas(seen, joints.position, views, self.observation)
+        sigmas = observation_sigmas(seen, joints.position, views, self.observation, self.skeleton.joints)
         placed = triangulate(seen, views, self.observation)
         at = np.where(np.isfinite(placed), placed, joints.position)
         measured, inlier = joints, candidate >= 0

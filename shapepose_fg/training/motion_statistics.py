@@ -124,7 +124,7 @@ def lasting_errors(
     """
     config, views = ObservationConfig(), Views.of(rig)
     points = triangulate(observations, views, config)
-    sigmas = observation_sigmas(observations, points, views, config)
+    sigmas = observation_sigmas(observations, points, views, config, BODY_25.joints)
     evidence = linearise(observations, sigmas, points, views, config)
     body = fitter.fit(joint_targets(evidence, np.ones(len(observations), dtype=bool)))
     told = np.linalg.inv(np.where(body.ok[:, None, None, None], body.prior_covariance, np.eye(3)))

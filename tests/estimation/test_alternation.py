@@ -15,9 +15,11 @@ from shapepose_fg.estimation.alternation import EstimatorConfig, RefineConfig
 from shapepose_fg.estimation.estimator import Estimates, Estimator
 from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas, triangulate
 from shapepose_fg.estimation.window_graph import WindowGraph, WindowGraphConfig
+from shapepose_fg.observation_table import Gate
 from shapepose_fg.observations import Observations
 from shapepose_fg.reconstruction import Status
 from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.solved_rows import result_rows
 
 WRIST, ELBOW, KNEE = 4, 3, 13
 
@@ -133,7 +135,7 @@ def test_the_fitter_is_told_what_the_views_alone_say(five_cameras, two_people, d
     run(doubtful_wrist, five_cameras, fitter, kernel, alternations=3)
     config = ObservationConfig(kernel=kernel)
     views = Views.of(five_cameras)
-    sigmas = observation_sigmas(doubtful_wrist, doubtful_wrist.initial, views, config)
+    sigmas = observation_sigmas(doubtful_wrist, doubtful_wrist.initial, views, config, BODY_25.joints)
     X = doubtful_wrist.initial
     for n, targets in enumerate(fitter.targets):
         if n > 0:
@@ -145,15 +147,15 @@ def test_the_fitter_is_told_what_the_views_alone_say(five_cameras, two_people, d
 
 def test_a_prior_does_not_come_back_through_the_body(five_cameras, two_people, doubtful_wrist):
     """The prior pulls the wrist by centimetres; where the fitter is told to put it stays where the views say."""
-    fitter = FakeFitter(two_people + 0.1)
+    fitter = FakeFitter(two_people + 0.1, sigma_m=0.035)
     pulled = run(doubtful_wrist, five_cameras, fitter)
     alone = run(doubtful_wrist, five_cameras, FakeFitter(two_people, fails=True))
     moved = np.linalg.norm(pulled.joints[:, WRIST] - alone.joints[:, WRIST], axis=-1)
     assert (moved > 0.03).all()
     # One Gauss-Newton step from up to 20 cm off: to the second order of that at 3.5 m.
     np.testing.assert_allclose(fitter.targets[-1].xyz, alone.joints, atol=0.012)
-    # The information changes with the point of linearisation by a few per cent, a prior would add 3 / 0.1² to
-    # the 3 / 0.06² or so of five views of confidence 0.1.
+    # The information changes with the point of linearisation by a few per cent, a prior would add 3 / 0.035² to
+    # the 3 / 0.018² or so of five views of confidence 0.1.
     before, after = fitter.targets[0].information, fitter.targets[-1].information
     np.testing.assert_allclose(np.trace(after, axis1=2, axis2=3), np.trace(before, axis1=2, axis2=3), rtol=0.1)
 
@@ -238,6 +240,11 @@ def test_views_that_contradict_the_body_are_gated_anew_around_it(five_cameras, t
     np.testing.assert_allclose(result.joints, two_people, atol=0.03)
     assert np.argwhere(~result.inlier.any(axis=-1)).tolist() == [[0, KNEE]]
     assert result.confidence[0, KNEE] == 0
+    place = np.zeros(seen.confidence.shape, dtype=np.int32)
+    rows = result_rows(seen, result, place, five_cameras, BODY_25.joints, np.arange(2))
+    assert rows.observations is not None
+    dropped = np.argwhere(rows.observations.gate == Gate.CONTRADICTS_BODY)
+    assert dropped.tolist() == [[0, KNEE, 0], [0, KNEE, 1]] and rows.observations.reasons()["too far"] == 0
     alone = run(seen, five_cameras, FakeFitter(two_people, fails=True))
     np.testing.assert_allclose(alone.joints[0, KNEE], elsewhere[0, KNEE], atol=0.01)
 

@@ -1,5 +1,7 @@
 """What the views say of each joint: gates, weights, information; and joints that stage I missed."""
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from shapepose_fg.estimation.linearisation import (
     triangulate,
 )
 from shapepose_fg.observations import Observations
+from shapepose_fg.skeleton import BODY_25
 
 
 def observations_of(
@@ -52,12 +55,27 @@ def test_sigma_is_the_detector_s_error_at_the_joint_s_depth(two_views):
     config = ObservationConfig(sigma_m=0.02, floor_px=3.0)
     points = np.array([[[0.0, 0, 2], [0, 0, 1], [0, 0, np.nan]]])
     seen = Observations(np.zeros((1, 3, 2, 2)), np.array([[[1.0, 0.0], [1.0, 0.25], [1.0, 0.0]]]), points)
-    sigma = observation_sigmas(seen, points, Views.of(two_views), config)[0]
+    sigma = observation_sigmas(seen, points, Views.of(two_views), config, ("Snout", "RAnkle", "Tail"))[0]
     # 2 cm are 10 px at 2 m and 20 px at 1 m; unknown joints are taken at the mean depth of the others, 1.5 m.
     expected = np.hypot(3.0, [10.0, 20.0, 20.0 / 1.5])
     np.testing.assert_allclose(sigma[:, 0], expected)
     assert sigma[0, 1] == 0 and sigma[2, 1] == 0, "unseen"
-    assert sigma[1, 1] > np.hypot(3.0, 10.0) * 1.5, "the less sure, the wider"
+    weight = (0.25**config.confidence_power + config.least_weight) / (1 + config.least_weight)
+    assert sigma[1, 1] == pytest.approx(np.hypot(3.0, 10.0) / np.sqrt(weight)) and weight < 0.1, "the less sure"
+    joints = ("MidHip", "RAnkle", "LEye")
+    by_joint = observation_sigmas(seen, points, Views.of(two_views), config, joints)[0, :, 0]
+    np.testing.assert_allclose(by_joint / expected, config.scatter(joints))
+    assert by_joint[0] / expected[0] > 1.2 and by_joint[2] / expected[2] < 0.8, "an eye is sharper than a hip"
+    alike = replace(config, by_joint=False)
+    np.testing.assert_allclose(
+        observation_sigmas(seen, points, Views.of(two_views), alike, joints)[0, :, 0], expected
+    )
+
+
+def test_the_paper_s_weight_is_the_confidence():
+    paper = ObservationConfig(confidence_power=1.0, least_weight=0.0, by_joint=False)
+    confidence = np.array([0.1, 0.5, 1.0])
+    np.testing.assert_allclose(paper.weight(confidence), confidence)
 
 
 @pytest.mark.parametrize("kernel", [None, "cauchy"])
@@ -65,7 +83,7 @@ def test_exact_observations_have_the_information_of_their_geometry(five_cameras,
     """Residuals are zero, so every kernel's weight is one."""
     config = ObservationConfig(kernel=kernel)
     seen = observations_of(five_cameras, two_people)
-    sigmas = observation_sigmas(seen, two_people, Views.of(five_cameras), config)
+    sigmas = observation_sigmas(seen, two_people, Views.of(five_cameras), config, BODY_25.joints)
     evidence = linearise(seen, sigmas, two_people, Views.of(five_cameras), config)
     joint, view = (index.ravel() for index in np.indices(sigmas.shape[1:]))
     for person in range(2):
@@ -87,7 +105,7 @@ def test_information_and_gradient_are_those_of_the_graph(five_cameras, two_peopl
     seen = without(seen, unseen)
     seen.xy[0, 3, 1] += 300.0
     points = two_people[:1] + rng.normal(0, 0.02, (1, 25, 3))
-    sigmas = observation_sigmas(seen, points, Views.of(five_cameras), config)
+    sigmas = observation_sigmas(seen, points, Views.of(five_cameras), config, BODY_25.joints)
     evidence = linearise(seen, sigmas, points, Views.of(five_cameras), config)
     assert not evidence.inlier[0, 3, 1] and 0.6 < evidence.inlier.mean() < 0.9
     cameras = [make_camera(camera.K, camera.wTc) for camera in five_cameras.cameras]
@@ -150,7 +168,7 @@ def test_a_joint_whose_place_is_not_known_has_no_evidence(five_cameras, two_peop
     seen = observations_of(five_cameras, two_people, initial=points)
     config = ObservationConfig()
     with np.errstate(all="raise"):
-        sigmas = observation_sigmas(seen, points, Views.of(five_cameras), config)
+        sigmas = observation_sigmas(seen, points, Views.of(five_cameras), config, BODY_25.joints)
         evidence = linearise(seen, sigmas, points, Views.of(five_cameras), config)
     unknown = np.isnan(points).any(axis=-1)
     assert not evidence.inlier[unknown].any() and evidence.inlier[~unknown].all()
@@ -258,8 +276,8 @@ def test_cameras_may_differ_from_row_to_row(five_cameras, two_people):
         seen.initial,
     )
     config, still = ObservationConfig(), Views.of(five_cameras)
-    sigmas = observation_sigmas(seen, two_people, still, config)
-    swapped = observation_sigmas(turned, two_people, views, config)
+    sigmas = observation_sigmas(seen, two_people, still, config, BODY_25.joints)
+    swapped = observation_sigmas(turned, two_people, views, config, BODY_25.joints)
     np.testing.assert_allclose(swapped[1], sigmas[1, :, ::-1])
     one = linearise(seen, sigmas, two_people, still, config)
     other = linearise(turned, swapped, two_people, views, config)

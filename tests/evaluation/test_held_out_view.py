@@ -55,10 +55,12 @@ def test_true_covariances_hold_95_percent(scene):
     points = point + rng.normal(size=(count, 3)) @ root.T
     true, depth = camera.project(np.broadcast_to(point, (count, 3)))
     confidence = np.full(count, 0.8)
-    sigma = np.hypot(CONFIG.sigma_m * camera.K[0, 0] / depth[0], CONFIG.floor_px) / 0.8
+    scatter = np.full(count, 1.3)
+    weight = (0.8**CONFIG.confidence_power + CONFIG.least_weight) / (1 + CONFIG.least_weight)
+    sigma = 1.3 * np.hypot(CONFIG.sigma_m * camera.K[0, 0] / depth[0], CONFIG.floor_px) / np.sqrt(weight)
     xy = true + rng.normal(size=(count, 2)) * sigma
     covariance = np.broadcast_to(root @ root.T, (count, 3, 3))
-    squared = squared_distances(camera, xy, confidence, points, covariance, CONFIG)
+    squared = squared_distances(camera, xy, confidence, points, covariance, scatter, CONFIG)
     assert squared.mean() == pytest.approx(2.0, abs=0.06)  # linear to a per cent at 2 % of the depth
     assert (squared <= INSIDE_95).mean() == pytest.approx(0.95, abs=0.006)
 
@@ -67,7 +69,9 @@ def test_behind_the_camera_there_is_no_distance(scene):
     camera = scene.rig.cameras[0]
     behind = camera.centre - camera.wTc[:3, 2]
     assert np.isnan(
-        squared_distances(camera, np.zeros((1, 2)), np.ones(1), behind[None], 1e-4 * np.eye(3)[None], CONFIG)
+        squared_distances(
+            camera, np.zeros((1, 2)), np.ones(1), behind[None], 1e-4 * np.eye(3)[None], np.ones(1), CONFIG
+        )
     )
 
 

@@ -119,7 +119,7 @@ def test_bad_number(text_folder, rig, what, word, sentence):
 @pytest.mark.parametrize(
     ("kind", "sentence"),
     [
-        ("3", "line 1: skeleton type 3 (COCO18) is not read here, only 4 (BODY_25); run the detector with"),
+        ("2", "line 1: skeleton type 2 (SKEL15) is not read here, only 4 (BODY_25) and 3 (COCO_18); run the"),
         ("0", "skeleton type 0 (SKEL19) is not read here"),
         ("25", "skeleton type 25 is not read here"),
         ("4.5", "skeleton type 4.5 is not read here"),

@@ -14,28 +14,34 @@ from shapepose_fg.camera import Camera
 from shapepose_fg.errors import InputError
 from shapepose_fg.files import read_text
 from shapepose_fg.io.detection_table import ViewCandidates
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.io.detections.association_skeletons import (
+    SKELETON_TYPES,
+    TEXT_SKELETONS,
+    TextSkeleton,
+    with_middles,
+)
+from shapepose_fg.skeleton import Skeleton
 
-_SKELETON_TYPES = ("SKEL19", "SKEL17", "SKEL15", "COCO18", "BODY25", "OPTITRACK21", "SHELF15", "MPIIHAND21")
-"""What the format's skeleton numbers mean; only BODY25 is read."""
 _OVERSHOOT = 1.1
 """Heat maps that are enlarged overshoot a little: scores up to this are read as 1."""
-_LIMBS = np.array(BODY_25.limbs)
 
 
-def read_association_text(path: Path, camera: Camera) -> ViewCandidates:
-    """Read the candidates that `camera` saw from `path`; InputError naming file, line, frame and cure."""
+def read_association_text(path: Path, camera: Camera) -> tuple[ViewCandidates, Skeleton]:
+    """Read the candidates that `camera` saw from `path`, and their skeleton; middle joints are made.
+
+    InputError naming file, line, frame and cure.
+    """
     text = read_text(path)
     stream = _Stream(path, text, _numbers(path, text))
-    frame_count = _header(stream)
-    counts, starts = _layout(stream, frame_count)
+    kind, frame_count = _header(stream)
+    counts, starts = _layout(stream, kind, frame_count)
     frame, joint, rows = _candidate_rows(counts, starts)
     values = stream.values
-    n = counts.ravel()[frame * len(BODY_25) + joint]
+    n = counts[frame, joint]
     fractions = np.column_stack([values[rows], values[rows + n]])
     _check(stream, rows, fractions, values[rows + 2 * n], n)
-    pairs, affinity = _pairs(values, counts, starts)
-    return ViewCandidates(
+    pairs, affinity = _pairs(values, kind, counts, starts)
+    view = ViewCandidates(
         source=path,
         frame_count=frame_count,
         frame=frame,
@@ -45,6 +51,7 @@ def read_association_text(path: Path, camera: Camera) -> ViewCandidates:
         pairs=pairs,
         affinity=affinity,
     )
+    return (with_middles(view, kind) if kind.skeleton.middles else view), kind.skeleton
 
 
 class _Stream:
@@ -90,24 +97,25 @@ def _first_bad(tokens: Sequence[str]) -> int:
     raise AssertionError("one of the tokens is no number")
 
 
-def _header(stream: _Stream) -> int:
-    """The number of frames, if the skeleton is BODY_25."""
+def _header(stream: _Stream) -> tuple[TextSkeleton, int]:
+    """The skeleton, if it is one that is read, and the number of frames."""
     values = stream.values
     if len(values) < 2:
         raise stream.refuse(0, "the first line must hold skeleton type and number of frames", "write both")
-    if values[0] != _SKELETON_TYPES.index("BODY25"):
-        known = f" ({_SKELETON_TYPES[int(values[0])]})" if values[0] in range(len(_SKELETON_TYPES)) else ""
+    kind = next((each for each in TEXT_SKELETONS.values() if each.number == values[0]), None)
+    if kind is None:
+        known = f" ({SKELETON_TYPES[int(values[0])]})" if values[0] in range(len(SKELETON_TYPES)) else ""
         raise stream.refuse(
             0,
-            f"skeleton type {values[0]:g}{known} is not read here, only 4 (BODY_25)",
+            f"skeleton type {values[0]:g}{known} is not read here, only 4 (BODY_25) and 3 (COCO_18)",
             "run the detector with its BODY_25 model",
         )
     if values[1] < 1 or values[1] != int(values[1]):
         raise stream.refuse(1, f"the number of frames must be 1 or more, got {values[1]:g}", "correct it")
-    return int(values[1])
+    return kind, int(values[1])
 
 
-def _layout(stream: _Stream, frame_count: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _layout(stream: _Stream, kind: TextSkeleton, frame_count: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """How many candidates each joint of each frame has, and where the numbers of each block start.
 
     Returns `counts` (T, J) and `starts` (T, J + 1): the first x of a joint, and in the last column the
@@ -119,7 +127,7 @@ def _layout(stream: _Stream, frame_count: int) -> tuple[NDArray[np.intp], NDArra
     position = 2
     for frame in range(frame_count):
         frame_counts, frame_starts = [], []
-        for name in BODY_25.joints:
+        for name in kind.joints:
             if position >= total:
                 raise _cut(stream, frame, f"the number of candidates of {name}", frame_count)
             n = values[position]
@@ -135,10 +143,10 @@ def _layout(stream: _Stream, frame_count: int) -> tuple[NDArray[np.intp], NDArra
             if position > total:
                 raise _cut(stream, frame, f"the candidates of {name}", frame_count)
         frame_starts.append(position)
-        for first, second in BODY_25.limbs:
+        for first, second in kind.limbs:
             position += frame_counts[first] * frame_counts[second]
             if position > total:
-                limb = f"{BODY_25.joints[first]}-{BODY_25.joints[second]}"
+                limb = f"{kind.joints[first]}-{kind.joints[second]}"
                 raise _cut(stream, frame, f"the affinities of {limb}", frame_count)
         counts.append(frame_counts)
         starts.append(frame_starts)
@@ -165,15 +173,15 @@ def _candidate_rows(
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
     """Frame (D,), joint (D,) and place of x in the stream (D,) of every candidate."""
     block, within = _expand(counts.ravel())
-    frame, joint = np.divmod(block, len(BODY_25))
+    frame, joint = np.divmod(block, counts.shape[1])
     return frame, joint, starts[:, :-1].ravel()[block] + within
 
 
 def _pairs(
-    values: NDArray[np.float64], counts: NDArray[np.intp], starts: NDArray[np.intp]
+    values: NDArray[np.float64], kind: TextSkeleton, counts: NDArray[np.intp], starts: NDArray[np.intp]
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """The pairs of candidates (E, 2) with an affinity above 0, and that affinity (E,)."""
-    first, second = _LIMBS.T
+    first, second = np.array(kind.limbs).T
     sizes = counts[:, first] * counts[:, second]  # (T, L)
     block_start = starts[:, -1:] + np.cumsum(sizes, axis=1) - sizes
     block, within = _expand(sizes.ravel())

@@ -1,6 +1,5 @@
 """Which files of a folder are which camera's."""
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,8 +7,8 @@ from typing import Literal
 
 from shapepose_fg.camera import Rig
 from shapepose_fg.errors import InputError
+from shapepose_fg.io.camera_names import match_names
 
-_NUMBERS = re.compile(r"\d+")
 _EXPECTED = (
     "give the folder with <camera>.txt (4D Association), <camera>/ or <camera>_json/ with a JSON file per frame"
     " (OpenPose, Pose2Sim, MMPose), or <camera>.json (COCO's results, AlphaPose, MMPose)"
@@ -79,36 +78,12 @@ def _alike(folder: Path, rig: Rig) -> Places | None:
     offered = [each for each in sorted(folder.iterdir()) if each.is_dir() or each.suffix == ".json"]
     offered = [each for each in offered if not each.name.startswith(".")]
     names = [each.name.removesuffix(".json").removesuffix("_json") for each in offered]
-    chosen = _within(rig.names, names)
+    chosen = match_names(rig.names, names)
     if chosen is None:
-        wanted, there = _one_number_each(rig.names), _one_number_each(names)
-        if wanted is None or there is None or not set(wanted) <= set(there):
-            return None
-        chosen = [there.index(number) for number in wanted]
+        return None
     places = [offered[index] for index in chosen]
     pairs = ", ".join(f"{name} is {place.name}" for name, place in zip(rig.names, places, strict=True))
     return Places("people", places, (f"{folder}: cameras were told by parts of the names: {pairs}",))
-
-
-def _within(cameras: Sequence[str], names: Sequence[str]) -> list[int] | None:
-    """For each camera the only name in which its own stands as a word; None where one has none or several."""
-    chosen = []
-    for camera in cameras:
-        word = re.compile(rf"(?<![A-Za-z0-9]){re.escape(camera)}(?![A-Za-z0-9])")
-        found = [index for index, name in enumerate(names) if word.search(name) is not None]
-        if len(found) != 1:
-            return None
-        chosen += found
-    return chosen if len(set(chosen)) == len(chosen) else None
-
-
-def _one_number_each(names: Sequence[str]) -> list[int] | None:
-    """The only number in each name; None where one has none or several, or two have the same."""
-    found = [_NUMBERS.findall(name) for name in names]
-    if any(len(each) != 1 for each in found):
-        return None
-    numbers = [int(each[0]) for each in found]
-    return numbers if len(set(numbers)) == len(numbers) else None
 
 
 def _complete(places: list[Path], rig: Rig, folder: Path) -> None:

@@ -32,10 +32,7 @@ def read_detections(path: str | Path, rig: Rig, skeleton: Skeleton | str | Path 
     places = find_places(Path(path), rig)
     wanted = find_skeleton(skeleton)
     if places.kind == "text":
-        if wanted is not None and wanted.joints != BODY_25.joints:
-            raise InputError(f"{places.paths[0]}: 4D Association's text is read with BODY_25, not {wanted.name}")
-        texts = zip(places.paths, rig.cameras, strict=True)
-        table = assemble([read_association_text(text, camera) for text, camera in texts], rig, BODY_25)
+        table = _read_texts(places.paths, rig, wanted)
         return replace(table, notes=(*places.notes, *table.notes))
     people = [_camera(each) for each in places.paths]
     found = _Found(people, _skeleton_of(people, wanted))
@@ -45,6 +42,26 @@ def read_detections(path: str | Path, rig: Rig, skeleton: Skeleton | str | Path 
     views = [candidates_of(each, found.skeleton, *(_own_span(each) or (first, last))) for each in found.people]
     table = assemble(views, rig, found.skeleton)
     return replace(table, notes=(*places.notes, *notes, *found.middles(), *table.notes))
+
+
+def _read_texts(texts: Sequence[Path], rig: Rig, wanted: Skeleton | None) -> DetectionTable:
+    """4D Association's text of every camera."""
+    read = [read_association_text(text, camera) for text, camera in zip(texts, rig.cameras, strict=True)]
+    skeleton = read[0][1]
+    for text, (_, each) in zip(texts, read, strict=True):
+        if each.name != skeleton.name:
+            raise InputError(
+                f"{text} has the joints of {each.name}, {texts[0]} those of {skeleton.name}; give the detections"
+                " of one model for all cameras"
+            )
+    if wanted is not None and wanted.joints != skeleton.joints:
+        raise InputError(f"{texts[0]}: these are joints of {skeleton.name}, not of {wanted.name}")
+    table = assemble([view for view, _ in read], rig, skeleton)
+    made = [skeleton.joints[joint] for joint, _, _ in skeleton.middles]
+    if len(made) > 0:
+        note = f"{skeleton.name} has no {' and no '.join(made)}: made between the two that one neighbour links"
+        table = replace(table, notes=(note, *table.notes))
+    return table
 
 
 def _camera(place: Path) -> CameraPeople:

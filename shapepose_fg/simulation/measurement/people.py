@@ -174,7 +174,7 @@ def left_out(people: People, rig: Rig, view: int, config: PipelineConfig) -> tup
     confidence[..., view] = 0.0
     others = Observations(people.observations.xy, confidence, people.joints)
     views = Views.of(rig)
-    sigmas = observation_sigmas(others, people.joints, views, config.observations)
+    sigmas = observation_sigmas(others, people.joints, views, config.observations, BODY_25.joints)
     points = triangulate(others, views, config.observations)
     evidence = linearise(others, sigmas, points, views, config.observations)
     for _ in range(4):

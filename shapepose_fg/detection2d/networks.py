@@ -1,0 +1,124 @@
+"""Which channel of a network's output is what, and which networks are known by name or checksum."""
+
+import json
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.errors import InputError
+
+
+@dataclass(frozen=True)
+class NetworkLayout:
+    """What a network takes and gives: of OpenPose's kind, heat maps and part affinity fields in one array."""
+
+    name: str
+    """What it is called."""
+    about: str
+    """Which networks have it, in a sentence."""
+    skeleton: str
+    """The skeleton in which its detections are read, a name of `SKELETONS`."""
+    joints: tuple[str, ...]
+    """The J joints, in the order of the heat maps."""
+    limbs: tuple[tuple[int, int], ...]
+    """The L limbs, in the order of the affinity fields, two channels (x, y) each."""
+    first_heat_map: int
+    """Channel of joint 0."""
+    first_affinity: int
+    """Channel of the x of limb 0."""
+    channels: int
+    """How many channels the output has."""
+    stride: int
+    """Pixels of the input per cell of the output, along each axis."""
+    multiple: int
+    """Both sides of the input are multiples of this."""
+    scale: float
+    """The input is `scale` * colour + `offset`, with colours (blue, green, red) from 0 to 255."""
+    offset: float
+    """See `scale`."""
+
+    @property
+    def limb_ends(self) -> NDArray[np.intp]:
+        """(L, 2) the joints that each limb joins."""
+        return np.array(self.limbs, dtype=np.intp)
+
+
+@dataclass(frozen=True)
+class KnownNetwork:
+    """A network that can be asked for by name."""
+
+    name: str
+    """What it is called."""
+    about: str
+    """What it is, in a sentence."""
+    layout: str
+    """Name of its `NetworkLayout`."""
+    sha256: str
+    """Checksum of its file."""
+    bytes: int
+    """Size of its file."""
+    address: str | None
+    """Where it is fetched from; None where no public address is known, and the user names one."""
+
+
+@lru_cache(maxsize=1)
+def _table() -> dict[str, Any]:
+    return json.loads((files("shapepose_fg.detection2d") / "data" / "networks.json").read_text(encoding="utf-8"))
+
+
+@lru_cache(maxsize=1)
+def layouts() -> dict[str, NetworkLayout]:
+    """All layouts by name."""
+    return {name: _layout(name, entry) for name, entry in _table()["layouts"].items()}
+
+
+@lru_cache(maxsize=1)
+def known_networks() -> dict[str, KnownNetwork]:
+    """All named networks by name."""
+    names = ("about", "layout", "sha256", "bytes", "address")
+    return {
+        name: KnownNetwork(name, **{each: entry[each] for each in names})
+        for name, entry in _table()["networks"].items()
+    }
+
+
+def find_layout(wanted: str | None, sha256: str, channels: int | None, place: object) -> NetworkLayout:
+    """The layout of a network: the one that is `wanted`, or that of a known file, or the only one that fits.
+
+    `channels` is the number of channels of the output, None where the file does not say. InputError, naming the
+    file `place`, where nothing tells.
+    """
+    every = layouts()
+    listing = "; ".join(f"{each.name} ({each.about})" for each in every.values())
+    if wanted is not None:
+        if wanted not in every:
+            raise InputError(f"--layout {wanted}: not known; known are {listing}")
+        return every[wanted]
+    for network in known_networks().values():
+        if network.sha256 == sha256:
+            return every[network.layout]
+    fitting = [each for each in every.values() if each.channels == channels]
+    if len(fitting) == 1:
+        return fitting[0]
+    gives = "gives no fixed number of channels" if channels is None else f"gives {channels} channels"
+    choice = " or ".join(each.name for each in fitting) or "another network"
+    raise InputError(
+        f"{place}: the network {gives}, which does not say how its output is to be read; give --layout {choice}"
+        f" (known are {listing})"
+    )
+
+
+def _layout(name: str, entry: dict[str, Any]) -> NetworkLayout:
+    """A layout as the table writes it."""
+    limbs = (limb.split("-") for limb in entry["limbs"].split())
+    rest = {each: value for each, value in entry.items() if each not in ("joints", "limbs")}
+    return NetworkLayout(
+        name=name,
+        joints=tuple(entry["joints"].split()),
+        limbs=tuple((int(first), int(second)) for first, second in limbs),
+        **rest,
+    )

@@ -1,0 +1,125 @@
+"""Pictures turned so that gravity points down, at the size of a network's input, and the way back.
+
+Detectors are trained on people who stand upright in the picture: of others they find half as many.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.camera import Camera
+from shapepose_fg.detection2d.networks import NetworkLayout
+
+LEVEL_DEG = 5.0
+"""Pictures that are rolled by less stay as they are: people lean by as much, and turning costs corners."""
+_LOOKS_DOWN = 0.17
+"""Where the picture of the vertical is shorter than this (the sine of 10 degrees), the camera looks along it, and
+no direction of the picture is up."""
+
+
+def roll_of(camera: Camera, up: NDArray[np.float64]) -> float:
+    """How far the picture of `camera` is to be turned for `up` (3,) to point up in its middle: degrees clockwise.
+
+    0 where the camera looks straight up or down.
+    """
+    x, y, z = camera.cTw[:, :3] @ up
+    width, height = camera.image_size
+    right, down, _ = np.linalg.solve(camera.K, [(width - 1) / 2, (height - 1) / 2, 1.0])
+    # How the picture of a point in the middle moves when the point goes up.
+    across, along = x - right * z, y - down * z
+    if np.hypot(across, along) < _LOOKS_DOWN:
+        return 0.0
+    return -float(np.degrees(np.arctan2(across, -along)))
+
+
+@dataclass(frozen=True)
+class UprightView:
+    """How a region of a picture becomes the input of a network, turned upright."""
+
+    size: tuple[int, int]
+    """(width, height) of the network's input, pixels."""
+    input_from_picture: NDArray[np.float64]
+    """(2, 3) affine map of the picture's pixels to those of the input."""
+    region: tuple[float, float, float, float]
+    """Left, top, right, bottom edge of the region, pixels of the picture; the centre of the first pixel is 0."""
+    cell_px: int
+    """Pixels of the input per cell of the output."""
+    turn_deg: float
+    """By how much the picture is turned clockwise, degrees."""
+
+    @property
+    def scale(self) -> float:
+        """Pixels of the input per pixel of the picture."""
+        return float(np.sqrt(abs(np.linalg.det(self.input_from_picture[:, :2]))))
+
+    @classmethod
+    def of(
+        cls,
+        region: tuple[float, float, float, float],
+        roll_deg: float,
+        long_side: int,
+        layout: NetworkLayout,
+        only_size: tuple[int, int] | None = None,
+    ) -> "UprightView":
+        """The view of a `region` turned clockwise by `roll_deg`, about `long_side` pixels along its longer side.
+
+        Rolls under `LEVEL_DEG` from a multiple of 90 degrees are turned by that multiple. Both sides are the
+        nearest multiples of what the network takes, so the axes' scales differ by a few per cent. A network that
+        takes pictures of `only_size` (width, height) gets the region in the middle of such a picture.
+        """
+        quarter = 90.0 * round(roll_deg / 90.0)
+        roll_deg = quarter if abs(roll_deg - quarter) < LEVEL_DEG else roll_deg
+        left, top, right, bottom = region
+        angle = np.radians(roll_deg)
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        corners = np.array([[left, top], [right, top], [right, bottom], [left, bottom]]) @ turn.T
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        sides = high - low
+        if only_size is None:
+            size = np.maximum(np.round(sides * long_side / sides.max() / layout.multiple), 1) * layout.multiple
+            stretch = np.diag(size / sides)
+        else:
+            size = np.array(only_size)
+            stretch = np.eye(2) * (size / sides).min()
+        # Edges, not centres, of pixels are scaled: hence the half pixel.
+        matrix = np.column_stack([stretch @ turn, (size - stretch @ (low + high)) / 2 - 0.5])
+        return cls((int(size[0]), int(size[1])), matrix, region, layout.stride, roll_deg)
+
+    def input_of(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The network's input (height, width, 3) of a `picture`; outside the region it has the mean colour."""
+        left, top, right, bottom = (round(edge + 0.5) for edge in self.region)
+        part = picture[max(top, 0) : bottom, max(left, 0) : right]
+        matrix = self.input_from_picture.copy()
+        matrix[:, 2] += matrix[:, :2] @ (max(left, 0), max(top, 0))
+        # Halves first: sampling a picture that is much too large would pass over most of its pixels.
+        shrink = self.scale
+        size = np.maximum(np.round(np.array(part.shape[1::-1]) * shrink), 1).astype(int)
+        if shrink < 1:
+            small = cv2.resize(part, size.tolist(), interpolation=cv2.INTER_AREA)
+            ratio = np.array(part.shape[1::-1]) / size
+            matrix[:, 2] += matrix[:, :2] @ (0.5 * ratio - 0.5)
+            matrix[:, :2] = matrix[:, :2] * ratio
+        else:
+            small = part
+        turned = cv2.warpAffine(
+            small,
+            matrix,
+            self.size,
+            flags=cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=cv2.mean(small)[:3],
+        )
+        return np.asarray(turned, dtype=np.uint8)
+
+    def picture_from_cells(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Pixels (N, 2) of the picture from positions (N, 2) in cells of the network's output."""
+        pixels = (xy + 0.5) * self.cell_px - 0.5
+        return (pixels - self.input_from_picture[:, 2]) @ np.linalg.inv(self.input_from_picture[:, :2]).T
+
+    def inside(self, xy: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """(N,) which pixels (N, 2) of the picture lie in the region."""
+        left, top, right, bottom = self.region
+        x, y = xy.T
+        return (x >= left) & (x <= right) & (y >= top) & (y <= bottom)

@@ -1,0 +1,1 @@
+"""Videos and folders of pictures, one for each camera."""

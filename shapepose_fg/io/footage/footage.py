@@ -1,0 +1,235 @@
+"""The pictures of one camera, frame by frame: of a video, of a folder of pictures, or a single picture."""
+
+import os
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.errors import InputError
+from shapepose_fg.io.footage.places import PICTURES
+
+Picture = NDArray[np.uint8]
+"""(H, W, 3) blue, green, red."""
+Progress = Callable[[int, int], None]
+"""Is told how many frames are done, and how many there are."""
+
+_READ_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
+_SAFE_READING = (
+    "protocol_whitelist;file"
+    "|format_whitelist;mov,mp4,m4a,3gp,3g2,mj2,avi,matroska,webm,mpeg,mpegts,mpegvideo,asf,h264,hevc,m4v"
+)
+"""A video is read by these rules: its file alone, and no playlist, which could name other files and addresses."""
+_LARGEST = 16384
+"""No camera has pictures with a longer side, pixels: a file that says so is damaged, or meant to do harm."""
+_LAST_NUMBER = re.compile(r"\d+(?=\D*$)")
+
+
+class Footage(Protocol):
+    """What one camera took: frames with numbers, of which some may have no picture."""
+
+    path: Path
+    """The video or the folder."""
+    size: tuple[int, int]
+    """(width, height) of the pictures."""
+    notes: tuple[str, ...]
+    """What is wrong with the files, a sentence each."""
+
+    @property
+    def number(self) -> NDArray[np.intp]:
+        """(N,) number of each frame, rising."""
+        ...
+
+    @property
+    def time_s(self) -> NDArray[np.float64] | None:
+        """(N,) when each frame was taken, seconds after the first; None where the files do not say."""
+        ...
+
+    def at(self, place: int) -> Picture | None:
+        """The picture of frame `place` of the N; None where it cannot be read. Fastest in rising order."""
+        ...
+
+
+def open_footage(path: Path, progress: Progress | None = None) -> Footage:
+    """The footage at `path`: a video (looked through once, for its frames and times), a folder, or a picture.
+
+    InputError where nothing in it can be read.
+    """
+    if path.is_dir() or path.suffix.lower() in PICTURES:
+        return PictureFiles.open(path)
+    return Video.open(path, progress)
+
+
+@dataclass
+class Video:
+    """The frames of a video file that can be read."""
+
+    path: Path
+    size: tuple[int, int]
+    time_s: NDArray[np.float64]
+    """(N,) the frames' own times in the file, seconds after the first."""
+    notes: tuple[str, ...] = ()
+    _capture: Any = field(default=None, repr=False)
+    _next: int = 0
+    _last: Picture | None = None
+
+    @property
+    def number(self) -> NDArray[np.intp]:
+        """(N,) frames count from 0."""
+        return np.arange(len(self.time_s))
+
+    @classmethod
+    def open(cls, path: Path, progress: Progress | None = None) -> "Video":
+        """Look through the video at `path`: every frame is decoded once, which shows what is cut or damaged."""
+        capture = _capture(path)
+        size = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        if not (min(size) > 0 and max(size) <= _LARGEST):
+            raise InputError(
+                f"{path}: the video's pictures would be {size[0]} x {size[1]}; give an undamaged video"
+            )
+        announced = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
+        fps = float(capture.get(cv2.CAP_PROP_FPS))
+        stamps = []
+        while capture.grab():
+            stamps.append(float(capture.get(cv2.CAP_PROP_POS_MSEC)) / 1e3)
+            if progress is not None and len(stamps) % 64 == 0:
+                progress(len(stamps), announced)
+        capture.release()
+        if len(stamps) == 0:
+            raise InputError(f"{path}: no frame of this video can be read; give an undamaged video")
+        time_s, notes = _times(path, np.array(stamps), fps)
+        # Files tell of a frame or two that players do not show; more is a file that was cut or damaged.
+        if announced - len(stamps) > 2:
+            notes.append(
+                f"{path}: only {len(stamps)} of the {announced} frames that the file tells of can be read; it was"
+                " cut or is damaged"
+            )
+        return cls(path, size, time_s, tuple(notes))
+
+    def at(self, place: int) -> Picture | None:
+        """The picture of frame `place`; None where it cannot be decoded."""
+        if self._capture is not None and place == self._next - 1:
+            return self._last
+        if self._capture is None or place < self._next:
+            self._capture, self._next = _capture(self.path), 0
+        while self._next <= place:
+            if not self._capture.grab():
+                self._next, self._last = place + 1, None
+                return None
+            self._next += 1
+        read, picture = self._capture.retrieve()
+        fits = read and picture is not None and picture.shape[1::-1] == self.size
+        self._last = np.asarray(picture, dtype=np.uint8) if fits else None
+        return self._last
+
+
+@dataclass
+class PictureFiles:
+    """A folder of pictures, or one picture."""
+
+    path: Path
+    size: tuple[int, int]
+    files: tuple[Path, ...]
+    """(N,) the files in the order of their numbers."""
+    number: NDArray[np.intp]
+    notes: tuple[str, ...] = ()
+    time_s: NDArray[np.float64] | None = None
+
+    @classmethod
+    def open(cls, path: Path) -> "PictureFiles":
+        """The pictures at `path`; the last number in a file's name is its frame's."""
+        if path.is_file():
+            return cls(path, _size(path), (path,), np.zeros(1, dtype=np.intp))
+        files = [each for each in path.iterdir() if each.suffix.lower() in PICTURES and each.name[0] != "."]
+        if len(files) == 0:
+            raise InputError(f"{path}: no pictures in this folder; known are {' '.join(sorted(PICTURES))}")
+        found = [_LAST_NUMBER.search(each.stem) for each in files]
+        if all(match is None for match in found) and len(files) == 1:
+            return cls(path, _size(files[0]), tuple(files), np.zeros(1, dtype=np.intp))
+        bare = next((each for each, match in zip(files, found, strict=True) if match is None), None)
+        if bare is not None:
+            raise InputError(f"{bare}: no number in its name says which frame this is; number the pictures")
+        numbers = np.array([int(match[0]) for match in found if match is not None], dtype=object)
+        if max(numbers) > np.iinfo(np.int64).max // 2:
+            raise InputError(
+                f"{path}: a number with {len(str(max(numbers)))} digits is no frame's; number the frames"
+            )
+        order = np.argsort(numbers.astype(np.int64), kind="stable")
+        number = numbers.astype(np.intp)[order]
+        twice = np.flatnonzero(np.diff(number) == 0)
+        files = [files[place] for place in order.tolist()]
+        if len(twice) > 0:
+            one, other = files[int(twice[0])].name, files[int(twice[0]) + 1].name
+            raise InputError(f"{path}: {one} and {other} are both frame {number[twice[0]]}; leave one of them")
+        missing = int(number[-1] - number[0] + 1 - len(number))
+        notes = (f"{path}: {missing} of {number[-1] - number[0] + 1} pictures are missing",) if missing > 0 else ()
+        return cls(path, _size(files[0]), tuple(files), number, notes)
+
+    def at(self, place: int) -> Picture | None:
+        """The picture of frame `place`; None where the file cannot be read, or is of another size."""
+        picture = cv2.imread(str(self.files[place]), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        if picture is None or picture.shape[1::-1] != self.size:
+            return None
+        return np.asarray(picture, dtype=np.uint8)
+
+
+def _capture(path: Path) -> Any:
+    """The video at `path`, opened by FFmpeg and by the rules for files that nobody vouches for."""
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such video; check the path")
+    before, level = os.environ.get(_READ_OPTIONS), cv2.utils.logging.getLogLevel()
+    os.environ[_READ_OPTIONS] = _SAFE_READING
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # silent; read when the first video is opened
+    # What OpenCV would say of a damaged file on stderr is said below.
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+        if before is None:
+            del os.environ[_READ_OPTIONS]
+        else:
+            os.environ[_READ_OPTIONS] = before
+    if not capture.isOpened():
+        raise InputError(f"{path}: not a video that can be read; give another copy, or convert it to H.264 in MP4")
+    return capture
+
+
+def _times(path: Path, stamp_s: NDArray[np.float64], fps: float) -> tuple[NDArray[np.float64], list[str]]:
+    """(N,) seconds after the first frame, and what is odd about them.
+
+    The file's own times where they rise; else the rate that it names.
+    """
+    known_rate = np.isfinite(fps) and 0.01 <= fps <= 1e5
+    if len(stamp_s) > 1 and not (np.diff(stamp_s) > 0).all():
+        if not known_rate:
+            raise InputError(
+                f"{path}: the video says neither times nor rate; give --fps CAMERA=RATE, or convert it"
+            )
+        return np.arange(len(stamp_s)) / fps, [
+            f"{path}: the frames' times in the file do not rise; its rate of {fps:g} a second was taken instead"
+        ]
+    time_s = stamp_s - stamp_s[0]
+    if len(time_s) < 3:
+        return time_s, []
+    step = float(np.median(np.diff(time_s)))
+    gaps = np.flatnonzero(np.diff(time_s) > 1.5 * step)
+    if len(gaps) == 0:
+        return time_s, []
+    return time_s, [
+        f"{path}: the time from frame to frame varies, {len(gaps)} steps are longer than one and a half frames"
+        f" (the first after frame {gaps[0]}); frames were taken by their times"
+    ]
+
+
+def _size(file: Path) -> tuple[int, int]:
+    """(width, height) of a picture."""
+    picture = cv2.imread(str(file), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if picture is None:
+        raise InputError(f"{file}: not a picture that can be read; give an undamaged one")
+    return picture.shape[1], picture.shape[0]

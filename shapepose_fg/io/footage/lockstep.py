@@ -1,0 +1,134 @@
+"""Which pictures of several cameras belong to one moment: the nearest, at most half a frame away."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.errors import InputError
+
+_SAME_RATE = 0.01
+"""Rates that differ by less than this share are the same."""
+_MISFIT_S = 1e-4
+"""Cameras whose pictures of one moment are no farther apart than this are synchronised."""
+
+
+@dataclass(frozen=True)
+class CameraClock:
+    """When one camera took its frames."""
+
+    name: str
+    """The camera."""
+    time: NDArray[np.float64]
+    """(N,) times of its frames on the common clock, rising; seconds, or frames where there is no clock."""
+    period: float
+    """From one frame to the next, in the same unit."""
+
+
+@dataclass(frozen=True)
+class Lockstep:
+    """The moments of a recording, and each camera's picture of each."""
+
+    picture: NDArray[np.intp]
+    """(T, V) place of each camera's frame; -1 where it has none within half a frame."""
+    time_s: NDArray[np.float64] | None
+    """(T, V) when those frames were taken, seconds; the moment where there is none. None without a clock."""
+    notes: tuple[str, ...]
+    """What was left out, and how far pictures of one moment are apart."""
+
+    def __len__(self) -> int:
+        return len(self.picture)
+
+    @property
+    def synchronised(self) -> bool:
+        """Whether all cameras took each moment's pictures at one time."""
+        return self.time_s is None or bool(np.ptp(self.time_s, axis=1).max(initial=0.0) <= _MISFIT_S)
+
+
+def align(clocks: Sequence[CameraClock], has_clock: bool) -> Lockstep:
+    """The moments that all cameras saw.
+
+    They are those of the slowest camera (of several the one with most frames), from where the last camera starts
+    to where the first one ends. InputError where there are none.
+    """
+    first = max(each.time[0] - each.period / 2 for each in clocks)
+    last = min(each.time[-1] + each.period / 2 for each in clocks)
+    slowest = max(each.period for each in clocks)
+    inside = [((each.time >= first) & (each.time <= last)).sum() for each in clocks]
+    slow = [v for v, each in enumerate(clocks) if each.period >= slowest * (1 - _SAME_RATE)]
+    master = max(slow, key=lambda v: (inside[v], -v))
+    moment = clocks[master].time
+    moment = moment[(moment >= first) & (moment <= last)]
+    if len(moment) == 0:
+        raise InputError(_apart(clocks, has_clock))
+    places, off = zip(*(_nearest(each, moment) for each in clocks), strict=True)
+    picture = np.column_stack(places)
+    notes = [_left_out(each, picture[:, v], slowest) for v, each in enumerate(clocks)]
+    notes += [_gaps(each, picture[:, v]) for v, each in enumerate(clocks)]
+    notes += [_misfit(each, off[v][picture[:, v] >= 0]) for v, each in enumerate(clocks) if has_clock]
+    time_s = None
+    if has_clock:
+        taken = [np.where(picture[:, v] >= 0, each.time[picture[:, v]], moment) for v, each in enumerate(clocks)]
+        time_s = np.column_stack(taken)
+    return Lockstep(picture, time_s, tuple(note for note in notes if note is not None))
+
+
+def _nearest(clock: CameraClock, moment: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """(T,) place of the frame nearest to each moment, -1 where it is more than half a frame away; and how far."""
+    after = np.clip(np.searchsorted(clock.time, moment), 0, len(clock.time) - 1)
+    before = np.maximum(after - 1, 0)
+    nearer = np.abs(clock.time[before] - moment) <= np.abs(clock.time[after] - moment)
+    place = np.where(nearer, before, after)
+    off = np.abs(clock.time[place] - moment)
+    # Times in files are rounded to a microsecond or so.
+    return np.where(off <= clock.period / 2 * (1 + 1e-3) + 1e-9, place, -1), off
+
+
+def _left_out(clock: CameraClock, place: NDArray[np.intp], moment: float) -> str | None:
+    """What a camera took before and after the moments that all cameras saw; `moment` is from one to the next."""
+    used = place[place >= 0]
+    if len(used) == 0:
+        return None
+    # A faster camera always has frames between the moments.
+    before, after = (
+        int(count) if count * clock.period >= 0.99 * moment else 0
+        for count in (used[0], len(clock.time) - 1 - used[-1])
+    )
+    if before == after == 0:
+        return None
+    where = " and ".join(f"{n} {at}" for n, at in ((before, "at the start"), (after, "at the end")) if n > 0)
+    return f"camera {clock.name}: frames that another camera has no picture for were left out, {where}"
+
+
+def _gaps(clock: CameraClock, place: NDArray[np.intp]) -> str | None:
+    """Moments of which a camera has no picture."""
+    missing = np.flatnonzero(place < 0)
+    if len(missing) == 0:
+        return None
+    return (
+        f"camera {clock.name}: no picture within half a frame of {len(missing)} of {len(place)} moments (the first"
+        f" is frame {missing[0]}); it sees nobody there"
+    )
+
+
+def _misfit(clock: CameraClock, off: NDArray[np.float64]) -> str | None:
+    """How far a camera's pictures are from the moments."""
+    if len(off) == 0 or off.max() <= _MISFIT_S:
+        return None
+    return (
+        f"camera {clock.name}: pictures are up to {1e3 * off.max():.1f} ms from the moment they stand for"
+        f" ({1e3 * off.mean():.1f} ms in the mean)"
+    )
+
+
+def _apart(clocks: Sequence[CameraClock], has_clock: bool) -> str:
+    """Two cameras that have no moment in common."""
+    late = max(clocks, key=lambda each: each.time[0])
+    early = min(clocks, key=lambda each: each.time[-1])
+    unit = "s" if has_clock else ""
+    return (
+        f"camera {early.name} ends at {early.time[-1]:.6g} {unit}".rstrip()
+        + f" and camera {late.name} starts at {late.time[0]:.6g} {unit}".rstrip()
+        + ": they have no moment in common; check --start"
+    )

@@ -1,0 +1,30 @@
+"""What several commands take as text: a range of frames, the size of a picture."""
+
+import re
+
+from shapepose_fg.errors import InputError
+
+
+def image_size_of(text: str | None) -> tuple[int, int] | None:
+    """Width and height of `WxH`."""
+    if text is None:
+        return None
+    match = re.fullmatch(r"\s*(\d+)\s*[x×,]\s*(\d+)\s*", text)
+    if match is None:
+        raise InputError(f"--image-size {text}: must be WIDTHxHEIGHT in pixels, such as 1920x1080")
+    return int(match[1]), int(match[2])
+
+
+def frame_range(text: str | None, count: int) -> range:
+    """Frames that `A:B` selects of a recording of `count` frames: half-open, either end optional."""
+    if text is None:
+        return range(count)
+    match = re.fullmatch(r"(\d*):(\d*)", text.strip())
+    if match is None:
+        raise InputError(f"--frames {text}: must be A:B, two frame numbers with a colon between, such as 0:100")
+    start, stop = int(match[1] or 0), int(match[2] or count)
+    if not start < stop <= count:
+        raise InputError(
+            f"--frames {text}: not in the recording, which has {count} frames; give A:B with 0 <= A < B <= {count}"
+        )
+    return range(start, stop)

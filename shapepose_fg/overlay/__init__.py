@@ -1,0 +1,1 @@
+"""A result drawn over the pictures that it was made from."""

@@ -1,0 +1,255 @@
+"""The command `overlay`: a result drawn over the videos or pictures that it was made from."""
+
+import re
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from shapepose_fg.errors import InputError
+from shapepose_fg.frame_times import ASSUMED_FPS
+from shapepose_fg.options import frame_range
+from shapepose_fg.result_options import results_folder
+from shapepose_fg.terminal import note, progress
+
+if TYPE_CHECKING:
+    from shapepose_fg.body.model.body_model import BodyModel
+    from shapepose_fg.camera import Rig
+    from shapepose_fg.io.footage.footage import Footage
+    from shapepose_fg.io.footage.used import CameraFootage
+    from shapepose_fg.overlay.frames import Overlay
+    from shapepose_fg.reconstruction import Reconstruction
+
+# Everything else is imported inside the command: `--help` must not wait for it.
+
+_GRID = "grid"
+"""What the file with all cameras is called."""
+
+
+def overlay(
+    results: Annotated[Path, typer.Argument(metavar="RESULTS", help="Folder of a reconstruction.")],
+    output: Annotated[
+        Path | None, typer.Option(help="Folder for videos and pictures; by default RESULTS/overlay.")
+    ] = None,
+    videos: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--videos",
+            "--images",
+            metavar="FOLDER|CAMERA=PATH",
+            help="The cameras' videos or pictures, as for `detect`; by default those that were detected in.",
+        ),
+    ] = None,
+    detections: Annotated[
+        Path | None,
+        typer.Option(help="Folder that `detect` wrote: it says which picture belongs to which frame."),
+    ] = None,
+    cameras: Annotated[str | None, typer.Option(metavar="A,B", help="Only these cameras.")] = None,
+    frames: Annotated[
+        str | None, typer.Option(metavar="A:B", help="Frames A to B-1; either may be left out.")
+    ] = None,
+    stills: Annotated[
+        str | None, typer.Option(metavar="A,B", help="Still pictures of these frames instead of a video.")
+    ] = None,
+    each: Annotated[
+        bool, typer.Option("--each/--grid", help="A file for each camera at its own size, or all in one.")
+    ] = False,
+    bodies: Annotated[bool, typer.Option("--bodies/--no-bodies", help="Draw the bodies' surfaces.")] = False,
+    skeletons: Annotated[bool, typer.Option("--skeletons/--no-skeletons", help="Draw joints and bones.")] = True,
+    points: Annotated[
+        bool, typer.Option("--points/--no-points", help="Draw the 2D detections; red crosses were not used.")
+    ] = True,
+    width: Annotated[int, typer.Option(help="Width of the grid, pixels.")] = 1920,
+    image_placement: Annotated[
+        list[str] | None,
+        typer.Option(metavar="KIND|CAMERA=KIND", help="As for `detect`, where pictures have another size."),
+    ] = None,
+) -> None:
+    """Draw a result over the videos or pictures that it was made from: mp4, or still pictures.
+
+    Everybody has a colour. Dots are joints that were seen, dark rings joints that were inferred; squares are 2D
+    detections that were used, red crosses those that were not.
+    """
+    if not 160 <= width <= 7680:
+        raise InputError(f"--width {width}: must be 160 to 7680 pixels")
+    from shapepose_fg.io.calibration import read_rig
+    from shapepose_fg.io.solved_setup import CAMERAS
+    from shapepose_fg.overlay.frames import Overlay, OverlayContent
+    from shapepose_fg.reconstruction import Reconstruction
+
+    folder = results_folder(results)
+    people = Reconstruction.load(folder)
+    rig = read_rig(folder / CAMERAS)
+    pictures = _pictures(
+        people, rig, _drawn_cameras(cameras, videos, rig), videos, detections, image_placement or []
+    )
+    content = OverlayContent(skeletons=skeletons, bodies=bodies, detections=points)
+    if points and people.observations is None:
+        note(f"{folder}: there is no observations.npz, so no detections are drawn")
+    over = Overlay(people, rig, pictures, content, _body(people) if bodies else None)
+    length = max(len(used.places) for used, _ in pictures)
+    if stills is not None and frames is not None:
+        raise InputError("--stills and --frames: both say which frames; give one of them")
+    if stills is not None:
+        chosen, fps = _stills(stills, length), None
+    else:
+        chosen, fps = _recorded(people, length) if frames is None else frame_range(frames, length), _fps(people)
+    if len(chosen) == 0:
+        raise InputError(f"{folder}: none of its frames has a picture; give the videos that it was made from")
+    for path in _write(over, chosen, output or folder / "overlay", each, width, fps):
+        print(f"written  {path}")
+
+
+def _drawn_cameras(text: str | None, videos: Sequence[str] | None, rig: "Rig") -> list[str]:
+    """The cameras that are drawn: those that are asked for, or else those whose videos are given one by one."""
+    if text is None:
+        named = {each.partition("=")[0].strip() for each in videos or [] if "=" in each}
+        return [name for name in rig.names if name in named] or list(rig.names)
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    for name in names:
+        if name not in rig.names:
+            raise InputError(f"--cameras {text}: there is no camera {name!r}; there are {' '.join(rig.names)}")
+    if len(names) == 0 or len(set(names)) < len(names):
+        raise InputError(f"--cameras {text}: must be names of cameras, each once, such as {rig.names[0]}")
+    return names
+
+
+def _pictures(
+    people: "Reconstruction",
+    rig: "Rig",
+    drawn: Sequence[str],
+    videos: Sequence[str] | None,
+    detections: Path | None,
+    image_placement: Sequence[str],
+) -> "list[tuple[CameraFootage, Footage]]":
+    """The pictures of the cameras that are drawn, and which belongs to which frame."""
+    import numpy as np
+
+    from shapepose_fg.io.footage.footage import open_footage
+    from shapepose_fg.io.footage.given import placements_of
+    from shapepose_fg.io.footage.places import find_footage
+    from shapepose_fg.io.footage.used import CameraFootage
+
+    used = {each.name: each for each in _used_footage(people, detections)}
+    if videos is not None:
+        places = find_footage(videos, drawn)
+        paths = dict(zip(drawn, places.paths, strict=True))
+        for text in places.notes:
+            note(text)
+    else:
+        missing = next((name for name in drawn if name not in used), None)
+        if missing is not None:
+            raise InputError(
+                f"nothing says where the pictures of camera {missing} are; give --videos, or with --detections the"
+                " folder that `shapepose-fg detect` wrote"
+            )
+        paths = {name: used[name].path for name in drawn}
+    opened = {}
+    for name, path in paths.items():
+        if not path.exists():
+            raise InputError(f"{path}: the pictures of camera {name} are not there any more; give --videos")
+        with progress(f"looking through {name}") as done:
+            opened[name] = open_footage(path, done)
+    # What detect was told of the pictures holds as long as they have the same size.
+    alike = {
+        name: used[name].placement
+        for name, each in opened.items()
+        if name in used and used[name].placement.picture_size == each.size and not image_placement
+    }
+    sizes = {name: each.size for name, each in opened.items() if name not in alike}
+    placements, notes = placements_of(image_placement, sizes, rig)
+    counted = [name for name in drawn if name not in used]
+    if len(counted) > 0:
+        notes.append(f"frame 0 of the result is taken to be the first picture of {' '.join(counted)}, and so on")
+    for text in notes:
+        note(text)
+    placements |= alike
+    pairs = []
+    for name, footage in opened.items():
+        count = len(footage.number)
+        index = used[name].places if name in used else np.arange(count)
+        index = np.where(index < count, index, -1)
+        pairs.append((CameraFootage(name, footage.path, placements[name], index), footage))
+    return pairs
+
+
+def _used_footage(people: "Reconstruction", detections: Path | None) -> "list[CameraFootage]":
+    """What `detect` wrote of the pictures, beside the detections that the result was made from."""
+    from shapepose_fg.io.footage.used import FOOTAGE, read_used_footage
+
+    if detections is not None:
+        file = detections / FOOTAGE if detections.is_dir() else detections
+        if not file.is_file():
+            raise InputError(f"{file}: there is no such file; give the folder that `shapepose-fg detect` wrote")
+        return read_used_footage(file)
+    inputs = people.run.get("inputs")
+    for text in inputs if isinstance(inputs, dict) else ():
+        file = Path(str(text)).parent / FOOTAGE
+        if Path(str(text)).suffix == ".txt" and file.is_file():
+            return read_used_footage(file)
+    return []
+
+
+def _body(people: "Reconstruction") -> "BodyModel":
+    """The model that the bodies of a result are of."""
+    from shapepose_fg.body.model.body_model import BodyModel
+
+    file = people.run.get("body")
+    return BodyModel.default() if file is None else BodyModel.load(Path(str(file)))
+
+
+def _recorded(people: "Reconstruction", length: int) -> range:
+    """The frames that a result tells of, people in them or not."""
+    told = people.run.get("frames")
+    if isinstance(told, list) and len(told) == 2 and all(isinstance(each, int) for each in told):
+        return range(max(0, told[0]), min(told[1], length))
+    return range(length)
+
+
+def _fps(people: "Reconstruction") -> float:
+    """Frames a second of the video that is made."""
+    told = people.run.get("time")
+    rate = told.get("fps") if isinstance(told, dict) else None
+    return float(rate) if isinstance(rate, int | float) and 0.1 <= rate <= 1000 else ASSUMED_FPS
+
+
+def _stills(text: str, length: int) -> list[int]:
+    """The frames of which still pictures are asked for."""
+    words = re.split(r"[,\s]+", text.strip())
+    if not all(re.fullmatch(r"\d{1,9}", word) and int(word) < length for word in words):
+        raise InputError(f"--stills {text}: must be frames 0 to {length - 1}, such as 0,50")
+    return [int(word) for word in words]
+
+
+def _write(
+    over: "Overlay", frames: Sequence[int], place: Path, each: bool, width: int, video_fps: float | None
+) -> list[Path]:
+    """Draw `frames` and write them: a video where a rate is given, else still pictures."""
+    from shapepose_fg.overlay.frames import grid, grid_shape
+    from shapepose_fg.overlay.output import VideoFile, even, write_picture
+
+    own = [even(footage.size) for _, footage in over.cameras]
+    columns, cells = grid_shape(own, width)
+    names = [used.name for used, _ in over.cameras] if each else [_GRID]
+    sizes = own if each else cells
+    paths: list[Path] = []
+    videos: list[VideoFile] = []
+    with ExitStack() as stack, progress("drawing") as done:
+        for at, frame in enumerate(frames):
+            drawn = over.draw(frame, sizes)
+            pictures = drawn if each else [grid(drawn, columns)]
+            if video_fps is not None and len(videos) == 0:
+                paths = [place / f"{name}.mp4" for name in names]
+                shapes = [(picture.shape[1], picture.shape[0]) for picture in pictures]
+                files = zip(paths, shapes, strict=True)
+                videos = [stack.enter_context(VideoFile(path, shape, video_fps)) for path, shape in files]
+            for index, picture in enumerate(pictures):
+                if video_fps is not None:
+                    videos[index].add(picture)
+                else:
+                    paths.append(place / f"{names[index]}_{frame:06d}.jpg")
+                    write_picture(paths[-1], picture)
+            done(at + 1, len(frames))
+    return paths
