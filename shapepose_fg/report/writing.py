@@ -41,7 +41,8 @@ def write_report(
     `rig` are the cameras, None where they are not known. `up` is the axis that is up where they are not, by
     default the one along which people stand. `fps` takes the place of the result's times. `body` is the body
     model's file where it is no longer where run.json says. `scene_bytes` is what the scene may take; of longer
-    recordings every second, third ... frame is drawn. InputError where people cannot be put on one timeline.
+    recordings every second, third ... frame is drawn. Where people cannot be put on one timeline, the page has no
+    scene and says why.
     """
     arrays, remarks = _body(people, body)
     if rig is None:
@@ -51,11 +52,13 @@ def write_report(
         up = rig.up
     scene: Scene | None = None
     if len(people) > 0:
+        if fps is None and not _timed(people):
+            fps = ASSUMED_FPS
+            remarks.append(f"nothing says when the frames were taken: the scene plays {fps:g} a second (--fps)")
         try:
-            take = Take.of(people, up, rig=rig, fps=_fps(people, fps), identities=False)
+            scene = scene_of(Take.of(people, up, rig=rig, fps=fps, identities=False), arrays, scene_bytes)
         except ValueError as error:
-            raise InputError(f"{folder}: {error}") from None
-        scene = scene_of(take, arrays, scene_bytes)
+            remarks.append(f"there is no scene: {error}")
     title = folder.resolve().name or str(folder)
     tracks = list_tracks(people, arrays)
     text = page_text(Content(title, people, tracks, camera_figures(people), scene, remarks))
@@ -89,10 +92,11 @@ def _body(people: Reconstruction, given: Path | None) -> tuple[SmplArrays | None
         return None, [f"no bodies and heights: {error}"]
 
 
-def _fps(people: Reconstruction, given: float | None) -> float | None:
-    """The rate to be used in place of the result's times, where it is given or a single frame needs one."""
-    alone = len(np.unique(people.frame)) == 1 and not (people.run.get("time", {}).get("fps") or 0) > 0
-    return ASSUMED_FPS if given is None and alone else given
+def _timed(people: Reconstruction) -> bool:
+    """Whether a result says when its frames were taken: by two times, or by a time and the rate."""
+    times = np.unique(people.time_s[np.isfinite(people.time_s)])
+    rate = people.run.get("time", {}).get("fps")
+    return len(times) > 1 or (len(times) == 1 and rate is not None and rate > 0)
 
 
 def _standing(people: Reconstruction) -> Axis:

@@ -13,7 +13,8 @@ import pytest
 
 from shapepose_fg.cli import main
 from shapepose_fg.observation_table import Gate
-from shapepose_fg.reconstruction import Known, Reconstruction
+from shapepose_fg.pipeline import PipelineConfig
+from shapepose_fg.reconstruction import Reconstruction
 from shapepose_fg.report.figures import camera_figures, known_counts
 from shapepose_fg.report.writing import report_of, write_report
 from shapepose_fg.skeleton import BODY_25
@@ -142,7 +143,6 @@ def test_figures_are_those_of_the_observations(result):
     assert counts[BODY_25.index(GUESSED[1])].tolist() == [16, 24, 0, 0]
     # By person: the guessed wrist is person 3's.
     by_person = known_counts(result, (result.person == 7).astype(int))
-    assert by_person[:, list(Known).index(Known.SEEN)].tolist() == [0, 0] or by_person[0, 1] == 24
     assert by_person[0].tolist() == [24 * 24, 24, 0, 0] and by_person[1].tolist() == [16 * 25 - 1, 0, 0, 1]
 
 
@@ -164,7 +164,7 @@ def test_the_page_says_who_was_there_and_what_happened(result, scene, tmp_path):
         "3 joints were left out.",
         "too few parts in the box4100–102, 110",
         "person 3, frame 101",
-        "observations.sigma_m0.020.013",
+        f"observations.sigma_m0.02{PipelineConfig().observations.sigma_m:g}",
         "1 234",
         "9.4 px, 21 mm",
         "1.4 / 1.4 px",
@@ -206,6 +206,33 @@ def test_one_frame_without_a_rate_is_a_page_too(result, scene, tmp_path):
     alone = result.at(FIRST).with_run(frames=[FIRST, FIRST + 1], time={"fps": None, "source": "assumed"})
     page = Page(write_report(tmp_path, replace(alone, time_s=np.full(len(alone), np.nan)), scene.rig))
     assert array(page.scene["frames"], "<i4").tolist() == [FIRST]
+
+
+def test_without_times_the_scene_plays_at_the_usual_rate(result, scene, tmp_path):
+    timeless = replace(result, time_s=np.full(len(result), np.nan)).with_run(time={})
+    page = Page(write_report(tmp_path, timeless, scene.rig))
+    np.testing.assert_allclose(array(page.scene["times"], "<f4"), np.arange(FRAMES) / 30, atol=1e-5)
+    assert "the scene plays 30 a second" in page.text
+
+
+def test_people_on_no_timeline_are_a_page_without_a_scene(result, scene, tmp_path):
+    twice = replace(result, person=np.full(len(result), 3), observations=None)
+    page = Page(write_report(tmp_path, twice, scene.rig))
+    assert_closed(page)
+    assert page.scripts == [] and "there is no scene: person 3 has two rows of frame 100" in page.text
+
+
+def test_every_reason_has_words(result, scene, tmp_path):
+    table = result.observations
+    gate = table.gate.copy()
+    gate[0, : len(Gate), 0] = list(Gate)
+    xy = np.where((gate == Gate.NOT_SEEN)[..., None], np.nan, table.xy)
+    confidence = np.where(gate == Gate.NOT_SEEN, 0, table.confidence)
+    candidate = np.where(gate == Gate.NOT_SEEN, -1, table.candidate)
+    changed = replace(table, gate=gate, xy=xy, confidence=confidence, candidate=candidate)
+    text = Page(write_report(tmp_path, replace(result, observations=changed), scene.rig)).text
+    for words in ("too far", "against the body", "behind camera", "joint not placed"):
+        assert f"{words}: " in text
 
 
 def test_result_without_observations_or_body_file(result, scene, tmp_path):
