@@ -18,7 +18,8 @@ from shapepose_fg.export_command import export
 from shapepose_fg.options import frame_range, image_size_of
 from shapepose_fg.overlay_command import overlay
 from shapepose_fg.report_command import report as report_command
-from shapepose_fg.terminal import note, show
+from shapepose_fg.setup_command import check_calibration
+from shapepose_fg.terminal import note, show, warn
 from shapepose_fg.terminal import progress as progress_bar
 from shapepose_fg.tracks_command import tracks
 from shapepose_fg.view_command import view
@@ -31,8 +32,11 @@ if TYPE_CHECKING:
     from shapepose_fg.camera import Axis, Rig
     from shapepose_fg.frame_times import FrameTimes
     from shapepose_fg.io.calibration import Unit
+    from shapepose_fg.io.detection_table import DetectionTable
+    from shapepose_fg.io.pose2sim_project import Pose2SimProject
     from shapepose_fg.pipeline import PipelineConfig
     from shapepose_fg.reconstruction import Reconstruction
+    from shapepose_fg.setup_check.in_result import ResultCheck
     from shapepose_fg.simulation.files import Format
 
 # Everything else is imported inside the commands: `--help` must not wait for torch.
@@ -47,6 +51,7 @@ evaluate = typer.Typer(help="Score a reconstruction against an annotation.")
 app.add_typer(evaluate, name="evaluate")
 app.add_typer(tracks, name="tracks")
 app.command()(detect)
+app.command("check-calibration")(check_calibration)
 app.command()(overlay)
 app.command()(export)
 app.command("report")(report_command)
@@ -80,9 +85,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 @app.command()
 def reconstruct(
-    calibration: Annotated[Path, typer.Option(help="Cameras: a file, or a folder, of one of the formats known.")],
-    detections: Annotated[Path, typer.Option(help="Folder with what a 2D detector wrote of every camera.")],
-    output: Annotated[Path, typer.Option(help="Folder for people.npz and run.json; made if it is not there.")],
+    calibration: Annotated[
+        Path | None, typer.Option(help="Cameras: a file, or a folder, of one of the formats known.")
+    ] = None,
+    detections: Annotated[
+        Path | None, typer.Option(help="Folder with what a 2D detector wrote of every camera.")
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option(help="Folder for people.npz and run.json; made if it is not there.")
+    ] = None,
+    project: Annotated[
+        Path | None,
+        typer.Option(help="A Pose2Sim project instead: its cameras, detections, settings; adds TRC and C3D."),
+    ] = None,
     config: Annotated[
         Path | None, typer.Option(help="Settings as TOML; `shapepose-fg config` prints all.")
     ] = None,
@@ -121,6 +136,9 @@ def reconstruct(
     report: Annotated[
         bool, typer.Option("--report/--no-report", help="Leave report.html, the result as a page to look at.")
     ] = True,
+    check: Annotated[
+        bool, typer.Option("--check/--no-check", help="Whether cameras and detections fit, and what is wrong.")
+    ] = True,
 ) -> None:
     """Reconstruct the people of a recording: 3D joints with covariances, and bodies."""
     from shapepose_fg.io.calibration import read_rig, write_rig
@@ -131,12 +149,18 @@ def reconstruct(
     from shapepose_fg.provenance import checksums
 
     _check_workers(workers)
+    whole = None if project is None else _project(project)
+    calibration, detections, output = _places(calibration, detections, output, whole)
     size = image_size_of(image_size)
     rig = read_rig(calibration, up=cast("Axis | None", up), unit=cast("Unit | None", unit), image_size=size)
     recording = read_detections(detections, rig, skeleton)
     for each in recording.notes:
         note(each)
     span = frame_range(frames, len(recording))
+    if whole is not None:
+        span = span if frames is not None else whole.span(len(recording))
+        if fps is None and timestamps is None:
+            fps, timestamps = whole.fps, whole.times
     times = _times(fps, timestamps, rig, len(recording))
     first_frames = _cuts(cuts, len(recording))
     refuse_corrected(output)
@@ -149,6 +173,8 @@ def reconstruct(
     settings = settings if temporal is None else replace(settings, temporal=temporal)
     if shapes is not None and not settings.temporal:
         raise InputError("--shapes: a person's shape is known over time only; leave out --shapes or --no-temporal")
+    if whole is not None and not settings.temporal:
+        raise InputError("--project: its files need people over time; leave out --no-temporal, or --project")
     fitter = _fitter(body, settings, recording.skeleton.joints)
     known = None if shapes is None else _known_shapes(shapes, body)
     start = time.perf_counter()
@@ -173,6 +199,11 @@ def reconstruct(
         path for path in (*read, shapes if known is not None and len(known) > 0 else None) if path is not None
     ]
     people = people.with_run(inputs=checksums(inputs), notes=list(recording.notes), body=body)
+    # Of its own detections `detect` knows which pictures they are of.
+    own = (detections / "footage.json").is_file()
+    videos = None if whole is None or own else whole.folder / "videos"
+    checked = _checked(recording, rig, span, people, videos) if check else None
+    people = people if checked is None else people.with_run(**checked.as_run())
     people.save(output)
     # What the observations were seen with: to solve or draw them anew.
     if not (output / CAMERAS).exists() or not (output / CAMERAS).samefile(calibration):
@@ -184,7 +215,11 @@ def reconstruct(
         summary.add_row("", f"{shapes}  shapes of {len(people.shapes)} people")
     if page is not None:
         summary.add_row("", f"{page}  to look at, in a browser")
+    if whole is not None:
+        _add_project_files(summary, people, rig, whole)
     show(summary)
+    if checked is not None:
+        _show_check(checked)
 
 
 @evaluate.command("shelf")
@@ -319,6 +354,41 @@ def _check_workers(workers: int | None) -> None:
         raise InputError(f"--workers {workers}: must be 1 to 64; leave it out for as many as pay")
 
 
+def _project(folder: Path) -> "Pose2SimProject":
+    """The Pose2Sim project in a folder, and a note of what was taken to be what."""
+    from shapepose_fg.io.pose2sim_project import read_pose2sim_project
+
+    found = read_pose2sim_project(folder)
+    for each in found.notes:
+        note(each)
+    return found
+
+
+def _places(
+    calibration: Path | None, detections: Path | None, output: Path | None, project: "Pose2SimProject | None"
+) -> tuple[Path, Path, Path]:
+    """Cameras, detections and the folder of results, as the options say, else the project."""
+    if project is not None:
+        return calibration or project.calibration, detections or project.detections, output or project.output
+    options = {"--calibration": calibration, "--detections": detections, "--output": output}
+    missing = [name for name, value in options.items() if value is None]
+    if calibration is None or detections is None or output is None:
+        listed = " and ".join([", ".join(missing[:-1]), missing[-1]] if len(missing) > 1 else missing)
+        raise InputError(f"{listed}: missing; give them, or --project with the folder of a Pose2Sim project")
+    return calibration, detections, output
+
+
+def _add_project_files(summary: "Table", people: "Reconstruction", rig: "Rig", project: "Pose2SimProject") -> None:
+    """Write TRC and C3D where Pose2Sim looks for them, and say so."""
+    from shapepose_fg.export.pose2sim_files import write_pose2sim_files
+
+    written = write_pose2sim_files(people, rig.up, project)
+    for path in written.files:
+        summary.add_row("", str(path))
+    for each in written.notes:
+        note(each)
+
+
 def _times(fps: float | None, timestamps: Path | None, rig: "Rig", frames: int) -> "FrameTimes | None":
     """When the frames were taken, as the options say it; None where they do not."""
     from shapepose_fg.frame_times import FrameTimes
@@ -423,7 +493,8 @@ def _summary(people: "Reconstruction", span: range, camera_count: int, seconds: 
     for status, count in zip(*np.unique(people.status, return_counts=True), strict=True):
         table.add_row("", f"{count} {status}", style="green" if status == "ok" else "yellow")
     for reason, count in people.run.get("people", {}).get("dropped", {}).items():
-        table.add_row("", f"{count} dropped: {reason}", style="dim")
+        where = _frames_words(people.run.get("dropped_frames", {}).get(reason, []))
+        table.add_row("", f"{count} dropped: {reason}{where}", style="dim")
     if len(people) > 0:
         table.add_row("joints", _joints(people))
     # Loading torch and the body takes a second or two, once; it says nothing about the time of a frame.
@@ -437,6 +508,45 @@ def _summary(people: "Reconstruction", span: range, camera_count: int, seconds: 
         table.add_row("", str(output / "observations.npz"))
     table.add_row("", str(output / CAMERAS))
     return table
+
+
+def _frames_words(spans: list[list[int]]) -> str:
+    """In which frames, as far as there is room: run.json has all."""
+    told = [f"{start}" if stop == start + 1 else f"{start}-{stop - 1}" for start, stop in spans[:4]]
+    more = " ..." if len(spans) > len(told) else ""
+    return f" (frames {' '.join(told)}{more})" if told else ""
+
+
+def _checked(
+    recording: "DetectionTable", rig: "Rig", span: range, people: "Reconstruction", videos: Path | None
+) -> "ResultCheck":
+    """Whether cameras, detections and, where there are any, videos fit."""
+    from shapepose_fg.setup_check.diagnosis import diagnose
+    from shapepose_fg.setup_check.in_result import result_check
+    from shapepose_fg.setup_check.pictures import other_sizes
+    from shapepose_fg.setup_check.report import report_of
+
+    sizes = ()
+    if videos is not None and videos.is_dir():
+        try:
+            sizes = other_sizes([str(videos)], rig)
+        except InputError as error:  # the result does not need them
+            note(f"{error}; their sizes are not checked")
+    report = report_of(diagnose(recording, rig, span), rig, sizes)
+    return result_check(report, people, recording, rig, span)
+
+
+def _show_check(checked: "ResultCheck") -> None:
+    """How far each camera is from the result, and on stderr what looks wrong."""
+    from shapepose_fg.setup_check.camera_use import use_table
+
+    if len(checked.cameras) > 0:
+        print()
+        show(use_table(checked.cameras))
+        show("[dim]error: median / 90 % of all detections given to people, before gates; used: after;[/]")
+        show("[dim]left out: median, from where the other cameras alone put the joint[/]")
+    for each in checked.warnings:
+        warn(each)
 
 
 def _joints(people: "Reconstruction") -> str:

@@ -1,6 +1,6 @@
 """When each frame of a recording was taken, and where the recording is cut."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -101,3 +101,13 @@ def stretches(frames: range, cuts: Sequence[int]) -> list[range]:
     inside = [cut for cut in cuts if frames.start < cut < frames.stop]
     edges = [frames.start, *inside, frames.stop]
     return [range(start, stop) for start, stop in pairwise(edges) if stop > start]
+
+
+def spans_of(frames: Iterable[int]) -> list[range]:
+    """Frames as ranges of those that follow each other."""
+    ordered = sorted(set(frames))
+    if len(ordered) == 0:
+        return []
+    breaks = [at for at in range(1, len(ordered)) if ordered[at] != ordered[at - 1] + 1]
+    edges = [0, *breaks, len(ordered)]
+    return [range(ordered[a], ordered[b - 1] + 1) for a, b in pairwise(edges)]

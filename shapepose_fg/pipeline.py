@@ -33,7 +33,7 @@ from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
 from shapepose_fg.estimation.outcome import Problem
 from shapepose_fg.estimation.window_graph import WindowGraphConfig
-from shapepose_fg.frame_times import FrameTimes, check_cuts, stretches
+from shapepose_fg.frame_times import FrameTimes, check_cuts, spans_of, stretches
 from shapepose_fg.observation_table import place_in_view
 from shapepose_fg.observations import Observations
 from shapepose_fg.proposal.association import AssociationConfig, associate
@@ -212,8 +212,8 @@ def find_people(
         proposals = propose(candidates, detections, skeleton, rig.up_vector, config.proposals)
     with run.stage("associate"):
         observations, phantoms = associate(proposals, candidates, detections, rig, skeleton, config.association)
-    run.dropped.update(proposals.dropped)
-    run.dropped["hardly any joint seen by two views"] += phantoms
+    for reason, count in (*proposals.dropped.items(), ("hardly any joint seen by two views", phantoms)):
+        run.drop(reason, count)
     return observations
 
 
@@ -278,10 +278,10 @@ def _spans(
             given = [read(frame) for frame in batch]
             with run.stage("follow"):
                 if config.temporal:
-                    spans, state = engine.follow(state, given, last=batch.stop == stretch.stop)
+                    spans, state = engine.follow(state, run.watched(given), last=batch.stop == stretch.stop)
                     next_id = state.follow.tracker.next_id
                 else:
-                    spans = [engine.alone(given)]
+                    spans = [engine.alone(run.watched(given))]
             yield from spans
 
 
@@ -354,6 +354,20 @@ class _Run:
         self.seconds: defaultdict[str, float] = defaultdict(float)
         self._inner = 0.0
         self.dropped: Counter[str] = Counter()
+        self.dropped_frames: defaultdict[str, set[int]] = defaultdict(set)
+        self.frame: int | None = None
+
+    def drop(self, reason: str, count: int) -> None:
+        """Note down people of the present frame who were none, or too little is seen of."""
+        self.dropped[reason] += count
+        if count > 0 and self.frame is not None:
+            self.dropped_frames[reason].add(self.frame)
+
+    def watched(self, given: Sequence[Input]) -> Iterator[Input]:
+        """The same frames; while one is worked on, it is the present frame."""
+        for each in given:
+            self.frame = each.frame
+            yield each
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -379,5 +393,9 @@ class _Run:
             "people": {
                 **people.counts(),
                 "dropped": {reason: count for reason, count in self.dropped.items() if count > 0},
+            },
+            "dropped_frames": {
+                reason: [[span.start, span.stop] for span in spans_of(frames)]
+                for reason, frames in self.dropped_frames.items()
             },
         }

@@ -23,6 +23,14 @@ def note(message: str) -> None:
     Console(stderr=True).print(Text.assemble(("note: ", "bold"), message), soft_wrap=True)
 
 
+def warn(message: str) -> None:
+    """Say on stderr, in one paragraph, what looks wrong."""
+    from rich.console import Console
+    from rich.text import Text
+
+    Console(stderr=True).print(Text.assemble(("warning: ", "bold yellow"), message), soft_wrap=True)
+
+
 @contextmanager
 def progress(what: str, unit: str = "frames") -> Iterator[Callable[[int, int], None]]:
     """A progress bar on stderr while the block runs: a function of how many are done, and how many there are.

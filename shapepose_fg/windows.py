@@ -6,7 +6,7 @@ processes.
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -135,14 +135,14 @@ class Engine:
         return StreamState(FollowState(TrackerState.start(self.tracker.skeleton, next_id)))
 
     def advance(
-        self, state: StreamState, frames: Sequence[Input], *, last: bool = False
+        self, state: StreamState, frames: Iterable[Input], *, last: bool = False
     ) -> tuple[list[Solved], StreamState]:
         """Take in `frames`; returns the rows that are done. With `last` the recording ends, or is cut, there."""
         spans, state = self.follow(state, frames, last=last)
         return [self.solver.solve(span) for span in spans], state
 
     def follow(
-        self, state: StreamState, frames: Sequence[Input], *, last: bool = False
+        self, state: StreamState, frames: Iterable[Input], *, last: bool = False
     ) -> tuple[list[Span], StreamState]:
         """The first half of `advance`: the windows that can be solved now, each by itself, in any process."""
         following, decided = state.follow, list(state.decided)
@@ -160,7 +160,7 @@ class Engine:
             decided, before = decided[keep:], stop - keep
         return spans, StreamState(following, tuple(decided), before)
 
-    def alone(self, frames: Sequence[Input]) -> Span:
+    def alone(self, frames: Iterable[Input]) -> Span:
         """Frames that have nothing to do with each other, in one window because bodies are fitted fastest so."""
         decided = list[Decided]()
         for frame in frames:
@@ -176,7 +176,8 @@ class Engine:
     def _next(self, decided: Sequence[Decided], before: int, last: bool) -> tuple[int, int] | None:
         """Where the next window's own frames stop, and where it ends; None where there is too little."""
         stop = before + self.frames
-        if stop < len(decided):
+        # A window of a few frames at the end would know its people less well than the others do.
+        if stop + self.frames // 2 < len(decided):
             end = self._overlap(decided, stop, 1)
             if end < len(decided) or last:
                 return stop, end

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -87,7 +88,8 @@ def test_reconstruct_writes_results_and_says_what_it_found(recording, pipeline, 
     left = hashlib.sha256((tmp_path / "left.txt").read_bytes()).hexdigest()
     assert people.run["inputs"][str(tmp_path / "left.txt")] == left
     printed = capsys.readouterr()
-    assert printed.err == ""  # no progress bar where nobody watches
+    # No progress bar where nobody watches; the files' frames are empty, and it is said.
+    assert re.fullmatch(r"warning: No camera sees a person [^\n]+\n", printed.err)
     words = " ".join(printed.out.split())
     for part in (
         "5 (0:5) of 2 cameras, 30 a second (assumed: give --fps)",
@@ -233,7 +235,7 @@ def test_errors_are_one_sentence_and_exit_code_2(recording, pipeline, capsys, op
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["reconstruct"], "Missing option '--calibration'; see shapepose-fg --help"),
+        (["reconstruct"], "--calibration, --detections and --output: missing; give them, or --project"),
         (["rebuild"], "No such command 'rebuild'"),
         (
             ["evaluate", "shelf", "--people", "/nothing", "--ground-truth", "/gt.txt"],

@@ -19,11 +19,18 @@ from shapepose_fg.estimation.alternation import (
     joint_targets,
 )
 from shapepose_fg.estimation.draft import WholeFitter, drafted, limb_steps, smoothed_in_time
-from shapepose_fg.estimation.linearisation import linearise, mean_confidence, observation_sigmas, triangulate
+from shapepose_fg.estimation.limb_lengths import limb_lengths, limbs_of, with_lengths
+from shapepose_fg.estimation.linearisation import (
+    linearise,
+    mean_confidence,
+    observation_sigmas,
+    triangulate,
+    weakest_sigma,
+)
 from shapepose_fg.estimation.motion_model import MotionModel
-from shapepose_fg.estimation.outcome import Problem, how_known, problems, reported_covariance
+from shapepose_fg.estimation.outcome import SEEN_M, Problem, how_known, problems, reported_covariance
 from shapepose_fg.estimation.state_covariances import state_covariances
-from shapepose_fg.estimation.window_graph import WindowGraph
+from shapepose_fg.estimation.window_graph import WindowGraph, near_in_time
 from shapepose_fg.observations import Observations
 from shapepose_fg.reconstruction import Status
 
@@ -92,6 +99,7 @@ class Estimator:
         self.fitter = fitter
         self.config = EstimatorConfig() if config is None else config
         self.joints = joints
+        self._limbs = limbs_of(joints)
         self._motion = MotionModel.load(joints, self.config.motion)
 
     def estimate(
@@ -231,7 +239,8 @@ class Estimator:
         windows: Sequence[Window],
         solution: Solution,
     ) -> NDArray[np.float64]:
-        """Joints that no view saw, in windows of several frames, where a body can have them.
+        """Joints that no view saw, in windows of several frames, where a body can have them, and limbs as long as
+        the body's where views leave an end open.
 
         Not those with factors of the user's own. Steps are averaged over time: bodies are fitted frame by frame.
         """
@@ -239,9 +248,17 @@ class Estimator:
         for window in windows:
             unseen[window.rows] &= window.graph.temporal & ~window.graph.touched
         steps = limb_steps(X, covariance, unseen, self.fitter)
+        weak, placed = weakest_sigma(solution.views.information) > SEEN_M, X.copy()
         for window in windows:
-            steps[window.rows] = smoothed_in_time(steps[window.rows], window.graph.times_s, STEP_S)
-        return X + np.where(unseen[..., None], steps, 0.0)
+            rows = window.rows
+            if not window.graph.temporal:
+                continue
+            moved = near_in_time(weak[rows], window.graph.times_s, STEP_S) & ~window.graph.touched
+            lengths = limb_lengths(solution.fit.joints[rows], self._limbs)
+            stepped = smoothed_in_time(steps[rows], window.graph.times_s, STEP_S)
+            stepped = X[rows] + np.where(unseen[rows][..., None], stepped, 0.0)
+            placed[rows] = with_lengths(stepped, covariance[rows], moved, lengths, self._limbs)
+        return placed
 
 
 STEP_S = 0.1

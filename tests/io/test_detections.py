@@ -196,10 +196,25 @@ def test_openpose_points_are_undistorted_once(openpose_folder, rig):
     np.testing.assert_array_equal(detections.xy[~right], measured[:, :2])
 
 
-def test_openpose_gap_names_the_missing_file(openpose_folder, rig):
-    missing = openpose_folder / "right" / "video_000000000008_keypoints.json"
-    missing.unlink()
-    refuses(openpose_folder, rig, missing, "this frame is missing, video_000000000009_keypoints.json comes next")
+def test_openpose_frames_may_be_missing_in_between_and_it_is_said(openpose_folder, rig):
+    for name in ("left", "right"):  # the last frame's person in the middle one, too
+        last = openpose_folder / name / "video_000000000009_keypoints.json"
+        last.with_name("video_000000000008_keypoints.json").write_text(last.read_text())
+    whole = read_detections(openpose_folder, rig)
+    (openpose_folder / "right" / "video_000000000008_keypoints.json").unlink()
+    table = read_detections(openpose_folder, rig)
+    assert len(table) == len(whole) == 3
+    assert set(whole[1].view.tolist()) == {0, 1} and set(table[1].view.tolist()) == {0}
+    for frame in (0, 2):
+        np.testing.assert_array_equal(table[frame].xy, whole[frame].xy)
+    assert f"{openpose_folder / 'right'}: 1 frame has no file (frame 8); nobody is seen there" in table.notes
+    assert whole.notes == ()
+
+
+def test_openpose_numbers_that_are_no_frames_are_refused(openpose_folder, rig):
+    last = openpose_folder / "right" / "video_000000000009_keypoints.json"
+    last.rename(last.with_name("video_20261121_keypoints.json"))
+    refuses(openpose_folder, rig, openpose_folder / "right", "3 files are numbered from 7 to 20261121")
 
 
 def test_openpose_frame_counts_that_differ(openpose_folder, rig):

@@ -55,17 +55,25 @@ def frame_files(folder: Path) -> list[Path]:
     return sorted(each for each in folder.iterdir() if _FILE.search(each.name) is not None and each.is_file())
 
 
+def frame_number(file: Path) -> int:
+    """The number of the frame that a file is named after."""
+    match = _FILE.search(file.name)
+    if match is None:
+        raise ValueError(f"{file.name} is not named after a frame")
+    return int(match[1])
+
+
 def read_frame_files(folder: Path) -> CameraPeople:
     """Read the frames that one camera saw; InputError naming file, key and cure.
 
-    A frame's number is in its file's name. Numbers must follow each other.
+    A frame's number is in its file's name. Nobody is seen in frames whose files are missing in between (`gaps`).
     """
     program = _program(folder)
     rerun = _RERUN[program]
-    first, files = _numbered(folder, program)
+    files = _numbered(folder, program)
     read = _instances if program.startswith("MMPose") else _people
     frames, people = [], []
-    for number, file in enumerate(files, first):
+    for number, file in files.items():
         found = read(file, program)
         people += found
         frames += [number] * len(found)
@@ -78,7 +86,9 @@ def read_frame_files(folder: Path) -> CameraPeople:
     count = counts.pop() if counts else 0
     keypoints = np.array(people, dtype=np.float64).reshape(len(people), count, 3)
     frame = np.array(frames, dtype=np.intp)
-    return CameraPeople(folder, program, frame, keypoints, first, first + len(files) - 1, rerun=rerun)
+    numbers = list(files) or [0]
+    gaps = tuple((one + 1, other - 1) for one, other in pairwise(numbers) if other > one + 1)
+    return CameraPeople(folder, program, frame, keypoints, numbers[0], numbers[-1], gaps=gaps, rerun=rerun)
 
 
 def _program(folder: Path) -> str:
@@ -92,9 +102,12 @@ def _program(folder: Path) -> str:
     return "MMPose's JSON of pictures" if begin == "[" else "Pose2Sim's JSON"
 
 
-def _numbered(folder: Path, program: str) -> tuple[int, list[Path]]:
-    """The number of the first frame, and the frames' files, in order and without a gap."""
-    rerun = _RERUN[program]
+_LONGEST_GAP = 1000
+"""Frames that may be missing, and as many as there are: more are numbers of something else."""
+
+
+def _numbered(folder: Path, program: str) -> dict[int, Path]:
+    """The frames' files by the frames' numbers, which rise."""
     files = frame_files(folder)
     if len(files) == 0:
         raise InputError(
@@ -105,16 +118,14 @@ def _numbered(folder: Path, program: str) -> tuple[int, list[Path]]:
     for (number, file), (following, other) in pairwise(numbered):
         if following == number:
             raise InputError(f"{other}: frame {number} is also in {file.name}; keep one recording in a folder")
-        if following > number + 1:
-            match = _FILE.search(file.name)
-            assert match is not None
-            digits, ending = match[1], match[0][len(match[1]) :]
-            missing = file.with_name(file.name[: match.start()] + f"{number + 1:0{len(digits)}d}{ending}")
-            raise InputError(
-                f"{missing}: this frame is missing, {other.name} comes next; {rerun}"
-                " (a frame without people has a file too)"
-            )
-    return numbered[0][0], [file for _, file in numbered]
+    numbers = dict(numbered)
+    missing = numbered[-1][0] - numbered[0][0] + 1 - len(numbered)
+    if missing > len(numbered) + _LONGEST_GAP:
+        raise InputError(
+            f"{folder}: {len(numbered)} files are numbered from {numbered[0][0]} to {numbered[-1][0]}; number them"
+            f" by the frames of the recording, or {_RERUN[program]}"
+        )
+    return numbers
 
 
 def _people(file: Path, program: str) -> list[list[float]]:

@@ -29,6 +29,8 @@ class CameraPeople:
     every_frame: bool = True
     """Whether the files list every frame, those in which nobody is too. Where not, frames may be missing at both
     ends, and the other cameras tell how long the recording is."""
+    gaps: tuple[tuple[int, int], ...] = ()
+    """First and last number of frames in between that are missing from the files: nobody is seen in them."""
     rerun: str = "write the detections again"
     """How the program makes pixels of the calibrated pictures."""
 

@@ -41,7 +41,7 @@ def read_detections(path: str | Path, rig: Rig, skeleton: Skeleton | str | Path 
     found.refuse_normalised()
     views = [candidates_of(each, found.skeleton, *(_own_span(each) or (first, last))) for each in found.people]
     table = assemble(views, rig, found.skeleton)
-    return replace(table, notes=(*places.notes, *notes, *found.middles(), *table.notes))
+    return replace(table, notes=(*places.notes, *notes, *found.gaps(), *found.middles(), *table.notes))
 
 
 def _read_texts(texts: Sequence[Path], rig: Rig, wanted: Skeleton | None) -> DetectionTable:
@@ -123,6 +123,18 @@ class _Found:
                     f"{each.source}: recognised as {each.program}, but all keypoints lie between -1 and 1,"
                     f" and pixels were expected; {each.rerun}"
                 )
+
+    def gaps(self) -> list[str]:
+        """Which cameras lack frames in between."""
+        notes = []
+        for each in self.people:
+            if len(each.gaps) > 0:
+                count = sum(last - first + 1 for first, last in each.gaps)
+                (first, last), more = each.gaps[0], ", and others" if len(each.gaps) > 1 else ""
+                where = f"frame {first}" if first == last else f"frames {first} to {last}"
+                have = "frames have" if count > 1 else "frame has"
+                notes.append(f"{each.source}: {count} {have} no file ({where}{more}); nobody is seen there")
+        return notes
 
     def middles(self) -> list[str]:
         """What the reader made itself."""

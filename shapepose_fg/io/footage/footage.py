@@ -65,6 +65,18 @@ def open_footage(path: Path, progress: Progress | None = None) -> Footage:
     return Video.open(path, progress)
 
 
+def glance(path: Path) -> tuple[tuple[int, int], float]:
+    """Size (width, height) and frames a second that a video tells of itself, without looking through it.
+
+    The rate is 0 where it does not say.
+    """
+    capture = _capture(path)
+    size = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+    fps = float(capture.get(cv2.CAP_PROP_FPS))
+    capture.release()
+    return size, fps if 0 < fps < 1e5 else 0.0
+
+
 @dataclass
 class Video:
     """The frames of a video file that can be read."""

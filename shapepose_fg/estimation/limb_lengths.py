@@ -1,0 +1,68 @@
+"""Limbs keep their length: joints that views hardly determine, beside neighbours that they do."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+LENGTH_SIGMA_M = 0.1
+"""How far a limb of a detector's joints may be from its length, metres: as far as the views may leave open a joint
+that counts as seen (`outcome.SEEN_M`), so that hardly anything moves but what they leave open."""
+_LIMBS = (
+    ("Shoulder", "Elbow"), ("Elbow", "Wrist"), ("Hip", "Knee"), ("Knee", "Ankle"), ("Ankle", "Heel"),
+    ("Ankle", "BigToe"), ("BigToe", "SmallToe"),
+)  # fmt: skip
+"""From the trunk outwards, on either side; a detector may lack some."""
+_SWEEPS = 4
+"""How often all limbs are gone through; a wrist follows the elbow that the shoulder holds."""
+
+
+def limbs_of(joints: Sequence[str]) -> list[tuple[int, int]]:
+    """The arms and legs among a detector's joints, as pairs of their numbers."""
+    place = {name: number for number, name in enumerate(joints)}
+    named = [(f"{side}{first}", f"{side}{second}") for side in "RL" for first, second in _LIMBS]
+    return [(place[first], place[second]) for first, second in named if first in place and second in place]
+
+
+def limb_lengths(body: NDArray[np.float64], limbs: Sequence[tuple[int, int]]) -> NDArray[np.float64]:
+    """(L,) length of each limb, metres: the median of those of one person's body in T frames; NaN where unknown.
+
+    `body` (T, J, 3) are the body's joints, NaN in frames without a body.
+    """
+    first, second = np.array(limbs, dtype=np.intp).reshape(-1, 2).T
+    length = np.linalg.norm(body[:, first] - body[:, second], axis=-1)
+    length = length[np.isfinite(length).all(axis=1)]
+    return np.median(length, axis=0) if len(length) > 0 else np.full(len(first), np.nan)
+
+
+def with_lengths(
+    joints: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+    moved: NDArray[np.bool_],
+    lengths: NDArray[np.float64],
+    limbs: Sequence[tuple[int, int]],
+) -> NDArray[np.float64]:
+    """Joints (N, J, 3), metres, of which those `moved` (N, J) go where limbs have their `lengths` (L,).
+
+    Each limb is an observation of its length to `LENGTH_SIGMA_M`, and its ends share what is missing by their
+    `covariance` (N, J, 3, 3): a joint that one view saw moves along the ray, one that nothing saw any way. Joints
+    that are not `moved` are held.
+    """
+    X = joints.copy()
+    known = np.asarray(np.isfinite(X).all(axis=-1) & np.isfinite(covariance).all(axis=(-2, -1)))
+    free = np.where((moved & known)[..., None, None], np.nan_to_num(covariance), 0.0)
+    for _ in range(_SWEEPS):
+        for length, ends in zip(lengths.tolist(), limbs, strict=True):
+            a, b = ends
+            rows = np.flatnonzero(known[:, a] & known[:, b] & (moved[:, a] | moved[:, b]))
+            if not np.isfinite(length) or len(rows) == 0:
+                continue
+            apart = X[rows, b] - X[rows, a]
+            distance = np.linalg.norm(apart, axis=1, keepdims=True)
+            along = apart / np.maximum(distance, 1e-6)
+            pulls = [np.einsum("nij,nj->ni", free[rows, end], along) for end in ends]
+            variance = sum(np.einsum("ni,ni->n", pull, along) for pull in pulls) + LENGTH_SIGMA_M**2
+            missing = (length - distance) / np.asarray(variance)[:, None]
+            X[rows, a] -= pulls[0] * missing
+            X[rows, b] += pulls[1] * missing
+    return X

@@ -1,0 +1,173 @@
+"""Recordings with one mistake in their set-up, made on purpose: does the check name it, and nothing else?"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from shapepose_fg.camera import Axis, Camera, Rig
+from shapepose_fg.detections import Detections, DetectionSequence, Recording
+from shapepose_fg.setup_check.changes import Kind
+from shapepose_fg.setup_check.diagnosis import Finding
+
+
+@dataclass(frozen=True)
+class Spoiled:
+    """A recording with a mistake."""
+
+    what: str
+    """The mistake, in words."""
+    detections: DetectionSequence
+    rig: Rig
+    kind: Kind
+    """What the check should name."""
+    cameras: tuple[int, ...]
+    """Whom it should name; empty where the mistake is nobody's, or everybody's."""
+    amount: float | None = None
+    """Frames that should be named, within one."""
+
+    def named_by(self, findings: Sequence[Finding]) -> bool:
+        """Whether a finding names the kind, the cameras, and the frames within one."""
+        return any(
+            finding.kind == self.kind
+            and (len(self.cameras) == 0 or finding.cameras == self.cameras)
+            and (self.amount is None or abs(finding.amount - self.amount) <= 1)
+            for finding in findings
+        )
+
+
+def spoiled(detections: DetectionSequence, rig: Rig, seed: int = 0) -> Iterator[Spoiled]:
+    """One recording with every mistake, of every camera: turned about axes that `seed` draws."""
+    rng = np.random.default_rng(seed)
+    everybody = tuple(range(len(rig)))
+    for view in everybody:
+        for degrees in (1, 5, 30, 180):
+            axis = rng.normal(size=3)
+            yield Spoiled(f"turned {degrees}", detections, turned(rig, view, degrees, axis), Kind.TURNED, (view,))
+        for frames in (6, 10, -8):
+            late = delayed(detections, view, frames)
+            yield Spoiled("late 6 to 10 frames", late, rig, Kind.LATE, (view,), frames)
+        other = (view + 1) % len(rig)
+        pair = (min(view, other), max(view, other))
+        yield Spoiled("exchanged", detections, exchanged(rig, view, other), Kind.EXCHANGED, pair)
+        yield Spoiled("focal length x 2", detections, zoomed(rig, view, 2.0), Kind.FOCAL, (view,))
+        yield Spoiled("detections x 0.5", resized(detections, (view,), 0.5), rig, Kind.RESIZED, (view,))
+        yield Spoiled("inverse pose", detections, inverted(rig, (view,)), Kind.INVERTED, (view,))
+        twice, copy = listed_twice(detections, rig, view)
+        yield Spoiled("listed twice", twice, copy, Kind.DUPLICATE, (view, len(rig)))
+        yield Spoiled("another's file", detections, same_pose(rig, view, other), Kind.DUPLICATE, pair)
+    yield Spoiled("detections x 0.5, all", resized(detections, everybody, 0.5), rig, Kind.RESIZED, everybody)
+    yield Spoiled("inverse poses, all", detections, inverted(rig, everybody), Kind.INVERTED, everybody)
+    yield Spoiled("metres read as mm", detections, scaled(rig, 0.001), Kind.UNIT, ())
+    yield Spoiled("mm read as metres", detections, scaled(rig, 1000.0), Kind.UNIT, ())
+    for name in get_args(Axis):
+        if name != rig.up:
+            yield Spoiled("wrong up axis", detections, Rig(rig.cameras, name), Kind.UP, ())
+
+
+def turned(rig: Rig, view: int, degrees: float, axis: NDArray[np.float64]) -> Rig:
+    """One camera turned about an axis (3,) of its own, where it stands."""
+    wTc = rig.cameras[view].wTc.copy()
+    wTc[:3, :3] = wTc[:3, :3] @ Rotation.from_rotvec(np.deg2rad(degrees) * axis / np.linalg.norm(axis)).as_matrix()
+    return _with(rig, view, wTc=wTc)
+
+
+def exchanged(rig: Rig, first: int, second: int) -> Rig:
+    """Two cameras under each other's names."""
+    a, b = rig.cameras[first], rig.cameras[second]
+    return _put(_put(rig, first, replace(b, name=a.name)), second, replace(a, name=b.name))
+
+
+def same_pose(rig: Rig, view: int, other: int) -> Rig:
+    """The calibration of `view` also under the name of `other`."""
+    return _put(rig, other, replace(rig.cameras[view], name=rig.cameras[other].name))
+
+
+def zoomed(rig: Rig, view: int, factor: float) -> Rig:
+    """One camera with another focal length."""
+    K = rig.cameras[view].K.copy()
+    K[:2, :2] *= factor
+    return _with(rig, view, K=K)
+
+
+def inverted(rig: Rig, views: tuple[int, ...]) -> Rig:
+    """Cameras whose pose is read as its inverse."""
+    for view in views:
+        rig = _with(rig, view, wTc=np.linalg.inv(rig.cameras[view].wTc))
+    return rig
+
+
+def scaled(rig: Rig, factor: float) -> Rig:
+    """The rig in another unit."""
+    for view, camera in enumerate(rig.cameras):
+        wTc = camera.wTc.copy()
+        wTc[:3, 3] *= factor
+        rig = _with(rig, view, wTc=wTc)
+    return rig
+
+
+def resized(detections: DetectionSequence, views: tuple[int, ...], factor: float) -> Recording:
+    """Detections of some cameras as on pictures of another size."""
+
+    def smaller(found: Detections) -> Detections:
+        xy = found.xy.copy()
+        mine = np.isin(found.view, views)
+        xy[mine] = factor * (xy[mine] + 0.5) - 0.5
+        return replace(found, xy=xy)
+
+    return _each(detections, smaller)
+
+
+def delayed(detections: DetectionSequence, view: int, frames: int) -> Recording:
+    """What one camera saw, so many frames later; at the ends it stands still."""
+    every = [detections[frame] for frame in range(len(detections))]
+    shifted = np.clip(np.arange(len(every)) - frames, 0, len(every) - 1)
+    return Recording(
+        detections.skeleton,
+        [
+            _together(now.only(now.view != view), every[then].only(every[then].view == view))
+            for now, then in zip(every, shifted.tolist(), strict=True)
+        ],
+    )
+
+
+def listed_twice(detections: DetectionSequence, rig: Rig, view: int) -> tuple[Recording, Rig]:
+    """One camera a second time, at the end of the rig and under a name of its own."""
+    copy = replace(rig.cameras[view], name=f"{rig.cameras[view].name}_again")
+
+    def more(found: Detections) -> Detections:
+        mine = found.only(found.view == view)
+        return _together(found, replace(mine, view=np.full(len(mine), len(rig))))
+
+    return _each(detections, more), Rig((*rig.cameras, copy), rig.up)
+
+
+def _together(first: Detections, second: Detections) -> Detections:
+    """The candidates of both, sorted by view."""
+    view, joint, xy, confidence = (
+        np.concatenate([getattr(first, name), getattr(second, name)])
+        for name in ("view", "joint", "xy", "confidence")
+    )
+    order = np.argsort(view, kind="stable")
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    pairs = place[np.concatenate([first.pairs, second.pairs + len(first)])]
+    affinity = np.concatenate([first.affinity, second.affinity])
+    return Detections(view[order], joint[order], xy[order], confidence[order], pairs, affinity)
+
+
+def _each(detections: DetectionSequence, change: Callable[[Detections], Detections]) -> Recording:
+    return Recording(detections.skeleton, [change(detections[frame]) for frame in range(len(detections))])
+
+
+def _put(rig: Rig, view: int, camera: Camera) -> Rig:
+    cameras = list(rig.cameras)
+    cameras[view] = camera
+    return Rig(tuple(cameras), rig.up)
+
+
+def _with(rig: Rig, view: int, **change: object) -> Rig:
+    return _put(rig, view, replace(rig.cameras[view], **change))

@@ -1,0 +1,94 @@
+"""TRC and C3D where Pose2Sim's next steps look for them: pose-3d/NAME_A-B.trc, with its frame numbers."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from shapepose_fg.camera import Axis
+from shapepose_fg.errors import InputError
+from shapepose_fg.export.c3d import c3d_bytes
+from shapepose_fg.export.job import Written, optional
+from shapepose_fg.export.markers import MarkerSet, markers_of
+from shapepose_fg.export.take import Take
+from shapepose_fg.export.trc import trc_text
+from shapepose_fg.files import write_atomically
+from shapepose_fg.io.pose2sim_project import Pose2SimProject
+from shapepose_fg.reconstruction import Known, Reconstruction
+
+
+def write_pose2sim_files(people: Reconstruction, up: Axis, project: Pose2SimProject) -> Written:
+    """A TRC and a C3D file per person into pose-3d/; of one person only, where the project is of one.
+
+    That one is who has most joints in the detections of most frames. Without ezc3d there is no C3D, and a note.
+    """
+    written = Written()
+    if len(people) == 0:
+        written.notes.append("nobody was found, so there is no TRC and no C3D")
+        return written
+    take = _numbered(Take.of(people, up), project.first_number)
+    chosen = range(len(take.persons)) if project.multi_person else [_main_person(take)]
+    c3d = _c3d_or_why_not(written)
+    before = {each.name for each in project.pose_3d.glob("*.trc")} if project.pose_3d.is_dir() else set()
+    for number, person in enumerate(chosen):
+        _write_person(take, person, number if project.multi_person else None, project, written, c3d)
+    left = sorted(before - {each.name for each in written.files})
+    if len(left) > 0:
+        written.notes.append(
+            f"{project.pose_3d} also has {' '.join(left[:4])}{' ...' if len(left) > 4 else ''} of before; take"
+            " out what the next steps are not to read"
+        )
+    return written
+
+
+def _write_person(
+    take: Take, person: int, number: int | None, project: Pose2SimProject, written: Written, c3d: bool
+) -> None:
+    """The files of one person, the `number`th of several."""
+    markers = markers_of(take, person, MarkerSet.OPENSIM)
+    if len(markers.frames) == 0:
+        written.notes.append(f"person {take.persons[person]} has no joint in any frame")
+        return
+    first, last = markers.frames[0], markers.frames[-1]
+    name = project.name_of(number, int(take.frames[first]), int(take.frames[last]))
+    _write(
+        project.pose_3d / f"{name}.trc",
+        trc_text(markers, take.frames, take.times_s, take.fps, f"{name}.trc").encode(),
+    )
+    written.files.append(project.pose_3d / f"{name}.trc")
+    holes = int(last - first + 1 - len(markers.frames))
+    if holes > 0:
+        written.notes.append(f"{name}.trc leaves out {holes} frames in which nothing is known of the person")
+    if c3d:
+        even, lost = take.at_one_rate()
+        written.note_rate(lost, take.fps)
+        there = markers_of(even, person, MarkerSet.OPENSIM)
+        part = slice(int(there.frames[0]), int(there.frames[-1]) + 1)
+        path = project.pose_3d / f"{name}.c3d"
+        _write(path, c3d_bytes(there, int(even.frames[part.start]), even.fps, part))
+        written.files.append(path)
+
+
+def _numbered(take: Take, first: int) -> Take:
+    """The same with the project's own frame numbers, and the times that go with them."""
+    return replace(take, frames=take.frames + first, times_s=take.times_s + first / take.fps)
+
+
+def _main_person(take: Take) -> int:
+    """Who was seen most: joints that a view saw, over all frames."""
+    seen = take.people.known == Known.SEEN
+    count = [int(seen[rows[rows >= 0]].sum()) for rows in take.rows]
+    return int(np.argmax(count))
+
+
+def _c3d_or_why_not(written: Written) -> bool:
+    try:
+        optional("ezc3d", "export")
+    except InputError as error:
+        written.notes.append(f"no C3D: {error}")
+        return False
+    return True
+
+
+def _write(path: Path, content: bytes) -> None:
+    write_atomically(path, lambda stream: stream.write(content))

@@ -1,0 +1,205 @@
+"""How well one camera fits the people that the others see, and which change of it would fit them."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.setup_check.matching import GATE, distances
+from shapepose_fg.setup_check.sightings import MIN_JOINTS, Sightings
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+_TRIES = 40
+"""Pairs of a person and a sighting that are tried as one another: half of them are, with two people."""
+_ROUNDS = 6
+"""Rounds of matching and solving."""
+_WIDTH = 0.03
+"""Width of the Cauchy kernel, as a part of a person's size in the picture."""
+_STEPS = 4
+"""Gauss-Newton steps between matchings."""
+
+
+@dataclass(frozen=True)
+class Others:
+    """The people whom all cameras but some see."""
+
+    frame: Index
+    """(P,) frame of each person."""
+    points: Array
+    """(P, J, 3) joints, the calibration's unit; NaN where not placed."""
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """One camera without its lens."""
+
+    K: Array
+    """(3, 3)."""
+    cTw: Array
+    """(3, 4)."""
+
+
+@dataclass(frozen=True)
+class Match:
+    """Which sightings of a camera are which people."""
+
+    person: Index
+    """(E,)."""
+    sighting: Index
+    """(E,) rows of the camera's sightings."""
+    error: Array
+    """(E,) median distance, as a part of the person's size in the picture."""
+    possible: int
+    """How many could have been matched: in every frame the smaller number, of people or sightings."""
+
+    @property
+    def score(self) -> float:
+        """How much of what could be matched is: 1 where all is without error, 0 where nothing is near."""
+        return float((1 - self.error / GATE).sum() / max(self.possible, 1))
+
+
+def match(others: Others, seen: Sightings, camera: Pinhole, lag: int = 0) -> Match:
+    """Each sighting with the person nearest to it, where it is the nearest to that person too."""
+    person, sighting, error = distances(others.frame, others.points, seen, camera.K, camera.cTw, lag)
+    best_of_person, best_of_sighting = np.full(len(others), np.inf), np.full(len(seen), np.inf)
+    np.minimum.at(best_of_person, person, error)
+    np.minimum.at(best_of_sighting, sighting, error)
+    keep = (error <= best_of_person[person]) & (error <= best_of_sighting[sighting]) & (error < GATE)
+    return Match(person[keep], sighting[keep], error[keep], possible_matches(others.frame, seen.frame - lag))
+
+
+def possible_matches(first: Index, second: Index) -> int:
+    """Pairs that there can be: in every frame the smaller count."""
+    frames, counts = np.unique(first, return_counts=True)
+    other, other_counts = np.unique(second, return_counts=True)
+    _, i, j = np.intersect1d(frames, other, assume_unique=True, return_indices=True)
+    return int(np.minimum(counts[i], other_counts[j]).sum())
+
+
+def tries(others: Others, seen: Sightings, rng: np.random.Generator) -> Iterator[tuple[Array, Array]]:
+    """Joints in the world (N, 3) and in the picture (N, 2) of people and sightings that may be one another."""
+    from shapepose_fg.setup_check.matching import same_frame
+
+    person, sighting = same_frame(others.frame, seen.frame)
+    both = ~np.isnan(others.points[person][..., 0]) & ~np.isnan(seen.xy[sighting][..., 0])
+    enough = np.flatnonzero(both.sum(axis=1) >= MIN_JOINTS + 3)
+    for row in rng.permutation(enough)[:_TRIES].tolist():
+        yield others.points[person[row]][both[row]], seen.xy[sighting[row]][both[row]]
+
+
+def turned_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
+    """The camera, turned where it stands so that it looks best at `points` (N, 3) along the pixels `xy` (N, 2)."""
+    centre = -camera.cTw[:, :3].T @ camera.cTw[:, 3]
+    away = points - centre
+    away = away / np.linalg.norm(away, axis=1, keepdims=True)
+    rays = np.column_stack([xy, np.ones(len(xy))]) @ np.linalg.inv(camera.K).T
+    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    U, _, Vt = np.linalg.svd(rays.T @ away)
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    return Pinhole(camera.K, np.column_stack([R, -R @ centre]))
+
+
+def posed_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
+    """The camera at the pose from which it sees `points` (N, 3) at `xy` (N, 2)."""
+    scale = np.linalg.norm(points - points.mean(axis=0), axis=1).mean()
+    if not scale > 0:
+        return None
+    middle = points.mean(axis=0)
+    ok, turn, move = cv2.solvePnP((points - middle) / scale, xy, camera.K, np.zeros(4), flags=cv2.SOLVEPNP_SQPNP)
+    if not ok or not (np.isfinite(turn).all() and np.isfinite(move).all()):
+        return None
+    R = np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64)
+    return Pinhole(camera.K, np.column_stack([R, scale * move[:, 0] - R @ middle]))
+
+
+def zoomed_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
+    """The camera with the focal length by which it sees `points` (N, 3) at `xy` (N, 2)."""
+    at = _ahead(points, camera)
+    if at is None:
+        return None
+    direction, offset = (at - camera.K[:2, 2]), xy - camera.K[:2, 2]
+    factor = float((direction * offset).sum() / (direction**2).sum())
+    if not 0.1 < factor < 10:
+        return None
+    return Pinhole(scaled_focal(camera.K, factor), camera.cTw)
+
+
+def resized_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
+    """The camera of pictures that are larger or smaller, in which `points` (N, 3) lie at `xy` (N, 2)."""
+    at = _ahead(points, camera)
+    if at is None:
+        return None
+    factor = float((at * xy).sum() / (at**2).sum())
+    if not 0.1 < factor < 10:
+        return None
+    return Pinhole(scaled_picture(camera.K, factor), camera.cTw)
+
+
+def scaled_focal(K: Array, factor: float) -> Array:
+    """K with another focal length."""
+    new = K.copy()
+    new[:2, :2] *= factor
+    return new
+
+
+def scaled_picture(K: Array, factor: float) -> Array:
+    """K of pictures `factor` times as large; pixels are counted from the middle of the first."""
+    new = K.copy()
+    new[:2, :2] *= factor
+    new[:2, 2] = factor * (K[:2, 2] + 0.5) - 0.5
+    return new
+
+
+def _ahead(points: Array, camera: Pinhole) -> Array | None:
+    """Pixels (N, 2) of points, if all are before the camera."""
+    at = (points @ camera.cTw[:, :3].T + camera.cTw[:, 3]) @ camera.K.T
+    return at[:, :2] / at[:, 2:] if (at[:, 2] > 0).all() else None
+
+
+def refined(others: Others, seen: Sightings, camera: Pinhole, columns: tuple[int, ...]) -> Pinhole:
+    """The camera, some of its parameters (`adjustment.PARAMETERS`) fitted to the people that it matches."""
+    for _ in range(_ROUNDS):
+        found = match(others, seen, camera)
+        if len(found.person) == 0:
+            return camera
+        points, xy = others.points[found.person], seen.xy[found.sighting]
+        both = ~np.isnan(points[..., 0]) & ~np.isnan(xy[..., 0])
+        size = np.broadcast_to(seen.size_px[found.sighting][:, None], both.shape)[both]
+        camera = _solved(points[both], xy[both], _WIDTH * size, camera, list(columns))
+    return camera
+
+
+def _solved(points: Array, xy: Array, width_px: Array, camera: Pinhole, columns: list[int]) -> Pinhole:
+    """Robust Gauss-Newton on points (N, 3) seen at xy (N, 2)."""
+    from shapepose_fg.camera import Views
+    from shapepose_fg.setup_check.adjustment import Q, camera_derivatives, changed
+
+    for _ in range(_STEPS):
+        at = points @ camera.cTw[:, :3].T + camera.cTw[:, 3]
+        ahead = at[:, 2] > 0
+        if ahead.sum() < 4:
+            return camera
+        pixels = (at[ahead] @ camera.K.T)[:, :2] / at[ahead][:, 2:]
+        r = pixels - xy[ahead]
+        B = camera_derivatives(at[ahead], camera.K)[..., columns]
+        w = 1 / (width_px[ahead] ** 2 + (r**2).sum(axis=1))
+        H = np.einsum("n,nai,naj->ij", w, B, B)
+        step = np.zeros((1, Q))
+        step[0, columns] = -np.linalg.lstsq(H, np.einsum("n,nai,na->i", w, B, r), rcond=1e-10)[0]
+        new = changed(Views(camera.K[None], camera.cTw[None]), step)
+        camera = Pinhole(new.K[0], new.cTw[0])
+    return camera
+
+
+def difference(cTw: Array, other: Array) -> tuple[float, float]:
+    """By how many degrees a camera is turned, and how far moved, against another pose, both (3, 4)."""
+    cosine = (np.trace(cTw[:, :3] @ other[:, :3].T) - 1) / 2
+    centres = [-each[:, :3].T @ each[:, 3] for each in (cTw, other)]
+    return float(np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))), float(np.linalg.norm(centres[0] - centres[1]))

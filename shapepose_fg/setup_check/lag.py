@@ -1,0 +1,106 @@
+"""Whether a camera's pictures are late: at which offset in frames its detections fit the others' people best."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.setup_check.fit import Others, Pinhole
+from shapepose_fg.setup_check.matching import GATE, residuals, same_frame
+from shapepose_fg.setup_check.sightings import MIN_JOINTS, Sightings
+
+Array = NDArray[np.float64]
+
+_MIN_AGREEMENT = 0.12
+_MIN_LAG_GAIN = 0.004
+"""An offset in time is named if it takes away enough of what people move in it, and 7 mm on average."""
+_STRIDE = 4
+"""Offsets are tried at every fourth frame first."""
+_MOST_PEOPLE = 100
+"""People that are enough to tell an offset by."""
+
+
+@dataclass(frozen=True)
+class Lag:
+    """An offset of a camera in time."""
+
+    frames: int
+    """What the others show at frame t, the camera shows at t + frames: positive is late."""
+    gain: float
+    """By how much the joints' errors fall, as a part of the people's size: mean over all joints."""
+    agreement: float
+    """The same, over how far the joints move within the offset: near 1 if it is the offset, near -1 if there is
+    none, 0 where nobody moves."""
+
+
+def is_offset(lag: Lag) -> bool:
+    """Whether an offset is more than chance."""
+    return lag.agreement > _MIN_AGREEMENT and lag.gain > _MIN_LAG_GAIN
+
+
+def find_lag(others: Others, seen: Sightings, camera: Pinhole, most: int) -> Lag:
+    """The offset within `most` frames at which `seen`, the camera's sightings at all frames, fit people best."""
+    step = max(1, len(others) // _MOST_PEOPLE)
+    others = Others(others.frame[::step], others.points[::step])
+    size = np.append(seen.size_px, np.inf)
+    still = _nearest(others, seen, camera, 0)
+
+    def tried(lag: int) -> Lag:
+        moved = _nearest(others, seen, camera, lag)
+        return _compare(lag, seen, size, still, moved)
+
+    first = {lag: tried(lag) for lag in range(-(most // _STRIDE) * _STRIDE, most + 1, _STRIDE)}
+    best = max(first.values(), key=lambda lag: lag.gain)
+    near = [tried(best.frames + d) for d in range(1 - _STRIDE, _STRIDE) if d != 0 and abs(best.frames + d) <= most]
+    best = max([best, *near], key=lambda lag: lag.gain)
+    return best if best.gain > 0 else Lag(0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class _Nearest:
+    """Each person's nearest sighting at some offset."""
+
+    there: NDArray[np.bool_]
+    """(P,) whether the camera has that frame at all."""
+    sighting: NDArray[np.intp]
+    """(P,) -1 where none is within the gate."""
+    error: Array
+    """(P, J) distance of each joint, a part of the size, no more than GATE; NaN where the joint is not seen."""
+
+
+def _nearest(others: Others, seen: Sightings, camera: Pinhole, lag: int) -> _Nearest:
+    person, sighting = same_frame(others.frame, seen.frame - lag)
+    residual = residuals(others.points[person], seen.xy[sighting], camera.K, camera.cTw)
+    error = np.linalg.norm(residual, axis=-1) / seen.size_px[sighting][:, None]
+    both = ~np.isnan(error)
+    mean = np.where(both, np.minimum(error, GATE), 0).sum(axis=1) / np.maximum(both.sum(axis=1), 1)
+    mean = np.where(both.sum(axis=1) >= MIN_JOINTS, mean, GATE)
+    order = np.lexsort((mean, person))
+    first = np.ones(len(order), dtype=bool)
+    first[1:] = person[order][1:] != person[order][:-1]
+    best = order[first]
+    near = best[mean[best] < 0.9 * GATE]
+    found = np.full(len(others), -1, dtype=np.intp)
+    found[person[near]] = sighting[near]
+    errors = np.full(others.points.shape[:2], np.nan)
+    errors[person[near]] = np.minimum(error[near], GATE)
+    return _Nearest(np.isin(others.frame + lag, seen.frame), found, errors)
+
+
+def _compare(lag: int, seen: Sightings, size: Array, still: _Nearest, moved: _Nearest) -> Lag:
+    """How much better people fit at an offset than without: joints of people that both have, or one has."""
+    usable = still.there & moved.there & ((still.sighting >= 0) | (moved.sighting >= 0))
+    a, b = still.sighting[usable], moved.sighting[usable]
+    error_a, error_b = still.error[usable], moved.error[usable]
+    # Who is out of the gate at one of the offsets has moved by that much.
+    error_a = np.where((a < 0)[:, None] & ~np.isnan(error_b), GATE, error_a)
+    error_b = np.where((b < 0)[:, None] & ~np.isnan(error_a), GATE, error_b)
+    xy = np.concatenate([seen.xy, np.full((1, *seen.xy.shape[1:]), np.inf)])
+    with np.errstate(invalid="ignore"):
+        way = np.linalg.norm(xy[a] - xy[b], axis=-1) / np.minimum(size[a], size[b])[:, None]
+    way = np.where(np.isnan(way), GATE, np.minimum(way, GATE))
+    both = ~np.isnan(error_a) & ~np.isnan(error_b)
+    if both.sum() < 10 * MIN_JOINTS:
+        return Lag(lag, 0.0, 0.0)
+    better = (error_a - error_b)[both]
+    return Lag(lag, float(better.mean()), float(better.sum() / max(way[both].sum(), 1e-9)))

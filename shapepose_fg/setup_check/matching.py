@@ -1,0 +1,224 @@
+"""Which sightings of different cameras are one person, if the cameras are where they are said to be.
+
+Nothing here has a unit: an error is a part of the person's own size in the picture, so that a calibration in the
+wrong unit matches as well as the right one.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.camera import Views
+from shapepose_fg.setup_check.sightings import MIN_JOINTS, Sightings
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+GATE = 0.15
+"""Two sightings whose joints miss each other by more than this part of the person's size are not one person: a
+detector errs by 3 cm of 170, and a calibration that is worth naming by three times that (docs/setup_checks.md)."""
+_MIN_ANGLE = np.deg2rad(4.0)
+"""Least angle between two rays of a pair that places somebody: below it depth is guessed."""
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """M pairs of sightings of one frame and two cameras that may be one person, and who else saw that person."""
+
+    members: Index
+    """(M, 2) the two sightings."""
+    views: Index
+    """(M, 2) their cameras."""
+    error: Array
+    """(M,) median distance of their rays, as a part of the person's size in the picture."""
+    frame: Index
+    """(M,) frame of each."""
+    third: Index
+    """(M, V) the sighting of every other camera that is nearest to the person's projection; -1 for none."""
+    third_error: Array
+    """(M, V) its median distance, as a part of its size; inf for none."""
+
+
+@dataclass(frozen=True)
+class Groups:
+    """P people: the sighting of each camera."""
+
+    frame: Index
+    """(P,) frame."""
+    member: Index
+    """(P, V) the sighting of each camera, -1 where it does not see the person."""
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+
+def rays_of(sightings: Sightings, views: Views) -> Array:
+    """(S, J, 3) unit vectors in the world from the camera to each joint; NaN where not seen."""
+    inverse = np.linalg.inv(views.K)[sightings.view]
+    camera = np.einsum("sij,skj->ski", inverse[:, :, :2], sightings.xy) + inverse[:, None, :, 2]
+    world = np.einsum("sji,skj->ski", views.cTw[sightings.view, :, :3], camera)
+    return np.asarray(world / np.linalg.norm(world, axis=-1, keepdims=True))
+
+
+def centres_of(views: Views) -> Array:
+    """(V, 3) optical centres in the world."""
+    return -np.einsum("vji,vj->vi", views.cTw[:, :, :3], views.cTw[:, :, 3])
+
+
+def pair_up(sightings: Sightings, views: Views) -> Pairs:
+    """All pairs of sightings that may be one person under the cameras `views`."""
+    first, second = same_frame_pairs(sightings)
+    error, points = _meeting(sightings, views, first, second)
+    keep = error < GATE
+    members = np.stack([first[keep], second[keep]], axis=1)
+    third, third_error = _others(sightings, views, members, points[keep])
+    return Pairs(members, sightings.view[members], error[keep], sightings.frame[members[:, 0]], third, third_error)
+
+
+def same_frame_pairs(sightings: Sightings) -> tuple[Index, Index]:
+    """All pairs of sightings of one frame and two cameras, the camera that comes first in the rig first."""
+    order = np.argsort(sightings.frame, kind="stable")
+    frame = sightings.frame[order]
+    follow = np.searchsorted(frame, frame, side="right") - np.arange(len(frame)) - 1
+    first = np.repeat(np.arange(len(frame)), follow)
+    step = np.arange(len(first)) - np.repeat(np.cumsum(follow) - follow, follow)
+    first, second = order[first], order[first + 1 + step]
+    swap = sightings.view[first] > sightings.view[second]
+    first, second = np.where(swap, second, first), np.where(swap, first, second)
+    differ = sightings.view[first] != sightings.view[second]
+    return first[differ], second[differ]
+
+
+def _meeting(sightings: Sightings, views: Views, first: Index, second: Index) -> tuple[Array, Array]:
+    """How far the rays of pairs miss each other (M,), as a part of people's sizes, and where they meet (M, J, 3).
+
+    The middle of the shortest line between two rays. Infinite where the rays meet behind a camera, are almost
+    parallel, or have fewer than MIN_JOINTS joints in common.
+    """
+    rays, centres = rays_of(sightings, views), centres_of(views)
+    a, b = rays[first], rays[second]
+    between = (centres[sightings.view[first]] - centres[sightings.view[second]])[:, None]
+    cosine = np.einsum("mji,mji->mj", a, b)
+    along_a, along_b = np.einsum("mji,mji->mj", a, between + 0 * a), np.einsum("mji,mji->mj", b, between + 0 * b)
+    sine2 = np.maximum(1 - cosine**2, 1e-12)
+    s, t = (cosine * along_b - along_a) / sine2, (along_b - cosine * along_a) / sine2
+    on_a = s[..., None] * a
+    on_b = t[..., None] * b - between
+    half_gap = np.linalg.norm(on_a - on_b, axis=-1) / 2
+    focal, size = views.focal_px[sightings.view], sightings.size_px
+    with np.errstate(divide="ignore", invalid="ignore"):
+        error = np.maximum(half_gap / s * (focal / size)[first, None], half_gap / t * (focal / size)[second, None])
+    both = np.isfinite(half_gap)
+    error = np.where(both & ((s <= 0) | (t <= 0)), np.inf, error)
+    angle = median_of(np.arcsin(np.minimum(np.sqrt(sine2), 1.0)), both)
+    median = np.where((both.sum(axis=1) >= MIN_JOINTS) & (angle > _MIN_ANGLE), median_of(error, both), np.inf)
+    points = centres[sightings.view[first]][:, None] + (on_a + on_b) / 2
+    return median, points
+
+
+def _others(sightings: Sightings, views: Views, members: Index, points: Array) -> tuple[Index, Array]:
+    """For pairs that place somebody at `points` (M, J, 3), who else saw them: see `Pairs`."""
+    frame = sightings.frame[members[:, 0]] if len(members) > 0 else np.zeros(0, np.intp)
+    third = np.full((len(members), len(views)), -1, dtype=np.intp)
+    third_error = np.full(third.shape, np.inf)
+    for view in range(len(views)):
+        of_view = np.flatnonzero(sightings.view == view)
+        beside = np.flatnonzero((sightings.view[members] != view).all(axis=1))
+        person, sighting, error = distances(
+            frame[beside], points[beside], sightings.only(of_view), views.K[view], views.cTw[view]
+        )
+        order = np.lexsort((error, person))
+        person, sighting, error = person[order], sighting[order], error[order]
+        best = np.ones(len(person), dtype=bool)
+        best[1:] = person[1:] != person[:-1]
+        third[beside[person[best]], view] = of_view[sighting[best]]
+        third_error[beside[person[best]], view] = error[best]
+    return third, third_error
+
+
+def distances(
+    frame: Index, points: Array, seen: Sightings, K: Array, cTw: Array, lag: int = 0
+) -> tuple[Index, Index, Array]:
+    """Median distance of each person's projection to each sighting of one camera in the same frame.
+
+    `points` (P, J, 3) are people at `frame` (P,), `seen` what the camera K, cTw saw, `lag` frames later. Returns
+    person (E,), sighting (E,) and error (E,), a part of the sighting's size.
+    """
+    person, sighting = same_frame(frame, seen.frame - lag)
+    residual = residuals(points[person], seen.xy[sighting], K, cTw)
+    error = np.linalg.norm(residual, axis=-1)
+    both = ~np.isnan(error)
+    median = np.where(both.sum(axis=1) >= MIN_JOINTS, median_of(error, both), np.inf)
+    return person, sighting, median / seen.size_px[sighting]
+
+
+def same_frame(first: Index, second: Index) -> tuple[Index, Index]:
+    """All pairs (i, j) with first[i] == second[j]."""
+    order = np.argsort(second, kind="stable")
+    start, stop = np.searchsorted(second[order], first), np.searchsorted(second[order], first, side="right")
+    i = np.repeat(np.arange(len(first)), stop - start)
+    step = np.arange(len(i)) - np.repeat(np.cumsum(stop - start) - (stop - start), stop - start)
+    return i, order[start[i] + step]
+
+
+def residuals(points: Array, xy: Array, K: Array, cTw: Array) -> Array:
+    """Projection minus detection (N, J, 2), pixels; infinite behind the camera, NaN where nothing was seen."""
+    camera = points @ cTw[:, :3].T + cTw[:, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pixels = (camera @ K.T)[..., :2] / camera[..., 2:]
+    residual = np.where(camera[..., 2:] > 0, pixels - xy, np.inf)
+    return np.where(np.isnan(xy) | np.isnan(camera[..., 2:]), np.nan, residual)
+
+
+def group(pairs: Pairs, count: int, views: tuple[int, ...]) -> Groups:
+    """People as the cameras `views` alone see them: the best supported pairs first, each sighting used once.
+
+    `count` is S, of all sightings. In every round each frame takes its best pair with those that support it.
+    """
+    allowed = np.zeros(pairs.third.shape[1], dtype=bool)
+    allowed[list(views)] = True
+    free = np.ones(count + 1, dtype=bool)  # the last stands for "nobody"
+    free[count] = False
+    V = len(allowed)
+    live = np.flatnonzero(allowed[pairs.views].all(axis=1))
+    members, thirds = pairs.members, pairs.third
+    frames, rows = [], []
+    while len(live) > 0:
+        live = live[free[members[live]].all(axis=1)]
+        if len(live) == 0:
+            break
+        supported = free[thirds[live]] & (thirds[live] >= 0) & allowed & (pairs.third_error[live] < GATE)
+        worth = 1 - pairs.error[live] / GATE
+        worth = worth + np.where(supported, 1 - pairs.third_error[live] / GATE, 0).sum(axis=1)
+        order = np.lexsort((-worth, pairs.frame[live]))
+        frame = pairs.frame[live][order]
+        first = np.ones(len(order), dtype=bool)
+        first[1:] = frame[1:] != frame[:-1]
+        best = order[first]
+        member = np.where(supported[best], thirds[live[best]], -1)
+        chosen = live[best]
+        member[np.arange(len(best))[:, None], pairs.views[chosen]] = members[chosen]
+        free[member[member >= 0]] = False
+        frames.append(pairs.frame[chosen])
+        rows.append(member)
+    if len(rows) == 0:
+        return Groups(np.zeros(0, np.intp), np.zeros((0, V), np.intp))
+    return Groups(np.concatenate(frames), np.concatenate(rows))
+
+
+def errors_of(pairs: Pairs, groups: Groups, first: int, second: int) -> Array:
+    """(P,) by how much the rays of two cameras miss each other, of people who were grouped by these two alone."""
+    of_pair = (pairs.views == (first, second)).all(axis=1)
+    members = pairs.members[of_pair].tolist()
+    error = {(a, b): miss for (a, b), miss in zip(members, pairs.error[of_pair].tolist(), strict=True)}
+    return np.array([error[a, b] for a, b in groups.member[:, [first, second]].tolist()])
+
+
+def median_of(values: Array, valid: Mask) -> Array:
+    """(...) median of the valid values of the last axis, lower of the two middles; inf where there is none."""
+    ordered = np.sort(np.where(valid, values, np.nan), axis=-1)  # NaN last
+    middle = np.maximum(valid.sum(axis=-1) - 1, 0) // 2
+    median = np.take_along_axis(ordered, middle[..., None], axis=-1)[..., 0]
+    return np.where(np.isnan(median), np.inf, median)
