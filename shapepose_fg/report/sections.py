@@ -82,7 +82,7 @@ def cameras_section(cameras: Sequence[CameraFigures]) -> Element:
         return section("cameras", title, element("p", "There is no observations.npz beside the result."))
     offered = any(each.offered is not None for each in cameras)
     left_out = any(each.left_out_mm is not None for each in cameras)
-    head: list[Child] = ["camera", *(["detections"] if offered else []), "given to people", "used"]
+    head: list[Child] = ["camera", *(["detections"] if offered else []), "given to people", "used of these"]
     head += ["error, all", "error, used", *(["left out"] if left_out else []), "median error over time"]
     most = max((value for each in cameras for value in each.trend_px if value is not None), default=0.0)
     longest = max((each.all.high_px or 0.0 for each in cameras), default=0.0)
