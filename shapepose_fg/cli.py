@@ -17,6 +17,7 @@ from shapepose_fg.errors import InputError
 from shapepose_fg.export_command import export
 from shapepose_fg.options import frame_range, image_size_of
 from shapepose_fg.overlay_command import overlay
+from shapepose_fg.report_command import report as report_command
 from shapepose_fg.setup_command import check_calibration
 from shapepose_fg.terminal import note, show, warn
 from shapepose_fg.terminal import progress as progress_bar
@@ -53,6 +54,7 @@ app.command()(detect)
 app.command("check-calibration")(check_calibration)
 app.command()(overlay)
 app.command()(export)
+app.command("report")(report_command)
 app.command()(view)
 
 _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
@@ -131,6 +133,9 @@ def reconstruct(
     workers: Annotated[
         int | None, typer.Option(help="Processes that solve; by default as many as pay. They change no byte.")
     ] = None,
+    report: Annotated[
+        bool, typer.Option("--report/--no-report", help="Leave report.html, the result as a page to look at.")
+    ] = True,
     check: Annotated[
         bool, typer.Option("--check/--no-check", help="Whether cameras and detections fit, and what is wrong.")
     ] = True,
@@ -198,14 +203,18 @@ def reconstruct(
     own = (detections / "footage.json").is_file()
     videos = None if whole is None or own else whole.folder / "videos"
     checked = _checked(recording, rig, span, people, videos) if check else None
-    (people if checked is None else people.with_run(**checked.as_run())).save(output)
+    people = people if checked is None else people.with_run(**checked.as_run())
+    people.save(output)
     # What the observations were seen with: to solve or draw them anew.
     if not (output / CAMERAS).exists() or not (output / CAMERAS).samefile(calibration):
         write_rig(rig, output / CAMERAS)
+    page = _report(people, rig, output) if report else _no_report(output)
     summary = _summary(people, span, len(rig), seconds, output)
     if shapes is not None and known is not None and people.shapes is not None:
         known.updated(people.shapes).save(shapes)
         summary.add_row("", f"{shapes}  shapes of {len(people.shapes)} people")
+    if page is not None:
+        summary.add_row("", f"{page}  to look at, in a browser")
     if whole is not None:
         _add_project_files(summary, people, rig, whole)
     show(summary)
@@ -233,12 +242,15 @@ def evaluate_shelf_command(
 _DEMO = """\
 Built-in scene: 4 people in close motion, 6 cameras, 60 frames. A simulated
 detector sees them with noise, misses, false candidates and occlusion; from what
-it saw the people are reconstructed, every frame by itself."""
+it saw the people are reconstructed, over time."""
 
 
 @app.command()
 def demo(
     output: Annotated[Path, typer.Option(help="Folder for the result and the picture.")] = Path("demo"),
+    report: Annotated[
+        bool, typer.Option("--report/--no-report", help="Leave report.html, the result as a page to look at.")
+    ] = True,
 ) -> None:
     """Reconstruct a built-in scene of four people, compare it with the truth, and draw it."""
     _prepare(output)
@@ -249,7 +261,7 @@ def demo(
         result = run_demo(progress)
     show(result.tables())
     print()
-    for line in result.save(output):
+    for line in result.save(output, report=report):
         print(line)
 
 
@@ -443,6 +455,20 @@ def _fitter(body: Path | None, settings: "PipelineConfig", joints: tuple[str, ..
     from shapepose_fg.body.model.body_model import BodyModel
 
     return make_fitter(settings.body, BodyModel.load(body).with_keypoints(joints))
+
+
+def _report(people: "Reconstruction", rig: "Rig", output: Path) -> Path:
+    """The result as a page."""
+    from shapepose_fg.report.writing import write_report
+
+    return write_report(output, people, rig)
+
+
+def _no_report(output: Path) -> None:
+    """A page of an earlier result would say what is no longer true."""
+    from shapepose_fg.report.writing import REPORT
+
+    (output / REPORT).unlink(missing_ok=True)
 
 
 def _summary(people: "Reconstruction", span: range, camera_count: int, seconds: float, output: Path) -> "Table":

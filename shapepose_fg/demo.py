@@ -15,8 +15,12 @@ from shapepose_fg.errors import InputError
 from shapepose_fg.evaluation.alternation import JointErrors, alternation_errors, before_refinement
 from shapepose_fg.evaluation.matching import Matches, match_people
 from shapepose_fg.evaluation.metrics import CORRECT_M, covariance_calibration, joint_metrics
+from shapepose_fg.frame_times import FrameTimes
+from shapepose_fg.io.calibration import write_rig
+from shapepose_fg.io.solved_setup import CAMERAS
 from shapepose_fg.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.report.writing import REPORT, write_report
 from shapepose_fg.simulation import Scene, built_in_scene, simulate
 
 _STAGES = {
@@ -83,14 +87,20 @@ class Demo:
             truth=self.scene.vertices_at(frame),
         )
 
-    def save(self, folder: Path) -> list[str]:
-        """Write people.npz, run.json and the picture; returns what to tell the user."""
+    def save(self, folder: Path, *, report: bool = True) -> list[str]:
+        """Write people.npz and what belongs to it, the report and the picture; returns what to tell the user."""
         self.people.save(folder)
+        write_rig(self.scene.rig, folder / CAMERAS)
         told = [
             f"{folder / 'people.npz'}  joints, covariances and bodies",
             f"{folder / 'run.json'}  settings, times",
             f"{folder / 'observations.npz'}  which detections the joints are made of",
+            f"{folder / CAMERAS}  the cameras",
         ]
+        if report:
+            told.append(f"{write_report(folder, self.people, self.scene.rig)}  to look at, in a browser")
+        else:
+            (folder / REPORT).unlink(missing_ok=True)
         picture = folder / "picture.png"
         try:
             self.draw(picture)
@@ -105,7 +115,8 @@ def run_demo(progress: Callable[[int, int], None] | None = None, scene: Scene | 
     detections = simulate(scene)
     config = PipelineConfig()
     before = before_refinement(detections, scene.rig, config)
-    people = reconstruct(detections, scene.rig, config, progress=progress)
+    times = FrameTimes.from_fps(scene.fps, len(scene))
+    people = reconstruct(detections, scene.rig, config, times=times, progress=progress)
     return Demo(scene, detections, people, alternation_errors(before, people, scene.keypoints))
 
 

@@ -17,8 +17,6 @@ from shapepose_fg.terminal import note, progress
 if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel
     from shapepose_fg.camera import Rig
-    from shapepose_fg.io.footage.footage import Footage
-    from shapepose_fg.io.footage.used import CameraFootage
     from shapepose_fg.overlay.frames import Overlay
     from shapepose_fg.reconstruction import Reconstruction
 
@@ -77,14 +75,14 @@ def overlay(
     from shapepose_fg.io.calibration import read_rig
     from shapepose_fg.io.solved_setup import CAMERAS
     from shapepose_fg.overlay.frames import Overlay, OverlayContent
+    from shapepose_fg.overlay.result_pictures import pictures_of
     from shapepose_fg.reconstruction import Reconstruction
 
     folder = results_folder(results)
     people = Reconstruction.load(folder)
     rig = read_rig(folder / CAMERAS)
-    pictures = _pictures(
-        people, rig, _drawn_cameras(cameras, videos, rig), videos, detections, image_placement or []
-    )
+    drawn = _drawn_cameras(cameras, videos, rig)
+    pictures = pictures_of(people, rig, drawn, videos, detections, image_placement or [])
     content = OverlayContent(skeletons=skeletons, bodies=bodies, detections=points)
     if points and people.observations is None:
         note(f"{folder}: there is no observations.npz, so no detections are drawn")
@@ -114,82 +112,6 @@ def _drawn_cameras(text: str | None, videos: Sequence[str] | None, rig: "Rig") -
     if len(names) == 0 or len(set(names)) < len(names):
         raise InputError(f"--cameras {text}: must be names of cameras, each once, such as {rig.names[0]}")
     return names
-
-
-def _pictures(
-    people: "Reconstruction",
-    rig: "Rig",
-    drawn: Sequence[str],
-    videos: Sequence[str] | None,
-    detections: Path | None,
-    image_placement: Sequence[str],
-) -> "list[tuple[CameraFootage, Footage]]":
-    """The pictures of the cameras that are drawn, and which belongs to which frame."""
-    import numpy as np
-
-    from shapepose_fg.io.footage.footage import open_footage
-    from shapepose_fg.io.footage.given import placements_of
-    from shapepose_fg.io.footage.places import find_footage
-    from shapepose_fg.io.footage.used import CameraFootage
-
-    used = {each.name: each for each in _used_footage(people, detections)}
-    if videos is not None:
-        places = find_footage(videos, drawn)
-        paths = dict(zip(drawn, places.paths, strict=True))
-        for text in places.notes:
-            note(text)
-    else:
-        missing = next((name for name in drawn if name not in used), None)
-        if missing is not None:
-            raise InputError(
-                f"nothing says where the pictures of camera {missing} are; give --videos, or with --detections the"
-                " folder that `shapepose-fg detect` wrote"
-            )
-        paths = {name: used[name].path for name in drawn}
-    opened = {}
-    for name, path in paths.items():
-        if not path.exists():
-            raise InputError(f"{path}: the pictures of camera {name} are not there any more; give --videos")
-        with progress(f"looking through {name}") as done:
-            opened[name] = open_footage(path, done)
-    # What detect was told of the pictures holds as long as they have the same size.
-    alike = {
-        name: used[name].placement
-        for name, each in opened.items()
-        if name in used and used[name].placement.picture_size == each.size and not image_placement
-    }
-    sizes = {name: each.size for name, each in opened.items() if name not in alike}
-    placements, notes = placements_of(image_placement, sizes, rig)
-    counted = [name for name in drawn if name not in used]
-    if len(counted) > 0:
-        notes.append(f"frame 0 of the result is taken to be the first picture of {' '.join(counted)}, and so on")
-    for text in notes:
-        note(text)
-    placements |= alike
-    pairs = []
-    for name, footage in opened.items():
-        count = len(footage.number)
-        index = used[name].places if name in used else np.arange(count)
-        index = np.where(index < count, index, -1)
-        pairs.append((CameraFootage(name, footage.path, placements[name], index), footage))
-    return pairs
-
-
-def _used_footage(people: "Reconstruction", detections: Path | None) -> "list[CameraFootage]":
-    """What `detect` wrote of the pictures, beside the detections that the result was made from."""
-    from shapepose_fg.io.footage.used import FOOTAGE, read_used_footage
-
-    if detections is not None:
-        file = detections / FOOTAGE if detections.is_dir() else detections
-        if not file.is_file():
-            raise InputError(f"{file}: there is no such file; give the folder that `shapepose-fg detect` wrote")
-        return read_used_footage(file)
-    inputs = people.run.get("inputs")
-    for text in inputs if isinstance(inputs, dict) else ():
-        file = Path(str(text)).parent / FOOTAGE
-        if Path(str(text)).suffix == ".txt" and file.is_file():
-            return read_used_footage(file)
-    return []
 
 
 def _body(people: "Reconstruction") -> "BodyModel":

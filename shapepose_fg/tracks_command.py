@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from shapepose_fg.errors import InputError
 from shapepose_fg.terminal import show
 
 if TYPE_CHECKING:
@@ -104,6 +105,7 @@ def undo_correction(context: typer.Context) -> None:
     edit, people = take_back(folder, _solver(folder))
     print(f"taken back: {edit}")
     show(_tracks_table(context.obj, people))
+    _renew_report(folder)
 
 
 def _folder(results: Path) -> Path:
@@ -175,6 +177,21 @@ def _correct(context: typer.Context, action: str, person: int, **more: int | Non
     print(f"done: {edit}{_solved_words(edited, solve)}")
     show(_tracks_table(context.obj, edited.people))
     print(f"take it back: shapepose-fg tracks {context.obj} undo")
+    _renew_report(folder)
+
+
+def _renew_report(folder: Path) -> None:
+    """The page of a result that was corrected, where there is one: it would say what is no longer true."""
+    from shapepose_fg.report.writing import REPORT, report_of
+
+    page = folder / REPORT
+    if not page.is_file():
+        return
+    try:
+        print(f"{report_of(folder)} is up to date")
+    except InputError as problem:
+        page.unlink()
+        print(f"{page} is removed: {problem}")
 
 
 def _solver(folder: Path) -> "Solve | None":

@@ -333,13 +333,24 @@ def test_demo_compares_with_the_truth_and_leaves_a_picture(short_scene, tmp_path
     assert (tmp_path / "demo" / "picture.png").read_bytes()[:4] == b"\x89PNG"
 
 
+def test_a_report_is_left_or_taken_away(recording, pipeline, capsys):
+    page = Path(recording[recording.index("--output") + 1]) / "report.html"
+    assert run(*recording) == 0
+    assert "to look at, in a browser" in capsys.readouterr().out
+    assert page.read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+    assert run(*recording, "--no-report") == 0
+    assert not page.exists() and "to look at" not in capsys.readouterr().out
+
+
 def test_demo_without_matplotlib_says_what_to_install(short_scene, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     assert run("demo", "--output", str(tmp_path / "out")) == 0
     assert "no picture: the picture needs matplotlib: pip install shapepose-fg[viewer]" in capsys.readouterr().out
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        "cameras.json",
         "observations.npz",
         "people.npz",
+        "report.html",
         "run.json",
     ]
 

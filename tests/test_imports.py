@@ -31,8 +31,9 @@ LEVELS = (
     "simulation viewer detection2d",
     "overlay setup_check",
     "training export",
+    "report",
     "evaluation",
-    "demo tracks_command detect_command overlay_command export_command view_command setup_command",
+    "demo tracks_command detect_command overlay_command export_command report_command view_command setup_command",
     "cli",
 )
 """Each level imports only from those before it; a package may import its own modules too."""

@@ -9,12 +9,12 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from shapepose_fg.body.model.smpl_file import SmplArrays
+from shapepose_fg.export.bones import bones_of
 from shapepose_fg.export.light_mesh import thinned
 from shapepose_fg.export.markers import sigma_m
 from shapepose_fg.export.skinned import rest_joints, skin
 from shapepose_fg.export.take import Take
 from shapepose_fg.reconstruction import Known
-from shapepose_fg.skeleton import BODY_25
 from shapepose_fg.viewer.palette import colour_of
 
 PEOPLE = "world/people"
@@ -47,24 +47,6 @@ def log_people(rr: ModuleType, stream: Any, take: Take, arrays: SmplArrays | Non
         _log_person(rr, stream, take, person, colour, bones)
         if arrays is not None and mesh is not None:
             _log_bodies(rr, stream, take, person, arrays, mesh[0], mesh[1])
-
-
-def bones_of(joint_names: tuple[str, ...]) -> NDArray[np.intp]:
-    """(B, 2) joints that a line joins: each of BODY_25 and the nearest joint towards the hip that is there."""
-    parents = {
-        name: BODY_25.joints[parent]
-        for name, parent in zip(BODY_25.joints, BODY_25.parents, strict=True)
-        if parent >= 0
-    }
-    parents["Head"] = "Neck"
-    pairs = []
-    for place, name in enumerate(joint_names):
-        parent = parents.get(name)
-        while parent is not None and parent not in joint_names:
-            parent = parents.get(parent)
-        if parent is not None:
-            pairs.append((joint_names.index(parent), place))
-    return np.array(pairs, dtype=np.intp).reshape(-1, 2)
 
 
 def _log_person(

@@ -51,8 +51,8 @@ def open_viewer(stream: Any, take: Take, url: str | None) -> None:
 
 
 def viewer_file() -> str | None:
-    """The viewer that came with rerun-sdk, also where its folder is not on the PATH; None for any other."""
-    return shutil.which("rerun", path=sysconfig.get_path("scripts"))
+    """The viewer that came with rerun-sdk, also where its folder is not on the PATH; any other; or None."""
+    return shutil.which("rerun", path=sysconfig.get_path("scripts")) or shutil.which("rerun")
 
 
 def body_if_there(job: Job) -> tuple[SmplArrays | None, str | None]:

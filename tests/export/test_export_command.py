@@ -1,5 +1,6 @@
 """`shapepose-fg export`: several formats in one call, and one sentence for what does not fit."""
 
+import json
 import os
 import shutil
 import subprocess
@@ -10,9 +11,12 @@ import numpy as np
 import pytest
 
 from shapepose_fg.cli import main
+from shapepose_fg.errors import InputError
+from shapepose_fg.export.bones import bones_of
 from shapepose_fg.export.light_mesh import thinned
 from shapepose_fg.export.registry import FORMATS
-from shapepose_fg.export.rerun_people import bones_of
+from shapepose_fg.export.rerun_scene import viewer_file
+from shapepose_fg.export.rerun_statistics import switch_off
 from shapepose_fg.skeleton import BODY_25, COCO_17
 
 from .conftest import AWAY, FIRST, FRAMES
@@ -141,6 +145,28 @@ def test_view_without_a_viewer_is_one_sentence(copied, capfd):
     pytest.importorskip("rerun")
     assert run("view", copied, "--connect", "nonsense") == 2
     assert "the rerun viewer cannot be reached at nonsense" in capfd.readouterr().err
+
+
+def test_rerun_sends_no_statistics(tmp_path, monkeypatch):
+    """On a machine where rerun was never used they are on; `rerun analytics disable` is what its manual says."""
+    pytest.importorskip("rerun")
+    for name in ("HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME"):
+        monkeypatch.setenv(name, str(tmp_path / name))
+    viewer = viewer_file()
+    assert viewer is not None
+    assert switch_off(viewer)
+    told = subprocess.run([viewer, "analytics", "config"], capture_output=True, text=True, check=True).stdout
+    assert json.loads(told)["analytics_enabled"] is False
+    assert not switch_off(viewer)
+
+
+@pytest.mark.parametrize("says", ["exit 1", "echo no JSON", "echo '{\"analytics_enabled\": true}'"])
+def test_statistics_that_cannot_be_switched_off_are_said(tmp_path, says):
+    viewer = tmp_path / "rerun"
+    viewer.write_text(f"#!/bin/sh\n{says}\n")
+    viewer.chmod(0o755)
+    with pytest.raises(InputError, match=r"cannot be switched off .* --statistics"):
+        switch_off(str(viewer))
 
 
 def test_view_without_rerun_names_the_command(copied, capsys, monkeypatch):

@@ -107,7 +107,7 @@ from shapepose_fg import cli
 def tell(what):
     yield lambda done, total: print(done, *(child.pid for child in multiprocessing.active_children()), flush=True)
 
-cli._progress = tell
+cli.progress_bar = tell
 cli.main(["simulate", "demo", "--people", "2", "--cameras", "2", "--frames", ":2000", "--workers", "2",
           "--output", sys.argv[1]])
 """

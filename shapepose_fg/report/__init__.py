@@ -1,0 +1,1 @@
+"""A result as one page for the browser: report.html."""

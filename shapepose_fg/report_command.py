@@ -1,0 +1,29 @@
+"""The command `report`: a result as one page for the browser."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, cast
+
+import typer
+
+from shapepose_fg.result_options import checked_fps
+
+if TYPE_CHECKING:
+    from shapepose_fg.camera import Axis
+
+# Everything else is imported inside the command: `--help` must not wait for it.
+
+
+def report(
+    results: Annotated[Path, typer.Argument(metavar="RESULTS", help="Folder of a reconstruction.")],
+    fps: Annotated[float | None, typer.Option(help="Frames a second, in place of the result's own times.")] = None,
+    up: Annotated[
+        str | None, typer.Option(metavar="AXIS", help="Axis that points up, where cameras.json is not there.")
+    ] = None,
+    body: Annotated[
+        Path | None, typer.Option(help="The body model of the result, where its file has moved.")
+    ] = None,
+) -> None:
+    """Write report.html anew: one page, to be opened in a browser, with the people in 3D and how good they are."""
+    from shapepose_fg.report.writing import report_of
+
+    print(report_of(results, up=cast("Axis | None", up), fps=checked_fps(fps), body=body))
