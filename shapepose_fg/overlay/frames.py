@@ -23,7 +23,7 @@ from shapepose_fg.overlay.drawing import (
 )
 from shapepose_fg.overlay.picture_view import PictureView
 from shapepose_fg.reconstruction import Known, Reconstruction, Status
-from shapepose_fg.viewer.figures import PALETTE
+from shapepose_fg.viewer.palette import colour_of
 
 if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel
@@ -84,10 +84,8 @@ class Overlay:
         return drawn
 
     def colour(self, person: int) -> Colour:
-        """The colour of an identity, the same in all frames."""
-        everybody = np.unique(self.people.person)
-        text = PALETTE[int(np.searchsorted(everybody, person)) % len(PALETTE)]
-        red, green, blue = (int(text[at : at + 2], 16) for at in (1, 3, 5))
+        """The colour of an identity, blue, green, red: the same in all that draws the result."""
+        red, green, blue = (round(255 * part) for part in colour_of(person))
         return blue, green, red
 
     def _skeletons(self, people: Reconstruction) -> Skeletons:
