@@ -14,10 +14,10 @@ def switch_off(viewer: str) -> bool:
     True where they were on. InputError where they cannot be switched off: nothing is sent unasked.
     """
     try:
-        if not json.loads(_said_by(viewer, "config")).get("analytics_enabled", True):
+        if not _on(viewer):
             return False
         _said_by(viewer, "disable")
-        if not json.loads(_said_by(viewer, "config")).get("analytics_enabled", True):
+        if not _on(viewer):
             return True
         problem = "they are still on"
     except (OSError, ValueError, AttributeError, subprocess.SubprocessError) as error:
@@ -26,6 +26,12 @@ def switch_off(viewer: str) -> bool:
         f"rerun's statistics of use cannot be switched off ({problem}); run `rerun analytics disable`, "
         "or give --statistics if they may be sent"
     )
+
+
+def _on(viewer: str) -> bool:
+    """Whether they are sent; where the variable CI is set, rerun has none and prints `null`."""
+    settings = json.loads(_said_by(viewer, "config"))
+    return settings is not None and settings.get("analytics_enabled", True)
 
 
 def _said_by(viewer: str, command: str) -> str:

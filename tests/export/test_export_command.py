@@ -154,6 +154,9 @@ def test_rerun_sends_no_statistics(tmp_path, monkeypatch):
         monkeypatch.setenv(name, str(tmp_path / name))
     viewer = viewer_file()
     assert viewer is not None
+    monkeypatch.setenv("CI", "true")
+    assert not switch_off(viewer), "rerun sends none from there"
+    monkeypatch.delenv("CI")
     assert switch_off(viewer)
     told = subprocess.run([viewer, "analytics", "config"], capture_output=True, text=True, check=True).stdout
     assert json.loads(told)["analytics_enabled"] is False
