@@ -15,7 +15,15 @@ import typer
 from shapepose_fg.detect_command import detect
 from shapepose_fg.errors import InputError
 from shapepose_fg.export_command import export
-from shapepose_fg.options import frame_range, image_size_of
+from shapepose_fg.options import (
+    FramesOption,
+    ImageSizeOption,
+    SkeletonOption,
+    UnitOption,
+    UpOption,
+    frame_range,
+    image_size_of,
+)
 from shapepose_fg.overlay_command import overlay
 from shapepose_fg.report_command import report as report_command
 from shapepose_fg.setup_command import check_calibration
@@ -101,19 +109,11 @@ def reconstruct(
     config: Annotated[
         Path | None, typer.Option(help="Settings as TOML; `shapepose-fg config` prints all.")
     ] = None,
-    frames: Annotated[
-        str | None, typer.Option(metavar="A:B", help="Frames A to B-1; either may be left out.")
-    ] = None,
-    up: Annotated[
-        str | None, typer.Option(metavar="AXIS", help="World axis that points up: x -x y -y z -z.")
-    ] = None,
-    unit: Annotated[str | None, typer.Option(metavar="UNIT", help="Unit of the calibration: m, cm or mm.")] = None,
-    image_size: Annotated[
-        str | None, typer.Option(metavar="WxH", help="Size of the calibrated pictures, where the file has none.")
-    ] = None,
-    skeleton: Annotated[
-        str | None, typer.Option(metavar="NAME", help="The detector's skeleton, or a TOML file that describes it.")
-    ] = None,
+    frames: FramesOption = None,
+    up: UpOption = None,
+    unit: UnitOption = None,
+    image_size: ImageSizeOption = None,
+    skeleton: SkeletonOption = None,
     body: Annotated[
         Path | None, typer.Option(help="Body model in SMPL's file format, instead of the built-in.")
     ] = None,
@@ -270,9 +270,7 @@ def simulate(
     name: Annotated[str, typer.Argument(help="demo, or an interaction sequence: salsa, crossing or crowd.")],
     output: Annotated[Path, typer.Option(help="Folder for cameras, detections and truth.")],
     split: Annotated[str, typer.Option(help="Takes of a sequence: tune, to choose settings by; report.")] = "tune",
-    frames: Annotated[
-        str | None, typer.Option(metavar="A:B", help="Frames A to B-1; either may be left out.")
-    ] = None,
+    frames: FramesOption = None,
     cameras: Annotated[int, typer.Option(help="Cameras around the room, 2 to 12.")] = 6,
     people: Annotated[int | None, typer.Option(help="People in demo, 0 to 12; a sequence has its own.")] = None,
     seed: Annotated[int, typer.Option(help="Fixes the detector's errors, and the people of demo.")] = 0,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from shapepose_fg.errors import InputError
-from shapepose_fg.options import frame_range, image_size_of
+from shapepose_fg.options import ImageSizeOption, UnitOption, UpOption, frame_range, image_size_of
 from shapepose_fg.terminal import note, progress, show
 
 if TYPE_CHECKING:
@@ -78,13 +78,9 @@ def detect(
     backend: Annotated[
         str, typer.Option(metavar="NAME", help="What runs the network: opencv or onnxruntime.")
     ] = "opencv",
-    up: Annotated[
-        str | None, typer.Option(metavar="AXIS", help="World axis that points up: x -x y -y z -z.")
-    ] = None,
-    unit: Annotated[str | None, typer.Option(metavar="UNIT", help="Unit of the calibration: m, cm or mm.")] = None,
-    image_size: Annotated[
-        str | None, typer.Option(metavar="WxH", help="Size of the calibrated pictures, where the file has none.")
-    ] = None,
+    up: UpOption = None,
+    unit: UnitOption = None,
+    image_size: ImageSizeOption = None,
 ) -> None:
     """Detect people's joints in videos or pictures, for `reconstruct`: candidates with part affinities.
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from shapepose_fg.errors import InputError
+from shapepose_fg.options import FramesOption, ResultUpOption
 from shapepose_fg.result_options import checked_fps, frame_range, results_folder
 from shapepose_fg.terminal import note
 
@@ -33,13 +34,9 @@ def export(
     person: Annotated[
         list[int] | None, typer.Option(help="Only this person; may be given several times.", show_default=False)
     ] = None,
-    frames: Annotated[
-        str | None, typer.Option(metavar="A:B", help="Frames A to B-1; either may be left out.")
-    ] = None,
+    frames: FramesOption = None,
     fps: Annotated[float | None, typer.Option(help="Frames a second, in place of the result's own times.")] = None,
-    up: Annotated[
-        str | None, typer.Option(metavar="AXIS", help="Axis that points up, where cameras.json is not there.")
-    ] = None,
+    up: ResultUpOption = None,
     fill_gaps: Annotated[
         float, typer.Option(metavar="SECONDS", help="Holes up to this long are filled in amass and bvh.")
     ] = 0.2,

@@ -1,8 +1,24 @@
-"""What several commands take as text: a range of frames, the size of a picture."""
+"""What several commands take: their common options, and what is given as text, a range of frames or a size."""
 
 import re
+from typing import Annotated
+
+import typer
 
 from shapepose_fg.errors import InputError
+
+FramesOption = Annotated[str | None, typer.Option(metavar="A:B", help="Frames A to B-1; either may be left out.")]
+UpOption = Annotated[str | None, typer.Option(metavar="AXIS", help="World axis that points up: x -x y -y z -z.")]
+ResultUpOption = Annotated[
+    str | None, typer.Option(metavar="AXIS", help="Axis that points up, where cameras.json is not there.")
+]
+UnitOption = Annotated[str | None, typer.Option(metavar="UNIT", help="Unit of the calibration: m, cm or mm.")]
+ImageSizeOption = Annotated[
+    str | None, typer.Option(metavar="WxH", help="Size of the calibrated pictures, where the file has none.")
+]
+SkeletonOption = Annotated[
+    str | None, typer.Option(metavar="NAME", help="The detector's skeleton, or a TOML file that describes it.")
+]
 
 
 def image_size_of(text: str | None) -> tuple[int, int] | None:

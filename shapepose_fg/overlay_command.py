@@ -10,7 +10,7 @@ import typer
 
 from shapepose_fg.errors import InputError
 from shapepose_fg.frame_times import ASSUMED_FPS
-from shapepose_fg.options import frame_range
+from shapepose_fg.options import FramesOption, frame_range
 from shapepose_fg.result_options import results_folder
 from shapepose_fg.terminal import note, progress
 
@@ -45,9 +45,7 @@ def overlay(
         typer.Option(help="Folder that `detect` wrote: it says which picture belongs to which frame."),
     ] = None,
     cameras: Annotated[str | None, typer.Option(metavar="A,B", help="Only these cameras.")] = None,
-    frames: Annotated[
-        str | None, typer.Option(metavar="A:B", help="Frames A to B-1; either may be left out.")
-    ] = None,
+    frames: FramesOption = None,
     stills: Annotated[
         str | None, typer.Option(metavar="A,B", help="Still pictures of these frames instead of a video.")
     ] = None,

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
+from shapepose_fg.options import ResultUpOption
 from shapepose_fg.result_options import checked_fps
 
 if TYPE_CHECKING:
@@ -16,9 +17,7 @@ if TYPE_CHECKING:
 def report(
     results: Annotated[Path, typer.Argument(metavar="RESULTS", help="Folder of a reconstruction.")],
     fps: Annotated[float | None, typer.Option(help="Frames a second, in place of the result's own times.")] = None,
-    up: Annotated[
-        str | None, typer.Option(metavar="AXIS", help="Axis that points up, where cameras.json is not there.")
-    ] = None,
+    up: ResultUpOption = None,
     body: Annotated[
         Path | None, typer.Option(help="The body model of the result, where its file has moved.")
     ] = None,

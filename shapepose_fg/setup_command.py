@@ -6,7 +6,15 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from shapepose_fg.options import frame_range, image_size_of
+from shapepose_fg.options import (
+    FramesOption,
+    ImageSizeOption,
+    SkeletonOption,
+    UnitOption,
+    UpOption,
+    frame_range,
+    image_size_of,
+)
 from shapepose_fg.terminal import note, show
 
 if TYPE_CHECKING:
@@ -28,19 +36,11 @@ def check_calibration(
             help="The videos or pictures too, to compare their sizes with the calibration's.",
         ),
     ] = None,
-    frames: Annotated[
-        str | None, typer.Option(metavar="A:B", help="Frames A to B-1; either may be left out.")
-    ] = None,
-    up: Annotated[
-        str | None, typer.Option(metavar="AXIS", help="World axis that points up: x -x y -y z -z.")
-    ] = None,
-    unit: Annotated[str | None, typer.Option(metavar="UNIT", help="Unit of the calibration: m, cm or mm.")] = None,
-    image_size: Annotated[
-        str | None, typer.Option(metavar="WxH", help="Size of the calibrated pictures, where the file has none.")
-    ] = None,
-    skeleton: Annotated[
-        str | None, typer.Option(metavar="NAME", help="The detector's skeleton, or a TOML file that describes it.")
-    ] = None,
+    frames: FramesOption = None,
+    up: UpOption = None,
+    unit: UnitOption = None,
+    image_size: ImageSizeOption = None,
+    skeleton: SkeletonOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
 ) -> None:
     """Check whether cameras and detections fit: turned, exchanged or late cameras, wrong units, in words.

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from shapepose_fg.errors import InputError
+from shapepose_fg.options import FramesOption, ResultUpOption
 from shapepose_fg.result_options import checked_fps, frame_range
 from shapepose_fg.terminal import note, progress
 
@@ -20,9 +21,7 @@ if TYPE_CHECKING:
 
 def view(
     results: Annotated[Path, typer.Argument(metavar="RESULTS", help="Folder of a reconstruction.")],
-    frames: Annotated[
-        str | None, typer.Option(metavar="A:B", help="Frames A to B-1; either may be left out.")
-    ] = None,
+    frames: FramesOption = None,
     person: Annotated[
         list[int] | None, typer.Option(help="Only this person; may be given several times.", show_default=False)
     ] = None,
@@ -30,9 +29,7 @@ def view(
         bool, typer.Option("--seen-only", help="Leave out joints that no view saw in that frame.")
     ] = False,
     fps: Annotated[float | None, typer.Option(help="Frames a second, in place of the result's own times.")] = None,
-    up: Annotated[
-        str | None, typer.Option(metavar="AXIS", help="Axis that points up, where cameras.json is not there.")
-    ] = None,
+    up: ResultUpOption = None,
     body: Annotated[
         Path | None, typer.Option(help="The body model of the result, where its file has moved.")
     ] = None,

@@ -61,7 +61,8 @@ def state_covariances(
             alike.setdefault(chains.diagonal.shape[1::2], []).append((n, chains))
     for members in alike.values():
         together = Chains(
-            *(np.concatenate(parts) for parts in zip(*(_arrays(c) for _, c in members), strict=True))
+            np.concatenate([chains.diagonal for _, chains in members]),
+            np.concatenate([chains.below for _, chains in members]),
         )
         try:
             found = np.split(together.covariances(), len(members))
@@ -73,10 +74,6 @@ def state_covariances(
         (graph.marginals(graph.keys), graph.marginals(graph.velocity_keys)) if each is None else each
         for graph, each in zip(graphs, result, strict=True)
     ]
-
-
-def _arrays(chains: Chains) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    return chains.diagonal, chains.below
 
 
 def _chains(graph: WindowGraph) -> Chains | None:
