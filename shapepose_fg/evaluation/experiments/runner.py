@@ -1,0 +1,72 @@
+"""Measure the cases of experiments one after the other; what is measured is kept, and not measured again."""
+
+import json
+import re
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from shapepose_fg.errors import InputError
+from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
+from shapepose_fg.files import read_json, write_atomically
+
+
+@dataclass(frozen=True)
+class Kept:
+    """Figures in a folder, one file a case: a run that was stopped goes on from there."""
+
+    folder: Path
+    """Where they are."""
+    made_with: str
+    """The `fingerprint` of now: figures that were made with another are measured again."""
+
+    def get(self, experiment: Experiment, case: Case) -> tuple[Figures, float] | None:
+        """Figures and the seconds they took; None where there are none of now."""
+        file = self._file(experiment, case)
+        if not file.is_file():
+            return None
+        kept = read_json(file)
+        if not isinstance(kept, dict) or kept.get("made_with") != self.made_with:
+            return None
+        try:
+            return kept["figures"], float(kept["seconds"])
+        except (KeyError, TypeError, ValueError):
+            raise InputError(f"{file}: these are not figures of an experiment; delete it") from None
+
+    def put(self, experiment: Experiment, case: Case, figures: Figures, seconds: float) -> None:
+        """Keep figures."""
+        content = {"made_with": self.made_with, "seconds": seconds, "figures": figures}
+        text = json.dumps(content, indent=1) + "\n"
+        write_atomically(self._file(experiment, case), lambda stream: stream.write(text.encode()))
+
+    def _file(self, experiment: Experiment, case: Case) -> Path:
+        return self.folder / _word(experiment.name) / f"{_word(case.name)}.json"
+
+
+def measured(
+    experiment: Experiment, kept: Kept, told: Callable[[str], None] = print
+) -> tuple[dict[str, Figures], float]:
+    """The figures of every case by name, and the seconds that all of them took, whenever that was."""
+    names = [_word(case.name) for case in experiment.cases]
+    if len(set(names)) < len(names):
+        raise ValueError(f"{experiment.name}: two cases have one name: {sorted(names)}")
+    figures, seconds = dict[str, Figures](), 0.0
+    for case in experiment.cases:
+        found = kept.get(experiment, case)
+        if found is None:
+            began = time.perf_counter()
+            measure = case.measure()
+            spent = time.perf_counter() - began
+            kept.put(experiment, case, measure, spent)
+            told(f"  {experiment.name}: {case.name}, {spent:.0f} s")
+            found = kept.get(experiment, case)  # as JSON gives it back, so that a run that goes on is no other
+            assert found is not None
+        figures[case.name] = found[0]
+        seconds += found[1]
+    return figures, seconds
+
+
+def _word(name: str) -> str:
+    """A name as that of a file."""
+    return re.sub(r"[^A-Za-z0-9.+-]+", "_", name)
