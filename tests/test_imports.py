@@ -14,7 +14,8 @@ ROOT = Path(__file__).parents[1]
 LEVELS = (
     "factors errors",
     "camera skeleton",
-    "files provenance result_options rendering run_summary columns workers body.threads options terminal",
+    "files",
+    "output_folder provenance result_options rendering run_summary columns workers body.threads options terminal",
     "body.model",
     "body.fitting body.shapes",
     "body.offsets",
@@ -33,7 +34,9 @@ LEVELS = (
     "training export",
     "report",
     "evaluation",
-    "demo tracks_command detect_command overlay_command export_command report_command view_command setup_command",
+    "reconstruct_summary",
+    "demo tracks_command detect_command overlay_command export_command report_command view_command"
+    " setup_command reconstruct_command",
     "cli",
 )
 """Each level imports only from those before it; a package may import its own modules too."""
