@@ -1,7 +1,5 @@
-"""Tables of arrays with one row each: shapes and types checked, `.npz` files read and written."""
+"""Tables of arrays with one row each: shapes and types checked, `.npz` files read."""
 
-import io
-from collections.abc import Mapping
 from enum import IntEnum
 from pathlib import Path
 from typing import Any, cast
@@ -56,10 +54,3 @@ def read_npz(file: Path, cure: str) -> dict[str, NDArray[Any]]:
         raise InputError(
             f"{file}: cannot be read as an .npz file without pickled objects ({reason}); {cure}"
         ) from None
-
-
-def npz_bytes(columns: Mapping[str, NDArray[Any]]) -> memoryview:
-    """The contents of a compressed `.npz` file."""
-    stream = io.BytesIO()
-    np.savez_compressed(stream, **cast(Any, dict(columns)))
-    return stream.getbuffer()

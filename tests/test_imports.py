@@ -15,7 +15,9 @@ LEVELS = (
     "factors errors",
     "camera skeleton",
     "files",
-    "output_folder provenance result_options rendering run_summary columns workers body.threads options terminal",
+    "output_folder npz_writer provenance result_options rendering run_summary columns workers body.threads options"
+    " terminal",
+    "result_files",
     "body.model",
     "body.fitting body.shapes",
     "body.offsets",
