@@ -1,7 +1,7 @@
 """What comes out: the people of every frame, as arrays with one row per person and frame."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum, StrEnum
 from pathlib import Path
@@ -191,15 +191,11 @@ class Reconstruction:
 
     def count_known(self) -> dict[str, int]:
         """How many joints are known in each way, in words: what run.json says of them."""
-        count = np.bincount(self.known.ravel(), minlength=len(Known))
-        return {
-            kind.name.lower(): int(count[kind]) for kind in (Known.SEEN, Known.BODY, Known.MOTION, Known.UNKNOWN)
-        }
+        return count_rows([(self.status, self.known)])["joints"]
 
     def counts(self) -> dict[str, Any]:
         """What run.json says of the rows: how many, with which status, and how their joints are known."""
-        status = Counter(self.status.tolist())
-        return {"found": len(self), "status": dict(status), "joints": self.count_known()}
+        return count_rows([(self.status, self.known)])
 
     def columns(self) -> dict[str, Column]:
         """What people.npz holds."""
@@ -276,3 +272,15 @@ _STORED: dict[str, Any] = {"status": np.dtype(f"U{max(map(len, Status))}")}
 def shared_columns(joint_names: NDArray[np.str_]) -> dict[str, Column]:
     """What people.npz holds beside its rows."""
     return {"joint_names": Column.of(joint_names), "known_names": Column.of(code_names(Known))}
+
+
+def count_rows(pieces: Iterable[tuple[NDArray[np.str_], NDArray[np.uint8]]]) -> dict[str, Any]:
+    """`Reconstruction.counts` of rows that come piece by piece: `status` (R,) and `known` (R, J) of each."""
+    status: Counter[str] = Counter()
+    known = np.zeros(len(Known), dtype=np.int64)
+    for their_status, their_known in pieces:
+        status.update(their_status.tolist())
+        known += np.bincount(their_known.ravel(), minlength=len(Known))
+    order = (Known.SEEN, Known.BODY, Known.MOTION, Known.UNKNOWN)
+    joints = {kind.name.lower(): int(known[kind]) for kind in order}
+    return {"found": status.total(), "status": dict(status), "joints": joints}

@@ -50,9 +50,11 @@ def write_result(
     def write_observations(stream: BinaryIO) -> None:
         write_npz(stream, {**(observations or {}), RUN_ID: np.array(id_text())})
 
+    def write_run(stream: BinaryIO) -> None:
+        stream.write(run_text().encode())
+
     run_text()  # what cannot be written is known before the work
-    files = {folder / PEOPLE: write_people, folder / OBSERVATIONS: write_observations}
-    files[folder / RUN] = lambda stream: stream.write(run_text().encode())
+    files = {folder / PEOPLE: write_people, folder / OBSERVATIONS: write_observations, folder / RUN: write_run}
     if observations is None:
         del files[folder / OBSERVATIONS]
     write_together(files)

@@ -15,8 +15,8 @@ LEVELS = (
     "factors errors",
     "camera skeleton",
     "files",
-    "output_folder npz_writer provenance result_options rendering run_summary columns workers body.threads options"
-    " terminal",
+    "output_folder npz_writer kept_arrays provenance result_options rendering run_summary columns workers"
+    " body.threads options terminal",
     "result_files",
     "body.model",
     "body.fitting body.shapes",
@@ -29,6 +29,7 @@ LEVELS = (
     "estimation",
     "tracking",
     "windows bodies_over_time solved_rows",
+    "runs",
     "pipeline",
     "io solving",
     "simulation viewer detection2d",
