@@ -1,0 +1,66 @@
+"""The processes of a Dask cluster: order, lost processes, and sentences."""
+
+import os
+import signal
+import time
+
+import pytest
+
+from shapepose_fg.cluster import Cluster
+from shapepose_fg.errors import InputError
+
+
+def power(base: int, exponent: int) -> int:
+    """The work."""
+    return base**exponent
+
+
+def once_killed(marker: str, item: int) -> int:
+    """Ends its own process the first time that anybody does item 3."""
+    try:
+        if item == 3:
+            os.close(os.open(marker, os.O_CREAT | os.O_EXCL))
+            os.kill(os.getpid(), signal.SIGKILL)
+    except FileExistsError:
+        pass
+    return 10 * item
+
+
+def late(_: str, item: int) -> int:
+    """Later items are done sooner."""
+    time.sleep(0.05 * (6 - item))
+    return item
+
+
+def fails(_: str, item: int) -> int:
+    raise ArithmeticError(f"item {item}")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def installed():
+    pytest.importorskip("distributed", reason="Dask is an extra")
+
+
+def test_results_come_in_order_whoever_does_them():
+    with Cluster(None, 2, "") as cluster:
+        assert list(cluster.map(late, range(6))) == list(range(6))
+        assert list(cluster.map(late, [])) == []
+
+
+def test_a_killed_process_costs_only_its_own_work(tmp_path):
+    with Cluster(None, 2, str(tmp_path / "killed")) as cluster:
+        assert list(cluster.map(once_killed, range(6))) == [0, 10, 20, 30, 40, 50]
+    assert (tmp_path / "killed").exists()
+
+
+def test_an_error_of_the_work_is_that_error():
+    with Cluster(None, 1, "") as cluster, pytest.raises(ArithmeticError, match="item 0"):
+        list(cluster.map(fails, range(3)))
+
+
+def test_nobody_answers():
+    with (
+        pytest.raises(InputError, match=r"tcp://127\.0\.0\.1:9: no Dask scheduler answers"),
+        Cluster("tcp://127.0.0.1:9", 1, 2),
+    ):
+        pass
