@@ -4,7 +4,6 @@ import ast
 import inspect
 import json
 import textwrap
-import tomllib
 from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
 from itertools import pairwise
@@ -14,7 +13,7 @@ from typing import Any, TypeVar, cast, get_type_hints
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from shapepose_fg.errors import InputError
-from shapepose_fg.files import read_text
+from shapepose_fg.files import read_toml
 from shapepose_fg.io.validation import describe, first_problem
 
 T = TypeVar("T")
@@ -29,11 +28,7 @@ def read_config(path: str | Path, kind: type[T]) -> T:
     for bad TOML, an unknown key, a wrong type, or a value that the dataclass refuses.
     """
     path = Path(path)
-    try:
-        table = tomllib.loads(read_text(path, may_be_empty=True))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: this is not TOML: {error}; correct it there") from None
-    return _build(kind, table, path)
+    return _build(kind, read_toml(path, may_be_empty=True), path)
 
 
 def config_from(table: dict[str, Any], kind: type[T], path: str | Path) -> T:
