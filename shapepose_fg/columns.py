@@ -54,7 +54,7 @@ def read_npz(file: Path, names: Collection[str], cure: str) -> dict[str, NDArray
     Of the file's other members nothing is read. An array takes memory only after its size, as zip and NumPy's
     header say it, was found to be one that the file can hold.
     """
-    stream = open_regular(file)
+    stream = open_regular(file, cure)
     try:
         with stream, zipfile.ZipFile(stream) as archive:
             members = [each for each in archive.infolist() if each.filename.removesuffix(".npy") in names]
@@ -75,7 +75,7 @@ _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.r
 
 
 def _check_members(members: Sequence[zipfile.ZipInfo], size: int) -> None:
-    """ValueError for members of a zip that no `np.savez` writes, or that are too large in a file of `size` bytes."""
+    """ValueError for members of a zip that `np.savez` does not write, or too large for a file of `size` bytes."""
     for member in members:
         if member.flag_bits & 1:
             raise ValueError(f"{member.filename} is encrypted")

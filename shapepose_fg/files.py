@@ -6,7 +6,7 @@ import re
 import stat
 import tempfile
 import tomllib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -21,7 +21,7 @@ _MOST_DOTS = 100
 _LONG_NUMBER = re.compile(r"\d{19}")
 
 
-def open_regular(path: Path) -> BinaryIO:
+def open_regular(path: Path, cure: str = "check the path") -> BinaryIO:
     """The file at `path`, open for reading bytes.
 
     InputError where it is missing, unreadable, or no regular file: a pipe would wait for ever, and a device may
@@ -35,7 +35,7 @@ def open_regular(path: Path) -> BinaryIO:
     except InputError:
         raise
     except FileNotFoundError:
-        raise InputError(f"{path}: there is no such file; check the path") from None
+        raise InputError(f"{path}: there is no such file; {cure}") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
     except ValueError:  # a zero byte
@@ -118,20 +118,33 @@ def bounded(value: Any, path: Path, *, numbers: bool = True) -> Any:
     With `numbers`, also if its whole numbers have 64 bits: longer ones fit no float and no array, and take the
     square of their length to print.
     """
-    level = [value]
+    level = [value] if isinstance(value, dict | list) else []
     for _ in range(_MOST_DEPTH):
-        inner = [child for each in level for child in _children(each)]
-        if numbers and any(type(child) is int and not -(2**63) <= child < 2**63 for child in (*level, *inner)):
-            raise InputError(f"{path}: a whole number has over 19 digits; write the file again")
-        level = [child for child in inner if isinstance(child, dict | list)]
         if len(level) == 0:
-            return value
-    raise InputError(f"{path}: its lists are over {_MOST_DEPTH} deep; write the file again")
+            break
+        inner = [child for each in level for child in (each.values() if isinstance(each, dict) else each)]
+        if numbers and any(type(child) is int and not -(2**63) <= child < 2**63 for child in inner):
+            place = "".join(_way_to_long_number(value)).removeprefix(".")
+            raise InputError(f"{path}: {place[:80]} is a whole number of over 18 digits; correct it there")
+        level = [child for child in inner if type(child) in (dict, list)]
+    if len(level) > 0:
+        raise InputError(f"{path}: its lists are over {_MOST_DEPTH} deep; write the file again")
+    return value
 
 
-def _children(value: Any) -> Iterable[Any]:
-    """What a list or an object holds."""
-    return value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+def _way_to_long_number(value: Any, depth: int = 0) -> list[str]:
+    """Keys and indices that lead to a number of more than 64 bits; none where there is none."""
+    if depth > _MOST_DEPTH:
+        return []
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, child in items:
+        here = f"[{key}]" if isinstance(key, int) else f".{key}"
+        if type(child) is int and not -(2**63) <= child < 2**63:
+            return [here]
+        below = _way_to_long_number(child, depth + 1)
+        if below:
+            return [here, *below]
+    return []
 
 
 def _refuse_irregular(path: Path, mode: int) -> None:

@@ -5,9 +5,10 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Interval
 
 from shapepose_fg.bodies_over_time import Person, SequenceFitting, with_bodies_over_time
 from shapepose_fg.body.fitting.body_sequence import SequenceFit
@@ -19,6 +20,7 @@ from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.offsets.estimation import learn_offsets
 from shapepose_fg.body.shapes import SubjectShapes
 from shapepose_fg.body.threads import torch_threads
+from shapepose_fg.bounds import Settings
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections, DetectionSequence
 from shapepose_fg.estimation.alternation import EstimatorConfig, RefineConfig
@@ -61,7 +63,7 @@ Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
-class PipelineConfig:
+class PipelineConfig(Settings):
     """The settings of every step, and how the work is cut."""
 
     candidates: CandidateConfig = field(default_factory=CandidateConfig)
@@ -92,16 +94,11 @@ class PipelineConfig:
     """Stage II: the alternation."""
     temporal: bool = True
     """People over time: identities, motion, one shape a person. Without it every frame stands alone."""
-    batch_frames: int = 96
+    batch_frames: Annotated[int, Interval(ge=1, le=10000)] = 96
     """Frames that are solved together and returned: bodies are fitted fastest by the hundred."""
-    threads: int = 1
+    threads: Annotated[int, Interval(ge=1, le=256)] = 1
     """Threads of torch while bodies are fitted: the matrices are small, and where cores are busy a second thread
     costs more than it brings."""
-
-    def __post_init__(self) -> None:
-        for name in ("batch_frames", "threads"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
 
 
 def reconstruct(

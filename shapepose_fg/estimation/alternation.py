@@ -2,11 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Interval
 from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus, JointTargets
+from shapepose_fg.bounds import Count, Factor, Metres, Repeats, Settings
 from shapepose_fg.camera import Views
 from shapepose_fg.estimation.draft import MODEL_SIGMA_M, WholeFitter
 from shapepose_fg.estimation.linearisation import (
@@ -21,33 +24,26 @@ from shapepose_fg.observations import Observations
 
 
 @dataclass(frozen=True)
-class RefineConfig:
+class RefineConfig(Settings):
     """How the alternation runs."""
 
-    alternations: int = 3
+    alternations: Repeats = 3
     """N of Algorithm 1: how often the body is fitted and the joints are solved, at the most."""
-    window_alternations: int = 1
+    window_alternations: Repeats = 1
     """The same for windows of several frames, which start from a draft of all joints (`Estimator.draft`): a second
     round, at twice the time, changed the mean error by 0.1 to 0.2 mm. Windows with factors of the user's own take
     as many as frames alone: what such a factor says may be far from what the views said."""
-    settled_m: float = 0.002
+    settled_m: Annotated[float, Interval(ge=0, le=10)] = 0.002
     """A window whose joints all moved less in a round is done: most frames are after one or two. 0: none is."""
-    max_sigma_m: float = 0.5
+    max_sigma_m: Metres = 0.5
     """A joint whose views leave it less certain than this in some direction is not determined by them."""
-    disagreement: float = 6.0
+    disagreement: Factor = 6.0
     """A joint that its views put this many standard deviations from where the body can have it is seen wrongly:
     its gates are decided anew from the body's place, and the body is fitted again without what was thrown away. 4
     threw away more joints that were right than wrong ones, in simulated crowds whose detections had been given out
     again."""
-    min_joints: int = 4
+    min_joints: Count = 4
     """Fewer joints than this determined by the views are not a person that can be placed in space."""
-
-    def __post_init__(self) -> None:
-        for name in ("alternations", "window_alternations", "max_sigma_m", "disagreement", "min_joints"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        if self.settled_m < 0:
-            raise ValueError(f"settled_m must not be negative, got {self.settled_m}")
 
 
 @dataclass(frozen=True)

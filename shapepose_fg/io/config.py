@@ -12,6 +12,7 @@ from typing import Any, TypeVar, cast, get_type_hints
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
+from shapepose_fg.bounds import range_of
 from shapepose_fg.errors import InputError
 from shapepose_fg.files import read_toml
 from shapepose_fg.io.validation import describe, first_problem
@@ -85,7 +86,7 @@ def _lines(config: Any, table: str = "") -> list[str]:
             name = f"{table}.{field.name}" if table else field.name
             tables += ["", *_comment(comments.get(field.name)), f"[{name}]", *_lines(value, name)]
         else:
-            settings += _comment(comments.get(field.name))
+            settings += _comment(comments.get(field.name)) + _comment(range_of(type(config), field.name))
             settings.append(f"# {field.name} is not set" if value is None else f"{field.name} = {_toml(value)}")
     return settings + tables
 

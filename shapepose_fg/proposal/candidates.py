@@ -4,38 +4,36 @@ Stage I (b) and (c) of the paper (section 3.1, "3D Joint Candidates Reconstructi
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Interval
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from shapepose_fg.bounds import Count, Metres, Settings
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections
 
 
 @dataclass(frozen=True)
-class CandidateConfig:
+class CandidateConfig(Settings):
     """How pairs of detections become 3D joint candidates."""
 
-    gate_m: float = 0.07
+    gate_m: Metres = 0.07
     """Largest reprojection error of a pair's point, as a length at the point's depth. The point shares the gap
     between the two rays out, so its error has 0.7 of a detection's sigma: 2 cm where the detector is half sure
     (3 cm, measured on real detections), and this is over three times as much."""
-    min_angle_deg: float = 3.0
+    min_angle_deg: Annotated[float, Interval(gt=0, le=90)] = 3.0
     """Smallest angle between the two rays; below it depth is guessed, not measured."""
-    vote_radius_m: float = 0.12
+    vote_radius_m: Metres = 0.12
     """rho: points of one joint closer than this to the most confident one vote for it."""
-    min_votes: int = 3
+    min_votes: Count = 3
     """The paper's three points: fewer make a *weak* candidate, which cannot anchor a person. With two cameras
     there is one pair only, so what counts is min(min_votes, pairs of views)."""
-    min_view_fraction: float = 1 / 6
+    min_view_fraction: Annotated[float, Interval(gt=0, le=1)] = 1 / 6
     """Where there are very many views, chance crossings of rays have three votes, too: a strong candidate must
     have those of all pairs of this fraction of the views (30 cameras: 5 views, 10 votes; 18 and fewer: 3)."""
-
-    def __post_init__(self) -> None:
-        for name in ("gate_m", "min_angle_deg", "vote_radius_m", "min_votes", "min_view_fraction"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True)

@@ -93,11 +93,8 @@ def _lenses(path: Path) -> dict[str, _Lens]:
 
 def _images(path: Path, lenses: dict[str, _Lens]) -> list[WrittenCamera]:
     """images.txt: IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; each followed by a line of points."""
-    lines = [
-        (number, line)
-        for number, line in enumerate(read_text(path, most=LARGE).splitlines(), 1)
-        if line[:1] != "#"
-    ]
+    every = enumerate(read_text(path, most=LARGE).splitlines(), 1)
+    lines = [(number, line) for number, line in every if line[:1] != "#"]
     rows = [(number, line.split(maxsplit=9)) for number, line in lines[::2] if line.strip()]
     names = _names([words[9] if len(words) == 10 else "" for _, words in rows])
     cameras = []
