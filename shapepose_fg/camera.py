@@ -77,7 +77,8 @@ class Camera:
         width, height = self.image_size
         if not 0 < min(width, height) <= max(width, height) <= _MOST_PIXELS:
             raise ValueError(
-                f"camera {self.name}: image_size must be positive and at most {_MOST_PIXELS}, got {self.image_size}"
+                f"camera {self.name}: image_size must be positive and at most {_MOST_PIXELS}, got"
+                f" {self.image_size}"
             )
         if not self.name or len(self.name) > _LONGEST_NAME or not self.name.isprintable():
             raise ValueError(f"camera {self.name[:40]!r}: names must be 1 to {_LONGEST_NAME} letters, in one line")

@@ -34,6 +34,14 @@ class CandidateConfig(Settings):
     min_view_fraction: Annotated[float, Interval(gt=0, le=1)] = 1 / 6
     """Where there are very many views, chance crossings of rays have three votes, too: a strong candidate must
     have those of all pairs of this fraction of the views (30 cameras: 5 views, 10 votes; 18 and fewer: 3)."""
+    most_pairs: Annotated[int, Interval(ge=1000, le=1_000_000)] = 150_000
+    """Pairs of detections of one joint that a frame may have: of more, each view keeps its most confident ones. 18
+    a view before 30 cameras, 47 before 12, 122 before 5."""
+    most_points: Annotated[int, Interval(ge=100, le=100_000)] = 8000
+    """Points of one joint: of more, the most confident. Twelve people before 30 cameras have 5000."""
+    most_candidates: Annotated[int, Interval(ge=10, le=10_000)] = 250
+    """Candidates of one joint: of more, those with most votes. Twelve people before 30 cameras have 220, half of
+    them crossings of rays."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +92,14 @@ def triangulate_pairs(detections: Detections, rig: Rig, config: CandidateConfig)
         rig.cTw[detections.view, :, :3],
         np.concatenate([normalised, np.ones((len(detections), 1))], axis=1),
     )
-    near = _rays_meet(rays, rig.centres[detections.view], first, second, config)
+    rays, origins = np.ascontiguousarray(rays.T), np.ascontiguousarray(rig.centres[detections.view].T)
+    parts = [slice(start, start + _PAIRS_AT_ONCE) for start in range(0, len(first), _PAIRS_AT_ONCE)]
+    near = np.concatenate(
+        [
+            np.zeros(0, dtype=bool),
+            *(_rays_meet(rays, origins, first[part], second[part], config) for part in parts),
+        ]
+    )
     first, second = first[near], second[near]
     xyz = _linear_points(rig, detections.view, normalised, first, second)
     error_m = np.maximum(
@@ -171,6 +186,10 @@ def _same_joint_pairs(detections: Detections) -> tuple[NDArray[np.intp], NDArray
     return first[differ], second[differ]
 
 
+_PAIRS_AT_ONCE = 2**19
+"""Pairs of rays that are looked at together: more take more memory, not less time."""
+
+
 def _rays_meet(
     rays: NDArray[np.float64],
     origins: NDArray[np.float64],
@@ -178,12 +197,13 @@ def _rays_meet(
     second: NDArray[np.intp],
     config: CandidateConfig,
 ) -> NDArray[np.bool_]:
-    """Cheap test before triangulation: do two rays pass each other at less than twice the gate?"""
-    normal = np.cross(rays[first], rays[second])
+    """Cheap test before triangulation: do two of the `rays` (3, D) pass each other at less than twice the gate?"""
+    (ax, ay, az), (bx, by, bz) = rays[:, first], rays[:, second]
+    normal = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
     sine = np.sqrt(np.einsum("mi,mi->m", normal, normal))
-    between = origins[second] - origins[first]
+    between = (origins[:, second] - origins[:, first]).T
     gap = np.abs(np.einsum("mi,mi->m", normal, between))
-    lengths = np.sqrt(np.einsum("di,di->d", rays, rays))
+    lengths = np.sqrt(np.einsum("id,id->d", rays, rays))
     parallel = np.sin(np.deg2rad(config.min_angle_deg)) * lengths[first] * lengths[second]
     return (gap < 2.0 * config.gate_m * sine) & (sine > parallel)
 
@@ -213,17 +233,44 @@ def _reprojection_error(
     return np.where(camera[:, 2] > 0, error, np.inf).astype(np.float64)
 
 
+_POINTS_AT_ONCE = 4096
+"""Points whose neighbours among each other are looked up at once: before 30 cameras a joint has 400 of them."""
+
+
 def _greedy_seeds(points: PairPoints, radius_m: float) -> NDArray[np.intp]:
-    """The seed (M,) whose cluster each point joins, as if points were picked one by one by confidence."""
-    count = len(points.xyz)
-    rank = np.empty(count, dtype=np.intp)
-    rank[np.argsort(-points.score, kind="stable")] = np.arange(count)
+    """The seed (M,) whose cluster each point joins, as if points were picked one by one by confidence.
+
+    The most confident points are clustered first; what lies near their seeds is theirs, and the rest goes on.
+    """
+    order = np.argsort(-points.score, kind="stable")
     # A fourth coordinate keeps different joints apart.
-    tree = KDTree(np.column_stack([points.xyz, points.joint * (4.0 * radius_m)]))
-    edges = tree.query_pairs(radius_m, output_type="ndarray")
-    swap = rank[edges[:, 0]] > rank[edges[:, 1]]
-    better = np.where(swap, edges[:, 1], edges[:, 0])
-    worse = np.where(swap, edges[:, 0], edges[:, 1])
+    places = np.column_stack([points.xyz, points.joint * (4.0 * radius_m)])[order]
+    if len(order) <= _POINTS_AT_ONCE:
+        return order[_seeds_of_ranked(places, radius_m)][np.argsort(order)]
+    every = KDTree(places, balanced_tree=False, compact_nodes=False)
+    seed = np.full(len(order), -1, dtype=np.intp)
+    left = np.arange(len(order))
+    while len(left) > 0:
+        first = left[:_POINTS_AT_ONCE]
+        seed[first] = first[_seeds_of_ranked(places[first], radius_m)]
+        seeds = np.unique(seed[first])
+        near = every.query_ball_point(places[seeds], radius_m)
+        member = np.concatenate(near).astype(np.intp)
+        of_seed = np.repeat(seeds, [len(each) for each in near])
+        new = seed[member] < 0
+        nearest = np.full(len(order), len(order), dtype=np.intp)
+        np.minimum.at(nearest, member[new], of_seed[new])
+        seed = np.where(nearest < len(order), nearest, seed)
+        left = left[_POINTS_AT_ONCE:]
+        left = left[seed[left] < 0]
+    return order[seed][np.argsort(order)]
+
+
+def _seeds_of_ranked(places: NDArray[np.float64], radius_m: float) -> NDArray[np.intp]:
+    """The seed (M,) of each of a few points that stand in the order in which they are picked."""
+    count = len(places)
+    edges = KDTree(places).query_pairs(radius_m, output_type="ndarray")
+    better, worse = edges.min(axis=1), edges.max(axis=1)
     is_seed = np.zeros(count, dtype=bool)
     undecided = np.ones(count, dtype=bool)
     live_better, live_worse = better, worse
@@ -236,7 +283,7 @@ def _greedy_seeds(points: PairPoints, radius_m: float) -> NDArray[np.intp]:
         undecided &= ~picked
         undecided[live_worse[picked[live_better]]] = False
     # A point near several seeds belongs to the one that is picked first.
-    seed_rank = np.where(is_seed, rank, count)
+    seed = np.where(is_seed, np.arange(count), count)
     from_seed = is_seed[better]
-    np.minimum.at(seed_rank, worse[from_seed], rank[better[from_seed]])
-    return np.argsort(rank)[seed_rank]
+    np.minimum.at(seed, worse[from_seed], better[from_seed])
+    return seed

@@ -11,7 +11,7 @@ import numpy as np
 from annotated_types import Interval
 from numpy.typing import NDArray
 
-from shapepose_fg.bounds import Metres, Settings, Share
+from shapepose_fg.bounds import Count, Metres, Settings, Share
 from shapepose_fg.detections import Detections
 from shapepose_fg.proposal.candidates import Candidates
 from shapepose_fg.proposal.growth import GrowthConfig, Links, grow, link
@@ -49,6 +49,8 @@ class ProposalConfig(Settings):
     alone shows has 0.6. On simulated people in close motion real ones have over 0.47, and most phantoms, whose
     joints belong to others, have less than 0.4."""
 
+    most_people: Count = 64
+    """People that are looked for in a frame, and hips between which nobody saw a mid-hip: the best come first."""
     growth: GrowthConfig = field(default_factory=GrowthConfig)
     """How a person is grown from the hip."""
 
@@ -125,9 +127,11 @@ class _Search:
         confident = score >= self.config.min_confidence
         anchors = roots[enough & confident]
         kept = _apart(anchors, taken, self.candidates, self.detections, self.config)
+        self.dropped["hip seen as a better one's"] += len(anchors) - len(kept)
+        self.dropped["more people than are looked for"] += max(0, len(kept) - self.config.most_people)
+        kept = kept[: self.config.most_people]
         self.dropped["too few parts in the box"] += int((~enough).sum())
         self.dropped["low confidence"] += int((enough & ~confident).sum())
-        self.dropped["hip seen as a better one's"] += len(anchors) - len(kept)
         return kept
 
     def boxes(self, roots: NDArray[np.intp]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -206,6 +210,9 @@ class _Search:
         width = np.linalg.norm(candidates.xyz[first] - candidates.xyz[second], axis=1)
         fits = (width < self.config.hip_width_m) & (candidates.strong[first] | candidates.strong[second])
         first, second = first[fits], second[fits]
+        best = np.argsort(-(candidates.score[first] + candidates.score[second]), kind="stable")
+        best = np.sort(best[: 4 * self.config.most_people])
+        first, second = first[best], second[best]
         middle = count + np.arange(len(first))
         owner, detection = candidates.support.T
         from_first = [
