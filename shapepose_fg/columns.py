@@ -100,7 +100,13 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
         if stream.tell() + math.prod(shape) * dtype.itemsize != member.file_size:
             raise ValueError(f"{member.filename} is {shape}, which its {member.file_size} bytes do not hold")
     with archive.open(member) as stream:
-        return np.lib.format.read_array(stream, allow_pickle=False)
+        array = np.lib.format.read_array(stream, allow_pickle=False)
+    if dtype.kind == "U" and array.size > 0 and dtype.itemsize > 0:
+        letters = np.frombuffer(array.tobytes(), dtype=np.dtype(np.uint32).newbyteorder(dtype.byteorder))
+        # Python text of such letters crashes where it is printed.
+        if np.any((letters > 0x10FFFF) | ((letters >= 0xD800) & (letters < 0xE000))):
+            raise ValueError(f"{member.filename} holds letters that there are not")
+    return array
 
 
 def npz_bytes(columns: Mapping[str, NDArray[Any]]) -> memoryview:
