@@ -327,7 +327,7 @@ def test_results_that_no_reconstruction_gives(tmp_path, column, value, sentence)
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's device that is always full")
 @pytest.mark.parametrize(("streams", "code"), [(">&-", 0), (">&- 2>&-", 0), (">/dev/full", 2), ("| true", 1)])
 def test_any_stdout(streams, code):
-    command = f"set -o pipefail; {sys.executable} -m shapepose_fg.cli config {streams}"
+    command = f"set -o pipefail; {sys.executable} -m shapepose_fg.cli --help {streams}"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=60, check=False)
     # Whether `true` ends before anything is written is chance.
     assert done.returncode in {code, 0 if streams == "| true" else code}
