@@ -340,7 +340,8 @@ class Preset(StrEnum):
 @app.command("config")
 def print_config(
     preset: Annotated[
-        Preset, typer.Option(help="paper: the method as it is written, without what was settled differently since.")
+        Preset,
+        typer.Option(help="paper: the method as it is written, without what is settled differently here."),
     ] = Preset.DEFAULT,
 ) -> None:
     """Print every setting with its value, as TOML."""

@@ -164,7 +164,10 @@ def _groups(windows: Sequence[Window]) -> NDArray[np.intp] | None:
 def _ties(windows: Sequence[Window]) -> list[Tie]:
     """Joints that the user's factors tie to each other, with the rows of the windows where they do."""
     return [
-        (joints, np.flatnonzero(np.concatenate([np.full(len(w.rows), joints in w.graph.coupled) for w in windows])))
+        (
+            joints,
+            np.flatnonzero(np.concatenate([np.full(len(w.rows), joints in w.graph.coupled) for w in windows])),
+        )
         for joints in sorted({each for window in windows for each in window.graph.coupled}, key=sorted)
     ]
 

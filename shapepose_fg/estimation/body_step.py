@@ -46,11 +46,11 @@ class BodyStep:
             last, groups = last.rows(rows), None if groups is None else groups[rows]
         if self.config.refine.leave_one_out:
             return self.fitter.fit(targets, last, groups)
-        quick = groups is None and isinstance(self.fitter, WholeFitter)
-        fit = self.fitter.fit_whole(targets, last) if quick else self.fitter.fit(targets, last, groups)
-        return replace(
-            fit, prior_xyz=fit.joints, prior_covariance=fit.covariance + MODEL_SIGMA_M**2 * np.eye(3)
-        )
+        if groups is None and isinstance(self.fitter, WholeFitter):
+            fit = self.fitter.fit_whole(targets, last)
+        else:
+            fit = self.fitter.fit(targets, last, groups)
+        return replace(fit, prior_xyz=fit.joints, prior_covariance=fit.covariance + MODEL_SIGMA_M**2 * np.eye(3))
 
     def message(
         self, body: BodyFit, targets: JointTargets, pulled: NDArray[np.bool_], ties: Sequence[Tie]

@@ -12,9 +12,9 @@ from factors import KernelName, in_front, inlier_gate, kernel_weight, sigma_px
 from shapepose_fg.camera import Views
 from shapepose_fg.observations import Observations
 
-
-_DEPTH_M = 5.0
-"""Of joints before the cameras of a room, in the median: where lengths become pixels in the paper's setting."""
+_DEPTH_M = 8.0
+"""Of joints before the cameras of the `tune` sequences, in the median (7 to 10 m): where lengths become pixels in
+the paper's setting."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ class ObservationConfig:
     min_depth_m: float = 0.2
     """An observation counts only if the joint is at least this far in front of the camera."""
     fixed_depth_m: float = 0.0
-    """Positive: `sigma_m` and `rho_2d_m` are lengths at this depth, wherever the joint is, so that d_2D is measured
-    in pixels, as in the paper. 0: at the joint's own depth."""
+    """Positive: `sigma_m` and `rho_2d_m` are lengths at this depth, wherever the joint is, so that d_2D is in
+    pixels, as in the paper. 0: at the joint's own depth."""
     kernel: KernelName | Literal["none"] = "cauchy"
     """Robust kernel of the projection factors. The paper has none."""
 
@@ -48,8 +48,7 @@ class ObservationConfig:
     def paper(cls) -> "ObservationConfig":
         """As written in Eqs. 1 and 2: squared pixels times the confidence, of all that lies within rho_2D.
 
-        The sigma is that of our own detections in the mean over confidences: with it rows of people in
-        `w_2D` keep their scale.
+        A detection has the measured sigma at a confidence of 0.7: 2 cm.
         """
         return cls(
             sigma_m=0.02,

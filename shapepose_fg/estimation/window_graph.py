@@ -47,8 +47,8 @@ class WindowGraphConfig:
     weight_shape: float = 1.0
     """w_shape of Eq. 5, multiplies the squared distances to the body model."""
     shape_sigma_m: float = 0.0
-    """Positive: the body pulls all joints alike, with this sigma, as in Eq. 3, where one weight is for all. 0: with
-    its own covariance, which differs from joint to joint and with direction."""
+    """Positive: the body pulls all joints alike, with this sigma, as in Eq. 3, which has one weight for all. 0:
+    with its own covariance, which differs from joint to joint and with direction."""
     max_iterations: int = 20
     """Levenberg-Marquardt steps at the most."""
     tolerance: float = 1e-4
@@ -57,7 +57,8 @@ class WindowGraphConfig:
     @classmethod
     def paper(cls) -> "WindowGraphConfig":
         """As written in Eqs. 3 to 5. The paper does not say its weights; this one is the best of 1 to 10 cm on
-        `tune`."""
+        `tune`.
+        """
         return cls(rho_3d=0.25, shape_sigma_m=0.03)
 
     def __post_init__(self) -> None:
