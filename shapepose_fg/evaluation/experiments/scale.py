@@ -62,10 +62,10 @@ class Stretch:
         """What the simulated detector saw."""
         return _detections(self)
 
-    def reconstruct(self, config: PipelineConfig | None = None) -> Reconstruction:
-        """Reconstructed at the scene's rate."""
+    def reconstruct(self, config: PipelineConfig | None = None, frames: range | None = None) -> Reconstruction:
+        """Reconstructed at the scene's rate; only `frames` of the stretch, if given."""
         times = FrameTimes.from_fps(self.scene.fps, len(self.span))
-        return reconstruct(self.detections, self.scene.rig, config, times=times)
+        return reconstruct(self.detections, self.scene.rig, config, frames=frames, times=times)
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class Scale:
         if self.quick:
             return (Stretch("demo", range(QUICK_FRAMES)),)
         return tuple(
-            Stretch(name, span, self.split, mocap=self._mocap)
+            Stretch(name, span, self.split, mocap=self.mocap)
             for name, spans in STRETCHES[self.split].items()
             for span in spans
         )
@@ -101,7 +101,13 @@ class Scale:
         return self._at("shelf")
 
     @property
-    def _mocap(self) -> Path | None:
+    def pose2sim_single(self) -> Path | None:
+        """The folder of Pose2Sim's demo recording, and its detections."""
+        return self._at("pose2sim_single")
+
+    @property
+    def mocap(self) -> Path | None:
+        """The file of recorded motions."""
         folder = self._at("cmu_mocap")
         return None if folder is None else folder / "cmu_smpl24.npz"
 
@@ -113,7 +119,7 @@ class Scale:
     @property
     def has_scenes(self) -> bool:
         """Whether there is anything to simulate stretches from."""
-        return self.quick or self._mocap is not None
+        return self.quick or self.mocap is not None
 
 
 def shorter(stretch: Stretch, frames: int) -> Stretch:
