@@ -1,4 +1,4 @@
-"""Experiments: every one works at a small scale; a run that was stopped goes on; old figures are measured again."""
+"""Experiments: each works at a small scale; a run that was stopped goes on; old figures are measured again."""
 
 import json
 import re
