@@ -11,7 +11,7 @@ from shapepose_fg.evaluation import (
     shelf_tables,
     visibility_agreement,
 )
-from shapepose_fg.evaluation.experiments import crowd, footage, over_time
+from shapepose_fg.evaluation.experiments import box, crowd, footage, over_time
 from shapepose_fg.evaluation.experiments.experiment import Experiment, whole
 from shapepose_fg.evaluation.experiments.scale import Scale
 
@@ -24,6 +24,7 @@ def experiments(scale: Scale, images: Path | None = None) -> Iterator[Experiment
         yield over_time.experiment(scale, temporal=True)
         yield over_time.experiment(scale, temporal=False)
     yield crowd.experiment(scale)
+    yield box.experiment(scale)
     for make in (footage.shelf_events, footage.held_out_views, footage.single_person):
         found = make(scale)
         if found is not None:
