@@ -47,7 +47,8 @@ def score_scene(people: Reconstruction, scene: Scene) -> Figures:
         "true": joints.joints_true,
         "predicted": joints.joints_predicted,
         "correct": joints.joints_correct,
-        "idf1": identities.idf1,
+        "identified": 2 * identities.true_positives,
+        "identities": identities.rows + identities.people_true,
         "nobody": joints.people_invented + joints.people_duplicated,
         "missed": joints.people_missed,
         "error_mm": _sum(error),
@@ -62,12 +63,13 @@ def score_scene(people: Reconstruction, scene: Scene) -> Figures:
 def mean_of(cases: Iterable[Figures]) -> dict[str, float]:
     """F1 in %, IDF1 in %, mean errors in mm, shares in %, ms a frame, counts: of all cases together; NaN for none."""
     all_of = list(cases)
-    total = {name: sum(case[name] for case in all_of) for name in ("frames", "true", "predicted", "correct")}
+    counts = ("frames", "true", "predicted", "correct", "identified", "identities")
+    total = {name: sum(case[name] for case in all_of) for name in counts}
     pairs = ("error_mm", "seen_mm", "unseen_mm", "body_mm", "inside_95", "unseen_inside_95")
     figures = {name: _ratio(*(sum(case[name][i] for case in all_of) for i in (0, 1))) for name in pairs}
     figures |= {name: 100 * figures[name] for name in ("inside_95", "unseen_inside_95")}
     figures |= {"f1": 200 * _ratio(total["correct"], total["predicted"] + total["true"])}
-    figures |= {"idf1": 100 * _ratio(sum(case["idf1"] for case in all_of), len(all_of))}
+    figures |= {"idf1": 100 * _ratio(total["identified"], total["identities"])}
     figures |= {name: sum(case[name] for case in all_of) for name in ("nobody", "missed")}
     figures["unseen_share"] = 100 * _ratio(
         sum(case["unseen_mm"][1] for case in all_of), sum(case["error_mm"][1] for case in all_of)
