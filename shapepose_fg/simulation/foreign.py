@@ -1,4 +1,4 @@
-"""The same people and motions with bodies that the fitted model does not have, and a detector of another skeleton."""
+"""The same motions by people whose bodies the fitted model does not have, and a detector with joints of its own."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -54,8 +54,8 @@ def people_of(kind: str, count: int, seed: int = 0) -> list[Proportions]:
 def recast(scene: AnyScene, proportions: Sequence[Proportions]) -> AnyScene:
     """The same motions by people of other `proportions` (one for each): every bone turns as it did.
 
-    They stand where they stood, on the same floor; steps and reaches are those of the adults, so that a child's feet
-    slide and hands that were held need not meet. Who hides whom follows from the new bodies.
+    They stand where they stood, on the same floor. Steps and reaches are those of the adults: a child's feet
+    slide, and hands that were held need not meet. Who hides whom follows from the new bodies.
     """
     body, betas = reshaped(scene.body, scene.motion.betas, proportions)
     motion = scene.motion

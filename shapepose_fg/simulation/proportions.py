@@ -60,8 +60,8 @@ class Proportions:
     def child(cls) -> "Proportions":
         """A child of about seven years, of 1.2 m where the body is the mean adult: a larger head, shorter legs.
 
-        The head is a sixth of the stature, that of adults 1 / 7.5 or less (Domljan et al. 2024); the hips are at half
-        the stature, those of this adult at 52 %: children sit higher for their stature (Snyder et al. 1977,
+        The head is a sixth of the stature, that of adults 1 / 7.5 or less (Domljan et al. 2024); the hips are at
+        half the stature, those of this adult at 52 %: children sit higher for their stature (Snyder et al. 1977,
         UM-HSRI-77-17).
         """
         adult_m, hip_m = 1.70, 0.893
@@ -84,11 +84,13 @@ def _only(joints: NDArray[np.intp], factor: float) -> Array:
 def reshaped(body: BodyModel, betas: Array, proportions: Sequence[Proportions]) -> tuple[BodyModel, Array]:
     """A model whose shapes are these people, and their betas (P, 10) in it: 1 in a column of their own.
 
-    Person p is the `body` of shape `betas[p]` with `proportions[p]`. Joints, keypoints and the posed surface follow
-    as they always do, for all of it is made from the mesh. ValueError for more people than a model has shapes.
+    Person p is the `body` of shape `betas[p]` with `proportions[p]`. Joints, keypoints and the posed surface
+    follow, for all of it is made from the mesh. ValueError for more people than a model has shapes.
     """
     if len(betas) > NUM_BETAS or len(betas) != len(proportions):
-        raise ValueError(f"up to {NUM_BETAS} people and proportions for each, got {len(betas)}, {len(proportions)}")
+        raise ValueError(
+            f"up to {NUM_BETAS} people and proportions for each, got {len(betas)}, {len(proportions)}"
+        )
     arrays = body.arrays
     shapes = np.zeros_like(arrays.shapes)
     for person, (own, share) in enumerate(zip(betas, proportions, strict=True)):

@@ -56,8 +56,8 @@ def foreign(scale: Scale) -> Experiment | None:
         rows = [f"{head} seen inside 95 %, % | unseen |", "|---" * 7 + "|"]
         for truth, m in means.items():
             rows.append(
-                f"| {truth.label} | {m['f1']:.1f} | {m['seen_mm']:.1f} | {m['unseen_mm']:.0f} ({m['unseen_share']:.1f}) "
-                f"| {m['body_mm']:.1f} | {m['inside_95']:.1f} | {m['unseen_inside_95']:.1f} |"
+                f"| {truth.label} | {m['f1']:.1f} | {m['seen_mm']:.1f} "
+                f"| {m['unseen_mm']:.0f} ({m['unseen_share']:.1f}) | {m['body_mm']:.1f} | {m['inside_95']:.1f} | {m['unseen_inside_95']:.1f} |"
             )
         return rows
 

@@ -1,4 +1,4 @@
-"""Human proposals: a proposal is right where its hip is within 0.2 m of a person's (Zhang et al. 2020, the paper)."""
+"""Human proposals: one is right where its hip is within 0.2 m of a person's (Zhang et al. 2020, the paper)."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -29,7 +29,8 @@ def hips_by_stage_one(detections: DetectionSequence, rig: Rig) -> list[Array]:
     """(P_t, 3) for each frame: the hips of the paper's first stage, alone."""
     config = PipelineConfig()
     return [
-        find_people(detections[t], rig, detections.skeleton, config).initial[:, HIP] for t in range(len(detections))
+        find_people(detections[t], rig, detections.skeleton, config).initial[:, HIP]
+        for t in range(len(detections))
     ]
 
 
@@ -81,8 +82,8 @@ class SeenHips:
 def with_hips_in_views(detections: DetectionSequence, scene: Scene, most: int, seed: int = 0) -> SeenHips:
     """The same recording with everybody's hips (middle, left and right) seen by at most `most` views.
 
-    A person's views are asked in an order that lasts for the whole recording, as what stands before a hip does; the
-    first `most` that see one of the hips keep theirs.
+    A person's views are asked in an order that lasts for the whole recording, as what stands before a hip does:
+    the first `most` that see one of the hips keep theirs.
     """
     order = np.random.default_rng([seed, 8]).permuted(
         np.tile(np.arange(len(scene.rig)), (scene.people, 1)), axis=1

@@ -91,7 +91,11 @@ def draw_hip_views(figures: Mapping[str, Figures], file: Path) -> None:
     points = curves(figures)
     figure = Figure(figsize=(7.2, 2.9), layout="constrained")
     for axes, which, name, paper in zip(
-        figure.subplots(1, 2), (0, 1), ("precision", "recall"), (PAPER_PRECISION, PAPER["the paper"][1]), strict=True
+        figure.subplots(1, 2),
+        (0, 1),
+        ("precision", "recall"),
+        (PAPER_PRECISION, PAPER["the paper"][1]),
+        strict=True,
     ):
         for method, style in zip(METHODS, ("o:", "s--", "D-"), strict=True):
             axes.plot(

@@ -61,7 +61,7 @@ def score_scene(people: Reconstruction, scene: Scene) -> Figures:
 
 
 def mean_of(cases: Iterable[Figures]) -> dict[str, float]:
-    """F1 in %, IDF1 in %, mean errors in mm, shares in %, ms a frame, counts: of all cases together; NaN for none."""
+    """F1, IDF1 and shares in %, mean errors in mm, ms a frame, counts: of all cases together; NaN for none."""
     all_of = list(cases)
     counts = ("frames", "true", "predicted", "correct", "identified", "identities")
     total = {name: sum(case[name] for case in all_of) for name in counts}

@@ -55,7 +55,7 @@ def sweeps(scale: Scale) -> Experiment | None:
 
     def table(figures: Mapping[str, Figures]) -> list[str]:
         rows = [
-            "| | scene | F1, % | MPJPE, mm | IDF1, % | rows of nobody | people missed | inside 95 %, % | ms a frame |",
+            "| | scene | F1, % | MPJPE, mm | IDF1, % | rows of nobody | people missed | inside 95 %, % | ms |",
             "|---" * 9 + "|",
         ]
         for setting in settings:
@@ -64,7 +64,8 @@ def sweeps(scale: Scale) -> Experiment | None:
             rows.append(
                 f"| {setting.sweep}: {setting.value} | {setting.scene}, {found['people']} people | {m['f1']:.1f} "
                 f"| {m['error_mm']:.1f} | {m['idf1']:.1f} | {m['nobody']:.0f} "
-                f"| {m['missed']:.0f} of {found['frames'] * found['people']} | {m['inside_95']:.1f} | {m['ms']:.0f} |"
+                f"| {m['missed']:.0f} of {found['frames'] * found['people']} | {m['inside_95']:.1f} "
+                f"| {m['ms']:.0f} |"
             )
         return rows
 
@@ -92,9 +93,7 @@ def _settings(quick: bool) -> list[Setting]:
     rows += [Setting("people", count, _BUILT_IN, people=count) for count in PEOPLE]
     rows += [Setting("detector's noise, times", k, scene, noise=float(k)) for scene in both for k in NOISE]
     rows += [Setting("frames a second", fps, _BUILT_IN, fps=fps) for fps in RATES]
-    return rows + [
-        Setting("frames a second", fps, "crowd", fps=fps) for fps in RATES if _RECORDED_HZ % fps == 0
-    ]
+    return rows + [Setting("frames a second", fps, "crowd", fps=fps) for fps in RATES if _RECORDED_HZ % fps == 0]
 
 
 def _measure(setting: Setting, scale: Scale, crowd: Stretch | None) -> Figures:
