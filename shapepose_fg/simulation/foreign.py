@@ -1,4 +1,4 @@
-"""The same motions by people whose bodies the fitted model does not have, and a detector with joints of its own."""
+"""The same motions by people whose bodies the fitted model lacks, and a detector with joints of its own."""
 
 from collections.abc import Sequence
 from dataclasses import replace

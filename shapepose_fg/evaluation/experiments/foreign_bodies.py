@@ -55,10 +55,10 @@ def foreign(scale: Scale) -> Experiment | None:
         head = "| truth | F1, % | seen: MPJPE, mm | unseen: MPJPE, mm (share of joints, %) | body: MPJPE, mm |"
         rows = [f"{head} seen inside 95 %, % | unseen |", "|---" * 7 + "|"]
         for truth, m in means.items():
-            rows.append(
-                f"| {truth.label} | {m['f1']:.1f} | {m['seen_mm']:.1f} "
-                f"| {m['unseen_mm']:.0f} ({m['unseen_share']:.1f}) | {m['body_mm']:.1f} | {m['inside_95']:.1f} | {m['unseen_inside_95']:.1f} |"
-            )
+            seen = f"{m['f1']:.1f} | {m['seen_mm']:.1f}"
+            unseen = f"{m['unseen_mm']:.0f} ({m['unseen_share']:.1f})"
+            inside = f"{m['inside_95']:.1f} | {m['unseen_inside_95']:.1f}"
+            rows.append(f"| {truth.label} | {seen} | {unseen} | {m['body_mm']:.1f} | {inside} |")
         return rows
 
     return Experiment("foreign", [case(*key, name) for key, name in cases.items()], table)
