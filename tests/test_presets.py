@@ -58,7 +58,7 @@ def test_presets_read_back(name, settings, tmp_path, capsys):
 
 
 def test_a_detection_weighs_its_confidence_in_pixels(five_cameras, two_people):
-    """Eq. 1: w_ij is the confidence, d_2D in pixels, whatever the depth and joint; no kernel: a far one counts too.
+    """Eq. 1: w_ij is the confidence, d_2D in pixels, whatever depth and joint; no kernel: a far one counts too.
 
     Twice the distance from the cameras halves a length in the pictures, and leaves these sigmas alone.
     """
@@ -81,7 +81,7 @@ def test_a_detection_weighs_its_confidence_in_pixels(five_cameras, two_people):
 
 
 def test_e_shape_has_one_weight(five_cameras, two_people):
-    """Eqs. 3 to 5: a doubtful joint is where w_2D E_2D + w_shape E_shape is least, others where their views are."""
+    """Eqs. 3 to 5: a doubtful joint is where w_2D E_2D + w_shape E_shape is least, others where views are."""
     observations = seen(five_cameras, two_people)
     observations.confidence[:, WRIST] = 0.2  # under rho_3D
     observations = replace(observations, xy=observations.xy + np.array([3.0, -2.0]))

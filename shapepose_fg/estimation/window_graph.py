@@ -56,7 +56,7 @@ class WindowGraphConfig:
 
     @classmethod
     def paper(cls) -> "WindowGraphConfig":
-        """As written in Eqs. 3 to 5. The paper does not say its weights; this one is the best of 1 to 10 cm on
+        """As written in Eqs. 3 to 5. The paper does not say its weights; this one is the best of 1, 3 and 10 cm on
         `tune`.
         """
         return cls(rho_3d=0.25, shape_sigma_m=0.03)
