@@ -40,9 +40,9 @@ class SmplifyConfig:
     """Steps of Adam in all."""
     root_iterations: int = 15
     """Of these, the first move the root only, by the joints of the torso."""
-    sigma_m: float = 0.03
+    sigma_m: float = 0.02
     """One sigma of a detection of confidence 1, as a length at the person's depth."""
-    kernel_scale: float = 4.0
+    kernel_scale: float = 2.5
     """Where the Geman-McClure kernel has cut a detection's weight to a quarter, sigmas."""
     prior_start: float = 10.0
     """How many times as stiff the priors begin; they loosen to 1 by the middle of the steps."""

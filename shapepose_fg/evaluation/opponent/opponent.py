@@ -24,7 +24,7 @@ class OpponentConfig:
     """Candidates less sure are left out."""
     min_affinity: float = 0.1
     """Pairs of candidates of less affinity join nobody in a picture."""
-    min_joints_2d: int = 4
+    min_joints_2d: int = 7
     """A group of fewer joints is nobody in a picture."""
     largest_m: float = 0.08
     """Two whose rays miss each other by so much in the mean are not one person."""
