@@ -49,7 +49,9 @@ for step in sys.argv[1:]:
 def main() -> None:
     """Run it on every recording that is asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--venv", type=Path, required=True, help="environment of Pose2Sim; made if it is not there")
+    parser.add_argument(
+        "--venv", type=Path, required=True, help="environment of Pose2Sim; made if it is not there"
+    )
     parser.add_argument("--output", type=Path, required=True, help="folder for the TRC files")
     parser.add_argument(
         "--data", type=Path, default=Path(os.environ.get("SHAPEPOSE_DATA", ROOT.parent / "shared"))
@@ -63,7 +65,9 @@ def main() -> None:
     wanted = arguments.only or ["shelf", "salsa", "crossing", "crowd"]
     if "shelf" in wanted and scale.shelf is not None:
         rig = read_rig(scale.shelf / "calibration.json")
-        run(python, read_detections(scale.shelf, rig), rig, SHELF_FPS, arguments.output / "shelf", arguments.frames)
+        run(
+            python, read_detections(scale.shelf, rig), rig, SHELF_FPS, arguments.output / "shelf", arguments.frames
+        )
     for stretch in scale.stretches if scale.has_scenes else ():
         if stretch.name in wanted:
             output = arguments.output / folder_name(stretch)
@@ -93,7 +97,10 @@ def run(
     with tempfile.TemporaryDirectory() as temporary:
         project = Path(temporary) / "project"
         write_project(project, part, rig)
-        for kind, steps in ((RAW, ("personAssociation", "triangulation")), (FILTERED, ("triangulation", "filtering"))):
+        for kind, steps in (
+            (RAW, ("personAssociation", "triangulation")),
+            (FILTERED, ("triangulation", "filtering")),
+        ):
             config = settings(project, fps, count, filtered=kind == FILTERED)
             (project / "settings.json").write_text(json.dumps(config))
             shutil.rmtree(project / "pose-3d", ignore_errors=True)
@@ -150,7 +157,12 @@ def calibration(rig: Rig, names: list[str]) -> str:
             "rotation": Rotation.from_matrix(camera.cTw[:, :3]).as_rotvec().tolist(),
             "translation": camera.cTw[:, 3].tolist(),
         }
-        lines += [f"[{name}]", *(f"{key} = {json.dumps(value)}" for key, value in values.items()), "fisheye = false", ""]
+        lines += [
+            f"[{name}]",
+            *(f"{key} = {json.dumps(value)}" for key, value in values.items()),
+            "fisheye = false",
+            "",
+        ]
     return "\n".join([*lines, "[metadata]", "adjusted = false", "error = 0.0", ""])
 
 

@@ -212,7 +212,10 @@ def _choose(
 
 def _shelf15(people: People) -> NDArray[np.float64]:
     """The joints (N, 15, 3) of `people`, who have BODY_25's or Shelf's own; InputError for any others."""
-    names, joints = tuple(getattr(people, "joint_names", BODY_25.joints)), np.asarray(people.joints, dtype=np.float64)
+    names, joints = (
+        tuple(getattr(people, "joint_names", BODY_25.joints)),
+        np.asarray(people.joints, dtype=np.float64),
+    )
     if names == SHELF_JOINTS:
         return joints
     if names != BODY_25.joints:

@@ -101,12 +101,12 @@ class MultiViewSmplify:
             rotation, pelvis = self._root(start[rows], placed[rows])
             views = _ViewTargets.of(observations.rows(rows), rig, pelvis.numpy(), self.config.sigma_m)
             solved = self._solve(rotation, views)
-            joints[rows] = self.model.keypoints(self._energy.complete(solved)).double().numpy() + pelvis.numpy()[:, None]
+            joints[rows] = (
+                self.model.keypoints(self._energy.complete(solved)).double().numpy() + pelvis.numpy()[:, None]
+            )
             solved[:, -3:] += pelvis.float()
             free[torch.from_numpy(rows)] = solved
-        return SmplifyPeople(
-            observations.frame, joints, self._energy.complete(free), self.config.iterations
-        )
+        return SmplifyPeople(observations.frame, joints, self._energy.complete(free), self.config.iterations)
 
     def _root(self, start: Array, placed: NDArray[np.bool_]) -> tuple[Tensor, Tensor]:
         """Rotations (B, 3, 3) and places (B, 3) of the root by the torso's joints, or by all where these are few."""
@@ -179,9 +179,7 @@ class _ViewTargets:
         parts = (rig.cTw[:, :, :3], in_camera, xy, observations.confidence, scale)
         return cls(*(torch.from_numpy(np.ascontiguousarray(part)).float() for part in parts))
 
-    def pull(
-        self, xyz: Tensor, kernel_scale: float, weight: float, only: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
+    def pull(self, xyz: Tensor, kernel_scale: float, weight: float, only: Tensor | None) -> tuple[Tensor, Tensor]:
         """See `BodyEnergy.slope_of`: squared distances (B, J), summed over the views, and forces (B, J, 3)."""
         camera = torch.einsum("vij,bkj->bkvi", self.cTw, xyz) + self.origin[:, None]
         depth = camera[..., 2].clamp_min(_MIN_DEPTH_M)

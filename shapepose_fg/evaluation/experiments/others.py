@@ -1,15 +1,36 @@
-"""Where results of other systems lie, so that they are scored beside ours: a folder for each recording."""
+"""What results of other systems are scored by, and where they lie: a folder for each recording."""
 
+from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.evaluation.experiments.experiment import Figures
 from shapepose_fg.evaluation.experiments.scale import Stretch
+from shapepose_fg.evaluation.matching import People
+from shapepose_fg.evaluation.metrics import joint_metrics
 from shapepose_fg.evaluation.other_results.reading import read_people
+from shapepose_fg.evaluation.other_results.skeleton_text import SKEL_19
 from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.skeleton import BODY_25
 
 FILTERED, RAW = "pose2sim", "pose2sim-raw"
 """Pose2Sim with time (gaps interpolated, outliers rejected, low-pass), and frame by frame."""
+OTHERS = {
+    "Zhang et al. 2020, frame by frame": "4d-association-raw.txt",
+    "Zhang et al. 2020, over time": "4d-association.txt",
+    "Pose2Sim, frame by frame": RAW,
+    "Pose2Sim, over time": FILTERED,
+}
+"""Other systems, and what their results are called: 4D Association's text, or a folder of TRC files."""
 SHELF_FPS = 25.0
 """Frames a second of the Shelf recording."""
+THRESHOLDS_M = (0.2, 0.1, 0.05)
+"""A joint is correct if it is at most so far from the true one."""
+COMMON = tuple(BODY_25.index(name) for name in SKEL_19)
+"""The joints that every system has, that of Zhang et al. 2020 too: no eyes, of the feet the big toes only."""
 
 
 def folder_name(stretch: Stretch) -> str:
@@ -17,8 +38,56 @@ def folder_name(stretch: Stretch) -> str:
     return f"{stretch.split}-{stretch.name}-{stretch.span.start}-{stretch.span.stop}"
 
 
-def read_other(others: Path | None, recording: str, kind: str) -> Reconstruction | None:
-    """What another system made of a recording; None where there is nothing."""
-    if others is None or not (others / recording / kind).is_dir():
-        return None
-    return read_people(others / recording / kind)
+def read_others(others: Path, recording: str) -> dict[str, Reconstruction]:
+    """What other systems made of a recording, by the names of `OTHERS`; those of which there is nothing are left out.
+
+    `others` has a folder for each recording, with what `OTHERS` calls a system's files in it.
+    """
+    places = {name: others / recording / place for name, place in OTHERS.items()}
+    return {name: read_people(place) for name, place in places.items() if place.exists()}
+
+
+def scored(people: People, truth: NDArray[np.float64]) -> Figures:
+    """Precision, recall and F1 at each threshold, per cent, and MPJPE, of the `common` joints and of `all` 25.
+
+    `truth` (T, P, 25, 3), metres. People are matched by the joints that are scored.
+    """
+    joints = np.asarray(people.joints)
+    return {
+        name: _figures(SimpleNamespace(frame=people.frame, joints=joints[:, chosen]), truth[:, :, chosen])
+        for name, chosen in (("common", list(COMMON)), ("all", list(range(len(BODY_25)))))
+    }
+
+
+def _figures(people: People, truth: NDArray[np.float64]) -> Figures:
+    found = {f"{limit:g}": joint_metrics(people, truth, correct_m=limit) for limit in THRESHOLDS_M}
+    first = next(iter(found.values()))
+    return {
+        "at": {
+            limit: {name: _percent(getattr(each, name)) for name in ("precision", "recall", "f1")}
+            for limit, each in found.items()
+        },
+        "mpjpe_mm": first.mpjpe_mm if np.isfinite(first.mpjpe_mm) else None,
+        "people": first.people_true,
+        "missed": first.people_missed,
+        "nobody": first.people_duplicated + first.people_invented,
+    }
+
+
+def _percent(share: float) -> float | None:
+    return 100 * share if np.isfinite(share) else None
+
+
+def mean_of(figures: Sequence[Figures]) -> Figures:
+    """The mean of figures of one form, number by number; None where one of them is None."""
+    first = figures[0]
+    return {
+        name: (
+            mean_of([each[name] for each in figures])
+            if isinstance(value, dict)
+            else None
+            if any(each[name] is None for each in figures)
+            else float(np.mean([each[name] for each in figures]))
+        )
+        for name, value in first.items()
+    }

@@ -63,9 +63,7 @@ class FoundPeople:
         return len(self.frame)
 
 
-def find_everybody(
-    detections: DetectionSequence, rig: Rig, config: OpponentConfig | None = None
-) -> FoundPeople:
+def find_everybody(detections: DetectionSequence, rig: Rig, config: OpponentConfig | None = None) -> FoundPeople:
     """Every frame by itself."""
     config = OpponentConfig() if config is None else config
     frames, persons, joints, views = [], [], [], []
@@ -75,7 +73,9 @@ def find_everybody(
         persons.append(np.arange(len(placed)))
         joints.append(placed)
         views.append(agree.sum(axis=-1))
-    return FoundPeople(*(np.concatenate(each) for each in (frames, persons, joints, views)), detections.skeleton.joints)
+    return FoundPeople(
+        *(np.concatenate(each) for each in (frames, persons, joints, views)), detections.skeleton.joints
+    )
 
 
 def people_in_frame(

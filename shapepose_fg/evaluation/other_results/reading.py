@@ -85,9 +85,7 @@ def _from_text(path: Path) -> Reconstruction:
     text = read_skeleton_text(path)
     names = joint_names(path, text)
     if names == SHELF_JOINTS:
-        return _people(
-            text.frame, text.person, _near(text.joints, path), text.confidence, None, SHELF_JOINTS
-        )
+        return _people(text.frame, text.person, _near(text.joints, path), text.confidence, None, SHELF_JOINTS)
     joints = _placed(text.joints, names, path)
     confidence = np.zeros(joints.shape[:2])
     confidence[:, [BODY_25.index(name) for name in names]] = text.confidence

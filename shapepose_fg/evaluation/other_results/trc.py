@@ -88,7 +88,9 @@ class _Table:
     def header(self) -> dict[str, str]:
         """Values of the third line by the headings of the second, in small letters."""
         if not is_trc(self._lines[0][0]) or len(self._lines) < 5:
-            raise InputError(f"{self._path}: does not begin as a TRC file does (PathFileType, then five lines); {_CURE}")
+            raise InputError(
+                f"{self._path}: does not begin as a TRC file does (PathFileType, then five lines); {_CURE}"
+            )
         headings = [cell.strip().lower() for cell in self._lines[1]]
         found = dict(zip(headings, (cell.strip() for cell in self._lines[2]), strict=False))
         for heading in _HEADINGS:
@@ -110,9 +112,7 @@ class _Table:
     def rows(self) -> list[tuple[int, list[str]]]:
         """Number and cells of the lines that are not blank, after the five of the header."""
         return [
-            (place, cells)
-            for place, cells in enumerate(self._lines[5:], 6)
-            if any(cell.strip() for cell in cells)
+            (place, cells) for place, cells in enumerate(self._lines[5:], 6) if any(cell.strip() for cell in cells)
         ]
 
     def number(self, place: int, cell: str) -> float:
