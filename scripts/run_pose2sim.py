@@ -4,12 +4,12 @@
     python scripts/run_pose2sim.py --venv /tmp/pose2sim --output others --only shelf
     shapepose-fg evaluate shelf --people others/shelf/pose2sim --ground-truth shelf/gt_dev.txt
 
-Makes the environment DIR where there is none, and installs Pose2Sim from PyPI into it; nothing of it is a dependency
-of ours. For every recording it writes a project as Pose2Sim wants it (cameras in TOML; people of each view, grouped
-greedily by their affinities, as OpenPose's JSON), runs person association, triangulation and filtering with the settings
-of its own demo of several people, and leaves `OUTPUT/RECORDING/pose2sim` (gaps interpolated, outliers rejected,
-Butterworth) and `OUTPUT/RECORDING/pose2sim-raw` (neither): a TRC file per person. Recordings are Shelf and the
-stretches of the named sequences; they need `--data FOLDER`, or SHAPEPOSE_DATA. What is there is not made again.
+Makes the environment DIR where there is none, and installs Pose2Sim from PyPI into it; nothing of it is among our
+dependencies. For every recording it writes a project as Pose2Sim wants it (cameras in TOML; people of each view,
+grouped greedily by their affinities, as OpenPose's JSON), runs association, triangulation and filtering with the
+settings of its own demo of several people, and leaves a TRC file per person in `OUTPUT/RECORDING/pose2sim` (gaps
+interpolated, outliers rejected, Butterworth) and in `OUTPUT/RECORDING/pose2sim-raw` (neither). Recordings are Shelf
+and the stretches of the named sequences; they need `--data FOLDER`, or SHAPEPOSE_DATA. What is there stays.
 """
 
 import argparse
@@ -35,6 +35,8 @@ from shapepose_fg.skeleton import BODY_25
 
 VERSION = "0.10.49"
 """Of Pose2Sim: the settings below are those of its demo `Demo_MultiPerson`."""
+KINDS = {RAW: ("personAssociation", "triangulation"), FILTERED: ("triangulation", "filtering")}
+"""The results, and the steps of Pose2Sim that lead to them; who is who is found once."""
 STEPS = """\
 import json, sys
 from pathlib import Path
@@ -49,9 +51,7 @@ for step in sys.argv[1:]:
 def main() -> None:
     """Run it on every recording that is asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "--venv", type=Path, required=True, help="environment of Pose2Sim; made if it is not there"
-    )
+    parser.add_argument("--venv", type=Path, required=True, help="environment of Pose2Sim; made if need be")
     parser.add_argument("--output", type=Path, required=True, help="folder for the TRC files")
     parser.add_argument(
         "--data", type=Path, default=Path(os.environ.get("SHAPEPOSE_DATA", ROOT.parent / "shared"))
@@ -97,10 +97,7 @@ def run(
     with tempfile.TemporaryDirectory() as temporary:
         project = Path(temporary) / "project"
         write_project(project, part, rig)
-        for kind, steps in (
-            (RAW, ("personAssociation", "triangulation")),
-            (FILTERED, ("triangulation", "filtering")),
-        ):
+        for kind, steps in KINDS.items():
             config = settings(project, fps, count, filtered=kind == FILTERED)
             (project / "settings.json").write_text(json.dumps(config))
             shutil.rmtree(project / "pose-3d", ignore_errors=True)
@@ -172,7 +169,7 @@ def settings(project: Path, fps: float, frames: int, *, filtered: bool) -> dict[
         "project": {
             "project_dir": str(project),
             "multi_person": True,
-            "frame_rate": int(round(fps)),
+            "frame_rate": round(fps),
             "frame_range": "all",
             "participant_height": 1.7,
             "participant_mass": 70.0,
@@ -216,7 +213,7 @@ def settings(project: Path, fps: float, frames: int, *, filtered: bool) -> dict[
 
 
 def skeleton() -> dict[str, Any]:
-    """All of BODY_25's joints as a tree: Pose2Sim's own BODY_25 leaves out eyes and ears, which Shelf's head needs."""
+    """BODY_25 as a tree: Pose2Sim's own leaves out eyes and ears, of which Shelf's head is made."""
 
     def node(joint: int) -> dict[str, Any]:
         children = [node(child) for child, parent in enumerate(BODY_25.parents) if parent == joint]

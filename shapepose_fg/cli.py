@@ -224,7 +224,9 @@ def reconstruct(
 
 @evaluate.command("shelf")
 def evaluate_shelf_command(
-    people: Annotated[Path, typer.Option(help="people.npz of a reconstruction, or the folder it is in.")],
+    people: Annotated[
+        Path, typer.Option(help="people.npz, or its folder; 4D Association's text; TRC, or a folder of it.")
+    ],
     ground_truth: Annotated[Path, typer.Option(help="Annotation of the Shelf recording, as text.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
 ) -> None:

@@ -1,7 +1,8 @@
 """SMPL-only: bodies fitted to all views' 2D detections directly, without 3D joints or a graph in between.
 
-Multi-view SMPLify (Bogo et al., ECCV 2016), the baseline of section 4.4 of the paper: robust reprojection error weighted by
-confidence, pose prior, shape prior; the root first, then everything, with priors that loosen and a kernel that narrows.
+Multi-view SMPLify (Bogo et al., ECCV 2016), the paper's "SMPL-only": robust reprojection error weighted by
+confidence, pose prior, shape prior; the root first, then everything, with priors that loosen and a kernel that
+narrows.
 """
 
 import math
@@ -88,13 +89,14 @@ class MultiViewSmplify:
 
     @torch.inference_mode()
     def fit(self, observations: Observations, rig: Rig, start: Array) -> SmplifyPeople:
-        """Bodies of N rows, from where triangulation puts the joints, `start` (N, J, 3), metres, NaN where it does not.
+        """Bodies of N rows.
 
-        Only the root's first place comes from there. Rows with fewer than three joints have no body.
+        Where triangulation puts the joints, `start` (N, J, 3), metres, NaN where it does not, gives the root's
+        first place, and nothing else. Rows with fewer than three joints have no body.
         """
-        placed = np.isfinite(start).all(axis=-1)
+        placed = np.asarray(np.isfinite(start).all(axis=-1))
         rows = np.flatnonzero(placed.sum(axis=1) >= _MIN_START_JOINTS)
-        N, J = placed.shape
+        N, J = start.shape[:2]
         joints = np.full((N, J, 3), np.nan)
         free = torch.full((N, self._energy.num_free), torch.nan)
         if len(rows) > 0:
@@ -109,7 +111,7 @@ class MultiViewSmplify:
         return SmplifyPeople(observations.frame, joints, self._energy.complete(free), self.config.iterations)
 
     def _root(self, start: Array, placed: NDArray[np.bool_]) -> tuple[Tensor, Tensor]:
-        """Rotations (B, 3, 3) and places (B, 3) of the root by the torso's joints, or by all where these are few."""
+        """Rotations (B, 3, 3) and places (B, 3) of the root, by the torso's joints, or by all if these are few."""
         torso = placed & self._torso.numpy()
         used = np.where(torso.sum(axis=1, keepdims=True) >= _MIN_START_JOINTS, torso, placed)
         variance = np.where(used, _START_SIGMA_M**2, 1e6)
@@ -120,7 +122,7 @@ class MultiViewSmplify:
         return self._frame.place(xyz, torch.from_numpy(variance), self._slots)
 
     def _solve(self, rotation: Tensor, views: "_ViewTargets") -> Tensor:
-        """All steps of Adam (Kingma and Ba 2015) from the mean pose; free parameters (B, P) around the root's start."""
+        """Free parameters (B, P) around the root's start: all steps of Adam (Kingma and Ba 2015)."""
         config, energy = self.config, self._energy
         B = len(rotation)
         angles = self._mean_angles.expand(B, -1)

@@ -1,4 +1,4 @@
-"""Stage II alone: rows whose 2D detections are given, every row by itself, and how many steps their bodies took."""
+"""Stage II alone: rows whose 2D detections are given, each by itself, and how many steps their bodies took."""
 
 import time
 from dataclasses import dataclass, replace
@@ -28,8 +28,8 @@ class StageTwo:
     cpu_s: float
     """Processor time of all rows together, seconds."""
     body_steps: float
-    """Steps that the fit of a row's body took in all alternations, the mean over rows; fits that leave joints out, and
-    rows that the plain optimiser took over, not counted. NaN for another fitter than the learned one."""
+    """Steps that the fit of a row's body took in all alternations, the mean over rows; without fits that leave
+    joints out, and rows that the plain optimiser took over. NaN for another fitter than the learned one."""
 
 
 def solve_alone(

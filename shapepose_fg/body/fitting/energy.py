@@ -292,7 +292,8 @@ class BodyEnergy:
     ) -> Slope:
         """The slope where something else than targets pulls the keypoints.
 
-        `pull` gives, of keypoints (B, K, 3), squared distances (B, K) and half the gradient of its energy (B, K, 3).
+        `pull` gives, of keypoints (B, K, 3), squared distances (B, K) and half the gradient of its energy
+        (B, K, 3).
         """
         body, points = self.complete(free), self.model.keypoint_points
         local = exp_so3(torch.cat((body.global_orient[:, None], body.body_pose), 1))

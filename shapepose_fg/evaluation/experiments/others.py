@@ -1,8 +1,8 @@
 """What results of other systems are scored by, and where they lie: a folder for each recording."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,13 +33,23 @@ COMMON = tuple(BODY_25.index(name) for name in SKEL_19)
 """The joints that every system has, that of Zhang et al. 2020 too: no eyes, of the feet the big toes only."""
 
 
+@dataclass(frozen=True)
+class PlainPeople:
+    """Joints and nothing else; implements `People`."""
+
+    frame: NDArray[np.integer]
+    """(N,) frame of each row."""
+    joints: NDArray[np.float64]
+    """(N, J, 3) metres; NaN where unknown."""
+
+
 def folder_name(stretch: Stretch) -> str:
     """The folder of a stretch among those of other systems' results."""
     return f"{stretch.split}-{stretch.name}-{stretch.span.start}-{stretch.span.stop}"
 
 
 def read_others(others: Path, recording: str) -> dict[str, Reconstruction]:
-    """What other systems made of a recording, by the names of `OTHERS`; those of which there is nothing are left out.
+    """What other systems made of a recording, by the names of `OTHERS`; those with nothing there are left out.
 
     `others` has a folder for each recording, with what `OTHERS` calls a system's files in it.
     """
@@ -52,9 +62,9 @@ def scored(people: People, truth: NDArray[np.float64]) -> Figures:
 
     `truth` (T, P, 25, 3), metres. People are matched by the joints that are scored.
     """
-    joints = np.asarray(people.joints)
+    joints = np.asarray(people.joints, dtype=np.float64)
     return {
-        name: _figures(SimpleNamespace(frame=people.frame, joints=joints[:, chosen]), truth[:, :, chosen])
+        name: _figures(PlainPeople(people.frame, joints[:, chosen]), truth[:, :, chosen])
         for name, chosen in (("common", list(COMMON)), ("all", list(range(len(BODY_25)))))
     }
 
@@ -80,14 +90,11 @@ def _percent(share: float) -> float | None:
 
 def mean_of(figures: Sequence[Figures]) -> Figures:
     """The mean of figures of one form, number by number; None where one of them is None."""
-    first = figures[0]
-    return {
-        name: (
-            mean_of([each[name] for each in figures])
-            if isinstance(value, dict)
-            else None
-            if any(each[name] is None for each in figures)
-            else float(np.mean([each[name] for each in figures]))
-        )
-        for name, value in first.items()
-    }
+    mean: Figures = {}
+    for name, value in figures[0].items():
+        values = [each[name] for each in figures]
+        if isinstance(value, dict):
+            mean[name] = mean_of(values)
+        else:
+            mean[name] = None if None in values else float(np.mean(values))
+    return mean

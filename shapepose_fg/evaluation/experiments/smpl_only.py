@@ -3,12 +3,11 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from types import SimpleNamespace
 
 import numpy as np
 
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
-from shapepose_fg.evaluation.experiments.others import mean_of, scored
+from shapepose_fg.evaluation.experiments.others import PlainPeople, mean_of, scored
 from shapepose_fg.evaluation.experiments.scale import Scale, Stretch, shorter
 from shapepose_fg.evaluation.smpl_only import SamePeople
 from shapepose_fg.pipeline import PipelineConfig
@@ -45,7 +44,7 @@ def _measure(stretch: Stretch) -> Figures:
         "**ours, after stage II**": (ours.estimates.joints, ours.cpu_s, ours.body_steps),
     }
     return {
-        name: scored(SimpleNamespace(frame=frame, joints=joints), scene.keypoints)["all"]
+        name: scored(PlainPeople(frame, joints), scene.keypoints)["all"]
         | {"cpu_ms": None if cpu_s is None else 1e3 * cpu_s / rows}
         | {"steps": None if steps is None or not np.isfinite(steps) else float(steps)}
         for name, (joints, cpu_s, steps) in found.items()

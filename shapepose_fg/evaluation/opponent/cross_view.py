@@ -21,7 +21,7 @@ _MIN_SINE = np.sin(np.deg2rad(3.0))
 
 
 def geometric_affinity(people: People2D, rig: Rig, largest_m: float) -> Array:
-    """(S, S) 1 where the rays to two people's joints meet, falling to 0 where they miss by `largest_m` in the mean.
+    """(S, S) 1 where the rays to two people's joints meet, 0 where they miss by `largest_m` in the mean.
 
     The distance between two rays is the epipolar distance as a length at the joint. 0 within a view, and for two
     with fewer than three joints in common.
@@ -54,7 +54,7 @@ def consistent_matches(affinity: Array, view: NDArray[np.intp], *, rank_weight: 
     """(S, S) how far two are one person, 0 to 1, so that matches agree over all views.
 
     Minimises -<A, P> + `rank_weight` |P|_* over symmetric P between 0 and 1 whose rows add up to 1 at most in each
-    view, by ADMM (Dong et al. 2019, Eq. 7 to 9): the nuclear norm is a stand-in for the rank, which is the number of
+    view, by ADMM (Dong et al. 2019, section 3.2): the nuclear norm stands in for the rank, which is the number of
     people where matches agree.
     """
     S = len(affinity)

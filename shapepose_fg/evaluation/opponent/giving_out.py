@@ -15,16 +15,15 @@ def nearest_given(
 ) -> NDArray[np.intp]:
     """Which detection each view has of each joint (P, J, V), -1 for none: the nearest, one-to-one.
 
-    A detection goes to a joint (P, J, 3) that is projected within `gate_m` of it, at the joint's depth. Joints that
-    are not placed keep what they `held` (P, J, V), where nobody else has it now.
+    A detection goes to a joint (P, J, 3) that is projected within `gate_m` of it, at the joint's depth. Joints
+    that are not placed keep what they `held` (P, J, V), where nobody else has it now.
     """
     projected, depth = rig.project(joints)  # (V, P, J, 2), (V, P, J)
-    placed = np.isfinite(joints).all(axis=-1)
+    placed = np.asarray(np.isfinite(joints).all(axis=-1))
     here = projected[found.view, :, found.joint] if len(joints) > 0 else np.zeros((len(found), 0, 2))
     metres = depth[found.view, :, found.joint] / rig.focal_px[found.view, None]
     distance = np.linalg.norm(here - found.xy[:, None], axis=-1) * metres  # (D, P)
-    with np.errstate(invalid="ignore"):
-        detection, person = np.nonzero(distance < gate_m)
+    detection, person = np.nonzero(distance < gate_m)
     # One-to-one in each view and joint: a person is another one in each.
     V, J = len(rig), joints.shape[1]
     slot = (person * J + found.joint[detection]) * V + found.view[detection]
@@ -41,7 +40,7 @@ def grown(found: Detections, joints: Array, held: NDArray[np.intp]) -> NDArray[n
     Along one limb at a time, until nothing changes; best affinities first, each detection to one person.
     """
     P, J, V = held.shape
-    placed = np.isfinite(joints).all(axis=-1)
+    placed = np.asarray(np.isfinite(joints).all(axis=-1))
     held = np.where(placed[..., None], held, -1)
     both = np.concatenate([found.pairs, found.pairs[:, ::-1]])
     affinity = np.concatenate([found.affinity, found.affinity])

@@ -22,15 +22,15 @@ class OpponentConfig:
 
     min_confidence: float = 0.1
     """Candidates less sure are left out."""
-    min_affinity: float = 0.1
+    min_affinity: float = 0.05
     """Pairs of candidates of less affinity join nobody in a picture."""
-    min_joints_2d: int = 7
+    min_joints_2d: int = 5
     """A group of fewer joints is nobody in a picture."""
     largest_m: float = 0.08
     """Two whose rays miss each other by so much in the mean are not one person."""
     rank_weight: float = 2.0
     """How much matches that agree over all views are preferred."""
-    least_match: float = 0.1
+    least_match: float = 0.3
     """Less of a match is none."""
     gate_m: float = 0.1
     """A view agrees with a joint within this distance at its depth."""
@@ -73,9 +73,8 @@ def find_everybody(detections: DetectionSequence, rig: Rig, config: OpponentConf
         persons.append(np.arange(len(placed)))
         joints.append(placed)
         views.append(agree.sum(axis=-1))
-    return FoundPeople(
-        *(np.concatenate(each) for each in (frames, persons, joints, views)), detections.skeleton.joints
-    )
+    frame, person, xyz, seen = (np.concatenate(each) for each in (frames, persons, joints, views))
+    return FoundPeople(frame, person, xyz, seen, detections.skeleton.joints)
 
 
 def people_in_frame(

@@ -1,4 +1,4 @@
-"""Joints from the views of a person, some of which are wrong: the best pair of views, and all that agree with it."""
+"""Joints from a person's views, some of which are wrong: the best pair of views, and all that agree with it."""
 
 from itertools import combinations
 
@@ -18,10 +18,10 @@ def triangulate_robustly(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Joints (P, J, 3), metres, from `xy` (P, J, V, 2) with `confidence` (P, J, V), 0 where a view lacks one.
 
-    Every pair of views is tried; a view agrees with its point within `gate_m` at the point's depth. The pair with the
-    greatest sum of confidence times (1 - squared distance over squared gate) wins (MSAC: Torr and Zisserman 2000), and
-    the point is refined by least squares over the views that agree. Returns also which views do (P, J, V); NaN where
-    they are fewer than `min_views`.
+    Every pair of views is tried; a view agrees with its point within `gate_m` at the point's depth. The pair with
+    the greatest sum of confidence times (1 - squared distance over squared gate) wins (MSAC: Torr and Zisserman
+    2000), and the point is refined by least squares over the views that agree. Returns also which views do
+    (P, J, V); NaN where they are fewer than `min_views`.
     """
     P, J, V = confidence.shape
     view = np.tile(np.arange(V), P * J)

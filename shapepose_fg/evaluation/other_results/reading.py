@@ -20,12 +20,12 @@ _FILTERED = "_filt_"
 
 
 def read_people(path: Path | str, up: Axis = "z") -> Reconstruction:
-    """People from a people.npz or its folder, 4D Association's text, a TRC file, or a folder of these, one a person.
+    """People from a people.npz or its folder, 4D Association's text, a TRC file, or a folder of TRC files.
 
     Joints are BODY_25's, NaN where the file has none of that name; people in Shelf's 15 joints keep these. In a
-    folder of TRC files persons are numbered in the order of the names. Nothing but joints (and times, confidences)
-    is known of people from others. `up` is the axis of the world that a TRC file's y becomes. InputError, one
-    sentence, for what cannot be read.
+    folder of TRC files each is a person, numbered in the order of the names. Nothing but joints (and times, or
+    confidences) is known of people from others. `up` is the axis of the world that a TRC file's y becomes.
+    InputError, one sentence, for what cannot be read.
     """
     path = Path(path)
     if path.is_dir():
@@ -105,9 +105,7 @@ def _near(joints: NDArray[np.float64], path: Path) -> NDArray[np.float64]:
     """The joints, if they are in some room."""
     far = np.abs(np.nan_to_num(joints)) > _FAR_M
     if far.any():
-        raise InputError(
-            f"{path}: a joint is {np.nanmax(np.abs(joints)):.3g} m from the origin; check the unit, or write it again"
-        )
+        raise InputError(f"{path}: a joint is {np.nanmax(np.abs(joints)):.3g} m from the origin; check the unit")
     return joints
 
 

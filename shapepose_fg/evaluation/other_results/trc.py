@@ -41,9 +41,9 @@ class TrcFile:
 def read_trc(path: Path, up: Axis = "z") -> TrcFile:
     """Read such a file into a world with the axis `up` upwards, turned as Pose2Sim and `export` turn it to y up.
 
-    A marker is missing where a cell is empty or NaN, or the line ends early. How many frames the header promises is
-    not looked at: Pose2Sim's filter leaves one out and keeps the number. InputError that names file and line for
-    anything else that is no number, for a unit that is not m, cm or mm, and for frames that do not rise.
+    A marker is missing where a cell is empty or NaN, or the line ends early. How many frames the header promises
+    is not looked at: Pose2Sim's filter leaves one out and keeps the number. InputError that names file and line
+    for anything else that is no number, for a unit that is not m, cm or mm, and for frames that do not rise.
     """
     lines = _Table(path)
     header = lines.header()
