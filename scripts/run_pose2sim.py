@@ -8,7 +8,7 @@ Makes the environment DIR where there is none, and installs Pose2Sim from PyPI i
 dependencies. For every recording it writes a project as Pose2Sim wants it (cameras in TOML; people of each view,
 grouped greedily by their affinities, as OpenPose's JSON), runs association, triangulation and filtering with the
 settings of its own demo of several people, and leaves a TRC file per person in `OUTPUT/RECORDING/pose2sim` (gaps
-interpolated, outliers rejected, Butterworth) and in `OUTPUT/RECORDING/pose2sim-raw` (neither). Recordings are Shelf
+interpolated, outliers rejected, Butterworth) and `OUTPUT/RECORDING/pose2sim-raw` (neither). Recordings are Shelf
 and the stretches of the named sequences; they need `--data FOLDER`, or SHAPEPOSE_DATA. What is there stays.
 """
 
