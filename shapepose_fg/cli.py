@@ -225,15 +225,17 @@ def reconstruct(
 
 @evaluate.command("shelf")
 def evaluate_shelf_command(
-    people: Annotated[Path, typer.Option(help="people.npz of a reconstruction, or the folder it is in.")],
+    people: Annotated[
+        Path, typer.Option(help="people.npz, or its folder; 4D Association's text; TRC, or a folder of it.")
+    ],
     ground_truth: Annotated[Path, typer.Option(help="Annotation of the Shelf recording, as text.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
 ) -> None:
     """PCP per limb and actor, MPJPE and recall on the Shelf recording."""
+    from shapepose_fg.evaluation.other_results.reading import read_people
     from shapepose_fg.evaluation.shelf import evaluate_shelf, read_shelf_ground_truth
-    from shapepose_fg.reconstruction import Reconstruction
 
-    score = evaluate_shelf(Reconstruction.load(people), read_shelf_ground_truth(ground_truth))
+    score = evaluate_shelf(read_people(people), read_shelf_ground_truth(ground_truth))
     if as_json:
         print(json.dumps(score.as_dict(), indent=2, allow_nan=False))
     else:
