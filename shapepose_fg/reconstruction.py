@@ -227,7 +227,8 @@ class Reconstruction:
         """
         path = Path(path)
         file = path / _PEOPLE if path.is_dir() else path
-        columns = read_npz(file, "give the people.npz of a reconstruction, or run one first")
+        every = (*cls.ROWS, "joint_names", "known_names")
+        columns = read_npz(file, every, "give the people.npz of a reconstruction, or run one first")
         needed = [name for name in (*cls.ROWS, "joint_names") if name not in _ADDED]
         for name in (*needed, "known_names") if "known" in columns else needed:
             if name not in columns:

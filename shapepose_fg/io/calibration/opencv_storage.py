@@ -6,7 +6,7 @@ import numpy as np
 
 from shapepose_fg.camera import Lens
 from shapepose_fg.errors import InputError
-from shapepose_fg.files import read_text
+from shapepose_fg.files import MIDDLE, read_text
 from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.calibration.filestorage import load_storage
 from shapepose_fg.io.calibration.written import ONE_CAMERA, Format, WrittenCamera, WrittenRig, picture_size, pose
@@ -72,7 +72,7 @@ def recognise_nodes(content: Content) -> bool:
     """Whether every camera has a node, or a file, of its own; also the intrinsics of one camera alone."""
     if content.syntax == "folder":
         files = [path for path in content.value if path.suffix in (".yml", ".yaml", ".xml") and path.is_file()]
-        return len(files) > 0 and all(_names_a_camera(read_text(path)) for path in files)
+        return len(files) > 0 and all(_names_a_camera(read_text(path, most=MIDDLE)) for path in files)
     return content.syntax == "OpenCV"
 
 
@@ -80,7 +80,7 @@ def read_nodes(content: Content) -> WrittenRig:
     """Cameras by name, of MC-Calib or of hand-written files: K, distortion, picture size and pose."""
     if content.syntax == "folder":
         nodes = {
-            path.stem: load_storage(path, read_text(path))
+            path.stem: load_storage(path, read_text(path, most=MIDDLE))
             for path in content.value
             if path.suffix in (".yml", ".yaml", ".xml")
         }
