@@ -68,7 +68,12 @@ def fuzz(name: str, seconds: int, held_out: bool) -> tuple[int, int]:
             found = [each for each in Path(folder).iterdir() if re.match(r"(crash|timeout|oom|leak)-", each.name)]
             if ended.returncode != 0:
                 faults += 1
-                print("\n".join(ended.stderr.splitlines()[-60:]) if not found else _told(ended.stderr), flush=True)
+                print(
+                    "\n".join(ended.stderr.splitlines()[-60:])
+                    if not found
+                    else _told(ended.stdout + ended.stderr),
+                    flush=True,
+                )
                 if not held_out:
                     _keep(name, found)
         seed += 1
@@ -81,11 +86,16 @@ def _told(text: str) -> str:
     return "\n".join(text[start:].splitlines()[:40]) if start >= 0 else "\n".join(text.splitlines()[-40:])
 
 
+def folder_of(name: str) -> str:
+    """What the folder of a reader's cases is called."""
+    return re.sub(r"\W+", "_", name)
+
+
 def _keep(name: str, found: list[Path]) -> None:
     """Lay what broke a reader where a test tries it again: which of the reader's files, and its content."""
     for each in found:
         content = each.read_bytes()
-        folder = FOUND / name.replace(" ", "_")
+        folder = FOUND / folder_of(name)
         folder.mkdir(parents=True, exist_ok=True)
         if content:
             (folder / f"{content[0]}-{each.name.rsplit('-', 1)[1][:8]}").write_bytes(content[1:])

@@ -5,6 +5,7 @@ time.
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import PurePath
 from typing import Literal
 
 import cv2
@@ -82,6 +83,9 @@ class Camera:
             )
         if not self.name or len(self.name) > _LONGEST_NAME or not self.name.isprintable():
             raise ValueError(f"camera {self.name[:40]!r}: names must be 1 to {_LONGEST_NAME} letters, in one line")
+        way = PurePath(self.name)
+        if way.is_absolute() or len(way.parts) == 0 or ".." in way.parts:
+            raise ValueError(f"camera {self.name}: the name must not lead out of a folder: files are called so")
         object.__setattr__(self, "image_size", (int(width), int(height)))
 
     @classmethod

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.model.pickle_records import RefusedPickle
+from shapepose_fg.body.model.plausible_body import implausible
 from shapepose_fg.body.model.smpl_pickle import as_array, read_smpl_pickle
 from shapepose_fg.columns import read_npz
 from shapepose_fg.errors import InputError
@@ -69,6 +70,9 @@ def read_smpl_file(path: Path, keypoint_regressor: NDArray[np.floating] | None =
             f"{path}: no keypoint_regressor, and with {count} vertices this is not SMPL's own mesh: add the key, "
             f"or pass keypoint_regressor= ({_NUM_KEYPOINTS}, {count}), the weights that make BODY_25 from vertices"
         )
+    problem = implausible(template, joint_regressor, keypoints)
+    if problem is not None:
+        raise InputError(f"{path}: {problem}")
     return SmplArrays(
         template=template,
         shapes=entries.shapes(count),

@@ -42,8 +42,11 @@ def read_multiview(content: Content) -> WrittenRig:
     Ts = _stack(nodes, "Ts", path).reshape(count, -1)
     sizes = _stack(nodes, "image_sizes", path).reshape(count, -1)
     models = np.zeros(count) if nodes.get("models") is None else _stack(nodes, "models", path).ravel()
-    if len(Rs) != count or Ts.shape[1] != 3 or sizes.shape[1] != 2 or len(models) != count:
-        raise InputError(f"{path}: Rs, Ts, image_sizes and models must hold one entry for each of the {count} Ks")
+    if Ks.size != 9 * count or len(Rs) != count or Ts.shape[1] != 3 or sizes.shape[1] != 2 or len(models) != count:
+        raise InputError(
+            f"{path}: Ks must be 3x3, and Rs, Ts, image_sizes and models hold one entry for each of the {count};"
+            " save it with OpenCV's calibration again"
+        )
     numbers = _stack(nodes, "distortions", path).ravel()
     fisheye = models == _FISHEYE
     # The coefficients stand one after the other: four of a fisheye, equally many of every other camera.
