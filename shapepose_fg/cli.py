@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
@@ -331,13 +332,25 @@ def simulate(
     )
 
 
+class Preset(StrEnum):
+    """Settings that hang together."""
+
+    DEFAULT = "default"
+    PAPER = "paper"
+
+
 @app.command("config")
-def print_config() -> None:
-    """Print every setting with its default, as TOML."""
+def print_config(
+    preset: Annotated[
+        Preset,
+        typer.Option(help="paper: the method as it is written, without what is settled differently here."),
+    ] = Preset.DEFAULT,
+) -> None:
+    """Print every setting with its value, as TOML."""
     from shapepose_fg.io.config import toml_text
     from shapepose_fg.pipeline import PipelineConfig
 
-    print(toml_text(PipelineConfig()), end="")
+    print(toml_text(PipelineConfig.paper() if preset is Preset.PAPER else PipelineConfig()), end="")
 
 
 @app.command()

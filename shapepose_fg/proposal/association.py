@@ -37,7 +37,12 @@ class AssociationConfig:
     """How often the choice is made again with the neighbours that the last one chose."""
     min_observed_parts: float = 0.35
     """Least fraction of the core joints (trunk, arms, legs) that two views must see: 6 of 15. Of one whose upper
-    body alone shows there are 9."""
+    body alone shows there are 9. The paper asks for none."""
+
+    @classmethod
+    def paper(cls) -> "AssociationConfig":
+        """As written: whoever was proposed stays."""
+        return cls(min_observed_parts=0.0)
 
     def __post_init__(self) -> None:
         for name in ("near_m", "far_m", "reach_m", "overlap_px", "passes"):

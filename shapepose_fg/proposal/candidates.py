@@ -12,6 +12,9 @@ from scipy.spatial import KDTree
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections
 
+_ANYWHERE_M = 1000.0
+"""A gate that no pair of rays in a room fails."""
+
 
 @dataclass(frozen=True)
 class CandidateConfig:
@@ -31,6 +34,27 @@ class CandidateConfig:
     min_view_fraction: float = 1 / 6
     """Where there are very many views, chance crossings of rays have three votes, too: a strong candidate must
     have those of all pairs of this fraction of the views (30 cameras: 5 views, 10 votes; 18 and fewer: 3)."""
+    weak: bool = True
+    """Whether clusters of fewer votes are kept, as weak candidates. The paper drops them: a joint that two views
+    see is lost."""
+    weighted_centre: bool = True
+    """Whether the centre of a cluster is weighted by the squared confidence of its points. In the paper it is
+    their mean."""
+
+    @classmethod
+    def paper(cls) -> "CandidateConfig":
+        """As written in section 3.1: every pair is triangulated, wherever its rays pass; three points or none.
+
+        The paper does not say rho: 6 cm is the best of 5 to 12 on `tune`.
+        """
+        return cls(
+            gate_m=_ANYWHERE_M,
+            min_angle_deg=1e-3,
+            vote_radius_m=0.06,
+            min_view_fraction=1e-3,
+            weak=False,
+            weighted_centre=False,
+        )
 
     def __post_init__(self) -> None:
         for name in ("gate_m", "min_angle_deg", "vote_radius_m", "min_votes", "min_view_fraction"):
@@ -117,7 +141,7 @@ def vote(points: PairPoints, detections: Detections, views: int, config: Candida
     count = cluster.max() + 1
     votes = np.bincount(cluster, minlength=count)
     # The centre of the cluster is weighted by confidence: one bad view must not drag the point of four good ones.
-    weight = points.score**2
+    weight = points.score**2 if config.weighted_centre else np.ones(len(points.score))
     total = np.bincount(cluster, weight, count)
     xyz = np.stack([np.bincount(cluster, weight * x, count) / total for x in points.xyz.T], axis=1)
     joint = np.zeros(count, dtype=np.intp)
@@ -129,7 +153,8 @@ def vote(points: PairPoints, detections: Detections, views: int, config: Candida
     # A detection that made a strong candidate is explained: what it makes with others' is a crossing of rays.
     explained = np.zeros(len(detections), dtype=bool)
     explained[support[strong[support[:, 0]], 1]] = True
-    keep = strong | (np.bincount(support[:, 0], ~explained[support[:, 1]], count) > 0)
+    unexplained = np.bincount(support[:, 0], ~explained[support[:, 1]], count) > 0
+    keep = strong | (unexplained & config.weak)
     support = support[keep[support[:, 0]]]
     support[:, 0] = (np.cumsum(keep) - 1)[support[:, 0]]
     return Candidates(xyz[keep], joint[keep], score[keep], votes[keep], strong[keep], support)

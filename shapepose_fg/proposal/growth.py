@@ -29,12 +29,13 @@ class GrowthConfig:
     """How often the joints are chosen again once all their neighbours are known."""
     bridge_m: float = 0.55
     """Beyond a joint that nobody saw, the next is sought within this distance a bone of the last known one: from
-    hip to ankle of a tall adult it is 0.9 m."""
+    hip to ankle of a tall adult it is 0.9 m. 0: it is not sought, as in the paper."""
 
     def __post_init__(self) -> None:
-        for name in ("max_limb_m", "bridge_m"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        if self.max_limb_m <= 0:
+            raise ValueError(f"max_limb_m must be positive, got {self.max_limb_m}")
+        if self.bridge_m < 0:
+            raise ValueError(f"bridge_m must not be negative, got {self.bridge_m}")
         if not 0 <= self.doubt <= 1:
             raise ValueError(f"doubt must be between 0 and 1, got {self.doubt}")
 
@@ -133,7 +134,7 @@ def _bridge(
     free[chosen[chosen >= 0]] = False
     loose = free & candidates.strong & ~(support > 0).any(axis=0)
     score = np.where(empty & free & (support > 0), support + evidence, 0.0)
-    if (empty & loose).any():
+    if config.bridge_m > 0 and (empty & loose).any():
         ancestor, bones = _nearest_known(chosen, skeleton)
         start = candidates.xyz[np.take_along_axis(chosen, ancestor, axis=1)]
         distance = np.linalg.norm(start[:, candidates.joint] - candidates.xyz, axis=-1)

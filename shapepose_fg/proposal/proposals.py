@@ -35,24 +35,47 @@ class ProposalConfig:
     hip_width_m: float = 0.4
     """Two hips of one person are not farther apart: their middle is a root where no two views saw one."""
     split_m: float = 0.4
-    """Two anchors nearer than this, with hardly a joint that both have, are one person's trunk and legs."""
+    """Two anchors nearer than this, with hardly a joint that both have, are one person's trunk and legs. 0: none
+    are, as in the paper."""
     split_shared: int = 2
     """Core joints that the two may both have."""
     min_own_views: int = 2
     """Views in which an anchor needs a detection of its own, not one that made a better anchor: where rays to
-    different people's hips cross, there is a candidate but nobody's."""
+    different people's hips cross, there is a candidate but nobody's. 0: it needs none, as in the paper."""
     min_grown_parts: float = 0.4
     """Least fraction of the core joints that must have a strong candidate linked to the hip: one whose upper body
     alone shows has 0.6. On simulated people in close motion real ones have over 0.47, and most phantoms, whose
-    joints belong to others, have less than 0.4."""
+    joints belong to others, have less than 0.4. The paper asks for none."""
+    weak_anchors: bool = True
+    """Whether weak hips, and middles between two hips, anchor people too where strong joints are left over that
+    nobody claims. In the paper only hips of three votes do."""
 
     growth: GrowthConfig = field(default_factory=GrowthConfig)
     """How a person is grown from the hip."""
 
+    @classmethod
+    def paper(cls) -> "ProposalConfig":
+        """As written in section 3.1: hips of three votes whose box holds 90 % of the parts.
+
+        Non-maximum suppression is all that stands against phantoms: 60 cm is the best of 20 to 80 on `tune`.
+        """
+        return cls(
+            separation_m=0.6,
+            min_parts=0.9,
+            min_own_views=0,
+            min_grown_parts=0.0,
+            split_m=0.0,
+            weak_anchors=False,
+            growth=GrowthConfig(bridge_m=0.0),
+        )
+
     def __post_init__(self) -> None:
-        for name in ("box_horizontal_m", "box_vertical_m", "separation_m", "hip_width_m", "split_m"):
+        for name in ("box_horizontal_m", "box_vertical_m", "separation_m", "hip_width_m"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        for name in ("split_m", "min_own_views"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
         for name in ("min_parts", "min_confidence", "min_grown_parts"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
@@ -95,7 +118,7 @@ def propose(
     roots = candidates.joint == skeleton.root
     anchors = search.anchors(np.flatnonzero(roots & candidates.strong), np.zeros(0, dtype=np.intp))
     anchors, chosen = search.linked(anchors)
-    for last_resort in (False, True):
+    for last_resort in (False, True) if config.weak_anchors else ():
         free = search.unclaimed(chosen)
         if free is None:
             break

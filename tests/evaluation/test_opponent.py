@@ -58,7 +58,7 @@ def test_matches_agree_over_all_views():
 
 
 def test_a_wrong_view_is_left_out(five_cameras, two_people):
-    """One of five views 20 cm off, another without the joint: the rest gives the point. Two that disagree: none."""
+    """One of five views 20 cm off, another without the joint: the rest decide. Two that disagree: none."""
     xy, depth = five_cameras.project(two_people[:1])
     xy, confidence = np.moveaxis(xy, 0, 2), np.full((1, 25, 5), 0.8)
     far_px = 0.2 * five_cameras.focal_px[0] / depth[0, 0]
