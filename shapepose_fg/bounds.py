@@ -7,6 +7,8 @@ from annotated_types import Interval
 
 Metres = Annotated[float, Interval(gt=0, le=10)]
 """A distance between joints, people or rays."""
+MetresOrNone = Annotated[float, Interval(ge=0, le=10)]
+"""The same, which may be 0: the setting's docstring says what that means."""
 Seconds = Annotated[float, Interval(gt=0, le=60)]
 """A time in which people move."""
 Speed = Annotated[float, Interval(gt=0, le=100)]

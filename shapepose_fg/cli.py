@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
@@ -225,15 +226,17 @@ def reconstruct(
 
 @evaluate.command("shelf")
 def evaluate_shelf_command(
-    people: Annotated[Path, typer.Option(help="people.npz of a reconstruction, or the folder it is in.")],
+    people: Annotated[
+        Path, typer.Option(help="people.npz, or its folder; 4D Association's text; TRC, or a folder of it.")
+    ],
     ground_truth: Annotated[Path, typer.Option(help="Annotation of the Shelf recording, as text.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
 ) -> None:
     """PCP per limb and actor, MPJPE and recall on the Shelf recording."""
+    from shapepose_fg.evaluation.other_results.reading import read_people
     from shapepose_fg.evaluation.shelf import evaluate_shelf, read_shelf_ground_truth
-    from shapepose_fg.reconstruction import Reconstruction
 
-    score = evaluate_shelf(Reconstruction.load(people), read_shelf_ground_truth(ground_truth))
+    score = evaluate_shelf(read_people(people), read_shelf_ground_truth(ground_truth))
     if as_json:
         print(json.dumps(score.as_dict(), indent=2, allow_nan=False))
     else:
@@ -330,13 +333,25 @@ def simulate(
     )
 
 
+class Preset(StrEnum):
+    """Settings that hang together."""
+
+    DEFAULT = "default"
+    PAPER = "paper"
+
+
 @app.command("config")
-def print_config() -> None:
-    """Print every setting with its default, as TOML."""
+def print_config(
+    preset: Annotated[
+        Preset,
+        typer.Option(help="paper: the method as it is written, without what is settled differently here."),
+    ] = Preset.DEFAULT,
+) -> None:
+    """Print every setting with its value, as TOML."""
     from shapepose_fg.io.config import toml_text
     from shapepose_fg.pipeline import PipelineConfig
 
-    print(toml_text(PipelineConfig()), end="")
+    print(toml_text(PipelineConfig.paper() if preset is Preset.PAPER else PipelineConfig()), end="")
 
 
 @app.command()

@@ -23,7 +23,6 @@ from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.bounds import Settings
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections, DetectionSequence
-from shapepose_fg.estimation.alternation import EstimatorConfig, RefineConfig
 from shapepose_fg.estimation.detector_offsets import (
     AdjustableFitter,
     OffsetConfig,
@@ -31,6 +30,7 @@ from shapepose_fg.estimation.detector_offsets import (
     spread_frames,
 )
 from shapepose_fg.estimation.estimator import Estimator, ExtraFactors
+from shapepose_fg.estimation.estimator_config import EstimatorConfig, RefineConfig
 from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
 from shapepose_fg.estimation.outcome import Problem
@@ -100,6 +100,23 @@ class PipelineConfig(Settings):
     threads: Annotated[int, Interval(ge=1, le=256)] = 1
     """Threads of torch while bodies are fitted: the matrices are small, and where cores are busy a second thread
     costs more than it brings."""
+
+    @classmethod
+    def paper(cls) -> "PipelineConfig":
+        """The method as the paper has it written in section 3, without what we settled differently."""
+        return cls(
+            candidates=CandidateConfig.paper(),
+            proposals=ProposalConfig.paper(),
+            association=AssociationConfig.paper(),
+            observations=ObservationConfig.paper(),
+            tracking=TrackingConfig(min_new_joints=1),
+            windows=WindowConfig(again_alone=0),
+            window_graph=WindowGraphConfig.paper(),
+            body=BodyConfig.paper(),
+            offsets=OffsetConfig(source="none"),
+            refine=RefineConfig.paper(),
+            temporal=False,
+        )
 
 
 def reconstruct(

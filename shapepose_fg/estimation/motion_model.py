@@ -16,10 +16,8 @@ FORMAT = "shapepose-fg motion model 1"
 
 @dataclass(frozen=True)
 class MotionConfig(Settings):
-    """Whether, and how, the frames of a person are solved together."""
+    """How the frames of a person are solved together."""
 
-    temporal: bool = True
-    """Rows of one track at several frames are one window. False: every frame stands alone."""
     model: str = ""
     """File of the motion model, as `scripts/measure_motion.py` writes it; empty: the one that ships."""
     psd_scale: Factor = 1.0
@@ -30,6 +28,9 @@ class MotionConfig(Settings):
     and in those around them, the difference between joint and body is followed (`factors.motion`)."""
     around_s: Seconds = 0.5
     """How far around them, seconds."""
+    keep_limbs: bool = True
+    """Whether joints that no view saw go to where a body can have them, and limbs with an open end get the body's
+    length: motion carries each joint by itself."""
 
 
 @dataclass(frozen=True)

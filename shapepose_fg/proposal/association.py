@@ -40,7 +40,12 @@ class AssociationConfig(Settings):
     """How often the choice is made again with the neighbours that the last one chose."""
     min_observed_parts: Share = 0.35
     """Least fraction of the core joints (trunk, arms, legs) that two views must see: 6 of 15. Of one whose upper
-    body alone shows there are 9."""
+    body alone shows there are 9. The paper asks for none."""
+
+    @classmethod
+    def paper(cls) -> "AssociationConfig":
+        """As written: whoever was proposed stays."""
+        return cls(min_observed_parts=0.0)
 
 
 def associate(

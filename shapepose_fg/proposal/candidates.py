@@ -15,6 +15,9 @@ from shapepose_fg.bounds import Count, Metres, Settings
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections
 
+_ANYWHERE_M = 10.0
+"""A gate that no pair of rays in a room fails."""
+
 
 @dataclass(frozen=True)
 class CandidateConfig(Settings):
@@ -34,6 +37,13 @@ class CandidateConfig(Settings):
     min_view_fraction: Annotated[float, Interval(gt=0, le=1)] = 1 / 6
     """Where there are very many views, chance crossings of rays have three votes, too: a strong candidate must
     have those of all pairs of this fraction of the views (30 cameras: 5 views, 10 votes; 18 and fewer: 3)."""
+    weak: bool = True
+    """Whether clusters of fewer votes are kept, as weak candidates. The paper drops them: a joint that two views
+    see is lost."""
+    weighted_centre: bool = True
+    """Whether the centre of a cluster is weighted by the squared confidence of its points. In the paper it is
+    their mean."""
+
     most_pairs: Annotated[int, Interval(ge=1000, le=1_000_000)] = 150_000
     """Pairs of detections of one joint that a frame may have: of more, each view keeps its most confident ones. 18
     a view before 30 cameras, 47 before 12, 122 before 5."""
@@ -42,6 +52,21 @@ class CandidateConfig(Settings):
     most_candidates: Annotated[int, Interval(ge=10, le=10_000)] = 250
     """Candidates of one joint: of more, those with most votes. Twelve people before 30 cameras have 220, half of
     them crossings of rays."""
+
+    @classmethod
+    def paper(cls) -> "CandidateConfig":
+        """As written in section 3.1: every pair is triangulated, wherever its rays pass; three points or none.
+
+        The paper does not say rho: 6 cm is the best of 5 to 12 on `tune`.
+        """
+        return cls(
+            gate_m=_ANYWHERE_M,
+            min_angle_deg=1e-3,
+            vote_radius_m=0.06,
+            min_view_fraction=1e-3,
+            weak=False,
+            weighted_centre=False,
+        )
 
 
 @dataclass(frozen=True)
@@ -130,7 +155,7 @@ def vote(points: PairPoints, detections: Detections, views: int, config: Candida
     count = cluster.max() + 1
     votes = np.bincount(cluster, minlength=count)
     # The centre of the cluster is weighted by confidence: one bad view must not drag the point of four good ones.
-    weight = points.score**2
+    weight = points.score**2 if config.weighted_centre else np.ones(len(points.score))
     total = np.bincount(cluster, weight, count)
     xyz = np.stack([np.bincount(cluster, weight * x, count) / total for x in points.xyz.T], axis=1)
     joint = np.zeros(count, dtype=np.intp)
@@ -142,7 +167,8 @@ def vote(points: PairPoints, detections: Detections, views: int, config: Candida
     # A detection that made a strong candidate is explained: what it makes with others' is a crossing of rays.
     explained = np.zeros(len(detections), dtype=bool)
     explained[support[strong[support[:, 0]], 1]] = True
-    keep = strong | (np.bincount(support[:, 0], ~explained[support[:, 1]], count) > 0)
+    unexplained = np.bincount(support[:, 0], ~explained[support[:, 1]], count) > 0
+    keep = strong | (unexplained & config.weak)
     support = support[keep[support[:, 0]]]
     support[:, 0] = (np.cumsum(keep) - 1)[support[:, 0]]
     return Candidates(xyz[keep], joint[keep], score[keep], votes[keep], strong[keep], support)

@@ -10,7 +10,7 @@ import numpy as np
 from annotated_types import Interval
 from numpy.typing import NDArray
 
-from shapepose_fg.bounds import Metres, RepeatsOrNone, Settings, Share
+from shapepose_fg.bounds import Metres, MetresOrNone, RepeatsOrNone, Settings, Share
 from shapepose_fg.detections import Detections
 from shapepose_fg.proposal.assignment import match_best_first
 from shapepose_fg.proposal.candidates import Candidates
@@ -30,9 +30,9 @@ class GrowthConfig(Settings):
     """No limb is longer: the trunk of a tall adult, hip to neck, is about 0.65 m."""
     sweeps: RepeatsOrNone = 2
     """How often the joints are chosen again once all their neighbours are known."""
-    bridge_m: Metres = 0.55
+    bridge_m: MetresOrNone = 0.55
     """Beyond a joint that nobody saw, the next is sought within this distance a bone of the last known one: from
-    hip to ankle of a tall adult it is 0.9 m."""
+    hip to ankle of a tall adult it is 0.9 m. 0: it is not sought, as in the paper."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ def _bridge(
     free[chosen[chosen >= 0]] = False
     loose = free & candidates.strong & ~(support > 0).any(axis=0)
     score = np.where(empty & free & (support > 0), support + evidence, 0.0)
-    if (empty & loose).any():
+    if config.bridge_m > 0 and (empty & loose).any():
         ancestor, bones = _nearest_known(chosen, skeleton)
         start = candidates.xyz[np.take_along_axis(chosen, ancestor, axis=1)]
         distance = np.linalg.norm(start[:, candidates.joint] - candidates.xyz, axis=-1)

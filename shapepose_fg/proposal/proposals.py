@@ -11,7 +11,7 @@ import numpy as np
 from annotated_types import Interval
 from numpy.typing import NDArray
 
-from shapepose_fg.bounds import Count, Metres, Settings, Share
+from shapepose_fg.bounds import Count, Metres, MetresOrNone, Settings, Share
 from shapepose_fg.detections import Detections
 from shapepose_fg.proposal.candidates import Candidates
 from shapepose_fg.proposal.growth import GrowthConfig, Links, grow, link
@@ -37,22 +37,42 @@ class ProposalConfig(Settings):
     deep and 30 cm wide: the middles of two are not closer even when people hug."""
     hip_width_m: Metres = 0.4
     """Two hips of one person are not farther apart: their middle is a root where no two views saw one."""
-    split_m: Metres = 0.4
-    """Two anchors nearer than this, with hardly a joint that both have, are one person's trunk and legs."""
+    split_m: MetresOrNone = 0.4
+    """Two anchors nearer than this, with hardly a joint that both have, are one person's trunk and legs. 0: none
+    are, as in the paper."""
     split_shared: Annotated[int, Interval(ge=0, le=1000)] = 2
     """Core joints that the two may both have."""
     min_own_views: Annotated[int, Interval(ge=0, le=1000)] = 2
     """Views in which an anchor needs a detection of its own, not one that made a better anchor: where rays to
-    different people's hips cross, there is a candidate but nobody's."""
+    different people's hips cross, there is a candidate but nobody's. 0: it needs none, as in the paper."""
     min_grown_parts: Share = 0.4
     """Least fraction of the core joints that must have a strong candidate linked to the hip: one whose upper body
     alone shows has 0.6. On simulated people in close motion real ones have over 0.47, and most phantoms, whose
-    joints belong to others, have less than 0.4."""
+    joints belong to others, have less than 0.4. The paper asks for none."""
+    weak_anchors: bool = True
+    """Whether weak hips, and middles between two hips, anchor people too where strong joints are left over that
+    nobody claims. In the paper only hips of three votes do."""
 
     most_people: Count = 64
     """People that are looked for in a frame, and hips between which nobody saw a mid-hip: the best come first."""
     growth: GrowthConfig = field(default_factory=GrowthConfig)
     """How a person is grown from the hip."""
+
+    @classmethod
+    def paper(cls) -> "ProposalConfig":
+        """As written in section 3.1: hips of three votes whose box holds 90 % of the parts.
+
+        Non-maximum suppression is all that stands against phantoms: 60 cm is the best of 20 to 80 on `tune`.
+        """
+        return cls(
+            separation_m=0.6,
+            min_parts=0.9,
+            min_own_views=0,
+            min_grown_parts=0.0,
+            split_m=0.0,
+            weak_anchors=False,
+            growth=GrowthConfig(bridge_m=0.0),
+        )
 
 
 @dataclass(frozen=True)
@@ -92,7 +112,7 @@ def propose(
     roots = candidates.joint == skeleton.root
     anchors = search.anchors(np.flatnonzero(roots & candidates.strong), np.zeros(0, dtype=np.intp))
     anchors, chosen = search.linked(anchors)
-    for last_resort in (False, True):
+    for last_resort in (False, True) if config.weak_anchors else ():
         free = search.unclaimed(chosen)
         if free is None:
             break
