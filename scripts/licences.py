@@ -16,9 +16,9 @@ EXTRAS = ("viewer", "detect", "export", "view")
 HEAD = """# Licences of what is installed with it
 
 `pip install shapepose-fg` brings the first table, its extras the second; what is only needed to test it is not
-listed. The names are those that each package's own metadata give. None asks that programs which use it be under its
-own licence. opencv-python-headless carries FFmpeg's libraries (LGPL-2.1) beside its own; they are separate files that
-may be exchanged.
+listed. The names are those that each package's own metadata give. None asks that programs which use it be under
+its own licence. opencv-python-headless carries FFmpeg's libraries (LGPL-2.1) beside its own; they are separate
+files that may be exchanged.
 
 Our code is MIT; what the body and priors are made from is in the [README](../README.md#licence-and-credits).
 """
