@@ -28,7 +28,7 @@ from shapepose_fg.options import (
 from shapepose_fg.overlay_command import overlay
 from shapepose_fg.report_command import report as report_command
 from shapepose_fg.setup_command import check_calibration
-from shapepose_fg.terminal import note, show, warn
+from shapepose_fg.terminal import note, show, use_any_streams, warn
 from shapepose_fg.terminal import progress as progress_bar
 from shapepose_fg.tracks_command import tracks
 from shapepose_fg.view_command import view
@@ -72,6 +72,7 @@ _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line. An error is one sentence on stderr and exit code 2."""
+    use_any_streams()
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     try:
         code = app(arguments or ["--help"], standalone_mode=False)

@@ -207,8 +207,8 @@ class ObservationTable:
     def load(cls, file: str | Path) -> "ObservationTable":
         """Read what `save` wrote; InputError, one sentence, on anything else."""
         file = Path(file)
-        columns = read_npz(file, _CURE)
         names = (*cls.ROWS, "joint_names", "view_names")
+        columns = read_npz(file, (*names, "gate_names"), _CURE)
         for name in (*names, "gate_names"):
             if name not in columns:
                 raise InputError(f"{file}: column {name} is missing; {_CURE}")

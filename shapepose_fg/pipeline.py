@@ -2,12 +2,13 @@
 
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Interval
 
 from shapepose_fg.bodies_over_time import Person, SequenceFitting, with_bodies_over_time
 from shapepose_fg.body.fitting.body_sequence import SequenceFit
@@ -19,6 +20,7 @@ from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.offsets.estimation import learn_offsets
 from shapepose_fg.body.shapes import SubjectShapes
 from shapepose_fg.body.threads import torch_threads
+from shapepose_fg.bounds import Settings
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections, DetectionSequence
 from shapepose_fg.estimation.detector_offsets import (
@@ -39,6 +41,7 @@ from shapepose_fg.observations import Observations
 from shapepose_fg.proposal.association import AssociationConfig, associate
 from shapepose_fg.proposal.candidates import CandidateConfig, triangulate_pairs, vote
 from shapepose_fg.proposal.proposals import ProposalConfig, propose
+from shapepose_fg.proposal.thinning import ThinnedFrames, thinned_candidates, thinned_points
 from shapepose_fg.provenance import versions
 from shapepose_fg.reconstruction import Reconstruction
 from shapepose_fg.skeleton import BODY_25, Skeleton
@@ -61,7 +64,7 @@ Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
-class PipelineConfig:
+class PipelineConfig(Settings):
     """The settings of every step, and how the work is cut."""
 
     candidates: CandidateConfig = field(default_factory=CandidateConfig)
@@ -92,9 +95,9 @@ class PipelineConfig:
     """Stage II: the alternation."""
     temporal: bool = True
     """People over time: identities, motion, one shape a person. Without it every frame stands alone."""
-    batch_frames: int = 96
+    batch_frames: Annotated[int, Interval(ge=1, le=10000)] = 96
     """Frames that are solved together and returned: bodies are fitted fastest by the hundred."""
-    threads: int = 1
+    threads: Annotated[int, Interval(ge=1, le=256)] = 1
     """Threads of torch while bodies are fitted: the matrices are small, and where cores are busy a second thread
     costs more than it brings."""
 
@@ -114,11 +117,6 @@ class PipelineConfig:
             refine=RefineConfig.paper(),
             temporal=False,
         )
-
-    def __post_init__(self) -> None:
-        for name in ("batch_frames", "threads"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
 
 
 def reconstruct(
@@ -155,6 +153,7 @@ def reconstruct(
     times.check(len(detections), len(rig))
     cuts = check_cuts(cuts, len(detections))
     run = _Run()
+    detections = ThinnedFrames(detections, len(rig), config.candidates)
     with run.stage("load"):
         if fitter is None:
             fitter = make_fitter(config.body, BodyModel.default().with_keypoints(detections.skeleton.joints))
@@ -222,9 +221,13 @@ def find_people(
     """Stage I, one frame: the people's 2D observations and where their joints are to begin with."""
     run = _Run() if run is None else run
     with run.stage("triangulate"):
-        points = triangulate_pairs(detections, rig, config.candidates)
+        every = triangulate_pairs(detections, rig, config.candidates)
+        points = thinned_points(every, config.candidates)
+        run.thin("points", len(points.xyz) < len(every.xyz))
     with run.stage("vote"):
-        candidates = vote(points, detections, len(rig), config.candidates)
+        every = vote(points, detections, len(rig), config.candidates)
+        candidates = thinned_candidates(every, detections, config.candidates)
+        run.thin("candidates", len(candidates) < len(every))
     with run.stage("propose"):
         proposals = propose(candidates, detections, skeleton, rig.up_vector, config.proposals)
     with run.stage("associate"):
@@ -266,13 +269,14 @@ def _engine(
 
 
 def _inputs(
-    detections: DetectionSequence, rig: Rig, frames: range, times: FrameTimes, run: "_Run"
+    detections: ThinnedFrames, rig: Rig, frames: range, times: FrameTimes, run: "_Run"
 ) -> Callable[[int], Input]:
     """What the cameras give of a frame."""
     of_views = times.of_views(len(rig))
 
     def read(frame: int) -> Input:
         with run.stage("read"):
+            run.thin("detections", detections.is_thinned(frame), frame)
             return Input(frame, of_views[frame], detections[frame], rig)
 
     return read
@@ -332,7 +336,7 @@ def _offsets(
         return learn_offsets(targets, fitter.model, config=config.body.plain, prior=config.offsets.prior)
 
 
-def _rows(solved: Solved, rig: Rig, detections: DetectionSequence, config: PipelineConfig) -> Reconstruction:
+def _rows(solved: Solved, rig: Rig, detections: ThinnedFrames, config: PipelineConfig) -> Reconstruction:
     """Solved rows as rows of the result, by frame and person; bodies that were not fitted are NaN there."""
     order = np.lexsort((solved.observations.track, solved.observations.frame))
     rows, estimates = solved.observations.rows(order), solved.estimates.rows(order)
@@ -340,7 +344,8 @@ def _rows(solved: Solved, rig: Rig, detections: DetectionSequence, config: Pipel
     place = np.full(rows.candidate.shape, -1, dtype=np.int32)
     for frame in np.unique(rows.frame).tolist():
         of_frame = rows.frame == frame
-        place[of_frame] = place_in_view(rows.candidate[of_frame], detections[frame].view)
+        own = detections.in_recording(frame, rows.candidate[of_frame])
+        place[of_frame] = place_in_view(own, detections.frames[frame].view)
     return result_rows(rows, estimates, place, rig, detections.skeleton.joints, person)
 
 
@@ -364,6 +369,11 @@ def _number_in_frame(frame: np.ndarray) -> np.ndarray:
     return np.arange(len(frame)) - np.searchsorted(frame, frame)
 
 
+def _spans_by_name(frames: Mapping[str, set[int]]) -> dict[str, list[list[int]]]:
+    """Frames as [start, stop), by what became of them."""
+    return {name: [[span.start, span.stop] for span in spans_of(numbers)] for name, numbers in frames.items()}
+
+
 class _Run:
     """What a run notes down for run.json."""
 
@@ -372,7 +382,16 @@ class _Run:
         self._inner = 0.0
         self.dropped: Counter[str] = Counter()
         self.dropped_frames: defaultdict[str, set[int]] = defaultdict(set)
+        self.thinned_frames: defaultdict[str, set[int]] = defaultdict(set)
         self.frame: int | None = None
+
+    def thin(self, what: str, is_thinned: bool, frame: int | None = None) -> None:
+        """Note down that some of the frame's detections or candidates were left out, because they were too
+        many.
+        """
+        frame = self.frame if frame is None else frame
+        if is_thinned and frame is not None:
+            self.thinned_frames[what].add(frame)
 
     def drop(self, reason: str, count: int) -> None:
         """Note down people of the present frame who were none, or too little is seen of."""
@@ -411,8 +430,6 @@ class _Run:
                 **people.counts(),
                 "dropped": {reason: count for reason, count in self.dropped.items() if count > 0},
             },
-            "dropped_frames": {
-                reason: [[span.start, span.stop] for span in spans_of(frames)]
-                for reason, frames in self.dropped_frames.items()
-            },
+            "dropped_frames": _spans_by_name(self.dropped_frames),
+            "thinned_frames": _spans_by_name(self.thinned_frames),
         }

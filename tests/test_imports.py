@@ -14,7 +14,8 @@ ROOT = Path(__file__).parents[1]
 LEVELS = (
     "factors errors",
     "camera skeleton",
-    "files provenance result_options rendering run_summary columns workers body.threads options terminal",
+    "files bounds",
+    "provenance result_options rendering run_summary columns workers body.threads options terminal",
     "body.model",
     "body.fitting body.shapes",
     "body.offsets",
