@@ -215,7 +215,7 @@ def test_frames_are_half_open(recording, pipeline, text, frames):
         (["--up", "up"], "up must be one of x -x y -y z -z, got 'up'"),
         (["--unit", "inch"], "unit must be one of m cm mm, got 'inch'"),
         (["--config", "/nothing.toml"], "/nothing.toml: there is no such file; check the path"),
-        (["--body", "/nothing.npz"], "/nothing.npz: no such file"),
+        (["--body", "/nothing.npz"], "/nothing.npz: there is no such file"),
         (["--calibration", "/nothing.json"], "/nothing.json: there is no such file; check the path"),
         (["--detections", "/nothing"], "/nothing: there is no such folder; check the path of the detections"),
         (["--output", f"{__file__}/out"], "out: results cannot be written here (Not a directory); give a folder"),
