@@ -20,6 +20,7 @@ from shapepose_fg.overlay_command import overlay
 from shapepose_fg.reconstruct_command import reconstruct
 from shapepose_fg.report_command import report as report_command
 from shapepose_fg.setup_command import check_calibration
+from shapepose_fg.stopping import Stopped, stoppable
 from shapepose_fg.terminal import progress as progress_bar
 from shapepose_fg.terminal import show
 from shapepose_fg.tracks_command import tracks
@@ -55,8 +56,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line. An error is one sentence on stderr and exit code 2."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        code = app(arguments or ["--help"], standalone_mode=False)
-        sys.stdout.flush()
+        with stoppable():
+            code = app(arguments or ["--help"], standalone_mode=False)
+            sys.stdout.flush()
     except _UsageProblem as error:
         code = _fail(f"{cast(Any, error).format_message().rstrip('.')}; see shapepose-fg --help")
     except InputError as error:
@@ -68,6 +70,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except OSError as error:
         place = f"{error.filename}: " if error.filename is not None else ""
         code = _fail(f"{place}{error.strerror or error}; check the path, its permissions and the space left")
+    except Stopped as stop:
+        _say("stopped", stop.message or "nothing is left half written", "bold yellow")
+        code = stop.exit_code
     except (typer.Abort, KeyboardInterrupt):
         code = 130
     sys.exit(code if isinstance(code, int) else 0)
@@ -200,12 +205,16 @@ def version() -> None:
 
 def _fail(message: str) -> int:
     """Say what went wrong, in one line on stderr."""
+    _say("error", message, "bold red")
+    return 2
+
+
+def _say(what: str, message: str, style: str) -> None:
     from rich.console import Console
     from rich.text import Text
 
-    line = Text.assemble(("error: ", "bold red"), " ".join(message.split()))
+    line = Text.assemble((f"{what}: ", style), " ".join(message.split()))
     Console(stderr=True).print(line, soft_wrap=True)
-    return 2
 
 
 if __name__ == "__main__":

@@ -85,9 +85,12 @@ def write_together(files: Mapping[Path, Callable[[BinaryIO], object]]) -> None:
         _sync_folder(folder)
 
 
-def sweep(folder: Path, name: str) -> None:
-    """Remove what a killed process left of the file `name` in `folder`; nobody else may be writing it."""
-    for left in folder.glob(f".{glob.escape(name)}.*{_PART}"):
+def sweep(folder: Path, name: str | None = None) -> None:
+    """Remove what a killed process was writing in `folder`, as the file `name` or as any.
+
+    Nobody else may be writing there.
+    """
+    for left in folder.glob(f".*{_PART}" if name is None else f".{glob.escape(name)}.*{_PART}"):
         left.unlink(missing_ok=True)
 
 

@@ -3,6 +3,7 @@
 import hashlib
 import platform
 from collections.abc import Iterable
+from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 
@@ -37,6 +38,45 @@ def checksums(inputs: Iterable[str | Path]) -> dict[str, str]:
     A recording of 10,000 JSON files is one line of run.json, and a file renamed or lost changes it.
     """
     return {str(path): _digest(Path(path)) for path in inputs}
+
+
+class ReadInputs:
+    """Input files while they are read: their checksums are those of what was read, or it is said.
+
+    Made before anything is read; `checksums` comes when all has been.
+    """
+
+    def __init__(self, paths: Iterable[str | Path | None]) -> None:
+        self._before = {Path(path): _state(Path(path)) for path in paths if path is not None}
+
+    def checksums(self, inputs: Iterable[str | Path | None]) -> dict[str, str]:
+        """`checksums` of what was read; InputError where a file has changed since this was made."""
+        found = checksums(path for path in inputs if path is not None)
+        for path, state in self._before.items():
+            if _state(path) != state:
+                raise InputError(f"{path}: this changed while it was read; start again when it is written")
+        return found
+
+
+def program_digest() -> str:
+    """sha256 of this program itself, its data included: whether two runs are by the same version."""
+    whole, here = hashlib.sha256(), Path(__file__).parent
+    for package in (here, here.with_name("factors")):
+        for file in sorted(package.rglob("*")):
+            if file.suffix in (".py", ".npz", ".json", ".safetensors"):
+                whole.update(f"{file.relative_to(package).as_posix()} {_digest(file)}\n".encode())
+    return whole.hexdigest()
+
+
+def _state(path: Path) -> list[tuple[str, int, int]]:
+    """Names, sizes and times of last change of a file, or of the files in a folder; empty where there is none."""
+    files = sorted(path.rglob("*")) if path.is_dir() else [path]
+    found = []
+    for file in files:
+        with suppress(OSError):
+            state = file.stat()
+            found.append((str(file), state.st_size, state.st_mtime_ns))
+    return found
 
 
 def _version(distribution: str) -> str | None:
