@@ -47,14 +47,18 @@ class ReadInputs:
     """
 
     def __init__(self, paths: Iterable[str | Path | None]) -> None:
-        self._before = {Path(path): _state(Path(path)) for path in paths if path is not None}
+        self._before = _states(paths)
 
     def checksums(self, inputs: Iterable[str | Path | None]) -> dict[str, str]:
-        """`checksums` of what was read; InputError where a file has changed since this was made."""
-        found = checksums(path for path in inputs if path is not None)
-        for path, state in self._before.items():
-            if _state(path) != state:
-                raise InputError(f"{path}: this changed while it was read; start again when it is written")
+        """`checksums` of what was read; InputError where one of these files has changed since this was made.
+
+        `inputs` are, or are in, the files and folders that this was made of.
+        """
+        inputs = [path for path in inputs if path is not None]
+        found = checksums(inputs)
+        for file, state in _states(inputs).items():
+            if self._before.get(file) != state:
+                raise InputError(f"{file}: this changed while it was read; start again when it is written")
         return found
 
 
@@ -68,14 +72,15 @@ def program_digest() -> str:
     return whole.hexdigest()
 
 
-def _state(path: Path) -> list[tuple[str, int, int]]:
-    """Names, sizes and times of last change of a file, or of the files in a folder; empty where there is none."""
-    files = sorted(path.rglob("*")) if path.is_dir() else [path]
-    found = []
-    for file in files:
-        with suppress(OSError):
-            state = file.stat()
-            found.append((str(file), state.st_size, state.st_mtime_ns))
+def _states(paths: Iterable[str | Path | None]) -> dict[Path, tuple[int, int]]:
+    """Size and time of last change of files, and of the files of numbers in folders."""
+    found = {}
+    for path in (Path(path) for path in paths if path is not None):
+        files = (file for file in path.rglob("*") if file.suffix in _INPUTS) if path.is_dir() else (path,)
+        for file in files:
+            with suppress(OSError):
+                state = file.stat()
+                found[file] = (state.st_size, state.st_mtime_ns)
     return found
 
 

@@ -18,7 +18,7 @@ from shapepose_fg.options import (
     image_size_of,
 )
 from shapepose_fg.output_folder import only_run_in
-from shapepose_fg.reconstruct_inputs import cuts_of, places, project_of, times_of
+from shapepose_fg.reconstruct_inputs import cuts_of, fitter_of, places, project_of, times_of
 from shapepose_fg.result_files import OBSERVATIONS, PEOPLE, RUN
 from shapepose_fg.terminal import note
 
@@ -91,7 +91,7 @@ def reconstruct(
     from shapepose_fg.io.config import read_config
     from shapepose_fg.io.corrections import refuse_corrected
     from shapepose_fg.io.detections import read_detections
-    from shapepose_fg.provenance import ReadInputs
+    from shapepose_fg.provenance import ReadInputs, checksums
 
     check_workers(workers)
     if resume and restart:
@@ -127,17 +127,10 @@ def reconstruct(
             raise InputError("--project: its files need people over time; leave out --no-temporal, or --project")
         source = settings.offsets.source
         offsets = None if source in ("recording", "none") else Path(source)
-        job = Job(
-            rig,
-            recording,
-            settings,
-            span,
-            times,
-            first_frames,
-            body,
-            shapes,
-            inputs=reading.checksums((calibration, *recording.sources, config, body, offsets, timestamps)),
-        )
+        fitter = fitter_of(body, settings, recording.skeleton.joints)
+        inputs = reading.checksums((calibration, *recording.sources, config, body, timestamps))
+        inputs |= {} if offsets is None else checksums([offsets])
+        job = Job(rig, recording, settings, span, times, first_frames, body, fitter, shapes, inputs)
         # Of its own detections `detect` knows which pictures they are of.
         own = (detections / "footage.json").is_file()
         videos = None if whole is None or own else whole.folder / "videos"

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.shapes import SubjectShapes
 from shapepose_fg.camera import Rig
 from shapepose_fg.errors import InputError
@@ -18,7 +19,7 @@ from shapepose_fg.kept_arrays import KeptArrays
 from shapepose_fg.pipeline import FRAMES_WORTH_A_WORKER, PipelineConfig, reconstruct_parts
 from shapepose_fg.provenance import program_digest, versions
 from shapepose_fg.reconstruct_ending import Ending
-from shapepose_fg.reconstruct_inputs import fitter_of, known_shapes
+from shapepose_fg.reconstruct_inputs import known_shapes
 from shapepose_fg.reconstruct_summary import show_check
 from shapepose_fg.runs.known_people import checksum_at_start, people_at_start, write_people
 from shapepose_fg.runs.manifest import PARTS, end_run, frames_done, open_run
@@ -47,6 +48,8 @@ class Job:
     """First frames of what follows a cut."""
     body: Path | None
     """File of the body model; None for the one that ships."""
+    fitter: BodyFitter | None
+    """The fitter with that model; None for the pipeline's own."""
     shapes: Path | None
     """File of people's shapes."""
     inputs: dict[str, str]
@@ -116,7 +119,7 @@ def _run(job: Job, output: Path, ending: Ending, kept: KeptArrays, workers: int 
             job.rig,
             job.settings,
             frames=job.frames,
-            fitter=fitter_of(job.body, job.settings, job.recording.skeleton.joints),
+            fitter=job.fitter,
             times=job.times,
             cuts=job.cuts,
             shapes=known,
