@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 LEVELS = (
     "factors errors",
     "camera skeleton",
-    "files",
+    "files bounds",
     "output_folder npz_writer kept_arrays provenance result_options rendering run_summary columns workers"
     " body.threads options terminal stopping",
     "result_files",

@@ -103,7 +103,7 @@ class SubjectShapes:
     def load(cls, file: str | Path, body: str) -> "SubjectShapes":
         """Read what `save` wrote, of the model with the fingerprint `body`; InputError on anything else."""
         file = Path(file)
-        columns = read_npz(file, _CURE)
+        columns = read_npz(file, _COLUMNS, _CURE)
         for name in _COLUMNS:
             if name not in columns:
                 raise InputError(f"{file}: column {name} is missing; {_CURE}")

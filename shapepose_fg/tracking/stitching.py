@@ -2,38 +2,36 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Interval
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from shapepose_fg.bounds import Metres, Settings
 from shapepose_fg.skeleton import Skeleton
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class StitchingConfig:
+class StitchingConfig(Settings):
     """When two tracks are one person."""
 
-    longest_gap_s: float = 10.0
+    longest_gap_s: Annotated[float, Interval(ge=0, le=86400)] = 10.0
     """Nobody is recognised after a longer time. 0: tracks are never joined."""
-    reach_m: float = 0.5
+    reach_m: Annotated[float, Interval(ge=0, le=10)] = 0.5
     """How far from where a track ended the next may begin, at once."""
-    walk_mps: float = 1.5
+    walk_mps: Annotated[float, Interval(ge=0, le=100)] = 1.5
     """And how much farther per second: people walk at 1.4 m/s."""
-    bone_sigma_m: float = 0.015
+    bone_sigma_m: Metres = 0.015
     """Error of a bone's mean length in a track: errors of detectors last, so that it does not vanish with time."""
-    least_rows: int = 10
+    least_rows: Annotated[int, Interval(ge=0, le=1000)] = 10
     """Rows that a track needs for its build to be known."""
-    build: float = 2.0
+    build: Annotated[float, Interval(ge=0, le=1000000.0)] = 2.0
     """Mean squared difference of bone lengths, in their standard deviations, up to which two builds are one. For
     one person it is 1 in the mean; lengths of adults differ by 2 to 3 cm, which gives 3 to 5."""
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not value >= 0 or (name == "bone_sigma_m" and value == 0):
-                raise ValueError(f"{name} must not be negative, got {value}")
 
 
 @dataclass(frozen=True)

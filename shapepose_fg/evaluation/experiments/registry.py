@@ -1,0 +1,68 @@
+"""Every experiment there is, in the order of the documents."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from shapepose_fg.evaluation import (
+    detector_agreement,
+    fitter_tables,
+    scene_tables,
+    sequence_difficulty,
+    shelf_tables,
+    visibility_agreement,
+)
+from shapepose_fg.evaluation.experiments import box, crowd, footage, over_time
+from shapepose_fg.evaluation.experiments.experiment import Experiment, whole
+from shapepose_fg.evaluation.experiments.scale import Scale
+
+
+def experiments(scale: Scale, images: Path | None = None) -> Iterator[Experiment]:
+    """Those whose data are there; figures are drawn into the folder `images`, or not at all."""
+    yield from _shelf(scale)
+    yield from _scenes(scale)
+    if scale.has_scenes:
+        yield over_time.experiment(scale, temporal=True)
+        yield over_time.experiment(scale, temporal=False)
+    yield crowd.experiment(scale)
+    yield box.experiment(scale)
+    for make in (footage.shelf_events, footage.held_out_views, footage.single_person):
+        found = make(scale)
+        if found is not None:
+            yield found
+    if not scale.quick and scale.mocap is not None:
+        for name, table in fitter_tables.tables(scale.mocap, scale.shelf, images).items():
+            yield whole(name, table, "pipeline" if name == "fitter alternation" else "bodies")
+    if not scale.quick:
+        yield from _simulation(scale, images)
+
+
+def _shelf(scale: Scale) -> Iterator[Experiment]:
+    folder = scale.shelf
+    if folder is None or scale.quick:
+        return
+    yield whole("shelf", lambda: shelf_tables.shelf_table(shelf_tables.shelf_steps(folder)))
+    yield whole("shelf limbs", lambda: shelf_tables.limb_table(shelf_tables.shelf_steps(folder)))
+    yield whole("contradictions", lambda: shelf_tables.contradiction_table(folder))
+    yield whole("sigma", lambda: shelf_tables.sigma_table(folder))
+
+
+def _scenes(scale: Scale) -> Iterator[Experiment]:
+    """The built-in scene, every frame by itself."""
+    seeds = (scene_tables.DEMO, *scene_tables.SEEDS)
+    trials = [
+        scene_tables.Trial(seed, frames=10 if scale.quick else 60) for seed in seeds[: 2 if scale.quick else None]
+    ]
+    yield whole("scenes", lambda: scene_tables.scene_table(trials))
+    yield whole("alternation", lambda: scene_tables.alternation_table(trials))
+    yield whole("covariances", lambda: scene_tables.covariance_table(trials))
+    yield whole("cameras", lambda: scene_tables.camera_table(trials[1]))
+
+
+def _simulation(scale: Scale, images: Path | None) -> Iterator[Experiment]:
+    """The simulator itself."""
+    shelf, mocap = scale.shelf, scale.mocap
+    if shelf is not None:
+        yield whole("detector", lambda: detector_agreement.table(shelf, images), "detector")
+    if mocap is not None:
+        yield whole("difficulty", lambda: sequence_difficulty.table(mocap, ("tune", "report"), 20))
+    yield whole("visibility", visibility_agreement.table, "detector")
