@@ -1,6 +1,6 @@
 """The joints' step of the alternation: Levenberg-Marquardt in the graph, or Algorithm 1's gradient step."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -88,7 +88,7 @@ def _measure(stretch: Stretch, *, quick: bool) -> Figures:
     return figures
 
 
-def _figures(this: Alternated, best: Alternated, truth: np.ndarray, rows: Sequence[int]) -> Figures:
+def _figures(this: Alternated, best: Alternated, truth: np.ndarray, rows: np.ndarray) -> Figures:
     """Against the truth of matched rows, and against the minimum: both in the last energy of `best`."""
     error = np.linalg.norm(this.joints[rows] - truth, axis=-1)
     apart = np.linalg.norm(this.joints - best.joints, axis=-1)
