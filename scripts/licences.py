@@ -7,6 +7,7 @@ import re
 import tomllib
 from importlib.metadata import Distribution, PackageNotFoundError, distribution
 from pathlib import Path
+from typing import Any
 
 from packaging.requirements import Requirement
 
@@ -59,14 +60,13 @@ def needed(extras: tuple[str, ...]) -> dict[str, Distribution]:
 
 def licence(of: Distribution) -> str:
     """The licence that a distribution's metadata name, as short as they do."""
-    expression = of.metadata.get("License-Expression")
+    metadata: Any = of.metadata
+    expression = metadata.get("License-Expression")
     if expression:
         return expression
-    classifiers = [
-        each.split(" :: ")[-1] for each in of.metadata.get_all("Classifier", []) if each[:7] == "License"
-    ]
-    named = [_SHORT.get(each.lower(), each) for each in classifiers if each != "OSI Approved"]
-    text = (of.metadata.get("License") or "").strip()
+    classifiers = [each.split(" :: ")[-1] for each in metadata.get_all("Classifier", []) if each[:7] == "License"]
+    named: list[str] = [str(_SHORT.get(each.lower(), each)) for each in classifiers if each != "OSI Approved"]
+    text = (metadata.get("License") or "").strip()
     if text and len(text) < 40 and "\n" not in text:
         return text
     return " or ".join(named) if named else "see its own files"
