@@ -2,8 +2,8 @@
 
 Every frame is picked by a rule (`shapepose_fg/evaluation/pictures/choice.py`), none by hand.
 `bodies` and `bodies_shelf` are frames of middling error, or in the middle; `before_after` initial and final poses,
-`failures` the largest errors over time, `lost_limbs` the limb of each actor on Shelf that is lost for longest. Needs
-the recordings (`--data FOLDER`, or SHAPEPOSE_DATA) and matplotlib. Takes about five minutes.
+`failures` the largest errors over time, `lost_limbs` the limb of each of Shelf's actors that is lost for longest.
+Needs the recordings (`--data FOLDER`, or SHAPEPOSE_DATA) and matplotlib. Takes about five minutes.
 """
 
 import argparse

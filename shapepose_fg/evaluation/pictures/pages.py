@@ -106,7 +106,7 @@ def draw_lost_limbs(
     `rows` are the people that the events' actors take in those frames; bodies are ours, for there are no others.
     """
     page = _Page(columns=len(events), rows=2)
-    page.head("Shelf: each actor's limb that is lost for longest", "grey: our bodies; skeleton: ours; red: the annotation")
+    page.head("Shelf: limbs that are lost for longest", "grey: our bodies")
     page.legend({_ANNOTATED: "annotated limbs, the lost one thick", INK: "2D candidates"})
     body = BodyModel.default()
     for column, (event, row) in enumerate(zip(events, rows, strict=True)):
