@@ -1,10 +1,9 @@
-"""Tables of arrays with one row each: shapes and types checked, `.npz` files read and written."""
+"""Tables of arrays with one row each: shapes and types checked, `.npz` files read."""
 
-import io
 import math
 import os
 import zipfile
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from enum import IntEnum
 from pathlib import Path
 from typing import Any, cast
@@ -107,10 +106,3 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
         if np.any((letters > 0x10FFFF) | ((letters >= 0xD800) & (letters < 0xE000))):
             raise ValueError(f"{member.filename} holds letters that there are not")
     return array
-
-
-def npz_bytes(columns: Mapping[str, NDArray[Any]]) -> memoryview:
-    """The contents of a compressed `.npz` file."""
-    stream = io.BytesIO()
-    np.savez_compressed(stream, **cast(Any, dict(columns)))
-    return stream.getbuffer()

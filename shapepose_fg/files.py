@@ -1,12 +1,14 @@
 """Files, read within bounds and with one clear error, and written whole or not at all."""
 
+import glob
 import json
 import os
 import re
 import stat
 import tempfile
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -157,22 +159,59 @@ def _refuse_irregular(path: Path, mode: int) -> None:
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
     """Let `write` fill a temporary file beside `path`, then put it in place in one step.
 
-    Whoever reads `path`, whenever this process dies, finds the old file or the whole new one.
+    Whoever reads `path`, whenever this process dies, finds the old file or the whole new one. OSError that names
+    `path` where that fails.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-    temporary = Path(name)
+    write_together({path: write})
+
+
+def write_together(files: Mapping[Path, Callable[[BinaryIO], object]]) -> None:
+    """`write_atomically` of several files in order, none of which is put in place before all are complete."""
+    temporary: dict[Path, Path] = {}
     try:
-        with os.fdopen(handle, "wb") as stream:
-            write(stream)
-            stream.flush()
-            os.fsync(stream.fileno())
-        temporary.chmod(0o666 & ~_umask())  # mkstemp makes files that only their owner reads
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    _sync_folder(path.parent)
+        for path, write in files.items():
+            with _naming(path):
+                path.parent.mkdir(parents=True, exist_ok=True)
+                handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=_PART)
+                temporary[path] = Path(name)
+                with os.fdopen(handle, "wb") as stream:
+                    write(stream)
+                    stream.flush()
+                    os.fsync(stream.fileno())
+                Path(name).chmod(0o666 & ~_umask())  # mkstemp makes files that only their owner reads
+        for path in files:
+            with _naming(path):
+                temporary[path].replace(path)
+            del temporary[path]
+    finally:
+        for left in temporary.values():
+            left.unlink(missing_ok=True)
+    for folder in {path.parent for path in files}:
+        _sync_folder(folder)
+
+
+def sweep(folder: Path, name: str | None = None) -> None:
+    """Remove what a killed process was writing in `folder`, as the file `name` or as any.
+
+    Nobody else may be writing there.
+    """
+    for left in folder.glob(f".*{_PART}" if name is None else f".{glob.escape(name)}.*{_PART}"):
+        left.unlink(missing_ok=True)
+
+
+_PART = ".part"
+"""What temporary files end with."""
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """An OSError inside the block names `path`, where it names none, or a temporary file beside `path`."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is not None and not Path(str(error.filename)).name.startswith(f".{path.name}."):
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def _unique(pairs: list[tuple[str, Any]], path: Path) -> dict[str, Any]:

@@ -44,3 +44,9 @@ def frame_range(text: str | None, count: int) -> range:
             f"--frames {text}: not in the recording, which has {count} frames; give A:B with 0 <= A < B <= {count}"
         )
     return range(start, stop)
+
+
+def check_workers(workers: int | None) -> None:
+    """Refuse a number of processes that makes no sense."""
+    if workers is not None and not 1 <= workers <= 64:
+        raise InputError(f"--workers {workers}: must be 1 to 64; leave it out for as many as pay")

@@ -89,6 +89,7 @@ def test_file_has_the_columns_that_are_promised_and_nothing_pickled(tmp_path):
         "body_pose": (3, 23, 3),
         "transl": (3, 3),
         "status": (3,),
+        "run_id": (),
     }
 
 
