@@ -2,8 +2,8 @@
 
 Every frame is picked by a rule (`shapepose_fg/evaluation/pictures/choice.py`), none by hand.
 `bodies` and `bodies_shelf` are frames of middling error, or in the middle; `before_after` initial and final poses,
-`failures` the largest errors over time, `lost_limbs` the limbs that are lost for longest on Shelf. Needs the
-recordings (`--data FOLDER`, or SHAPEPOSE_DATA) and matplotlib. Takes about five minutes.
+`failures` the largest errors over time, `lost_limbs` the limb of each of Shelf's actors that is lost for longest.
+Needs the recordings (`--data FOLDER`, or SHAPEPOSE_DATA) and matplotlib. Takes about five minutes.
 """
 
 import argparse
@@ -30,8 +30,6 @@ from shapepose_fg.viewer import demo_picture
 
 FRAMES = 150
 """Of each stretch that examples are picked from."""
-LOST = 3
-"""Events on Shelf that are drawn, of different limbs."""
 
 
 def main() -> None:
@@ -101,7 +99,7 @@ def bodies_shelf(file: Path, folder: Path) -> None:
 
 
 def lost(file: Path, folder: Path) -> None:
-    """The limbs that are lost for longest on Shelf, one event for each limb of an actor."""
+    """The limb of each actor on Shelf that is lost for longest."""
     rig = read_rig(folder / "calibration.json")
     detections = read_detections(folder, rig)
     people = reconstruct(detections, rig)
@@ -109,8 +107,8 @@ def lost(file: Path, folder: Path) -> None:
     matched = match_actors(people, truth)
     longest = {}
     for event in sorted(lost_limbs(matched), key=lambda each: each.first - each.last):
-        longest.setdefault((event.actor, event.limb), event)
-    events, rows = list(longest.values())[:LOST], []
+        longest.setdefault(event.actor, event)
+    events, rows = list(longest.values()), []
     for event in events:
         own = np.flatnonzero(
             (matched.actor == ACTORS[event.actor - 1])

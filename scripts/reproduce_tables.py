@@ -19,7 +19,7 @@ from pathlib import Path
 import torch
 from marked_tables import IMAGES, ROOT, write_table
 
-from shapepose_fg.evaluation.experiments.fingerprint import fingerprint
+from shapepose_fg.evaluation.experiments.made_with import made_with
 from shapepose_fg.evaluation.experiments.registry import experiments
 from shapepose_fg.evaluation.experiments.runner import Kept, measured
 from shapepose_fg.evaluation.experiments.scale import Scale
@@ -59,7 +59,7 @@ def main() -> None:
         text = "\n".join(experiment.table(figures))
         print(f"{experiment.name} ({seconds:.0f} s)\n\n{text}\n", flush=True)
         if arguments.update:
-            write_table(experiment.name, text, fingerprint(experiment.basis))
+            write_table(experiment.name, text, made_with(experiment.basis))
     print(f"{total / 60:.0f} minutes in all" if not arguments.list else "")
 
 

@@ -6,15 +6,12 @@ import re
 import pytest
 
 from shapepose_fg.errors import InputError
-from shapepose_fg.estimation.window_graph import WindowGraphConfig
-from shapepose_fg.evaluation.experiments import fingerprint as module
 from shapepose_fg.evaluation.experiments import runner
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment
-from shapepose_fg.evaluation.experiments.fingerprint import fingerprint
+from shapepose_fg.evaluation.experiments.made_with import changes, fingerprint, made_with
 from shapepose_fg.evaluation.experiments.registry import experiments
 from shapepose_fg.evaluation.experiments.runner import Kept, measured
 from shapepose_fg.evaluation.experiments.scale import Scale
-from shapepose_fg.pipeline import PipelineConfig
 
 QUICK = {each.name: each for each in experiments(Scale(quick=True))}
 """Those that need no recording."""
@@ -62,7 +59,7 @@ def test_what_is_old_is_measured_again(why, tmp_path, monkeypatch):
     times: list[str] = []
     measured(counting(times), Kept(tmp_path, "full"), told=lambda _: None)
     if why == "other defaults":
-        monkeypatch.setattr(runner, "fingerprint", lambda basis: "00000000")
+        monkeypatch.setattr(runner, "made_with", lambda basis: made_with(basis) | {"temporal": "False"})
     scale = "quick" if why == "another scale" else "full"
     measured(counting(times), Kept(tmp_path, scale, afresh=why == "afresh"), told=lambda _: None)
     assert times == ["first", "second"] * 2
@@ -78,14 +75,22 @@ def test_damaged_figures_are_named(tmp_path):
         measured(counting([]), kept, told=lambda _: None)
 
 
-def test_fingerprints_are_of_what_they_are_called(monkeypatch):
-    fingerprint.cache_clear()
-    before = {basis: fingerprint(basis) for basis in ("pipeline", "bodies", "detector")}
-    assert len(set(before.values())) == 3
-    graph = WindowGraphConfig(rho_3d=0.5)
-    monkeypatch.setattr(module, "PipelineConfig", lambda: PipelineConfig(window_graph=graph))
-    fingerprint.cache_clear()
-    after = {basis: fingerprint(basis) for basis in before}
-    fingerprint.cache_clear()
-    changed = {basis for basis in before if before[basis] != after[basis]}
-    assert changed == {"pipeline"}
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"window_graph.rho_3d": "0.5"}, ["window_graph.rho_3d was 0.5, is 1.0"]),
+        ({"window_graph.no_longer": "3"}, []),
+        ({"body/data/gone.npz": "0123"}, ["body/data/gone.npz is gone"]),
+    ],
+)
+def test_what_makes_a_table_old(change, told):
+    now = made_with()
+    assert changes(now | change, now) == told
+    assert changes({name: value for name, value in now.items() if name != "temporal"}, now) == ["temporal is new"]
+
+
+def test_tables_depend_on_what_they_say():
+    every, bodies, detector = (made_with(basis) for basis in ("pipeline", "bodies", "detector"))
+    assert {f"body.{name}" if "/" not in name else name for name in bodies} <= set(every)
+    assert "simulation/data/detector.json" in detector and "window_graph.rho_3d" not in detector
+    assert len({fingerprint(each) for each in (every, bodies, detector)}) == 3

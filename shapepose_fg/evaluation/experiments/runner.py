@@ -9,7 +9,7 @@ from pathlib import Path
 
 from shapepose_fg.errors import InputError
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
-from shapepose_fg.evaluation.experiments.fingerprint import fingerprint
+from shapepose_fg.evaluation.experiments.made_with import changes, made_with
 from shapepose_fg.files import read_json, write_atomically
 
 
@@ -21,8 +21,7 @@ class Kept:
     """Where they are."""
     scale: str = ""
     """How much was measured: figures of another scale are measured again, and so are those that were made with
-    other defaults (`fingerprint`)."""
-
+    other defaults (`made_with`)."""
     afresh: bool = False
     """Whether to measure everything again."""
 
@@ -32,22 +31,18 @@ class Kept:
         if not file.is_file():
             return None
         kept = read_json(file)
-        if not isinstance(kept, dict) or kept.get("made_with") != self.made_with(experiment):
-            return None
         try:
-            return kept["figures"], float(kept["seconds"])
+            same = kept["scale"] == self.scale and not changes(kept["made_with"], made_with(experiment.basis))
+            return (kept["figures"], float(kept["seconds"])) if same else None
         except (KeyError, TypeError, ValueError):
             raise InputError(f"{file}: these are not figures of an experiment; delete it") from None
 
     def put(self, experiment: Experiment, case: Case, figures: Figures, seconds: float) -> None:
         """Keep figures."""
-        content = {"made_with": self.made_with(experiment), "seconds": seconds, "figures": figures}
+        made = made_with(experiment.basis)
+        content = {"seconds": seconds, "figures": figures, "scale": self.scale, "made_with": made}
         text = json.dumps(content, indent=1) + "\n"
         write_atomically(self._file(experiment, case), lambda stream: stream.write(text.encode()))
-
-    def made_with(self, experiment: Experiment) -> str:
-        """What figures of now are made with."""
-        return " ".join(filter(None, (fingerprint(experiment.basis), self.scale)))
 
     def words(self, experiment: Experiment) -> str:
         """How much of an experiment is kept, and the time that it took."""

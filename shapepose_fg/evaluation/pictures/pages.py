@@ -106,7 +106,7 @@ def draw_lost_limbs(
     `rows` are the people that the events' actors take in those frames; bodies are ours, for there are no others.
     """
     page = _Page(columns=len(events), rows=2)
-    page.head("Shelf: limbs that are lost for longest", "grey: our bodies; skeleton: ours; red: the annotation")
+    page.head("Shelf: limbs that are lost for longest", "grey: our bodies")
     page.legend({_ANNOTATED: "annotated limbs, the lost one thick", INK: "2D candidates"})
     body = BodyModel.default()
     for column, (event, row) in enumerate(zip(events, rows, strict=True)):
@@ -135,7 +135,7 @@ def draw_lost_limbs(
             for limb, ends in enumerate(LIMBS):
                 lost = LIMB_NAMES[limb] == event.limb
                 axes.plot(*xy[list(ends)].T, color=_ANNOTATED, lw=3.0 if lost else 1.0, zorder=4)
-            tag(axes, rig.cameras[view].name)
+            tag(axes, f"camera {rig.cameras[view].name}")
     page.save(file)
 
 
@@ -211,14 +211,17 @@ class _Page:
         self._page.text(1 - _GAP / self._across, y, note, va="center", ha="right", fontsize=8.5, color=QUIET)
 
     def legend(self, signs: dict[str, str]) -> None:
-        """What the colours mean."""
+        """What the colours mean: rings, but for detections, which are dots, and the annotation, which is lines."""
         from matplotlib.lines import Line2D
 
-        handles = [
-            Line2D([], [], lw=0, marker="o", ms=3 if colour == INK else 8, mec=colour, label=text,
-                   mfc=colour if colour == INK else "none", mew=1.8)
-            for colour, text in signs.items()
-        ]  # fmt: skip
+        handles = []
+        for colour, text in signs.items():
+            if colour == _ANNOTATED:
+                handles.append(Line2D([], [], lw=2.5, color=colour, label=text))
+                continue
+            dot = colour == INK
+            fill, size = (colour, 3) if dot else ("none", 8)
+            handles.append(Line2D([], [], lw=0, marker="o", ms=size, mec=colour, mfc=fill, mew=1.8, label=text))
         self._page.legend(
             handles=handles,
             loc="center left",
@@ -227,7 +230,7 @@ class _Page:
             frameon=False,
             fontsize=8.5,
             labelcolor=INK,
-            handletextpad=0.2,
+            handletextpad=0.4,
         )
 
     def label(self, row: int, column: int, text: str) -> None:
