@@ -1,10 +1,11 @@
 """The joints' step of the alternation: Levenberg-Marquardt in the graph, or Algorithm 1's gradient step."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.threads import torch_threads
@@ -20,7 +21,7 @@ from shapepose_fg.pipeline import PipelineConfig, find_people
 
 FRAMES = 60
 """Of each stretch."""
-STEPS_M2 = (1e-5, 3e-5, 1e-4, 3e-4, 1e-3)
+STEPS_M2 = (3e-6, 1e-5, 2e-5, 3e-5, 5e-5)
 """Step sizes lambda. Too large ones diverge: lambda times the information of six sure views must stay under 2."""
 ROUNDS, LONG_ROUNDS = 10, 100
 """N of Algorithm 1; and so many that small steps arrive."""
@@ -88,7 +89,7 @@ def _measure(stretch: Stretch, *, quick: bool) -> Figures:
     return figures
 
 
-def _figures(this: Alternated, best: Alternated, truth: np.ndarray, rows: Sequence[int]) -> Figures:
+def _figures(this: Alternated, best: Alternated, truth: np.ndarray, rows: NDArray[np.intp]) -> Figures:
     """Against the truth of matched rows, and against the minimum: both in the last energy of `best`."""
     error = np.linalg.norm(this.joints[rows] - truth, axis=-1)
     apart = np.linalg.norm(this.joints - best.joints, axis=-1)
