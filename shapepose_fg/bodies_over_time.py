@@ -1,8 +1,8 @@
 """One body per person over a recording: one shape, and poses that move as people do, fitted to solved joints."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from shapepose_fg.body.fitting.fitter import BodyFitter, JointTargets
 from shapepose_fg.body.fitting.weights import fingerprint
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.shapes import SubjectShapes, recognise
+from shapepose_fg.kept_arrays import InMemory, KeptArrays
 from shapepose_fg.reconstruction import Reconstruction, Status
 
 
@@ -48,68 +49,156 @@ class Person:
     shapes: Shapes | None = None
     """What is known of the shape, (1)."""
 
-    def fitted(self, fitter: SequenceFitting) -> SequenceFit:
+    @classmethod
+    def of(
+        cls,
+        number: int,
+        joints: NDArray[np.float64],
+        covariance: NDArray[np.float64],
+        time_s: NDArray[np.float64],
+    ) -> "Person":
+        """From the solved rows of one person: `joints` (N, J, 3), `covariance` (N, J, 3, 3), `time_s` (N,)."""
+        solved = np.isfinite(joints.sum(axis=-1)) & np.isfinite(covariance.sum(axis=(-1, -2)))
+        information = np.zeros_like(covariance)
+        information[solved] = np.linalg.inv(covariance[solved])
+        information = (information + information.swapaxes(-1, -2)) / 2
+        return cls(number, JointTargets(np.where(solved[..., None], joints, 0.0), information), time_s)
+
+    def fitted(self, fitter: SequenceFitting) -> "PersonBodies":
         """The bodies, and the shape that they share."""
-        return fitter.fit_sequence(self.targets, np.full(len(self.time_s), self.number), self.time_s, self.shapes)
+        group = np.full(len(self.time_s), self.number)
+        found = fitter.fit_sequence(self.targets, group, self.time_s, self.shapes)
+        fit = found.fit
+        return PersonBodies(fit.ok, fit.betas, fit.global_orient, fit.body_pose, fit.transl, found.shapes)
 
 
-Fits = Callable[[Iterable[Person]], Iterable[SequenceFit]]
+@dataclass(frozen=True)
+class PersonBodies:
+    """One person's bodies in N rows."""
+
+    ok: NDArray[np.bool_]
+    """(N,) which rows have one."""
+    betas: NDArray[np.float64]
+    """(N, 10), and the next three as in `Reconstruction`."""
+    global_orient: NDArray[np.float64]
+    body_pose: NDArray[np.float64]
+    transl: NDArray[np.float64]
+    shape: Shapes
+    """(1) what all rows say of the shape."""
+
+
+Fits = Callable[[Iterable[Person]], Iterable[PersonBodies]]
 """Fits the bodies of people, in order."""
+
+_COLUMNS = ("betas", "global_orient", "body_pose", "transl")
+
+
+@dataclass(frozen=True)
+class BodiesOverTime:
+    """Everybody's bodies, kept person by person."""
+
+    kept: KeptArrays
+    """Where they are."""
+    places: Mapping[int, str]
+    """Under which name each person's are."""
+    shapes: SubjectShapes
+    """Everybody's shape; those who were recognised by their known names."""
+
+    def filled(
+        self, column: str, values: NDArray[Any], person: NDArray[np.integer], before: Mapping[int, int]
+    ) -> NDArray[Any]:
+        """Rows of a column of a result with these bodies, where there are any; `status` says that there are.
+
+        `values` (R, ...) are the rows as they were, `person` (R,) whose they are, and `before` how many rows of
+        each person there are before them. Other columns stay as they are.
+        """
+        if column not in (*_COLUMNS, "status"):
+            return values
+        values = values.copy()
+        for number in np.unique(person).tolist():
+            mine = np.flatnonzero(person == number)
+            first = before.get(number, 0)
+            part = slice(first, first + len(mine))
+            ok = self.kept.array(self.places[number], "ok", part)
+            if column == "status":
+                undetermined = values[mine] == Status.BODY_UNDETERMINED
+                values[mine[ok & undetermined]] = Status.OK
+            else:
+                values[mine[ok]] = self.kept.array(self.places[number], column, part)[ok]
+        return values
+
+
+def fit_everybody(
+    numbers: Sequence[int],
+    person: Callable[[int], Person],
+    fits: Fits,
+    kept: KeptArrays,
+    known: SubjectShapes,
+) -> BodiesOverTime:
+    """Fit one body per person to the joints as they were solved; who is kept already is not fitted again.
+
+    `known` are people from other recordings: who is recognised by shape (`recognise`) is fitted again with that as
+    the prior. `person` gives what somebody's bodies are fitted to, `fits` fits people, side by side if it likes.
+    """
+    places = {number: f"bodies-{number}" for number in numbers}
+    _fit_missing(places, lambda number: person(number), fits, kept)
+    whose = recognise(_subjects(places, kept, known.body), known)
+    met = {numbers[n]: int(whose[n]) for n in np.flatnonzero(whose >= 0).tolist()}
+    again = {number: f"recognised-{number}" for number in met}
+    _fit_missing(
+        again, lambda number: replace(person(number), shapes=_prior(known, np.array([met[number]]))), fits, kept
+    )
+    places |= again
+    names = _names(np.array(numbers, dtype=np.intp), known, whose)
+    return BodiesOverTime(kept, places, _subjects(places, kept, known.body).named(names))
 
 
 def with_bodies_over_time(
-    people: Reconstruction,
-    fitter: SequenceFitting,
-    known: SubjectShapes | None = None,
-    fits: Fits | None = None,
+    people: Reconstruction, fitter: SequenceFitting, known: SubjectShapes | None = None
 ) -> Reconstruction:
     """The same rows with one body per person, fitted to the joints as they were solved, and everybody's shape.
 
-    `known` are people from other recordings: who is recognised by shape (`recognise`) is fitted again with that as
-    the prior. Nothing of this returns into the joints or their covariances. Rows without a body keep the body that
-    they had. `shapes` of the result are everybody's, those who were recognised by their known names. `fits` fits
-    people with `fitter` elsewhere, side by side.
+    `known`: see `fit_everybody`. Nothing of this returns into the joints or their covariances. Rows without a body
+    keep the body that they had. `shapes` of the result are everybody's.
     """
     if len(people) == 0:
         return people
-    solved = np.isfinite(people.joints.sum(axis=-1)) & np.isfinite(people.covariance.sum(axis=(-1, -2)))
-    information = np.zeros_like(people.covariance)
-    information[solved] = np.linalg.inv(people.covariance[solved])
-    information = (information + information.swapaxes(-1, -2)) / 2
-    xyz = np.where(solved[..., None], people.joints, 0.0)
-    numbers = np.unique(people.person)
-    rows = [np.flatnonzero(people.person == number) for number in numbers]
-    everybody = [
-        Person(int(number), JointTargets(xyz[mine], information[mine]), people.time_s[mine])
-        for number, mine in zip(numbers, rows, strict=True)
-    ]
-    fits = (lambda persons: (person.fitted(fitter) for person in persons)) if fits is None else fits
-    found = list(fits(everybody))
-    body = fingerprint(fitter.model)
-    known = SubjectShapes.empty(body) if known is None else known
-    whose = recognise(_subjects(found, body), known)
-    met = np.flatnonzero(whose >= 0).tolist()
-    if len(met) > 0:
-        prior = [_prior(known, whose[[n]]) for n in met]
-        again = fits(replace(everybody[n], shapes=shape) for n, shape in zip(met, prior, strict=True))
-        for n, fit in zip(met, again, strict=True):
-            found[n] = fit
-    columns = {name: getattr(people, name).copy() for name in ("betas", "global_orient", "body_pose", "transl")}
-    status = people.status.copy()
-    for mine, each in zip(rows, found, strict=True):
-        done = mine[each.fit.ok]
-        for name, column in columns.items():
-            column[done] = getattr(each.fit, name)[each.fit.ok]
-        status[done[status[done] == Status.BODY_UNDETERMINED]] = Status.OK
-    shapes = _subjects(found, body).named(_names(numbers.astype(np.intp), known, whose))
-    return replace(people, status=status, shapes=shapes, **columns)
+    known = SubjectShapes.empty(fingerprint(fitter.model)) if known is None else known
+    if known.body != fingerprint(fitter.model):
+        raise ValueError("shapes must be of the same body model as the fitter's")
+
+    def person(number: int) -> Person:
+        mine = people.person == number
+        return Person.of(number, people.joints[mine], people.covariance[mine], people.time_s[mine])
+
+    bodies = fit_everybody(
+        np.unique(people.person).tolist(),
+        person,
+        lambda jobs: (job.fitted(fitter) for job in jobs),
+        InMemory(),
+        known,
+    )
+    columns = {
+        name: bodies.filled(name, getattr(people, name), people.person, {}) for name in (*_COLUMNS, "status")
+    }
+    return replace(people, shapes=bodies.shapes, **columns)
 
 
-def _subjects(found: Sequence[SequenceFit], body: str) -> SubjectShapes:
+def _fit_missing(places: Mapping[int, str], person: Callable[[int], Person], fits: Fits, kept: KeptArrays) -> None:
+    """Fit who is not kept, and keep them."""
+    there = set(kept.names(""))
+    missing = [number for number, place in places.items() if place not in there]
+    for number, bodies in zip(missing, fits(map(person, missing)), strict=True):
+        arrays = {name: getattr(bodies, name) for name in ("ok", *_COLUMNS)}
+        kept.keep(places[number], arrays | {"mean": bodies.shape.mean, "information": bodies.shape.information})
+
+
+def _subjects(places: Mapping[int, str], kept: KeptArrays, body: str) -> SubjectShapes:
     """Everybody's shape, named by their numbers."""
-    names = np.array([str(group) for each in found for group in each.groups.tolist()])
-    mean = np.concatenate([each.shapes.mean for each in found])
-    return SubjectShapes(names, mean, np.concatenate([each.shapes.information for each in found]), body)
+    mean, information = (
+        np.concatenate([kept.array(place, name) for place in places.values()]) for name in ("mean", "information")
+    )
+    return SubjectShapes(np.array([str(number) for number in places]), mean, information, body)
 
 
 def _prior(known: SubjectShapes, whose: NDArray[np.intp]) -> Shapes:

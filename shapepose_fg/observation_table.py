@@ -10,10 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.camera import Rig
-from shapepose_fg.columns import check_codes, checked, code_names, npz_bytes, read_npz
+from shapepose_fg.columns import check_codes, checked, code_names, read_npz
 from shapepose_fg.errors import InputError
 from shapepose_fg.files import write_atomically
+from shapepose_fg.npz_writer import Column, write_npz
 from shapepose_fg.observations import Observations
+from shapepose_fg.result_files import RUN_ID, check_id
 from shapepose_fg.skeleton import BODY_25
 
 _CURE = "give the observations.npz of a reconstruction"
@@ -193,22 +195,25 @@ class ObservationTable:
         names = code_names(Gate).tolist()
         return {names[gate]: int(count[gate]) for gate in Gate if gate != Gate.NOT_SEEN}
 
-    def to_bytes(self) -> memoryview:
-        """The contents of observations.npz."""
-        columns = {name: getattr(self, name) for name in (*self.ROWS, "joint_names", "view_names")}
-        return npz_bytes(columns | {"gate_names": code_names(Gate)})
+    def columns(self) -> dict[str, Column]:
+        """What observations.npz holds."""
+        arrays = {name: getattr(self, name) for name in (*self.ROWS, "joint_names", "view_names")}
+        return {name: Column.of(array) for name, array in (arrays | {"gate_names": code_names(Gate)}).items()}
 
     def save(self, file: str | Path) -> None:
         """Write the table as `file`, whole or not at all; NumPy alone reads it (docs/conventions.md)."""
-        content = self.to_bytes()
-        write_atomically(Path(file), lambda stream: stream.write(content))
+        write_atomically(Path(file), lambda stream: write_npz(stream, self.columns()))
 
     @classmethod
-    def load(cls, file: str | Path) -> "ObservationTable":
-        """Read what `save` wrote; InputError, one sentence, on anything else."""
+    def load(cls, file: str | Path, run_id: object = None) -> "ObservationTable":
+        """Read what `save` wrote; InputError, one sentence, on anything else.
+
+        `run_id` is that of the people whose observations they must be (`result_files.check_id`).
+        """
         file = Path(file)
-        columns = read_npz(file, _CURE)
         names = (*cls.ROWS, "joint_names", "view_names")
+        columns = read_npz(file, (*names, "gate_names", RUN_ID), _CURE)
+        check_id(run_id, columns.get(RUN_ID), file)
         for name in (*names, "gate_names"):
             if name not in columns:
                 raise InputError(f"{file}: column {name} is missing; {_CURE}")

@@ -1,24 +1,24 @@
 """The whole way: triangulate, vote, propose, associate; follow, solve in windows, put bodies on; rows out."""
 
-import time
-from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Interval
 
-from shapepose_fg.bodies_over_time import Person, SequenceFitting, with_bodies_over_time
-from shapepose_fg.body.fitting.body_sequence import SequenceFit
+from shapepose_fg.bodies_over_time import Person, PersonBodies, SequenceFitting, fit_everybody
 from shapepose_fg.body.fitting.bone_reach import longest_bones
 from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.fitting.fitters import BodyConfig, make_fitter
+from shapepose_fg.body.fitting.weights import fingerprint
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.offsets.estimation import learn_offsets
 from shapepose_fg.body.shapes import SubjectShapes
 from shapepose_fg.body.threads import torch_threads
+from shapepose_fg.bounds import Settings
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections, DetectionSequence
 from shapepose_fg.estimation.detector_offsets import (
@@ -31,20 +31,25 @@ from shapepose_fg.estimation.estimator import Estimator, ExtraFactors
 from shapepose_fg.estimation.estimator_config import EstimatorConfig, RefineConfig
 from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
-from shapepose_fg.estimation.outcome import Problem
 from shapepose_fg.estimation.window_graph import WindowGraphConfig
 from shapepose_fg.frame_times import FrameTimes, check_cuts, spans_of, stretches
+from shapepose_fg.kept_arrays import InMemory, KeptArrays
 from shapepose_fg.observation_table import place_in_view
 from shapepose_fg.observations import Observations
 from shapepose_fg.proposal.association import AssociationConfig, associate
 from shapepose_fg.proposal.candidates import CandidateConfig, triangulate_pairs, vote
 from shapepose_fg.proposal.proposals import ProposalConfig, propose
+from shapepose_fg.proposal.thinning import ThinnedFrames, thinned_candidates, thinned_points
 from shapepose_fg.provenance import versions
 from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.runs.assembly import Assembly
+from shapepose_fg.runs.checkpoint import Checkpoint
+from shapepose_fg.runs.notes import Notebook, Notes
+from shapepose_fg.runs.parts import Part, Parts
 from shapepose_fg.skeleton import BODY_25, Skeleton
 from shapepose_fg.solved_rows import result_rows
 from shapepose_fg.tracking.following import FollowingConfig, Input
-from shapepose_fg.tracking.stitching import StitchingConfig, stitch
+from shapepose_fg.tracking.stitching import StitchingConfig, Traces, stitch
 from shapepose_fg.tracking.tracker import BodyScale, Tracker, TrackingConfig
 from shapepose_fg.windows import Engine, Solved, Span, WindowConfig, WindowSolver
 from shapepose_fg.workers import Workers
@@ -61,7 +66,7 @@ Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
-class PipelineConfig:
+class PipelineConfig(Settings):
     """The settings of every step, and how the work is cut."""
 
     candidates: CandidateConfig = field(default_factory=CandidateConfig)
@@ -92,9 +97,9 @@ class PipelineConfig:
     """Stage II: the alternation."""
     temporal: bool = True
     """People over time: identities, motion, one shape a person. Without it every frame stands alone."""
-    batch_frames: int = 96
+    batch_frames: Annotated[int, Interval(ge=1, le=10000)] = 96
     """Frames that are solved together and returned: bodies are fitted fastest by the hundred."""
-    threads: int = 1
+    threads: Annotated[int, Interval(ge=1, le=256)] = 1
     """Threads of torch while bodies are fitted: the matrices are small, and where cores are busy a second thread
     costs more than it brings."""
 
@@ -114,11 +119,6 @@ class PipelineConfig:
             refine=RefineConfig.paper(),
             temporal=False,
         )
-
-    def __post_init__(self) -> None:
-        for name in ("batch_frames", "threads"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
 
 
 def reconstruct(
@@ -147,6 +147,42 @@ def reconstruct(
     reasons, and where the detector's joints lie on the body. That is learnt from frames spread over the whole
     recording, whatever `frames` picks; a fitter of your own takes part if it is an `AdjustableFitter`.
     """
+    return reconstruct_parts(
+        InMemory(),
+        detections,
+        rig,
+        config,
+        frames=frames,
+        fitter=fitter,
+        extra_factors=extra_factors,
+        times=times,
+        cuts=cuts,
+        shapes=shapes,
+        progress=progress,
+        workers=workers,
+    ).reconstruction()
+
+
+def reconstruct_parts(
+    kept: KeptArrays,
+    detections: DetectionSequence,
+    rig: Rig,
+    config: PipelineConfig | None = None,
+    *,
+    frames: range | None = None,
+    fitter: BodyFitter | None = None,
+    extra_factors: ExtraFactors | None = None,
+    times: FrameTimes | None = None,
+    cuts: Sequence[int] = (),
+    shapes: SubjectShapes | None = None,
+    progress: Progress | None = None,
+    workers: int = 1,
+) -> Assembly:
+    """`reconstruct` whose windows leave memory for `kept` as they are solved, and whose result is made of them.
+
+    What an earlier call with the same arguments left in `kept`, wherever it was stopped, is not done again, and
+    the result is the same to the byte.
+    """
     config = PipelineConfig() if config is None else config
     frames = range(len(detections)) if frames is None else frames
     if frames.step != 1 or not 0 <= frames.start <= frames.stop <= len(detections):
@@ -154,42 +190,46 @@ def reconstruct(
     times = FrameTimes.assumed(len(detections)) if times is None else times
     times.check(len(detections), len(rig))
     cuts = check_cuts(cuts, len(detections))
-    run = _Run()
-    with run.stage("load"):
+    book, skeleton = Notebook(), detections.skeleton
+    detections = ThinnedFrames(detections, len(rig), config.candidates)
+    with book.stage("load"):
         if fitter is None:
-            fitter = make_fitter(config.body, BodyModel.default().with_keypoints(detections.skeleton.joints))
+            fitter = make_fitter(config.body, BodyModel.default().with_keypoints(skeleton.joints))
     with torch_threads(config.threads):
-        offsets = _offsets(detections, rig, config, fitter, run)
+        offsets = _kept_offsets(kept, detections, rig, config, fitter, book)
         if isinstance(fitter, AdjustableFitter) and offsets is not None:
             fitter = fitter.with_keypoint_offsets(offsets)
-        engine = _engine(rig, detections.skeleton, config, fitter, extra_factors, run)
-        spans = _spans(engine, config, _inputs(detections, rig, frames, times, run), frames, cuts, run)
-        parts, problems, done = [], list[Problem](), 0
+        engine = _engine(rig, skeleton, config, fitter, extra_factors, book)
+        parts = Parts(kept)
+        read = _inputs(detections, rig, frames, times, book)
+        done = parts.notes().frames
         with Workers(workers, engine.solver) as pool:
-            for solved in pool.map(WindowSolver.solve, spans):
-                parts.append(_rows(solved, rig, detections, config))
-                problems += solved.estimates.problems
-                run.add(solved.seconds)
-                done += solved.frames
+            beginning = book.torn_off()
+            for part in _solved(engine, pool, read, parts.checkpoint(read), frames, cuts, book, config):
+                rows = _rows(part.solved, rig, detections, config)
+                parts.append(Part(rows, part.notes, part.checkpoint))
+                done += part.notes.frames
                 if progress is not None:
                     progress(done, len(frames))
-            people = (
-                Reconstruction.concatenate(parts) if parts else Reconstruction.empty(detections.skeleton.joints)
-            )
-            if config.temporal:
-                with run.stage("follow"):
+            result = Assembly(parts, skeleton.joints, rig.names)
+            if config.temporal and len(parts) > 0:
+                with book.stage("follow"):
                     # Between two frames, where no rounding matters.
                     cuts_s = (times.frame_s[list(cuts)] + times.frame_s[[cut - 1 for cut in cuts]]) / 2
-                    before, people = people.person, _stitched(people, detections.skeleton, config, cuts_s)
-                    names = dict(zip(before.tolist(), people.person.tolist(), strict=True))
-                    problems = [replace(problem, track=names[problem.track]) for problem in problems]
-            if config.temporal and isinstance(fitter, SequenceFitting):
-                with run.stage("bodies over time"):
-                    people = with_bodies_over_time(people, fitter, shapes, lambda jobs: pool.map(_bodies, jobs))
-    summary = run.summary(config, frames, people) | {"time": times.as_dict(), "cuts": list(cuts)}
-    summary["people"]["problems"] = [_named(problem, detections.skeleton) for problem in problems]
-    summary |= {"keypoint_offsets": None if offsets is None else offsets.as_dict()}
-    return replace(people, run=summary)
+                    result = replace(result, names=_names(parts, skeleton, config, cuts_s.tolist()))
+            if config.temporal and isinstance(fitter, SequenceFitting) and len(result) > 0:
+                with book.stage("bodies over time"):
+                    known = SubjectShapes.empty(fingerprint(fitter.model)) if shapes is None else shapes
+                    bodies = fit_everybody(
+                        result.numbers(), result.person, lambda jobs: pool.map(_bodies, jobs), kept, known
+                    )
+                    result = replace(result, bodies=bodies)
+        notes = beginning
+        for each in (parts.notes(), book.torn_off()):
+            notes.add(each)
+    more = {"time": times.as_dict(), "cuts": list(cuts)}
+    more |= {"keypoint_offsets": None if offsets is None else offsets.as_dict()}
+    return result.with_run(**_summary(notes, config, frames, result), **more)
 
 
 def estimate_offsets(
@@ -208,7 +248,7 @@ def estimate_offsets(
     fitter = make_fitter(config.body) if fitter is None else fitter
     config = replace(config, offsets=replace(config.offsets, source="recording"))
     with torch_threads(config.threads):
-        offsets = _offsets(detections, rig, config, fitter, _Run())
+        offsets = _offsets(detections, rig, config, fitter, Notebook())
     if offsets is None:
         raise ValueError(
             f"offsets are known for {BODY_25.name} only, these are joints of {detections.skeleton.name}"
@@ -217,20 +257,24 @@ def estimate_offsets(
 
 
 def find_people(
-    detections: Detections, rig: Rig, skeleton: Skeleton, config: PipelineConfig, run: "_Run | None" = None
+    detections: Detections, rig: Rig, skeleton: Skeleton, config: PipelineConfig, book: Notebook | None = None
 ) -> Observations:
     """Stage I, one frame: the people's 2D observations and where their joints are to begin with."""
-    run = _Run() if run is None else run
-    with run.stage("triangulate"):
-        points = triangulate_pairs(detections, rig, config.candidates)
-    with run.stage("vote"):
-        candidates = vote(points, detections, len(rig), config.candidates)
-    with run.stage("propose"):
+    book = Notebook() if book is None else book
+    with book.stage("triangulate"):
+        every = triangulate_pairs(detections, rig, config.candidates)
+        points = thinned_points(every, config.candidates)
+        book.thin("points", len(points.xyz) < len(every.xyz))
+    with book.stage("vote"):
+        every = vote(points, detections, len(rig), config.candidates)
+        candidates = thinned_candidates(every, detections, config.candidates)
+        book.thin("candidates", len(candidates) < len(every))
+    with book.stage("propose"):
         proposals = propose(candidates, detections, skeleton, rig.up_vector, config.proposals)
-    with run.stage("associate"):
+    with book.stage("associate"):
         observations, phantoms = associate(proposals, candidates, detections, rig, skeleton, config.association)
     for reason, count in (*proposals.dropped.items(), ("hardly any joint seen by two views", phantoms)):
-        run.drop(reason, count)
+        book.drop(reason, count)
     return observations
 
 
@@ -240,13 +284,13 @@ def _engine(
     config: PipelineConfig,
     fitter: BodyFitter,
     extra_factors: ExtraFactors | None,
-    run: "_Run",
+    book: Notebook,
 ) -> Engine:
     """Everything from frames to rows."""
     weaker = replace(config, candidates=replace(config.candidates, min_votes=1))
 
     def find(detections: Detections, rig: Rig, weak: bool) -> Observations:
-        return find_people(detections, rig, skeleton, weaker if weak else config, run)
+        return find_people(detections, rig, skeleton, weaker if weak else config, book)
 
     motion = MotionModel.load(skeleton.joints, config.motion)
     scale = BodyScale(longest_bones(skeleton), motion.psd(np.full(len(skeleton), FAST_M_S)))
@@ -266,43 +310,102 @@ def _engine(
 
 
 def _inputs(
-    detections: DetectionSequence, rig: Rig, frames: range, times: FrameTimes, run: "_Run"
+    detections: ThinnedFrames, rig: Rig, frames: range, times: FrameTimes, book: Notebook
 ) -> Callable[[int], Input]:
     """What the cameras give of a frame."""
     of_views = times.of_views(len(rig))
 
     def read(frame: int) -> Input:
-        with run.stage("read"):
+        with book.stage("read"):
+            book.thin("detections", detections.is_thinned(frame), frame)
             return Input(frame, of_views[frame], detections[frame], rig)
 
     return read
 
 
-def _spans(
+@dataclass(frozen=True)
+class _Window:
+    """A window that waits to be solved, or is."""
+
+    span: Span
+    """Its frames."""
+    notes: Notes
+    """What was noted down since the window before."""
+    checkpoint: Checkpoint | None
+    """From where following goes on behind it, where that is known."""
+
+
+def _windows(
     engine: Engine,
     config: PipelineConfig,
     read: Callable[[int], Input],
+    begin: Checkpoint | None,
     frames: range,
     cuts: Sequence[int],
-    run: "_Run",
-) -> Iterator[Span]:
+    book: Notebook,
+) -> Iterator[_Window]:
     """The windows of a recording, one after the other, as far as their people have been followed."""
-    next_id = 0
+    begin = Checkpoint(frames.start) if begin is None else begin
+    next_id = begin.next_id
     for stretch in stretches(frames, cuts):
+        if stretch.stop <= begin.frame:
+            continue
         state = engine.start(next_id)
-        for start in range(stretch.start, stretch.stop, config.batch_frames):
+        if begin.state is not None and begin.frame > stretch.start:
+            state = begin.state
+        for start in range(max(stretch.start, begin.frame), stretch.stop, config.batch_frames):
             batch = stretch[start - stretch.start : start - stretch.start + config.batch_frames]
-            given = [read(frame) for frame in batch]
-            with run.stage("follow"):
+            given, last = [read(frame) for frame in batch], batch.stop == stretch.stop
+            with book.stage("follow"):
                 if config.temporal:
-                    spans, state = engine.follow(state, run.watched(given), last=batch.stop == stretch.stop)
+                    spans, state = engine.follow(state, book.watched(given), last=last)
                     next_id = state.follow.tracker.next_id
                 else:
-                    spans = [engine.alone(run.watched(given))]
-            yield from spans
+                    spans = [engine.alone(book.watched(given))]
+            carried = state if config.temporal and not last else None
+            behind = Checkpoint(batch.stop, next_id, carried)
+            for n, span in enumerate(spans, start=1):
+                yield _Window(span, book.torn_off(), behind if n == len(spans) else None)
 
 
-def _bodies(solver: WindowSolver, person: Person) -> SequenceFit:
+@dataclass(frozen=True)
+class _Done:
+    """A window that is solved."""
+
+    solved: Solved
+    """Its rows."""
+    notes: Notes
+    """What is to be said about it."""
+    checkpoint: Checkpoint | None
+    """As in `_Window`."""
+
+
+def _solved(
+    engine: Engine,
+    pool: Workers[WindowSolver],
+    read: Callable[[int], Input],
+    begin: Checkpoint | None,
+    frames: range,
+    cuts: Sequence[int],
+    book: Notebook,
+    config: PipelineConfig,
+) -> Iterator[_Done]:
+    """The windows from `begin` on, solved, in order."""
+    waiting: deque[_Window] = deque()
+
+    def spans() -> Iterator[Span]:
+        for window in _windows(engine, config, read, begin, frames, cuts, book):
+            waiting.append(window)
+            yield window.span
+
+    for solved in pool.map(WindowSolver.solve, spans()):
+        window = waiting.popleft()
+        notes = Notes(solved.frames, dict(solved.seconds), problems=list(solved.estimates.problems))
+        notes.add(window.notes)
+        yield _Done(solved, notes, window.checkpoint)
+
+
+def _bodies(solver: WindowSolver, person: Person) -> PersonBodies:
     """One person's bodies, in whatever process."""
     fitter = solver.estimator.fitter
     if not isinstance(fitter, SequenceFitting):
@@ -310,8 +413,30 @@ def _bodies(solver: WindowSolver, person: Person) -> SequenceFit:
     return person.fitted(fitter)
 
 
+def _kept_offsets(
+    kept: KeptArrays,
+    detections: DetectionSequence,
+    rig: Rig,
+    config: PipelineConfig,
+    fitter: BodyFitter,
+    book: Notebook,
+) -> KeypointOffsets | None:
+    """Where the detector puts its joints; what a run began with it goes on with."""
+    columns = [each.name for each in fields(KeypointOffsets)]
+    if len(kept.names(_OFFSETS)) > 0:
+        return KeypointOffsets(**{name: kept.array(_OFFSETS, name) for name in columns})
+    offsets = _offsets(detections, rig, config, fitter, book)
+    if offsets is not None:
+        kept.keep(_OFFSETS, {name: getattr(offsets, name) for name in columns})
+    return offsets
+
+
+_OFFSETS = "keypoint-offsets"
+"""The name under which they are kept."""
+
+
 def _offsets(
-    detections: DetectionSequence, rig: Rig, config: PipelineConfig, fitter: BodyFitter, run: "_Run"
+    detections: DetectionSequence, rig: Rig, config: PipelineConfig, fitter: BodyFitter, book: Notebook
 ) -> KeypointOffsets | None:
     """Where the detector puts its joints, by frames spread over the recording; None where nothing says it."""
     source = config.offsets.source
@@ -323,7 +448,7 @@ def _offsets(
         raise ValueError(f"offsets of {source} need a fitter with `with_keypoint_offsets` and joints of BODY_25")
     if source != "recording":
         return KeypointOffsets.load(source)
-    with run.stage("offsets"):
+    with book.stage("offsets"):
         spread = spread_frames(len(detections), config.offsets.frames)
         people = [find_people(detections[t], rig, detections.skeleton, config) for t in spread]
         if len(people) == 0:
@@ -332,7 +457,7 @@ def _offsets(
         return learn_offsets(targets, fitter.model, config=config.body.plain, prior=config.offsets.prior)
 
 
-def _rows(solved: Solved, rig: Rig, detections: DetectionSequence, config: PipelineConfig) -> Reconstruction:
+def _rows(solved: Solved, rig: Rig, detections: ThinnedFrames, config: PipelineConfig) -> Reconstruction:
     """Solved rows as rows of the result, by frame and person; bodies that were not fitted are NaN there."""
     order = np.lexsort((solved.observations.track, solved.observations.frame))
     rows, estimates = solved.observations.rows(order), solved.estimates.rows(order)
@@ -340,23 +465,18 @@ def _rows(solved: Solved, rig: Rig, detections: DetectionSequence, config: Pipel
     place = np.full(rows.candidate.shape, -1, dtype=np.int32)
     for frame in np.unique(rows.frame).tolist():
         of_frame = rows.frame == frame
-        place[of_frame] = place_in_view(rows.candidate[of_frame], detections[frame].view)
+        own = detections.in_recording(frame, rows.candidate[of_frame])
+        place[of_frame] = place_in_view(own, detections.frames[frame].view)
     return result_rows(rows, estimates, place, rig, detections.skeleton.joints, person)
 
 
-def _stitched(
-    people: Reconstruction, skeleton: Skeleton, config: PipelineConfig, cuts_s: np.ndarray
-) -> Reconstruction:
-    """The same rows, tracks of one person joined over longer times out of sight."""
-    person = stitch(people.person, people.time_s, people.joints, skeleton, config.stitching, cuts_s.tolist())
-    table = None if people.observations is None else replace(people.observations, person=person)
-    return replace(people, person=person, observations=table)
-
-
-def _named(problem: Problem, skeleton: Skeleton) -> dict[str, Any]:
-    """A problem as run.json has it: the person (without time, of its batch), frame, joint and what happened."""
-    joint = skeleton.joints[problem.joint]
-    return {"person": problem.track, "frame": problem.frame, "joint": joint, "reason": problem.reason}
+def _names(parts: Parts, skeleton: Skeleton, config: PipelineConfig, cuts_s: Sequence[float]) -> dict[int, int]:
+    """What tracks are called when those of one person are joined over longer times out of sight."""
+    columns = ("person", "time_s", "joints")
+    traces = [
+        Traces.of(*(parts.column(n, name) for name in columns), skeleton=skeleton) for n in range(len(parts))
+    ]
+    return stitch(Traces.concatenate(traces), config.stitching, cuts_s)
 
 
 def _number_in_frame(frame: np.ndarray) -> np.ndarray:
@@ -364,55 +484,30 @@ def _number_in_frame(frame: np.ndarray) -> np.ndarray:
     return np.arange(len(frame)) - np.searchsorted(frame, frame)
 
 
-class _Run:
-    """What a run notes down for run.json."""
+def _spans_by_name(frames: Mapping[str, Sequence[int]]) -> dict[str, list[list[int]]]:
+    """Frames as [start, stop), by what became of them."""
+    return {name: [[span.start, span.stop] for span in spans_of(numbers)] for name, numbers in frames.items()}
 
-    def __init__(self) -> None:
-        self.seconds: defaultdict[str, float] = defaultdict(float)
-        self._inner = 0.0
-        self.dropped: Counter[str] = Counter()
-        self.dropped_frames: defaultdict[str, set[int]] = defaultdict(set)
-        self.frame: int | None = None
 
-    def drop(self, reason: str, count: int) -> None:
-        """Note down people of the present frame who were none, or too little is seen of."""
-        self.dropped[reason] += count
-        if count > 0 and self.frame is not None:
-            self.dropped_frames[reason].add(self.frame)
-
-    def watched(self, given: Sequence[Input]) -> Iterator[Input]:
-        """The same frames; while one is worked on, it is the present frame."""
-        for each in given:
-            self.frame = each.frame
-            yield each
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Add the time of a block to a stage, but for that of stages inside it."""
-        start, outside, self._inner = time.perf_counter(), self._inner, 0.0
-        yield
-        whole = time.perf_counter() - start
-        self.seconds[name] += whole - self._inner
-        self._inner = outside + whole
-
-    def add(self, seconds: dict[str, float]) -> None:
-        """Add what a window took, wherever it was solved."""
-        for name, spent in seconds.items():
-            self.seconds[name] += spent
-
-    def summary(self, config: PipelineConfig, frames: range, people: Reconstruction) -> dict[str, Any]:
-        """The contents of `Reconstruction.run`."""
-        return {
-            "configuration": asdict(config),
-            "versions": versions(),
-            "frames": [frames.start, frames.stop],
-            "seconds": dict(self.seconds),
-            "people": {
-                **people.counts(),
-                "dropped": {reason: count for reason, count in self.dropped.items() if count > 0},
-            },
-            "dropped_frames": {
-                reason: [[span.start, span.stop] for span in spans_of(frames)]
-                for reason, frames in self.dropped_frames.items()
-            },
+def _summary(notes: Notes, config: PipelineConfig, frames: range, result: Assembly) -> dict[str, Any]:
+    """What run.json says of a run, but for what it was made from."""
+    skeleton = result.joint_names
+    problems = [
+        {
+            "person": result.names.get(each.track, each.track),  # without time, of its batch
+            "frame": each.frame,
+            "joint": skeleton[each.joint],
+            "reason": each.reason,
         }
+        for each in notes.problems
+    ]
+    dropped = {reason: count for reason, count in notes.dropped.items() if count > 0}
+    return {
+        "configuration": asdict(config),
+        "versions": versions(),
+        "frames": [frames.start, frames.stop],
+        "seconds": notes.seconds,
+        "people": {**result.counts(), "dropped": dropped, "problems": problems},
+        "dropped_frames": _spans_by_name(notes.dropped_frames),
+        "thinned_frames": _spans_by_name(notes.thinned_frames),
+    }

@@ -1,8 +1,7 @@
 """What comes out: the people of every frame, as arrays with one row per person and frame."""
 
-import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum, StrEnum
 from pathlib import Path
@@ -12,11 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.shapes import SubjectShapes
-from shapepose_fg.columns import check_codes, checked, code_names, npz_bytes, read_npz
+from shapepose_fg.columns import check_codes, checked, code_names, read_npz
 from shapepose_fg.errors import InputError
-from shapepose_fg.files import read_json, write_atomically
+from shapepose_fg.files import read_json
+from shapepose_fg.npz_writer import Column
 from shapepose_fg.observation_table import ObservationTable
-from shapepose_fg.run_summary import check_run, merged_run, plain
+from shapepose_fg.result_files import OBSERVATIONS, PEOPLE, RUN, RUN_ID, check_id, write_result
+from shapepose_fg.run_summary import check_run, merged_run
 from shapepose_fg.skeleton import BODY_25
 
 
@@ -115,6 +116,15 @@ class Reconstruction:
             raise ValueError(f"status must be one of {[*map(str, Status)]}, got {sorted(unknown)}")
         self._check_observations()
 
+    def _check_values(self) -> None:
+        """ValueError for what no reconstruction gives: numbers that are infinite, frames before the first."""
+        for name in self.ROWS:
+            column = getattr(self, name)
+            if column.dtype.kind == "f" and np.isinf(column).any():
+                raise ValueError(f"{name} must be finite, or NaN where unknown")
+            if column.dtype.kind == "i" and (column < 0).any():
+                raise ValueError(f"{name} must not be negative, got {column.min()}")
+
     def _check_observations(self) -> None:
         """ValueError where `observations` are of other rows."""
         table = self.observations
@@ -190,33 +200,26 @@ class Reconstruction:
 
     def count_known(self) -> dict[str, int]:
         """How many joints are known in each way, in words: what run.json says of them."""
-        count = np.bincount(self.known.ravel(), minlength=len(Known))
-        return {
-            kind.name.lower(): int(count[kind]) for kind in (Known.SEEN, Known.BODY, Known.MOTION, Known.UNKNOWN)
-        }
+        return count_rows([(self.status, self.known)])["joints"]
 
     def counts(self) -> dict[str, Any]:
         """What run.json says of the rows: how many, with which status, and how their joints are known."""
-        status = Counter(self.status.tolist())
-        return {"found": len(self), "status": dict(status), "joints": self.count_known()}
+        return count_rows([(self.status, self.known)])
+
+    def columns(self) -> dict[str, Column]:
+        """What people.npz holds."""
+        columns = {name: Column.of(getattr(self, name), _STORED.get(name)) for name in self.ROWS}
+        return columns | shared_columns(self.joint_names)
 
     def save(self, folder: str | Path) -> None:
         """Write people.npz, run.json and observations.npz into `folder`, each whole or not at all.
 
-        A process killed on the way leaves each file as it was or as it shall be (docs/conventions.md). Without
-        `observations`, those of an earlier result are removed. OSError where `folder` cannot be written.
+        A process killed on the way leaves each file as it was or as it shall be, and `load` says where they do not
+        belong together (docs/conventions.md). Without `observations`, those of an earlier result are removed.
+        OSError where `folder` cannot be written.
         """
-        folder = Path(folder)
-        columns = {name: getattr(self, name) for name in (*self.ROWS, "joint_names")}
-        run = json.dumps(self.run, indent=2, allow_nan=False, default=plain) + "\n"
-        # All are complete in memory before the first is touched.
-        files = {_PEOPLE: npz_bytes(columns | {"known_names": code_names(Known)}), _RUN: run.encode()}
-        if self.observations is not None:
-            files[_OBSERVATIONS] = self.observations.to_bytes()
-        for name, content in files.items():
-            write_atomically(folder / name, lambda stream, content=content: stream.write(content))
-        if self.observations is None:
-            (folder / _OBSERVATIONS).unlink(missing_ok=True)
+        observations = None if self.observations is None else self.observations.columns()
+        write_result(Path(folder), self.columns(), observations, self.run)
 
     @classmethod
     def load(cls, path: str | Path) -> "Reconstruction":
@@ -226,15 +229,16 @@ class Reconstruction:
         observations.npz. Columns that files of earlier versions lack are unknown.
         """
         path = Path(path)
-        file = path / _PEOPLE if path.is_dir() else path
-        columns = read_npz(file, "give the people.npz of a reconstruction, or run one first")
+        file = path / PEOPLE if path.is_dir() else path
+        every = (*cls.ROWS, "joint_names", "known_names", RUN_ID)
+        columns = read_npz(file, every, "give the people.npz of a reconstruction, or run one first")
         needed = [name for name in (*cls.ROWS, "joint_names") if name not in _ADDED]
         for name in (*needed, "known_names") if "known" in columns else needed:
             if name not in columns:
                 raise InputError(f"{file}: column {name} is missing; {_CURE}")
         if "known" in columns and not np.array_equal(columns["known_names"], code_names(Known)):
             raise InputError(f"{file}: known_names are not those of this version; {_CURE}")
-        run_file = file.with_name(_RUN)
+        run_file = file.with_name(RUN)
         run = read_json(run_file) if run_file.is_file() else {}
         if not isinstance(run, dict):
             raise InputError(f"{run_file}: must hold an object; restore it or delete it")
@@ -242,23 +246,25 @@ class Reconstruction:
             check_run(run)
         except ValueError as error:
             raise InputError(f"{run_file}: {error}; restore it or delete it") from None
+        # Whoever changes the people and saves them gives them another id.
+        check_id(columns.get(RUN_ID), run.pop(RUN_ID, None), run_file)
         given: dict[str, Any] = {name: columns[name] for name in (*cls.ROWS, "joint_names") if name in columns}
         try:
             people = cls(**given, run=run)
+            people._check_values()
         except ValueError as error:
             raise InputError(f"{file}: {error}; {_CURE}") from None
-        table_file = file.with_name(_OBSERVATIONS)
+        table_file = file.with_name(OBSERVATIONS)
         if not table_file.is_file():
             return people
         try:
-            return replace(people, observations=ObservationTable.load(table_file))
+            return replace(people, observations=ObservationTable.load(table_file, columns.get(RUN_ID)))
         except InputError:
             raise
         except ValueError as error:
             raise InputError(f"{table_file}: {error}; delete it or run the reconstruction again") from None
 
 
-_PEOPLE, _RUN, _OBSERVATIONS = "people.npz", "run.json", "observations.npz"
 _CURE = "give the people.npz of a reconstruction"
 _TYPES: dict[str, type] = {
     "frame": np.int64,
@@ -270,3 +276,22 @@ _TYPES: dict[str, type] = {
 """The type of a column; every other column is float64."""
 _ADDED = frozenset({"time_s", "velocity", "velocity_covariance", "known"})
 """Columns that files of version 0.1 lack."""
+_STORED: dict[str, Any] = {"status": np.dtype(f"U{max(map(len, Status))}")}
+"""Types in people.npz that do not depend on the rows."""
+
+
+def shared_columns(joint_names: NDArray[np.str_]) -> dict[str, Column]:
+    """What people.npz holds beside its rows."""
+    return {"joint_names": Column.of(joint_names), "known_names": Column.of(code_names(Known))}
+
+
+def count_rows(pieces: Iterable[tuple[NDArray[np.str_], NDArray[np.uint8]]]) -> dict[str, Any]:
+    """`Reconstruction.counts` of rows that come piece by piece: `status` (R,) and `known` (R, J) of each."""
+    status: Counter[str] = Counter()
+    known = np.zeros(len(Known), dtype=np.int64)
+    for their_status, their_known in pieces:
+        status.update(their_status.tolist())
+        known += np.bincount(their_known.ravel(), minlength=len(Known))
+    order = (Known.SEEN, Known.BODY, Known.MOTION, Known.UNKNOWN)
+    joints = {kind.name.lower(): int(known[kind]) for kind in order}
+    return {"found": status.total(), "status": dict(status), "joints": joints}

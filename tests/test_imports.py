@@ -14,7 +14,10 @@ ROOT = Path(__file__).parents[1]
 LEVELS = (
     "factors errors",
     "camera skeleton",
-    "files provenance result_options rendering run_summary columns workers body.threads options terminal",
+    "files bounds",
+    "output_folder npz_writer kept_arrays provenance result_options rendering run_summary columns workers"
+    " body.threads options terminal stopping",
+    "result_files",
     "body.model",
     "body.fitting body.shapes",
     "body.offsets",
@@ -26,6 +29,7 @@ LEVELS = (
     "estimation",
     "tracking",
     "windows bodies_over_time solved_rows",
+    "runs",
     "pipeline",
     "io solving",
     "simulation viewer detection2d",
@@ -33,8 +37,13 @@ LEVELS = (
     "training export",
     "report",
     "evaluation",
-    "demo tracks_command detect_command overlay_command export_command report_command view_command setup_command",
+    "reconstruct_summary reconstruct_inputs",
+    "reconstruct_ending",
+    "reconstruct_run",
+    "demo tracks_command detect_command overlay_command export_command report_command view_command"
+    " setup_command reconstruct_command",
     "cli",
+    "__main__",
 )
 """Each level imports only from those before it; a package may import its own modules too."""
 

@@ -3,16 +3,17 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from shapepose_fg.body.model.smpl_file import SmplArrays, read_smpl_file
-from shapepose_fg.columns import checked, npz_bytes, read_npz
+from shapepose_fg.columns import checked, read_npz
 from shapepose_fg.errors import InputError
 from shapepose_fg.files import write_atomically
+from shapepose_fg.npz_writer import write_npz
 
 _OPEN_BODY = Path(__file__).with_name("data") / "open_body.npz"
 _COLUMNS = ("names", "betas", "information", "body")
@@ -92,15 +93,17 @@ class SubjectShapes:
 
     def save(self, file: str | Path) -> None:
         """Write the shapes as `.npz`, whole or not at all (docs/conventions.md)."""
-        columns = {name: np.asarray(getattr(self, name)) for name in _COLUMNS}
-        content = npz_bytes(columns)
-        write_atomically(Path(file), lambda stream: stream.write(content))
+        write_atomically(Path(file), self.write)
+
+    def write(self, stream: BinaryIO) -> None:
+        """Write the contents of that file."""
+        write_npz(stream, {name: np.asarray(getattr(self, name)) for name in _COLUMNS})
 
     @classmethod
     def load(cls, file: str | Path, body: str) -> "SubjectShapes":
         """Read what `save` wrote, of the model with the fingerprint `body`; InputError on anything else."""
         file = Path(file)
-        columns = read_npz(file, _CURE)
+        columns = read_npz(file, _COLUMNS, _CURE)
         for name in _COLUMNS:
             if name not in columns:
                 raise InputError(f"{file}: column {name} is missing; {_CURE}")

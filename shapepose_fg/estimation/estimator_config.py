@@ -1,34 +1,37 @@
 """The settings of stage II."""
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Interval
 
+from shapepose_fg.bounds import Count, Metres, MetresOrNone, Repeats, Settings
 from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.estimation.motion_model import MotionConfig
 from shapepose_fg.estimation.window_graph import WindowGraphConfig
 
 
 @dataclass(frozen=True)
-class RefineConfig:
+class RefineConfig(Settings):
     """How the alternation runs."""
 
-    alternations: int = 3
+    alternations: Repeats = 3
     """N of Algorithm 1: how often the body is fitted and the joints are solved, at the most."""
-    window_alternations: int = 1
+    window_alternations: Repeats = 1
     """The same for windows of several frames, which start from a draft of all joints (`Estimator.draft`): a second
     round, at twice the time, changed the mean error by 0.1 to 0.2 mm. Windows with factors of the user's own take
     as many as frames alone: what such a factor says may be far from what the views said."""
-    settled_m: float = 0.002
+    settled_m: MetresOrNone = 0.002
     """A window whose joints all moved less in a round is done: most frames are after one or two. 0: none is."""
-    max_sigma_m: float = 0.5
+    max_sigma_m: Metres = 0.5
     """A joint whose views leave it less certain than this in some direction is not determined by them."""
-    disagreement: float = 6.0
+    disagreement: Annotated[float, Interval(ge=0, le=1e6)] = 6.0
     """A joint that its views put this many standard deviations from where the body can have it is seen wrongly:
     its gates are decided anew from the body's place, and the body is fitted again without what was thrown away. 4
     threw away more joints that were right than wrong ones, in simulated crowds whose detections had been given out
     again. 0: nothing is thrown away, as in the paper."""
-    min_joints: int = 4
+    min_joints: Count = 4
     """Fewer joints than this determined by the views are not a person that can be placed in space."""
     complete_start: bool = True
     """Whether joints that two views saw and stage I did not place are triangulated for X_0. In the paper they are
@@ -51,14 +54,6 @@ class RefineConfig:
             body_from_views=False,
             leave_one_out=False,
         )
-
-    def __post_init__(self) -> None:
-        for name in ("alternations", "window_alternations", "max_sigma_m", "min_joints"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        for name in ("settled_m", "disagreement"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
 
     @property
     def contradiction(self) -> float:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.bounds import Factor, Metres, Seconds, Settings
 from shapepose_fg.errors import InputError
 from shapepose_fg.files import read_json
 
@@ -14,27 +15,22 @@ FORMAT = "shapepose-fg motion model 1"
 
 
 @dataclass(frozen=True)
-class MotionConfig:
+class MotionConfig(Settings):
     """How the frames of a person are solved together."""
 
     model: str = ""
     """File of the motion model, as `scripts/measure_motion.py` writes it; empty: the one that ships."""
-    psd_scale: float = 1.0
+    psd_scale: Factor = 1.0
     """Multiplies the power spectral densities of the joints' accelerations: more follows faster and smooths
     less."""
-    lost_m: float = 0.1
+    lost_m: Metres = 0.1
     """A joint whose views leave it less certain than this in some direction is lost from sight: in these frames,
     and in those around them, the difference between joint and body is followed (`factors.motion`)."""
-    around_s: float = 0.5
+    around_s: Seconds = 0.5
     """How far around them, seconds."""
     keep_limbs: bool = True
     """Whether joints that no view saw go to where a body can have them, and limbs with an open end get the body's
     length: motion carries each joint by itself."""
-
-    def __post_init__(self) -> None:
-        for name in ("psd_scale", "lost_m", "around_s"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True)

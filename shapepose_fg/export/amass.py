@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.columns import npz_bytes
 from shapepose_fg.export.axes import z_up
 from shapepose_fg.export.job import Job, Written
 from shapepose_fg.export.skinned import RestBody, motion_of
 from shapepose_fg.export.stretches import Stretch, stretches
 from shapepose_fg.files import write_atomically
+from shapepose_fg.npz_writer import write_npz
 
 _SMPL_H = 156
 """Numbers of a pose of SMPL-H: pelvis, 21 joints of the body, 15 of each hand."""
@@ -41,8 +41,7 @@ def write_amass(job: Job) -> Written:
             columns = amass_columns(motion.rest, stretch, take.fps) | {
                 "times": times, "frames": frames, "body": np.array(body), "gender": np.array(_gender(body)),
             }  # fmt: skip
-            content = npz_bytes(columns)
-            write_atomically(path, lambda stream, content=content: stream.write(content))
+            write_atomically(path, lambda stream, columns=columns: write_npz(stream, columns))
             written.files.append(path)
     if job.body_file is None and len(written.files) > 0:
         written.notes.append("amass: betas are those of the open body that ships, not SMPL's; poses fit both")

@@ -4,10 +4,13 @@ Stage I (e) of the paper (section 3.1): gives each person *their* 2D observation
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Interval
 from numpy.typing import NDArray
 
+from shapepose_fg.bounds import Metres, Repeats, Settings, Share
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections
 from shapepose_fg.observations import Observations
@@ -18,24 +21,24 @@ from shapepose_fg.skeleton import Skeleton
 
 
 @dataclass(frozen=True)
-class AssociationConfig:
+class AssociationConfig(Settings):
     """When a 2D detection is an observation of a proposal's joint."""
 
-    near_m: float = 0.08
+    near_m: Metres = 0.08
     """How closeness to the projected joint falls off: sigma of a Gaussian, as a length at the joint's depth. A
     detector is 2 cm off on a visible joint and several on a hidden one."""
-    far_m: float = 0.25
+    far_m: Metres = 0.25
     """No detection farther than this from the projection of a joint whose place is known is taken."""
-    reach_m: float = 0.6
+    reach_m: Metres = 0.6
     """A joint whose place is not known yet is sought this far around its neighbours on the skeleton: no limb
     from a joint to the next is longer, the trunk aside."""
-    least_affinity: float = 0.3
+    least_affinity: Share = 0.3
     """A joint whose place is not known is only taken by an affinity of at least this to an observed neighbour."""
-    overlap_px: float = 6.0
+    overlap_px: Annotated[float, Interval(gt=0, le=1000)] = 6.0
     """Two people's projected joints closer than this overlap: the one detection there serves both."""
-    passes: int = 2
+    passes: Repeats = 2
     """How often the choice is made again with the neighbours that the last one chose."""
-    min_observed_parts: float = 0.35
+    min_observed_parts: Share = 0.35
     """Least fraction of the core joints (trunk, arms, legs) that two views must see: 6 of 15. Of one whose upper
     body alone shows there are 9. The paper asks for none."""
 
@@ -43,11 +46,6 @@ class AssociationConfig:
     def paper(cls) -> "AssociationConfig":
         """As written: whoever was proposed stays."""
         return cls(min_observed_parts=0.0)
-
-    def __post_init__(self) -> None:
-        for name in ("near_m", "far_m", "reach_m", "overlap_px", "passes"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
 
 
 def associate(

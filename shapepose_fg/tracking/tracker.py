@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from shapepose_fg.bounds import Count, Metres, Repeats, Seconds, Settings, Speed
 from shapepose_fg.camera import Rig, Views
 from shapepose_fg.detections import Detections
 from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas, triangulate
@@ -26,46 +27,41 @@ FindPeople = Callable[[Detections, Rig, bool], Observations]
 
 
 @dataclass(frozen=True)
-class TrackingConfig:
+class TrackingConfig(Settings):
     """How people are followed."""
 
     assignment: AssignmentConfig = field(default_factory=AssignmentConfig)
     """Which detections are a track's."""
-    lost_m: float = 0.2
+    lost_m: Metres = 0.2
     """A joint whose predicted place has a larger sigma is lost: it is sought around its parent on the skeleton."""
-    trusted_m: float = 0.1
+    trusted_m: Metres = 0.1
     """A joint with a smaller sigma is judged by the length of its bones."""
-    follow_s: float = 0.25
+    follow_s: Seconds = 0.25
     """Time constant with which the velocity of an unseen joint becomes that of the person."""
-    follow_sigma_m: float = 0.05
+    follow_sigma_m: Metres = 0.05
     """Sigma from which on a joint counts as unseen in this sense."""
-    iterations: int = 3
+    iterations: Repeats = 3
     """How often gates and linearisation are made anew in one frame."""
-    min_seen_twice: int = 4
+    min_seen_twice: Count = 4
     """Core joints that two views must see for a frame to count as evidence of the person."""
-    min_new_joints: int = 6
+    min_new_joints: Count = 6
     """Core joints that two views must see, by detections that no track has, for a new person."""
-    apart_m: float = 0.25
+    apart_m: Metres = 0.25
     """A new person's joints are at least this far from any track's, in the mean: nearer is the same person."""
-    double_m: float = 0.15
+    double_m: Metres = 0.15
     """Of two tracks whose core joints are nearer in the mean, the younger gets no more evidence."""
-    patience_s: float = 0.5
+    patience_s: Seconds = 0.5
     """A track without evidence for longer has ended."""
-    trial_s: float = 0.25
+    trial_s: Seconds = 0.25
     """A new track that has not had evidence for nearly all of this time was a phantom."""
-    weak_trial_s: float = 0.5
+    weak_trial_s: Seconds = 0.5
     """The same for a person whose hips two views saw: only time tells one from a crossing of rays."""
-    walk_mps: float = 1.0
+    walk_mps: Speed = 1.0
     """How far off a person is who comes back into view, per second out of sight: people turn and stop."""
-    birth_sigma_m: float = 0.04
+    birth_sigma_m: Metres = 0.04
     """Sigma of a new person's joints as stage I places them."""
-    birth_speed_mps: float = 2.0
+    birth_speed_mps: Speed = 2.0
     """Sigma of a new person's velocities along each axis."""
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if name != "assignment" and not value > 0:
-                raise ValueError(f"{name} must be positive, got {value}")
 
 
 @dataclass(frozen=True)

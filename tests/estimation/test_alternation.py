@@ -333,7 +333,7 @@ def test_nobody_is_refined_to_nobody(five_cameras):
 
 
 def test_refuses_settings_that_make_no_sense():
-    with pytest.raises(ValueError, match="alternations must be positive"):
+    with pytest.raises(ValueError, match="alternations must be at least 1"):
         RefineConfig(alternations=0)
 
 

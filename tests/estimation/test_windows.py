@@ -285,7 +285,7 @@ def test_the_motion_model_is_read_by_name_and_checked(tmp_path):
         MotionModel.load(("RWrist",), MotionConfig(model=str(tmp_path / "other.json")))
     with pytest.raises(ValueError, match="psd_scale must be positive"):
         MotionConfig(psd_scale=0.0)
-    with pytest.raises(ValueError, match="window_alternations must be positive"):
+    with pytest.raises(ValueError, match="window_alternations must be at least 1"):
         RefineConfig(window_alternations=0)
 
 

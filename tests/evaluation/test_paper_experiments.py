@@ -151,17 +151,16 @@ def test_errors_by_confidence_are_means_over_cases_with_a_picture(tmp_path: Path
     curves = prior_confidence.curves(found)
     before, after = curves["own", "paper"].values()
     assert (before[1], after[1]) == (40.0, 25.0) and np.isnan(np.delete(after, 1)).all()
-    experiment = prior_confidence.prior_confidence(Scale(quick=True))
+    experiment = prior_confidence.prior_confidence(Scale(quick=True), tmp_path)
     assert experiment is not None
     rows = experiment.table(found)
     assert rows[3] == "| 0.1 to 0.2 | 40 | 25 | 40 | 25 | 10 | 25 | 10 | 25 |"
     assert rows[-1].endswith("|  | always better |  | always better |  | 0.00 |  | 0.00 |")
-    prior_confidence.draw_prior_confidence(found, tmp_path / "picture.png")
-    assert (tmp_path / "picture.png").stat().st_size > 5000
+    assert (tmp_path / "prior_confidence.png").stat().st_size > 5000
 
 
 def test_iterations_are_means_over_stretches_with_a_picture(tmp_path: Path):
-    experiment = iterations.iterations(Scale(quick=True))
+    experiment = iterations.iterations(Scale(quick=True), tmp_path)
     assert experiment is not None
     found = {
         case.name: {"precision": 0.5 + n / 10, "f1": 0.75, "mpjpe_mm": 30.0 - n}
@@ -169,5 +168,4 @@ def test_iterations_are_means_over_stretches_with_a_picture(tmp_path: Path):
     }
     rows = experiment.table(found)
     assert rows[2] == "| 0 | 50.0 | 75.0 | 30.0 | 80.0 | 75.0 | 27.0 | 83.7 |"
-    iterations.draw_iterations(found, tmp_path / "picture.png")
-    assert (tmp_path / "picture.png").stat().st_size > 5000
+    assert (tmp_path / "iterations.png").stat().st_size > 5000

@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 from shapepose_fg.skeleton import BODY_25
-from shapepose_fg.tracking.stitching import StitchingConfig, stitch
+from shapepose_fg.tracking.stitching import StitchingConfig, Traces
+from shapepose_fg.tracking.stitching import stitch as stitch_traces
+
+
+def stitch(track, time_s, joints, skeleton, config, cuts_s=()):
+    """The identity of each row."""
+    names = stitch_traces(Traces.of(track, time_s, joints, skeleton), config, cuts_s)
+    return np.array([names[each] for each in track.tolist()], dtype=int)
 
 
 @pytest.fixture

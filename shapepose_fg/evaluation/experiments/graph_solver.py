@@ -21,7 +21,7 @@ from shapepose_fg.pipeline import PipelineConfig, find_people
 
 FRAMES = 60
 """Of each stretch."""
-STEPS_M2 = (3e-6, 1e-5, 2e-5, 3e-5, 5e-5)
+STEPS_M2 = (1e-5, 3e-5, 1e-4, 3e-4, 1e-3)
 """Step sizes lambda. Too large ones diverge: lambda times the information of six sure views must stay under 2."""
 ROUNDS, LONG_ROUNDS = 10, 100
 """N of Algorithm 1; and so many that small steps arrive."""

@@ -39,8 +39,11 @@ Curve = dict[str, list[list[float]]]
 """Of each figure the sum of errors in millimetres and how many, bin by bin."""
 
 
-def prior_confidence(scale: Scale) -> Experiment | None:
-    """By the paper's setting: X_0, and the body fitted to it. By ours: the views, and fused with the body."""
+def prior_confidence(scale: Scale, images: Path | None = None) -> Experiment | None:
+    """By the paper's setting: X_0, and the body fitted to it. By ours: the views, and fused with the body.
+
+    Drawn into the folder `images`, if given.
+    """
     if not scale.has_scenes:
         return None
     stretches = [shorter(stretch, FRAMES) for stretch in scale.one_each]
@@ -50,7 +53,13 @@ def prior_confidence(scale: Scale) -> Experiment | None:
         for world in WORLDS
         for setting in CURVES
     ]
-    return Experiment("prior confidence", cases, _table)
+
+    def table(figures: Mapping[str, Figures]) -> list[str]:
+        if images is not None:
+            draw_prior_confidence(figures, images / "prior_confidence.png")
+        return _table(figures)
+
+    return Experiment("prior confidence", cases, table)
 
 
 def curves(figures: Mapping[str, Figures]) -> dict[tuple[str, str], dict[str, NDArray[np.float64]]]:

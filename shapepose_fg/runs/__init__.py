@@ -1,0 +1,1 @@
+"""A reconstruction on its way: solved windows that are kept, where it can go on, and the result made of them."""

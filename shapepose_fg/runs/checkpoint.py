@@ -1,0 +1,105 @@
+"""From where a run can go on: who is followed, and the frames that are not solved, as plain arrays."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.kept_arrays import split
+from shapepose_fg.observations import Observations
+from shapepose_fg.tracking.following import FollowState, Input
+from shapepose_fg.tracking.motion_filter import JointStates
+from shapepose_fg.tracking.tracker import TrackedFrame, TrackerState
+from shapepose_fg.windows import StreamState
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """After a batch of frames was followed."""
+
+    frame: int
+    """The first frame that was not."""
+    next_id: int = 0
+    """The identity of the next new person."""
+    state: StreamState | None = None
+    """What is carried on; None where nothing is: after the last frame before a cut, and without time."""
+
+
+_TRACK = ("ids", "born_s", "evident_s", "misses", "weak")
+_TRACKED = ("ids", "candidate", "evident", "weak")
+_OBSERVED = tuple(field.name for field in fields(Observations))
+
+
+def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray[Any]]:
+    """A checkpoint as arrays. What the cameras gave is not among them: it is read again."""
+    arrays: dict[str, NDArray[Any]] = {"at": np.array([checkpoint.frame, checkpoint.next_id])}
+    if checkpoint.state is None:
+        return arrays
+    follow, decided = checkpoint.state.follow, checkpoint.state.decided
+    tracker, pending = follow.tracker, follow.pending
+    arrays |= {f"tracker.{name}": getattr(tracker, name) for name in _TRACK}
+    arrays |= {"tracker.mean": tracker.joints.mean, "tracker.covariance": tracker.joints.covariance}
+    arrays |= {"tracker.time_s": np.array([tracker.time_s]), "tracker.next_id": np.array([tracker.next_id])}
+    arrays["evident"] = np.array(sorted(follow.evident.items()), dtype=np.int64).reshape(-1, 2)
+    arrays["real"] = np.array(sorted(follow.real), dtype=np.int64)
+    arrays["before"] = np.array([checkpoint.state.before])
+    tracked = [each for _, each in pending]
+    arrays |= _frames("pending", [given for given, _ in pending], [len(each.ids) for each in tracked])
+    arrays |= _joined("pending", _TRACKED, tracked)
+    arrays |= _joined("pending", ("mean", "covariance"), [each.joints for each in tracked])
+    arrays |= _frames("decided", [given for given, _ in decided], [len(rows) for _, rows in decided])
+    return arrays | _joined("decided", _OBSERVED, [rows for _, rows in decided])
+
+
+def checkpoint_of(
+    array: Callable[[str], NDArray[Any]], keys: Sequence[str], read: Callable[[int], Input]
+) -> Checkpoint:
+    """The checkpoint that `checkpoint_arrays` made the arrays of; `read` gives what the cameras saw of a frame."""
+    following, next_id = array("at").tolist()
+    if "before" not in keys:
+        return Checkpoint(following, next_id)
+    joints = JointStates(array("tracker.mean"), array("tracker.covariance"))
+    tracker = TrackerState(
+        time_s=float(array("tracker.time_s")[0]),
+        joints=joints,
+        next_id=int(array("tracker.next_id")[0]),
+        **{name: array(f"tracker.{name}") for name in _TRACK},
+    )
+    evident = {int(track): int(count) for track, count in array("evident").tolist()}
+    given = {frame: read(frame) for name in ("pending", "decided") for frame in array(f"{name}.frames").tolist()}
+    pending = []
+    for frame, parts in _parted("pending", (*_TRACKED, "mean", "covariance"), array):
+        states = JointStates(parts.pop("mean"), parts.pop("covariance"))
+        pending.append((given[frame], TrackedFrame(joints=states, **parts)))
+    decided = [(given[frame], Observations(**parts)) for frame, parts in _parted("decided", _OBSERVED, array)]
+    follow = FollowState(tracker, tuple(pending), evident, frozenset(array("real").tolist()))
+    return Checkpoint(following, next_id, StreamState(follow, tuple(decided), int(array("before")[0])))
+
+
+def _frames(name: str, given: Sequence[Input], counts: Sequence[int]) -> dict[str, NDArray[Any]]:
+    """Numbers of some frames, and how many rows each has."""
+    numbers = np.array([each.frame for each in given], dtype=np.int64)
+    return {f"{name}.frames": numbers, f"{name}.counts": np.array(counts, dtype=np.int64)}
+
+
+def _joined(name: str, keys: Sequence[str], parts: Sequence[Any]) -> dict[str, NDArray[Any]]:
+    """Arrays of several frames, one after the other; none where there are no frames."""
+    if len(parts) == 0:
+        return {}
+    return {f"{name}.{key}": np.concatenate([getattr(part, key) for part in parts]) for key in keys}
+
+
+def _parted(
+    name: str, keys: Sequence[str], array: Callable[[str], NDArray[Any]]
+) -> list[tuple[int, dict[str, NDArray[Any]]]]:
+    """Frames with their arrays, as `_joined` put them together."""
+    frames, counts = array(f"{name}.frames"), array(f"{name}.counts")
+    if len(frames) == 0:
+        return []
+    columns = [split(array(f"{name}.{key}"), counts) for key in keys]
+    return [
+        (frame, dict(zip(keys, parts, strict=True)))
+        for frame, *parts in zip(frames.tolist(), *columns, strict=True)
+    ]

@@ -1,0 +1,107 @@
+"""What a run notes down for run.json, window by window: times, who was dropped, what could not be solved."""
+
+import time
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from shapepose_fg.estimation.outcome import Problem
+from shapepose_fg.tracking.following import Input
+
+
+@dataclass
+class Notes:
+    """Of one window, or of all together."""
+
+    frames: int = 0
+    """How many frames it is of."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Time per stage, over all processes."""
+    dropped: dict[str, int] = field(default_factory=dict)
+    """How many people were none, or too little is seen of, for each reason."""
+    dropped_frames: dict[str, list[int]] = field(default_factory=dict)
+    """The frames in which that was."""
+    thinned_frames: dict[str, list[int]] = field(default_factory=dict)
+    """The frames of which something was left out, because it was too much."""
+    problems: list[Problem] = field(default_factory=list)
+    """What could not be solved."""
+
+    def add(self, other: "Notes") -> None:
+        """Take in the notes of what comes next."""
+        self.frames += other.frames
+        for name, spent in other.seconds.items():
+            self.seconds[name] = self.seconds.get(name, 0.0) + spent
+        for reason, count in other.dropped.items():
+            self.dropped[reason] = self.dropped.get(reason, 0) + count
+        for reason, frames in other.dropped_frames.items():
+            self.dropped_frames.setdefault(reason, []).extend(frames)
+        for what, frames in other.thinned_frames.items():
+            self.thinned_frames.setdefault(what, []).extend(frames)
+        self.problems += other.problems
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values; `from_dict` reads them back."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> "Notes":
+        """What `as_dict` gave."""
+        return cls(**{**values, "problems": [Problem(**each) for each in values["problems"]]})
+
+
+class Notebook:
+    """Notes that are being taken."""
+
+    def __init__(self) -> None:
+        self._seconds: defaultdict[str, float] = defaultdict(float)
+        self._inner = 0.0
+        self._dropped: Counter[str] = Counter()
+        self._dropped_frames: defaultdict[str, list[int]] = defaultdict(list)
+        self._thinned_frames: defaultdict[str, list[int]] = defaultdict(list)
+        self._frame: int | None = None
+
+    def thin(self, what: str, is_thinned: bool, frame: int | None = None) -> None:
+        """Note down that some of the frame's detections or candidates were left out, because they were too
+        many.
+        """
+        frame = self._frame if frame is None else frame
+        if is_thinned and frame is not None:
+            self._thinned_frames[what].append(frame)
+
+    def drop(self, reason: str, count: int) -> None:
+        """Note down people of the present frame who were none, or too little is seen of."""
+        self._dropped[reason] += count
+        frames = self._dropped_frames
+        if count > 0 and self._frame is not None and self._frame not in frames[reason][-1:]:
+            frames[reason].append(self._frame)
+
+    def watched(self, given: Sequence[Input]) -> Iterator[Input]:
+        """The same frames; while one is worked on, it is the present frame."""
+        for each in given:
+            self._frame = each.frame
+            yield each
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Add the time of a block to a stage, but for that of stages inside it."""
+        start, outside, self._inner = time.perf_counter(), self._inner, 0.0
+        yield
+        whole = time.perf_counter() - start
+        self._seconds[name] += whole - self._inner
+        self._inner = outside + whole
+
+    def torn_off(self) -> Notes:
+        """What was noted since the last time, which is forgotten here."""
+        notes = Notes(
+            seconds=dict(self._seconds),
+            dropped=dict(self._dropped),
+            dropped_frames={reason: frames for reason, frames in self._dropped_frames.items() if frames},
+            thinned_frames=dict(self._thinned_frames),
+        )
+        self._seconds.clear()
+        self._dropped.clear()
+        self._dropped_frames.clear()
+        self._thinned_frames.clear()
+        return notes
