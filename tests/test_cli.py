@@ -236,7 +236,7 @@ def test_frames_are_half_open(recording, pipeline, text, frames):
         (["--up", "up"], "up must be one of x -x y -y z -z, got 'up'"),
         (["--unit", "inch"], "unit must be one of m cm mm, got 'inch'"),
         (["--config", "/nothing.toml"], "/nothing.toml: there is no such file; check the path"),
-        (["--body", "/nothing.npz"], "/nothing.npz: no such file"),
+        (["--body", "/nothing.npz"], "/nothing.npz: there is no such file"),
         (["--calibration", "/nothing.json"], "/nothing.json: there is no such file; check the path"),
         (["--detections", "/nothing"], "/nothing: there is no such folder; check the path of the detections"),
         (["--output", f"{__file__}/out"], "out: results cannot be written here (Not a directory); give a folder"),
@@ -279,6 +279,20 @@ def test_a_disk_that_is_full_is_one_sentence_too(recording, pipeline, monkeypatc
     assert f"{out}/people.npz: No space left on device; " in capsys.readouterr().err
     # What was done is kept, and nothing is left half written.
     assert [path.name for path in out.iterdir()] == ["parts"]
+
+
+def test_inputs_that_go_while_it_runs_do_no_harm(recording, pipeline, tmp_path, monkeypatch):
+    fake = shapepose_fg.reconstruct_run.reconstruct_parts
+    left = hashlib.sha256((tmp_path / "left.txt").read_bytes()).hexdigest()
+
+    def vanishing(*arguments, **options):
+        (tmp_path / "left.txt").unlink()
+        (tmp_path / "right.txt").write_text("something else")
+        return fake(*arguments, **options)
+
+    monkeypatch.setattr(shapepose_fg.reconstruct_run, "reconstruct_parts", vanishing)
+    assert run(*recording) == 0
+    assert Reconstruction.load(tmp_path / "out").run["inputs"][str(tmp_path / "left.txt")] == left
 
 
 def test_help_names_the_commands(capsys):
