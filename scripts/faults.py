@@ -26,7 +26,7 @@ _SETTINGS = "batch_frames = 24\n"
 
 def main() -> int:
     """Run the campaign."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--kills", type=int, default=200, help="how many kills in all")
     parser.add_argument("--frames", type=int, default=300, help="frames of the recording")
     parser.add_argument("--workers", type=int, default=1, help="processes that solve")
@@ -75,8 +75,8 @@ def _command(folder: Path, frames: int, workers: int) -> list[str]:
 
 def _run(command: list[str], kill_after_s: float | None) -> int:
     """The exit code of a run that is killed after some seconds, if it takes so long."""
-    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    process = subprocess.Popen(command, **silent, env=os.environ | {"OMP_NUM_THREADS": "1"})
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment)
     try:
         return process.wait(kill_after_s)
     except subprocess.TimeoutExpired:

@@ -38,6 +38,7 @@ def main() -> None:
     parser.add_argument("--list", action="store_true", help="measure nothing, say what there is")
     parser.add_argument("--afresh", action="store_true", help="measure again what is kept")
     parser.add_argument("--results", type=Path, default=ROOT / "build" / "figures", help="where figures are kept")
+    parser.add_argument("--others", type=Path, help="folder of results by scripts/run_pose2sim.py")
     parser.add_argument("--update", action="store_true", help="write the tables into the documents")
     arguments = parser.parse_args()
     if arguments.update and (arguments.quick or arguments.cases or arguments.split != "report"):
@@ -46,7 +47,7 @@ def main() -> None:
     scale = Scale(arguments.quick, arguments.data if arguments.data.is_dir() else None, arguments.split)
     kept = Kept(arguments.results, "quick" if arguments.quick else arguments.split, arguments.afresh)
     total = 0.0
-    for experiment in experiments(scale, IMAGES if arguments.update else None):
+    for experiment in experiments(scale, IMAGES if arguments.update else None, arguments.others):
         if not _begins(experiment.name, arguments.only):
             continue
         part = experiment.only([case for case in experiment.cases if _begins(case.name, arguments.cases)])

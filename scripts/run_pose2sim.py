@@ -7,9 +7,10 @@
 Makes the environment DIR where there is none, and installs Pose2Sim from PyPI into it; nothing of it is among our
 dependencies. For every recording it writes a project as Pose2Sim wants it (cameras in TOML; people of each view,
 grouped greedily by their affinities, as OpenPose's JSON), runs association, triangulation and filtering with the
-settings of its own demo of several people, and leaves a TRC file per person in `OUTPUT/RECORDING/pose2sim` (gaps
-interpolated, outliers rejected, Butterworth) and `OUTPUT/RECORDING/pose2sim-raw` (neither). Recordings are Shelf
-and the stretches of the named sequences; they need `--data FOLDER`, or SHAPEPOSE_DATA. What is there stays.
+settings of its own demo of several people (`Choice` says what is another on the stretches), and leaves a TRC file
+per person in `OUTPUT/RECORDING/pose2sim` (gaps interpolated, outliers rejected, Butterworth) and in
+`OUTPUT/RECORDING/pose2sim-raw` (neither). Recordings are Shelf and the stretches of the named sequences; they need
+`--data FOLDER`, or SHAPEPOSE_DATA. What is there stays.
 """
 
 import argparse
@@ -19,6 +20,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +37,22 @@ from shapepose_fg.skeleton import BODY_25
 
 VERSION = "0.10.49"
 """Of Pose2Sim: the settings below are those of its demo `Demo_MultiPerson`."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What is not left as it is in the demo."""
+
+    error_m: float = 0.1
+    """`reconstruction_error_threshold`: people whose rays miss each other by more are not the same."""
+    smallest_person: int = 3
+    """Groups of fewer joints in a picture are nobody; 3 as in OpenPose."""
+
+
+SHELF = Choice()
+"""Real detections: the demo's settings."""
+STRETCHES = Choice(0.035, 9)
+"""Chosen on split `tune` (40 frames of salsa): F1 80 %; the demo's settings give 39, either alone up to 52."""
 KINDS = {RAW: ("personAssociation", "triangulation"), FILTERED: ("triangulation", "filtering")}
 """The results, and the steps of Pose2Sim that lead to them; who is who is found once."""
 STEPS = """\
@@ -64,14 +82,13 @@ def main() -> None:
     scale = Scale(data=arguments.data, split=arguments.split)
     wanted = arguments.only or ["shelf", "salsa", "crossing", "crowd"]
     if "shelf" in wanted and scale.shelf is not None:
-        rig = read_rig(scale.shelf / "calibration.json")
-        run(
-            python, read_detections(scale.shelf, rig), rig, SHELF_FPS, arguments.output / "shelf", arguments.frames
-        )
+        rig, output = read_rig(scale.shelf / "calibration.json"), arguments.output / "shelf"
+        run(python, read_detections(scale.shelf, rig), rig, SHELF_FPS, output, arguments.frames, SHELF)
     for stretch in scale.stretches if scale.has_scenes else ():
         if stretch.name in wanted:
             output = arguments.output / folder_name(stretch)
-            run(python, stretch.detections, stretch.scene.rig, stretch.scene.fps, output, arguments.frames)
+            rig, fps = stretch.scene.rig, stretch.scene.fps
+            run(python, stretch.detections, rig, fps, output, arguments.frames, STRETCHES)
 
 
 def environment(folder: Path) -> Path:
@@ -86,7 +103,13 @@ def environment(folder: Path) -> Path:
 
 
 def run(
-    python: Path, detections: DetectionSequence, rig: Rig, fps: float, output: Path, frames: int | None
+    python: Path,
+    detections: DetectionSequence,
+    rig: Rig,
+    fps: float,
+    output: Path,
+    frames: int | None,
+    choice: Choice,
 ) -> None:
     """Both results of one recording."""
     if all((output / kind).is_dir() for kind in (FILTERED, RAW)):
@@ -96,9 +119,9 @@ def run(
     part = Recording(detections.skeleton, [detections[frame] for frame in range(count)])
     with tempfile.TemporaryDirectory() as temporary:
         project = Path(temporary) / "project"
-        write_project(project, part, rig)
+        write_project(project, part, rig, choice.smallest_person)
         for kind, steps in KINDS.items():
-            config = settings(project, fps, count, filtered=kind == FILTERED)
+            config = settings(project, fps, count, choice.error_m, filtered=kind == FILTERED)
             (project / "settings.json").write_text(json.dumps(config))
             shutil.rmtree(project / "pose-3d", ignore_errors=True)
             _call(python, steps, project)
@@ -126,13 +149,13 @@ def _call(python: Path, steps: tuple[str, ...], project: Path) -> None:
         raise SystemExit(f"Pose2Sim failed ({' '.join(steps)}):\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}")
 
 
-def write_project(project: Path, detections: DetectionSequence, rig: Rig) -> None:
+def write_project(project: Path, detections: DetectionSequence, rig: Rig, smallest_person: int) -> None:
     """Cameras and people of each view, named so that Pose2Sim sorts both alike."""
     names = [f"cam{view:02d}" for view in range(1, len(rig) + 1)]
     (project / "calibration").mkdir(parents=True)
     (project / "calibration" / "Calib.toml").write_text(calibration(rig, names))
     (project / "Config.toml").write_text("")  # marks the project; settings come as a dict
-    write_openpose(detections, rig, project / "pose")
+    write_openpose(detections, rig, project / "pose", smallest_person=smallest_person)
     for camera, name in zip(rig.cameras, names, strict=True):
         (project / "pose" / camera.name).rename(project / "pose" / f"{name}_json")
 
@@ -163,7 +186,7 @@ def calibration(rig: Rig, names: list[str]) -> str:
     return "\n".join([*lines, "[metadata]", "adjusted = false", "error = 0.0", ""])
 
 
-def settings(project: Path, fps: float, frames: int, *, filtered: bool) -> dict[str, Any]:
+def settings(project: Path, fps: float, frames: int, error_m: float, *, filtered: bool) -> dict[str, Any]:
     """Pose2Sim's settings: those of its demo of several people, without anything that is shown."""
     return {
         "project": {
@@ -178,7 +201,7 @@ def settings(project: Path, fps: float, frames: int, *, filtered: bool) -> dict[
         "pose": {"pose_model": "CUSTOM", "CUSTOM": skeleton()},
         "personAssociation": {
             "single_person": {"likelihood_threshold_association": 0.3, "tracked_keypoint": "Neck"},
-            "multi_person": {"reconstruction_error_threshold": 0.1, "min_affinity": 0.2},
+            "multi_person": {"reconstruction_error_threshold": error_m, "min_affinity": 0.2},
         },
         "triangulation": {
             "reproj_error_threshold_triangulation": 15,

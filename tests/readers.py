@@ -21,6 +21,9 @@ from shapepose_fg.body.model.smpl_file import SMPL_PARENTS, read_smpl_file
 from shapepose_fg.body.shapes import SubjectShapes
 from shapepose_fg.camera import Rig
 from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
+from shapepose_fg.evaluation.other_results.reading import read_people
+from shapepose_fg.export.markers import Markers, opensim_names
+from shapepose_fg.export.trc import trc_text
 from shapepose_fg.io.calibration import read_rig, write_rig
 from shapepose_fg.io.config import read_config, toml_text
 from shapepose_fg.io.corrections import read_corrections
@@ -237,6 +240,28 @@ def _rig(seed: int, cameras: int = 3) -> Rig:
     return ring_of_cameras(cameras, np.random.default_rng(seed))
 
 
+def _people_text(folder: Path, seed: int) -> Read:
+    path, rng = folder / "skel.txt", np.random.default_rng(seed)
+    joints = (15, 17, 19)[seed % 3]
+    lines = [f"{joints}\t2"]
+    for count in (2, 1):
+        lines.append(str(count))
+        for person in range(count):
+            rows = np.concatenate([rng.normal(0, 1, (3, joints)), np.ones((1, joints))])
+            lines += [str(person), *(" ".join(f"{value:10.6g}" for value in row) for row in rows)]
+    path.write_text("\n".join(lines) + "\n")
+    return lambda: read_people(path)
+
+
+def _people_trc(folder: Path, seed: int) -> Read:
+    rng = np.random.default_rng(seed)
+    for person in range(2):
+        markers = Markers(opensim_names(BODY_25.joints), rng.normal(0, 1, (3, 25, 3)), np.zeros((3, 25)))
+        text = trc_text(markers, np.arange(3), np.arange(3) / 25, 25.0, f"P{person}.trc")
+        (folder / f"P{person}.trc").write_text(text)
+    return lambda: read_people(folder)
+
+
 READERS: dict[str, Prepare] = {
     **{f"cameras of {program}": _calibration(program) for program in rigs.WRITERS},
     **{f"detections of {program}": _people(program) for program in people.WRITERS},
@@ -258,5 +283,7 @@ READERS: dict[str, Prepare] = {
     "body": _body(False),
     "pickled body": _body(True),
     "weights": _weights,
+    "people in 4D Association's text": _people_text,
+    "people in TRC": _people_trc,
 }
 """Every reader, by what it reads."""

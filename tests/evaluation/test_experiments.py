@@ -6,12 +6,15 @@ import re
 import pytest
 
 from shapepose_fg.errors import InputError
+from shapepose_fg.estimation.window_graph import WindowGraphConfig
+from shapepose_fg.evaluation.experiments import fingerprint as module
 from shapepose_fg.evaluation.experiments import runner
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment
 from shapepose_fg.evaluation.experiments.fingerprint import fingerprint
 from shapepose_fg.evaluation.experiments.registry import experiments
 from shapepose_fg.evaluation.experiments.runner import Kept, measured
 from shapepose_fg.evaluation.experiments.scale import Scale
+from shapepose_fg.pipeline import PipelineConfig
 
 QUICK = {each.name: each for each in experiments(Scale(quick=True))}
 """Those that need no recording."""
@@ -79,12 +82,8 @@ def test_fingerprints_are_of_what_they_are_called(monkeypatch):
     fingerprint.cache_clear()
     before = {basis: fingerprint(basis) for basis in ("pipeline", "bodies", "detector")}
     assert len(set(before.values())) == 3
-    from shapepose_fg.evaluation.experiments import fingerprint as module
-
-    written = module.toml_text
-    monkeypatch.setattr(
-        module, "toml_text", lambda config: written(config).replace("rho_3d = 1.0", "rho_3d = 0.5")
-    )
+    graph = WindowGraphConfig(rho_3d=0.5)
+    monkeypatch.setattr(module, "PipelineConfig", lambda: PipelineConfig(window_graph=graph))
     fingerprint.cache_clear()
     after = {basis: fingerprint(basis) for basis in before}
     fingerprint.cache_clear()

@@ -29,7 +29,7 @@ class BodyConfig:
     @classmethod
     def paper(cls) -> "BodyConfig":
         """As written in Eq. 6: the network's steps, and nothing after them."""
-        return cls(learned=LearnedFitterConfig(polish_steps=0, unfinished=1e9))
+        return cls(learned=LearnedFitterConfig(polish_steps=0, unfinished=1e6))
 
     def __post_init__(self) -> None:
         if self.method not in get_args(Method):

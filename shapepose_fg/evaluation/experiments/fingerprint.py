@@ -6,7 +6,6 @@ from pathlib import Path
 
 from shapepose_fg.body.fitting.fitters import BodyConfig
 from shapepose_fg.evaluation.experiments.experiment import Basis
-from shapepose_fg.io.config import toml_text
 from shapepose_fg.pipeline import PipelineConfig
 from shapepose_fg.simulation import DetectorConfig
 
@@ -20,7 +19,7 @@ _FILES = ("*.npz", "*.json", "*.safetensors")
 def fingerprint(basis: Basis = "pipeline") -> str:
     """Of the default settings and of the data that ship, as far as they decide about figures of `basis`."""
     settings = {"pipeline": (PipelineConfig(),), "bodies": (BodyConfig(),), "detector": ()}[basis]
-    whole = hashlib.sha256("".join(map(toml_text, settings)).encode())
+    whole = hashlib.sha256(repr(settings).encode())
     if basis != "bodies":
         whole.update(repr(DetectorConfig()).encode())
     for room in _DATA[basis]:

@@ -50,8 +50,6 @@ def interactions(scale: Scale, others: Path | None = None) -> Experiment | None:
     cases = []
     for stretch in scale.stretches:
         made: dict[str, Callable[[], Figures]] = {name: partial(make, stretch) for name, make in _MEASURES.items()}
-        if not hasattr(PipelineConfig, "paper"):
-            del made["paper's settings"]
         if others is not None and (others / folder_name(stretch)).is_dir():
             made["others"] = partial(_others, stretch, others)
         cases += [Case(f"{stretch.label} {name}", measure) for name, measure in made.items()]
@@ -86,7 +84,7 @@ def _paper(stretch: Stretch) -> Figures:
     """The method as the paper has it."""
     _ = stretch.detections
     began = time.process_time()
-    people = stretch.reconstruct(getattr(PipelineConfig, "paper")())  # noqa: B009
+    people = stretch.reconstruct(PipelineConfig.paper())
     return {"paper's settings": _with_time(scored(people, stretch.scene.keypoints), began, stretch)}
 
 

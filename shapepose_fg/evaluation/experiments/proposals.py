@@ -49,8 +49,8 @@ def proposals(scale: Scale) -> Experiment | None:
     return Experiment("proposals", [case(*key, name) for key, name in cases.items()], table)
 
 
-def hip_views(scale: Scale) -> Experiment | None:
-    """The same with hips that are seen by two views only, up to six."""
+def hip_views(scale: Scale, images: Path | None = None) -> Experiment | None:
+    """The same with hips that are seen by two views only, up to six; drawn into the folder `images`, if given."""
     if not scale.has_scenes:
         return None
     stretches = [shorter(stretch, FRAMES_OF_VIEWS) for stretch in scale.one_each]
@@ -66,6 +66,8 @@ def hip_views(scale: Scale) -> Experiment | None:
         for views, mean, found in curves(figures):
             cells = (f"{precision:.1f}, {recall:.1f}" for precision, recall in found.values())
             rows.append(f"| {views} | {mean:.1f} | {' | '.join(cells)} |")
+        if images is not None:
+            draw_hip_views(figures, images / "hip_views.png")
         return rows
 
     return Experiment("hip_views", [case(*key, name) for key, name in cases.items()], table)

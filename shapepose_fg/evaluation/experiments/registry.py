@@ -12,12 +12,25 @@ from shapepose_fg.evaluation import (
     visibility_agreement,
 )
 from shapepose_fg.evaluation.experiments import box, crowd, footage, over_time
+from shapepose_fg.evaluation.experiments.ablation import ablation
 from shapepose_fg.evaluation.experiments.experiment import Experiment, whole
+from shapepose_fg.evaluation.experiments.foreign_bodies import foreign
+from shapepose_fg.evaluation.experiments.graph_solver import graph_solver
+from shapepose_fg.evaluation.experiments.interactions import interactions
+from shapepose_fg.evaluation.experiments.iterations import iterations
+from shapepose_fg.evaluation.experiments.prior_confidence import prior_confidence
+from shapepose_fg.evaluation.experiments.proposals import hip_views, proposals
 from shapepose_fg.evaluation.experiments.scale import Scale
+from shapepose_fg.evaluation.experiments.shelf_others import shelf_others
+from shapepose_fg.evaluation.experiments.smpl_only import smpl_only
+from shapepose_fg.evaluation.experiments.sweeps import sweeps
 
 
-def experiments(scale: Scale, images: Path | None = None) -> Iterator[Experiment]:
-    """Those whose data are there; figures are drawn into the folder `images`, or not at all."""
+def experiments(scale: Scale, images: Path | None = None, others: Path | None = None) -> Iterator[Experiment]:
+    """Those whose data are there; figures are drawn into the folder `images`, or not at all.
+
+    Results of other systems are read from the folder `others` (scripts/run_pose2sim.py).
+    """
     yield from _shelf(scale)
     yield from _scenes(scale)
     if scale.has_scenes:
@@ -26,14 +39,28 @@ def experiments(scale: Scale, images: Path | None = None) -> Iterator[Experiment
     yield crowd.experiment(scale)
     yield box.experiment(scale)
     for make in (footage.shelf_events, footage.held_out_views, footage.single_person):
-        found = make(scale)
-        if found is not None:
-            yield found
+        yield from _there(make(scale))
+    yield from _paper(scale, images, others)
     if not scale.quick and scale.mocap is not None:
         for name, table in fitter_tables.tables(scale.mocap, scale.shelf, images).items():
             yield whole(name, table, "pipeline" if name == "fitter alternation" else "bodies")
     if not scale.quick:
         yield from _simulation(scale, images)
+
+
+def _paper(scale: Scale, images: Path | None, others: Path | None) -> Iterator[Experiment]:
+    """The paper's experiments, and what goes beyond them."""
+    yield from _there(shelf_others(scale, others))
+    yield from _there(interactions(scale, others))
+    yield from _there(hip_views(scale, images))
+    for make in (proposals, smpl_only, prior_confidence, iterations, graph_solver, sweeps, foreign, ablation):
+        yield from _there(make(scale))
+
+
+def _there(found: Experiment | None) -> Iterator[Experiment]:
+    """The experiment, if its data are there."""
+    if found is not None:
+        yield found
 
 
 def _shelf(scale: Scale) -> Iterator[Experiment]:

@@ -10,6 +10,7 @@ from shapepose_fg.camera import Axis
 from shapepose_fg.errors import InputError
 from shapepose_fg.evaluation.other_results.skeleton_text import SHELF_JOINTS, joint_names, read_skeleton_text
 from shapepose_fg.evaluation.other_results.trc import is_trc, read_trc
+from shapepose_fg.files import open_regular
 from shapepose_fg.reconstruction import Reconstruction, Status
 from shapepose_fg.skeleton import BODY_25
 
@@ -44,9 +45,9 @@ def read_people(path: Path | str, up: Axis = "z") -> Reconstruction:
 def _beginning(path: Path) -> str:
     """The first line of a file, if it is text; nothing where it cannot be read: who reads it says why."""
     try:
-        with path.open("rb") as stream:
+        with open_regular(path) as stream:
             return stream.read(200).decode("utf-8-sig", errors="replace").partition("\n")[0]
-    except OSError:
+    except (InputError, OSError):
         return ""
 
 
