@@ -1,7 +1,8 @@
-"""Build sdist and wheel, install the wheel into an empty environment, and use it there: python scripts/check_package.py
+"""Build sdist and wheel, install the wheel into an empty environment, and use it: python scripts/check_package.py
 
-The wheel is built from the sdist, so that what the sdist lacks is noticed. The environment takes the dependencies from
-the one that runs this (torch is a large download), but nothing of this folder: what is used is what was installed.
+The wheel is built from the sdist, so that what the sdist lacks is noticed. The environment takes the dependencies
+from the one that runs this (torch is a large download), but nothing of this folder: what is used is what was
+installed.
 """
 
 import os

@@ -8,6 +8,7 @@ random numbers, which nothing was mended by, and keeps nothing.
 """
 
 import argparse
+import importlib
 import os
 import random
 import re
@@ -15,7 +16,9 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).parents[1]
 FOUND = ROOT / "tests" / "data" / "fuzz"
@@ -34,10 +37,7 @@ def main() -> None:
     if given.worker is not None:
         work(given.worker, given.held_out, given.seed, given.seconds)
         return
-    sys.path.insert(0, str(ROOT / "tests"))
-    from readers import READERS
-
-    names = given.reader or list(READERS)
+    names = given.reader or list(readers())
     cases = faults = 0
     for name in names:
         ran, failed = fuzz(name, max(1, given.seconds // len(names)), given.held_out)
@@ -45,6 +45,12 @@ def main() -> None:
         print(f"{name}: {ran} cases, {failed} faults", flush=True)
     print(f"all: {cases} cases, {faults} faults")
     sys.exit(1 if faults else 0)
+
+
+def readers() -> dict[str, Any]:
+    """Every reader, as the tests list them."""
+    sys.path.insert(0, str(ROOT / "tests"))
+    return importlib.import_module("readers").READERS
 
 
 def fuzz(name: str, seconds: int, held_out: bool) -> tuple[int, int]:
@@ -56,8 +62,6 @@ def fuzz(name: str, seconds: int, held_out: bool) -> tuple[int, int]:
         command = [sys.executable, __file__, "--worker", name, "--seed", str(seed), "--seconds", str(int(left))]
         command += ["--held-out"] if held_out else []
         with tempfile.TemporaryDirectory() as folder:
-            import time
-
             start = time.monotonic()
             ended = subprocess.run(
                 command, cwd=folder, capture_output=True, text=True, errors="replace", check=False
@@ -103,20 +107,20 @@ def _keep(name: str, found: list[Path]) -> None:
 
 def work(name: str, held_out: bool, seed: int, seconds: int) -> None:
     """One reader in this process, until it breaks or the time is up."""
-    import atheris
-
-    sys.path.insert(0, str(ROOT / "tests"))
+    try:
+        atheris: Any = importlib.import_module("atheris")
+    except ImportError:
+        sys.exit('error: the fuzzer needs atheris; pip install -e ".[fuzz]"')
     with atheris.instrument_imports(include=["shapepose_fg"]):
-        from readers import READERS
-
-        from shapepose_fg.errors import InputError
-    from mutations import mutated
+        prepare = readers()[name]
+    mutated = importlib.import_module("mutations").mutated
+    from shapepose_fg.errors import InputError
 
     shared = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
     folder = Path(tempfile.mkdtemp(dir=shared))
     corpus = Path.cwd() / "corpus"
     corpus.mkdir()
-    read = READERS[name](folder, 12345 if held_out else 0)
+    read = prepare(folder, 12345 if held_out else 0)
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     valid = [path.read_bytes() for path in files]
     for index, content in enumerate(valid[:64]):

@@ -7,6 +7,7 @@ import re
 import tomllib
 from importlib.metadata import Distribution, PackageNotFoundError, distribution
 from pathlib import Path
+from typing import Any
 
 from packaging.requirements import Requirement
 
@@ -15,9 +16,10 @@ PAGE = ROOT / "docs" / "licences.md"
 EXTRAS = ("viewer", "detect", "export", "view")
 HEAD = """# Licences of what is installed with it
 
-`pip install shapepose-fg` brings the first table, its extras the second; what is only needed to test it is not listed.
-The names are those that each package's own metadata give. None asks that programs which use it be under its own licence.
-opencv-python-headless carries FFmpeg's libraries (LGPL-2.1) beside its own; they are separate files that may be exchanged.
+`pip install shapepose-fg` brings the first table, its extras the second; what is only needed to test it is not
+listed. The names are those that each package's own metadata give. None asks that programs which use it be under
+its own licence. opencv-python-headless carries FFmpeg's libraries (LGPL-2.1) beside its own; they are separate
+files that may be exchanged.
 
 Our code is MIT; what the body and priors are made from is in the [README](../README.md#licence-and-credits).
 """
@@ -58,14 +60,13 @@ def needed(extras: tuple[str, ...]) -> dict[str, Distribution]:
 
 def licence(of: Distribution) -> str:
     """The licence that a distribution's metadata name, as short as they do."""
-    expression = of.metadata.get("License-Expression")
+    metadata: Any = of.metadata
+    expression = metadata.get("License-Expression")
     if expression:
         return expression
-    classifiers = [
-        each.split(" :: ")[-1] for each in of.metadata.get_all("Classifier", []) if each[:7] == "License"
-    ]
-    named = [_SHORT.get(each.lower(), each) for each in classifiers if each != "OSI Approved"]
-    text = (of.metadata.get("License") or "").strip()
+    classifiers = [each.split(" :: ")[-1] for each in metadata.get_all("Classifier", []) if each[:7] == "License"]
+    named: list[str] = [str(_SHORT.get(each.lower(), each)) for each in classifiers if each != "OSI Approved"]
+    text = (metadata.get("License") or "").strip()
     if text and len(text) < 40 and "\n" not in text:
         return text
     return " or ".join(named) if named else "see its own files"

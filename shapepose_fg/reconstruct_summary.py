@@ -41,6 +41,8 @@ def summary_table(
     for reason, count in run.get("people", {}).get("dropped", {}).items():
         where = _frames_words(run.get("dropped_frames", {}).get(reason, []))
         table.add_row("", f"{count} dropped: {reason}{where}", style="dim")
+    for what, spans in run.get("thinned_frames", {}).items():
+        table.add_row("", f"too many {what}, the surest were taken{_frames_words(spans)}", style="yellow")
     if len(people) > 0:
         table.add_row("joints", _joints(counts["joints"], people))
     # Loading torch and the body takes a second or two, once; it says nothing about the time of a frame.

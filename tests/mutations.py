@@ -26,6 +26,8 @@ WORDS = [
     "!!python/object:os.system",
     "<!DOCTYPE a>",
 ]
+_LARGEST = 2**18
+"""Bytes of what comes out: readers are to be tried, not the disk."""
 _TEXT = re.compile(rb"[\t\n\r -~]{64}")
 
 
@@ -38,6 +40,7 @@ def mutated(content: bytes, rng: random.Random) -> bytes:
             content = _text(content.decode("utf-8", "replace"), rng).encode("utf-8", "replace")
         else:
             content = _bytes(content, rng)
+        content = content[:_LARGEST]
     return content
 
 

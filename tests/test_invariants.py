@@ -1,8 +1,8 @@
-"""What may not matter: the cameras' order, where the world's origin is, its unit, left and right, a frame given twice.
+"""What may not matter: the cameras' order, the world's origin, its unit, left and right, a frame given twice.
 
 Each is a small scene, reconstructed twice. Tolerances: sums over cameras and people are made in another order, and
-the solver stops when steps are small, so that places differ by far less than they are known to (1 cm): 1 mm. Where
-the detector's errors are mirrored the learned fitter, which was not trained on mirrored people, may differ by more.
+the solver stops when steps are small, so that places differ by far less than they are known to (1 cm): 1 mm.
+Where all is mirrored the learned fitter, which is not quite the same on both sides, may differ by more.
 """
 
 import sys
@@ -107,7 +107,7 @@ def test_the_unit_of_the_calibration(tmp_path):
 
 
 def test_left_and_right():
-    """The world and all pictures in a mirror, the left hand called right: stage I finds the mirrored candidates."""
+    """World and pictures in a mirror, the left hand called right: stage I finds the mirrored candidates."""
     rig, frames = recording()
     flip = np.diag([-1.0, 1.0, 1.0])
     cameras = []

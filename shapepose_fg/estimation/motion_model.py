@@ -89,18 +89,18 @@ class MotionModel:
             if data["format"] != FORMAT:
                 raise KeyError("format")
             known = {name: tuple(map(float, numbers)) for name, numbers in data["joints"].items()}
+            if any(len(numbers) != 3 for numbers in known.values()):
+                raise ValueError("a joint has other than 3 densities")
             views, body = (
                 Lasting(*(float(data[name][key]) for key in ("white_share", "correlation_s", "kept")))
                 for name in ("views", "body")
             )
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise InputError(
                 f"{path}: is not a motion model ({error}); give what scripts/measure_motion.py writes"
             ) from None
-        table = np.array(list(known.values()))
-        if not (
-            np.isfinite(table).all() and (table[:, 0] > 0).all() and table.shape[1] == 3 and (table >= 0).all()
-        ):
+        table = np.array(list(known.values())).reshape(-1, 3)
+        if len(table) == 0 or not (np.isfinite(table).all() and (table[:, 0] > 0).all() and (table >= 0).all()):
             raise InputError(f"{path}: densities must be positive; give what scripts/measure_motion.py writes")
         chosen = config.psd_scale * np.array([known.get(name, tuple(table.mean(axis=0))) for name in joints])
         still, speed, lost = np.ascontiguousarray(chosen.T)

@@ -270,7 +270,8 @@ def _greedy_seeds(points: PairPoints, radius_m: float) -> NDArray[np.intp]:
     """
     order = np.argsort(-points.score, kind="stable")
     # A fourth coordinate keeps different joints apart.
-    places = np.column_stack([points.xyz, points.joint * (4.0 * radius_m)])[order]
+    apart = points.joint * (4.0 * radius_m)
+    places = np.asarray(np.column_stack([points.xyz, apart])[order], dtype=np.float64)
     if len(order) <= _POINTS_AT_ONCE:
         return order[_seeds_of_ranked(places, radius_m)][np.argsort(order)]
     every = KDTree(places, balanced_tree=False, compact_nodes=False)

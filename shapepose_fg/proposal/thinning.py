@@ -6,6 +6,7 @@ below both bounds.
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,9 +109,7 @@ def _with_most(candidates: Candidates, most: int) -> Candidates:
     return replace(candidates, **columns, support=np.column_stack([place[support[:, 0]], support[:, 1]]))
 
 
-def _best(
-    group: NDArray[np.intp], most: int, order: tuple[NDArray[np.float64] | NDArray[np.bool_], ...]
-) -> NDArray[np.bool_]:
+def _best(group: NDArray[np.intp], most: int, order: tuple[NDArray[Any], ...]) -> NDArray[np.bool_]:
     """(N,) the first `most` of each group by `order` (last key first), then as they stand."""
     ranked = np.lexsort((*order, group))
     sizes = np.bincount(group)

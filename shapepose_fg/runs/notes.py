@@ -63,11 +63,9 @@ class Notebook:
         self._frame: int | None = None
 
     def thin(self, what: str, is_thinned: bool, frame: int | None = None) -> None:
-        """Note down that some of the frame's detections or candidates were left out, because they were too
-        many.
-        """
+        """Note down that some of a frame's detections, points or candidates were too many and left out."""
         frame = self._frame if frame is None else frame
-        if is_thinned and frame is not None:
+        if is_thinned and frame is not None and frame not in self._thinned_frames[what][-1:]:
             self._thinned_frames[what].append(frame)
 
     def drop(self, reason: str, count: int) -> None:
@@ -98,7 +96,7 @@ class Notebook:
             seconds=dict(self._seconds),
             dropped=dict(self._dropped),
             dropped_frames={reason: frames for reason, frames in self._dropped_frames.items() if frames},
-            thinned_frames=dict(self._thinned_frames),
+            thinned_frames={what: frames for what, frames in self._thinned_frames.items() if frames},
         )
         self._seconds.clear()
         self._dropped.clear()

@@ -16,6 +16,7 @@ from typing import Any, BinaryIO
 
 _MOST_STEPS = 2_000_000
 """SMPL's files take a few thousand."""
+_OPCODES = {each.code: each for each in pickletools.opcodes}
 _REBUILDS = {("copy_reg", "_reconstructor"), ("copyreg", "_reconstructor")}
 """Functions that make an object of the class that is their first argument."""
 
@@ -62,7 +63,7 @@ class _Machine:
     def run(self, stream: BinaryIO) -> Any:
         for _ in range(_MOST_STEPS):
             code = stream.read(1)
-            opcode = pickletools.code2op.get(code.decode("latin1"))
+            opcode = _OPCODES.get(code.decode("latin1"))
             if opcode is None:
                 raise ValueError("the pickle ends too early" if code == b"" else f"{code!r} is no instruction")
             argument = _argument(opcode, stream)

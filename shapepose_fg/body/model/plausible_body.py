@@ -40,8 +40,10 @@ def implausible(
             return (
                 f"{name} has rows that do not sum to 1 (off by {off:.2g}): use the file of one and the same model"
             )
-    joints = dict(zip(SMPL_24, joint_regressor @ template, strict=True))
-    keypoints = dict(zip(BODY_25.joints, keypoint_regressor @ template, strict=True))
+    joints: dict[str, NDArray[np.float64]] = dict(zip(SMPL_24, joint_regressor @ template, strict=True))
+    keypoints: dict[str, NDArray[np.float64]] = dict(
+        zip(BODY_25.joints, keypoint_regressor @ template, strict=True)
+    )
     for part in (*_RISING, "elbow", "wrist"):
         if not joints[f"left_{part}"][0] > joints[f"right_{part}"][0]:
             return f"J_regressor puts left_{part} to the right of right_{part}: the body's left is +x"
