@@ -281,6 +281,20 @@ def test_a_disk_that_is_full_is_one_sentence_too(recording, pipeline, monkeypatc
     assert [path.name for path in out.iterdir()] == ["parts"]
 
 
+def test_inputs_that_go_while_it_runs_do_no_harm(recording, pipeline, tmp_path, monkeypatch):
+    fake = shapepose_fg.reconstruct_run.reconstruct_parts
+    left = hashlib.sha256((tmp_path / "left.txt").read_bytes()).hexdigest()
+
+    def vanishing(*arguments, **options):
+        (tmp_path / "left.txt").unlink()
+        (tmp_path / "right.txt").write_text("something else")
+        return fake(*arguments, **options)
+
+    monkeypatch.setattr(shapepose_fg.reconstruct_run, "reconstruct_parts", vanishing)
+    assert run(*recording) == 0
+    assert Reconstruction.load(tmp_path / "out").run["inputs"][str(tmp_path / "left.txt")] == left
+
+
 def test_help_names_the_commands(capsys):
     for arguments in ([], ["--help"]):
         assert run(*arguments) == 0

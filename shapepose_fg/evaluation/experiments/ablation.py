@@ -11,7 +11,7 @@ from shapepose_fg.evaluation.experiments.scale import Scale, Stretch, shorter
 from shapepose_fg.evaluation.experiments.scene_scores import mean_of, solve_and_score
 from shapepose_fg.pipeline import PipelineConfig
 
-FRAMES = 100
+FRAMES = 30
 """Of each stretch."""
 
 OURS = replace(PipelineConfig(), temporal=False)

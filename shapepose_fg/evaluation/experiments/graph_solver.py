@@ -5,6 +5,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.threads import torch_threads
@@ -88,7 +89,7 @@ def _measure(stretch: Stretch, *, quick: bool) -> Figures:
     return figures
 
 
-def _figures(this: Alternated, best: Alternated, truth: np.ndarray, rows: np.ndarray) -> Figures:
+def _figures(this: Alternated, best: Alternated, truth: np.ndarray, rows: NDArray[np.intp]) -> Figures:
     """Against the truth of matched rows, and against the minimum: both in the last energy of `best`."""
     error = np.linalg.norm(this.joints[rows] - truth, axis=-1)
     apart = np.linalg.norm(this.joints - best.joints, axis=-1)

@@ -21,8 +21,11 @@ PAPER = {0: 83.7, 10: 90.1}
 """Precision in % of initial and final poses on the Association Dataset: it converges after about 10."""
 
 
-def iterations(scale: Scale) -> Experiment | None:
-    """Every frame by itself, ours and the paper's preset, each for exactly so many rounds."""
+def iterations(scale: Scale, images: Path | None = None) -> Experiment | None:
+    """Every frame by itself, ours and the paper's preset, each for exactly so many rounds.
+
+    Drawn into the folder `images`, if given.
+    """
     if not scale.has_scenes:
         return None
     stretches = [shorter(stretch, FRAMES) for stretch in scale.one_each]
@@ -35,6 +38,8 @@ def iterations(scale: Scale) -> Experiment | None:
     ]
 
     def table(figures: Mapping[str, Figures]) -> list[str]:
+        if images is not None:
+            draw_iterations(figures, images / "iterations.png")
         head = " | ".join(f"{name}: precision | F1 | MPJPE, mm" for name in CONFIGS)
         rows = [
             f"| alternations | {head} | the paper, its data: precision |",

@@ -52,8 +52,9 @@ def _paper(scale: Scale, images: Path | None, others: Path | None) -> Iterator[E
     """The paper's experiments, and what goes beyond them."""
     yield from _there(shelf_others(scale, others))
     yield from _there(interactions(scale, others))
-    yield from _there(hip_views(scale, images))
-    for make in (proposals, smpl_only, prior_confidence, iterations, graph_solver, sweeps, foreign, ablation):
+    for draws in (hip_views, prior_confidence, iterations):
+        yield from _there(draws(scale, images))
+    for make in (proposals, smpl_only, graph_solver, sweeps, foreign, ablation):
         yield from _there(make(scale))
 
 
