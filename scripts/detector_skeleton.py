@@ -30,25 +30,13 @@ from shapepose_fg.io.detections import read_detections
 from shapepose_fg.observations import Observations
 from shapepose_fg.pipeline import PipelineConfig, find_people, reconstruct
 from shapepose_fg.simulation import DetectorConfig, built_in_scene, simulate
+from shapepose_fg.simulation.foreign import DETECTOR_S_OWN
 
 SEEDS = (2000, 2001, 2002)
 CONFIG = replace(PipelineConfig(), temporal=False)
 DOUBTFUL = 0.25
 """A joint whose mean confidence over all views is less is doubtful (the paper's rho_3D)."""
 WITHOUT = replace(CONFIG, offsets=replace(CONFIG.offsets, source="none"))
-ODD = KeypointOffsets.symmetric(
-    {
-        "LHip": (0.035, 0.03, 0.0),
-        "LShoulder": (0.01, -0.02, -0.01),
-        "Neck": (0.0, -0.03, 0.01),
-        "Nose": (0.0, 0.0, 0.02),
-        "LEar": (0.0, 0.01, -0.02),
-        "LKnee": (0.0, 0.02, 0.01),
-        "LElbow": (-0.015, 0.0, -0.01),
-        "LHeel": (0.0, 0.01, -0.02),
-    }
-)
-"""A detector with hips, shoulders, neck, face, knees and heels of its own: 14 mm over all joints."""
 
 
 def simulated() -> list[str]:
@@ -57,7 +45,7 @@ def simulated() -> list[str]:
         "| detector | offsets | F1, % | MPJPE, mm | doubtful joints: mean (median), mm |",
         "|---|---|---|---|---|",
     ]
-    for name, offsets in (("has the body's joints", None), ("has its own", ODD)):
+    for name, offsets in (("has the body's joints", None), ("has its own", DETECTOR_S_OWN)):
         for label, config in (("none", WITHOUT), ("learnt", CONFIG)):
             f1, mpjpe, doubtful = zip(*(_scene(seed, offsets, config) for seed in SEEDS), strict=True)
             error = np.concatenate(doubtful)

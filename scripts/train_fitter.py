@@ -7,7 +7,9 @@ an hour on one core.
 """
 
 import json
+import os
 import sys
+import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -54,6 +56,7 @@ def main(
 ) -> None:
     """Train, validate, write."""
     torch.set_num_threads(threads)
+    _refuse_unwritable(output)
     config = replace(TrainingConfig(), iterations=iterations, batch=batch, seed=seed)
     model = BodyModel.default() if body is None else BodyModel.load(body)
     recorded = load_motions(motions)
@@ -91,6 +94,20 @@ def main(
     weights = FitterWeights(network, frame, fingerprint(model), card=card)
     _calibrated(weights, recorded, model, config).save(output)
     print(f"{output}: {output.stat().st_size / 1e6:.1f} MB, {num_weights(trainer.averaged)} weights")
+
+
+def _refuse_unwritable(output: Path) -> None:
+    """InputError where the weights could not be written in the end."""
+    for file in (output, output.with_suffix(".checkpoint"), output.with_suffix(".log")):
+        if file.is_dir():
+            raise InputError(f"{file}: this is a folder; give another --output")
+        if file.exists() and not os.access(file, os.W_OK):
+            raise InputError(f"{file}: it may not be written; give another --output")
+    try:
+        with tempfile.TemporaryFile(dir=output.parent):
+            pass
+    except OSError as error:
+        raise InputError(f"{output}: cannot be written ({error.strerror}); give another --output") from None
 
 
 def _calibrated(
@@ -146,5 +163,6 @@ def _card(trainer: Trainer, recorded: Motions, motions: Path, errors: list[float
 if __name__ == "__main__":
     try:
         typer.run(main)
-    except InputError as error:
-        sys.exit(str(error))
+    except (InputError, OSError) as problem:
+        print(f"error: {' '.join(str(problem).split())}", file=sys.stderr)
+        sys.exit(2)

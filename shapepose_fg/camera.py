@@ -5,6 +5,7 @@ time.
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import PurePath
 from typing import Literal
 
 import cv2
@@ -20,6 +21,8 @@ Lens = Literal["perspective", "fisheye"]
 """OpenCV's two families of lenses: Brown's model with its rational extension, and the equidistant fisheye."""
 
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+_MOST_PIXELS, _MOST_METRES, _MOST_DISTORTION, _LONGEST_NAME = 1_000_000, 1e6, 1e6, 200
+"""No picture, room, lens or name is as large; what is computed of larger numbers overflows."""
 _ROTATION_TOLERANCE = 1e-3
 """How far R Rᵀ may be from the identity: calibrations are printed with four to six digits."""
 _COEFFICIENTS: dict[str, tuple[int, ...]] = {"perspective": (5, 8, 12, 14), "fisheye": (4,)}
@@ -64,9 +67,25 @@ class Camera:
         R = self.wTc[:3, :3]
         if np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(R) < 0:
             raise ValueError(f"camera {self.name}: the rotation of wTc must be orthonormal with determinant 1")
+        for name, value, most in (
+            ("K", self.K, _MOST_PIXELS),
+            ("wTc", self.wTc, _MOST_METRES),
+            ("distortion", self.distortion, _MOST_DISTORTION),
+        ):
+            if np.abs(value).max(initial=0.0) > most:
+                largest = np.abs(value).max()
+                raise ValueError(f"camera {self.name}: {name} must be at most {most:g}, got {largest:.3g}")
         width, height = self.image_size
-        if min(width, height) <= 0:
-            raise ValueError(f"camera {self.name}: image_size must be positive, got {self.image_size}")
+        if not 0 < min(width, height) <= max(width, height) <= _MOST_PIXELS:
+            raise ValueError(
+                f"camera {self.name}: image_size must be positive and at most {_MOST_PIXELS}, got"
+                f" {self.image_size}"
+            )
+        if not self.name or len(self.name) > _LONGEST_NAME or not self.name.isprintable():
+            raise ValueError(f"camera {self.name[:40]!r}: names must be 1 to {_LONGEST_NAME} letters, in one line")
+        way = PurePath(self.name)
+        if way.is_absolute() or len(way.parts) == 0 or ".." in way.parts:
+            raise ValueError(f"camera {self.name}: the name must not lead out of a folder: files are called so")
         object.__setattr__(self, "image_size", (int(width), int(height)))
 
     @classmethod

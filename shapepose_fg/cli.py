@@ -6,6 +6,7 @@ import re
 import sys
 import time
 from collections.abc import Sequence
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
@@ -20,8 +21,9 @@ from shapepose_fg.overlay_command import overlay
 from shapepose_fg.reconstruct_command import reconstruct
 from shapepose_fg.report_command import report as report_command
 from shapepose_fg.setup_command import check_calibration
+from shapepose_fg.stopping import Stopped, stoppable
 from shapepose_fg.terminal import progress as progress_bar
-from shapepose_fg.terminal import show
+from shapepose_fg.terminal import show, use_any_streams
 from shapepose_fg.tracks_command import tracks
 from shapepose_fg.view_command import view
 
@@ -53,10 +55,12 @@ _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line. An error is one sentence on stderr and exit code 2."""
+    use_any_streams()
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        code = app(arguments or ["--help"], standalone_mode=False)
-        sys.stdout.flush()
+        with stoppable():
+            code = app(arguments or ["--help"], standalone_mode=False)
+            sys.stdout.flush()
     except _UsageProblem as error:
         code = _fail(f"{cast(Any, error).format_message().rstrip('.')}; see shapepose-fg --help")
     except InputError as error:
@@ -68,6 +72,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except OSError as error:
         place = f"{error.filename}: " if error.filename is not None else ""
         code = _fail(f"{place}{error.strerror or error}; check the path, its permissions and the space left")
+    except Stopped as stop:
+        _say("stopped", stop.message or "nothing is left half written", "bold yellow")
+        code = stop.exit_code
     except (typer.Abort, KeyboardInterrupt):
         code = 130
     sys.exit(code if isinstance(code, int) else 0)
@@ -75,15 +82,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 @evaluate.command("shelf")
 def evaluate_shelf_command(
-    people: Annotated[Path, typer.Option(help="people.npz of a reconstruction, or the folder it is in.")],
+    people: Annotated[
+        Path, typer.Option(help="people.npz, or its folder; 4D Association's text; TRC, or a folder of it.")
+    ],
     ground_truth: Annotated[Path, typer.Option(help="Annotation of the Shelf recording, as text.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
 ) -> None:
     """PCP per limb and actor, MPJPE and recall on the Shelf recording."""
+    from shapepose_fg.evaluation.other_results.reading import read_people
     from shapepose_fg.evaluation.shelf import evaluate_shelf, read_shelf_ground_truth
-    from shapepose_fg.reconstruction import Reconstruction
 
-    score = evaluate_shelf(Reconstruction.load(people), read_shelf_ground_truth(ground_truth))
+    score = evaluate_shelf(read_people(people), read_shelf_ground_truth(ground_truth))
     if as_json:
         print(json.dumps(score.as_dict(), indent=2, allow_nan=False))
     else:
@@ -180,13 +189,25 @@ def simulate(
     )
 
 
+class Preset(StrEnum):
+    """Settings that hang together."""
+
+    DEFAULT = "default"
+    PAPER = "paper"
+
+
 @app.command("config")
-def print_config() -> None:
-    """Print every setting with its default, as TOML."""
+def print_config(
+    preset: Annotated[
+        Preset,
+        typer.Option(help="paper: the method as it is written, without what is settled differently here."),
+    ] = Preset.DEFAULT,
+) -> None:
+    """Print every setting with its value, as TOML."""
     from shapepose_fg.io.config import toml_text
     from shapepose_fg.pipeline import PipelineConfig
 
-    print(toml_text(PipelineConfig()), end="")
+    print(toml_text(PipelineConfig.paper() if preset is Preset.PAPER else PipelineConfig()), end="")
 
 
 @app.command()
@@ -200,12 +221,16 @@ def version() -> None:
 
 def _fail(message: str) -> int:
     """Say what went wrong, in one line on stderr."""
+    _say("error", message, "bold red")
+    return 2
+
+
+def _say(what: str, message: str, style: str) -> None:
     from rich.console import Console
     from rich.text import Text
 
-    line = Text.assemble(("error: ", "bold red"), " ".join(message.split()))
+    line = Text.assemble((f"{what}: ", style), " ".join(message.split()))
     Console(stderr=True).print(line, soft_wrap=True)
-    return 2
 
 
 if __name__ == "__main__":

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+_LEAST_FPS, _MOST_FPS = 1e-3, 1e6
+"""No recording of people is slower, or faster."""
 ASSUMED_FPS = 30.0
 """Frames a second where nothing says how many."""
 
@@ -42,8 +44,10 @@ class FrameTimes:
     @classmethod
     def from_fps(cls, fps: float, frames: int) -> "FrameTimes":
         """`frames` frames at `fps` frames a second, frame 0 at 0 s."""
-        if not (np.isfinite(fps) and fps > 0):
-            raise ValueError(f"fps must be a positive number of frames a second, got {fps}")
+        if not _LEAST_FPS <= fps <= _MOST_FPS:
+            raise ValueError(
+                f"fps must be a positive number of frames a second, {_LEAST_FPS:g} to {_MOST_FPS:g}, got {fps}"
+            )
         return cls(np.arange(frames) / fps, source="fps")
 
     @classmethod

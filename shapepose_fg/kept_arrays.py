@@ -12,7 +12,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from shapepose_fg.errors import InputError
-from shapepose_fg.files import sweep, write_atomically
+from shapepose_fg.files import write_atomically
 
 Arrays = Mapping[str, NDArray[Any]]
 """Arrays of numbers by name."""
@@ -125,10 +125,6 @@ class InFolder:
         """See `KeptArrays`."""
         with _opened(self._file(name)) as file:
             return list(file.keys())
-
-    def sweep(self) -> None:
-        """Remove what a killed process was writing."""
-        sweep(self.folder, f"*{_SUFFIX}")
 
     def _file(self, name: str) -> Path:
         return self.folder / f"{name}{_SUFFIX}"

@@ -211,9 +211,9 @@ class ObservationTable:
         `run_id` is that of the people whose observations they must be (`result_files.check_id`).
         """
         file = Path(file)
-        columns = read_npz(file, _CURE)
-        check_id(run_id, columns.get(RUN_ID), file)
         names = (*cls.ROWS, "joint_names", "view_names")
+        columns = read_npz(file, (*names, "gate_names", RUN_ID), _CURE)
+        check_id(run_id, columns.get(RUN_ID), file)
         for name in (*names, "gate_names"):
             if name not in columns:
                 raise InputError(f"{file}: column {name} is missing; {_CURE}")

@@ -25,7 +25,7 @@ def image_size_of(text: str | None) -> tuple[int, int] | None:
     """Width and height of `WxH`."""
     if text is None:
         return None
-    match = re.fullmatch(r"\s*(\d+)\s*[x×,]\s*(\d+)\s*", text)
+    match = re.fullmatch(r"\s*(\d{1,9})\s*[x×,]\s*(\d{1,9})\s*", text)
     if match is None:
         raise InputError(f"--image-size {text}: must be WIDTHxHEIGHT in pixels, such as 1920x1080")
     return int(match[1]), int(match[2])
@@ -35,7 +35,7 @@ def frame_range(text: str | None, count: int) -> range:
     """Frames that `A:B` selects of a recording of `count` frames: half-open, either end optional."""
     if text is None:
         return range(count)
-    match = re.fullmatch(r"(\d*):(\d*)", text.strip())
+    match = re.fullmatch(r"(\d{0,18}):(\d{0,18})", text.strip())
     if match is None:
         raise InputError(f"--frames {text}: must be A:B, two frame numbers with a colon between, such as 0:100")
     start, stop = int(match[1] or 0), int(match[2] or count)

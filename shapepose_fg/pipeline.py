@@ -1,11 +1,12 @@
 """The whole way: triangulate, vote, propose, associate; follow, solve in windows, put bodies on; rows out."""
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Interval
 
 from shapepose_fg.bodies_over_time import Person, PersonBodies, SequenceFitting, fit_everybody
 from shapepose_fg.body.fitting.bone_reach import longest_bones
@@ -17,9 +18,9 @@ from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.offsets.estimation import learn_offsets
 from shapepose_fg.body.shapes import SubjectShapes
 from shapepose_fg.body.threads import torch_threads
+from shapepose_fg.bounds import Settings
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections, DetectionSequence
-from shapepose_fg.estimation.alternation import EstimatorConfig, RefineConfig
 from shapepose_fg.estimation.detector_offsets import (
     AdjustableFitter,
     OffsetConfig,
@@ -27,16 +28,18 @@ from shapepose_fg.estimation.detector_offsets import (
     spread_frames,
 )
 from shapepose_fg.estimation.estimator import Estimator, ExtraFactors
+from shapepose_fg.estimation.estimator_config import EstimatorConfig, RefineConfig
 from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
 from shapepose_fg.estimation.window_graph import WindowGraphConfig
-from shapepose_fg.frame_times import FrameTimes, check_cuts, stretches
+from shapepose_fg.frame_times import FrameTimes, check_cuts, spans_of, stretches
 from shapepose_fg.kept_arrays import InMemory, KeptArrays
 from shapepose_fg.observation_table import place_in_view
 from shapepose_fg.observations import Observations
 from shapepose_fg.proposal.association import AssociationConfig, associate
 from shapepose_fg.proposal.candidates import CandidateConfig, triangulate_pairs, vote
 from shapepose_fg.proposal.proposals import ProposalConfig, propose
+from shapepose_fg.proposal.thinning import ThinnedFrames, thinned_candidates, thinned_points
 from shapepose_fg.provenance import versions
 from shapepose_fg.reconstruction import Reconstruction
 from shapepose_fg.runs.assembly import Assembly
@@ -63,7 +66,7 @@ Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
-class PipelineConfig:
+class PipelineConfig(Settings):
     """The settings of every step, and how the work is cut."""
 
     candidates: CandidateConfig = field(default_factory=CandidateConfig)
@@ -94,16 +97,28 @@ class PipelineConfig:
     """Stage II: the alternation."""
     temporal: bool = True
     """People over time: identities, motion, one shape a person. Without it every frame stands alone."""
-    batch_frames: int = 96
+    batch_frames: Annotated[int, Interval(ge=1, le=10000)] = 96
     """Frames that are solved together and returned: bodies are fitted fastest by the hundred."""
-    threads: int = 1
+    threads: Annotated[int, Interval(ge=1, le=256)] = 1
     """Threads of torch while bodies are fitted: the matrices are small, and where cores are busy a second thread
     costs more than it brings."""
 
-    def __post_init__(self) -> None:
-        for name in ("batch_frames", "threads"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+    @classmethod
+    def paper(cls) -> "PipelineConfig":
+        """The method as the paper has it written in section 3, without what we settled differently."""
+        return cls(
+            candidates=CandidateConfig.paper(),
+            proposals=ProposalConfig.paper(),
+            association=AssociationConfig.paper(),
+            observations=ObservationConfig.paper(),
+            tracking=TrackingConfig(min_new_joints=1),
+            windows=WindowConfig(again_alone=0),
+            window_graph=WindowGraphConfig.paper(),
+            body=BodyConfig.paper(),
+            offsets=OffsetConfig(source="none"),
+            refine=RefineConfig.paper(),
+            temporal=False,
+        )
 
 
 def reconstruct(
@@ -176,6 +191,7 @@ def reconstruct_parts(
     times.check(len(detections), len(rig))
     cuts = check_cuts(cuts, len(detections))
     book, skeleton = Notebook(), detections.skeleton
+    detections = ThinnedFrames(detections, len(rig), config.candidates)
     with book.stage("load"):
         if fitter is None:
             fitter = make_fitter(config.body, BodyModel.default().with_keypoints(skeleton.joints))
@@ -246,9 +262,13 @@ def find_people(
     """Stage I, one frame: the people's 2D observations and where their joints are to begin with."""
     book = Notebook() if book is None else book
     with book.stage("triangulate"):
-        points = triangulate_pairs(detections, rig, config.candidates)
+        every = triangulate_pairs(detections, rig, config.candidates)
+        points = thinned_points(every, config.candidates)
+        book.thin("points", len(points.xyz) < len(every.xyz))
     with book.stage("vote"):
-        candidates = vote(points, detections, len(rig), config.candidates)
+        every = vote(points, detections, len(rig), config.candidates)
+        candidates = thinned_candidates(every, detections, config.candidates)
+        book.thin("candidates", len(candidates) < len(every))
     with book.stage("propose"):
         proposals = propose(candidates, detections, skeleton, rig.up_vector, config.proposals)
     with book.stage("associate"):
@@ -290,13 +310,14 @@ def _engine(
 
 
 def _inputs(
-    detections: DetectionSequence, rig: Rig, frames: range, times: FrameTimes, book: Notebook
+    detections: ThinnedFrames, rig: Rig, frames: range, times: FrameTimes, book: Notebook
 ) -> Callable[[int], Input]:
     """What the cameras give of a frame."""
     of_views = times.of_views(len(rig))
 
     def read(frame: int) -> Input:
         with book.stage("read"):
+            book.thin("detections", detections.is_thinned(frame), frame)
             return Input(frame, of_views[frame], detections[frame], rig)
 
     return read
@@ -436,7 +457,7 @@ def _offsets(
         return learn_offsets(targets, fitter.model, config=config.body.plain, prior=config.offsets.prior)
 
 
-def _rows(solved: Solved, rig: Rig, detections: DetectionSequence, config: PipelineConfig) -> Reconstruction:
+def _rows(solved: Solved, rig: Rig, detections: ThinnedFrames, config: PipelineConfig) -> Reconstruction:
     """Solved rows as rows of the result, by frame and person; bodies that were not fitted are NaN there."""
     order = np.lexsort((solved.observations.track, solved.observations.frame))
     rows, estimates = solved.observations.rows(order), solved.estimates.rows(order)
@@ -444,7 +465,8 @@ def _rows(solved: Solved, rig: Rig, detections: DetectionSequence, config: Pipel
     place = np.full(rows.candidate.shape, -1, dtype=np.int32)
     for frame in np.unique(rows.frame).tolist():
         of_frame = rows.frame == frame
-        place[of_frame] = place_in_view(rows.candidate[of_frame], detections[frame].view)
+        own = detections.in_recording(frame, rows.candidate[of_frame])
+        place[of_frame] = place_in_view(own, detections.frames[frame].view)
     return result_rows(rows, estimates, place, rig, detections.skeleton.joints, person)
 
 
@@ -460,6 +482,11 @@ def _names(parts: Parts, skeleton: Skeleton, config: PipelineConfig, cuts_s: Seq
 def _number_in_frame(frame: np.ndarray) -> np.ndarray:
     """(N,) which of its frame's rows each row is; `frame` (N,) rises."""
     return np.arange(len(frame)) - np.searchsorted(frame, frame)
+
+
+def _spans_by_name(frames: Mapping[str, Sequence[int]]) -> dict[str, list[list[int]]]:
+    """Frames as [start, stop), by what became of them."""
+    return {name: [[span.start, span.stop] for span in spans_of(numbers)] for name, numbers in frames.items()}
 
 
 def _summary(notes: Notes, config: PipelineConfig, frames: range, result: Assembly) -> dict[str, Any]:
@@ -481,5 +508,6 @@ def _summary(notes: Notes, config: PipelineConfig, frames: range, result: Assemb
         "frames": [frames.start, frames.stop],
         "seconds": notes.seconds,
         "people": {**result.counts(), "dropped": dropped, "problems": problems},
-        "dropped_frames": notes.dropped_spans(),
+        "dropped_frames": _spans_by_name(notes.dropped_frames),
+        "thinned_frames": _spans_by_name(notes.thinned_frames),
     }

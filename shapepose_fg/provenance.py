@@ -3,6 +3,7 @@
 import hashlib
 import platform
 from collections.abc import Iterable
+from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 
@@ -37,6 +38,50 @@ def checksums(inputs: Iterable[str | Path]) -> dict[str, str]:
     A recording of 10,000 JSON files is one line of run.json, and a file renamed or lost changes it.
     """
     return {str(path): _digest(Path(path)) for path in inputs}
+
+
+class ReadInputs:
+    """Input files while they are read: their checksums are those of what was read, or it is said.
+
+    Made before anything is read; `checksums` comes when all has been.
+    """
+
+    def __init__(self, paths: Iterable[str | Path | None]) -> None:
+        self._before = _states(paths)
+
+    def checksums(self, inputs: Iterable[str | Path | None]) -> dict[str, str]:
+        """`checksums` of what was read; InputError where one of these files has changed since this was made.
+
+        `inputs` are, or are in, the files and folders that this was made of.
+        """
+        inputs = [path for path in inputs if path is not None]
+        found = checksums(inputs)
+        for file, state in _states(inputs).items():
+            if self._before.get(file) != state:
+                raise InputError(f"{file}: this changed while it was read; start again when it is written")
+        return found
+
+
+def program_digest() -> str:
+    """sha256 of this program itself, its data included: whether two runs are by the same version."""
+    whole, here = hashlib.sha256(), Path(__file__).parent
+    for package in (here, here.with_name("factors")):
+        for file in sorted(package.rglob("*")):
+            if file.suffix in (".py", ".npz", ".json", ".safetensors"):
+                whole.update(f"{file.relative_to(package).as_posix()} {_digest(file)}\n".encode())
+    return whole.hexdigest()
+
+
+def _states(paths: Iterable[str | Path | None]) -> dict[Path, tuple[int, int]]:
+    """Size and time of last change of files, and of the files of numbers in folders."""
+    found = {}
+    for path in (Path(path) for path in paths if path is not None):
+        files = (file for file in path.rglob("*") if file.suffix in _INPUTS) if path.is_dir() else (path,)
+        for file in files:
+            with suppress(OSError):
+                state = file.stat()
+                found[file] = (state.st_size, state.st_mtime_ns)
+    return found
 
 
 def _version(distribution: str) -> str | None:

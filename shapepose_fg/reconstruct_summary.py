@@ -9,45 +9,50 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from shapepose_fg.reconstruction import Reconstruction
+    from shapepose_fg.runs.assembly import Assembly
     from shapepose_fg.setup_check.in_result import ResultCheck
 
 
 def summary_table(
-    people: "Reconstruction", span: range, camera_count: int, seconds: float, output: Path
+    result: "Assembly", people: "Reconstruction", span: range, camera_count: int, seconds: float, output: Path
 ) -> "Table":
-    """What was reconstructed, how well it went, how long it took, and where it is."""
+    """What was reconstructed, how well it went, how long it took, and where it is.
+
+    `people` are rows of the `result` that say how sure the joints are.
+    """
     import numpy as np
     from rich.table import Table
 
     from shapepose_fg.frame_times import rate_words
     from shapepose_fg.io.solved_setup import CAMERAS
 
-    per_frame = np.bincount(people.frame - span.start, minlength=len(span))
+    frame, run, counts = result.columns()["frame"].array(), result.run, result.counts()
+    per_frame = np.bincount(frame - span.start, minlength=len(span))
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     table.add_column(style="bold")
     table.add_column(overflow="fold")
-    table.add_row(
-        "frames", f"{len(span)} ({span.start}:{span.stop}) of {camera_count} cameras{rate_words(people.run)}"
-    )
-    over_time = people.run.get("configuration", {}).get("temporal", False)
-    count = f"{len(np.unique(people.person))} people over time" if over_time else "no identities"
+    table.add_row("frames", f"{len(span)} ({span.start}:{span.stop}) of {camera_count} cameras{rate_words(run)}")
+    over_time = run.get("configuration", {}).get("temporal", False)
+    count = f"{len(result.numbers())} people over time" if over_time else "no identities"
     table.add_row("people", f"{count}, {per_frame.mean():.1f} a frame ({per_frame.min()} to {per_frame.max()})")
-    table.add_row("rows", f"{len(people)} in all")
-    for status, count in zip(*np.unique(people.status, return_counts=True), strict=True):
+    table.add_row("rows", f"{len(result)} in all")
+    for status, count in sorted(counts["status"].items()):
         table.add_row("", f"{count} {status}", style="green" if status == "ok" else "yellow")
-    for reason, count in people.run.get("people", {}).get("dropped", {}).items():
-        where = _frames_words(people.run.get("dropped_frames", {}).get(reason, []))
+    for reason, count in run.get("people", {}).get("dropped", {}).items():
+        where = _frames_words(run.get("dropped_frames", {}).get(reason, []))
         table.add_row("", f"{count} dropped: {reason}{where}", style="dim")
+    for what, spans in run.get("thinned_frames", {}).items():
+        table.add_row("", f"too many {what}, the surest were taken{_frames_words(spans)}", style="yellow")
     if len(people) > 0:
-        table.add_row("joints", _joints(people))
+        table.add_row("joints", _joints(counts["joints"], people))
     # Loading torch and the body takes a second or two, once; it says nothing about the time of a frame.
-    stages = {name: spent for name, spent in people.run.get("seconds", {}).items() if name != "load"}
+    stages = {name: spent for name, spent in run.get("seconds", {}).items() if name != "load"}
     per_stage = "  ".join(f"{name} {1e3 * spent / len(span):.1f}" for name, spent in stages.items())
     table.add_row("time", f"{1e3 * sum(stages.values()) / len(span):.1f} ms a frame, {seconds:.1f} s in all")
     table.add_row("", per_stage, style="dim")
     table.add_row("written", str(output / "people.npz"))
     table.add_row("", str(output / "run.json"))
-    if people.observations is not None:
+    if len(result) > 0:
         table.add_row("", str(output / "observations.npz"))
     table.add_row("", str(output / CAMERAS))
     return table
@@ -60,11 +65,10 @@ def _frames_words(spans: list[list[int]]) -> str:
     return f" (frames {' '.join(told)}{more})" if told else ""
 
 
-def _joints(people: "Reconstruction") -> str:
+def _joints(count: dict[str, int], people: "Reconstruction") -> str:
     """How the joints are known, as shares, and how sure they are, as words."""
     import numpy as np
 
-    count = people.count_known()
     words = {"seen": "seen", "body": "inferred from the body", "motion": "carried by motion", "unknown": "unknown"}
     total = max(sum(count.values()), 1)
     shares = ", ".join(f"{100 * count[how] / total:.1f} % {word}" for how, word in words.items() if count[how] > 0)

@@ -116,6 +116,15 @@ class Reconstruction:
             raise ValueError(f"status must be one of {[*map(str, Status)]}, got {sorted(unknown)}")
         self._check_observations()
 
+    def _check_values(self) -> None:
+        """ValueError for what no reconstruction gives: numbers that are infinite, frames before the first."""
+        for name in self.ROWS:
+            column = getattr(self, name)
+            if column.dtype.kind == "f" and np.isinf(column).any():
+                raise ValueError(f"{name} must be finite, or NaN where unknown")
+            if column.dtype.kind == "i" and (column < 0).any():
+                raise ValueError(f"{name} must not be negative, got {column.min()}")
+
     def _check_observations(self) -> None:
         """ValueError where `observations` are of other rows."""
         table = self.observations
@@ -221,7 +230,8 @@ class Reconstruction:
         """
         path = Path(path)
         file = path / PEOPLE if path.is_dir() else path
-        columns = read_npz(file, "give the people.npz of a reconstruction, or run one first")
+        every = (*cls.ROWS, "joint_names", "known_names", RUN_ID)
+        columns = read_npz(file, every, "give the people.npz of a reconstruction, or run one first")
         needed = [name for name in (*cls.ROWS, "joint_names") if name not in _ADDED]
         for name in (*needed, "known_names") if "known" in columns else needed:
             if name not in columns:
@@ -241,6 +251,7 @@ class Reconstruction:
         given: dict[str, Any] = {name: columns[name] for name in (*cls.ROWS, "joint_names") if name in columns}
         try:
             people = cls(**given, run=run)
+            people._check_values()
         except ValueError as error:
             raise InputError(f"{file}: {error}; {_CURE}") from None
         table_file = file.with_name(OBSERVATIONS)

@@ -109,18 +109,18 @@ def _refuse_other_settings(configurations: Sequence[Any]) -> None:
     """ValueError that names the first setting in which two parts differ, of those that say their settings."""
     known = [each for each in configurations if each is not None]
     for other in known[1:]:
-        name = _difference(known[0], other)
+        name = difference(known[0], other)
         if name is not None:
             raise ValueError(
                 f"parts must have the same configuration, {name} differs; reconstruct them with one and the same"
             )
 
 
-def _difference(one: Any, other: Any, name: str = "") -> str | None:
-    """The dotted name of the first setting that differs; None where none does."""
+def difference(one: Any, other: Any, name: str = "") -> str | None:
+    """The dotted name of the first entry in which two sets of plain values differ; None where there is none."""
     if isinstance(one, dict) and isinstance(other, dict):
         for key in dict.fromkeys((*one, *other)):
-            found = _difference(one.get(key), other.get(key), f"{name}.{key}" if name else key)
+            found = difference(one.get(key), other.get(key), f"{name}.{key}" if name else key)
             if found is not None:
                 return found
         return None

@@ -10,8 +10,8 @@ from shapepose_fg.bodies_over_time import SequenceFitting, with_bodies_over_time
 from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.camera import Rig
-from shapepose_fg.estimation.alternation import EstimatorConfig
 from shapepose_fg.estimation.estimator import Estimator, ExtraFactors
+from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.frame_times import stretches
 from shapepose_fg.pipeline import PipelineConfig
 from shapepose_fg.reconstruction import Reconstruction

@@ -1,11 +1,32 @@
 """What the commands say on a terminal: results, notes, a bar while something runs."""
 
+import os
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
+
+
+def use_any_streams() -> None:
+    """Make stdout and stderr take whatever is said: closed ones swallow it, foreign letters are escaped.
+
+    A descriptor that is closed is opened on nothing: or the next file that is opened would have its number, and
+    what libraries say would be written into it.
+    """
+    for descriptor in range(3):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: PTH123, SIM115
+        elif hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def show(content: "RenderableType") -> None:

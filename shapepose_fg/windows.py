@@ -8,35 +8,33 @@ processes.
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Interval
 
+from shapepose_fg.bounds import RepeatsOrNone, Settings
 from shapepose_fg.estimation.estimator import Estimates, Estimator, ExtraFactors
 from shapepose_fg.observations import Observations
 from shapepose_fg.skeleton import Skeleton
 from shapepose_fg.tracking.following import Decided, FollowingConfig, FollowState, Input, finish, follow
-from shapepose_fg.tracking.reassociation import Survival, reassociate
+from shapepose_fg.tracking.reassociation import Survival, reassociate, reassociate_over_time
 from shapepose_fg.tracking.tracker import Tracker, TrackerState
 from shapepose_fg.tracking.view_assignment import AssignmentConfig
 
 
 @dataclass(frozen=True)
-class WindowConfig:
+class WindowConfig(Settings):
     """How frames are cut into windows."""
 
-    overlap_s: float = 0.4
+    overlap_s: Annotated[float, Interval(ge=0, le=60)] = 0.4
     """What a window takes of the frames before and after its own, and does not return: smoothing reaches a few
     frames. Windows of other lengths move joints by under 2 mm in the median (tests/test_windows.py)."""
-    again_over_time: int = 2
+    again_over_time: RepeatsOrNone = 2
     """How often detections are given out again around a draft of a window."""
-    again_alone: int = 5
+    again_alone: RepeatsOrNone = 5
     """The same for frames that stand alone. From time to time more is asked of who stays (`Survival`): whoever
     goes leaves detections to others, so the least goes first."""
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not value >= 0:
-                raise ValueError(f"{name} must not be negative, got {value}")
 
 
 @dataclass(frozen=True)
@@ -90,8 +88,11 @@ class WindowSolver:
         began = time.perf_counter()
         for n in range(again if len(rows) > 0 else 0):
             joints, covariance = self.estimator.draft(rows)
-            survival = Survival().at(n / max(again - 1, 1)) if span.alone else None
-            rows = reassociate(given, rows, joints, covariance, self.skeleton, self.assignment, survival)
+            draft = given, rows, joints, covariance, self.skeleton, self.assignment
+            if span.alone:
+                rows = reassociate(*draft, Survival().at(n / max(again - 1, 1)))
+            else:
+                rows = reassociate_over_time(*draft)
         associated = time.perf_counter()
         estimates = self.estimator.estimate(rows, self.extra_factors)
         own = {frame.frame for frame in given[span.start : span.stop]}

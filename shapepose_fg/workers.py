@@ -11,6 +11,7 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import get_context, parent_process
+from multiprocessing.synchronize import Event
 from typing import Any, Generic, TypeVar
 
 Shared = TypeVar("Shared")
@@ -37,6 +38,7 @@ class Workers(Generic[Shared]):
         self._shared = shared
         self._ahead = ahead
         self._pool: ProcessPoolExecutor | None = None
+        self._end: Event | None = None
 
     def __enter__(self) -> "Workers[Shared]":
         if self.count > 1:
@@ -48,14 +50,18 @@ class Workers(Generic[Shared]):
                     " at the top of a module, or use workers=1"
                 ) from error
             spawn = get_context("spawn")
-            self._pool = ProcessPoolExecutor(self.count, spawn, initializer=_begin, initargs=(content,))
+            self._end = spawn.Event()
+            given = (content, self._end)
+            self._pool = ProcessPoolExecutor(self.count, spawn, initializer=_begin, initargs=given)
             with _what_workers_inherit():
                 for _ in range(self.count):  # the pool starts a process for each of its first jobs
                     self._pool.submit(_nothing)
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if self._pool is not None:
+            if kind is not None and self._end is not None:
+                self._end.set()  # nobody waits for what they are at
             self._pool.shutdown(cancel_futures=True)
             self._pool = None
 
@@ -114,11 +120,12 @@ _shared: Any = None
 """In a worker process: what all its work shares."""
 
 
-def _begin(content: bytes) -> None:
+def _begin(content: bytes, end: Event) -> None:
     """What a worker does first."""
     global _shared
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    for wait in (_end_with_parent, lambda: _end_when_told(end)):
+        threading.Thread(target=wait, daemon=True).start()
     _shared = pickle.loads(content)  # made by this program a moment ago
     if "cv2" in sys.modules:
         sys.modules["cv2"].setNumThreads(1)
@@ -132,6 +139,12 @@ def _end_with_parent() -> None:
     if parent is not None:
         parent.join()
         os._exit(1)
+
+
+def _end_when_told(end: Event) -> None:
+    """End this process, whatever it is at."""
+    end.wait()
+    os._exit(1)
 
 
 def _work(work: Callable[[Any, Item], Result], item: Item) -> Result:

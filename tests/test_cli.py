@@ -12,11 +12,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import shapepose_fg.pipeline
+import shapepose_fg.reconstruct_run
+from shapepose_fg.bodies_over_time import BodiesOverTime
 from shapepose_fg.body.shapes import SubjectShapes
 from shapepose_fg.cli import main
 from shapepose_fg.frame_times import FrameTimes
+from shapepose_fg.observation_table import ObservationTable
 from shapepose_fg.reconstruction import Known, Reconstruction, Status
+from shapepose_fg.runs.assembly import Assembly
+from shapepose_fg.runs.notes import Notes
+from shapepose_fg.runs.parts import Part, Parts
 from shapepose_fg.skeleton import BODY_25
 
 K = [1000.0, 0, 500, 0, 1000, 400, 0, 0, 1]
@@ -43,14 +48,18 @@ def pipeline(monkeypatch) -> dict:
     """Replace the pipeline by one that finds two people in every frame; returns what it was called with."""
     called: dict = {}
 
-    def fake(detections, rig, config, *, frames, fitter, times, cuts, shapes, progress, workers):
+    def fake(kept, detections, rig, config, *, frames, fitter, times, cuts, shapes, progress, workers):
         called.update(detections=detections, rig=rig, config=config, frames=frames, fitter=fitter)
         called.update(times=times, cuts=cuts, shapes=shapes, workers=workers)
         progress(len(frames), len(frames))
         N = 2 * len(frames)
-        return Reconstruction(
-            frame=np.repeat(np.array(frames), 2),
-            person=np.arange(N),
+        frame, person = np.repeat(np.array(frames), 2), np.arange(N)
+        J, V, names = 25, len(rig), {"joint_names": np.array(BODY_25.joints), "view_names": np.array(rig.names)}
+        nothing = {"xy": np.full((N, J, V, 2), np.nan), "residual_px": np.full((N, J, V, 2), np.nan)}
+        nothing |= {"candidate": np.full((N, J, V), -1), "confidence": np.zeros((N, J, V))}
+        rows = Reconstruction(
+            frame=frame,
+            person=person,
             joint_names=np.array(BODY_25.joints),
             joints=np.ones((N, 25, 3)),
             covariance=np.tile(4e-4 * np.eye(3), (N, 25, 1, 1)),
@@ -61,14 +70,20 @@ def pipeline(monkeypatch) -> dict:
             body_pose=np.zeros((N, 23, 3)),
             transl=np.zeros((N, 3)),
             status=np.array([Status.OK, Status.TOO_FEW_VIEWS] * len(frames), dtype=str),
-            run={
-                "frames": [frames.start, frames.stop],
-                "time": (times or FrameTimes.assumed(5)).as_dict(),
-                "seconds": {"load": 3.0, "vote": 0.005 * len(frames)},
-            },
+            observations=ObservationTable(
+                frame=frame, person=person, gate=np.zeros((N, J, V), dtype=int), **names, **nothing
+            ),
         )
+        parts = Parts(kept)
+        parts.append(Part(rows, Notes(len(frames))))
+        run = {
+            "frames": [frames.start, frames.stop],
+            "time": (times or FrameTimes.assumed(5)).as_dict(),
+            "seconds": {"load": 3.0, "vote": 0.005 * len(frames)},
+        }
+        return Assembly(parts, BODY_25.joints, rig.names, run=run)
 
-    monkeypatch.setattr(shapepose_fg.pipeline, "reconstruct", fake)
+    monkeypatch.setattr(shapepose_fg.reconstruct_run, "reconstruct_parts", fake)
     return called
 
 
@@ -141,14 +156,20 @@ def test_times_cuts_and_time_itself_reach_the_pipeline(recording, pipeline, tmp_
 
 
 def test_shapes_are_kept_from_one_recording_to_the_next(recording, pipeline, tmp_path, monkeypatch, capsys):
-    fake, file = shapepose_fg.pipeline.reconstruct, tmp_path / "kept" / "subjects.npz"
+    fake, file = shapepose_fg.reconstruct_run.reconstruct_parts, tmp_path / "kept" / "subjects.npz"
 
     def with_shapes(*arguments, shapes, **options):
-        people = fake(*arguments, shapes=shapes, **options)
+        result = fake(*arguments, shapes=shapes, **options)
         found = SubjectShapes(np.array(["0"]), np.full((1, 10), 0.5), np.eye(10)[None], shapes.body)
-        return replace(people, shapes=found)
+        rows = result.numbers()
+        nobody = {"ok": np.zeros(1, dtype=bool), "betas": np.zeros((1, 10)), "transl": np.zeros((1, 3))}
+        nobody |= {"global_orient": np.zeros((1, 3)), "body_pose": np.zeros((1, 23, 3))}
+        for number in rows:
+            result.parts.kept.keep(f"bodies-{number}", nobody)
+        bodies = BodiesOverTime(result.parts.kept, {number: f"bodies-{number}" for number in rows}, found)
+        return replace(result, bodies=bodies)
 
-    monkeypatch.setattr(shapepose_fg.pipeline, "reconstruct", with_shapes)
+    monkeypatch.setattr(shapepose_fg.reconstruct_run, "reconstruct_parts", with_shapes)
     assert run(*recording, "--shapes", str(file)) == 0
     assert len(pipeline["shapes"]) == 0
     assert "shapes of 1 people" in " ".join(capsys.readouterr().out.split())
@@ -215,7 +236,7 @@ def test_frames_are_half_open(recording, pipeline, text, frames):
         (["--up", "up"], "up must be one of x -x y -y z -z, got 'up'"),
         (["--unit", "inch"], "unit must be one of m cm mm, got 'inch'"),
         (["--config", "/nothing.toml"], "/nothing.toml: there is no such file; check the path"),
-        (["--body", "/nothing.npz"], "/nothing.npz: no such file"),
+        (["--body", "/nothing.npz"], "/nothing.npz: there is no such file"),
         (["--calibration", "/nothing.json"], "/nothing.json: there is no such file; check the path"),
         (["--detections", "/nothing"], "/nothing: there is no such folder; check the path of the detections"),
         (["--output", f"{__file__}/out"], "out: results cannot be written here (Not a directory); give a folder"),
@@ -249,15 +270,29 @@ def test_wrong_command_lines(capsys, arguments, sentence):
 
 
 def test_a_disk_that_is_full_is_one_sentence_too(recording, pipeline, monkeypatch, capsys):
-    def full(self, folder):
-        raise OSError(28, "No space left on device", str(folder))
+    def full(stream, columns):
+        raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(Reconstruction, "save", full)
+    monkeypatch.setattr(shapepose_fg.result_files, "write_npz", full)
     assert run(*recording) == 2
-    assert (
-        "out: No space left on device; check the path, its permissions and the space left"
-        in capsys.readouterr().err
-    )
+    out = Path(recording[recording.index("--output") + 1])
+    assert f"{out}/people.npz: No space left on device; " in capsys.readouterr().err
+    # What was done is kept, and nothing is left half written.
+    assert [path.name for path in out.iterdir()] == ["parts"]
+
+
+def test_inputs_that_go_while_it_runs_do_no_harm(recording, pipeline, tmp_path, monkeypatch):
+    fake = shapepose_fg.reconstruct_run.reconstruct_parts
+    left = hashlib.sha256((tmp_path / "left.txt").read_bytes()).hexdigest()
+
+    def vanishing(*arguments, **options):
+        (tmp_path / "left.txt").unlink()
+        (tmp_path / "right.txt").write_text("something else")
+        return fake(*arguments, **options)
+
+    monkeypatch.setattr(shapepose_fg.reconstruct_run, "reconstruct_parts", vanishing)
+    assert run(*recording) == 0
+    assert Reconstruction.load(tmp_path / "out").run["inputs"][str(tmp_path / "left.txt")] == left
 
 
 def test_help_names_the_commands(capsys):

@@ -14,9 +14,9 @@ ROOT = Path(__file__).parents[1]
 LEVELS = (
     "factors errors",
     "camera skeleton",
-    "files",
+    "files bounds",
     "output_folder npz_writer kept_arrays provenance result_options rendering run_summary columns workers"
-    " body.threads options terminal",
+    " body.threads options terminal stopping",
     "result_files",
     "body.model",
     "body.fitting body.shapes",
@@ -37,10 +37,13 @@ LEVELS = (
     "training export",
     "report",
     "evaluation",
-    "reconstruct_summary",
+    "reconstruct_summary reconstruct_inputs",
+    "reconstruct_ending",
+    "reconstruct_run",
     "demo tracks_command detect_command overlay_command export_command report_command view_command"
     " setup_command reconstruct_command",
     "cli",
+    "__main__",
 )
 """Each level imports only from those before it; a package may import its own modules too."""
 

@@ -203,7 +203,7 @@ def test_a_factor_that_throws_a_wrist_away_is_a_status_that_names_it(scene, reco
 def test_settings_reach_their_steps(scene, recording):
     strict = PipelineConfig(proposals=ProposalConfig(min_confidence=1.0))
     assert len(find_people(recording[0], scene.rig, BODY_25, strict)) == 0
-    with pytest.raises(ValueError, match="batch_frames must be positive"):
+    with pytest.raises(ValueError, match="batch_frames must be at least 1"):
         replace(strict, batch_frames=0)
 
 

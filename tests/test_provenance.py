@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from shapepose_fg.errors import InputError
-from shapepose_fg.provenance import checksums, versions
+from shapepose_fg.provenance import ReadInputs, checksums, program_digest, versions
 
 
 def test_versions_are_those_that_run():
@@ -43,3 +43,24 @@ def test_a_folder_changes_with_the_names_and_contents_of_its_files(tmp_path):
 def test_a_file_that_is_not_there(tmp_path):
     with pytest.raises(InputError, match="nothing: cannot be read"):
         checksums([tmp_path / "nothing"])
+
+
+def test_what_changes_while_it_is_read_is_refused_and_afterwards_is_not_looked_at(tmp_path):
+    camera, folder = tmp_path / "a.json", tmp_path / "pose"
+    folder.mkdir()
+    camera.write_text("1")
+    (folder / "000.json").write_text("1")
+    reading = ReadInputs([camera, folder, None, tmp_path / "not there"])
+    (tmp_path / "results").mkdir()
+    found = reading.checksums([camera, None, folder])
+    assert list(found) == [str(camera), str(folder)] and found == checksums([camera, folder])
+    (folder / "000.json").write_text("12")
+    with pytest.raises(InputError, match=r"000\.json: this changed while it was read"):
+        reading.checksums([folder])
+    camera.unlink()
+    with pytest.raises(InputError, match=r"a\.json: cannot be read"):
+        reading.checksums([camera])
+
+
+def test_the_program_is_the_same_as_long_as_its_files_are():
+    assert program_digest() == program_digest() and len(program_digest()) == 64

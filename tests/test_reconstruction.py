@@ -180,8 +180,11 @@ def write_bad(path, kind: str) -> None:
         ("text", "cannot be read as an .npz file without pickled objects"),
         ("array", "cannot be read as an .npz file"),
         ("cut", "cannot be read as an .npz file"),
-        ("zip", "column person is missing"),
-        ("pickled", "cannot be read as an .npz file without pickled objects (Object arrays cannot be loaded"),
+        ("zip", "cannot be read as an .npz file"),
+        (
+            "pickled",
+            "cannot be read as an .npz file without pickled objects (frame.npy holds object, neither numbers",
+        ),
         ("other columns", "column frame is missing; give the people.npz of a reconstruction"),
         ("other codes", "known_names are not those of this version; give the people.npz of a reconstruction"),
         ("no code names", "column joint_names is missing"),

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,14 +93,17 @@ class SubjectShapes:
 
     def save(self, file: str | Path) -> None:
         """Write the shapes as `.npz`, whole or not at all (docs/conventions.md)."""
-        columns = {name: np.asarray(getattr(self, name)) for name in _COLUMNS}
-        write_atomically(Path(file), lambda stream: write_npz(stream, columns))
+        write_atomically(Path(file), self.write)
+
+    def write(self, stream: BinaryIO) -> None:
+        """Write the contents of that file."""
+        write_npz(stream, {name: np.asarray(getattr(self, name)) for name in _COLUMNS})
 
     @classmethod
     def load(cls, file: str | Path, body: str) -> "SubjectShapes":
         """Read what `save` wrote, of the model with the fingerprint `body`; InputError on anything else."""
         file = Path(file)
-        columns = read_npz(file, _CURE)
+        columns = read_npz(file, _COLUMNS, _CURE)
         for name in _COLUMNS:
             if name not in columns:
                 raise InputError(f"{file}: column {name} is missing; {_CURE}")

@@ -78,7 +78,7 @@ class Block:
     @classmethod
     def read(cls, file: Path) -> "Block":
         """What `write_block` wrote; InputError on anything else."""
-        arrays = read_npz(file, "delete the folder that it is in, and detect again")
+        arrays = read_npz(file, cls.__dataclass_fields__, "delete the folder that it is in, and detect again")
         try:
             return cls(**arrays)
         except TypeError:

@@ -5,25 +5,28 @@ All joints, and all pairs of candidates of all limbs, are decoded at once.
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
+from annotated_types import Interval
 from numpy.typing import NDArray
 
+from shapepose_fg.bounds import Settings, Share
 from shapepose_fg.detection2d.networks import NetworkLayout
 
 
 @dataclass(frozen=True)
-class DecodingConfig:
+class DecodingConfig(Settings):
     """How candidates are read from a network's output."""
 
-    min_score: float = 0.1
+    min_score: Share = 0.1
     """Heights of peaks below this are noise."""
-    line_samples: int = 10
+    line_samples: Annotated[int, Interval(ge=2, le=1000)] = 10
     """Places along a limb at which the affinity field is read, as in OpenPose."""
-    min_along: float = 0.05
+    min_along: Share = 0.05
     """A place supports a limb where the field has at least this component along it, as in OpenPose."""
-    min_supported: float = 0.7
+    min_supported: Share = 0.7
     """The share of places that must support a limb for it to have an affinity."""
 
 

@@ -1,10 +1,13 @@
 """A picture of a calibrated camera to joint candidates in the camera's calibrated pixels."""
 
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Interval
 from numpy.typing import NDArray
 
+from shapepose_fg.bounds import Settings
 from shapepose_fg.camera import Camera
 from shapepose_fg.detection2d.decoding import Candidates, DecodingConfig, decode
 from shapepose_fg.detection2d.network import HeatMapNetwork
@@ -13,10 +16,10 @@ from shapepose_fg.io.footage.placement import Placement
 
 
 @dataclass(frozen=True)
-class DetectionConfig:
+class DetectionConfig(Settings):
     """How people's joints are sought in pictures."""
 
-    long_side: int = 656
+    long_side: Annotated[int, Interval(ge=32, le=8192)] = 656
     """The longer side of the network's input, pixels: more finds smaller people, and takes longer."""
     decoding: DecodingConfig = field(default_factory=DecodingConfig)
     """How candidates are read from the network's output."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.detection2d.networks import NetworkLayout, find_layout
 from shapepose_fg.errors import InputError
+from shapepose_fg.files import open_regular
 
 Backend = Literal["opencv", "onnxruntime"]
 """What runs the network."""
@@ -76,12 +77,8 @@ class HeatMapNetwork:
 
 def _read(file: Path) -> bytes:
     """The bytes of a network's file."""
-    try:
-        return file.read_bytes()
-    except FileNotFoundError:
-        raise InputError(f"{file}: there is no such file; give the ONNX file of a network") from None
-    except OSError as error:
-        raise InputError(f"{file}: cannot be read ({error.strerror}); give the ONNX file of a network") from None
+    with open_regular(file, "give the ONNX file of a network") as stream:
+        return stream.read()
 
 
 def _with_opencv(file: Path, content: bytes) -> tuple[_Forward, None]:

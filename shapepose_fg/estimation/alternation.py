@@ -1,67 +1,19 @@
 """Stage II: joints and bodies in alternation, as in Algorithm 1 of the paper, over windows of frames."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus, JointTargets
 from shapepose_fg.camera import Views
-from shapepose_fg.estimation.draft import MODEL_SIGMA_M, WholeFitter
-from shapepose_fg.estimation.linearisation import (
-    ObservationConfig,
-    ViewEvidence,
-    linearise,
-    mean_confidence,
-)
-from shapepose_fg.estimation.motion_model import MotionConfig
-from shapepose_fg.estimation.window_graph import Message, WindowGraph, WindowGraphConfig
+from shapepose_fg.estimation.body_step import BodyStep, Tie, disagreement
+from shapepose_fg.estimation.draft import WholeFitter
+from shapepose_fg.estimation.estimator_config import EstimatorConfig
+from shapepose_fg.estimation.linearisation import ViewEvidence, linearise, mean_confidence
+from shapepose_fg.estimation.window_graph import Message, WindowGraph
 from shapepose_fg.observations import Observations
-
-
-@dataclass(frozen=True)
-class RefineConfig:
-    """How the alternation runs."""
-
-    alternations: int = 3
-    """N of Algorithm 1: how often the body is fitted and the joints are solved, at the most."""
-    window_alternations: int = 1
-    """The same for windows of several frames, which start from a draft of all joints (`Estimator.draft`): a second
-    round, at twice the time, changed the mean error by 0.1 to 0.2 mm. Windows with factors of the user's own take
-    as many as frames alone: what such a factor says may be far from what the views said."""
-    settled_m: float = 0.002
-    """A window whose joints all moved less in a round is done: most frames are after one or two. 0: none is."""
-    max_sigma_m: float = 0.5
-    """A joint whose views leave it less certain than this in some direction is not determined by them."""
-    disagreement: float = 6.0
-    """A joint that its views put this many standard deviations from where the body can have it is seen wrongly:
-    its gates are decided anew from the body's place, and the body is fitted again without what was thrown away. 4
-    threw away more joints that were right than wrong ones, in simulated crowds whose detections had been given out
-    again."""
-    min_joints: int = 4
-    """Fewer joints than this determined by the views are not a person that can be placed in space."""
-
-    def __post_init__(self) -> None:
-        for name in ("alternations", "window_alternations", "max_sigma_m", "disagreement", "min_joints"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        if self.settled_m < 0:
-            raise ValueError(f"settled_m must not be negative, got {self.settled_m}")
-
-
-@dataclass(frozen=True)
-class EstimatorConfig:
-    """The settings of stage II."""
-
-    observations: ObservationConfig = field(default_factory=ObservationConfig)
-    """How far a 2D observation is trusted."""
-    graph: WindowGraphConfig = field(default_factory=WindowGraphConfig)
-    """What goes into the factor graph of a person."""
-    refine: RefineConfig = field(default_factory=RefineConfig)
-    """How joints and bodies alternate."""
-    motion: MotionConfig = field(default_factory=MotionConfig)
-    """How frames hang together."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +72,8 @@ def alternate(
 
     In each round the body is fitted to what the views alone say of all joints, and then pulls the joints. What it
     says of a joint leaves that joint's own views out (`BodyFit.prior_xyz`), so that nothing is counted twice and
-    the covariances stay honest. Motion acts on the joints, never on what the body is fitted to.
+    the covariances stay honest. Motion acts on the joints, never on what the body is fitted to. `config.refine`
+    switches to what the paper does in place of it.
     """
     solution = Solution.start(X, len(views))
     moving = list(windows)
@@ -136,19 +89,23 @@ def alternate(
         if n == 0:
             placed = evidence.sigma_m <= config.refine.max_sigma_m
             solution.enough[rows] = placed.sum(axis=1) >= config.refine.min_joints
-        groups = _groups(moving)
         enough = solution.enough[rows]
-        body = fitter.fit(joint_targets(evidence, enough), solution.fit.rows(rows), groups)  # the Theta step
+        step = BodyStep(fitter, _groups(moving), config)
+        targets = step.targets(evidence, enough)
+        body = step.fit(targets, solution.fit.rows(rows))  # the Theta step
         fitted = evidence.target
-        wrong = disagreement(evidence, body) > config.refine.disagreement
+        wrong = disagreement(evidence, body) > config.refine.contradiction
         if wrong.any():
             # Gated anew around the body's place; and the body is fitted again, without what was thrown away.
             there = np.where(wrong[..., None], body.prior_xyz, start)
             evidence = linearise(observed, sigma, there, here, config.observations)
             again = np.flatnonzero(wrong.any(axis=-1))
-            targets = joint_targets(evidence, enough)
-            body = body.with_rows(again, _fit(fitter, targets, body, groups, again))
-        said = _message(observed, evidence, body, moving, groups, enough, fitter, config)
+            targets = step.targets(evidence, enough)
+            body = body.with_rows(again, step.fit(targets, body, again))
+        # delta of Eq. 4; and what its views do not determine needs the body however sure its one view is.
+        pulled = mean_confidence(observed, evidence.inlier) <= config.graph.rho_3d
+        pulled |= evidence.sigma_m > config.refine.max_sigma_m
+        said = step.message(body, targets, pulled, _ties(moving))
         X_new = _solve(moving, evidence, said, config)
         solution.joints[rows], solution.inlier[rows] = X_new, evidence.inlier
         solution.contradicts[rows] |= wrong
@@ -198,99 +155,26 @@ def final_bodies(
     return solution.fit.with_rows(rows[fit.ok], fit.rows(np.flatnonzero(fit.ok)))
 
 
-def disagreement(evidence: ViewEvidence, fit: BodyFit) -> NDArray[np.float64]:
-    """How far (N, J) each joint's views put it from where the body can have it, in standard deviations.
-
-    The smaller of two distances, each against the sum of both covariances: to where the rest of the body puts the
-    joint (`prior_xyz`), and to the joint of the body that was fitted with it. The first is a Gaussian around one
-    pose: a forearm that is bent further lies far outside it though no bone is too long for it. The second is there
-    to tell; it stays away from what no pose reaches, since its kernel is robust. Where the views leave a
-    direction open, they cannot disagree in it. 0 for rows without a body.
-    """
-    model = MODEL_SIGMA_M**2 * np.eye(3)
-    prior = _sigmas_apart(evidence, fit.prior_xyz, fit.prior_covariance)
-    fitted = _sigmas_apart(evidence, fit.joints, np.nan_to_num(fit.covariance) + model)
-    return np.where(fit.ok[:, None], np.fmin(prior, fitted), 0.0)
-
-
-def _sigmas_apart(
-    evidence: ViewEvidence, xyz: NDArray[np.float64], covariance: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Distance (N, J) of what the views say from `xyz` (N, J, 3) +- `covariance`, standard deviations; NaN
-    unknown.
-    """
-    known = np.asarray(np.isfinite(xyz).all(axis=2))
-    apart = np.where(known[..., None], np.nan_to_num(evidence.target - xyz), 0.0)
-    other = np.where(known[..., None, None], covariance, np.eye(3))
-    # (L^-1 + C)^-1 = L (I + C L)^-1, which holds for information L that is singular, too.
-    information = evidence.information
-    weight = information @ np.linalg.inv(np.eye(3) + other @ information)
-    squared = np.einsum("...i,...ij,...j->...", apart, weight, apart)
-    return np.where(known, np.sqrt(np.maximum(squared, 0.0)), np.nan)
-
-
-def joint_targets(evidence: ViewEvidence, enough: NDArray[np.bool_]) -> JointTargets:
-    """What the body is fitted to: what the views say of all joints, of rows whom they determine (`enough`)."""
-    information = np.where(enough[:, None, None, None], evidence.information, 0.0)
-    return JointTargets(np.nan_to_num(evidence.target), information)
-
-
 def _groups(windows: Sequence[Window]) -> NDArray[np.intp] | None:
     """(R,) a number for each row that says whose shape it has; None where every row is alone."""
     lengths = [len(window.rows) for window in windows]
     return np.repeat(np.arange(len(lengths)), lengths) if any(length > 1 for length in lengths) else None
 
 
+def _ties(windows: Sequence[Window]) -> list[Tie]:
+    """Joints that the user's factors tie to each other, with the rows of the windows where they do."""
+    return [
+        (
+            joints,
+            np.flatnonzero(np.concatenate([np.full(len(w.rows), joints in w.graph.coupled) for w in windows])),
+        )
+        for joints in sorted({each for window in windows for each in window.graph.coupled}, key=sorted)
+    ]
+
+
 def _by_window(values: NDArray, windows: Sequence[Window]) -> list[NDArray]:
     """Values (R, ...) of the windows' rows, one after the other, cut into windows again."""
     return np.split(values, np.cumsum([len(window.rows) for window in windows])[:-1]) if windows else []
-
-
-def _fit(
-    fitter: BodyFitter,
-    targets: JointTargets,
-    last: BodyFit,
-    groups: NDArray[np.intp] | None,
-    rows: NDArray[np.intp],
-) -> BodyFit:
-    """Fit some of the rows."""
-    some = JointTargets(targets.xyz[rows], targets.information[rows])
-    return fitter.fit(some, last.rows(rows), None if groups is None else groups[rows])
-
-
-def _message(
-    observed: Observations,
-    evidence: ViewEvidence,
-    body: BodyFit,
-    windows: Sequence[Window],
-    groups: NDArray[np.intp] | None,
-    enough: NDArray[np.bool_],
-    fitter: BodyFitter,
-    config: EstimatorConfig,
-) -> Message:
-    """What the body says of the joints that it pulls: delta of Eq. 4, and joints that their views do not
-    determine.
-
-    The latter need the body however sure their one view is.
-    """
-    xyz, covariance = body.prior_xyz.copy(), body.prior_covariance.copy()
-    ok = np.repeat(body.ok[:, None], xyz.shape[1], axis=1)
-    targets = joint_targets(evidence, enough)
-    for joints in sorted({each for window in windows for each in window.graph.coupled}, key=sorted):
-        # Tied to each other, each would get the others' views twice: through the tie, and through the body.
-        tied = np.concatenate([np.full(len(w.rows), joints in w.graph.coupled) for w in windows])  # one flag a row
-        rows, columns = np.flatnonzero(tied), np.array(sorted(joints))
-        information = targets.information.copy()
-        information[:, columns] = 0.0
-        alone = _fit(fitter, JointTargets(targets.xyz, information), body, groups, rows)
-        here = np.ix_(rows, columns)
-        xyz[here], covariance[here] = alone.prior_xyz[:, columns], alone.prior_covariance[:, columns]
-        ok[here] = alone.ok[:, None]
-    doubtful = mean_confidence(observed, evidence.inlier) <= config.graph.rho_3d
-    pulled = (doubtful | (evidence.sigma_m > config.refine.max_sigma_m)) & ok
-    information = np.zeros_like(covariance)
-    information[pulled] = np.linalg.inv(covariance[pulled])
-    return Message(np.where(pulled[..., None], xyz, np.nan), information)
 
 
 def _solve(

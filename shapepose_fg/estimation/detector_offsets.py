@@ -1,14 +1,16 @@
 """Which joints of a recording are known well enough to learn the detector's habits from, and who uses them."""
 
 from dataclasses import dataclass, field
-from typing import Protocol, Self, runtime_checkable
+from typing import Annotated, Protocol, Self, runtime_checkable
 
 import numpy as np
+from annotated_types import Interval
 
 from shapepose_fg.body.fitting.fitter import BodyFitter, JointTargets
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.offsets.estimation import OffsetPrior
+from shapepose_fg.bounds import Count, Metres, Settings, Share
 from shapepose_fg.camera import Rig, Views
 from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas, triangulate
 from shapepose_fg.observations import Observations
@@ -16,29 +18,25 @@ from shapepose_fg.skeleton import BODY_25
 
 
 @dataclass(frozen=True)
-class OffsetConfig:
+class OffsetConfig(Settings):
     """Whether, and from what, the difference between the detector's joints and the body's is learnt."""
 
     source: str = "recording"
     """"recording": learnt from the recording itself; "none": there is none; else a file that holds offsets:
     the run.json of another recording by the same detector, or what `KeypointOffsets.save` wrote."""
-    frames: int = 30
+    frames: Annotated[int, Interval(ge=1, le=10000)] = 30
     """Frames, spread over the whole recording, that offsets are learnt from."""
-    min_views: int = 3
+    min_views: Count = 3
     """Views that must agree on a joint for it to be learnt from: two that agree may both be wrong."""
-    min_confidence: float = 0.4
+    min_confidence: Share = 0.4
     """Confidence that a detection must have to count as one of these views."""
-    max_sigma_m: float = 0.03
+    max_sigma_m: Metres = 0.03
     """A joint whose views leave it less certain than this in some direction is not learnt from."""
     prior: OffsetPrior = field(default_factory=OffsetPrior)
     """What is believed before."""
 
     def __post_init__(self) -> None:
-        for name in ("frames", "min_views", "max_sigma_m"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        if not 0 <= self.min_confidence <= 1:
-            raise ValueError(f"min_confidence must be between 0 and 1, got {self.min_confidence}")
+        super().__post_init__()
         if self.source == "":
             raise ValueError('source must be "recording", "none" or a file, got nothing')
 

@@ -10,15 +10,10 @@ from numpy.typing import NDArray
 from factors import make_camera
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter
 from shapepose_fg.camera import Rig, Views
-from shapepose_fg.estimation.alternation import (
-    EstimatorConfig,
-    Solution,
-    Window,
-    alternate,
-    final_bodies,
-    joint_targets,
-)
+from shapepose_fg.estimation.alternation import Solution, Window, alternate, final_bodies
+from shapepose_fg.estimation.body_step import joint_targets
 from shapepose_fg.estimation.draft import WholeFitter, drafted, limb_steps, smoothed_in_time
+from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.limb_lengths import limb_lengths, limbs_of, with_lengths
 from shapepose_fg.estimation.linearisation import (
     linearise,
@@ -87,8 +82,8 @@ _COLUMNS = (
 class Estimator:
     """Stage II: rig, settings and fitter in one place.
 
-    Rows of one track at several frames are a window, one factor graph; a row alone (or `motion.temporal` false) is
-    the paper's frame-by-frame method, by the same code.
+    Rows of one track at several frames are a window, one factor graph; a row whose track has no other is the
+    paper's frame-by-frame method, by the same code.
     """
 
     def __init__(
@@ -116,8 +111,10 @@ class Estimator:
             raise ValueError(
                 f"views must be of the {len(observations)} rows' {observations.confidence.shape[2]} views"
             )
-        X = triangulate(observations, views, config.observations)
-        if config.motion.temporal and len(np.unique(observations.track)) < len(observations):
+        X = observations.initial
+        if config.refine.complete_start:
+            X = triangulate(observations, views, config.observations)
+        if len(np.unique(observations.track)) < len(observations):
             X = self._completed(X, observations, views)
         sigmas = observation_sigmas(observations, X, views, config.observations, self.joints)
         windows = self._windows(observations, sigmas, views, extra_factors)
@@ -139,7 +136,7 @@ class Estimator:
         evidence = linearise(observations, sigmas, X, views, config.observations)
         enough = (evidence.sigma_m <= config.refine.max_sigma_m).sum(axis=1) >= config.refine.min_joints
         whole = self.fitter.fit_whole if isinstance(self.fitter, WholeFitter) else self.fitter.fit
-        return drafted(evidence, whole(joint_targets(evidence, enough)), config.refine.disagreement)
+        return drafted(evidence, whole(joint_targets(evidence, enough)), config.refine.contradiction)
 
     def _completed(self, X: NDArray[np.float64], observations: Observations, views: Views) -> NDArray[np.float64]:
         """X_0 (N, J, 3) with joints that are not placed where a draft has them.
@@ -170,7 +167,7 @@ class Estimator:
             )
         windows = []
         still = _cameras(views)
-        for rows in window_rows(observations, self.config.motion.temporal):
+        for rows in window_rows(observations):
             moving = views.rows_known is not None
             cameras = [_cameras(views, row) if moving else still for row in rows.tolist()]
             graph = WindowGraph(
@@ -178,7 +175,7 @@ class Estimator:
                 observations.xy[rows],
                 sigmas[rows],
                 self.config.graph,
-                self.config.observations.kernel,
+                self.config.observations.robust_kernel,
                 self._motion,
                 track=int(observations.track[rows[0]]),
                 frames=observations.frame[rows],
@@ -210,7 +207,8 @@ class Estimator:
                 velocity[rows] = graph.velocity()
                 velocity_covariance[rows] = of_velocities
                 covariance[rows] = reported_covariance(solution, window, covariance[rows], self._motion.views)
-        X = self._limbs_kept(X, covariance, windows, solution)
+        if self.config.motion.keep_limbs:
+            X = self._limbs_kept(X, covariance, windows, solution)
         fit = final_bodies(solution, covariance, windows, self.fitter)
         final = linearise(observations, sigmas, X, views, self.config.observations)
         wrong = problems(observations, windows, solution, first, covariance)
@@ -265,13 +263,11 @@ STEP_S = 0.1
 """Time over which what a body changes of unseen joints is averaged, seconds, one sigma."""
 
 
-def window_rows(observations: Observations, temporal: bool) -> list[NDArray[np.intp]]:
-    """Rows of each window, frames rising: those of one track; or every row by itself.
+def window_rows(observations: Observations) -> list[NDArray[np.intp]]:
+    """Rows of each window, frames rising: those of one track.
 
     ValueError where a person is twice in a frame.
     """
-    if not temporal:
-        return [np.array([row]) for row in range(len(observations))]
     order = np.lexsort((observations.frame, observations.track))
     track, frame = observations.track[order], observations.frame[order]
     if np.any((np.diff(track) == 0) & (np.diff(frame) == 0)):

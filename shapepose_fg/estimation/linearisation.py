@@ -3,50 +3,77 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated, Literal
 
 import numpy as np
+from annotated_types import Interval
 from numpy.typing import NDArray
 
 from factors import KernelName, in_front, inlier_gate, kernel_weight, sigma_px
+from shapepose_fg.bounds import Factor, Metres, MetresOrNone, Pixels, Settings, Share
 from shapepose_fg.camera import Views
 from shapepose_fg.observations import Observations
 
+_DEPTH_M = 8.0
+"""Of joints before the cameras of the `tune` sequences, in the median (7 to 10 m): where lengths become pixels in
+the paper's setting."""
+
 
 @dataclass(frozen=True)
-class ObservationConfig:
+class ObservationConfig(Settings):
     """How far a 2D observation is trusted."""
 
-    sigma_m: float = 0.0105
+    sigma_m: Metres = 0.0105
     """How far a detection of confidence 1 is from the joint, one sigma per axis, as a length at the joint's
     depth: a person's image shrinks with distance, and so does the detector's error."""
-    confidence_power: float = 5.0
+    confidence_power: Annotated[float, Interval(gt=0, le=100)] = 5.0
     """p of w_ij, the weight in Eq. 1 of an observation of confidence c: w_ij = (c^p + w_0) / (1 + w_0). The
     paper's weight is the confidence itself. Measured, sigma at 0.95 is a third of what it is under 0.4."""
-    least_weight: float = 0.077
+    least_weight: Share = 0.077
     """w_0 in it: what the least confident observation weighs."""
     by_joint: bool = True
     """Whether sigma differs from joint to joint (`JOINT_SCATTER`): a detector knows an eye better than a hip."""
-    floor_px: float = 1.0
+    floor_px: Pixels = 1.0
     """What the detector's grid costs at any size."""
-    rho_2d_m: float = 0.15
+    rho_2d_m: Factor = 0.15
     """rho_2D of Eq. 2, as a length at the joint's depth: an observation farther from the projected joint is
     discarded. Half the distance between a person's own shoulders or hips."""
-    min_depth_m: float = 0.2
+    min_depth_m: Metres = 0.2
     """An observation counts only if the joint is at least this far in front of the camera."""
-    kernel: KernelName | None = "cauchy"
-    """Robust kernel of the projection factors."""
+    fixed_depth_m: MetresOrNone = 0.0
+    """Positive: `sigma_m` and `rho_2d_m` are lengths at this depth, wherever the joint is, so that d_2D is in
+    pixels, as in the paper. 0: at the joint's own depth."""
+    kernel: KernelName | Literal["none"] = "cauchy"
+    """Robust kernel of the projection factors. The paper has none."""
 
-    def __post_init__(self) -> None:
-        for name in ("sigma_m", "confidence_power", "rho_2d_m", "min_depth_m"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        for name in ("least_weight", "floor_px"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
+    @classmethod
+    def paper(cls) -> "ObservationConfig":
+        """As written in Eqs. 1 and 2: squared pixels times the confidence, of all that lies within rho_2D.
+
+        A detection has the measured sigma at a confidence of 0.7: 2 cm.
+        """
+        return cls(
+            sigma_m=0.02,
+            confidence_power=1.0,
+            least_weight=0.0,
+            by_joint=False,
+            floor_px=0.0,
+            fixed_depth_m=_DEPTH_M,
+            kernel="none",
+        )
 
     def weight(self, confidence: NDArray[np.float64]) -> NDArray[np.float64]:
         """w_ij of Eq. 1 for observations of this confidence."""
         return (confidence**self.confidence_power + self.least_weight) / (1.0 + self.least_weight)
+
+    @property
+    def robust_kernel(self) -> KernelName | None:
+        """The kernel's name, None for plain least squares."""
+        return None if self.kernel == "none" else self.kernel
+
+    def depth(self, depth: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The depths (...), metres, at which lengths are meant for joints at these depths (...)."""
+        return np.full_like(depth, self.fixed_depth_m) if self.fixed_depth_m > 0 else depth
 
     def scatter(self, joints: Sequence[str]) -> NDArray[np.float64]:
         """(J,) what sigma is multiplied with for each joint; 1 for names that are not known."""
@@ -143,7 +170,7 @@ def observation_sigmas(
     scatter = np.broadcast_to(config.scatter(joints)[:, None], seen.shape)
     sigmas[seen] = sigma_px(
         config.weight(observations.confidence[seen]) / scatter[seen] ** 2,
-        depth[seen],
+        config.depth(depth[seen]),
         focal[seen],
         sigma_m=config.sigma_m,
         floor_px=config.floor_px,
@@ -167,9 +194,9 @@ def linearise(
     residual = np.where(usable[..., None], projected - observations.xy, np.nan)
     distance = np.linalg.norm(residual, axis=-1)
     focal = _per_joint(views.focal_px, depth.shape)
-    inlier = inlier_gate(distance, config.rho_2d_m * focal / np.where(usable, depth, 1.0))
+    inlier = inlier_gate(distance, config.rho_2d_m * focal / config.depth(np.where(usable, depth, 1.0)))
     sigma = np.where(inlier, sigmas, 1.0)
-    weight = inlier * kernel_weight(config.kernel, np.where(inlier, distance, 0.0) / sigma) / sigma**2
+    weight = inlier * kernel_weight(config.robust_kernel, np.where(inlier, distance, 0.0) / sigma) / sigma**2
     jacobian = np.where(inlier[..., None, None], jacobian, 0.0)
     weighted = jacobian * weight[..., None, None]
     information = np.einsum("pqvki,pqvkj->pqij", weighted, jacobian)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.bounds import Factor, Metres, Seconds, Settings
 from shapepose_fg.errors import InputError
 from shapepose_fg.files import read_json
 
@@ -14,26 +15,22 @@ FORMAT = "shapepose-fg motion model 1"
 
 
 @dataclass(frozen=True)
-class MotionConfig:
-    """Whether, and how, the frames of a person are solved together."""
+class MotionConfig(Settings):
+    """How the frames of a person are solved together."""
 
-    temporal: bool = True
-    """Rows of one track at several frames are one window. False: every frame stands alone."""
     model: str = ""
     """File of the motion model, as `scripts/measure_motion.py` writes it; empty: the one that ships."""
-    psd_scale: float = 1.0
+    psd_scale: Factor = 1.0
     """Multiplies the power spectral densities of the joints' accelerations: more follows faster and smooths
     less."""
-    lost_m: float = 0.1
+    lost_m: Metres = 0.1
     """A joint whose views leave it less certain than this in some direction is lost from sight: in these frames,
     and in those around them, the difference between joint and body is followed (`factors.motion`)."""
-    around_s: float = 0.5
+    around_s: Seconds = 0.5
     """How far around them, seconds."""
-
-    def __post_init__(self) -> None:
-        for name in ("psd_scale", "lost_m", "around_s"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+    keep_limbs: bool = True
+    """Whether joints that no view saw go to where a body can have them, and limbs with an open end get the body's
+    length: motion carries each joint by itself."""
 
 
 @dataclass(frozen=True)
@@ -92,18 +89,18 @@ class MotionModel:
             if data["format"] != FORMAT:
                 raise KeyError("format")
             known = {name: tuple(map(float, numbers)) for name, numbers in data["joints"].items()}
+            if any(len(numbers) != 3 for numbers in known.values()):
+                raise ValueError("a joint has other than 3 densities")
             views, body = (
                 Lasting(*(float(data[name][key]) for key in ("white_share", "correlation_s", "kept")))
                 for name in ("views", "body")
             )
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise InputError(
                 f"{path}: is not a motion model ({error}); give what scripts/measure_motion.py writes"
             ) from None
-        table = np.array(list(known.values()))
-        if not (
-            np.isfinite(table).all() and (table[:, 0] > 0).all() and table.shape[1] == 3 and (table >= 0).all()
-        ):
+        table = np.array(list(known.values())).reshape(-1, 3)
+        if len(table) == 0 or not (np.isfinite(table).all() and (table[:, 0] > 0).all() and (table >= 0).all()):
             raise InputError(f"{path}: densities must be positive; give what scripts/measure_motion.py writes")
         chosen = config.psd_scale * np.array([known.get(name, tuple(table.mean(axis=0))) for name in joints])
         still, speed, lost = np.ascontiguousarray(chosen.T)

@@ -41,12 +41,8 @@ COLOURS = ("black", "#7570b3", "#1b9e77", "#d95f02", "#e7298a")
 Table = Callable[[], list[str]]
 
 
-def tables(data: Path, images: Path | None) -> dict[str, Table]:
-    """The tables by name; the figure goes to the folder `images`, or nowhere."""
-    motions, shelf = data / "data" / "cmu_mocap" / "cmu_smpl24.npz", data / "data" / "shelf"
-    if not motions.is_file():
-        print(f"(no recorded motions in {motions.parent}: the comparison of fitters is left out)\n")
-        return {}
+def tables(motions: Path, shelf: Path | None, images: Path | None) -> dict[str, Table]:
+    """The tables by name; `motions` is the recorded motions' file, the figure goes to the folder `images`."""
     all_ = Comparison(motions)
     return {
         "fitter": lambda: error_table(all_),
@@ -213,13 +209,13 @@ def sigma_table(comparison: Comparison) -> list[str]:
     return [f"| targets | fitter | joints | {' | '.join(GROUPS)} |", _rule(3 + len(GROUPS)), *rows]
 
 
-def alternation_table(motions: Path, shelf: Path) -> list[str]:
+def alternation_table(motions: Path, shelf: Path | None) -> list[str]:
     """The whole pipeline with each fitter, on the same detections."""
     config = replace(PipelineConfig(), temporal=False)
     fitters = {"Levenberg-Marquardt": LevenbergMarquardtFitter(config=config.body.plain)}
     fitters |= {method.name: method.make(None) for method in learned()[1:]}
     rows = []
-    if shelf.is_dir():
+    if shelf is not None:
         truth, rig = read_shelf_ground_truth(shelf / "gt_dev.txt"), read_rig(shelf / "calibration.json")
         detections = read_detections(shelf, rig)
         for name, fitter in fitters.items():

@@ -33,11 +33,13 @@ class Trial:
     """Of the scene and of the detector."""
     cameras: int = 6
     """Views."""
+    frames: int = 60
+    """Of the scene."""
 
     @cached_property
     def scene(self):
         """The people and cameras."""
-        return built_in_scene(self.seed, cameras=self.cameras)
+        return built_in_scene(self.seed, cameras=self.cameras, frames=self.frames)
 
     @cached_property
     def detections(self):
@@ -85,11 +87,11 @@ def scene_table(trials: list[Trial]) -> list[str]:
     return [head, _rule(9), *rows]
 
 
-def camera_table() -> list[str]:
-    """What more cameras bring, on the first of the seeds."""
+def camera_table(trial: Trial) -> list[str]:
+    """What more cameras bring to the scene of `trial`."""
     rows = []
     for count in CAMERAS:
-        m = Trial(SEEDS[0], count).metrics
+        m = replace(trial, cameras=count).metrics
         people = f"{m.people_found} of {m.people_true} | {m.people_duplicated} | {m.people_invented}"
         rows.append(f"| {count} | {100 * m.precision:.1f} | {100 * m.recall:.1f} | {m.mpjpe_mm:.0f} | {people} |")
     head = "| cameras | precision, % | recall, % | MPJPE, mm | people found | twice | invented |"

@@ -13,6 +13,7 @@ from rich.table import Table
 
 from shapepose_fg.errors import InputError
 from shapepose_fg.evaluation.matching import People
+from shapepose_fg.evaluation.other_results.skeleton_text import SHELF_JOINTS
 from shapepose_fg.evaluation.shelf_ground_truth import (
     ShelfGroundTruth,
     read_shelf_ground_truth,
@@ -197,7 +198,7 @@ def _choose(
     truth: NDArray[np.float64], frame: NDArray[np.int64], people: People
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """Row (G,) and joints (G, 15, 3) that each annotated person takes; -1 and NaN where its frame has none."""
-    joints = shelf_joints(_body25(people))
+    joints = _shelf15(people)
     person, row = np.nonzero(frame[:, None] == np.asarray(people.frame)[None, :])
     distance = np.linalg.norm(joints[row] - truth[person], axis=2)
     cost = np.where(np.isfinite(distance), distance, MISSING_JOINT_M).mean(axis=1)
@@ -209,12 +210,17 @@ def _choose(
     return taken, chosen
 
 
-def _body25(people: People) -> NDArray[np.float64]:
-    """The joints (N, 25, 3) of `people`; InputError if they are not those of BODY_25, in its order."""
-    names = getattr(people, "joint_names", BODY_25.joints)
-    if tuple(names) != BODY_25.joints:
+def _shelf15(people: People) -> NDArray[np.float64]:
+    """The joints (N, 15, 3) of `people`, who have BODY_25's or Shelf's own; InputError for any others."""
+    names, joints = (
+        tuple(getattr(people, "joint_names", BODY_25.joints)),
+        np.asarray(people.joints, dtype=np.float64),
+    )
+    if names == SHELF_JOINTS:
+        return joints
+    if names != BODY_25.joints:
         raise InputError("the people's joints are not those of BODY_25, which this protocol maps to Shelf's 15")
-    return np.asarray(people.joints, dtype=np.float64)
+    return shelf_joints(joints)
 
 
 def _limbs_right(distance: NDArray[np.float64], truth: NDArray[np.float64]) -> NDArray[np.bool_]:

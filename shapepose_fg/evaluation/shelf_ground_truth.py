@@ -1,24 +1,13 @@
 """The annotation of the Shelf recording: its text file, its 15 joints, and how BODY_25 maps to them."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.errors import InputError
-from shapepose_fg.files import read_text
+from shapepose_fg.evaluation.other_results.skeleton_text import SHELF_JOINTS, read_skeleton_text
 from shapepose_fg.skeleton import BODY_25
-
-SHELF_JOINTS = tuple(
-    "RAnkle RKnee RHip LHip LKnee LAnkle RWrist RElbow RShoulder LShoulder LElbow LWrist Neck HeadTop "
-    "MidHip".split()
-)
-"""The 15 annotated joints, in the order of the file."""
-
-_MAX_PEOPLE = 1000
-"""A count of people beyond this is not a count of people."""
 
 
 @dataclass(frozen=True)
@@ -48,35 +37,8 @@ def read_shelf_ground_truth(path: Path | str) -> ShelfGroundTruth:
 
     InputError that names file and line for a missing, malformed or truncated file.
     """
-    path = Path(path)
-    lines = _Lines(path)
-    joint_count, frame_count = lines.integers(2, "the number of joints and of frames")
-    if joint_count != len(SHELF_JOINTS) or frame_count < 0:
-        lines.refuse(f"must say 15 joints and the number of frames, got {joint_count} and {frame_count}")
-    frames: list[int] = []
-    actors: list[int] = []
-    joints: list[NDArray[np.float64]] = []
-    for frame in range(frame_count):
-        (people,) = lines.integers(1, f"the number of people in frame {frame}")
-        if not 0 <= people <= _MAX_PEOPLE:
-            lines.refuse(f"must be the number of people in frame {frame}, got {people}")
-        seen: set[int] = set()
-        for _ in range(people):
-            (actor,) = lines.integers(1, f"a person's id in frame {frame}")
-            if actor in seen or actor < 0:
-                lines.refuse(f"gives the id {actor} in frame {frame}; ids must be 0 or more and differ")
-            seen.add(actor)
-            rows = [lines.numbers(f"15 values of {row} in frame {frame}") for row in ("x", "y", "z", "confidence")]
-            frames.append(frame)
-            actors.append(actor)
-            joints.append(np.stack(rows[:3], axis=1))
-    lines.expect_end(frame_count)
-    return ShelfGroundTruth(
-        np.array(frames, dtype=np.int64),
-        np.array(actors, dtype=np.int64),
-        np.stack(joints) if joints else np.zeros((0, 15, 3)),
-        frame_count,
-    )
+    text = read_skeleton_text(Path(path), joints=len(SHELF_JOINTS), unknown=False)
+    return ShelfGroundTruth(text.frame, text.person, text.joints, text.frame_count)
 
 
 _SAME_NAME = [BODY_25.index(name) for name in SHELF_JOINTS[:12]]
@@ -121,54 +83,3 @@ def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     """Vectors (N, 3) of length one; NaN for one of no length."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return vectors / np.where(length > 0, length, np.nan)
-
-
-class _Lines:
-    """The lines of a text file that are not blank, one after the other, and where we are in it."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._place = 0
-        self._lines: Iterator[tuple[int, str]] = (
-            (place, line) for place, line in enumerate(read_text(path).splitlines(), 1) if line.strip()
-        )
-
-    def refuse(self, complaint: str) -> None:
-        raise InputError(f"{self._path}: line {self._place} {complaint}; copy the annotation again")
-
-    def integers(self, count: int, meaning: str) -> list[int]:
-        words = self._next(count, meaning)
-        try:
-            return [int(word) for word in words]
-        except ValueError:
-            raise InputError(
-                f"{self._path}: line {self._place} must hold {meaning}, got {' '.join(words)[:40]!r}; "
-                "copy the annotation again"
-            ) from None
-
-    def numbers(self, meaning: str) -> NDArray[np.float64]:
-        words = self._next(len(SHELF_JOINTS), meaning)
-        try:
-            values = np.array([float(word) for word in words])
-        except ValueError:
-            values = np.array([np.nan])
-        if not np.isfinite(values).all():
-            self.refuse(f"must hold {meaning}, all finite numbers")
-        return values
-
-    def expect_end(self, frame_count: int) -> None:
-        for place, _ in self._lines:
-            self._place = place
-            self.refuse(f"goes on after the {frame_count} frames that line 1 promises")
-
-    def _next(self, count: int, meaning: str) -> list[str]:
-        entry = next(self._lines, None)
-        if entry is None:
-            raise InputError(
-                f"{self._path}: the file ends after line {self._place}, before {meaning}; copy it again whole"
-            )
-        self._place, line = entry
-        words = line.split()
-        if len(words) != count:
-            self.refuse(f"must hold {meaning}, got {len(words)} values")
-        return words

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.camera import Rig, Views
-from shapepose_fg.estimation.alternation import disagreement, joint_targets
+from shapepose_fg.estimation.body_step import disagreement, joint_targets
 from shapepose_fg.estimation.linearisation import linearise, observation_sigmas, triangulate
 from shapepose_fg.evaluation.alternation import before_refinement
 from shapepose_fg.evaluation.bodies import body_joints

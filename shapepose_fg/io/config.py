@@ -4,7 +4,6 @@ import ast
 import inspect
 import json
 import textwrap
-import tomllib
 from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
 from itertools import pairwise
@@ -13,8 +12,9 @@ from typing import Any, TypeVar, cast, get_type_hints
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
+from shapepose_fg.bounds import range_of
 from shapepose_fg.errors import InputError
-from shapepose_fg.files import read_text
+from shapepose_fg.files import read_toml
 from shapepose_fg.io.validation import describe, first_problem
 
 T = TypeVar("T")
@@ -29,11 +29,7 @@ def read_config(path: str | Path, kind: type[T]) -> T:
     for bad TOML, an unknown key, a wrong type, or a value that the dataclass refuses.
     """
     path = Path(path)
-    try:
-        table = tomllib.loads(read_text(path, may_be_empty=True))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: this is not TOML: {error}; correct it there") from None
-    return _build(kind, table, path)
+    return _build(kind, read_toml(path, may_be_empty=True), path)
 
 
 def config_from(table: dict[str, Any], kind: type[T], path: str | Path) -> T:
@@ -90,7 +86,7 @@ def _lines(config: Any, table: str = "") -> list[str]:
             name = f"{table}.{field.name}" if table else field.name
             tables += ["", *_comment(comments.get(field.name)), f"[{name}]", *_lines(value, name)]
         else:
-            settings += _comment(comments.get(field.name))
+            settings += _comment(comments.get(field.name)) + _comment(range_of(type(config), field.name))
             settings.append(f"# {field.name} is not set" if value is None else f"{field.name} = {_toml(value)}")
     return settings + tables
 

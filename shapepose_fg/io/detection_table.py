@@ -19,6 +19,10 @@ _STRAY = 0.01
 are detections of other pictures, or another camera's calibration."""
 
 
+_LEAST_SCORE = 1e-6
+"""Below this a detector says that it saw nothing; products of such scores are 0."""
+
+
 @dataclass(frozen=True)
 class ViewCandidates:
     """All candidates that one camera saw in a recording, sorted by frame and then by joint."""
@@ -151,6 +155,9 @@ def _undistorted(view: ViewCandidates, camera: Camera) -> tuple[ViewCandidates, 
             raise InputError(f"{where}; give detections made on pictures of the calibrated size")
         notes.append(f"{where}; {outside.sum()} such joints of {len(outside)} were left out")
         view = _only(view, ~outside)
+    certain = view.confidence >= _LEAST_SCORE
+    if not certain.all():
+        view = _only(view, certain)
     xy = camera.undistort(view.xy)
     undone = np.asarray(np.isfinite(xy).all(axis=1))
     if not undone.all():

@@ -1,13 +1,12 @@
 """A Pose2Sim project as it lies: which of its files are what, and where its next steps look for results."""
 
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from shapepose_fg.errors import InputError
-from shapepose_fg.files import read_text
+from shapepose_fg.files import read_toml
 from shapepose_fg.io.calibration.content import load
 from shapepose_fg.io.calibration.reading import FORMATS
 from shapepose_fg.io.detections.frame_files import frame_files, frame_number
@@ -121,10 +120,7 @@ def _settings(folder: Path) -> tuple[dict[str, Any], Path | None]:
 
 
 def _toml(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(read_text(path, may_be_empty=True))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not valid TOML: {error}; correct it there") from None
+    return read_toml(path, may_be_empty=True)
 
 
 def _over(below: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:

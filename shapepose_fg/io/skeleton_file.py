@@ -1,6 +1,5 @@
 """A detector's own skeleton, described in TOML: its keypoints, limbs, mirror, anchor and places on the body."""
 
-import tomllib
 from pathlib import Path
 from typing import Annotated
 
@@ -8,7 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.errors import InputError
-from shapepose_fg.files import read_text
+from shapepose_fg.files import read_toml
 from shapepose_fg.io.validation import first_problem, key_text
 from shapepose_fg.skeleton import MID_HIP, SKELETONS, Skeleton
 
@@ -57,12 +56,10 @@ def read_skeleton(path: str | Path) -> Skeleton:
     """
     path = Path(path)
     try:
-        file = _File.model_validate(tomllib.loads(read_text(path)))
+        file = _File.model_validate(read_toml(path))
     except ValidationError as error:
         place, problem = first_problem(error)
         raise InputError(f"{path}: {key_text(place)} {problem}; {_CURE}") from None
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: is not TOML: {error}; correct it there") from None
     points = _points(file, path)
 
     def pairs(rows: list[list[str]]) -> list[tuple[str, str]]:

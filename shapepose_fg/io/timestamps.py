@@ -13,6 +13,8 @@ from shapepose_fg.frame_times import FrameTimes
 
 _FRAME, _TIME = "frame", "time_s"
 """Columns with a meaning of their own; every other column is a camera's."""
+_MOST_BYTES = 2**28
+"""A line a frame: a day of 30 cameras."""
 _LONGEST_STEP_S = 10.0
 """Frames farther apart than this are no recording of motion: the file is in milliseconds or less."""
 _SAME_CLOCK_S = 1.0
@@ -48,7 +50,7 @@ def _table(path: Path) -> tuple[list[str], NDArray[np.float64], NDArray[np.intp]
     """Names of the columns, the numbers (T, C), and the line of the file that each row is from."""
     names: list[str] = []
     rows, lines = [], []
-    for line, text in enumerate(read_text(path).splitlines(), start=1):
+    for line, text in enumerate(read_text(path, most=_MOST_BYTES).splitlines(), start=1):
         words = [word for word in re.split(r"[,\s]+", text.split("#")[0].strip()) if word]
         if len(words) == 0:
             continue

@@ -50,12 +50,14 @@ def write_association(recording: DetectionSequence, rig: Rig, folder: str | Path
         _write(folder / "detection" / f"{camera.name}.txt", "\n".join(lines) + "\n")
 
 
-def write_openpose(recording: DetectionSequence, rig: Rig, folder: str | Path) -> None:
+def write_openpose(
+    recording: DetectionSequence, rig: Rig, folder: str | Path, *, smallest_person: int = SMALLEST_PERSON
+) -> None:
     """Write <camera>/<camera>_000000000000_keypoints.json and so on into `folder`: people, as OpenPose does.
 
-    Candidates are grouped by `group_people`; those that belong to nobody are not in such files. Positions
-    have three decimals, pixels. ValueError where the skeleton is not BODY_25 or there is no frame;
-    InputError where the folder of a camera already holds frames.
+    Candidates are grouped by `group_people`; groups of fewer joints than `smallest_person` are nobody, and not in
+    such files. Positions have three decimals, pixels. ValueError where the skeleton is not BODY_25 or there is no
+    frame; InputError where the folder of a camera already holds frames.
     """
     _check(recording)
     refuse_leftovers(rig, folder)
@@ -64,7 +66,7 @@ def write_openpose(recording: DetectionSequence, rig: Rig, folder: str | Path) -
         each.mkdir(parents=True, exist_ok=True)
     for frame in range(len(recording)):
         found = recording[frame]
-        people = [members for members in group_people(found) if len(members) >= SMALLEST_PERSON]
+        people = [members for members in group_people(found) if len(members) >= smallest_person]
         for view, (camera, each) in enumerate(zip(rig.cameras, folders, strict=True)):
             mine = [members for members in people if found.view[members[0]] == view]
             # Thousands of small files: written plainly, the reader notices one that is missing or cut.

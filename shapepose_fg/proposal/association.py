@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.bounds import Settings, Share
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections
 from shapepose_fg.observations import Observations
@@ -16,33 +17,34 @@ from shapepose_fg.proposal.candidates import Candidates
 from shapepose_fg.proposal.proposals import Proposals
 from shapepose_fg.skeleton import Skeleton
 
+_NEAR_M = 0.08
+"""How closeness to the projected joint falls off: sigma of a Gaussian, as a length at the joint's depth. A
+detector is 2 cm off on a visible joint and several on a hidden one."""
+_FAR_M = 0.25
+"""No detection farther than this from the projection of a joint whose place is known is taken."""
+_REACH_M = 0.6
+"""A joint whose place is not known yet is sought this far around its neighbours on the skeleton: no limb
+from a joint to the next is longer, the trunk aside."""
+_LEAST_AFFINITY = 0.3
+"""A joint whose place is not known is only taken by an affinity of at least this to an observed neighbour."""
+_OVERLAP_PX = 6.0
+"""Two people's projected joints closer than this overlap: the one detection there serves both."""
+_PASSES = 2
+"""How often the choice is made again with the neighbours that the last one chose."""
+
 
 @dataclass(frozen=True)
-class AssociationConfig:
+class AssociationConfig(Settings):
     """When a 2D detection is an observation of a proposal's joint."""
 
-    near_m: float = 0.08
-    """How closeness to the projected joint falls off: sigma of a Gaussian, as a length at the joint's depth. A
-    detector is 2 cm off on a visible joint and several on a hidden one."""
-    far_m: float = 0.25
-    """No detection farther than this from the projection of a joint whose place is known is taken."""
-    reach_m: float = 0.6
-    """A joint whose place is not known yet is sought this far around its neighbours on the skeleton: no limb
-    from a joint to the next is longer, the trunk aside."""
-    least_affinity: float = 0.3
-    """A joint whose place is not known is only taken by an affinity of at least this to an observed neighbour."""
-    overlap_px: float = 6.0
-    """Two people's projected joints closer than this overlap: the one detection there serves both."""
-    passes: int = 2
-    """How often the choice is made again with the neighbours that the last one chose."""
-    min_observed_parts: float = 0.35
+    min_observed_parts: Share = 0.35
     """Least fraction of the core joints (trunk, arms, legs) that two views must see: 6 of 15. Of one whose upper
-    body alone shows there are 9."""
+    body alone shows there are 9. The paper asks for none."""
 
-    def __post_init__(self) -> None:
-        for name in ("near_m", "far_m", "reach_m", "overlap_px", "passes"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+    @classmethod
+    def paper(cls) -> "AssociationConfig":
+        """As written: whoever was proposed stays."""
+        return cls(min_observed_parts=0.0)
 
 
 def associate(
@@ -60,20 +62,20 @@ def associate(
     both. Proposals that are left with hardly any joint seen by two views are dropped, and what they took is given
     out anew; the second value is their number.
     """
-    nearness = _nearness(proposals.places, detections, rig, skeleton, config)
+    nearness = _nearness(proposals.places, detections, rig, skeleton)
     owns = _by_support(proposals, candidates, len(detections))
     real = np.ones(len(proposals), dtype=bool)
     chosen = np.full((*proposals.candidate.shape, len(rig)), -1, dtype=np.intp)
-    rounds = 1 + config.passes
+    rounds = 1 + _PASSES
     while rounds > 0:
-        chosen = _choose(nearness, owns, detections, skeleton, config)
+        chosen = _choose(nearness, owns, detections, skeleton)
         seen_twice = ((chosen >= 0).sum(axis=2) >= 2)[:, skeleton.core].mean(axis=1)
         keep = seen_twice >= config.min_observed_parts
         real[np.flatnonzero(real)[~keep]] = False
         nearness, chosen = nearness.of(keep), chosen[keep]
         owns = owned(chosen, len(detections))
         # What the dropped had is given out anew.
-        rounds = rounds - 1 if keep.all() else config.passes
+        rounds = rounds - 1 if keep.all() else _PASSES
     return Observations.of(chosen, detections, proposals.places[real]), int((~real).sum())
 
 
@@ -107,7 +109,6 @@ def _nearness(
     detections: Detections,
     rig: Rig,
     skeleton: Skeleton,
-    config: AssociationConfig,
 ) -> _Nearness:
     """Compare all detections with the projections of all joints at `places` (P, J, 3)."""
     xy, depth = rig.project(places)
@@ -126,7 +127,7 @@ def _nearness(
     if not placed.all():
         for neighbour in skeleton.tree_neighbours.T:  # a joint has few
             of_each = neighbour[detections.joint]
-            reachable |= (of_each >= 0) & (distance_px(of_each)[1] < config.reach_m)
+            reachable |= (of_each >= 0) & (distance_px(of_each)[1] < _REACH_M)
     return _Nearness(len(rig), placed, own_m, own_px, reachable & ~placed)
 
 
@@ -135,17 +136,16 @@ def _choose(
     owns: NDArray[np.bool_],
     detections: Detections,
     skeleton: Skeleton,
-    config: AssociationConfig,
 ) -> NDArray[np.intp]:
     """(P, J, V) detections for the people who are thought to own `owns` (P, D)."""
     affinity, neighbours = mean_affinity(owns, detections, skeleton, nearness.views)
     # Where no neighbour is seen, the affinities say nothing: neither for nor against.
-    spoken = np.where(neighbours > 0, affinity, config.least_affinity)
-    score = np.exp(-0.5 * (nearness.distance_m / config.near_m) ** 2) + spoken
-    likely = (nearness.distance_m < config.far_m) & (score >= 2 * config.least_affinity)
-    likely |= nearness.reachable & (affinity >= config.least_affinity)
+    spoken = np.where(neighbours > 0, affinity, _LEAST_AFFINITY)
+    score = np.exp(-0.5 * (nearness.distance_m / _NEAR_M) ** 2) + spoken
+    likely = (nearness.distance_m < _FAR_M) & (score >= 2 * _LEAST_AFFINITY)
+    likely |= nearness.reachable & (affinity >= _LEAST_AFFINITY)
     chosen = match_views(likely, score, detections, (len(owns), len(skeleton), nearness.views))
-    overlap = (nearness.distance_px < config.overlap_px) & (affinity >= config.least_affinity)
+    overlap = (nearness.distance_px < _OVERLAP_PX) & (affinity >= _LEAST_AFFINITY)
     share_overlaps(chosen, overlap, nearness.distance_px, detections)
     return chosen
 

@@ -4,38 +4,69 @@ Stage I (b) and (c) of the paper (section 3.1, "3D Joint Candidates Reconstructi
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Interval
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from shapepose_fg.bounds import Count, Metres, Settings
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections
 
+_ANYWHERE_M = 10.0
+"""A gate that no pair of rays in a room fails."""
+
 
 @dataclass(frozen=True)
-class CandidateConfig:
+class CandidateConfig(Settings):
     """How pairs of detections become 3D joint candidates."""
 
-    gate_m: float = 0.07
+    gate_m: Metres = 0.07
     """Largest reprojection error of a pair's point, as a length at the point's depth. The point shares the gap
     between the two rays out, so its error has 0.7 of a detection's sigma: 2 cm where the detector is half sure
     (3 cm, measured on real detections), and this is over three times as much."""
-    min_angle_deg: float = 3.0
+    min_angle_deg: Annotated[float, Interval(gt=0, le=90)] = 3.0
     """Smallest angle between the two rays; below it depth is guessed, not measured."""
-    vote_radius_m: float = 0.12
+    vote_radius_m: Metres = 0.12
     """rho: points of one joint closer than this to the most confident one vote for it."""
-    min_votes: int = 3
+    min_votes: Count = 3
     """The paper's three points: fewer make a *weak* candidate, which cannot anchor a person. With two cameras
     there is one pair only, so what counts is min(min_votes, pairs of views)."""
-    min_view_fraction: float = 1 / 6
+    min_view_fraction: Annotated[float, Interval(gt=0, le=1)] = 1 / 6
     """Where there are very many views, chance crossings of rays have three votes, too: a strong candidate must
     have those of all pairs of this fraction of the views (30 cameras: 5 views, 10 votes; 18 and fewer: 3)."""
+    weak: bool = True
+    """Whether clusters of fewer votes are kept, as weak candidates. The paper drops them: a joint that two views
+    see is lost."""
+    weighted_centre: bool = True
+    """Whether the centre of a cluster is weighted by the squared confidence of its points. In the paper it is
+    their mean."""
 
-    def __post_init__(self) -> None:
-        for name in ("gate_m", "min_angle_deg", "vote_radius_m", "min_votes", "min_view_fraction"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+    most_pairs: Annotated[int, Interval(ge=1000, le=1_000_000)] = 150_000
+    """Pairs of detections of one joint that a frame may have: of more, each view keeps its most confident ones. 18
+    a view before 30 cameras, 47 before 12, 122 before 5."""
+    most_points: Annotated[int, Interval(ge=100, le=100_000)] = 8000
+    """Points of one joint: of more, the most confident. Twelve people before 30 cameras have 5000."""
+    most_candidates: Annotated[int, Interval(ge=10, le=10_000)] = 250
+    """Candidates of one joint: of more, those with most votes. Twelve people before 30 cameras have 220, half of
+    them crossings of rays."""
+
+    @classmethod
+    def paper(cls) -> "CandidateConfig":
+        """As written in section 3.1: every pair is triangulated, wherever its rays pass; three points or none.
+
+        The paper does not say rho: 6 cm is the best of 5 to 12 on `tune`.
+        """
+        return cls(
+            gate_m=_ANYWHERE_M,
+            min_angle_deg=1e-3,
+            vote_radius_m=0.06,
+            min_view_fraction=1e-3,
+            weak=False,
+            weighted_centre=False,
+        )
 
 
 @dataclass(frozen=True)
@@ -86,7 +117,14 @@ def triangulate_pairs(detections: Detections, rig: Rig, config: CandidateConfig)
         rig.cTw[detections.view, :, :3],
         np.concatenate([normalised, np.ones((len(detections), 1))], axis=1),
     )
-    near = _rays_meet(rays, rig.centres[detections.view], first, second, config)
+    rays, origins = np.ascontiguousarray(rays.T), np.ascontiguousarray(rig.centres[detections.view].T)
+    parts = [slice(start, start + _PAIRS_AT_ONCE) for start in range(0, len(first), _PAIRS_AT_ONCE)]
+    near = np.concatenate(
+        [
+            np.zeros(0, dtype=bool),
+            *(_rays_meet(rays, origins, first[part], second[part], config) for part in parts),
+        ]
+    )
     first, second = first[near], second[near]
     xyz = _linear_points(rig, detections.view, normalised, first, second)
     error_m = np.maximum(
@@ -117,7 +155,7 @@ def vote(points: PairPoints, detections: Detections, views: int, config: Candida
     count = cluster.max() + 1
     votes = np.bincount(cluster, minlength=count)
     # The centre of the cluster is weighted by confidence: one bad view must not drag the point of four good ones.
-    weight = points.score**2
+    weight = points.score**2 if config.weighted_centre else np.ones(len(points.score))
     total = np.bincount(cluster, weight, count)
     xyz = np.stack([np.bincount(cluster, weight * x, count) / total for x in points.xyz.T], axis=1)
     joint = np.zeros(count, dtype=np.intp)
@@ -129,7 +167,8 @@ def vote(points: PairPoints, detections: Detections, views: int, config: Candida
     # A detection that made a strong candidate is explained: what it makes with others' is a crossing of rays.
     explained = np.zeros(len(detections), dtype=bool)
     explained[support[strong[support[:, 0]], 1]] = True
-    keep = strong | (np.bincount(support[:, 0], ~explained[support[:, 1]], count) > 0)
+    unexplained = np.bincount(support[:, 0], ~explained[support[:, 1]], count) > 0
+    keep = strong | (unexplained & config.weak)
     support = support[keep[support[:, 0]]]
     support[:, 0] = (np.cumsum(keep) - 1)[support[:, 0]]
     return Candidates(xyz[keep], joint[keep], score[keep], votes[keep], strong[keep], support)
@@ -173,6 +212,10 @@ def _same_joint_pairs(detections: Detections) -> tuple[NDArray[np.intp], NDArray
     return first[differ], second[differ]
 
 
+_PAIRS_AT_ONCE = 2**19
+"""Pairs of rays that are looked at together: more take more memory, not less time."""
+
+
 def _rays_meet(
     rays: NDArray[np.float64],
     origins: NDArray[np.float64],
@@ -180,12 +223,13 @@ def _rays_meet(
     second: NDArray[np.intp],
     config: CandidateConfig,
 ) -> NDArray[np.bool_]:
-    """Cheap test before triangulation: do two rays pass each other at less than twice the gate?"""
-    normal = np.cross(rays[first], rays[second])
+    """Cheap test before triangulation: do two of the `rays` (3, D) pass each other at less than twice the gate?"""
+    (ax, ay, az), (bx, by, bz) = rays[:, first], rays[:, second]
+    normal = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
     sine = np.sqrt(np.einsum("mi,mi->m", normal, normal))
-    between = origins[second] - origins[first]
+    between = (origins[:, second] - origins[:, first]).T
     gap = np.abs(np.einsum("mi,mi->m", normal, between))
-    lengths = np.sqrt(np.einsum("di,di->d", rays, rays))
+    lengths = np.sqrt(np.einsum("id,id->d", rays, rays))
     parallel = np.sin(np.deg2rad(config.min_angle_deg)) * lengths[first] * lengths[second]
     return (gap < 2.0 * config.gate_m * sine) & (sine > parallel)
 
@@ -215,17 +259,45 @@ def _reprojection_error(
     return np.where(camera[:, 2] > 0, error, np.inf).astype(np.float64)
 
 
+_POINTS_AT_ONCE = 4096
+"""Points whose neighbours among each other are looked up at once: before 30 cameras a joint has 400 of them."""
+
+
 def _greedy_seeds(points: PairPoints, radius_m: float) -> NDArray[np.intp]:
-    """The seed (M,) whose cluster each point joins, as if points were picked one by one by confidence."""
-    count = len(points.xyz)
-    rank = np.empty(count, dtype=np.intp)
-    rank[np.argsort(-points.score, kind="stable")] = np.arange(count)
+    """The seed (M,) whose cluster each point joins, as if points were picked one by one by confidence.
+
+    The most confident points are clustered first; what lies near their seeds is theirs, and the rest goes on.
+    """
+    order = np.argsort(-points.score, kind="stable")
     # A fourth coordinate keeps different joints apart.
-    tree = KDTree(np.column_stack([points.xyz, points.joint * (4.0 * radius_m)]))
-    edges = tree.query_pairs(radius_m, output_type="ndarray")
-    swap = rank[edges[:, 0]] > rank[edges[:, 1]]
-    better = np.where(swap, edges[:, 1], edges[:, 0])
-    worse = np.where(swap, edges[:, 0], edges[:, 1])
+    apart = points.joint * (4.0 * radius_m)
+    places = np.asarray(np.column_stack([points.xyz, apart])[order], dtype=np.float64)
+    if len(order) <= _POINTS_AT_ONCE:
+        return order[_seeds_of_ranked(places, radius_m)][np.argsort(order)]
+    every = KDTree(places, balanced_tree=False, compact_nodes=False)
+    seed = np.full(len(order), -1, dtype=np.intp)
+    left = np.arange(len(order))
+    while len(left) > 0:
+        first = left[:_POINTS_AT_ONCE]
+        seed[first] = first[_seeds_of_ranked(places[first], radius_m)]
+        seeds = np.unique(seed[first])
+        near = every.query_ball_point(places[seeds], radius_m)
+        member = np.concatenate(near).astype(np.intp)
+        of_seed = np.repeat(seeds, [len(each) for each in near])
+        new = seed[member] < 0
+        nearest = np.full(len(order), len(order), dtype=np.intp)
+        np.minimum.at(nearest, member[new], of_seed[new])
+        seed = np.where(nearest < len(order), nearest, seed)
+        left = left[_POINTS_AT_ONCE:]
+        left = left[seed[left] < 0]
+    return order[seed][np.argsort(order)]
+
+
+def _seeds_of_ranked(places: NDArray[np.float64], radius_m: float) -> NDArray[np.intp]:
+    """The seed (M,) of each of a few points that stand in the order in which they are picked."""
+    count = len(places)
+    edges = KDTree(places).query_pairs(radius_m, output_type="ndarray")
+    better, worse = edges.min(axis=1), edges.max(axis=1)
     is_seed = np.zeros(count, dtype=bool)
     undecided = np.ones(count, dtype=bool)
     live_better, live_worse = better, worse
@@ -238,7 +310,7 @@ def _greedy_seeds(points: PairPoints, radius_m: float) -> NDArray[np.intp]:
         undecided &= ~picked
         undecided[live_worse[picked[live_better]]] = False
     # A point near several seeds belongs to the one that is picked first.
-    seed_rank = np.where(is_seed, rank, count)
+    seed = np.where(is_seed, np.arange(count), count)
     from_seed = is_seed[better]
-    np.minimum.at(seed_rank, worse[from_seed], rank[better[from_seed]])
-    return np.argsort(rank)[seed_rank]
+    np.minimum.at(seed, worse[from_seed], better[from_seed])
+    return seed

@@ -4,10 +4,13 @@ Stage I (e) of the paper (section 3.1): the affinities tell whose joint a candid
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Interval
 from numpy.typing import NDArray
 
+from shapepose_fg.bounds import Metres, MetresOrNone, RepeatsOrNone, Settings, Share
 from shapepose_fg.detections import Detections
 from shapepose_fg.proposal.assignment import match_best_first
 from shapepose_fg.proposal.candidates import Candidates
@@ -15,28 +18,21 @@ from shapepose_fg.skeleton import Skeleton
 
 
 @dataclass(frozen=True)
-class GrowthConfig:
+class GrowthConfig(Settings):
     """How candidates are linked, and a person is grown."""
 
-    doubt: float = 0.2
+    doubt: Share = 0.2
     """Affinity below which a view speaks against a limb: unrelated pairs are mostly 0, true ones above 0.4."""
-    view_weight: float = 0.5
+    view_weight: Annotated[float, Interval(ge=0, le=1000000.0)] = 0.5
     """What a view that supports a candidate counts, times its confidence, beside the affinities of its limbs:
     where these leave a choice, a point that five views agree on is a joint, and a crossing of two rays is not."""
-    max_limb_m: float = 0.75
+    max_limb_m: Metres = 0.75
     """No limb is longer: the trunk of a tall adult, hip to neck, is about 0.65 m."""
-    sweeps: int = 2
+    sweeps: RepeatsOrNone = 2
     """How often the joints are chosen again once all their neighbours are known."""
-    bridge_m: float = 0.55
+    bridge_m: MetresOrNone = 0.55
     """Beyond a joint that nobody saw, the next is sought within this distance a bone of the last known one: from
-    hip to ankle of a tall adult it is 0.9 m."""
-
-    def __post_init__(self) -> None:
-        for name in ("max_limb_m", "bridge_m"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        if not 0 <= self.doubt <= 1:
-            raise ValueError(f"doubt must be between 0 and 1, got {self.doubt}")
+    hip to ankle of a tall adult it is 0.9 m. 0: it is not sought, as in the paper."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +129,7 @@ def _bridge(
     free[chosen[chosen >= 0]] = False
     loose = free & candidates.strong & ~(support > 0).any(axis=0)
     score = np.where(empty & free & (support > 0), support + evidence, 0.0)
-    if (empty & loose).any():
+    if config.bridge_m > 0 and (empty & loose).any():
         ancestor, bones = _nearest_known(chosen, skeleton)
         start = candidates.xyz[np.take_along_axis(chosen, ancestor, axis=1)]
         distance = np.linalg.norm(start[:, candidates.joint] - candidates.xyz, axis=-1)

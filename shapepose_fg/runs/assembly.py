@@ -92,14 +92,23 @@ class Assembly:
         empty = ObservationTable.empty(self.joint_names, self.view_names).columns()
         return self._columns(empty, ObservationTable.ROWS, OBSERVED)
 
-    def reconstruction(self) -> Reconstruction:
-        """All of it in memory."""
-        columns = {name: column.array() for name, column in self.columns().items() if name != "known_names"}
+    def reconstruction(self, every: int = 1) -> Reconstruction:
+        """In memory, all of it or every so many frames."""
+
+        def array(column: Column) -> NDArray[Any]:
+            if column.shape[:1] != (len(self),) or every == 1:
+                return column.array()
+            frames = self.pieces("frame")
+            return np.concatenate(
+                [piece[frame % every == 0] for piece, frame in zip(column.pieces(), frames, strict=True)]
+            )
+
+        columns = {name: array(column) for name, column in self.columns().items() if name != "known_names"}
         observed = self.observation_columns()
         table = None
         if observed is not None:
             table = ObservationTable(
-                **{name: column.array() for name, column in observed.items() if name != "gate_names"}
+                **{name: array(column) for name, column in observed.items() if name != "gate_names"}
             )
         return Reconstruction(**columns, run=self.run, observations=table, shapes=self.shapes)
 

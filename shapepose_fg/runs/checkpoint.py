@@ -57,9 +57,9 @@ def checkpoint_of(
     array: Callable[[str], NDArray[Any]], keys: Sequence[str], read: Callable[[int], Input]
 ) -> Checkpoint:
     """The checkpoint that `checkpoint_arrays` made the arrays of; `read` gives what the cameras saw of a frame."""
-    frame, next_id = array("at").tolist()
+    following, next_id = array("at").tolist()
     if "before" not in keys:
-        return Checkpoint(frame, next_id)
+        return Checkpoint(following, next_id)
     joints = JointStates(array("tracker.mean"), array("tracker.covariance"))
     tracker = TrackerState(
         time_s=float(array("tracker.time_s")[0]),
@@ -75,7 +75,7 @@ def checkpoint_of(
         pending.append((given[frame], TrackedFrame(joints=states, **parts)))
     decided = [(given[frame], Observations(**parts)) for frame, parts in _parted("decided", _OBSERVED, array)]
     follow = FollowState(tracker, tuple(pending), evident, frozenset(array("real").tolist()))
-    return Checkpoint(frame, next_id, StreamState(follow, tuple(decided), int(array("before")[0])))
+    return Checkpoint(following, next_id, StreamState(follow, tuple(decided), int(array("before")[0])))
 
 
 def _frames(name: str, given: Sequence[Input], counts: Sequence[int]) -> dict[str, NDArray[Any]]:

@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from shapepose_fg.estimation.outcome import Problem
-from shapepose_fg.frame_times import spans_of
 from shapepose_fg.tracking.following import Input
 
 
@@ -24,6 +23,8 @@ class Notes:
     """How many people were none, or too little is seen of, for each reason."""
     dropped_frames: dict[str, list[int]] = field(default_factory=dict)
     """The frames in which that was."""
+    thinned_frames: dict[str, list[int]] = field(default_factory=dict)
+    """The frames of which something was left out, because it was too much."""
     problems: list[Problem] = field(default_factory=list)
     """What could not be solved."""
 
@@ -36,6 +37,8 @@ class Notes:
             self.dropped[reason] = self.dropped.get(reason, 0) + count
         for reason, frames in other.dropped_frames.items():
             self.dropped_frames.setdefault(reason, []).extend(frames)
+        for what, frames in other.thinned_frames.items():
+            self.thinned_frames.setdefault(what, []).extend(frames)
         self.problems += other.problems
 
     def as_dict(self) -> dict[str, Any]:
@@ -47,13 +50,6 @@ class Notes:
         """What `as_dict` gave."""
         return cls(**{**values, "problems": [Problem(**each) for each in values["problems"]]})
 
-    def dropped_spans(self) -> dict[str, list[list[int]]]:
-        """For each reason the frames in which people were dropped, as [start, stop)."""
-        return {
-            reason: [[span.start, span.stop] for span in spans_of(frames)]
-            for reason, frames in self.dropped_frames.items()
-        }
-
 
 class Notebook:
     """Notes that are being taken."""
@@ -63,7 +59,14 @@ class Notebook:
         self._inner = 0.0
         self._dropped: Counter[str] = Counter()
         self._dropped_frames: defaultdict[str, list[int]] = defaultdict(list)
+        self._thinned_frames: defaultdict[str, list[int]] = defaultdict(list)
         self._frame: int | None = None
+
+    def thin(self, what: str, is_thinned: bool, frame: int | None = None) -> None:
+        """Note down that some of a frame's detections, points or candidates were too many and left out."""
+        frame = self._frame if frame is None else frame
+        if is_thinned and frame is not None and frame not in self._thinned_frames[what][-1:]:
+            self._thinned_frames[what].append(frame)
 
     def drop(self, reason: str, count: int) -> None:
         """Note down people of the present frame who were none, or too little is seen of."""
@@ -93,8 +96,10 @@ class Notebook:
             seconds=dict(self._seconds),
             dropped=dict(self._dropped),
             dropped_frames={reason: frames for reason, frames in self._dropped_frames.items() if frames},
+            thinned_frames={what: frames for what, frames in self._thinned_frames.items() if frames},
         )
         self._seconds.clear()
         self._dropped.clear()
         self._dropped_frames.clear()
+        self._thinned_frames.clear()
         return notes

@@ -6,7 +6,6 @@ SMPL's T-pose, y up, row 0 the global orientation; `trans` (N, 3) the pelvis' pl
 `floor_y` (S,); `pairs` (K, 2) clips of two people together; `parents` (24,).
 """
 
-import zipfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS
+from shapepose_fg.columns import read_npz
 from shapepose_fg.errors import InputError
 
 Array = NDArray[np.float64]
@@ -166,18 +166,10 @@ def _bridged(rotations: Array, pelvis: Array, fps: float) -> tuple[Array, Array]
 
 def _read(path: Path) -> dict[str, NDArray]:
     """The arrays of the file, shapes, ranges and indices checked."""
-    if not path.is_file():
-        raise InputError(f"{path}: there is no such file; give the .npz of recorded motions")
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            missing = [name for name in _ARRAYS if name not in archive]
-            if missing:
-                raise InputError(f"{path}: array {missing[0]!r} is missing; give motions in SMPL's structure")
-            arrays = {name: archive[name] for name in _ARRAYS}
-    except InputError:
-        raise
-    except (OSError, ValueError, EOFError, KeyError, TypeError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: cannot be read as .npz of plain arrays ({error}); copy it again") from None
+    arrays = read_npz(path, _ARRAYS, "copy the recorded motions again")
+    missing = [name for name in _ARRAYS if name not in arrays]
+    if missing:
+        raise InputError(f"{path}: array {missing[0]!r} is missing; give motions in SMPL's structure")
     _check(path, arrays)
     return arrays
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.bounds import Count, Seconds, Settings
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections
 from shapepose_fg.observations import Observations
@@ -13,18 +14,14 @@ from shapepose_fg.tracking.tracker import TrackedFrame, Tracker, TrackerState
 
 
 @dataclass(frozen=True)
-class FollowingConfig:
+class FollowingConfig(Settings):
     """What becomes of tracks."""
 
-    look_ahead_s: float = 1.0
+    look_ahead_s: Seconds = 1.0
     """A frame is decided when this much more has been seen: whether a new track was a phantom, whether a person
     out of sight comes back, and since when a new person had been there."""
-    least_frames: int = 5
+    least_frames: Count = 5
     """Frames with evidence that a track needs; fewer only where the recording ends."""
-
-    def __post_init__(self) -> None:
-        if not (self.look_ahead_s > 0 and self.least_frames >= 1):
-            raise ValueError(f"look_ahead_s must be positive and least_frames at least 1, got {self}")
 
 
 @dataclass(frozen=True)

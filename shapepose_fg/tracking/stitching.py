@@ -2,38 +2,38 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Interval
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from shapepose_fg.bounds import Settings
 from shapepose_fg.skeleton import Skeleton
 
 Array = NDArray[np.float64]
 
 
+_BONE_SIGMA_M = 0.015
+"""Error of a bone's mean length in a track: errors of detectors last, so that it does not vanish with time."""
+_LEAST_ROWS = 10
+"""Rows that a track needs for its build to be known."""
+_BUILD = 2.0
+"""Mean squared difference of bone lengths, in their standard deviations, up to which two builds are one. For
+one person it is 1 in the mean; lengths of adults differ by 2 to 3 cm, which gives 3 to 5."""
+
+
 @dataclass(frozen=True)
-class StitchingConfig:
+class StitchingConfig(Settings):
     """When two tracks are one person."""
 
-    longest_gap_s: float = 10.0
+    longest_gap_s: Annotated[float, Interval(ge=0, le=86400)] = 10.0
     """Nobody is recognised after a longer time. 0: tracks are never joined."""
-    reach_m: float = 0.5
+    reach_m: Annotated[float, Interval(ge=0, le=10)] = 0.5
     """How far from where a track ended the next may begin, at once."""
-    walk_mps: float = 1.5
+    walk_mps: Annotated[float, Interval(ge=0, le=100)] = 1.5
     """And how much farther per second: people walk at 1.4 m/s."""
-    bone_sigma_m: float = 0.015
-    """Error of a bone's mean length in a track: errors of detectors last, so that it does not vanish with time."""
-    least_rows: int = 10
-    """Rows that a track needs for its build to be known."""
-    build: float = 2.0
-    """Mean squared difference of bone lengths, in their standard deviations, up to which two builds are one. For
-    one person it is 1 in the mean; lengths of adults differ by 2 to 3 cm, which gives 3 to 5."""
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not value >= 0 or (name == "bone_sigma_m" and value == 0):
-                raise ValueError(f"{name} must not be negative, got {value}")
 
 
 @dataclass(frozen=True)
@@ -86,14 +86,14 @@ def stitch(traces: Traces, config: StitchingConfig, cuts_s: Sequence[float] = ()
     Each track has one before it and one after it at the most; which, is decided for all together. Nothing is
     joined across `cuts_s`.
     """
-    ends = _ends(traces, config)
+    ends = _ends(traces)
     if len(ends.track) < 2 or config.longest_gap_s == 0:
         return {track: track for track in ends.track.tolist()}
     gap_s = ends.time_s[None, :, 0] - ends.time_s[:, None, 1]
     apart = np.linalg.norm(ends.place[None, :, 0] - ends.place[:, None, 1], axis=-1)
     may = (gap_s > 0) & (gap_s <= config.longest_gap_s)
     may &= apart <= config.reach_m + config.walk_mps * np.maximum(gap_s, 0.0)
-    may &= _alike(ends.bones, config)
+    may &= _alike(ends.bones)
     for cut in cuts_s:
         may &= ~((ends.time_s[:, None, 1] < cut) & (ends.time_s[None, :, 0] >= cut))
     cost = np.where(may, gap_s, 2 * config.longest_gap_s)
@@ -106,7 +106,7 @@ def stitch(traces: Traces, config: StitchingConfig, cuts_s: Sequence[float] = ()
     return {int(ends.track[place]): int(name) for place, name in names.items()}
 
 
-def _ends(traces: Traces, config: StitchingConfig) -> Ends:
+def _ends(traces: Traces) -> Ends:
     """Ends and builds of all tracks."""
     ids, count = np.unique(traces.track), traces.bones.shape[1]
     times, places, bones = [], [], []
@@ -115,7 +115,7 @@ def _ends(traces: Traces, config: StitchingConfig) -> Ends:
         rows = rows[np.argsort(traces.time_s[rows], kind="stable")]
         times.append(traces.time_s[rows[[0, -1]]])
         places.append(traces.centre[rows[[0, -1]]])
-        enough = np.isfinite(traces.bones[rows]).sum(axis=0) >= config.least_rows
+        enough = np.isfinite(traces.bones[rows]).sum(axis=0) >= _LEAST_ROWS
         median = np.full(count, np.nan)
         median[enough] = np.nanmedian(traces.bones[rows][:, enough], axis=0)
         bones.append(median)
@@ -128,11 +128,11 @@ def _ends(traces: Traces, config: StitchingConfig) -> Ends:
     )
 
 
-def _alike(bones: Array, config: StitchingConfig) -> NDArray[np.bool_]:
+def _alike(bones: Array) -> NDArray[np.bool_]:
     """(G, G) which builds may be one person's: enough bones known, and alike."""
     difference = bones[:, None] - bones[None]
     known = np.isfinite(difference)
-    squared = np.where(known, difference, 0.0) ** 2 / (2 * config.bone_sigma_m**2)
+    squared = np.where(known, difference, 0.0) ** 2 / (2 * _BONE_SIGMA_M**2)
     count = known.sum(axis=-1)
     mean = squared.sum(axis=-1) / np.maximum(count, 1)
-    return (count >= bones.shape[1] / 2) & (mean <= config.build)
+    return (count >= bones.shape[1] / 2) & (mean <= _BUILD)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from shapepose_fg.bounds import Count, Seconds, Settings
 from shapepose_fg.camera import Rig, Views
 from shapepose_fg.detections import Detections
 from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas, triangulate
@@ -25,47 +26,44 @@ FindPeople = Callable[[Detections, Rig, bool], Observations]
 """Stage I of one frame: detections and rig to people; with True, hips that two views saw are enough."""
 
 
+_LOST_M = 0.2
+"""A joint whose predicted place has a larger sigma is lost: it is sought around its parent on the skeleton."""
+_TRUSTED_M = 0.1
+"""A joint with a smaller sigma is judged by the length of its bones."""
+_FOLLOW_S = 0.25
+"""Time constant with which the velocity of an unseen joint becomes that of the person."""
+_FOLLOW_SIGMA_M = 0.05
+"""Sigma from which on a joint counts as unseen in this sense."""
+_ITERATIONS = 3
+"""How often gates and linearisation are made anew in one frame."""
+_MIN_SEEN_TWICE = 4
+"""Core joints that two views must see for a frame to count as evidence of the person."""
+_APART_M = 0.25
+"""A new person's joints are at least this far from any track's, in the mean: nearer is the same person."""
+_DOUBLE_M = 0.15
+"""Of two tracks whose core joints are nearer in the mean, the younger gets no more evidence."""
+_TRIAL_S = 0.25
+"""A new track that has not had evidence for nearly all of this time was a phantom."""
+_WEAK_TRIAL_S = 0.5
+"""The same for a person whose hips two views saw: only time tells one from a crossing of rays."""
+_WALK_MPS = 1.0
+"""How far off a person is who comes back into view, per second out of sight: people turn and stop."""
+_BIRTH_SIGMA_M = 0.04
+"""Sigma of a new person's joints as stage I places them."""
+_BIRTH_SPEED_MPS = 2.0
+"""Sigma of a new person's velocities along each axis."""
+
+
 @dataclass(frozen=True)
-class TrackingConfig:
+class TrackingConfig(Settings):
     """How people are followed."""
 
     assignment: AssignmentConfig = field(default_factory=AssignmentConfig)
     """Which detections are a track's."""
-    lost_m: float = 0.2
-    """A joint whose predicted place has a larger sigma is lost: it is sought around its parent on the skeleton."""
-    trusted_m: float = 0.1
-    """A joint with a smaller sigma is judged by the length of its bones."""
-    follow_s: float = 0.25
-    """Time constant with which the velocity of an unseen joint becomes that of the person."""
-    follow_sigma_m: float = 0.05
-    """Sigma from which on a joint counts as unseen in this sense."""
-    iterations: int = 3
-    """How often gates and linearisation are made anew in one frame."""
-    min_seen_twice: int = 4
-    """Core joints that two views must see for a frame to count as evidence of the person."""
-    min_new_joints: int = 6
+    min_new_joints: Count = 6
     """Core joints that two views must see, by detections that no track has, for a new person."""
-    apart_m: float = 0.25
-    """A new person's joints are at least this far from any track's, in the mean: nearer is the same person."""
-    double_m: float = 0.15
-    """Of two tracks whose core joints are nearer in the mean, the younger gets no more evidence."""
-    patience_s: float = 0.5
+    patience_s: Seconds = 0.5
     """A track without evidence for longer has ended."""
-    trial_s: float = 0.25
-    """A new track that has not had evidence for nearly all of this time was a phantom."""
-    weak_trial_s: float = 0.5
-    """The same for a person whose hips two views saw: only time tells one from a crossing of rays."""
-    walk_mps: float = 1.0
-    """How far off a person is who comes back into view, per second out of sight: people turn and stop."""
-    birth_sigma_m: float = 0.04
-    """Sigma of a new person's joints as stage I places them."""
-    birth_speed_mps: float = 2.0
-    """Sigma of a new person's velocities along each axis."""
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if name != "assignment" and not value > 0:
-                raise ValueError(f"{name} must be positive, got {value}")
 
 
 @dataclass(frozen=True)
@@ -165,7 +163,7 @@ class Tracker:
         if len(state.ids) > 0:
             state = replace(state, joints=self._predict(state.joints, time_s - state.time_s))
         state = replace(state, time_s=time_s)
-        lost = state.joints.sigma_m > self.config.lost_m
+        lost = state.joints.sigma_m > _LOST_M
         joints = self._beside_neighbours(state.joints, lost)
         candidate = self._assign(joints, lost, state.weak, detections, rig)
         joints, candidate = self._measure(joints, lost, candidate, detections, rig)
@@ -186,8 +184,8 @@ class Tracker:
         core = list(self.skeleton.core)
         certainty = 1 / joints.sigma_m[:, core, None] ** 2
         person = (joints.velocity[:, core] * certainty).sum(1) / certainty.sum(1)
-        decay = np.exp(-abs(step_s) / self.config.follow_s)
-        unseen = (joints.sigma_m > self.config.follow_sigma_m)[..., None]
+        decay = np.exp(-abs(step_s) / _FOLLOW_S)
+        unseen = (joints.sigma_m > _FOLLOW_SIGMA_M)[..., None]
         following = person[:, None] + decay * (joints.velocity - person[:, None])
         joints = joints.with_velocity(np.where(unseen, following, joints.velocity))
         return joints.predicted(step_s, self.scale.psd)
@@ -255,12 +253,12 @@ class Tracker:
         placed = triangulate(seen, views, self.observation)
         at = np.where(np.isfinite(placed), placed, joints.position)
         measured, inlier = joints, candidate >= 0
-        for _ in range(self.config.iterations):
+        for _ in range(_ITERATIONS):
             said = linearise(seen, sigmas, at, views, self.observation)
             toward = np.einsum("...ij,...j->...i", said.information, at - joints.position) - said.gradient
             measured, inlier = joints.updated(said.information, toward), said.inlier
             at = measured.position
-        trusted = measured.sigma_m < self.config.trusted_m
+        trusted = measured.sigma_m < _TRUSTED_M
         torn = torn_joints(at, trusted, inlier.sum(axis=-1), self.scale.longest_m, self.skeleton)
         doubt = np.zeros((6, 6))
         doubt[:3, :3] = self.config.assignment.farthest_m**2 * np.eye(3)
@@ -270,7 +268,7 @@ class Tracker:
 
     def _evident(self, candidate: NDArray[np.intp]) -> NDArray[np.bool_]:
         """(A,) whether enough core joints are seen by two views."""
-        return self._seen_twice(candidate) >= self.config.min_seen_twice
+        return self._seen_twice(candidate) >= _MIN_SEEN_TWICE
 
     def _seen_twice(self, candidate: NDArray[np.intp]) -> NDArray[np.intp]:
         return ((candidate >= 0).sum(axis=-1) >= 2)[:, list(self.skeleton.core)].sum(axis=1)
@@ -280,7 +278,7 @@ class Tracker:
         core = joints.position[:, list(self.skeleton.core)]
         apart = np.linalg.norm(core[:, None] - core[None], axis=-1).mean(axis=-1)
         older = (state.ids[None] < state.ids[:, None]) & ~(state.weak[None] & ~state.weak[:, None])
-        return ((apart < self.config.double_m) & older).any(axis=1)
+        return ((apart < _DOUBLE_M) & older).any(axis=1)
 
     def _births(
         self,
@@ -329,7 +327,7 @@ class Tracker:
         expected = np.where(known, state.joints.position[waiting][:, None, core], 0.0).sum(axis=2) / count
         distance = np.linalg.norm(centre - expected, axis=-1)  # (W, K)
         waited_s = np.abs(state.time_s - state.evident_s[waiting])
-        gate_m = self.config.apart_m + self.config.walk_mps * waited_s
+        gate_m = _APART_M + _WALK_MPS * waited_s
         first, second = linear_sum_assignment(np.minimum(distance, gate_m.max()))
         near = distance[first, second] < gate_m[first]
         return waiting[first[near]], people[second[near]]
@@ -347,8 +345,8 @@ class Tracker:
         """People at `places` (P, J, 3), whose NaN joints are lost."""
         known = np.asarray(np.isfinite(places).all(axis=-1))
         centre = np.nanmean(places, axis=1, keepdims=True)
-        sigma = np.where(known, self.config.birth_sigma_m, 2 * self.config.lost_m)
-        return JointStates.at(np.where(known[..., None], places, centre), sigma, self.config.birth_speed_mps)
+        sigma = np.where(known, _BIRTH_SIGMA_M, 2 * _LOST_M)
+        return JointStates.at(np.where(known[..., None], places, centre), sigma, _BIRTH_SPEED_MPS)
 
     def _enough(self, detections: Detections, free: NDArray[np.bool_]) -> bool:
         """Whether the free detections can be a person: enough core joints, each in two views."""
@@ -367,7 +365,7 @@ class Tracker:
         distance = np.linalg.norm(places[:, None] - state.joints.position[None], axis=-1)
         known = np.isfinite(distance)
         mean = np.where(known, distance, 0.0).sum(axis=-1) / np.maximum(known.sum(axis=-1), 1)
-        return (mean > self.config.apart_m).all(axis=1)
+        return (mean > _APART_M).all(axis=1)
 
     def _with_new(self, state: TrackerState, places: Array, weak: bool) -> TrackerState:
         """The tracks and new ones at `places` (P, J, 3), whose NaN joints are lost."""
@@ -391,7 +389,7 @@ class Tracker:
         """Tracks go on that had evidence lately; new ones only if hardly a frame lacked it."""
         age_s = np.abs(state.time_s - state.born_s)
         waited_s = np.abs(state.time_s - state.evident_s)
-        on_trial = age_s < np.where(state.weak, self.config.weak_trial_s, self.config.trial_s)
+        on_trial = age_s < np.where(state.weak, _WEAK_TRIAL_S, _TRIAL_S)
         ended = (waited_s > self.config.patience_s) | (on_trial & (state.misses >= 3))
         proven = replace(state, weak=state.weak & on_trial)
         return proven.rows(~ended)

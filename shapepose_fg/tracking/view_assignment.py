@@ -1,10 +1,13 @@
 """Which detections are whose when it is known where people's joints should be: one-to-one in every view."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Interval
 from numpy.typing import NDArray
 
+from shapepose_fg.bounds import Metres, Repeats, Settings, Share
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections
 from shapepose_fg.proposal.association import match_views, mean_affinity, owned, share_overlaps
@@ -12,30 +15,25 @@ from shapepose_fg.skeleton import Skeleton
 
 
 @dataclass(frozen=True)
-class AssignmentConfig:
+class AssignmentConfig(Settings):
     """When a detection is taken for a joint whose place is predicted."""
 
-    near_m: float = 0.06
+    near_m: Metres = 0.06
     """How closeness to the predicted joint falls off where the prediction is exact: sigma of a Gaussian, as a
     length at the joint's depth. A detector is 2 cm off on a visible joint and several on a hidden one."""
-    far_m: float = 0.12
+    far_m: Metres = 0.12
     """No detection farther than this, and twice the prediction's sigma, is taken."""
-    farthest_m: float = 0.5
+    farthest_m: Metres = 0.5
     """No detection farther than this is taken, however uncertain the prediction."""
-    least_affinity: float = 0.3
+    least_affinity: Share = 0.3
     """Mean affinity to the person's other detections that takes a detection for a joint whose place is lost; half
     of the least score of all others. Unrelated pairs are mostly 0, true ones above 0.4."""
-    reach_m: float = 0.8
+    reach_m: Metres = 0.8
     """A lost joint is sought this far around its neighbour on the skeleton."""
-    overlap_px: float = 6.0
+    overlap_px: Annotated[float, Interval(gt=0, le=1000)] = 6.0
     """Two people's predicted joints closer than this overlap: the one detection there serves both."""
-    passes: int = 2
+    passes: Repeats = 2
     """How often the choice is made again with the affinities to what the last one chose."""
-
-    def __post_init__(self) -> None:
-        for name in ("near_m", "far_m", "farthest_m", "reach_m", "overlap_px", "passes"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
 
 
 def assign(

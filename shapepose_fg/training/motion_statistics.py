@@ -14,7 +14,7 @@ from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.camera import Rig, Views
 from shapepose_fg.detections import Detections
-from shapepose_fg.estimation.alternation import joint_targets
+from shapepose_fg.estimation.body_step import joint_targets
 from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas, triangulate
 from shapepose_fg.estimation.window_graph import speeds, symmetric_roots
 from shapepose_fg.observations import Observations

@@ -1,6 +1,5 @@
 """Poses of recorded people, frame by frame: from CMU's .npz or a folder of AMASS files, split by subject."""
 
-import zipfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -8,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from shapepose_fg.columns import read_npz
 from shapepose_fg.errors import InputError
 from shapepose_fg.simulation.mocap import Clip, Mocap
 from shapepose_fg.simulation.shoulder import COLLARS, shoulder_rhythm
@@ -197,20 +197,14 @@ def _read_amass(path: Path) -> _Recording:
 def _amass_arrays(path: Path) -> tuple[NDArray[np.float64], float]:
     """`poses` (T, 66 or more) and frame rate of an AMASS file, checked."""
     rates = ("mocap_framerate", "mocap_frame_rate")
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            rate = next((name for name in rates if name in archive), None)
-            if rate is None or "poses" not in archive:
-                missing = "poses" if rate is not None else rates[0]
-                raise InputError(f"{path}: array {missing!r} is missing; give motions in AMASS's format")
-            poses, fps = (
-                np.asarray(archive["poses"], dtype=np.float64),
-                np.asarray(archive[rate], dtype=np.float64),
-            )
-    except InputError:
-        raise
-    except (OSError, ValueError, EOFError, KeyError, TypeError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: cannot be read as .npz of plain arrays ({error}); copy it again") from None
+    arrays = read_npz(path, ("poses", *rates), "copy it again")
+    rate = next((name for name in rates if name in arrays), None)
+    if rate is None or "poses" not in arrays:
+        missing = "poses" if rate is not None else rates[0]
+        raise InputError(f"{path}: array {missing!r} is missing; give motions in AMASS's format")
+    if any(arrays[name].dtype.kind == "U" for name in ("poses", rate)):
+        raise InputError(f"{path}: poses and {rate} must be numbers; give motions in AMASS's format")
+    poses, fps = arrays["poses"].astype(np.float64), arrays[rate].astype(np.float64)
     if poses.ndim != 2 or len(poses) == 0 or poses.shape[1] < _BODY_COLUMNS or poses.shape[1] % 3:
         raise InputError(
             f"{path}: poses must be (T, 66 or more), is {poses.shape}; give motions in AMASS's format"

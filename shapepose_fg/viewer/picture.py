@@ -10,8 +10,7 @@ from shapepose_fg.camera import Camera, Rig
 from shapepose_fg.detections import Detections
 from shapepose_fg.errors import InputError
 from shapepose_fg.reconstruction import Reconstruction
-from shapepose_fg.rendering import render_shaded
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.viewer.drawing import INK, QUIET, draw_skeletons, light_on, over, panel, tag
 from shapepose_fg.viewer.figures import Figures, Mesh, floor_under, framed, free_viewpoint, two_views
 from shapepose_fg.viewer.floor import Floor, floor_picture
 
@@ -20,11 +19,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-_INK, _QUIET, _EDGE = "#2b2d33", "#7b7d84", "#d9d8d4"
 _GAP, _HEADER, _FOOTER = 14, 92, 14
 """Space between panels, above and below them, pixels."""
-_DRAWN = np.array([limb for limb in BODY_25.limbs if limb not in ((2, 17), (5, 18))])
-"""The limbs of a drawing: without the detector's links from shoulders to ears."""
 
 
 def demo_picture(
@@ -62,10 +58,10 @@ def demo_picture(
     size = width_px, tall + _HEADER + _FOOTER
     page = Figure(figsize=(size[0] / 100, size[1] / 100), dpi=100, facecolor="white")
     for place, view in enumerate(views):
-        axes = _panel(page, (_GAP, _HEADER + place * (short + _GAP), left, short), size)
+        axes = panel(page, (_GAP, _HEADER + place * (short + _GAP), left, short), size)
         seen = None if detections is None else detections.xy[detections.view == view]
         _draw_view(axes, rig.cameras[view], (left, short), figures, ghosts, floor, seen)
-    axes = _panel(page, (left + 2 * _GAP, _HEADER, right, tall), size)
+    axes = panel(page, (left + 2 * _GAP, _HEADER, right, tall), size)
     _draw_room(axes, rig, views, (right, tall), figures, floor)
     people = len(figures.labels)
     count = f"{people} {'person' if people == 1 else 'people'} · {len(rig)} cameras · frame {frame}"
@@ -90,17 +86,17 @@ def _draw_view(
 ) -> None:
     """What a camera sees: the room, the true people in grey where they are known, over them what was found."""
     window = framed(camera, np.concatenate([figures.points, ghosts.vertices]), size)
-    light = _light(window, floor)
+    light = light_on(window, floor)
     casting = ghosts if len(ghosts.vertices) else figures.mesh
     picture = floor_picture(floor, window, casting.vertices, casting.faces, light)
-    picture = _over(picture, ghosts, window, light, 1.0)
-    axes.imshow(_over(picture, figures.mesh, window, light, 0.72), interpolation="none")
-    _draw_skeletons(axes, window, figures.joints, figures.colours, width=1.5)
+    picture = over(picture, ghosts, window, light, 1.0)
+    axes.imshow(over(picture, figures.mesh, window, light, 0.72), interpolation="none")
+    draw_skeletons(axes, window, figures.joints, figures.colours, width=1.5)
     if candidates is not None:
         scale = window.K[0, 0] / camera.K[0, 0]
         shift = window.K[:2, 2] + 0.5 - scale * (camera.K[:2, 2] + 0.5)
-        axes.scatter(*(scale * (candidates + 0.5) + shift - 0.5).T, s=5, color=_INK, linewidths=0, zorder=4)
-    _tag(axes, camera.name)
+        axes.scatter(*(scale * (candidates + 0.5) + shift - 0.5).T, s=5, color=INK, linewidths=0, zorder=4)
+    tag(axes, camera.name)
 
 
 def _draw_room(
@@ -108,28 +104,14 @@ def _draw_room(
 ) -> None:
     """The bodies on the floor from a free viewpoint, with the cameras around them."""
     camera = free_viewpoint(rig, figures.points, floor, size)
-    light = _light(camera, floor)
+    light = light_on(camera, floor)
     picture = floor_picture(floor, camera, figures.mesh.vertices, figures.mesh.faces, light)
-    axes.imshow(_over(picture, figures.mesh, camera, light, 1.0), interpolation="none")
+    axes.imshow(over(picture, figures.mesh, camera, light, 1.0), interpolation="none")
     bare = ~figures.has_body
-    _draw_skeletons(axes, camera, figures.joints[bare], figures.colours[bare], width=2.2)
+    draw_skeletons(axes, camera, figures.joints[bare], figures.colours[bare], width=2.2)
     for view, other in enumerate(rig.cameras):
         _draw_frustum(axes, camera, other, floor, strong=view in views)
-    _tag(axes, "3D")
-
-
-def _over(picture: Array, mesh: Mesh, camera: Camera, light: Array, opacity: float) -> Array:
-    """`picture` (H, W, 3) with shaded bodies over it."""
-    rgb, coverage = render_shaded(mesh.vertices, mesh.faces, mesh.colours, camera, light=light)
-    return picture * (1.0 - opacity * coverage[..., None]) + opacity * rgb
-
-
-def _light(camera: Camera, floor: Floor) -> Array:
-    """From above, over the viewer's left shoulder."""
-    right, toward = camera.wTc[:3, 0], -camera.wTc[:3, 2]
-    toward = toward - floor.up * (toward @ floor.up)
-    light = 1.5 * floor.up - 0.55 * right + 0.75 * toward / max(float(np.linalg.norm(toward)), 1e-9)
-    return light / np.linalg.norm(light)
+    tag(axes, "3D")
 
 
 def _draw_frustum(axes: Any, camera: Camera, other: Camera, floor: Floor, *, strong: bool) -> None:
@@ -142,12 +124,12 @@ def _draw_frustum(axes: Any, camera: Camera, other: Camera, floor: Floor, *, str
     inside = (xy[0] > 0) & (xy[0] < camera.image_size)  # NaN behind the eye compares false
     if not inside.all() or not np.isfinite(xy).all():
         return
-    colour, width_pt = (_INK, 1.1) if strong else (_QUIET, 0.8)
+    colour, width_pt = (INK, 1.1) if strong else (QUIET, 0.8)
     for corner in xy[1:5]:
         axes.plot(*np.stack([xy[0], corner]).T, color=colour, lw=width_pt, solid_capstyle="round")
     axes.fill(*xy[1:5].T, facecolor=colour, alpha=0.12, lw=0)
     axes.plot(*np.concatenate([xy[1:5], xy[1:2]]).T, color=colour, lw=width_pt, solid_joinstyle="round")
-    axes.plot(*xy[[0, 5]].T, color=_QUIET, lw=0.6, ls=(0, (2, 3)))
+    axes.plot(*xy[[0, 5]].T, color=QUIET, lw=0.6, ls=(0, (2, 3)))
     axes.annotate(
         other.name,
         (xy[:5, 0].mean(), xy[:5, 1].min()),
@@ -160,47 +142,6 @@ def _draw_frustum(axes: Any, camera: Camera, other: Camera, floor: Floor, *, str
     )
 
 
-def _draw_skeletons(axes: Any, camera: Camera, joints: Array, colours: Array, *, width: float) -> None:
-    """Limbs and joints that are known, in a darker shade of each person's colour with a light rim."""
-    from matplotlib.collections import LineCollection
-
-    xy, _ = camera.project(joints)
-    for points, colour in zip(xy, 0.55 * colours, strict=True):
-        segments = points[_DRAWN]
-        segments = segments[np.isfinite(segments).all(axis=(1, 2))]
-        for line, paint in ((width + 1.6, (1, 1, 1, 0.75)), (width, tuple(colour))):
-            axes.add_collection(LineCollection(segments, colors=[paint], linewidths=line, capstyle="round"))
-        known = points[np.isfinite(points).all(axis=1)]
-        axes.scatter(*known.T, s=9, color=[tuple(colour)], edgecolors="white", linewidths=0.5, zorder=3)
-
-
-def _panel(page: Any, box: tuple[int, int, int, int], size: tuple[int, int]) -> Any:
-    """Axes over `box` (left, top, width, height) px of the page, whose units are pixels too."""
-    left, top, across, down = box
-    width, height = size
-    axes = page.add_axes((left / width, 1 - (top + down) / height, across / width, down / height))
-    axes.set(xlim=(-0.5, across - 0.5), ylim=(down - 0.5, -0.5), xticks=[], yticks=[], autoscale_on=False)
-    for spine in axes.spines.values():
-        spine.set(color=_EDGE, linewidth=0.8)
-    return axes
-
-
-def _tag(axes: Any, text: str) -> None:
-    """A name in the upper left corner of a panel."""
-    axes.annotate(
-        text,
-        (0, 1),
-        xycoords="axes fraction",
-        xytext=(9, -9),
-        textcoords="offset points",
-        va="top",
-        color=_INK,
-        fontsize=9.5,
-        fontweight="bold",
-        bbox={"boxstyle": "round,pad=0.35", "facecolor": "white", "edgecolor": "none", "alpha": 0.85},
-    )
-
-
 def _draw_header(
     page: Any, size: tuple[int, int], figures: Figures, texts: tuple[str, str], *, dots: bool, grey: bool
 ) -> None:
@@ -210,13 +151,13 @@ def _draw_header(
 
     width, height = size
     top = 1 - 22 / height
-    page.text(_GAP / width, top, texts[0], va="center", fontsize=16, fontweight="bold", color=_INK)
-    page.text(1 - _GAP / width, top, texts[1], va="center", ha="right", fontsize=11, color=_QUIET)
+    page.text(_GAP / width, top, texts[0], va="center", fontsize=16, fontweight="bold", color=INK)
+    page.text(1 - _GAP / width, top, texts[1], va="center", ha="right", fontsize=11, color=QUIET)
     people = zip(figures.colours, figures.labels, strict=True)
     handles: list[Any] = [Patch(facecolor=tuple(colour), label=label) for colour, label in people]
-    handles.append(Line2D([], [], color=_INK, lw=1.5, marker="o", ms=3.5, label="skeleton"))
+    handles.append(Line2D([], [], color=INK, lw=1.5, marker="o", ms=3.5, label="skeleton"))
     if dots:
-        handles.append(Line2D([], [], color=_INK, lw=0, marker="o", ms=2.6, label="2D candidates"))
+        handles.append(Line2D([], [], color=INK, lw=0, marker="o", ms=2.6, label="2D candidates"))
     if grey:
         handles.append(Patch(facecolor="#bdbdbf", label="true people"))
     page.legend(
@@ -225,7 +166,7 @@ def _draw_header(
         bbox_to_anchor=((_GAP - 8) / width, 1 - 62 / height),
         ncols=min(len(handles), 12),
         frameon=False,
-        labelcolor=_INK,
+        labelcolor=INK,
         fontsize=10.5,
         handlelength=1.2,
         handleheight=0.9,

@@ -1,4 +1,6 @@
-"""A tiny random body in SMPL's file format: nothing human about it, so that no symmetry hides a mistake."""
+"""A tiny random body in SMPL's file format: joints are roughly where a person's are, and nothing else is human: no
+symmetry hides a mistake.
+"""
 
 import numpy as np
 import pytest
@@ -7,17 +9,23 @@ import torch
 from shapepose_fg.body.fitting.weights import FitterWeights
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS
+from shapepose_fg.body.shapes import read_body
 
 NUM_VERTICES = 60
 
 
 def make_smpl_arrays(num_betas: int = 10, num_vertices: int = NUM_VERTICES) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(0)
+    person = read_body()
+    joints = np.concatenate([person.joint_regressor, person.keypoint_regressor]) @ person.template
+    template = rng.normal(0, 0.5, (num_vertices, 3))
+    template[:49] = joints + rng.normal(0, 0.02, joints.shape)
     weights = rng.random((num_vertices, 24)) ** 4
-    regressor = rng.random((24, num_vertices)) ** 4
-    keypoints = rng.random((25, num_vertices)) ** 4
+    regressor, keypoints = (rng.random((count, num_vertices)) ** 4 for count in (24, 25))
+    regressor[:, :24] += 5 * regressor.sum(1).mean() * np.eye(24)
+    keypoints[:, 24:49] += 5 * keypoints.sum(1).mean() * np.eye(25)
     return {
-        "v_template": rng.normal(0, 0.5, (num_vertices, 3)),
+        "v_template": template,
         "shapedirs": rng.normal(0, 0.05, (num_vertices, 3, num_betas)),
         "posedirs": rng.normal(0, 0.02, (num_vertices, 3, 207)),
         "J_regressor": regressor / regressor.sum(1, keepdims=True),

@@ -281,7 +281,7 @@ def test_offsets_of_joints_that_a_skeleton_lacks_change_nothing(shipped_weights)
 def test_misuse_is_refused(fitter, joints):
     with pytest.raises(ValueError, match="the 25 keypoints of the body, got 17"):
         fitter.fit(known_to(joints[:, :17], 0.01))
-    with pytest.raises(ValueError, match="kernel_scale, unfinished and left_out_sets must be positive"):
+    with pytest.raises(ValueError, match="polish_steps must not be negative"):
         LearnedFitterConfig(polish_steps=-1)
 
 

@@ -72,7 +72,7 @@ def test_files_give_back_what_was_written(weights, file):
 
 
 def test_what_is_no_safetensors_file_is_refused(tmp_path, file):
-    assert_refused(tmp_path / "nothing.safetensors", "not readable as safetensors")
+    assert_refused(tmp_path / "nothing.safetensors", "there is no such file")
     for damage in (
         file.read_bytes()[:1000],
         file.read_bytes()[:-500],
@@ -82,7 +82,8 @@ def test_what_is_no_safetensors_file_is_refused(tmp_path, file):
     ):
         (tmp_path / "damaged.safetensors").write_bytes(damage)
         assert_refused(tmp_path / "damaged.safetensors", "not readable as safetensors")
-    assert_refused(tmp_path, "not readable as safetensors")  # a folder
+    with pytest.raises(InputError, match="this is a folder"):
+        FitterWeights.load(tmp_path)
 
 
 @pytest.mark.parametrize("metadata", [None, {}, {"format": "pt"}, {"format": "shapepose-fg fitter 0"}])

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from shapepose_fg.body.fitting.fitter import BodyFit, FitStatus, JointTargets
 from shapepose_fg.camera import Rig, Views
 from shapepose_fg.detections import Detections
-from shapepose_fg.estimation.alternation import EstimatorConfig, RefineConfig
 from shapepose_fg.estimation.estimator import Estimates, Estimator
+from shapepose_fg.estimation.estimator_config import EstimatorConfig, RefineConfig
 from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas, triangulate
 from shapepose_fg.estimation.window_graph import WindowGraph, WindowGraphConfig
 from shapepose_fg.observation_table import Gate
@@ -80,7 +80,7 @@ def run(
     observations: Observations,
     rig: Rig,
     fitter,
-    kernel=None,
+    kernel="none",
     alternations=3,
     extra_factors=None,
     settled_m=0.0,
@@ -333,7 +333,7 @@ def test_nobody_is_refined_to_nobody(five_cameras):
 
 
 def test_refuses_settings_that_make_no_sense():
-    with pytest.raises(ValueError, match="alternations must be positive"):
+    with pytest.raises(ValueError, match="alternations must be at least 1"):
         RefineConfig(alternations=0)
 
 

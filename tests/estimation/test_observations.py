@@ -181,7 +181,7 @@ def test_one_view_moves_a_joint_onto_its_ray_and_leaves_the_depth(two_views):
     xy = two_views.project(point)[0] + [[6.0, -4.0], [0.0, 0.0]]
     seen = without(seen_at(two_views, xy, point), np.array([[[False, True]]]))
     evidence = linearise(
-        seen, np.array([[[10.0, 0.0]]]), point[None, None], Views.of(two_views), ObservationConfig(kernel=None)
+        seen, np.array([[[10.0, 0.0]]]), point[None, None], Views.of(two_views), ObservationConfig(kernel="none")
     )
     target = evidence.target[0, 0]
     assert np.linalg.matrix_rank(evidence.information[0, 0], tol=1.0) == 2
@@ -195,7 +195,7 @@ def test_two_views_move_a_joint_where_they_meet(two_views):
     seen = seen_at(two_views, two_views.project(truth)[0], truth)
     beside = truth + np.array([0.01, -0.02, 0.015])
     evidence = linearise(
-        seen, np.full((1, 1, 2), 10.0), beside[None, None], Views.of(two_views), ObservationConfig(kernel=None)
+        seen, np.full((1, 1, 2), 10.0), beside[None, None], Views.of(two_views), ObservationConfig(kernel="none")
     )
     # 2.7 cm off at 2 m: the second order is 0.027² / 2 m.
     np.testing.assert_allclose(evidence.target[0, 0], truth, atol=5e-4)

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitter import BodyFit, FitStatus
 from shapepose_fg.errors import InputError
-from shapepose_fg.estimation.alternation import EstimatorConfig, RefineConfig, interpolated
+from shapepose_fg.estimation.alternation import interpolated
 from shapepose_fg.estimation.estimator import Estimates, Estimator, window_rows
+from shapepose_fg.estimation.estimator_config import EstimatorConfig, RefineConfig
 from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
 from shapepose_fg.estimation.state_covariances import Chains, state_covariances
 from shapepose_fg.estimation.window_graph import WindowGraph, near_in_time
@@ -71,20 +72,22 @@ def hidden(observations: Observations, rows, joint: int) -> Observations:
     return replace(observations, confidence=confidence, xy=xy)
 
 
-def solve(observations: Observations, rig, fitter, extra_factors=None, **motion) -> Estimates:
+def solve(observations: Observations, rig, fitter, extra_factors=None, *, temporal=True, **motion) -> Estimates:
+    if not temporal:
+        observations = replace(observations, track=np.arange(len(observations)))
     config = EstimatorConfig(motion=MotionConfig(**motion))
     return Estimator(rig, fitter, BODY_25.joints, config).estimate(observations, extra_factors)
 
 
-def test_a_row_alone_is_the_same_whatever_its_track_and_switch(walk, five_cameras, two_people):
-    """One code path: tracks of one frame, and `temporal = false`, give the same numbers."""
+def test_a_row_without_others_of_its_track_stands_alone(walk, five_cameras, two_people):
+    """Whatever its track and company: every row of a batch is what it is by itself."""
     observations, _ = walk
-    names = replace(observations, track=np.arange(len(observations)))
-    one = solve(names, five_cameras, BesideFitter(two_people[0]))
-    other = solve(observations, five_cameras, BesideFitter(two_people[0]), temporal=False)
-    for name in ("joints", "covariance", "confidence", "inlier", "known", "status"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
-    assert np.isnan(one.velocity).all() and np.isnan(one.velocity_covariance).all()
+    together = solve(observations, five_cameras, BesideFitter(two_people[0]), temporal=False)
+    for row in (0, 31, 59):
+        one = solve(observations.rows(np.array([row])), five_cameras, BesideFitter(two_people[0]))
+        for name in ("joints", "covariance", "confidence", "inlier", "known", "status"):
+            np.testing.assert_array_equal(getattr(one, name)[0], getattr(together, name)[row])
+    assert np.isnan(together.velocity).all() and np.isnan(together.velocity_covariance).all()
 
 
 def test_motion_takes_noise_away_and_knows_the_velocity(walk, five_cameras, two_people):
@@ -206,20 +209,21 @@ def test_joints_tied_to_each_other_get_the_body_without_any_of_their_targets(
 @pytest.mark.parametrize("temporal", [True, False])
 def test_a_joint_thrown_away_is_a_status_with_a_name(walk, five_cameras, two_people, temporal):
     observations, _ = walk
+    bad = (observations.track == 1) & (observations.frame == 4)
+    row = int(np.flatnonzero(bad)[0])
+    who = 1 if temporal else row  # alone, every row is a track
 
     def throw(window, keys):
-        if window.track == 1 and 4 in window.frames:
+        if window.track == who and 4 in window.frames:
             key = int(keys[window.frames == 4, WRIST][0])
             yield gtsam.PriorFactorPoint3(key, [1000.0, 0, 0], gtsam.noiseModel.Isotropic.Sigma(3, 1e-3))
 
     found = solve(observations, five_cameras, BesideFitter(two_people[0]), throw, temporal=temporal)
-    bad = (observations.track == 1) & (observations.frame == 4)
     assert (found.status[bad] == Status.NOT_SOLVED).all()
     assert (found.status[observations.track == 0] == Status.OK).all()
     named = {(each.track, each.frame, each.joint) for each in found.problems}
-    assert (1, 4, WRIST) in named and {joint for _, _, joint in named} == {WRIST}
+    assert (who, 4, WRIST) in named and {joint for _, _, joint in named} == {WRIST}
     assert "ran away" in found.problems[0].reason
-    row = int(np.flatnonzero(bad)[0])
     assert {each.row for each in found.rows(np.array([row])).problems} == {0}
 
 
@@ -249,7 +253,7 @@ def test_a_factor_must_be_on_the_window_s_own_keys(walk, five_cameras, two_peopl
 def test_a_person_twice_in_a_frame_is_refused(walk, five_cameras, two_people):
     twice = Observations.concatenate([walk[0], walk[0].rows(np.array([3]))])
     with pytest.raises(ValueError, match="one row a frame"):
-        window_rows(twice, temporal=True)
+        window_rows(twice)
     late = walk[0].time_s.copy()
     late[:, 2] += 0.01
     with pytest.raises(ValueError, match="synchronise"):
@@ -281,7 +285,7 @@ def test_the_motion_model_is_read_by_name_and_checked(tmp_path):
         MotionModel.load(("RWrist",), MotionConfig(model=str(tmp_path / "other.json")))
     with pytest.raises(ValueError, match="psd_scale must be positive"):
         MotionConfig(psd_scale=0.0)
-    with pytest.raises(ValueError, match="window_alternations must be positive"):
+    with pytest.raises(ValueError, match="window_alternations must be at least 1"):
         RefineConfig(window_alternations=0)
 
 

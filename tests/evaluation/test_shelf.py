@@ -5,6 +5,7 @@ import pytest
 from rich.console import Console
 
 from shapepose_fg.errors import InputError
+from shapepose_fg.evaluation.other_results.skeleton_text import SHELF_JOINTS
 from shapepose_fg.evaluation.shelf import (
     LIMB_NAMES,
     LIMBS,
@@ -13,7 +14,6 @@ from shapepose_fg.evaluation.shelf import (
     read_shelf_ground_truth,
     shelf_joints,
 )
-from shapepose_fg.evaluation.shelf_ground_truth import SHELF_JOINTS
 from shapepose_fg.skeleton import BODY_25
 
 UPRIGHT = dict(

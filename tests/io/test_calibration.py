@@ -197,7 +197,7 @@ BAD_TEXT = [
     ('{"a": {"fx": 3}}', "this is not a calibration that is known here"),
     ('{"a": ' * 100_000, "cannot be read as JSON"),
     ('{"a": {"K": [' + "1" * 5000 + "]}}", "cannot be read as JSON"),
-    ('{"a": {"K": [' + "1" * 400 + ",0,0,0,1,0,0,0,1]}}", 'camera "a": K[0]'),
+    ('{"a": {"K": [' + "1" * 400 + ",0,0,0,1,0,0,0,1]}}", "a.K[0] is a whole number"),
 ]
 
 

@@ -267,7 +267,7 @@ BAD_JSON = [
     (json.dumps({"people": {}}), "people must be a list, got an object"),
     (json.dumps({}), "people is missing"),
     (json.dumps([]), "the file must be an object, got a list of 0"),
-    (person(FULL)[:100], "line 1 column 100"),
+    (person(FULL)[:100], "line 1 column 101"),
     ("", "the file is empty"),
 ]
 

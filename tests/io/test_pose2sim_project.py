@@ -138,7 +138,7 @@ def test_what_is_missing_is_named_with_the_cure(project):
         ({"rate": "true"}, "frame_rate must be"),
         ({"frames": "[9, 3]"}, "frame_range must be 'auto', 'all', or two frame numbers"),
         ({"multi": "'yes'"}, "multi_person must be true or false"),
-        ({"multi": "="}, "not valid TOML"),
+        ({"multi": "="}, "this is not TOML"),
     ],
 )
 def test_a_malformed_config_is_named(project, change, words):

@@ -193,5 +193,5 @@ def test_nobody_has_no_observations(five_cameras):
 
 
 def test_refuses_settings_that_make_no_sense():
-    with pytest.raises(ValueError, match="near_m must be positive"):
-        AssociationConfig(near_m=-0.1)
+    with pytest.raises(ValueError, match="min_observed_parts"):
+        AssociationConfig(min_observed_parts=-0.1)

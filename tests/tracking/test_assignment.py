@@ -1,12 +1,14 @@
 """Detections of predicted joints, joints that cannot be a person's own, and detections given out again."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from shapepose_fg.observations import Observations
 from shapepose_fg.skeleton import BODY_25
 from shapepose_fg.tracking.following import Input
 from shapepose_fg.tracking.plausibility import torn_joints
-from shapepose_fg.tracking.reassociation import Survival, reassociate
+from shapepose_fg.tracking.reassociation import Lasting, Survival, reassociate, reassociate_over_time
 from shapepose_fg.tracking.view_assignment import AssignmentConfig, assign
 
 WRIST, ELBOW = BODY_25.index("RWrist"), BODY_25.index("RElbow")
@@ -85,8 +87,6 @@ def test_detections_are_given_out_again_and_doubles_go(five_cameras, two_people,
     covariance = np.broadcast_to(0.02**2 * np.eye(3), (3, 25, 3, 3))
     none = np.full((3, 25, 5), -1)
     rows = Observations.of(none, detections, joints)
-    from dataclasses import replace
-
     rows = replace(rows, track=np.array([4, 5, 6]), frame=np.full(3, 7), time_s=np.full((3, 5), 0.5))
     kept = reassociate(given, rows, joints, covariance, BODY_25, AssignmentConfig())
     assert kept.track.tolist() == [4, 5, 6] and (kept.time_s == 0.5).all()
@@ -94,3 +94,44 @@ def test_detections_are_given_out_again_and_doubles_go(five_cameras, two_people,
     assert alone.track.tolist() == [4, 5]
     share, total = own(detections, five_cameras, two_people, alone.candidate)
     assert share == 1.0 and total == 250
+
+
+def test_a_track_that_has_next_to_nothing_of_its_own_for_a_window_is_nobody(
+    five_cameras, two_people, seen_exactly
+):
+    frames = range(4)
+    given, parts, places = [], [], []
+    beside = two_people[1] + [0.0, 0.0, 3.0]  # out of everybody's reach, in sight of the cameras
+    for frame in frames:
+        detections = seen_exactly(five_cameras, two_people)
+        given.append(Input(frame, np.full(5, frame / 30), detections, five_cameras))
+        joints = np.stack([*two_people, beside])
+        rows = Observations.of(np.full((3, 25, 5), -1), detections, joints)
+        parts.append(replace(rows, track=np.array([4, 5, 6]), frame=np.full(3, frame)))
+        places.append(joints)
+    rows, joints = Observations.concatenate(parts), np.concatenate(places)
+    covariance = np.broadcast_to(0.02**2 * np.eye(3), (len(rows), 25, 3, 3))
+    asked = given, rows, joints, covariance, BODY_25, AssignmentConfig()
+    assert sorted(set(reassociate(*asked).track.tolist())) == [4, 5, 6]
+    kept = reassociate_over_time(*asked)
+    assert kept.track.tolist() == [4, 5] * 4 and kept.frame.tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
+    # Where every place counts as one too few, still nobody goes whom two views see with an upper body.
+    strict = reassociate_over_time(*asked, Lasting(min_share=1.1))
+    assert strict.track.tolist() == [4, 5] * 4
+
+
+def test_of_two_tracks_on_one_person_the_lesser_goes_and_the_other_has_all(five_cameras, two_people, seen_exactly):
+    detections = seen_exactly(five_cameras, two_people[:1])
+    given = [Input(0, np.zeros(5), detections, five_cameras)]
+    joints = np.stack([two_people[0], two_people[0]])
+    joints[0, 13:] += 0.06  # the one is nearer to trunk and arms, the other to legs and face
+    joints[1, :13] += 0.06
+    rows = Observations.of(np.full((2, 25, 5), -1), detections, joints)
+    rows = replace(rows, track=np.array([1, 2]), frame=np.zeros(2, dtype=int))
+    covariance = np.broadcast_to(0.02**2 * np.eye(3), (2, 25, 3, 3))
+    asked = given, rows, joints, covariance, BODY_25, AssignmentConfig()
+    both = (reassociate(*asked).candidate >= 0).sum(axis=(1, 2))
+    assert both[0] > both[1] > 50, "each has what is nearer to it"
+    kept = reassociate_over_time(*asked, Lasting(min_share=0.9, min_seen_twice=26.0))
+    assert kept.track.tolist() == [1]
+    assert (kept.candidate >= 0).mean() > 0.9, "but for joints that are too far off"

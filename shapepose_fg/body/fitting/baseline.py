@@ -1,9 +1,11 @@
 """Bodies by plain optimisation: the SMPLify-style comparison, Levenberg-Marquardt over many rows at once."""
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 import torch
+from annotated_types import Interval
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -20,6 +22,7 @@ from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.rotation import log_so3
 from shapepose_fg.body.model.target_skeletons import slots
+from shapepose_fg.bounds import Factor, Repeats, RepeatsOrNone, Settings
 
 Array = NDArray[np.float64]
 
@@ -30,32 +33,25 @@ _DAMPING_START, _DAMPING_MIN, _DAMPING_MAX = 1e-3, 1e-7, 1e7
 
 
 @dataclass(frozen=True)
-class PlainFitterConfig:
+class PlainFitterConfig(Settings):
     """Settings of `LevenbergMarquardtFitter`."""
 
     evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
     """How targets are judged and weighed."""
     sequence: SequenceConfig = field(default_factory=SequenceConfig)
     """How bodies are fitted over time."""
-    kernel_scale: float = 6.0
+    kernel_scale: Factor = 6.0
     """Mahalanobis distance at which the Geman-McClure kernel has cut a joint's weight to a quarter."""
-    anneal_steps: int = 2
+    anneal_steps: RepeatsOrNone = 2
     """From a cold start the kernel begins 2^anneal_steps times as wide, and is halved every iteration."""
-    max_iterations: int = 40
+    max_iterations: Annotated[int, Interval(ge=1, le=1000)] = 40
     """Levenberg-Marquardt steps, refused ones included."""
-    tolerance: float = 1e-2
+    tolerance: Factor = 1e-2
     """A row is done when a step lowers its energy (in squared standard deviations) by less."""
-    unfinished: float = 9.0
+    unfinished: Factor = 9.0
     """Rows whose energy a Newton step would still lower by more (3 sigma of the posterior) are NOT_CONVERGED."""
-    left_out_sets: int = 6
+    left_out_sets: Repeats = 6
     """Passes without some of the targets, each joint in one: more cost more, and leave fewer out at a time."""
-
-    def __post_init__(self) -> None:
-        for name in ("kernel_scale", "tolerance", "unfinished"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        if self.max_iterations < 1 or self.anneal_steps < 0 or self.left_out_sets < 1:
-            raise ValueError("max_iterations and left_out_sets must be >= 1, and anneal_steps >= 0")
 
 
 class LevenbergMarquardtFitter:

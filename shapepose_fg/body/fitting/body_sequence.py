@@ -1,9 +1,11 @@
 """Bodies over time: one shape per person, and poses that move as people do."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import torch
+from annotated_types import Interval
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -16,6 +18,7 @@ from shapepose_fg.body.fitting.fitter import BodyFit, FitStatus, JointTargets
 from shapepose_fg.body.fitting.motion_prior import MotionPrior
 from shapepose_fg.body.fitting.posterior import joint_covariance
 from shapepose_fg.body.fitting.shared_shape import check_groups
+from shapepose_fg.bounds import Factor, Repeats, Seconds, Settings
 
 Array = NDArray[np.float64]
 
@@ -24,29 +27,22 @@ _CHUNK = 128
 
 
 @dataclass(frozen=True)
-class SequenceConfig:
+class SequenceConfig(Settings):
     """How bodies are fitted over time."""
 
-    gap_s: float = 1.0
+    gap_s: Seconds = 1.0
     """Rows of a person that are farther apart are not linked."""
-    lasting_s: float = 1.5
+    lasting_s: Annotated[float, Interval(gt=0, le=3600)] = 1.5
     """How long errors of targets last, seconds: rows within that time tell of the shape as one. On real detections
     of a static camera they are correlated by 0.83 after 0.04 s, 0.63 after 0.2 s and 0.40 after 1 s."""
-    max_iterations: int = 8
+    max_iterations: Repeats = 8
     """Steps of Levenberg-Marquardt, refused ones included."""
-    tolerance: float = 0.05
+    tolerance: Factor = 0.05
     """A chain is done when a step lowers its energy by less than this a row, in squared standard deviations."""
-    segment_rows: int = 320
+    segment_rows: Annotated[int, Interval(ge=1, le=100000)] = 320
     """Longer chains are cut, so that memory does not grow with them."""
-    overlap_rows: int = 16
+    overlap_rows: Annotated[int, Interval(ge=0, le=10000)] = 16
     """Rows that a cut-off segment has of its neighbours, on either side."""
-
-    def __post_init__(self) -> None:
-        for name in ("gap_s", "lasting_s", "max_iterations", "tolerance", "segment_rows"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        if self.overlap_rows < 0:
-            raise ValueError(f"overlap_rows must not be negative, got {self.overlap_rows}")
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ with S_iᵀ S_i the information of target z_i, rho a robust kernel, p the pose p
 (Bogo et al. 2016) for 3D joints. There is no factor 1/2, so that the inverse of the Hessian below is a covariance.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -277,16 +278,30 @@ class BodyEnergy:
         self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor, held: "Held | None" = None
     ) -> Slope:
         """Keypoints, energy and gradient at free parameters (B, P), with the kernel's scale (B, 1)."""
+
+        def pull(xyz: Tensor) -> tuple[Tensor, Tensor]:
+            residual = (targets.root @ (xyz - targets.xyz)[..., None]).squeeze(-1)
+            squared = residual.square().sum(-1)
+            weight = robust_weight(squared, kernel_scale)[..., None]
+            return squared, (targets.root @ (weight * residual)[..., None]).squeeze(-1)
+
+        return self.slope_of(free, pull, held)
+
+    def slope_of(
+        self, free: Tensor, pull: Callable[[Tensor], tuple[Tensor, Tensor]], held: "Held | None" = None
+    ) -> Slope:
+        """The slope where something else than targets pulls the keypoints.
+
+        `pull` gives, of keypoints (B, K, 3), squared distances (B, K) and half the gradient of its energy
+        (B, K, 3).
+        """
         body, points = self.complete(free), self.model.keypoint_points
         local = exp_so3(torch.cat((body.global_orient[:, None], body.body_pose), 1))
         rotations = accumulate(local)
         blend = (local[:, 1:] - torch.eye(3, dtype=self.dtype)).flatten(1)
         feature = None if points.offsets_pose is None else blend
         xyz, arms = points.positions_with_arms(rotations, body.betas, body.transl, feature)
-        residual = (targets.root @ (xyz - targets.xyz)[..., None]).squeeze(-1)
-        squared = residual.square().sum(-1)
-        weight = robust_weight(squared, kernel_scale)[..., None]
-        forces = (targets.root @ (weight * residual)[..., None]).squeeze(-1)
+        squared, forces = pull(xyz)
         by_column = points.pull_back(forces, arms, rotations, local)
         angles = free[:, self._angle_slice]
         stiffness, away, pose = self._pulls(free, held)

@@ -1,11 +1,14 @@
 """Which joint targets can be believed, and how much: what every fitter does before it fits."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Interval
 from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitter import FitStatus, JointTargets
+from shapepose_fg.bounds import Metres, Settings
 
 Array = NDArray[np.float64]
 
@@ -15,24 +18,17 @@ _ROUNDING = 1e-4
 
 
 @dataclass(frozen=True)
-class EvidenceConfig:
+class EvidenceConfig(Settings):
     """When a row of targets is enough for a body, and how far detector and body differ."""
 
-    model_sigma_m: float = 0.02
+    model_sigma_m: Metres = 0.02
     """How far the detector's joints lie from the body's, metres: added to every target's covariance."""
-    min_joints: int = 4
+    min_joints: Annotated[int, Interval(ge=3, le=1000)] = 4
     """Joints with full information that a fit needs."""
-    seen_sigma_m: float = 0.3
+    seen_sigma_m: Metres = 0.3
     """A joint counts as fully seen when its target's sigma is under this along every axis, metres."""
-    min_spread_m: float = 0.03
+    min_spread_m: Metres = 0.03
     """Those joints must lie this far off a common line (root mean square), metres, or the body could spin."""
-
-    def __post_init__(self) -> None:
-        for name in ("model_sigma_m", "seen_sigma_m", "min_spread_m"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        if self.min_joints < 3:
-            raise ValueError(f"min_joints must be at least 3 to turn a body, got {self.min_joints}")
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,11 @@ class BodyConfig:
     plain: PlainFitterConfig = field(default_factory=PlainFitterConfig)
     """Settings of the plain one."""
 
+    @classmethod
+    def paper(cls) -> "BodyConfig":
+        """As written in Eq. 6: the network's steps, and nothing after them."""
+        return cls(learned=LearnedFitterConfig(polish_steps=0, unfinished=1e6))
+
     def __post_init__(self) -> None:
         if self.method not in get_args(Method):
             raise ValueError(f"method must be one of {' '.join(get_args(Method))}, got {self.method!r}")

@@ -2,9 +2,11 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
+from annotated_types import Interval
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -24,40 +26,33 @@ from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.rotation import log_so3
 from shapepose_fg.body.model.skinned_points import SkinnedPoints
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, slots
+from shapepose_fg.bounds import Factor, Repeats, RepeatsOrNone, Settings
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class LearnedFitterConfig:
+class LearnedFitterConfig(Settings):
     """Settings of `LearnedFitter`."""
 
     evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
     """How targets are judged and weighed."""
     sequence: SequenceConfig = field(default_factory=SequenceConfig)
     """How bodies are fitted over time."""
-    kernel_scale: float = 6.0
+    kernel_scale: Factor = 6.0
     """Mahalanobis distance at which the Geman-McClure kernel has cut a joint's weight to a quarter."""
-    polish_steps: int = 1
+    polish_steps: RepeatsOrNone = 1
     """Gauss-Newton steps after the network's, held by the pose prior around where the network arrived. On
     validation subjects the first takes clean joints from 5.2 to 2.6 mm; a second changes nothing."""
-    stale: float = 0.3
+    stale: Annotated[float, Interval(ge=0, le=1000000.0)] = 0.3
     """Change of a joint's robust weight, in a step, from which on a row is linearised anew after it."""
-    left_out_sets: int = 6
+    left_out_sets: Repeats = 6
     """Passes without some of the targets, each joint in one: more cost more, and leave fewer out at a time."""
-    well_seen_m: float = 0.05
+    well_seen_m: Annotated[float, Interval(ge=0, le=10)] = 0.05
     """Sigma of a joint, metres, from which on the network is not shown it."""
-    unfinished: float = 30.0
+    unfinished: Factor = 30.0
     """Rows whose energy another step would still lower by more are left to the plain optimiser: some in a hundred
     whose joints contradict each other, such as those of two people."""
-
-    def __post_init__(self) -> None:
-        if not (
-            self.kernel_scale > 0 and self.unfinished > 0 and self.polish_steps >= 0 and self.left_out_sets > 0
-        ):
-            raise ValueError(
-                f"kernel_scale, unfinished and left_out_sets must be positive, polish_steps at least 0; got {self}"
-            )
 
 
 class LearnedFitter:

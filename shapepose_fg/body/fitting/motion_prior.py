@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.pose_prior import NUM_ANGLES
+from shapepose_fg.columns import read_npz
+from shapepose_fg.errors import InputError
 
 Array = NDArray[np.float64]
 
@@ -53,12 +55,12 @@ class MotionPrior:
 
     @classmethod
     def load(cls, path: str | Path) -> "MotionPrior":
-        """Read a prior that `save` wrote; ValueError naming the file if something is missing."""
-        with np.load(path, allow_pickle=False) as data:
-            missing = [name for name in (*_ARRAYS, "provenance") if name not in data.files]
-            if missing:
-                raise ValueError(f"{path}: not a motion prior, it has no {' '.join(missing)}")
-            return cls(*(data[name] for name in _ARRAYS), provenance=str(data["provenance"]))
+        """Read a prior that `save` wrote; InputError naming the file if something is missing."""
+        data = read_npz(Path(path), (*_ARRAYS, "provenance"), "fit it again")
+        missing = [name for name in (*_ARRAYS, "provenance") if name not in data]
+        if missing:
+            raise InputError(f"{path}: not a motion prior, it has no {' '.join(missing)}; fit it again")
+        return cls(*(data[name] for name in _ARRAYS), provenance=str(data["provenance"]))
 
     def save(self, path: str | Path) -> None:
         """Write the prior as .npz, readable without pickle."""

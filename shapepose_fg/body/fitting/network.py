@@ -1,11 +1,14 @@
 """The update network N_w of learned gradient descent (Eq. 5 of the paper; Song et al., ECCV 2020)."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
+from annotated_types import Interval
 from torch import Tensor, nn
 
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
+from shapepose_fg.bounds import Settings
 
 NUM_ROTATIONS = 22
 """Root and the 21 joints of SMPL that are not hands: what the network turns."""
@@ -16,25 +19,19 @@ _NUM_POINTS = len(BODY_POINTS)
 
 
 @dataclass(frozen=True)
-class NetworkConfig:
+class NetworkConfig(Settings):
     """The size of an `UpdateNetwork`."""
 
-    width: int = 384
+    width: Annotated[int, Interval(ge=1, le=8192)] = 384
     """Units of every layer."""
-    blocks: int = 2
+    blocks: Annotated[int, Interval(ge=1, le=64)] = 2
     """Residual blocks."""
-    steps: int = 3
+    steps: Annotated[int, Interval(ge=1, le=14)] = 3
     """Updates that it is made for; each knows its number."""
-    dropout: float = 0.1
+    dropout: Annotated[float, Interval(ge=0, le=0.99)] = 0.1
     """Share of the units that are left out in training."""
     half_precision: bool = True
     """Trains with bfloat16 products, twice as fast on processors that have them; fits are always in float32."""
-
-    def __post_init__(self) -> None:
-        if min(self.width, self.blocks, self.steps) < 1 or self.steps > 14:
-            raise ValueError(f"width and blocks must be at least 1, steps 1 to 14; got {self}")
-        if not 0 <= self.dropout < 1:
-            raise ValueError(f"dropout must be at least 0 and below 1, got {self.dropout}")
 
 
 class UpdateNetwork(nn.Module):

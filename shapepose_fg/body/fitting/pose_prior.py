@@ -7,6 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.columns import read_npz
+from shapepose_fg.errors import InputError
+
 NUM_ANGLES = 69
 """The 23 local rotations below the root, axis-angle, in SMPL's order."""
 
@@ -63,13 +66,13 @@ class PosePrior:
 
     @classmethod
     def load(cls, path: str | Path) -> "PosePrior":
-        """Read a prior that `save` wrote; ValueError naming the file if something is missing."""
-        with np.load(path, allow_pickle=False) as data:
-            missing = [name for name in (*_ARRAYS, "provenance") if name not in data.files]
-            if missing:
-                raise ValueError(f"{path}: not a pose prior, it has no {' '.join(missing)}")
-            arrays = (data[name].astype(np.float64) for name in _ARRAYS)
-            return cls(*arrays, provenance=str(data["provenance"]))
+        """Read a prior that `save` wrote; InputError naming the file if something is missing."""
+        data = read_npz(Path(path), (*_ARRAYS, "provenance"), "fit it again")
+        missing = [name for name in (*_ARRAYS, "provenance") if name not in data]
+        if missing:
+            raise InputError(f"{path}: not a pose prior, it has no {' '.join(missing)}; fit it again")
+        arrays = (data[name].astype(np.float64) for name in _ARRAYS)
+        return cls(*arrays, provenance=str(data["provenance"]))
 
     def save(self, path: str | Path) -> None:
         """Write the prior as .npz, readable without pickle."""

@@ -17,9 +17,12 @@ from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.errors import InputError
+from shapepose_fg.files import open_regular
 
 _DEFAULT = Path(__file__).parents[1] / "data" / "fitter.safetensors"
 _FORMAT = "shapepose-fg fitter 1"
+_KINDS = ("F32", "F64", "I64")
+"""Of numbers, as safetensors calls them: weights, and what a checkpoint counts."""
 _FRAME, _SPREAD = "frame.", "spread"
 
 
@@ -61,9 +64,11 @@ class FitterWeights:
         if not all(bool(torch.isfinite(tensor).all()) for tensor in tensors.values()):
             raise InputError(f"{path}: the weights hold NaN or infinity; train or fetch them again")
         try:
-            network = UpdateNetwork(NetworkConfig(**json.loads(about["network"])))
             spread = tensors.pop(_SPREAD)
-            network.load_state_dict({k: v for k, v in tensors.items() if not k.startswith(_FRAME)})
+            with torch.device("meta"):  # what the file says of the size takes no memory
+                network = UpdateNetwork(NetworkConfig(**json.loads(about["network"])))
+            learnt = {name: value.float() for name, value in tensors.items() if not name.startswith(_FRAME)}
+            network.load_state_dict(learnt, assign=True)
             frame = PersonFrame(**{k.removeprefix(_FRAME): v for k, v in tensors.items() if k.startswith(_FRAME)})
             network.requires_grad_(False)
             return cls(network.eval(), frame, about["body"], spread, json.loads(about["card"]))
@@ -99,8 +104,15 @@ class FitterWeights:
 def read_tensors(path: Path, cure: str) -> tuple[dict[str, str], dict[str, Tensor]]:
     """Texts and tensors of a safetensors file; InputError with the `cure` where it cannot be read."""
     try:
-        with safe_open(path, framework="pt") as file:
-            return file.metadata() or {}, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        with open_regular(path, cure), safe_open(path, framework="pt") as file:
+            names = list(file.keys())
+            for name in names:
+                kind = file.get_slice(name).get_dtype()
+                if kind not in _KINDS:
+                    raise InputError(f"{path}: {name} holds {kind}, not numbers of {' '.join(_KINDS)}; {cure}")
+            return file.metadata() or {}, {name: file.get_tensor(name) for name in names}
+    except InputError:
+        raise
     except (OSError, SafetensorError) as error:
         raise InputError(f"{path}: not readable as safetensors ({error}); {cure}") from error
 

@@ -7,7 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.body.model.smpl_pickle import RefusedPickle, as_array, read_smpl_pickle
+from shapepose_fg.body.model.pickle_records import RefusedPickle
+from shapepose_fg.body.model.plausible_body import implausible
+from shapepose_fg.body.model.smpl_pickle import as_array, read_smpl_pickle
+from shapepose_fg.columns import read_npz
 from shapepose_fg.errors import InputError
 from shapepose_fg.skeleton import BODY_25
 
@@ -58,8 +61,8 @@ def read_smpl_file(path: Path, keypoint_regressor: NDArray[np.floating] | None =
     joint_regressor = entries.floats("J_regressor", (24, count))
     if keypoint_regressor is not None:
         keypoints = entries.checked("keypoint_regressor", keypoint_regressor, (_NUM_KEYPOINTS, count))
-    elif "keypoint_regressor" in entries:
-        keypoints = entries.floats("keypoint_regressor", (_NUM_KEYPOINTS, count))
+    elif _KEYPOINTS in entries:
+        keypoints = entries.floats(_KEYPOINTS, (_NUM_KEYPOINTS, count))
     elif count == _SMPL_NUM_VERTICES:
         keypoints = _smpl_keypoint_regressor(joint_regressor)
     else:
@@ -67,6 +70,9 @@ def read_smpl_file(path: Path, keypoint_regressor: NDArray[np.floating] | None =
             f"{path}: no keypoint_regressor, and with {count} vertices this is not SMPL's own mesh: add the key, "
             f"or pass keypoint_regressor= ({_NUM_KEYPOINTS}, {count}), the weights that make BODY_25 from vertices"
         )
+    problem = implausible(template, joint_regressor, keypoints)
+    if problem is not None:
+        raise InputError(f"{path}: {problem}")
     return SmplArrays(
         template=template,
         shapes=entries.shapes(count),
@@ -80,15 +86,14 @@ def read_smpl_file(path: Path, keypoint_regressor: NDArray[np.floating] | None =
 
 def _read_entries(path: Path) -> dict[str, Any]:
     """The file's arrays or stand-ins for them, by name."""
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; give the body model's .npz or .pkl")
     if path.suffix not in (".npz", ".pkl"):
         raise InputError(f"{path}: a body model is read from .npz or .pkl; give one of those")
     try:
         if path.suffix == ".pkl":
             return read_smpl_pickle(path)
-        with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
+        return read_npz(path, (*_KEYS, _KEYPOINTS), "fetch the file again")
+    except InputError:
+        raise
     except RefusedPickle as error:
         raise InputError(
             f"{path}: refused, {error}: use the unchanged file from the model's site, or save its arrays as .npz"
@@ -186,6 +191,7 @@ class _Entries:
             )
 
 
+_KEYPOINTS = "keypoint_regressor"
 _KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f")
 
 

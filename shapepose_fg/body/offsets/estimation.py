@@ -13,9 +13,11 @@ alike, turning a limb) is not mistaken for an offset; the prior Q keeps that at 
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import torch
+from annotated_types import Interval
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -26,6 +28,7 @@ from shapepose_fg.body.fitting.fitter import BodyFit, JointTargets
 from shapepose_fg.body.fitting.pose_prior import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import LARGEST_M, RIDES_ON, KeypointOffsets
+from shapepose_fg.bounds import Metres, Repeats, Settings
 from shapepose_fg.skeleton import BODY_25
 
 Array = NDArray[np.floating]
@@ -35,30 +38,22 @@ _CHUNK = 128
 
 
 @dataclass(frozen=True)
-class OffsetPrior:
+class OffsetPrior(Settings):
     """What is believed of a detector's offsets before it is seen."""
 
-    sigma_m: float = 0.02
+    sigma_m: Metres = 0.02
     """How far joints lie from the body's, metres per axis: offsets are shrunk towards zero by this."""
-    asymmetry_sigma_m: float = 0.003
+    asymmetry_sigma_m: Metres = 0.003
     """How far left and right may differ from being mirror images, metres per axis."""
-    pose_widening: float = 3.0
+    pose_widening: Annotated[float, Interval(ge=1, le=1000000.0)] = 3.0
     """The pose prior is this many times as wide while offsets are learnt: a prior is never quite right about how
     poses vary, and what it has wrong would look like an offset, the same in hundreds of rows."""
-    rows_per_draw: float = 4.0
+    rows_per_draw: Annotated[float, Interval(ge=1, le=1000000.0)] = 4.0
     """How many rows say as much as one that is independent: a detector's error lasts over frames, and people come
     back."""
-    rounds: int = 1
+    rounds: Repeats = 1
     """How often bodies are fitted and offsets are solved. As bodies are eliminated and not held, the first
     solution is nearly the last: more rounds change what the body predicts by 0.2 mm."""
-
-    def __post_init__(self) -> None:
-        for name in ("sigma_m", "asymmetry_sigma_m"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        for name in ("pose_widening", "rows_per_draw", "rounds"):
-            if not getattr(self, name) >= 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
 
 
 def learn_offsets(

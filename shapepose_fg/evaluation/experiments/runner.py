@@ -9,6 +9,7 @@ from pathlib import Path
 
 from shapepose_fg.errors import InputError
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
+from shapepose_fg.evaluation.experiments.made_with import changes, made_with
 from shapepose_fg.files import read_json, write_atomically
 
 
@@ -18,8 +19,11 @@ class Kept:
 
     folder: Path
     """Where they are."""
-    made_with: str
-    """The `fingerprint` of now: figures that were made with another are measured again."""
+    scale: str = ""
+    """How much was measured: figures of another scale are measured again, and so are those that were made with
+    other defaults (`made_with`)."""
+    afresh: bool = False
+    """Whether to measure everything again."""
 
     def get(self, experiment: Experiment, case: Case) -> tuple[Figures, float] | None:
         """Figures and the seconds they took; None where there are none of now."""
@@ -27,18 +31,23 @@ class Kept:
         if not file.is_file():
             return None
         kept = read_json(file)
-        if not isinstance(kept, dict) or kept.get("made_with") != self.made_with:
-            return None
         try:
-            return kept["figures"], float(kept["seconds"])
+            same = kept["scale"] == self.scale and not changes(kept["made_with"], made_with(experiment.basis))
+            return (kept["figures"], float(kept["seconds"])) if same else None
         except (KeyError, TypeError, ValueError):
             raise InputError(f"{file}: these are not figures of an experiment; delete it") from None
 
     def put(self, experiment: Experiment, case: Case, figures: Figures, seconds: float) -> None:
         """Keep figures."""
-        content = {"made_with": self.made_with, "seconds": seconds, "figures": figures}
+        made = made_with(experiment.basis)
+        content = {"seconds": seconds, "figures": figures, "scale": self.scale, "made_with": made}
         text = json.dumps(content, indent=1) + "\n"
         write_atomically(self._file(experiment, case), lambda stream: stream.write(text.encode()))
+
+    def words(self, experiment: Experiment) -> str:
+        """How much of an experiment is kept, and the time that it took."""
+        found = [each for case in experiment.cases if (each := self.get(experiment, case)) is not None]
+        return f", {len(found)} kept, {sum(seconds for _, seconds in found):.0f} s" if len(found) > 0 else ""
 
     def _file(self, experiment: Experiment, case: Case) -> Path:
         return self.folder / _word(experiment.name) / f"{_word(case.name)}.json"
@@ -53,7 +62,7 @@ def measured(
         raise ValueError(f"{experiment.name}: two cases have one name: {sorted(names)}")
     figures, seconds = dict[str, Figures](), 0.0
     for case in experiment.cases:
-        found = kept.get(experiment, case)
+        found = None if kept.afresh else kept.get(experiment, case)
         if found is None:
             began = time.perf_counter()
             measure = case.measure()

@@ -5,6 +5,7 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 
 from shapepose_fg.detections import DetectionSequence
+from shapepose_fg.estimation.estimator import ExtraFactors
 from shapepose_fg.frame_times import FrameTimes
 from shapepose_fg.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.reconstruction import Reconstruction
@@ -44,6 +45,8 @@ class Stretch:
     """Views."""
     seed: int = 0
     """Of the detector's errors; of the built-in scene, too."""
+    people: int = 4
+    """Of the built-in scene; a sequence has its own."""
     mocap: Path | None = field(default=None, compare=False)
     """The recorded motions; None: where SHAPEPOSE_DATA says."""
 
@@ -62,10 +65,16 @@ class Stretch:
         """What the simulated detector saw."""
         return _detections(self)
 
-    def reconstruct(self, config: PipelineConfig | None = None) -> Reconstruction:
-        """Reconstructed at the scene's rate."""
+    def reconstruct(
+        self,
+        config: PipelineConfig | None = None,
+        frames: range | None = None,
+        extra_factors: ExtraFactors | None = None,
+    ) -> Reconstruction:
+        """Reconstructed at the scene's rate; only `frames` of the stretch, if given."""
         times = FrameTimes.from_fps(self.scene.fps, len(self.span))
-        return reconstruct(self.detections, self.scene.rig, config, times=times)
+        rig = self.scene.rig
+        return reconstruct(self.detections, rig, config, frames=frames, times=times, extra_factors=extra_factors)
 
 
 @dataclass(frozen=True)
@@ -85,7 +94,7 @@ class Scale:
         if self.quick:
             return (Stretch("demo", range(QUICK_FRAMES)),)
         return tuple(
-            Stretch(name, span, self.split, mocap=self._mocap)
+            Stretch(name, span, self.split, mocap=self.mocap)
             for name, spans in STRETCHES[self.split].items()
             for span in spans
         )
@@ -101,7 +110,13 @@ class Scale:
         return self._at("shelf")
 
     @property
-    def _mocap(self) -> Path | None:
+    def pose2sim_single(self) -> Path | None:
+        """The folder of Pose2Sim's demo recording, and its detections."""
+        return self._at("pose2sim_single")
+
+    @property
+    def mocap(self) -> Path | None:
+        """The file of recorded motions."""
         folder = self._at("cmu_mocap")
         return None if folder is None else folder / "cmu_smpl24.npz"
 
@@ -113,7 +128,7 @@ class Scale:
     @property
     def has_scenes(self) -> bool:
         """Whether there is anything to simulate stretches from."""
-        return self.quick or self._mocap is not None
+        return self.quick or self.mocap is not None
 
 
 def shorter(stretch: Stretch, frames: int) -> Stretch:
@@ -124,9 +139,9 @@ def shorter(stretch: Stretch, frames: int) -> Stretch:
 @lru_cache(maxsize=2)
 def _scene(stretch: Stretch) -> Scene:
     if stretch.name == "demo":
-        return cut(
-            built_in_scene(stretch.seed, cameras=stretch.cameras, frames=max(60, stretch.span.stop)), stretch.span
-        )
+        frames = max(60, stretch.span.stop)
+        whole = built_in_scene(stretch.seed, people=stretch.people, cameras=stretch.cameras, frames=frames)
+        return cut(whole, stretch.span)
     whole = named_scene(
         stretch.name, split=stretch.split, cameras=stretch.cameras, frames=stretch.span.stop, mocap=stretch.mocap
     )

@@ -7,7 +7,7 @@ import numpy as np
 
 from shapepose_fg.camera import Lens
 from shapepose_fg.errors import InputError
-from shapepose_fg.files import read_text
+from shapepose_fg.files import LARGE, read_text
 from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.calibration.written import Format, WrittenCamera, WrittenRig, intrinsics, pose, rotation_of
 
@@ -69,7 +69,7 @@ def read(content: Content) -> WrittenRig:
 def _lenses(path: Path) -> dict[str, _Lens]:
     """The cameras of cameras.txt by their id: CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]."""
     lenses = {}
-    for number, line in enumerate(read_text(path).splitlines(), 1):
+    for number, line in enumerate(read_text(path, most=LARGE).splitlines(), 1):
         words = line.split()
         if len(words) == 0 or line.startswith("#"):
             continue
@@ -93,7 +93,8 @@ def _lenses(path: Path) -> dict[str, _Lens]:
 
 def _images(path: Path, lenses: dict[str, _Lens]) -> list[WrittenCamera]:
     """images.txt: IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; each followed by a line of points."""
-    lines = [(number, line) for number, line in enumerate(read_text(path).splitlines(), 1) if line[:1] != "#"]
+    every = enumerate(read_text(path, most=LARGE).splitlines(), 1)
+    lines = [(number, line) for number, line in every if line[:1] != "#"]
     rows = [(number, line.split(maxsplit=9)) for number, line in lines[::2] if line.strip()]
     names = _names([words[9] if len(words) == 10 else "" for _, words in rows])
     cameras = []

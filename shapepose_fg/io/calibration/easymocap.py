@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from shapepose_fg.errors import InputError
-from shapepose_fg.files import read_text
+from shapepose_fg.files import MIDDLE, read_text
 from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.calibration.filestorage import load_storage
 from shapepose_fg.io.calibration.written import Format, WrittenCamera, WrittenRig, picture_size, pose
@@ -24,7 +24,7 @@ def recognise(content: Content) -> bool:
 def read(content: Content) -> WrittenRig:
     """The cameras in the order of the names in the intrinsics."""
     intri, extri = _both(content)
-    inner, outer = (load_storage(path, read_text(path)) for path in (intri, extri))
+    inner, outer = (load_storage(path, read_text(path, most=MIDDLE)) for path in (intri, extri))
     names = inner.get("names")
     if not isinstance(names, list) or not all(isinstance(name, str | int) for name in names):
         raise InputError(f"{intri}: names must be a list of the cameras' names; write it with EasyMocap again")

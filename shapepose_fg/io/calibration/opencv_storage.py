@@ -6,7 +6,7 @@ import numpy as np
 
 from shapepose_fg.camera import Lens
 from shapepose_fg.errors import InputError
-from shapepose_fg.files import read_text
+from shapepose_fg.files import MIDDLE, read_text
 from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.calibration.filestorage import load_storage
 from shapepose_fg.io.calibration.written import ONE_CAMERA, Format, WrittenCamera, WrittenRig, picture_size, pose
@@ -42,8 +42,11 @@ def read_multiview(content: Content) -> WrittenRig:
     Ts = _stack(nodes, "Ts", path).reshape(count, -1)
     sizes = _stack(nodes, "image_sizes", path).reshape(count, -1)
     models = np.zeros(count) if nodes.get("models") is None else _stack(nodes, "models", path).ravel()
-    if len(Rs) != count or Ts.shape[1] != 3 or sizes.shape[1] != 2 or len(models) != count:
-        raise InputError(f"{path}: Rs, Ts, image_sizes and models must hold one entry for each of the {count} Ks")
+    if Ks.size != 9 * count or len(Rs) != count or Ts.shape[1] != 3 or sizes.shape[1] != 2 or len(models) != count:
+        raise InputError(
+            f"{path}: Ks must be 3x3, and Rs, Ts, image_sizes and models hold one entry for each of the {count};"
+            " save it with OpenCV's calibration again"
+        )
     numbers = _stack(nodes, "distortions", path).ravel()
     fisheye = models == _FISHEYE
     # The coefficients stand one after the other: four of a fisheye, equally many of every other camera.
@@ -72,7 +75,7 @@ def recognise_nodes(content: Content) -> bool:
     """Whether every camera has a node, or a file, of its own; also the intrinsics of one camera alone."""
     if content.syntax == "folder":
         files = [path for path in content.value if path.suffix in (".yml", ".yaml", ".xml") and path.is_file()]
-        return len(files) > 0 and all(_names_a_camera(read_text(path)) for path in files)
+        return len(files) > 0 and all(_names_a_camera(read_text(path, most=MIDDLE)) for path in files)
     return content.syntax == "OpenCV"
 
 
@@ -80,7 +83,7 @@ def read_nodes(content: Content) -> WrittenRig:
     """Cameras by name, of MC-Calib or of hand-written files: K, distortion, picture size and pose."""
     if content.syntax == "folder":
         nodes = {
-            path.stem: load_storage(path, read_text(path))
+            path.stem: load_storage(path, read_text(path, most=MIDDLE))
             for path in content.value
             if path.suffix in (".yml", ".yaml", ".xml")
         }

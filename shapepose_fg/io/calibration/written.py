@@ -23,7 +23,6 @@ METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _ROTATION_TOLERANCE = 1e-3
 """How far R Rᵀ may be from the identity: calibrations are printed with four to six digits."""
 _MOST_PIXELS = 1_000_000
-"""No picture is as wide."""
 _EXACT = 1e-12
 """Below this a rotation is left as written, so that a rig that is written and read stays the same."""
 

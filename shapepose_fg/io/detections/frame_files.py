@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, FiniteFloat, TypeAdapter, ValidationError
 
 from shapepose_fg.errors import InputError
-from shapepose_fg.files import read_text
+from shapepose_fg.files import MIDDLE, read_json, read_text
 from shapepose_fg.io.detections.people import CameraPeople
 from shapepose_fg.io.validation import first_problem, key_text
 
@@ -98,7 +98,7 @@ def _program(folder: Path) -> str:
         return "OpenPose's JSON"
     if files[0].name.endswith("_keypoints.json"):
         return "OpenPose's JSON"
-    begin = read_text(files[0]).lstrip()[:1]
+    begin = read_text(files[0], most=MIDDLE).lstrip()[:1]
     return "MMPose's JSON of pictures" if begin == "[" else "Pose2Sim's JSON"
 
 
@@ -131,7 +131,7 @@ def _numbered(folder: Path, program: str) -> dict[int, Path]:
 def _people(file: Path, program: str) -> list[list[float]]:
     """Flat keypoints of the people of a frame; empty people are nobody."""
     try:
-        frame = _Frame.model_validate_json(read_text(file))
+        frame = _Frame.model_validate(read_json(file, most=MIDDLE))
     except ValidationError as error:
         place, problem = first_problem(error)
         raise InputError(f"{file}: {key_text(place)} {problem}; {_RERUN[program]}") from None
@@ -156,7 +156,7 @@ def _people(file: Path, program: str) -> list[list[float]]:
 def _instances(file: Path, program: str) -> list[list[float]]:
     """Flat keypoints of the people of a picture of MMPose."""
     try:
-        instances = _INSTANCES.validate_json(read_text(file))
+        instances = _INSTANCES.validate_python(read_json(file, most=MIDDLE))
     except ValidationError as error:
         place, problem = first_problem(error)
         raise InputError(f"{file}: {key_text(place)} {problem}; {_RERUN[program]}") from None

@@ -20,6 +20,8 @@ _RERUN = {
 }
 _MOST = 10**12
 """No frame has a higher number."""
+_LONGEST_NAME = 4096
+"""Characters of a picture's path: the search takes the square of them."""
 _FRAME_NUMBER = re.compile(r"(\d+)\D*$")
 """The last number in the name of a picture."""
 
@@ -153,7 +155,7 @@ def _number(image: int | str, names: dict[int, str], place: str, program: str) -
         if image not in names and 0 <= image < _MOST:
             return image
         image = names.get(image, str(image))
-    match = _FRAME_NUMBER.search(Path(image).stem)
+    match = _FRAME_NUMBER.search(Path(image).stem) if len(image) <= _LONGEST_NAME else None
     if match is None or len(match[1]) > len(str(_MOST)):
         raise InputError(f"{place} {image[:40]!r} has no frame number; {_RERUN[program]}, of numbered pictures")
     return int(match[1])

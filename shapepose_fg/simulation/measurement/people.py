@@ -13,8 +13,8 @@ from shapepose_fg.body.fitting.fitter import BodyFit
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.camera import Rig, Views
 from shapepose_fg.detections import DetectionSequence
-from shapepose_fg.estimation.alternation import EstimatorConfig
 from shapepose_fg.estimation.estimator import Estimator
+from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.linearisation import linearise, observation_sigmas, triangulate
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
@@ -71,9 +71,7 @@ def shelf_people(folder: Path) -> tuple[DetectionSequence, Rig, People]:
 def find(detections: DetectionSequence, rig: Rig, config: PipelineConfig) -> People:
     """Everybody in the recording, with bodies, every frame by itself."""
     parts, frames, joints, fits = [], [], [], []
-    settings = EstimatorConfig(
-        config.observations, config.window_graph, config.refine, replace(config.motion, temporal=False)
-    )
+    settings = EstimatorConfig(config.observations, config.window_graph, config.refine, config.motion)
     fitter = LevenbergMarquardtFitter(config=config.body.plain)
     estimator = Estimator(rig, fitter, BODY_25.joints, settings)
     for start in range(0, len(detections), BATCH):
@@ -81,7 +79,8 @@ def find(detections: DetectionSequence, rig: Rig, config: PipelineConfig) -> Peo
         found = [find_people(detections[t], rig, BODY_25, config) for t in numbers]
         frame = np.repeat(np.array(numbers), [len(people) for people in found])
         observations = Observations.concatenate(found)
-        estimates = estimator.estimate(observations)
+        alone = replace(observations, track=np.arange(len(observations)))
+        estimates = estimator.estimate(alone)
         parts.append(observations)
         frames.append(frame)
         joints.append(estimates.joints)

@@ -1,0 +1,87 @@
+"""Write docs/licences.md: the licences of everything that is installed with this package.
+
+Run by hand after a dependency is added (python scripts/licences.py); tests/test_licences.py says when.
+"""
+
+import re
+import tomllib
+from importlib.metadata import Distribution, PackageNotFoundError, distribution
+from pathlib import Path
+from typing import Any
+
+from packaging.requirements import Requirement
+
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs" / "licences.md"
+EXTRAS = ("viewer", "detect", "export", "view")
+HEAD = """# Licences of what is installed with it
+
+`pip install shapepose-fg` brings the first table, its extras the second; what is only needed to test it is not
+listed. The names are those that each package's own metadata give. None asks that programs which use it be under
+its own licence. opencv-python-headless carries FFmpeg's libraries (LGPL-2.1) beside its own; they are separate
+files that may be exchanged.
+
+Our code is MIT; what the body and priors are made from is in the [README](../README.md#licence-and-credits).
+"""
+_SHORT = {
+    "apache software license": "Apache-2.0",
+    "bsd license": "BSD",
+    "mit license": "MIT",
+    "mozilla public license 2.0 (mpl 2.0)": "MPL-2.0",
+    "python software foundation license": "PSF-2.0",
+}
+
+
+def needed(extras: tuple[str, ...]) -> dict[str, Distribution]:
+    """Every distribution that is installed with this one and these extras, by its name."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    own = list(project["dependencies"])
+    for extra in extras:
+        own += project["optional-dependencies"][extra]
+    found: dict[str, Distribution] = {}
+    waiting = [(each.name, frozenset(each.extras)) for each in map(Requirement, own)]
+    while waiting:
+        name, wanted = waiting.pop()
+        try:
+            here = distribution(name)
+        except PackageNotFoundError:  # of another system
+            continue
+        key = re.sub(r"[-_.]+", "-", here.metadata["Name"]).lower()
+        if key in found:
+            continue
+        found[key] = here
+        for text in here.requires or ():
+            requirement = Requirement(text)
+            marker = requirement.marker
+            if marker is None or any(marker.evaluate({"extra": extra}) for extra in ("", *wanted)):
+                waiting.append((requirement.name, frozenset(requirement.extras)))
+    return dict(sorted(found.items()))
+
+
+def licence(of: Distribution) -> str:
+    """The licence that a distribution's metadata name, as short as they do."""
+    metadata: Any = of.metadata
+    expression = metadata.get("License-Expression")
+    if expression:
+        return expression
+    classifiers = [each.split(" :: ")[-1] for each in metadata.get_all("Classifier", []) if each[:7] == "License"]
+    named: list[str] = [str(_SHORT.get(each.lower(), each)) for each in classifiers if each != "OSI Approved"]
+    text = (metadata.get("License") or "").strip()
+    if text and len(text) < 40 and "\n" not in text:
+        return text
+    return " or ".join(named) if named else "see its own files"
+
+
+def page() -> str:
+    """The whole document."""
+    always, more = needed(()), needed(EXTRAS)
+    tables = [always, {name: each for name, each in more.items() if name not in always}]
+    text = HEAD
+    for title, rows in zip(("## Always", f"## With the extras {', '.join(EXTRAS)}"), tables, strict=True):
+        lines = [f"| {name} | {licence(each)} |" for name, each in rows.items()]
+        text += f"\n{title}\n\n| package | licence |\n|---|---|\n" + "\n".join(lines) + "\n"
+    return text
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")

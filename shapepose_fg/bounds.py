@@ -1,0 +1,71 @@
+"""Settings with bounds: said once, in the type of a field, and checked wherever a setting is made."""
+
+from functools import cache
+from typing import Annotated, Any, get_type_hints
+
+from annotated_types import Interval
+
+Metres = Annotated[float, Interval(gt=0, le=10)]
+"""A distance between joints, people or rays."""
+MetresOrNone = Annotated[float, Interval(ge=0, le=10)]
+"""The same, which may be 0: the setting's docstring says what that means."""
+Seconds = Annotated[float, Interval(gt=0, le=60)]
+"""A time in which people move."""
+Speed = Annotated[float, Interval(gt=0, le=100)]
+"""Metres a second."""
+Pixels = Annotated[float, Interval(ge=0, le=1000)]
+"""A distance in a picture."""
+Share = Annotated[float, Interval(ge=0, le=1)]
+"""A part of a whole, or a score."""
+Factor = Annotated[float, Interval(gt=0, le=1e6)]
+"""Something else that is multiplied or compared with."""
+Count = Annotated[int, Interval(ge=1, le=1000)]
+"""How many there must be."""
+Repeats = Annotated[int, Interval(ge=1, le=100)]
+"""How often something is done."""
+RepeatsOrNone = Annotated[int, Interval(ge=0, le=100)]
+"""How often something is done, which need not be done."""
+
+
+class Settings:
+    """Base of dataclasses whose fields have bounds; ValueError that names the field outside of its own."""
+
+    def __post_init__(self) -> None:
+        for name, interval in _intervals(type(self)).items():
+            problem = _problem(interval, getattr(self, name))
+            if problem is not None:
+                raise ValueError(f"{name} must {problem}, got {getattr(self, name)}")
+
+
+def range_of(kind: type, name: str) -> str | None:
+    """The bounds of a field in words, None where it has none: "above 0, at most 10"."""
+    interval = _intervals(kind).get(name) if issubclass(kind, Settings) else None
+    if interval is None:
+        return None
+    return (
+        f"above {interval.gt}, at most {interval.le}" if interval.ge is None else f"{interval.ge} to {interval.le}"
+    )
+
+
+@cache
+def _intervals(kind: type) -> dict[str, Interval]:
+    """The bounds of each field that has some."""
+    found = {}
+    for name, hint in get_type_hints(kind, include_extras=True).items():
+        for each in getattr(hint, "__metadata__", ()):
+            if isinstance(each, Interval):
+                found[name] = each
+    return found
+
+
+def _problem(interval: Interval, value: Any) -> str | None:
+    """What a value must be and is not; NaN is nowhere inside."""
+    low, high = interval.gt if interval.ge is None else interval.ge, interval.le
+    inside = low < value <= high if interval.ge is None else low <= value <= high
+    if inside:
+        return None
+    if interval.ge == 0 and high == 1:
+        return "be between 0 and 1"
+    if value > high:
+        return f"be at most {high}"
+    return "be positive" if interval.gt == 0 else "not be negative" if low == 0 else f"be at least {low}"

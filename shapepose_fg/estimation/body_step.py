@@ -1,0 +1,111 @@
+"""The Theta step: what the body is fitted to, and what it then says of each joint."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
+from shapepose_fg.estimation.draft import MODEL_SIGMA_M, WholeFitter
+from shapepose_fg.estimation.estimator_config import EstimatorConfig
+from shapepose_fg.estimation.linearisation import ViewEvidence
+from shapepose_fg.estimation.window_graph import Message
+
+JOINT_SIGMA_M = 0.03
+"""Sigma of every joint where the body is fitted to X, all joints alike, metres."""
+
+Tie = tuple[frozenset[int], NDArray[np.intp]]
+"""Joints that factors of the user's own tie to each other, and in which rows (K,)."""
+
+
+@dataclass(frozen=True)
+class BodyStep:
+    """The Theta step of one round, for its R rows."""
+
+    fitter: BodyFitter
+    """Fits bodies."""
+    groups: NDArray[np.intp] | None
+    """(R,) a number for each row that says whose shape it has; None where every row is alone."""
+    config: EstimatorConfig
+    """How."""
+
+    def targets(self, evidence: ViewEvidence, enough: NDArray[np.bool_]) -> JointTargets:
+        """What the bodies of the rows whom their views determine, `enough` (R,), are fitted to."""
+        if self.config.refine.body_from_views:
+            return joint_targets(evidence, enough)
+        known = np.isfinite(evidence.points).all(axis=-1) & enough[:, None]
+        information = known[..., None, None] * np.eye(3) / JOINT_SIGMA_M**2
+        return JointTargets(np.nan_to_num(evidence.points), information)
+
+    def fit(self, targets: JointTargets, last: BodyFit, rows: NDArray[np.intp] | None = None) -> BodyFit:
+        """Bodies of some `rows` (K,) or of all, from the `last` ones (R) on."""
+        groups = self.groups
+        if rows is not None:
+            targets = JointTargets(targets.xyz[rows], targets.information[rows])
+            last, groups = last.rows(rows), None if groups is None else groups[rows]
+        if self.config.refine.leave_one_out:
+            return self.fitter.fit(targets, last, groups)
+        if groups is None and isinstance(self.fitter, WholeFitter):
+            fit = self.fitter.fit_whole(targets, last)
+        else:
+            fit = self.fitter.fit(targets, last, groups)
+        return replace(fit, prior_xyz=fit.joints, prior_covariance=fit.covariance + MODEL_SIGMA_M**2 * np.eye(3))
+
+    def message(
+        self, body: BodyFit, targets: JointTargets, pulled: NDArray[np.bool_], ties: Sequence[Tie]
+    ) -> Message:
+        """What the bodies say of the joints `pulled` (R, J): E_shape of Eq. 3."""
+        xyz, covariance = body.prior_xyz.copy(), body.prior_covariance.copy()
+        ok = np.repeat(body.ok[:, None], xyz.shape[1], axis=1)
+        for joints, rows in ties if self.config.refine.leave_one_out else ():
+            # Tied to each other, each would get the others' views twice: through the tie, and through the body.
+            columns = np.array(sorted(joints))
+            information = targets.information.copy()
+            information[:, columns] = 0.0
+            alone = self.fit(JointTargets(targets.xyz, information), body, rows)
+            here = np.ix_(rows, columns)
+            xyz[here], covariance[here] = alone.prior_xyz[:, columns], alone.prior_covariance[:, columns]
+            ok[here] = alone.ok[:, None]
+        pulled = pulled & ok
+        information = np.zeros_like(covariance)
+        sigma_m = self.config.graph.shape_sigma_m
+        information[pulled] = np.eye(3) / sigma_m**2 if sigma_m > 0 else np.linalg.inv(covariance[pulled])
+        return Message(np.where(pulled[..., None], xyz, np.nan), information)
+
+
+def joint_targets(evidence: ViewEvidence, enough: NDArray[np.bool_]) -> JointTargets:
+    """What the body is fitted to: what the views say of all joints, of rows whom they determine (`enough`)."""
+    information = np.where(enough[:, None, None, None], evidence.information, 0.0)
+    return JointTargets(np.nan_to_num(evidence.target), information)
+
+
+def disagreement(evidence: ViewEvidence, fit: BodyFit) -> NDArray[np.float64]:
+    """How far (N, J) each joint's views put it from where the body can have it, in standard deviations.
+
+    The smaller of two distances, each against the sum of both covariances: to where the rest of the body puts the
+    joint (`prior_xyz`), and to the joint of the body that was fitted with it. The first is a Gaussian around one
+    pose: a forearm that is bent further lies far outside it though no bone is too long for it. The second is there
+    to tell; it stays away from what no pose reaches, since its kernel is robust. Where the views leave a
+    direction open, they cannot disagree in it. 0 for rows without a body.
+    """
+    model = MODEL_SIGMA_M**2 * np.eye(3)
+    prior = _sigmas_apart(evidence, fit.prior_xyz, fit.prior_covariance)
+    fitted = _sigmas_apart(evidence, fit.joints, np.nan_to_num(fit.covariance) + model)
+    return np.where(fit.ok[:, None], np.fmin(prior, fitted), 0.0)
+
+
+def _sigmas_apart(
+    evidence: ViewEvidence, xyz: NDArray[np.float64], covariance: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Distance (N, J) of what the views say from `xyz` (N, J, 3) +- `covariance`, standard deviations; NaN
+    unknown.
+    """
+    known = np.asarray(np.isfinite(xyz).all(axis=2))
+    apart = np.where(known[..., None], np.nan_to_num(evidence.target - xyz), 0.0)
+    other = np.where(known[..., None, None], covariance, np.eye(3))
+    # (L^-1 + C)^-1 = L (I + C L)^-1, which holds for information L that is singular, too.
+    information = evidence.information
+    weight = information @ np.linalg.inv(np.eye(3) + other @ information)
+    squared = np.einsum("...i,...ij,...j->...", apart, weight, apart)
+    return np.where(known, np.sqrt(np.maximum(squared, 0.0)), np.nan)

@@ -1,0 +1,75 @@
+"""The settings of stage II."""
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import numpy as np
+from annotated_types import Interval
+
+from shapepose_fg.bounds import Count, Metres, MetresOrNone, Repeats, Settings
+from shapepose_fg.estimation.linearisation import ObservationConfig
+from shapepose_fg.estimation.motion_model import MotionConfig
+from shapepose_fg.estimation.window_graph import WindowGraphConfig
+
+
+@dataclass(frozen=True)
+class RefineConfig(Settings):
+    """How the alternation runs."""
+
+    alternations: Repeats = 3
+    """N of Algorithm 1: how often the body is fitted and the joints are solved, at the most."""
+    window_alternations: Repeats = 1
+    """The same for windows of several frames, which start from a draft of all joints (`Estimator.draft`): a second
+    round, at twice the time, changed the mean error by 0.1 to 0.2 mm. Windows with factors of the user's own take
+    as many as frames alone: what such a factor says may be far from what the views said."""
+    settled_m: MetresOrNone = 0.002
+    """A window whose joints all moved less in a round is done: most frames are after one or two. 0: none is."""
+    max_sigma_m: Metres = 0.5
+    """A joint whose views leave it less certain than this in some direction is not determined by them."""
+    disagreement: Annotated[float, Interval(ge=0, le=1e6)] = 6.0
+    """A joint that its views put this many standard deviations from where the body can have it is seen wrongly:
+    its gates are decided anew from the body's place, and the body is fitted again without what was thrown away. 4
+    threw away more joints that were right than wrong ones, in simulated crowds whose detections had been given out
+    again. 0: nothing is thrown away, as in the paper."""
+    min_joints: Count = 4
+    """Fewer joints than this determined by the views are not a person that can be placed in space."""
+    complete_start: bool = True
+    """Whether joints that two views saw and stage I did not place are triangulated for X_0. In the paper they are
+    missing until the body puts them somewhere."""
+    body_from_views: bool = True
+    """Whether the body is fitted to what the views alone say of each joint, weighed by it. In Algorithm 1 it is
+    fitted to X_n, all joints alike, of which part was made by the body."""
+    leave_one_out: bool = True
+    """Whether what the body says of a joint comes from a fit without that joint's own target, so that no view
+    counts twice. In the paper it is the body fitted to everything, the joint included."""
+
+    @classmethod
+    def paper(cls) -> "RefineConfig":
+        """Algorithm 1 as written, with N = 10."""
+        return cls(
+            alternations=10,
+            settled_m=0.0,
+            disagreement=0.0,
+            complete_start=False,
+            body_from_views=False,
+            leave_one_out=False,
+        )
+
+    @property
+    def contradiction(self) -> float:
+        """Standard deviations from which on views and body contradict each other; infinite where none do."""
+        return self.disagreement if self.disagreement > 0 else np.inf
+
+
+@dataclass(frozen=True)
+class EstimatorConfig:
+    """The settings of stage II."""
+
+    observations: ObservationConfig = field(default_factory=ObservationConfig)
+    """How far a 2D observation is trusted."""
+    graph: WindowGraphConfig = field(default_factory=WindowGraphConfig)
+    """What goes into the factor graph of a person."""
+    refine: RefineConfig = field(default_factory=RefineConfig)
+    """How joints and bodies alternate."""
+    motion: MotionConfig = field(default_factory=MotionConfig)
+    """How frames hang together."""

@@ -1,0 +1,142 @@
+"""Real footage: Shelf's lost limbs as events, its cameras left out one by one, Pose2Sim's demo recording."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
+from shapepose_fg.evaluation.experiments.scale import Scale
+from shapepose_fg.evaluation.held_out_view import held_out
+from shapepose_fg.evaluation.shelf import evaluate_shelf, match_actors, read_shelf_ground_truth
+from shapepose_fg.evaluation.shelf_events import identity_switches, lost_limbs, pcp_interval
+from shapepose_fg.evaluation.single_person import FPS, measure_single_person
+from shapepose_fg.frame_times import FrameTimes
+from shapepose_fg.io.calibration import read_rig
+from shapepose_fg.io.detections import read_detections
+from shapepose_fg.pipeline import PipelineConfig, reconstruct
+
+QUICK = range(20)
+"""Frames of a recording that a quick run takes."""
+SINGLE = {
+    "frames with the man, of all": lambda f: f"{f['man_found']} of {f['frames']}",
+    "limbs over 1.25 times their own median": lambda f: str(f["torn_limbs"]),
+    "forearm, standard deviation over mean: joints, %": lambda f: f"{f['forearm_spread']:.2f}",
+    "the same of the bodies, %": lambda f: f"{f['body_forearm_spread']:.2f}",
+    "wrists, mean acceleration, m/s²": lambda f: f"{f['wrist_acceleration']:.1f}",
+    "raised wrist under the shoulder, at the most, m": lambda f: f"{f['lowest_wrist_m']:.3f}",
+    "arms to the nearest detection, median, px": lambda f: f"{f['residual_px']:.2f}",
+    "bystander found, of the frames in which two views have five joints, %": lambda f: (
+        f"{f['bystander_found']:.0f}"
+    ),
+}
+"""What a row is called, and its words."""
+
+
+def shelf_events(scale: Scale) -> Experiment | None:
+    """Avg PCP with an interval over blocks of frames, lost limbs as events, identities that change."""
+    folder = scale.shelf
+    if folder is None:
+        return None
+    cases = [Case(name, partial(_shelf, scale, temporal)) for name, temporal in _MODES.items()]
+    return Experiment("shelf events", cases, _events_table)
+
+
+def held_out_views(scale: Scale) -> Experiment | None:
+    """Solve without each of Shelf's cameras: what it saw against the 95 % regions of the rest."""
+    return (
+        None if scale.shelf is None else Experiment("views", [Case("shelf", partial(_views, scale))], _view_table)
+    )
+
+
+def single_person(scale: Scale) -> Experiment | None:
+    """Pose2Sim's demo recording, which has no truth."""
+    folder = scale.pose2sim_single
+    if folder is None:
+        return None
+    return Experiment(
+        "single", [Case(name, partial(_single, scale, on)) for name, on in _MODES.items()], _single_table
+    )
+
+
+_MODES = {"with time": True, "without time": False}
+
+
+def _shelf(scale: Scale, temporal: bool) -> Figures:
+    folder = _there(scale.shelf)
+    rig = read_rig(folder / "calibration.json")
+    recording = read_detections(folder, rig)
+    config = replace(PipelineConfig(), temporal=temporal)
+    people = reconstruct(recording, rig, config, frames=_frames(scale, len(recording)))
+    truth = read_shelf_ground_truth(folder / "gt_dev.txt")
+    matched = match_actors(people, truth)
+    return {
+        "average": evaluate_shelf(people, truth).pcp_average,
+        "interval": list(pcp_interval(matched)),
+        "switches": identity_switches(matched, people.person) if temporal else None,
+        "lost": [str(event) for event in lost_limbs(matched)],
+    }
+
+
+def _events_table(found: Mapping[str, Figures]) -> list[str]:
+    rows = []
+    for name, each in found.items():
+        low, high = each["interval"]
+        switches = "-" if each["switches"] is None else each["switches"]
+        cells = f"{each['average']:.2f} | {low:.1f} to {high:.1f} | {len(each['lost'])} | {switches}"
+        rows.append(f"| {name} | {cells} |")
+    head = (
+        "| Shelf | Avg PCP, % | 95 % interval over blocks of 15 frames | limbs lost, events | identity switches |"
+    )
+    lost = found.get("with time", {}).get("lost", [])
+    return [head, "|---" * 5 + "|", *rows, "", "With time: " + "; ".join(lost) + "."]
+
+
+def _views(scale: Scale) -> Figures:
+    folder = _there(scale.shelf)
+    rig = read_rig(folder / "calibration.json")
+    recording = read_detections(folder, rig)
+    frames = _frames(scale, len(recording))
+    config = PipelineConfig()
+    solve: Callable = partial(reconstruct, config=config, frames=frames)
+    cameras = held_out(recording, rig, solve(recording, rig), solve, config.observations)
+    return {
+        camera.name: {"inside": 100 * camera.inside, "of": len(camera.squared), "unmatched": camera.unmatched}
+        for camera in cameras
+    }
+
+
+def _view_table(found: Mapping[str, Figures]) -> list[str]:
+    rows = [
+        f"| {name} | {each['inside']:.1f} | {each['of']} | {each['unmatched']} |"
+        for name, each in found["shelf"].items()
+    ]
+    head = (
+        "| camera left out | inside the 95 % region, % | of its candidates | joints that the others do not place |"
+    )
+    return [head, "|---" * 4 + "|", *rows]
+
+
+def _single(scale: Scale, temporal: bool) -> Figures:
+    folder = _there(scale.pose2sim_single)
+    rig = read_rig(folder / "rig.json")
+    recording = read_detections(folder / "openpose", rig)
+    times = FrameTimes.from_fps(FPS, len(recording))
+    config = replace(PipelineConfig(), temporal=temporal)
+    people = reconstruct(recording, rig, config, frames=_frames(scale, len(recording)), times=times)
+    return measure_single_person(people, recording, rig).as_dict()
+
+
+def _single_table(found: Mapping[str, Figures]) -> list[str]:
+    rows = [f"| {name} | {' | '.join(words(each) for each in found.values())} |" for name, words in SINGLE.items()]
+    return [f"| pose2sim_single | {' | '.join(found)} |", "|---" * (1 + len(found)) + "|", *rows]
+
+
+def _frames(scale: Scale, count: int) -> range:
+    return range(min(len(QUICK), count)) if scale.quick else range(count)
+
+
+def _there(folder: Path | None) -> Path:
+    if folder is None:
+        raise ValueError("the recording is not there")
+    return folder

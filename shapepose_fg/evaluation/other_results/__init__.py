@@ -1,0 +1,1 @@
+"""Results of other systems, read so that they are scored like ours."""

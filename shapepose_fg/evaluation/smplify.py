@@ -1,0 +1,198 @@
+"""SMPL-only: bodies fitted to all views' 2D detections directly, without 3D joints or a graph in between.
+
+Multi-view SMPLify (Bogo et al., ECCV 2016), the paper's "SMPL-only": robust reprojection error weighted by
+confidence, pose prior, shape prior; the root first, then everything, with priors that loosen and a kernel that
+narrows.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from shapepose_fg.body.fitting.energy import BodyEnergy, robust_weight
+from shapepose_fg.body.fitting.person_frame import PersonFrame
+from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
+from shapepose_fg.body.model.rotation import log_so3
+from shapepose_fg.body.model.target_skeletons import slots
+from shapepose_fg.camera import Rig
+from shapepose_fg.observations import Observations
+
+Array = NDArray[np.float64]
+
+TORSO = ("Neck", "RShoulder", "LShoulder", "MidHip", "RHip", "LHip")
+"""What the root is found by."""
+_MOMENTUM, _MEMORY, _TINY = 0.8, 0.95, 1e-8
+"""Adam's averages, as in `gradient_descent.py`."""
+_MIN_DEPTH_M = 0.2
+_START_SIGMA_M = 0.05
+_MIN_START_JOINTS = 3
+
+
+@dataclass(frozen=True)
+class SmplifyConfig:
+    """Settings, chosen on the split `tune`: see docs/evaluation.md."""
+
+    iterations: int = 100
+    """Steps of Adam in all."""
+    root_iterations: int = 15
+    """Of these, the first move the root only, by the joints of the torso."""
+    sigma_m: float = 0.02
+    """One sigma of a detection of confidence 1, as a length at the person's depth."""
+    kernel_scale: float = 2.5
+    """Where the Geman-McClure kernel has cut a detection's weight to a quarter, sigmas."""
+    prior_start: float = 10.0
+    """How many times as stiff the priors begin; they loosen to 1 by the middle of the steps."""
+    prior: float = 1.0
+    """How stiff the priors are in the end, against detections that were independent."""
+    step_rad: float = 0.2
+    """Length of the first steps along each angle; it falls to zero as half a cosine."""
+    step_beta: float = 0.5
+    """The same along each beta."""
+    step_m: float = 0.03
+    """The same along the axes of the translation, metres."""
+
+
+@dataclass(frozen=True)
+class SmplifyPeople:
+    """N rows, one per person and frame; what `evaluation` scores."""
+
+    frame: NDArray[np.intp]
+    """(N,) frame."""
+    joints: Array
+    """(N, J, 3) the bodies' joints, where the detector puts them, metres; NaN where nothing placed the body."""
+    parameters: BodyParameters
+    """The bodies, NaN where there is none."""
+    iterations: int
+    """Steps that each body took."""
+
+
+class MultiViewSmplify:
+    """Fits bodies to the views' detections of rows that have nothing to do with each other, all at once."""
+
+    def __init__(
+        self, model: BodyModel | None = None, prior: PosePrior | None = None, config: SmplifyConfig | None = None
+    ):
+        model = BodyModel.default() if model is None else model
+        prior = PosePrior.default() if prior is None else prior
+        self.config = SmplifyConfig() if config is None else config
+        self.model = model.to(torch.float32)
+        self._frame = PersonFrame.of_angles(model, prior.mean, prior.covariance)
+        self._slots = slots(model.keypoint_names)
+        self._energy = BodyEnergy(self.model, prior.widened(1 / math.sqrt(self.config.prior)))
+        self._mean_angles = torch.from_numpy(prior.mean[self._energy.angles]).float()
+        self._torso = torch.tensor([name in TORSO for name in model.keypoint_names])
+
+    @torch.inference_mode()
+    def fit(self, observations: Observations, rig: Rig, start: Array) -> SmplifyPeople:
+        """Bodies of N rows.
+
+        Where triangulation puts the joints, `start` (N, J, 3), metres, NaN where it does not, gives the root's
+        first place, and nothing else. Rows with fewer than three joints have no body.
+        """
+        placed = np.asarray(np.isfinite(start).all(axis=-1))
+        rows = np.flatnonzero(placed.sum(axis=1) >= _MIN_START_JOINTS)
+        N, J = start.shape[:2]
+        joints = np.full((N, J, 3), np.nan)
+        free = torch.full((N, self._energy.num_free), torch.nan)
+        if len(rows) > 0:
+            rotation, pelvis = self._root(start[rows], placed[rows])
+            views = _ViewTargets.of(observations.rows(rows), rig, pelvis.numpy(), self.config.sigma_m)
+            solved = self._solve(rotation, views)
+            joints[rows] = (
+                self.model.keypoints(self._energy.complete(solved)).double().numpy() + pelvis.numpy()[:, None]
+            )
+            solved[:, -3:] += pelvis.float()
+            free[torch.from_numpy(rows)] = solved
+        return SmplifyPeople(observations.frame, joints, self._energy.complete(free), self.config.iterations)
+
+    def _root(self, start: Array, placed: NDArray[np.bool_]) -> tuple[Tensor, Tensor]:
+        """Rotations (B, 3, 3) and places (B, 3) of the root, by the torso's joints, or by all if these are few."""
+        torso = placed & self._torso.numpy()
+        used = np.where(torso.sum(axis=1, keepdims=True) >= _MIN_START_JOINTS, torso, placed)
+        variance = np.where(used, _START_SIGMA_M**2, 1e6)
+        xyz = torch.from_numpy(np.where(used[..., None], start, 0.0))
+        # Nothing of a joint that is not used: its place is that of those that are.
+        centre = np.nanmean(np.where(used[..., None], start, np.nan), axis=1, keepdims=True)
+        xyz = torch.where(torch.from_numpy(used)[..., None], xyz, torch.from_numpy(centre))
+        return self._frame.place(xyz, torch.from_numpy(variance), self._slots)
+
+    def _solve(self, rotation: Tensor, views: "_ViewTargets") -> Tensor:
+        """Free parameters (B, P) around the root's start: all steps of Adam (Kingma and Ba 2015)."""
+        config, energy = self.config, self._energy
+        B = len(rotation)
+        angles = self._mean_angles.expand(B, -1)
+        transl = self._frame.transl.float().expand(B, -1)
+        free = torch.cat((torch.zeros(B, 10), log_so3(rotation).float(), angles, transl), 1)
+        lengths = torch.full((energy.num_free,), config.step_rad)
+        lengths[:10], lengths[-3:] = config.step_beta, config.step_m
+        first, second = torch.zeros_like(free), torch.zeros_like(free)
+        for n in range(config.iterations):
+            root_only = n < config.root_iterations
+            if n == config.root_iterations:
+                first, second = torch.zeros_like(free), torch.zeros_like(free)
+            stage = (n - config.root_iterations) / max(config.iterations - config.root_iterations, 1)
+            done = n / max(config.root_iterations, 1) if root_only else stage
+            looser = 1.0 if root_only else max(0.0, 1.0 - 2.0 * stage)
+            stiff, scale = config.prior_start**looser, config.kernel_scale * 4.0**looser
+            only = self._torso if root_only else None
+            # The priors are the energy's own; stiffer ones are detections that weigh less.
+            slope = energy.slope_of(free, lambda xyz: views.pull(xyz, scale, 1 / stiff, only))  # noqa: B023
+            gradient = slope.gradient.clone()
+            if root_only:
+                gradient[:, :10] = 0.0
+                gradient[:, 13:-3] = 0.0
+            first = _MOMENTUM * first + (1 - _MOMENTUM) * gradient
+            second = _MEMORY * second + (1 - _MEMORY) * gradient.square()
+            age = n + 1 if root_only else n + 1 - config.root_iterations
+            unbiased = math.sqrt(1 - _MEMORY**age) / (1 - _MOMENTUM**age)
+            length = 0.5 * (1 + math.cos(math.pi * done)) * unbiased * lengths
+            free = energy.retract(free, -length * first / (second.sqrt() + _TINY))
+        return free
+
+
+@dataclass(frozen=True)
+class _ViewTargets:
+    """The detections of B rows as lengths at each row's depth, around each row's own origin."""
+
+    cTw: Tensor
+    """(V, 3, 3) rotations, camera from world."""
+    origin: Tensor
+    """(B, V, 3) the row's origin in each camera, metres."""
+    xy: Tensor
+    """(B, J, V, 2) detections, normalised image coordinates."""
+    weight: Tensor
+    """(B, J, V) confidence; 0 where there is none."""
+    scale: Tensor
+    """(B, V) depth of the origin over sigma: from normalised coordinates to sigmas."""
+
+    @classmethod
+    def of(cls, observations: Observations, rig: Rig, origin: Array, sigma_m: float) -> "_ViewTargets":
+        """The detections of B rows, with `origin` (B, 3) in the world."""
+        B, J, V = observations.confidence.shape
+        view = np.tile(np.arange(V), B * J)
+        xy = rig.normalise(view, observations.xy.reshape(-1, 2)).reshape(B, J, V, 2)
+        in_camera = np.einsum("vij,bj->bvi", rig.cTw[:, :, :3], origin) + rig.cTw[:, :, 3]
+        scale = np.maximum(in_camera[..., 2], _MIN_DEPTH_M) / sigma_m
+        parts = (rig.cTw[:, :, :3], in_camera, xy, observations.confidence, scale)
+        return cls(*(torch.from_numpy(np.ascontiguousarray(part)).float() for part in parts))
+
+    def pull(self, xyz: Tensor, kernel_scale: float, weight: float, only: Tensor | None) -> tuple[Tensor, Tensor]:
+        """See `BodyEnergy.slope_of`: squared distances (B, J), summed over the views, and forces (B, J, 3)."""
+        camera = torch.einsum("vij,bkj->bkvi", self.cTw, xyz) + self.origin[:, None]
+        depth = camera[..., 2].clamp_min(_MIN_DEPTH_M)
+        projected = camera[..., :2] / depth[..., None]
+        residual = (projected - self.xy) * self.scale[:, None, :, None]
+        squared = residual.square().sum(-1)
+        strength = weight * self.weight * (camera[..., 2] > _MIN_DEPTH_M)
+        if only is not None:
+            strength = strength * only[:, None]
+        robust = strength * robust_weight(squared, torch.tensor(kernel_scale))
+        across = (robust * self.scale[:, None] / depth)[..., None] * residual
+        along = -(across * projected).sum(-1, keepdim=True)
+        forces = torch.einsum("vij,bkvi->bkj", self.cTw, torch.cat((across, along), -1))
+        return (strength * squared).sum(-1), forces

@@ -1,0 +1,119 @@
+"""What is left out of a frame with more detections than people could make, so that no frame takes for ever.
+
+Every detection meets those of the same joint in all other views, and each candidate that comes of it meets
+everybody: the work grows with the square of both. Ordinary crowds (a dozen people before thirty cameras) stay
+below both bounds.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.detections import Detections, DetectionSequence
+from shapepose_fg.proposal.candidates import CandidateConfig, Candidates, PairPoints
+from shapepose_fg.skeleton import Skeleton
+
+_LEAST_IN_A_VIEW = 8
+"""Detections of a joint that a view may always have, however many views there are."""
+
+
+@dataclass(frozen=True)
+class ThinnedFrames:
+    """A recording whose frames have no more detections than are allowed."""
+
+    frames: DetectionSequence
+    """The recording as it is."""
+    views: int
+    """V, its cameras."""
+    config: CandidateConfig
+    """How many are allowed."""
+
+    @property
+    def skeleton(self) -> Skeleton:
+        """The detector's joints."""
+        return self.frames.skeleton
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, frame: int, /) -> Detections:
+        every = self.frames[frame]
+        kept = kept_detections(every, self.views, self.config)
+        return every if kept is None else every.only(kept)
+
+    def in_recording(self, frame: int, candidate: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Detections of a thinned frame, of any shape, -1 for none: which of the recording's own they are."""
+        kept = kept_detections(self.frames[frame], self.views, self.config)
+        return candidate if kept is None else np.append(np.flatnonzero(kept), -1)[candidate]
+
+    def is_thinned(self, frame: int) -> bool:
+        """Whether detections of a frame were left out."""
+        return kept_detections(self.frames[frame], self.views, self.config) is not None
+
+
+def kept_detections(detections: Detections, views: int, config: CandidateConfig) -> NDArray[np.bool_] | None:
+    """(D,) the detections that stay; None where all do.
+
+    Of each joint each view keeps its most confident ones, as many as make at most `config.most_pairs` pairs of
+    views.
+    """
+    joints = int(detections.joint.max(initial=0)) + 1
+    group = detections.view * joints + detections.joint
+    most = max(_LEAST_IN_A_VIEW, int(np.sqrt(2 * config.most_pairs / max(views * (views - 1), 1))))
+    if np.bincount(group, minlength=1).max() <= most:
+        return None
+    return _best(group, most, (-detections.confidence,))
+
+
+def thinned_points(points: PairPoints, config: CandidateConfig) -> PairPoints:
+    """The points that stay: of each joint the `config.most_points` most confident."""
+    if np.bincount(points.joint, minlength=1).max() <= config.most_points:
+        return points
+    keep = _best(points.joint, config.most_points, (-points.score,))
+    return PairPoints(points.xyz[keep], points.joint[keep], points.pair[keep], points.score[keep])
+
+
+def thinned_candidates(candidates: Candidates, detections: Detections, config: CandidateConfig) -> Candidates:
+    """The candidates that stay: of each joint `config.most_candidates`, and fewer where they have too many links.
+
+    Strong ones stay first, then those with most votes and confidence.
+    """
+    most = config.most_candidates
+    kept = _with_most(candidates, most)
+    while most > _LEAST_IN_A_VIEW and _count_links(kept, detections) > _MOST_LINKS:
+        most //= 2
+        kept = _with_most(kept, most)
+    return kept
+
+
+_MOST_LINKS = 2_000_000
+"""Pairs of candidates that affinities speak of: 12 people before 30 cameras have 50,000."""
+
+
+def _count_links(candidates: Candidates, detections: Detections) -> int:
+    """How many pairs of candidates the affinities of a frame speak of."""
+    supports = np.bincount(candidates.support[:, 1], minlength=len(detections))
+    return int(supports[detections.pairs].prod(axis=1).sum())
+
+
+def _with_most(candidates: Candidates, most: int) -> Candidates:
+    """At most so many candidates of each joint, the best ones."""
+    if np.bincount(candidates.joint, minlength=1).max() <= most:
+        return candidates
+    keep = _best(candidates.joint, most, (-candidates.score, -candidates.votes, ~candidates.strong))
+    place = np.cumsum(keep) - 1
+    support = candidates.support[keep[candidates.support[:, 0]]]
+    columns = {name: getattr(candidates, name)[keep] for name in ("xyz", "joint", "score", "votes", "strong")}
+    return replace(candidates, **columns, support=np.column_stack([place[support[:, 0]], support[:, 1]]))
+
+
+def _best(group: NDArray[np.intp], most: int, order: tuple[NDArray[Any], ...]) -> NDArray[np.bool_]:
+    """(N,) the first `most` of each group by `order` (last key first), then as they stand."""
+    ranked = np.lexsort((*order, group))
+    sizes = np.bincount(group)
+    place = np.arange(len(group)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    keep = np.zeros(len(group), dtype=bool)
+    keep[ranked[place < most]] = True
+    return keep

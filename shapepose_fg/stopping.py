@@ -1,0 +1,58 @@
+"""Ctrl-C and a request to end: the program stops where it is, says so in a sentence, and keeps what is done."""
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import NoReturn
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Stopped(BaseException):
+    """The user, or the system, wants the program to end; nobody's error, so that nothing catches it by chance."""
+
+    def __init__(self, number: int, message: str = "") -> None:
+        super().__init__(message)
+        self.number = number
+        """Of the signal."""
+        self.message = message
+        """Where the work stands, and how to go on."""
+
+    @property
+    def exit_code(self) -> int:
+        """What a shell shows for a program that ended by this signal."""
+        return 128 + self.number
+
+
+@contextmanager
+def stoppable() -> Iterator[None]:
+    """Inside the block a signal raises `Stopped`, once: the second is not to disturb the tidying up.
+
+    What the parent process wants to be ignored stays ignored; in another thread than the main one nothing changes.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    stopped = False
+
+    def stop(number: int, _: FrameType | None) -> None:
+        nonlocal stopped
+        if not stopped:
+            stopped = True
+            _raise(number)
+
+    before = {number: signal.getsignal(number) for number in _SIGNALS}
+    heard = [number for number in _SIGNALS if before[number] not in (signal.SIG_IGN, None)]
+    for number in heard:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number in heard:
+            signal.signal(number, before[number])
+
+
+def _raise(number: int) -> NoReturn:
+    raise Stopped(number)

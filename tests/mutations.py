@@ -1,0 +1,137 @@
+"""A valid file with something wrong in it: text, numbers, structure, arrays, bytes."""
+
+import io
+import random
+import re
+import zipfile
+
+NUMBERS = [
+    *"0 -1 1e400 -1e308 1e-320 nan NaN Infinity null true [] {}".split(),
+    *"99999999999999999999 2147483648 0x10 1_000".split(),
+    "9" * 5000,
+    "0." + "0" * 400 + "1",
+    "[" * 2000 + "]" * 2000,
+    '"' + "a" * 3000 + '"',
+    "{a: 1, a: 2}",
+]
+WORDS = [
+    "zzz",
+    "",
+    "../../x",
+    "a\\u0000b",
+    "\u202e",
+    "name",
+    "*a",
+    "&a",
+    "!!python/object:os.system",
+    "<!DOCTYPE a>",
+]
+_LARGEST = 2**18
+"""Bytes of what comes out: readers are to be tried, not the disk."""
+_TEXT = re.compile(rb"[\t\n\r -~]{64}")
+
+
+def mutated(content: bytes, rng: random.Random) -> bytes:
+    """`content` with one to three things changed, as fits what it is."""
+    for _ in range(rng.choice((1, 1, 1, 2, 3))):
+        if content[:2] == b"PK" and rng.random() < 0.9:
+            content = _archive(content, rng)
+        elif _TEXT.match(content) is not None and rng.random() < 0.9:
+            content = _text(content.decode("utf-8", "replace"), rng).encode("utf-8", "replace")
+        else:
+            content = _bytes(content, rng)
+        content = content[:_LARGEST]
+    return content
+
+
+def _text(text: str, rng: random.Random) -> str:
+    """Cut, or with something changed, taken out, doubled or renamed."""
+    place = rng.randrange(len(text) + 1)
+    match rng.randrange(8):
+        case 0:
+            return text[:place]
+        case 1:
+            return text[:place] + rng.choice("0123456789-.eE[]{}\":,=<>/ \nax\x00&*%!\\'") + text[place + 1 :]
+        case 2:
+            return text[:place] + text[place + rng.randrange(1, 40) :]
+        case 3:
+            return text[: place + rng.randrange(1, 60)] + text[place:]
+        case 4 | 5:
+            found, new = list(re.finditer(r"-?\d+\.?\d*(e-?\d+)?", text)), rng.choice(NUMBERS)
+        case 6:
+            found, new = list(re.finditer(r"[A-Za-z_]{3,}", text)), rng.choice(WORDS)
+        case _:
+            lines = text.splitlines(keepends=True) or [""]
+            one, other = rng.randrange(len(lines)), rng.randrange(len(lines))
+            lines[one], lines[other] = lines[other], lines[one] * rng.choice((0, 1, 2, 50))
+            return "".join(lines)
+    if len(found) == 0:
+        return text
+    chosen = rng.choice(found)
+    return text[: chosen.start()] + new + text[chosen.end() :]
+
+
+def _archive(content: bytes, rng: random.Random) -> bytes:
+    """An `.npz` with one array changed, its checksum right again; or its own bytes changed."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            members = {name: archive.read(name) for name in archive.namelist()}
+    except Exception:
+        return _bytes(content, rng)
+    if len(members) == 0 or rng.random() < 0.15:
+        return _bytes(content, rng)
+    name = rng.choice(sorted(members))
+    if rng.random() < 0.1:
+        members[rng.choice((name + "x", "frame.npy", "../x.npy"))] = members.pop(name)
+    elif rng.random() < 0.5:
+        members[name] = _header(members[name], rng)
+    else:
+        members[name] = _bytes(members[name], rng)
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", rng.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))) as archive:
+        for key, value in members.items():
+            archive.writestr(key, value)
+    return stream.getvalue()
+
+
+def _header(array: bytes, rng: random.Random) -> bytes:
+    """An array that says something else of itself, in as many bytes."""
+    head, body = array[:128], array[128:]
+    changes = [
+        (b"'<f8'", b"'<i8'"),
+        (b"'<i8'", b"'<f8'"),
+        (b"'<f8'", b"'<U2'"),
+        (b"'<f", b"'>f"),
+        (rb"'\S\S\S'", b"'|O8'"),
+        (rb"\d+,", b"%d," % rng.randrange(-2, 10)),
+        (rb"\(\d", b"(9"),
+        (b"False", b"True "),
+        (rb"\d", b"0"),
+    ]
+    old, new = rng.choice(changes)
+    head = re.sub(old, new, head, count=1)
+    if rng.random() < 0.5:
+        kind = rng.choice((b"\xff" * 8, b"\0" * 8, b"\0" * 6 + b"\xf0\x7f", b"\0" * 6 + b"\xf8\x7f"))
+        at = 8 * rng.randrange(max(1, len(body) // 8))
+        body = body[:at] + kind + body[at + 8 :]
+    return head[:128] + body
+
+
+def _bytes(content: bytes, rng: random.Random) -> bytes:
+    """Bits turned, bytes put in, cut out or doubled."""
+    if len(content) == 0:
+        return rng.randbytes(3)
+    place, length = rng.randrange(len(content)), rng.randrange(1, 16)
+    match rng.randrange(6):
+        case 0:
+            return content[:place]
+        case 1:
+            return content[:place] + bytes([content[place] ^ 1 << rng.randrange(8)]) + content[place + 1 :]
+        case 2:
+            return content[:place] + rng.randbytes(length) + content[place + length :]
+        case 3:
+            return content[:place] + content[place + length :]
+        case 4:
+            return content[: place + length] + content[place:]
+        case _:
+            return content[:place] + b"\xff" * length + content[place + length :]
