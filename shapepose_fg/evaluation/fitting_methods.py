@@ -98,7 +98,7 @@ def learned_methods() -> tuple[Method, ...]:
 
     def polished(steps: int | None) -> BodyFitter:
         config = LearnedFitterConfig()
-        short = replace(config, polish_steps=steps or 0, unfinished=np.inf)  # no row is given up
+        short = replace(config, polish_steps=steps or 0, unfinished=1e6)  # no row is given up
         return LearnedFitter(config=config if steps is None else short)
 
     return (
