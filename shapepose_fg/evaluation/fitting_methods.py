@@ -60,7 +60,7 @@ class ClosedFormFitter(LevenbergMarquardtFitter):
     def __init__(self, model: BodyModel | None = None, pose_prior: PosePrior | None = None, steps: int | None = 0):
         plain = PlainFitterConfig()
         steps = plain.max_iterations if steps is None else steps
-        super().__init__(model, pose_prior, PlainFitterConfig(max_iterations=max(steps, 1), unfinished=np.inf))
+        super().__init__(model, pose_prior, PlainFitterConfig(max_iterations=max(steps, 1), unfinished=1e6))
         self._steps = steps
         self._closed_form = ClosedFormStart(self._energy.model, self._prior)
 
@@ -98,7 +98,7 @@ def learned_methods() -> tuple[Method, ...]:
 
     def polished(steps: int | None) -> BodyFitter:
         config = LearnedFitterConfig()
-        short = replace(config, polish_steps=steps or 0, unfinished=np.inf)  # no row is given up
+        short = replace(config, polish_steps=steps or 0, unfinished=1e6)  # no row is given up
         return LearnedFitter(config=config if steps is None else short)
 
     return (
@@ -119,7 +119,7 @@ def _gradient_descent(steps: int | None) -> BodyFitter:
 def _levenberg_marquardt(steps: int | None) -> BodyFitter:
     if steps is None:
         return LevenbergMarquardtFitter()
-    return LevenbergMarquardtFitter(config=PlainFitterConfig(max_iterations=steps, unfinished=np.inf))
+    return LevenbergMarquardtFitter(config=PlainFitterConfig(max_iterations=steps, unfinished=1e6))
 
 
 def timed_fit(fitter: BodyFitter, targets: JointTargets, batch: int, rounds: int = 1) -> tuple[BodyFit, Array]:
