@@ -2,60 +2,50 @@
 
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Annotated, Any
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
 
 import numpy as np
-from annotated_types import Interval
 
 from shapepose_fg.bodies_over_time import Person, PersonBodies, SequenceFitting, fit_everybody
-from shapepose_fg.body.fitting.bone_reach import longest_bones
 from shapepose_fg.body.fitting.fitter import BodyFitter
-from shapepose_fg.body.fitting.fitters import BodyConfig, make_fitter
+from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.fitting.weights import fingerprint
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.offsets.estimation import learn_offsets
 from shapepose_fg.body.shapes import SubjectShapes
 from shapepose_fg.body.threads import torch_threads
-from shapepose_fg.bounds import Settings
 from shapepose_fg.camera import Rig
-from shapepose_fg.detections import Detections, DetectionSequence
+from shapepose_fg.chunk_work import ChunkJob, solve_chunk
+from shapepose_fg.cluster import Cluster
+from shapepose_fg.detections import DetectionSequence
+from shapepose_fg.engine import Setup, find_people
 from shapepose_fg.estimation.detector_offsets import (
     AdjustableFitter,
-    OffsetConfig,
     confident_targets,
     spread_frames,
 )
-from shapepose_fg.estimation.estimator import Estimator, ExtraFactors
-from shapepose_fg.estimation.estimator_config import EstimatorConfig, RefineConfig
-from shapepose_fg.estimation.linearisation import ObservationConfig
-from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
-from shapepose_fg.estimation.window_graph import WindowGraphConfig
+from shapepose_fg.estimation.estimator import ExtraFactors
 from shapepose_fg.frame_times import FrameTimes, check_cuts, spans_of, stretches
 from shapepose_fg.kept_arrays import InMemory, KeptArrays
 from shapepose_fg.observation_table import place_in_view
 from shapepose_fg.observations import Observations
-from shapepose_fg.proposal.association import AssociationConfig, associate
-from shapepose_fg.proposal.candidates import CandidateConfig, triangulate_pairs, vote
-from shapepose_fg.proposal.proposals import ProposalConfig, propose
-from shapepose_fg.proposal.thinning import ThinnedFrames, thinned_candidates, thinned_points
+from shapepose_fg.pipeline_config import PipelineConfig
+from shapepose_fg.proposal.thinning import ThinnedFrames
 from shapepose_fg.provenance import versions
 from shapepose_fg.reconstruction import Reconstruction
 from shapepose_fg.runs.assembly import Assembly
 from shapepose_fg.runs.checkpoint import Checkpoint
+from shapepose_fg.runs.chunks import Chunk, Identities, cut_in_chunks
 from shapepose_fg.runs.notes import Notebook, Notes
 from shapepose_fg.runs.parts import Part, Parts
 from shapepose_fg.skeleton import BODY_25, Skeleton
 from shapepose_fg.solved_rows import result_rows
-from shapepose_fg.tracking.following import FollowingConfig, Input
-from shapepose_fg.tracking.stitching import StitchingConfig, Traces, stitch
-from shapepose_fg.tracking.tracker import BodyScale, Tracker, TrackingConfig
-from shapepose_fg.windows import Engine, Solved, Span, WindowConfig, WindowSolver
-from shapepose_fg.workers import Workers
-
-FAST_M_S = 3.0
-"""The tracker predicts joints as if they moved so fast: a hand that is thrown up or strikes."""
+from shapepose_fg.tracking.following import Input
+from shapepose_fg.tracking.stitching import Traces, stitch
+from shapepose_fg.windows import Engine, Solved, Span
+from shapepose_fg.workers import Pool, Workers
 
 FRAMES_WORTH_A_WORKER = 200
 """A recording must have this many for each worker: starting one takes some seconds of a core, and a window is a
@@ -63,62 +53,6 @@ hundred frames."""
 
 Progress = Callable[[int, int], None]
 """Called with the number of frames that are done and the number of all."""
-
-
-@dataclass(frozen=True)
-class PipelineConfig(Settings):
-    """The settings of every step, and how the work is cut."""
-
-    candidates: CandidateConfig = field(default_factory=CandidateConfig)
-    """Stage I (b, c): pairs of views to 3D joint candidates."""
-    proposals: ProposalConfig = field(default_factory=ProposalConfig)
-    """Stage I (d): candidates to people."""
-    association: AssociationConfig = field(default_factory=AssociationConfig)
-    """Stage I (e): people to their 2D observations."""
-    observations: ObservationConfig = field(default_factory=ObservationConfig)
-    """How far a 2D observation is trusted."""
-    tracking: TrackingConfig = field(default_factory=TrackingConfig)
-    """People over time: how they are followed from frame to frame."""
-    following: FollowingConfig = field(default_factory=FollowingConfig)
-    """People over time: what becomes of tracks."""
-    stitching: StitchingConfig = field(default_factory=StitchingConfig)
-    """People over time: who comes back after a longer time out of sight."""
-    windows: WindowConfig = field(default_factory=WindowConfig)
-    """People over time: how frames are cut into windows, and how often detections are given out again."""
-    window_graph: WindowGraphConfig = field(default_factory=WindowGraphConfig)
-    """Stage II: the factor graph of a person."""
-    motion: MotionConfig = field(default_factory=MotionConfig)
-    """Stage II: how frames hang together."""
-    body: BodyConfig = field(default_factory=BodyConfig)
-    """Stage II: how bodies are fitted."""
-    offsets: OffsetConfig = field(default_factory=OffsetConfig)
-    """Stage II: where the detector puts its joints on the body."""
-    refine: RefineConfig = field(default_factory=RefineConfig)
-    """Stage II: the alternation."""
-    temporal: bool = True
-    """People over time: identities, motion, one shape a person. Without it every frame stands alone."""
-    batch_frames: Annotated[int, Interval(ge=1, le=10000)] = 96
-    """Frames that are solved together and returned: bodies are fitted fastest by the hundred."""
-    threads: Annotated[int, Interval(ge=1, le=256)] = 1
-    """Threads of torch while bodies are fitted: the matrices are small, and where cores are busy a second thread
-    costs more than it brings."""
-
-    @classmethod
-    def paper(cls) -> "PipelineConfig":
-        """The method as the paper has it written in section 3, without what we settled differently."""
-        return cls(
-            candidates=CandidateConfig.paper(),
-            proposals=ProposalConfig.paper(),
-            association=AssociationConfig.paper(),
-            observations=ObservationConfig.paper(),
-            tracking=TrackingConfig(min_new_joints=1),
-            windows=WindowConfig(again_alone=0),
-            window_graph=WindowGraphConfig.paper(),
-            body=BodyConfig.paper(),
-            offsets=OffsetConfig(source="none"),
-            refine=RefineConfig.paper(),
-            temporal=False,
-        )
 
 
 def reconstruct(
@@ -134,6 +68,8 @@ def reconstruct(
     shapes: SubjectShapes | None = None,
     progress: Progress | None = None,
     workers: int = 1,
+    cluster: str | None = None,
+    chunk_frames: int | None = None,
 ) -> Reconstruction:
     """Reconstruct the people of a recording over time; with `config.temporal` false, every frame by itself.
 
@@ -142,8 +78,11 @@ def reconstruct(
     time (without time, the number of a person within the frame). `times` says when the frames were taken; without
     it 30 frames a second are assumed, and `run` says so. `cuts` are first frames of what follows a cut: nothing
     carries over to them, identities least of all. `shapes` are people known from other recordings. `workers`
-    processes solve (1: this one does); they change no byte of the result. `run` of the result holds the
-    configuration, versions, seconds per stage (over all processes), how many people were found and dropped, with
+    processes solve (1: this one does); they change no byte of the result. `cluster` is the address of a Dask
+    scheduler whose processes do it instead, or `local` for `workers` processes of Dask's own. With `chunk_frames`
+    people are followed side by side, too, chunk by chunk of about so many frames, for which identities are joined
+    across the borders (`runs/chunks.py`); the result may differ by who was in hiding there. `run` of the result
+    holds the configuration, versions, seconds per stage (over all processes), how many people were found and dropped, with
     reasons, and where the detector's joints lie on the body. That is learnt from frames spread over the whole
     recording, whatever `frames` picks; a fitter of your own takes part if it is an `AdjustableFitter`.
     """
@@ -160,6 +99,8 @@ def reconstruct(
         shapes=shapes,
         progress=progress,
         workers=workers,
+        cluster=cluster,
+        chunk_frames=chunk_frames,
     ).reconstruction()
 
 
@@ -177,6 +118,8 @@ def reconstruct_parts(
     shapes: SubjectShapes | None = None,
     progress: Progress | None = None,
     workers: int = 1,
+    cluster: str | None = None,
+    chunk_frames: int | None = None,
 ) -> Assembly:
     """`reconstruct` whose windows leave memory for `kept` as they are solved, and whose result is made of them.
 
@@ -190,6 +133,11 @@ def reconstruct_parts(
     times = FrameTimes.assumed(len(detections)) if times is None else times
     times.check(len(detections), len(rig))
     cuts = check_cuts(cuts, len(detections))
+    if chunk_frames is not None and not (config.temporal and chunk_frames >= config.batch_frames):
+        raise ValueError(
+            f"chunk_frames must be at least batch_frames ({config.batch_frames}), for people over time; got"
+            f" {chunk_frames}"
+        )
     book, skeleton = Notebook(), detections.skeleton
     detections = ThinnedFrames(detections, len(rig), config.candidates)
     with book.stage("load"):
@@ -199,13 +147,18 @@ def reconstruct_parts(
         offsets = _kept_offsets(kept, detections, rig, config, fitter, book)
         if isinstance(fitter, AdjustableFitter) and offsets is not None:
             fitter = fitter.with_keypoint_offsets(offsets)
-        engine = _engine(rig, skeleton, config, fitter, extra_factors, book)
+        setup = Setup(rig, skeleton, config, fitter, extra_factors)
         parts = Parts(kept)
         read = _inputs(detections, rig, frames, times, book)
         done = parts.notes().frames
-        with Workers(workers, engine.solver) as pool:
+        with _pool(cluster, workers, setup) as pool:
             beginning = book.torn_off()
-            for part in _solved(engine, pool, read, parts.checkpoint(read), frames, cuts, book, config):
+            begin = parts.checkpoint(read)
+            if chunk_frames is None:
+                solved = _solved(setup.engine(book), pool, read, begin, frames, cuts, book, config)
+            else:
+                solved = _solved_in_chunks(setup, pool, read, begin, frames, cuts, times, book, chunk_frames)
+            for part in solved:
                 rows = _rows(part.solved, rig, detections, config)
                 parts.append(Part(rows, part.notes, part.checkpoint))
                 done += part.notes.frames
@@ -254,59 +207,6 @@ def estimate_offsets(
             f"offsets are known for {BODY_25.name} only, these are joints of {detections.skeleton.name}"
         )
     return offsets
-
-
-def find_people(
-    detections: Detections, rig: Rig, skeleton: Skeleton, config: PipelineConfig, book: Notebook | None = None
-) -> Observations:
-    """Stage I, one frame: the people's 2D observations and where their joints are to begin with."""
-    book = Notebook() if book is None else book
-    with book.stage("triangulate"):
-        every = triangulate_pairs(detections, rig, config.candidates)
-        points = thinned_points(every, config.candidates)
-        book.thin("points", len(points.xyz) < len(every.xyz))
-    with book.stage("vote"):
-        every = vote(points, detections, len(rig), config.candidates)
-        candidates = thinned_candidates(every, detections, config.candidates)
-        book.thin("candidates", len(candidates) < len(every))
-    with book.stage("propose"):
-        proposals = propose(candidates, detections, skeleton, rig.up_vector, config.proposals)
-    with book.stage("associate"):
-        observations, phantoms = associate(proposals, candidates, detections, rig, skeleton, config.association)
-    for reason, count in (*proposals.dropped.items(), ("hardly any joint seen by two views", phantoms)):
-        book.drop(reason, count)
-    return observations
-
-
-def _engine(
-    rig: Rig,
-    skeleton: Skeleton,
-    config: PipelineConfig,
-    fitter: BodyFitter,
-    extra_factors: ExtraFactors | None,
-    book: Notebook,
-) -> Engine:
-    """Everything from frames to rows."""
-    weaker = replace(config, candidates=replace(config.candidates, min_votes=1))
-
-    def find(detections: Detections, rig: Rig, weak: bool) -> Observations:
-        return find_people(detections, rig, skeleton, weaker if weak else config, book)
-
-    motion = MotionModel.load(skeleton.joints, config.motion)
-    scale = BodyScale(longest_bones(skeleton), motion.psd(np.full(len(skeleton), FAST_M_S)))
-    settings = EstimatorConfig(config.observations, config.window_graph, config.refine, config.motion)
-    return Engine(
-        Tracker(skeleton, scale, find, config.tracking, config.observations, weak_births=config.temporal),
-        config.following,
-        WindowSolver(
-            Estimator(rig, fitter, skeleton.joints, settings),
-            skeleton,
-            config.tracking.assignment,
-            config.windows,
-            extra_factors,
-        ),
-        frames=config.batch_frames,
-    )
 
 
 def _inputs(
@@ -382,7 +282,7 @@ class _Done:
 
 def _solved(
     engine: Engine,
-    pool: Workers[WindowSolver],
+    pool: Pool[Setup],
     read: Callable[[int], Input],
     begin: Checkpoint | None,
     frames: range,
@@ -398,16 +298,70 @@ def _solved(
             waiting.append(window)
             yield window.span
 
-    for solved in pool.map(WindowSolver.solve, spans()):
+    for solved in pool.map(_solve, spans()):
         window = waiting.popleft()
         notes = Notes(solved.frames, dict(solved.seconds), problems=list(solved.estimates.problems))
         notes.add(window.notes)
         yield _Done(solved, notes, window.checkpoint)
 
 
-def _bodies(solver: WindowSolver, person: Person) -> PersonBodies:
+def _solve(setup: Setup, span: Span) -> Solved:
+    """One window, in whatever process."""
+    return setup.solver.solve(span)
+
+
+def _solved_in_chunks(
+    setup: Setup,
+    pool: Pool[Setup],
+    read: Callable[[int], Input],
+    begin: Checkpoint | None,
+    frames: range,
+    cuts: Sequence[int],
+    times: FrameTimes,
+    book: Notebook,
+    chunk_frames: int,
+) -> Iterator[_Done]:
+    """The windows from `begin` on, in order, whose people were followed chunk by chunk."""
+    begin = Checkpoint(frames.start) if begin is None else begin
+    chunks = cut_in_chunks(frames, cuts, times.frame_s, setup.config, chunk_frames)
+    waiting: deque[tuple[Chunk, Notes]] = deque()
+
+    def jobs() -> Iterator[ChunkJob]:
+        for chunk in chunks:
+            if chunk.own.start >= begin.frame:
+                given = tuple(read(frame) for frame in range(chunk.first, chunk.until))
+                waiting.append((chunk, book.torn_off()))
+                yield ChunkJob(chunk, given)
+
+    identities = Identities(begin.next_id, begin.border)
+    for found in pool.map(solve_chunk, jobs()):
+        chunk, notes = waiting.popleft()
+        names = identities.names(found.begins, alone=chunk.first == chunk.own.start)
+        identities.remember(found.ends, names)
+        for n, solved in enumerate(found.solved, start=1):
+            seconds, problems = dict(solved.seconds), list(solved.estimates.problems)
+            renamed = [replace(each, track=identities.name(each.track, names)) for each in problems]
+            of_window = Notes(solved.frames, seconds, problems=renamed)
+            track = np.array([identities.name(each, names) for each in solved.observations.track.tolist()])
+            last = n == len(found.solved)
+            if last:
+                of_window.add(notes)
+                of_window.add(found.notes)
+            rows = replace(solved.observations, track=track.astype(np.intp))
+            behind = Checkpoint(chunk.own.stop, identities.next_id, border=identities.border) if last else None
+            yield _Done(replace(solved, observations=rows), of_window, behind)
+
+
+def _pool(cluster: str | None, workers: int, setup: Setup) -> "Workers[Setup] | Cluster[Setup]":
+    """The processes that take part."""
+    if cluster is None:
+        return Workers(workers, setup)
+    return Cluster(None if cluster == "local" else cluster, workers, setup)
+
+
+def _bodies(setup: Setup, person: Person) -> PersonBodies:
     """One person's bodies, in whatever process."""
-    fitter = solver.estimator.fitter
+    fitter = setup.fitter
     if not isinstance(fitter, SequenceFitting):
         raise TypeError(f"{type(fitter).__name__} does not fit bodies over time")
     return person.fitted(fitter)

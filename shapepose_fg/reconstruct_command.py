@@ -73,6 +73,13 @@ def reconstruct(
     workers: Annotated[
         int | None, typer.Option(help="Processes that solve; by default as many as pay. They change no byte.")
     ] = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="A Dask scheduler (tcp://host:8786) whose processes solve; or local."),
+    ] = None,
+    chunk_frames: Annotated[
+        int | None, typer.Option(help="Follow people side by side, too, in chunks of about so many frames.")
+    ] = None,
     report: Annotated[
         bool, typer.Option("--report/--no-report", help="Leave report.html, the result as a page to look at.")
     ] = True,
@@ -123,6 +130,11 @@ def reconstruct(
             raise InputError(
                 "--shapes: a person's shape is known over time only; leave out --shapes or --no-temporal"
             )
+        if chunk_frames is not None and not (settings.temporal and chunk_frames >= settings.batch_frames):
+            raise InputError(
+                f"--chunk-frames {chunk_frames}: must be {settings.batch_frames} (batch_frames) or more, for people"
+                " over time"
+            )
         if whole is not None and not settings.temporal:
             raise InputError("--project: its files need people over time; leave out --no-temporal, or --project")
         source = settings.offsets.source
@@ -130,9 +142,9 @@ def reconstruct(
         fitter = fitter_of(body, settings, recording.skeleton.joints)
         inputs = reading.checksums((calibration, *recording.sources, config, body, timestamps))
         inputs |= {} if offsets is None else checksums([offsets])
-        job = Job(rig, recording, settings, span, times, first_frames, body, fitter, shapes, inputs)
+        job = Job(rig, recording, settings, span, times, first_frames, body, fitter, shapes, inputs, chunk_frames)
         # Of its own detections `detect` knows which pictures they are of.
         own = (detections / "footage.json").is_file()
         videos = None if whole is None or own else whole.folder / "videos"
         ending = Ending(calibration, whole, videos, report=report, check=check)
-        run_job(job, output, ending, workers=workers, resume=resume, restart=restart)
+        run_job(job, output, ending, workers=workers, cluster=cluster, resume=resume, restart=restart)

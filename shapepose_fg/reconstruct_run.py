@@ -54,6 +54,8 @@ class Job:
     """File of people's shapes."""
     inputs: dict[str, str]
     """Checksums of the files that were read."""
+    chunk_frames: int | None = None
+    """Into chunks of how many frames the recording is cut; None for one."""
 
     def begun(self) -> dict[str, Any]:
         """All that the result depends on, as plain values: equal for a run that goes on."""
@@ -74,6 +76,7 @@ class Job:
             "frames": [self.frames.start, self.frames.stop],
             "time": {**times.as_dict(), "sha256": _digest(_numbers(times.time_s))},
             "cuts": list(self.cuts),
+            "chunk_frames": self.chunk_frames,
             "body": None if self.body is None else str(self.body),
             "shapes": None if self.shapes is None else str(self.shapes),
             "skeleton": skeleton,
@@ -83,7 +86,16 @@ class Job:
         }
 
 
-def run_job(job: Job, output: Path, ending: Ending, *, workers: int | None, resume: bool, restart: bool) -> None:
+def run_job(
+    job: Job,
+    output: Path,
+    ending: Ending,
+    *,
+    workers: int | None,
+    cluster: str | None,
+    resume: bool,
+    restart: bool,
+) -> None:
     """Reconstruct, and leave the results in `output`, where the caller is the only one.
 
     Whatever stops it, what is done is kept there, and the next call with `resume` goes on. InputError where that
@@ -96,7 +108,7 @@ def run_job(job: Job, output: Path, ending: Ending, *, workers: int | None, resu
             note(f"{output}: no run was stopped here; this one begins anew")
     kept = open_run(output, begun, resume=resume, restart=restart)
     try:
-        _run(job, output, ending, kept, workers)
+        _run(job, output, ending, kept, workers, cluster)
     except Stopped as stop:
         raise Stopped(stop.number, _standing(job, output)) from None
     except OSError as error:
@@ -104,7 +116,9 @@ def run_job(job: Job, output: Path, ending: Ending, *, workers: int | None, resu
         raise InputError(f"{place}{error.strerror or error}; {_standing(job, output)}") from None
 
 
-def _run(job: Job, output: Path, ending: Ending, kept: KeptArrays, workers: int | None) -> None:
+def _run(
+    job: Job, output: Path, ending: Ending, kept: KeptArrays, workers: int | None, cluster: str | None
+) -> None:
     """The reconstruction, its files, and what is said of it."""
     file = job.shapes
     known: SubjectShapes | None = None
@@ -125,6 +139,8 @@ def _run(job: Job, output: Path, ending: Ending, kept: KeptArrays, workers: int 
             shapes=known,
             progress=progress,
             workers=count,
+            cluster=cluster,
+            chunk_frames=job.chunk_frames,
         )
     seconds = time.perf_counter() - start
     inputs = dict(job.inputs)

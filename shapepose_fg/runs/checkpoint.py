@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.kept_arrays import split
 from shapepose_fg.observations import Observations
+from shapepose_fg.runs.borders import Border
 from shapepose_fg.tracking.following import FollowState, Input
 from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.tracker import TrackedFrame, TrackerState
@@ -24,17 +25,22 @@ class Checkpoint:
     next_id: int = 0
     """The identity of the next new person."""
     state: StreamState | None = None
-    """What is carried on; None where nothing is: after the last frame before a cut, and without time."""
+    """What is carried on; None where nothing is: after the last frame before a cut or of a chunk, without time."""
+    border: Border | None = None
+    """Between chunks: who was where at the end of the last."""
 
 
 _TRACK = ("ids", "born_s", "evident_s", "misses", "weak")
 _TRACKED = ("ids", "candidate", "evident", "weak")
+_BORDER = tuple(field.name for field in fields(Border))
 _OBSERVED = tuple(field.name for field in fields(Observations))
 
 
 def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray[Any]]:
     """A checkpoint as arrays. What the cameras gave is not among them: it is read again."""
     arrays: dict[str, NDArray[Any]] = {"at": np.array([checkpoint.frame, checkpoint.next_id])}
+    if checkpoint.border is not None:
+        arrays |= {f"border.{name}": getattr(checkpoint.border, name) for name in _BORDER}
     if checkpoint.state is None:
         return arrays
     follow, decided = checkpoint.state.follow, checkpoint.state.decided
@@ -59,7 +65,9 @@ def checkpoint_of(
     """The checkpoint that `checkpoint_arrays` made the arrays of; `read` gives what the cameras saw of a frame."""
     following, next_id = array("at").tolist()
     if "before" not in keys:
-        return Checkpoint(following, next_id)
+        known = "border.frame" in keys
+        border = Border(**{name: array(f"border.{name}") for name in _BORDER}) if known else None
+        return Checkpoint(following, next_id, border=border)
     joints = JointStates(array("tracker.mean"), array("tracker.covariance"))
     tracker = TrackerState(
         time_s=float(array("tracker.time_s")[0]),

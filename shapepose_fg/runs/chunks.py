@@ -1,24 +1,20 @@
-"""A recording cut into chunks whose people are followed apart, side by side, and who is who across the borders."""
+"""A recording cut into chunks whose people are followed apart, side by side; who is who from chunk to chunk."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from shapepose_fg.frame_times import stretches
-from shapepose_fg.observations import Observations
+from shapepose_fg.pipeline_config import PipelineConfig
+from shapepose_fg.runs.borders import Border, same_people
 from shapepose_fg.tracking.following import Input
 from shapepose_fg.windows import Engine, Span
 
 WARM_S = 6.0
-"""Before a chunk people are followed for so long: who is there is known after a second or two, and people who
-hide for longer than that are rare. Following takes a tenth of the time."""
-_SAME = 0.5
-"""Of two tracks the lesser one's detections that the other has too, from which on they are one person."""
-_NEAR_M = 0.3
-"""Or both are out of sight, and their joints so near to each other in the mean."""
+"""Before a chunk people are followed for so long: who is there is known after a second or two, and people who hide
+for longer than that are rare. Following takes a tenth of the time."""
 
 
 @dataclass(frozen=True)
@@ -29,105 +25,84 @@ class Chunk:
     """The frames whose rows are its own."""
     first: int
     """People are followed from this frame on."""
-    last: int
-    """The one after the last that may be followed: the recording ends, or is cut, there."""
+    until: int
+    """And up to the one before this: the last own window is known then."""
+    ended: bool
+    """Whether the recording ends, or is cut, at `until`."""
 
 
 def cut_in_chunks(
-    frames: range, cuts: Sequence[int], time_s: NDArray[np.float64], batch_frames: int, chunk_frames: int
+    frames: range, cuts: Sequence[int], time_s: NDArray[np.float64], config: PipelineConfig, chunk_frames: int
 ) -> list[Chunk]:
     """Chunks of about `chunk_frames` whose borders are those of windows, so that windows are as without chunks.
 
-    `time_s` (T,) are the times of all frames of the recording. What is followed before a chunk is whole windows of
-    `batch_frames`, at least `WARM_S` of them. A stretch between cuts is cut for itself.
+    `time_s` (T,) are the times of all frames of the recording. What is followed before a chunk is whole windows,
+    at least `WARM_S` of them. A stretch between cuts is cut for itself.
     """
-    step = max(1, round(chunk_frames / batch_frames)) * batch_frames
+    batch = config.batch_frames
+    step = max(1, round(chunk_frames / batch)) * batch
     found = []
     for stretch in stretches(frames, cuts):
         # The last window takes up to half a window more than its own frames (`Engine.follow`).
-        borders = [at for at in stretch[step::step] if at + batch_frames // 2 < stretch.stop]
+        borders = [at for at in stretch[step::step] if at + batch // 2 < stretch.stop]
         for start, stop in zip((stretch.start, *borders), (*borders, stretch.stop), strict=True):
             first = start
             while first > stretch.start and time_s[start] - time_s[first] < WARM_S:
-                first -= batch_frames
-            found.append(Chunk(range(start, stop), first, stretch.stop))
+                first -= batch
+            until = _until(stop, stretch, first, time_s, config)
+            found.append(Chunk(range(start, stop), first, until, until == stretch.stop))
     return found
 
 
-def windows_of(engine: Engine, chunk: Chunk, read: Callable[[int], Input], batch_frames: int) -> Iterator[Span]:
+def _until(stop: int, stretch: range, first: int, time_s: NDArray[np.float64], config: PipelineConfig) -> int:
+    """How far people must be followed for the window that ends at `stop`: half a window and the overlap beyond it,
+    and as far as following looks ahead.
+    """
+    beyond = stop + config.batch_frames // 2 + 1
+    while beyond < stretch.stop and time_s[beyond] - time_s[stop] <= config.windows.overlap_s:
+        beyond += 1
+    if beyond >= stretch.stop:
+        return stretch.stop
+    newest = beyond
+    while newest < stretch.stop and time_s[newest] - time_s[beyond] < config.following.look_ahead_s:
+        newest += 1
+    batches = -(-(newest + 1 - first) // config.batch_frames)
+    return min(first + batches * config.batch_frames, stretch.stop)
+
+
+def windows_of(engine: Engine, chunk: Chunk, read: Callable[[int], Input]) -> Iterator[Span]:
     """The windows of a chunk, whose people are followed from `chunk.first` on."""
-    state = engine.start()
-    done = chunk.first
-    for start in range(chunk.first, chunk.last, batch_frames):
-        batch = range(start, min(start + batch_frames, chunk.last))
-        spans, state = engine.follow(state, [read(frame) for frame in batch], last=batch.stop == chunk.last)
+    state, done = engine.start(), chunk.first
+    for start in range(chunk.first, chunk.until, engine.frames):
+        batch = range(start, min(start + engine.frames, chunk.until))
+        last = chunk.ended and batch.stop == chunk.until
+        spans, state = engine.follow(state, [read(frame) for frame in batch], last=last)
         for span in spans:
             if done in chunk.own:
                 yield span
-            done = _frame(span, span.stop - 1) + 1
-        if done >= chunk.own.stop:
-            return
+            done = span.decided[span.stop - 1][0].frame + 1
 
 
-@dataclass(frozen=True)
-class Border:
-    """Who is where in the frames on both sides of a border: N rows."""
+class Identities:
+    """What the tracks of one chunk after the other are called, so that a person keeps the name."""
 
-    frame: NDArray[np.intp]
-    """(N,) frame of each row."""
-    track: NDArray[np.intp]
-    """(N,) whose it is, as one of the chunks has it."""
-    candidate: NDArray[np.intp]
-    """(N, J, V) its detections; -1 for none."""
-    place: NDArray[np.float64]
-    """(N, J, 3) where its joints were expected, metres; NaN where nothing was."""
+    def __init__(self, next_id: int, border: Border | None) -> None:
+        """The next new person's identity, and who was where at the end of the chunk before."""
+        self.next_id = next_id
+        self.border = border
 
-    @classmethod
-    def of(cls, span: Span) -> "Border":
-        """The rows of a window, and of the frames that it overlaps."""
-        rows = Observations.concatenate([rows for _, rows in span.decided])
-        return cls(rows.frame, rows.track, rows.candidate, rows.initial)
+    def names(self, begins: Border, *, alone: bool) -> dict[int, int]:
+        """What tracks of a chunk are called that were there in the one before; `alone`: nothing carries over."""
+        return {} if alone or self.border is None else same_people(self.border, begins)
 
-    def rows(self, index: NDArray[np.intp]) -> "Border":
-        """Some of the rows."""
-        return Border(self.frame[index], self.track[index], self.candidate[index], self.place[index])
+    def name(self, track: int, names: dict[int, int]) -> int:
+        """What a track is called; whoever has no name gets the next."""
+        if track not in names:
+            names[track] = self.next_id
+            self.next_id += 1
+        return names[track]
 
-
-def same_people(before: Border, after: Border) -> dict[int, int]:
-    """For tracks of `after` who they are among those of `before`, as far as they are there.
-
-    By the detections that both chunks gave to them in the frames that both know; people out of sight by where they
-    were expected. One to one.
-    """
-    shared = np.intersect1d(before.frame, after.frame)
-    before = before.rows(np.flatnonzero(np.isin(before.frame, shared)))
-    after = after.rows(np.flatnonzero(np.isin(after.frame, shared)))
-    old, new = np.unique(before.track), np.unique(after.track)
-    alike = np.zeros((len(old), len(new)))
-    for i, a in enumerate(old.tolist()):
-        for k, b in enumerate(new.tolist()):
-            alike[i, k] = _alike(
-                before.rows(np.flatnonzero(before.track == a)), after.rows(np.flatnonzero(after.track == b))
-            )
-    rows, columns = linear_sum_assignment(-alike)
-    return {int(new[k]): int(old[i]) for i, k in zip(rows, columns, strict=True) if alike[i, k] > 0}
-
-
-def _alike(a: Border, b: Border) -> float:
-    """0 for two people; up to 1 for one whom nobody saw, and up to 2 by how many detections both tracks have."""
-    _, first, second = np.intersect1d(a.frame, b.frame, return_indices=True)
-    if len(first) == 0:
-        return 0.0
-    mine, theirs = a.candidate[first], b.candidate[second]
-    count = min(int((mine >= 0).sum()), int((theirs >= 0).sum()))
-    if count > 0:
-        share = int(((mine == theirs) & (mine >= 0)).sum()) / count
-        return 1.0 + share if share >= _SAME else 0.0
-    apart = np.linalg.norm(a.place[first] - b.place[second], axis=-1)
-    apart = apart[np.isfinite(apart)]
-    return 1.0 - float(apart.mean()) / _NEAR_M if len(apart) > 0 and apart.mean() < _NEAR_M else 0.0
-
-
-def _frame(span: Span, place: int) -> int:
-    """The number of one of a window's frames."""
-    return span.decided[place][0].frame
+    def remember(self, ends: Border, names: dict[int, int]) -> None:
+        """Who is where at the end of a chunk."""
+        track = [self.name(each, names) for each in ends.track.tolist()]
+        self.border = replace(ends, track=np.array(track, dtype=np.intp))

@@ -1,0 +1,44 @@
+"""One chunk of a recording, from what the cameras gave to solved windows, in whatever process."""
+
+from dataclasses import dataclass
+
+from shapepose_fg.engine import Setup
+from shapepose_fg.runs.borders import Border
+from shapepose_fg.runs.chunks import Chunk, windows_of
+from shapepose_fg.runs.notes import Notebook, Notes
+from shapepose_fg.tracking.following import Input
+from shapepose_fg.windows import Solved
+
+
+@dataclass(frozen=True)
+class ChunkJob:
+    """What is to be done; plain data, which can be sent to another process."""
+
+    chunk: Chunk
+    """Which frames."""
+    given: tuple[Input, ...]
+    """What the cameras gave, from `chunk.first` on."""
+
+
+@dataclass(frozen=True)
+class SolvedChunk:
+    """A chunk that is done; its tracks count from 0."""
+
+    solved: tuple[Solved, ...]
+    """Its windows."""
+    notes: Notes
+    """What is to be said about following its people."""
+    begins: Border
+    """Who is where at its beginning."""
+    ends: Border
+    """And at its end."""
+
+
+def solve_chunk(setup: Setup, job: ChunkJob) -> SolvedChunk:
+    """Follow people through a chunk and solve its windows."""
+    book = Notebook()
+    engine = setup.engine(book)
+    with book.stage("follow"):
+        spans = list(windows_of(engine, job.chunk, lambda frame: job.given[frame - job.chunk.first]))
+    solved = tuple(setup.solver.solve(span) for span in spans)
+    return SolvedChunk(solved, book.torn_off(), Border.of(spans[0]), Border.of(spans[-1]))
