@@ -82,9 +82,9 @@ def reconstruct(
     scheduler whose processes do it instead, or `local` for `workers` processes of Dask's own. With `chunk_frames`
     people are followed side by side, too, chunk by chunk of about so many frames, for which identities are joined
     across the borders (`runs/chunks.py`); the result may differ by who was in hiding there. `run` of the result
-    holds the configuration, versions, seconds per stage (over all processes), how many people were found and dropped, with
-    reasons, and where the detector's joints lie on the body. That is learnt from frames spread over the whole
-    recording, whatever `frames` picks; a fitter of your own takes part if it is an `AdjustableFitter`.
+    holds the configuration, versions, seconds per stage (over all processes), how many people were found and
+    dropped, with reasons, and where the detector's joints lie on the body. That is learnt from frames spread over
+    the whole recording, whatever `frames` picks; a fitter of your own takes part if it is an `AdjustableFitter`.
     """
     return reconstruct_parts(
         InMemory(),

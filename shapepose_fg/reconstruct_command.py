@@ -75,7 +75,7 @@ def reconstruct(
     ] = None,
     cluster: Annotated[
         str | None,
-        typer.Option(metavar="ADDRESS", help="A Dask scheduler (tcp://host:8786) whose processes solve; or local."),
+        typer.Option(metavar="ADDRESS", help="Dask scheduler (tcp://host:8786) whose processes solve, or: local."),
     ] = None,
     chunk_frames: Annotated[
         int | None, typer.Option(help="Follow people side by side, too, in chunks of about so many frames.")
@@ -132,8 +132,8 @@ def reconstruct(
             )
         if chunk_frames is not None and not (settings.temporal and chunk_frames >= settings.batch_frames):
             raise InputError(
-                f"--chunk-frames {chunk_frames}: must be {settings.batch_frames} (batch_frames) or more, for people"
-                " over time"
+                f"--chunk-frames {chunk_frames}: must be {settings.batch_frames} (batch_frames) or more, and needs"
+                " people over time"
             )
         if whole is not None and not settings.temporal:
             raise InputError("--project: its files need people over time; leave out --no-temporal, or --project")

@@ -29,7 +29,7 @@ LEVELS = (
     "estimation",
     "tracking",
     "windows bodies_over_time solved_rows",
-    "runs.notes pipeline_config cluster",
+    "pipeline_config cluster",
     "runs",
     "engine",
     "chunk_work",

@@ -1,0 +1,124 @@
+"""Chunks of a recording, reconstructed side by side: the same people, the same joints, the same names."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from shapepose_fg.frame_times import FrameTimes
+from shapepose_fg.kept_arrays import InFolder
+from shapepose_fg.pipeline import PipelineConfig, reconstruct, reconstruct_parts
+from shapepose_fg.runs import chunks
+from shapepose_fg.runs.borders import Border, same_people
+from shapepose_fg.runs.chunks import cut_in_chunks
+from shapepose_fg.simulation import built_in_scene, simulate
+from shapepose_fg.stopping import Stopped
+from shapepose_fg.tracking.following import FollowingConfig
+
+CONFIG = PipelineConfig(batch_frames=12, following=FollowingConfig(look_ahead_s=0.3))
+CUTS = (50,)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_warm_up():
+    """Chunks of a second deserve less than six to warm up."""
+    before, chunks.WARM_S = chunks.WARM_S, 0.5
+    yield
+    chunks.WARM_S = before
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Three people before four cameras, 80 frames with a cut after 50."""
+    return built_in_scene(seed=3, people=3, cameras=4, frames=80)
+
+
+@pytest.fixture(scope="module")
+def recording(scene):
+    return simulate(scene, seed=3)
+
+
+@pytest.fixture(scope="module")
+def whole(scene, recording):
+    return reconstruct(recording, scene.rig, CONFIG, cuts=CUTS)
+
+
+@pytest.fixture(scope="module")
+def in_chunks(scene, recording):
+    return reconstruct(recording, scene.rig, CONFIG, cuts=CUTS, chunk_frames=12)
+
+
+def test_chunks_change_neither_people_nor_names(whole, in_chunks):
+    assert np.array_equal(in_chunks.frame, whole.frame)
+    pairs = set(zip(whole.person.tolist(), in_chunks.person.tolist(), strict=True))
+    assert len(pairs) == len(np.unique(whole.person)) == len(np.unique(in_chunks.person))
+    # The windows are the same, and so are their detections. Only where tracks expected joints, after a warm-up of half
+    # a second here, is not, and that is where joints start that no two views see.
+    apart = np.abs(in_chunks.joints - whole.joints)
+    assert apart.max() < 2e-3 and apart.mean() < 1e-5
+
+
+def test_processes_change_no_byte_of_it(scene, recording, in_chunks):
+    found = reconstruct(recording, scene.rig, CONFIG, cuts=CUTS, chunk_frames=12, workers=2)
+    for name in found.ROWS:
+        assert np.array_equal(getattr(found, name), getattr(in_chunks, name), equal_nan=name not in ("status",)), (
+            name
+        )
+
+
+def test_a_dask_cluster_changes_no_byte_of_it(scene, recording, in_chunks):
+    pytest.importorskip("distributed", reason="Dask is an extra")
+    found = reconstruct(recording, scene.rig, CONFIG, cuts=CUTS, chunk_frames=12, workers=2, cluster="local")
+    for name in ("joints", "covariance", "person", "body_pose"):
+        assert np.array_equal(getattr(found, name), getattr(in_chunks, name), equal_nan=name != "person"), name
+
+
+def test_a_run_in_chunks_that_was_stopped_goes_on(scene, recording, in_chunks, tmp_path):
+    def stop(done: int, _: int) -> None:
+        if done >= 30:
+            raise Stopped(15)
+
+    arguments = {"cuts": CUTS, "chunk_frames": 12}
+    with pytest.raises(Stopped):
+        reconstruct_parts(InFolder(tmp_path), recording, scene.rig, CONFIG, progress=stop, **arguments)
+    done: list[int] = []
+    found = reconstruct_parts(
+        InFolder(tmp_path), recording, scene.rig, CONFIG, progress=lambda n, _: done.append(n), **arguments
+    ).reconstruction()
+    assert done[0] > 30
+    for name in ("joints", "covariance", "person", "body_pose", "frame"):
+        equal_nan = name not in ("person", "frame")
+        assert np.array_equal(getattr(found, name), getattr(in_chunks, name), equal_nan=equal_nan), name
+
+
+def test_every_frame_is_in_one_chunk_whose_borders_are_those_of_windows():
+    times = FrameTimes.from_fps(25.0, 1000)
+    config = replace(CONFIG, batch_frames=20)
+    found = cut_in_chunks(range(10, 1000), (333,), times.frame_s, config, 100)
+    frames = [frame for chunk in found for frame in chunk.own]
+    assert frames == list(range(10, 1000))
+    for chunk in found:
+        start = 10 if chunk.own.start < 333 else 333
+        assert (chunk.own.start - start) % 20 == 0 and (chunk.first - start) % 20 == 0
+        assert chunk.first >= start and chunk.until <= (333 if chunk.own.stop <= 333 else 1000)
+        assert chunk.until >= chunk.own.stop
+        assert chunk.ended == (chunk.until in (333, 1000))
+
+
+def border(track, candidate, place):
+    """Rows of one frame with one joint and one view."""
+    n = len(track)
+    return Border(
+        np.zeros(n, int), np.array(track), np.array(candidate).reshape(n, 1, 1), np.array(place).reshape(n, 1, 3)
+    )
+
+
+def test_who_is_who_by_detections_and_out_of_sight_by_place():
+    before = border([0, 1, 2], [7, 8, -1], [[0, 0, 0], [9, 0, 0], [5, 0, 0.0]])
+    after = border([10, 11, 12, 13], [8, 7, -1, -1], [[0, 0, 0], [9, 0, 0], [5.1, 0, 0], [5.0, 2, 0.0]])
+    assert same_people(before, after) == {10: 1, 11: 0, 12: 2}
+
+
+def test_chunks_shorter_than_a_window_are_refused(scene, recording):
+    with pytest.raises(ValueError, match="chunk_frames must be at least batch_frames"):
+        reconstruct(recording, scene.rig, CONFIG, chunk_frames=3)
