@@ -1,7 +1,12 @@
 """From several calibrated cameras to every person in the room in 3D, with a body."""
 
+import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
+
+# MKL, which torch brings, else rounds by where in memory an array happens to lie: the last digits of a result would
+# depend on the number of processes.
+os.environ.setdefault("MKL_CBWR", "AUTO")
 
 if TYPE_CHECKING:
     from shapepose_fg.errors import InputError as InputError
