@@ -1,7 +1,12 @@
 """From several calibrated cameras to every person in the room in 3D, with a body."""
 
+import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
+
+# Or MKL, which torch brings, rounds by where in memory an array happens to lie, and the last digits of a result
+# depend on the number of processes.
+os.environ.setdefault("MKL_CBWR", "AUTO")
 
 if TYPE_CHECKING:
     from shapepose_fg.errors import InputError as InputError

@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from multiprocessing import get_context, parent_process
-from multiprocessing.synchronize import Event
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from typing import Any, Generic, Protocol, TypeVar
 
 Shared = TypeVar("Shared")
@@ -46,7 +46,7 @@ class Workers(Generic[Shared]):
         self._shared = shared
         self._ahead = ahead
         self._pool: ProcessPoolExecutor | None = None
-        self._end: Event | None = None
+        self._lifeline: Connection | None = None
 
     def __enter__(self) -> "Workers[Shared]":
         if self.count > 1:
@@ -58,8 +58,8 @@ class Workers(Generic[Shared]):
                     " at the top of a module, or use workers=1"
                 ) from error
             spawn = get_context("spawn")
-            self._end = spawn.Event()
-            given = (content, self._end)
+            held, self._lifeline = spawn.Pipe(duplex=False)
+            given = (content, held)
             self._pool = ProcessPoolExecutor(self.count, spawn, initializer=_begin, initargs=given)
             with _what_workers_inherit():
                 for _ in range(self.count):  # the pool starts a process for each of its first jobs
@@ -68,10 +68,13 @@ class Workers(Generic[Shared]):
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if self._pool is not None:
-            if kind is not None and self._end is not None:
-                self._end.set()  # nobody waits for what they are at
+            if kind is not None and self._lifeline is not None:
+                self._lifeline.close()  # nobody waits for what they are at
             self._pool.shutdown(cancel_futures=True)
             self._pool = None
+        if self._lifeline is not None:
+            self._lifeline.close()
+            self._lifeline = None
 
     def map(self, work: Callable[[Shared, Item], Result], items: Iterable[Item]) -> Iterator[Result]:
         """`work(shared, item)` for each item, in order; `items` are taken as they are needed.
@@ -128,12 +131,11 @@ _shared: Any = None
 """In a worker process: what all its work shares."""
 
 
-def _begin(content: bytes, end: Event) -> None:
+def _begin(content: bytes, lifeline: Connection) -> None:
     """What a worker does first."""
     global _shared
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    for wait in (_end_with_parent, lambda: _end_when_told(end)):
-        threading.Thread(target=wait, daemon=True).start()
+    threading.Thread(target=_end_with, args=(lifeline,), daemon=True).start()
     _shared = pickle.loads(content)  # made by this program a moment ago
     if "cv2" in sys.modules:
         sys.modules["cv2"].setNumThreads(1)
@@ -141,18 +143,15 @@ def _begin(content: bytes, end: Event) -> None:
         sys.modules["torch"].set_num_threads(1)
 
 
-def _end_with_parent() -> None:
-    """End this process when the one that started it has been killed: nobody else would."""
-    parent = parent_process()
-    if parent is not None:
-        parent.join()
+def _end_with(lifeline: Connection) -> None:
+    """End this process, whatever it is at, when the one that started it lets go of the other end, or is killed.
+
+    A pipe and no event: whoever is killed while it waits for an event leaves its lock to nobody.
+    """
+    try:
+        lifeline.recv_bytes()
+    except (EOFError, OSError):
         os._exit(1)
-
-
-def _end_when_told(end: Event) -> None:
-    """End this process, whatever it is at."""
-    end.wait()
-    os._exit(1)
 
 
 def _work(work: Callable[[Any, Item], Result], item: Item) -> Result:

@@ -61,9 +61,8 @@ def test_chunks_change_neither_people_nor_names(whole, in_chunks):
 def test_processes_change_no_byte_of_it(scene, recording, in_chunks):
     found = reconstruct(recording, scene.rig, CONFIG, cuts=CUTS, chunk_frames=12, workers=2)
     for name in found.ROWS:
-        assert np.array_equal(getattr(found, name), getattr(in_chunks, name), equal_nan=name not in ("status",)), (
-            name
-        )
+        equal_nan = name != "status"
+        assert np.array_equal(getattr(found, name), getattr(in_chunks, name), equal_nan=equal_nan), name
 
 
 def test_a_dask_cluster_changes_no_byte_of_it(scene, recording, in_chunks):
