@@ -37,6 +37,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="a few frames of each, nothing to report")
     parser.add_argument("--list", action="store_true", help="measure nothing, say what there is")
     parser.add_argument("--afresh", action="store_true", help="measure again what is kept")
+    parser.add_argument("--kept", action="store_true", help="measure nothing: tables whose figures are all kept")
     parser.add_argument("--results", type=Path, default=ROOT / "build" / "figures", help="where figures are kept")
     parser.add_argument("--others", type=Path, help="folder of results by scripts/run_pose2sim.py")
     parser.add_argument("--update", action="store_true", help="write the tables into the documents")
@@ -53,6 +54,8 @@ def main() -> None:
         part = experiment.only([case for case in experiment.cases if _begins(case.name, arguments.cases)])
         if arguments.list:
             print(f"{experiment.name:<24}{len(part.cases):>3} cases{kept.words(part)}")
+            continue
+        if arguments.kept and not kept.whole(part):
             continue
         figures, seconds = measured(part, kept)
         total += seconds

@@ -44,6 +44,10 @@ class Kept:
         text = json.dumps(content, indent=1) + "\n"
         write_atomically(self._file(experiment, case), lambda stream: stream.write(text.encode()))
 
+    def whole(self, experiment: Experiment) -> bool:
+        """Whether the figures of every case are kept."""
+        return all(self.get(experiment, case) is not None for case in experiment.cases)
+
     def words(self, experiment: Experiment) -> str:
         """How much of an experiment is kept, and the time that it took."""
         found = [each for case in experiment.cases if (each := self.get(experiment, case)) is not None]
