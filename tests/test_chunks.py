@@ -52,8 +52,8 @@ def test_chunks_change_neither_people_nor_names(whole, in_chunks):
     assert np.array_equal(in_chunks.frame, whole.frame)
     pairs = set(zip(whole.person.tolist(), in_chunks.person.tolist(), strict=True))
     assert len(pairs) == len(np.unique(whole.person)) == len(np.unique(in_chunks.person))
-    # The same windows and detections. Only where tracks expected joints differs, after half a second of warm-up, and
-    # that is where joints start that no two views see.
+    # The same windows and detections. Only where tracks expected joints differs, after half a second of warm-up,
+    # and that is where joints start that no two views see.
     apart = np.abs(in_chunks.joints - whole.joints)
     assert apart.max() < 2e-3 and apart.mean() < 1e-5
 

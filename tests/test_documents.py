@@ -1,5 +1,6 @@
 """README.md and docs/extending.md, typed as a reader would type them; and links that lead somewhere."""
 
+import json
 import re
 import shlex
 from pathlib import Path
@@ -9,6 +10,7 @@ import pytest
 
 from shapepose_fg.cli import main
 from shapepose_fg.detections import Detections, Recording
+from shapepose_fg.evaluation.experiments.made_with import changes, made_with
 from shapepose_fg.evaluation.metrics import joint_metrics
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.reconstruction import Reconstruction
@@ -141,3 +143,24 @@ def test_files_that_are_named_exist(page):
     there = [f"/{path.relative_to(ROOT)}" for folder in folders for path in folder.rglob("*.*")]
     missing = {name for name in named if not any(path.endswith(f"/{name}") for path in there)}
     assert missing <= {"settings.toml"}
+
+
+NOT_MEASURED_AGAIN: frozenset[str] = frozenset()
+"""Tables that are older than their marks can say; to be measured with the next change of a default."""
+
+
+def test_no_table_is_older_than_the_defaults_it_was_made_with():
+    """Each table's mark names a file in docs/made_with: settings and data then, which must be those of now."""
+    every = [made_with(basis) for basis in ("pipeline", "bodies", "detector")]
+    found = {}
+    for page in PAGES:
+        for name, digits in re.findall(r"<!-- ([\w ]+?)(?: @(\w+))? -->", page.read_text(encoding="utf-8")):
+            if name != "end":
+                found[name] = digits
+    assert {name for name, digits in found.items() if digits == ""} == NOT_MEASURED_AGAIN
+    for digits in {digits for digits in found.values() if digits}:
+        then = json.loads((ROOT / "docs" / "made_with" / f"{digits}.json").read_text(encoding="utf-8"))
+        tables = sorted(name for name, each in found.items() if each == digits)
+        # The basis with which a table was made is the one whose names it has.
+        now = max(every, key=lambda each: len(set(each) & set(then)) - len(set(each) - set(then)))
+        assert changes(then, now) == [], f"{tables} are old: scripts/reproduce_tables.py --only ... --update"
