@@ -48,9 +48,9 @@ def pipeline(monkeypatch) -> dict:
     """Replace the pipeline by one that finds two people in every frame; returns what it was called with."""
     called: dict = {}
 
-    def fake(kept, detections, rig, config, *, frames, fitter, times, cuts, shapes, progress, workers):
+    def fake(kept, detections, rig, config, *, frames, fitter, times, cuts, shapes, progress, workers, **more):
         called.update(detections=detections, rig=rig, config=config, frames=frames, fitter=fitter)
-        called.update(times=times, cuts=cuts, shapes=shapes, workers=workers)
+        called.update(times=times, cuts=cuts, shapes=shapes, workers=workers, **more)
         progress(len(frames), len(frames))
         N = 2 * len(frames)
         frame, person = np.repeat(np.array(frames), 2), np.arange(N)
@@ -426,3 +426,11 @@ def test_a_reader_that_stops_reading_is_no_error():
     os.close(writer)
     assert result.stderr == ""
     assert result.returncode == 1
+
+
+def test_chunks_and_a_cluster_reach_the_pipeline(recording, pipeline, capsys):
+    assert run(*recording, "--chunk-frames", "200", "--cluster", "tcp://host:8786") == 0
+    assert (pipeline["chunk_frames"], pipeline["cluster"]) == (200, "tcp://host:8786")
+    capsys.readouterr()
+    assert run(*recording, "--chunk-frames", "20") == 2
+    assert "--chunk-frames 20: must be 96" in capsys.readouterr().err

@@ -140,7 +140,14 @@ def command(scene, recording, tmp_path_factory) -> list[str]:
 
 def start(command: list[str], *more: str) -> subprocess.Popen:
     words = [sys.executable, "-m", "shapepose_fg", *command, *more]
-    return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=hears_ctrl_c
+    )
+
+
+def hears_ctrl_c() -> None:
+    """Whoever runs the tests may ignore it, and what is ignored is inherited."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def wait_for(file: Path, process: subprocess.Popen) -> None:
@@ -206,7 +213,9 @@ begin.main()
 
 @pytest.mark.skipif(os.name != "posix", reason="stops processes by POSIX signals")
 def test_ctrl_c_while_the_program_is_loaded_leaves_no_traceback():
-    done = subprocess.run([sys.executable, "-c", EARLY], capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", EARLY], capture_output=True, text=True, timeout=60, preexec_fn=hears_ctrl_c
+    )
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
 
 

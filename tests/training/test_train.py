@@ -133,7 +133,7 @@ def test_a_checkpoint_of_other_settings_is_refused(frame, tmp_path, change):
 
 def test_what_is_no_checkpoint_is_refused(frame, tmp_path):
     trainer, path = make_trainer(frame), tmp_path / "run.checkpoint"
-    with pytest.raises(InputError, match=r"run\.checkpoint: not readable"):
+    with pytest.raises(InputError, match=r"run\.checkpoint: there is no such file"):
         load_checkpoint(trainer, path)
     save_checkpoint(trainer, path)
     path.write_bytes(path.read_bytes()[:-100])
