@@ -34,11 +34,6 @@ class Cluster(Generic[Shared]):
         self._client: Client | None = None
         self._at: Future[Any] | None = None
 
-    @property
-    def dashboard(self) -> str:
-        """Where the progress can be looked at in a browser; empty where there is no such page."""
-        return "" if self._client is None else str(self._client.dashboard_link or "")
-
     def __enter__(self) -> "Cluster[Shared]":
         Client, LocalCluster = _dask()
         try:
@@ -51,18 +46,18 @@ class Cluster(Generic[Shared]):
                     dashboard_address=None,
                     silence_logs=50,
                 )
-                self._client = Client(local, timeout=_SECONDS)
+                client = Client(local, timeout=_SECONDS)
             else:
-                self._client = Client(self._address, timeout=_SECONDS)
+                client = Client(self._address, timeout=_SECONDS)
         except (OSError, ValueError, TimeoutError) as error:
             reason = " ".join(str(error).split())
             raise InputError(
-                f"--cluster {self._address}: no Dask scheduler answers there ({reason}); start one with"
+                f"--cluster {self._address or 'local'}: no Dask scheduler answers there ({reason}); start one with"
                 " `dask scheduler`, or leave it out"
             ) from None
         with _large():
             # A task, not data that was scattered: what is lost with a process can be made again.
-            self._at = self._client.submit(_same, self._shared, pure=False)
+            self._client, self._at = client, client.submit(_same, self._shared, pure=False)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -79,7 +74,8 @@ class Cluster(Generic[Shared]):
         """
         from distributed import KilledWorker
 
-        client, waiting = self._client, deque["Future[Any]"]()
+        client: Any = self._client
+        waiting = deque["Future[Any]"]()
         if client is None:
             raise RuntimeError("a cluster is a context: use it in `with`")
         try:
@@ -99,7 +95,7 @@ class Cluster(Generic[Shared]):
             client.cancel(list(waiting))
 
 
-def _dask() -> tuple[type, type]:
+def _dask() -> tuple[Any, Any]:
     try:
         from distributed import Client, LocalCluster
     except ImportError:
@@ -111,9 +107,9 @@ def _dask() -> tuple[type, type]:
 
 def _large() -> Any:
     """Context in which Dask does not complain of large tasks: bodies and minutes of footage are large."""
-    import dask
+    from dask import config
 
-    return dask.config.set({"distributed.admin.large-graph-warning-threshold": "1GiB"})
+    return config.set({"distributed.admin.large-graph-warning-threshold": "1GiB"})
 
 
 def _same(shared: Shared) -> Shared:

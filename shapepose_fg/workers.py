@@ -11,7 +11,6 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import get_context
-from multiprocessing.connection import Connection
 from typing import Any, Generic, Protocol, TypeVar
 
 Shared = TypeVar("Shared")
@@ -46,7 +45,7 @@ class Workers(Generic[Shared]):
         self._shared = shared
         self._ahead = ahead
         self._pool: ProcessPoolExecutor | None = None
-        self._lifeline: Connection | None = None
+        self._lifeline: Any = None
 
     def __enter__(self) -> "Workers[Shared]":
         if self.count > 1:
@@ -59,7 +58,7 @@ class Workers(Generic[Shared]):
                 ) from error
             spawn = get_context("spawn")
             held, self._lifeline = spawn.Pipe(duplex=False)
-            given = (content, held)
+            given: tuple[Any, ...] = (content, held)  # one end of a pipe, of one class or another by the system
             self._pool = ProcessPoolExecutor(self.count, spawn, initializer=_begin, initargs=given)
             with _what_workers_inherit():
                 for _ in range(self.count):  # the pool starts a process for each of its first jobs
@@ -131,7 +130,7 @@ _shared: Any = None
 """In a worker process: what all its work shares."""
 
 
-def _begin(content: bytes, lifeline: Connection) -> None:
+def _begin(content: bytes, lifeline: Any) -> None:
     """What a worker does first."""
     global _shared
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -143,7 +142,7 @@ def _begin(content: bytes, lifeline: Connection) -> None:
         sys.modules["torch"].set_num_threads(1)
 
 
-def _end_with(lifeline: Connection) -> None:
+def _end_with(lifeline: Any) -> None:
     """End this process, whatever it is at, when the one that started it lets go of the other end, or is killed.
 
     A pipe and no event: whoever is killed while it waits for an event leaves its lock to nobody.
