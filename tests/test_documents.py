@@ -164,7 +164,6 @@ NOT_MEASURED_AGAIN = frozenset(
         "iterations",
         "prior confidence",
         "sweeps",
-        "visibility",
     }
 )
 """Tables that are older than their marks can say; to be measured with the next change of a default."""
