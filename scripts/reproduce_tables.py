@@ -34,7 +34,9 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", help="names of tables, or their first words")
     parser.add_argument("--cases", nargs="*", help="first words of cases: only these of the tables")
     parser.add_argument("--split", choices=("tune", "report"), default="report", help="of the recorded motions")
-    parser.add_argument("--quick", action="store_true", help="a few frames of each, nothing to report")
+    parser.add_argument(
+        "--quick", action="store_true", help="a few frames of each but Shelf's own, fitters, simulator"
+    )
     parser.add_argument("--list", action="store_true", help="measure nothing, say what there is")
     parser.add_argument("--afresh", action="store_true", help="measure again what is kept")
     parser.add_argument("--kept", action="store_true", help="measure nothing: tables whose figures are all kept")

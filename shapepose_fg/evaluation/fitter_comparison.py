@@ -61,8 +61,16 @@ class Comparison:
 
     def __init__(self, motions: Path, bodies: int = BODIES):
         self.motions, self.bodies = motions, bodies
-        self.methods = (*plain_methods(), *learned())
-        self.model = BodyModel.default()
+
+    @cached_property
+    def methods(self) -> tuple[Method, ...]:
+        """What is compared."""
+        return (*plain_methods(), *learned())
+
+    @cached_property
+    def model(self) -> BodyModel:
+        """The body that all of them fit."""
+        return BodyModel.default()
 
     @cached_property
     def drawn(self) -> tuple[TrueBodies, NDArray[np.bool_]]:

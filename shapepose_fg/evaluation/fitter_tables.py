@@ -25,6 +25,7 @@ from shapepose_fg.evaluation.fitting_methods import (
     fits_per_second,
 )
 from shapepose_fg.evaluation.fitting_optimum import check_optimum
+from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.metrics import joint_metrics
 from shapepose_fg.evaluation.shelf import evaluate_shelf, read_shelf_ground_truth
 from shapepose_fg.io.calibration import read_rig
@@ -72,7 +73,7 @@ def error_table(comparison: Comparison) -> list[str]:
         f"| targets | fitter | all joints, mm | seen | missing | vertices | ms a fit, {BATCH} at a time "
         "| ms alone | no body |"
     )
-    return [head, _rule(9), *rows]
+    return [head, rule(9), *rows]
 
 
 def group_table(comparison: Comparison) -> list[str]:
@@ -86,7 +87,7 @@ def group_table(comparison: Comparison) -> list[str]:
                 e = FitErrors(found.errors.joints_mm[group], found.errors.missing[group], np.zeros(0))
                 cells += [_mm(e.seen_mm), _mm(e.missing_mm)]
             rows.append(f"| {setting.name} | {name} | {' | '.join(cells)} |")
-    return ["| mm | fitter | salsa: seen | missing | others: seen | missing |", _rule(6), *rows]
+    return ["| mm | fitter | salsa: seen | missing | others: seen | missing |", rule(6), *rows]
 
 
 def time_table(comparison: Comparison, images: Path | None) -> list[str]:
@@ -109,7 +110,7 @@ def time_table(comparison: Comparison, images: Path | None) -> list[str]:
     if images is not None:
         draw_curves(comparison, images / "fitter_time.png")
     head = f"| ms a fit (share of the time of {PLAIN_STEPS} steps) | error to reach, mm | {' | '.join(names)} |"
-    return [head, _rule(2 + len(names)), *rows]
+    return [head, rule(2 + len(names)), *rows]
 
 
 def draw_curves(comparison: Comparison, path: Path) -> None:
@@ -151,7 +152,7 @@ def speed_table(comparison: Comparison) -> list[str]:
         cells = [f"{fits_per_second(fitter, some, batch, workers):.0f}" for workers, batch in asked]
         rows.append(f"| {method.name} | {' | '.join(cells)} |")
     head = f"| fits a second | 1 thread, {BATCH} at a time | 1 thread, {LARGE_BATCH} | 2, {LARGE_BATCH} each |"
-    return [head, _rule(4), *rows]
+    return [head, rule(4), *rows]
 
 
 def optimum_lines(comparison: Comparison, rows: int = 8) -> list[str]:
@@ -159,7 +160,7 @@ def optimum_lines(comparison: Comparison, rows: int = 8) -> list[str]:
     lines = [
         "| L-BFGS, energy lower by | median | largest | joints move, mm | from the closed form: median "
         "| in a worse optimum |",
-        _rule(6),
+        rule(6),
     ]
     for setting, (targets, _) in comparison.targets.items():
         some = first(targets, rows)
@@ -191,7 +192,7 @@ def covariance_table(comparison: Comparison) -> list[str]:
                         f"| {c.mean_nees:.2f} |"
                     )
     head = "| targets | fitter | joints, from | inside the 50 % ellipsoid, % | 90 % | 95 % | median NEES | mean |"
-    return [head, _rule(8), *rows]
+    return [head, rule(8), *rows]
 
 
 def sigma_table(comparison: Comparison) -> list[str]:
@@ -206,7 +207,7 @@ def sigma_table(comparison: Comparison) -> list[str]:
                     rows.append(
                         f"| {setting.name} | {name} | {joints} | {' | '.join(f'{r:.2f}' for r in ratios)} |"
                     )
-    return [f"| targets | fitter | joints | {' | '.join(GROUPS)} |", _rule(3 + len(GROUPS)), *rows]
+    return [f"| targets | fitter | joints | {' | '.join(GROUPS)} |", rule(3 + len(GROUPS)), *rows]
 
 
 def alternation_table(motions: Path, shelf: Path | None) -> list[str]:
@@ -231,7 +232,7 @@ def alternation_table(motions: Path, shelf: Path | None) -> list[str]:
             people, ms = _reconstructed(seen, scene.rig, config, fitter)
             m = joint_metrics(people, scene.keypoints[::STRIDE])
             rows.append(f"| {scene_name} | {name} | | {100 * m.f1:.2f} | {m.mpjpe_mm:.1f} | {ms:.1f} |")
-    return ["| recording | fitter | Avg PCP, % | F1, % | MPJPE, mm | ms a frame |", _rule(6), *rows]
+    return ["| recording | fitter | Avg PCP, % | F1, % | MPJPE, mm | ms a frame |", rule(6), *rows]
 
 
 def _reconstructed(
@@ -250,7 +251,3 @@ def _mm(value: float) -> str:
 def _spread(values: NDArray[np.float64]) -> str:
     low, middle, high = np.quantile(values, (0.1, 0.5, 0.9))
     return f"{middle:.2f} ({low:.2f} to {high:.2f})"
-
-
-def _rule(columns: int) -> str:
-    return "|---" * columns + "|"

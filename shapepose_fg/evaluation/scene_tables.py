@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.evaluation.alternation import BeforeRefinement, alternation_errors, before_refinement
+from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.matching import match_people
 from shapepose_fg.evaluation.metrics import JointMetrics, covariance_calibration, joint_metrics
 from shapepose_fg.pipeline import PipelineConfig, reconstruct
@@ -84,7 +85,7 @@ def scene_table(trials: list[Trial]) -> list[str]:
         name = f"{trial.seed} (the demo)" if trial.seed == DEMO else str(trial.seed)
         rows.append(f"| {name} | {shares} | {m.mpjpe_mm:.1f} | {median:.1f} | {people} |")
     head = "| seed | precision, % | recall, % | F1, % | MPJPE, mm | median, mm | people found | twice | invented |"
-    return [head, _rule(9), *rows]
+    return [head, rule(9), *rows]
 
 
 def camera_table(trial: Trial) -> list[str]:
@@ -95,7 +96,7 @@ def camera_table(trial: Trial) -> list[str]:
         people = f"{m.people_found} of {m.people_true} | {m.people_duplicated} | {m.people_invented}"
         rows.append(f"| {count} | {100 * m.precision:.1f} | {100 * m.recall:.1f} | {m.mpjpe_mm:.0f} | {people} |")
     head = "| cameras | precision, % | recall, % | MPJPE, mm | people found | twice | invented |"
-    return [head, _rule(7), *rows]
+    return [head, rule(7), *rows]
 
 
 def alternation_table(trials: list[Trial]) -> list[str]:
@@ -123,7 +124,7 @@ def alternation_table(trials: list[Trial]) -> list[str]:
                 )
             rows.append(f"| {label}: {group} | {len(before)} | {' | '.join(cells)} |")
     head = f"| joints, mean (median) error in mm | count | before | {' | '.join(settings)} |"
-    return [head, _rule(3 + len(settings)), *rows]
+    return [head, rule(3 + len(settings)), *rows]
 
 
 def covariance_table(trials: list[Trial]) -> list[str]:
@@ -135,7 +136,7 @@ def covariance_table(trials: list[Trial]) -> list[str]:
         shares = " | ".join(f"{100 * share:.1f}" for share in found.coverage.values())
         rows.append(f"| {label} | {shares} | {found.median_nees:.2f} | {found.mean_nees:.2f} |")
     head = "| | inside the 50 % ellipsoid, % | 90 % | 95 % | median NEES | mean NEES |"
-    return [head, _rule(6), "| if true | 50 | 90 | 95 | 2.37 | 3 |", *rows]
+    return [head, rule(6), "| if true | 50 | 90 | 95 | 2.37 | 3 |", *rows]
 
 
 def _errors(trial: Trial, config: PipelineConfig):
@@ -146,7 +147,3 @@ def _errors(trial: Trial, config: PipelineConfig):
 def _mean_median(errors: NDArray[np.float64]) -> str:
     known = errors[np.isfinite(errors)]
     return f"{known.mean():.1f} ({np.median(known):.1f})" if known.size else "-"
-
-
-def _rule(columns: int) -> str:
-    return "|---" * columns + "|"

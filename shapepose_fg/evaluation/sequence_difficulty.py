@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from shapepose_fg.detections import Recording
+from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.metrics import joint_metrics
 from shapepose_fg.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.simulation import simulate
@@ -28,7 +29,7 @@ def table(motions: Path, splits: TypingSequence[Split], stride: int) -> list[str
     return [
         "| sequence | people | frames | views that see the hip, of 6 | precision, % | recall, % | F1, % "
         "| MPJPE, mm | people found, % | twice or invented |",
-        "|---" * 10 + "|",
+        rule(10),
         *rows,
     ]
 

@@ -14,6 +14,7 @@ from shapepose_fg.estimation.body_step import disagreement, joint_targets
 from shapepose_fg.estimation.linearisation import linearise, observation_sigmas, triangulate
 from shapepose_fg.evaluation.alternation import before_refinement
 from shapepose_fg.evaluation.bodies import body_joints
+from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.shelf import LIMB_NAMES, ShelfScore, evaluate_shelf, read_shelf_ground_truth
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
@@ -55,7 +56,7 @@ def shelf_table(steps: dict[str, ShelfScore]) -> list[str]:
     others = [f"| {' | '.join(row)} |" for row in OTHERS]
     return [
         "| PCP@0.5, % | actor 1 | actor 2 | actor 3 | Avg |",
-        _rule(5),
+        rule(5),
         others[0],
         ours[3],
         ours[2],
@@ -77,7 +78,7 @@ def limb_table(steps: dict[str, ShelfScore]) -> list[str]:
         if right.sum() < count.sum():
             cells = " | ".join(f"{a} of {b}" for a, b in zip(right, count, strict=True))
             rows.append(f"| {limb} | {cells} | {count.sum() - right.sum()} |")
-    return ["| limbs that are right | actor 1 | actor 2 | actor 3 | lost |", _rule(5), *rows]
+    return ["| limbs that are right | actor 1 | actor 2 | actor 3 | lost |", rule(5), *rows]
 
 
 def contradiction_table(folder: Path) -> list[str]:
@@ -93,7 +94,7 @@ def contradiction_table(folder: Path) -> list[str]:
         typical = f"{np.median(here):.2f} | {np.percentile(here, 99):.1f}"
         rows.append(f"| {count} | {len(here)} | {typical} | {over:.2f} |")
     limit = f"over {CONFIG.refine.disagreement:g}, %"
-    return [f"| views that agree | joints | median, sigma | 99 %, sigma | {limit} |", _rule(5), *rows]
+    return [f"| views that agree | joints | median, sigma | 99 %, sigma | {limit} |", rule(5), *rows]
 
 
 def sigma_table(folder: Path) -> list[str]:
@@ -131,7 +132,7 @@ def sigma_table(folder: Path) -> list[str]:
             f"{1e3 * np.median(modelled[here]):.0f} | {tail:.2f} |"
         )
     head = "| confidence | detections | sigma, mm | sigma that we give it, mm | 90 % / 50 % (Gaussian: 1.82) |"
-    return [head, _rule(5), *rows]
+    return [head, rule(5), *rows]
 
 
 @cache
@@ -149,7 +150,3 @@ def shelf_observations(folder: Path) -> tuple[Rig, Observations, NDArray[np.floa
         observation_sigmas(observations, points, views, CONFIG.observations, BODY_25.joints),
         points,
     )
-
-
-def _rule(columns: int) -> str:
-    return "|---" * columns + "|"

@@ -4,6 +4,7 @@ import time
 
 import numpy as np
 
+from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.simulation import Scene, built_in_scene
 from shapepose_fg.simulation.visibility import BORDER, ITSELF, NOBODY, Skin, Visibility, VisibilityConfig, see
 
@@ -33,7 +34,7 @@ def table() -> list[str]:
         f"{exact.size:,} joints and views: visible / hidden by the body itself / by others / outside {shares} %.",
         "",
         "| cells | visible or not differs, % | who hides differs, % | visible, % | a frame, ms |",
-        "|---" * 5 + "|",
+        rule(5),
     ]
     for cell_m in (0.02, 0.03, 0.04, 0.05):
         found = [look(*each, VisibilityConfig(cell_m=cell_m)) for each in scenes]

@@ -9,6 +9,7 @@ from typing import Any
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
 from shapepose_fg.evaluation.experiments.scale import Scale, Stretch, shorter
 from shapepose_fg.evaluation.experiments.scene_scores import mean_of, solve_and_score
+from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.pipeline import PipelineConfig
 
 FRAMES = 30
@@ -82,7 +83,7 @@ def ablation(scale: Scale) -> Experiment | None:
             return f"{m['f1']:.1f} | {m['error_mm']:.1f} | {m['nobody']:.0f} | {m['missed']:.0f}"
 
         head = "F1, % | MPJPE, mm | nobody | missed"
-        rows = [f"| | the paper, with it: {head} | ours, without it: {head} |", "|---" * 9 + "|"]
+        rows = [f"| | the paper, with it: {head} | ours, without it: {head} |", rule(9)]
         rows.append(f"| **nothing switched** | {cells('paper')} | {cells('ours')} |")
         rows.append(f"| time (on the right: ours, with it) | {cells('paper + time')} | {cells('ours + time')} |")
         for switch in SWITCHES:

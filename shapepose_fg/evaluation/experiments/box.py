@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from factors import isotropic
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
 from shapepose_fg.evaluation.experiments.scale import Scale, Stretch
+from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.metrics import covariance_calibration
 from shapepose_fg.pipeline import PipelineConfig
 from shapepose_fg.reconstruction import Reconstruction
@@ -88,4 +89,4 @@ def _table(found: Mapping[str, Figures]) -> list[str]:
             cells.append(f"{f['mean_mm']:.1f} | {f['inside_50']:.1f} / {f['inside_95']:.1f}")
         rows.append(f"| {name} | {' | '.join(cells)} |")
     head = "| wrists | count | error, mm | inside 50 / 95 %, % | with the box: error | inside 50 / 95 %, % |"
-    return [head, "|---" * 6 + "|", *rows]
+    return [head, rule(6), *rows]

@@ -6,6 +6,7 @@ from functools import partial
 
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
 from shapepose_fg.evaluation.experiments.scale import Scale, Stretch
+from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.tracking import score_tracks
 from shapepose_fg.simulation.truth import truth_of
 
@@ -43,4 +44,4 @@ def _table(found: Mapping[str, Figures]) -> list[str]:
             cells.append("-" if f[name] is None else f"{f[name]:.1f}")
         rows.append(f"| {count} | {' | '.join(cells)} |")
     head = "| cameras | people found, % | rows of nobody, % | twice | F1, % | IDF1, % | MPJPE, mm | 50 % | 95 % |"
-    return [head, "|---" * 9 + "|", *rows]
+    return [head, rule(9), *rows]

@@ -8,6 +8,7 @@ from pathlib import Path
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
 from shapepose_fg.evaluation.experiments.scale import Scale
 from shapepose_fg.evaluation.held_out_view import held_out
+from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.shelf import evaluate_shelf, match_actors, read_shelf_ground_truth
 from shapepose_fg.evaluation.shelf_events import identity_switches, lost_limbs, pcp_interval
 from shapepose_fg.evaluation.single_person import FPS, measure_single_person
@@ -89,7 +90,7 @@ def _events_table(found: Mapping[str, Figures]) -> list[str]:
         "| Shelf | Avg PCP, % | 95 % interval over blocks of 15 frames | limbs lost, events | identity switches |"
     )
     lost = found.get("with time", {}).get("lost", [])
-    return [head, "|---" * 5 + "|", *rows, "", "With time: " + "; ".join(lost) + "."]
+    return [head, rule(5), *rows, "", "With time: " + "; ".join(lost) + "."]
 
 
 def _views(scale: Scale) -> Figures:
@@ -114,7 +115,7 @@ def _view_table(found: Mapping[str, Figures]) -> list[str]:
     head = (
         "| camera left out | inside the 95 % region, % | of its candidates | joints that the others do not place |"
     )
-    return [head, "|---" * 4 + "|", *rows]
+    return [head, rule(4), *rows]
 
 
 def _single(scale: Scale, temporal: bool) -> Figures:
@@ -129,7 +130,7 @@ def _single(scale: Scale, temporal: bool) -> Figures:
 
 def _single_table(found: Mapping[str, Figures]) -> list[str]:
     rows = [f"| {name} | {' | '.join(words(each) for each in found.values())} |" for name, words in SINGLE.items()]
-    return [f"| pose2sim_single | {' | '.join(found)} |", "|---" * (1 + len(found)) + "|", *rows]
+    return [f"| pose2sim_single | {' | '.join(found)} |", rule(1 + len(found)), *rows]
 
 
 def _frames(scale: Scale, count: int) -> range:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
 from shapepose_fg.evaluation.experiments.scale import Scale, Stretch, shorter
 from shapepose_fg.evaluation.experiments.scene_scores import mean_of, solve_and_score
+from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.simulation import DetectorConfig, simulate
 from shapepose_fg.simulation.foreign import DETECTOR_S_OWN, PEOPLE, people_of, recast
 
@@ -53,7 +54,7 @@ def foreign(scale: Scale) -> Experiment | None:
             for truth in truths
         }
         head = "| truth | F1, % | seen: MPJPE, mm | unseen: MPJPE, mm (share of joints, %) | body: MPJPE, mm |"
-        rows = [f"{head} seen inside 95 %, % | unseen |", "|---" * 7 + "|"]
+        rows = [f"{head} seen inside 95 %, % | unseen |", rule(7)]
         for truth, m in means.items():
             seen = f"{m['f1']:.1f} | {m['seen_mm']:.1f}"
             unseen = f"{m['unseen_mm']:.0f} ({m['unseen_share']:.1f})"

@@ -15,6 +15,7 @@ from shapepose_fg.estimation.linearisation import observation_sigmas
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
 from shapepose_fg.evaluation.experiments.scale import Scale, Stretch, shorter
 from shapepose_fg.evaluation.gradient_x_step import Alternated, GradientStep, GraphStep, alternate_with
+from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.matching import match_people
 from shapepose_fg.observations import Observations
 from shapepose_fg.pipeline import PipelineConfig, find_people
@@ -41,7 +42,7 @@ def _table(figures: Mapping[str, Figures]) -> list[str]:
     rows = [
         "| X step | MPJPE, mm | from the minimum, mm (mean; 99 %) | E over the minimum's | steps of X "
         "| X step, ms a frame | with bodies, ms |",
-        "|---" * 7 + "|",
+        rule(7),
     ]
     for name in next(iter(figures.values())):
         those = [each[name] for each in figures.values()]

@@ -20,6 +20,7 @@ from shapepose_fg.evaluation.experiments.others import (
     scored,
 )
 from shapepose_fg.evaluation.experiments.scale import Scale, Stretch
+from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.opponent.opponent import find_everybody
 from shapepose_fg.evaluation.opponent.over_time import over_time
 from shapepose_fg.evaluation.smpl_only import SamePeople
@@ -147,7 +148,7 @@ def _table(found: Mapping[str, Figures]) -> list[str]:
         cells += [_cell(mean["common"]["nobody"], 0), _cell(mean["cpu_ms"], 0)]
         cells += ["-"] * 3 if paper is None else [f"{value:.1f}" for value in paper]
         rows.append(f"| {name} | {' | '.join(cells)} |")
-    return [head, "|---" * 19 + "|", *rows]
+    return [head, rule(19), *rows]
 
 
 def _cell(value: float | None, decimals: int) -> str:

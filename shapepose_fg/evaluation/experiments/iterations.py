@@ -9,6 +9,7 @@ import numpy as np
 
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
 from shapepose_fg.evaluation.experiments.scale import Scale, Stretch, shorter
+from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.metrics import joint_metrics
 from shapepose_fg.pipeline import PipelineConfig, find_people
 
@@ -43,7 +44,7 @@ def iterations(scale: Scale, images: Path | None = None) -> Experiment | None:
         head = " | ".join(f"{name}: precision | F1 | MPJPE, mm" for name in CONFIGS)
         rows = [
             f"| alternations | {head} | the paper, its data: precision |",
-            "|---" * (2 + 3 * len(CONFIGS)) + "|",
+            rule(2 + 3 * len(CONFIGS)),
         ]
         for count in counts:
             cells = [f"{value:.1f}" for name in CONFIGS for value in _mean(figures, name, count)]

@@ -9,6 +9,7 @@ import numpy as np
 
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
 from shapepose_fg.evaluation.experiments.scale import Scale, Stretch
+from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.tracking import score_tracks, stature_by_person
 from shapepose_fg.pipeline import PipelineConfig
 from shapepose_fg.simulation.truth import truth_of
@@ -96,7 +97,7 @@ def table(scores: Mapping[str, Figures]) -> list[str]:
     every = with_mean(scores)
     told = {h: (n, d) for h, (n, d) in COLUMNS.items() if any(each.get(n) is not None for each in every.values())}
     rows = [f"| {label} | {' | '.join(cells(figures, told.values()))} |" for label, figures in every.items()]
-    return [f"| | {' | '.join(told)} |", "|---" * (1 + len(told)) + "|", *rows]
+    return [f"| | {' | '.join(told)} |", rule(1 + len(told)), *rows]
 
 
 def cells(figures: Figures, columns: Iterable[tuple[str, int]] | None = None) -> list[str]:

@@ -16,6 +16,7 @@ from shapepose_fg.estimation.estimator import Estimator
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
 from shapepose_fg.evaluation.experiments.scale import Scale, Stretch, shorter
+from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.matching import match_people
 from shapepose_fg.observations import Observations
 from shapepose_fg.pipeline import PipelineConfig, find_people, reconstruct
@@ -124,7 +125,7 @@ def _table(figures: Mapping[str, Figures]) -> list[str]:
         for (world, setting), pair in found.items()
         for n, name in enumerate(pair)
     ]
-    rows = [f"| confidence | {' | '.join(names)} |", "|---" * (1 + len(names)) + "|"]
+    rows = [f"| confidence | {' | '.join(names)} |", rule(1 + len(names))]
     for n, (low, high) in enumerate(pairwise(BINS)):
         cells = " | ".join(f"{each[n]:.0f}" if np.isfinite(each[n]) else "-" for each in columns)
         rows.append(f"| {low:g} to {high:g} | {cells} |")

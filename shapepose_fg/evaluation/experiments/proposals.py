@@ -12,6 +12,7 @@ from shapepose_fg.evaluation.experiments.hips import (
     with_hips_in_views,
 )
 from shapepose_fg.evaluation.experiments.scale import Scale, Stretch, shorter
+from shapepose_fg.evaluation.markdown import rule
 
 VIEWS = (2, 3, 4, 5, 6)
 """The views that may see a person's hips."""
@@ -62,7 +63,7 @@ def hip_views(scale: Scale, images: Path | None = None) -> Experiment | None:
 
     def table(figures: Mapping[str, Figures]) -> list[str]:
         head = " | ".join(f"{method}: precision, recall, %" for method in METHODS)
-        rows = [f"| hips are seen by at most | mean of views | {head} |", "|---" * (2 + len(METHODS)) + "|"]
+        rows = [f"| hips are seen by at most | mean of views | {head} |", rule(2 + len(METHODS))]
         for views, mean, found in curves(figures):
             cells = (f"{precision:.1f}, {recall:.1f}" for precision, recall in found.values())
             rows.append(f"| {views} | {mean:.1f} | {' | '.join(cells)} |")

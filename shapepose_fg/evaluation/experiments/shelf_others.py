@@ -10,6 +10,7 @@ import numpy as np
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
 from shapepose_fg.evaluation.experiments.others import OTHERS, SHELF_FPS, read_others
 from shapepose_fg.evaluation.experiments.scale import Scale
+from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.matching import People
 from shapepose_fg.evaluation.opponent.opponent import find_everybody
 from shapepose_fg.evaluation.opponent.over_time import over_time
@@ -111,7 +112,7 @@ def _table(found: Mapping[str, Figures]) -> list[str]:
     head = f"| limbs that are right | {' | '.join(methods)} |"
     return [
         head,
-        "|---" * (1 + len(methods)) + "|",
+        rule(1 + len(methods)),
         *rows,
         "",
         f"The paper's table, on all annotated frames: {told}.",

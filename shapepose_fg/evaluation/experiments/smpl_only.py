@@ -9,6 +9,7 @@ import numpy as np
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
 from shapepose_fg.evaluation.experiments.others import PlainPeople, mean_of, scored
 from shapepose_fg.evaluation.experiments.scale import Scale, Stretch, shorter
+from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.smpl_only import SamePeople
 from shapepose_fg.pipeline import PipelineConfig
 
@@ -64,4 +65,4 @@ def _table(found: Mapping[str, Figures]) -> list[str]:
         figures += [(at["0.1"]["f1"], 1), (mean["mpjpe_mm"], 1), (mean["cpu_ms"], 1), (mean["steps"], 1)]
         cells = ["-" if value is None else f"{value:.{decimals}f}" for value, decimals in figures]
         rows.append(f"| {name} | {' | '.join(cells)} | {paper} |")
-    return [head, "|---" * 9 + "|", *rows]
+    return [head, rule(9), *rows]

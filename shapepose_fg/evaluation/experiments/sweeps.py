@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
 from shapepose_fg.evaluation.experiments.scale import Scale, Stretch, shorter
 from shapepose_fg.evaluation.experiments.scene_scores import mean_of, solve_and_score
+from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.simulation import DetectorConfig, Scene, built_in_scene, simulate
 from shapepose_fg.simulation.motion import Motion
 
@@ -56,7 +57,7 @@ def sweeps(scale: Scale) -> Experiment | None:
     def table(figures: Mapping[str, Figures]) -> list[str]:
         rows = [
             "| | scene | F1, % | MPJPE, mm | IDF1, % | rows of nobody | people missed | inside 95 %, % | ms |",
-            "|---" * 9 + "|",
+            rule(9),
         ]
         for setting in settings:
             found = figures[names[setting]]
