@@ -1,6 +1,7 @@
 """What `shapepose-fg reconstruct` is told by its options, and by a Pose2Sim project: places, times, people."""
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,13 +18,13 @@ if TYPE_CHECKING:
     from shapepose_fg.pipeline import PipelineConfig
 
 
-def project_of(folder: Path) -> "Pose2SimProject":
-    """The Pose2Sim project in a folder, and a note of what was taken to be what."""
+def project_of(folder: Path, tell: Callable[[str], None] = note) -> "Pose2SimProject":
+    """The Pose2Sim project in a folder; `tell` is given what was taken to be what."""
     from shapepose_fg.io.pose2sim_project import read_pose2sim_project
 
     found = read_pose2sim_project(folder)
     for each in found.notes:
-        note(each)
+        tell(each)
     return found
 
 

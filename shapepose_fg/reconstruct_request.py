@@ -118,12 +118,12 @@ class Prepared:
         return found
 
 
-def prepare(request: Request, output: Path | None) -> Prepared:
+def prepare(request: Request, output: Path | None, tell: Callable[[str], None] = note) -> Prepared:
     """Find a request's places, and look at its options, before any large file is read.
 
-    InputError, one sentence, where something is missing or wrong.
+    `tell` is given what a project's files were taken to be. InputError, one sentence, where something is missing or wrong.
     """
-    project = None if request.project is None else project_of(request.project)
+    project = None if request.project is None else project_of(request.project, tell)
     calibration, detections, output = places(request.calibration, request.detections, output, project)
     fps, timestamps = request.fps, request.timestamps
     if project is not None and fps is None and timestamps is None:
