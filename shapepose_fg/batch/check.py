@@ -15,11 +15,12 @@ from shapepose_fg.io.skeleton_file import find_skeleton
 from shapepose_fg.output_folder import prepare_output
 from shapepose_fg.reconstruct_request import OUTPUTS, prepare
 from shapepose_fg.runs.manifest import PARTS
+from shapepose_fg.terminal import note
 
 LOG = "log.txt"
 """What was said about a recording, in its folder."""
-RESULT_SHARE = 0.5
-"""Bytes of results for each byte of detections, at the least: OpenPose's JSON has most of them, and leaves least."""
+_LEAST, _USUAL = 0.1, 2.0
+"""Bytes of results for each byte of detections: many cameras whose files hold hands and faces, and others."""
 
 
 def look_at_all(table: Path, entries: Sequence[Entry], output: Path, *, begun: bool) -> dict[str, int]:
@@ -40,13 +41,15 @@ def look_at_all(table: Path, entries: Sequence[Entry], output: Path, *, begun: b
         listed = ", ".join(others[:5]) + (f" and {len(others) - 5} more" if len(others) > 5 else "")
         more = f" (and something is wrong with {listed}, too)" if len(others) > 0 else ""
         raise InputError(f"{table}: {problems[0]}{more}")
-    needed = int(RESULT_SHARE * sum(sizes.values()))
-    free = shutil.disk_usage(output).free
-    if free < needed:
+    whole, free = sum(sizes.values()), shutil.disk_usage(output).free
+    if free < _LEAST * whole:
         raise InputError(
-            f"{output}: at least {decimal(needed)} are needed for {len(entries)} recordings, and {decimal(free)} are"
-            " free; make room, give another --output, or make several tables of this one"
+            f"{output}: at least {decimal(int(_LEAST * whole))} are needed for {len(entries)} recordings, and"
+            f" {decimal(free)} are free; make room, give another --output, or split the table"
         )
+    if free < _USUAL * whole:
+        usual = decimal(int(_USUAL * whole))
+        note(f"{output}: {decimal(free)} are free, and results of so much footage mostly take {usual}")
     return sizes
 
 
