@@ -157,9 +157,7 @@ def _client(address: str) -> Iterator[Any]:
 
 
 def _refuse_other_programs(client: Any, address: str) -> None:
-    """InputError where a process of a cluster has another version of this program, or of what decides about numbers:
-    results would depend on who did what.
-    """
+    """InputError where a process has another version of this program, or of what decides on numbers."""
     own = _program()
     for process, theirs in client.run(_program, on_error="return").items():
         if not isinstance(theirs, dict):

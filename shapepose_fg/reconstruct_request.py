@@ -121,7 +121,8 @@ class Prepared:
 def prepare(request: Request, output: Path | None, tell: Callable[[str], None] = note) -> Prepared:
     """Find a request's places, and look at its options, before any large file is read.
 
-    `tell` is given what a project's files were taken to be. InputError, one sentence, where something is missing or wrong.
+    `tell` is given what a project's files were taken to be. InputError, one sentence, where something is missing
+    or wrong.
     """
     project = None if request.project is None else project_of(request.project, tell)
     calibration, detections, output = places(request.calibration, request.detections, output, project)
@@ -145,10 +146,10 @@ def carry_out(
     restart: bool = False,
     watched: "Callable[[], AbstractContextManager[Callable[[int, int], None]]] | None" = None,
 ) -> "Ended":
-    """Reconstruct what is asked for into the folder `output`, or the project's, and say on the terminal how it went.
+    """Reconstruct what is asked for into the folder `output`, or the project's, and say how it went.
 
-    `workers`, `cluster`, `resume` and `restart` are the command's options. `watched` is a context that gives what is
-    told how many frames are done, a progress bar by default. InputError, one sentence, for what cannot be used;
+    `workers`, `cluster`, `resume` and `restart` are the command's options. `watched` is a context that gives what
+    is told how many frames are done, a progress bar by default. InputError, one sentence, for what cannot be used;
     `Stopped` on Ctrl-C or a request to end.
     """
     from shapepose_fg.io.corrections import refuse_corrected

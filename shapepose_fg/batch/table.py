@@ -74,9 +74,8 @@ def _check_names(names: list[str], path: Path) -> None:
                 " with a letter or digit, because a folder is called so; rename it"
             )
         if name.lower() in ("batch.json", *seen):
-            raise InputError(
-                f"{path}: recordings.{name}: this name is taken by {seen.get(name.lower(), 'batch.json')}; rename it"
-            )
+            other = seen.get(name.lower(), "batch.json")
+            raise InputError(f"{path}: recordings.{name}: {other} has this name on some systems, too; rename it")
         seen[name.lower()] = name
 
 
@@ -107,7 +106,7 @@ def _inside(given: Path, path: Path, place: str) -> Path:
         raise InputError(f"{path}: {place}: no file has the name {str(given)[:80]!r}; correct it") from None
     if not inside:
         raise InputError(
-            f"{path}: {place}: {given} leads out of the table's folder; if it is meant, give it as an absolute path"
+            f"{path}: {place}: {given} leads out of the table's folder; if that is meant, write an absolute path"
         )
     return found
 
@@ -123,8 +122,8 @@ def _in_turn(entries: list[Entry], path: Path) -> list[Entry]:
             key = project.resolve(), each.request.frames
             if key in projects:
                 raise InputError(
-                    f"{path}: recordings.{each.name}: {project} is that of {projects[key]}, too, and one's TRC would"
-                    " be written over the other's; leave one out"
+                    f"{path}: recordings.{each.name}: {project} is that of {projects[key]}, too, and TRC of"
+                    " one would be written over those of the other; leave one out"
                 )
             projects[key] = each.name
         if shapes is not None:
