@@ -1,4 +1,4 @@
-"""An archive on a machine's processes: interrupted, gone on with, and to the byte what each recording alone gives."""
+"""An archive on a machine's processes: interrupted, gone on with, and to the byte what each alone gives."""
 
 import json
 import os
@@ -6,10 +6,12 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 
+from shapepose_fg.batch.table import read_table
 from shapepose_fg.cli import main
 from shapepose_fg.errors import InputError
 from shapepose_fg.estimation.detector_offsets import OffsetConfig
@@ -18,8 +20,11 @@ from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.config import toml_text
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.pipeline import PipelineConfig, reconstruct
+from shapepose_fg.reconstruct_request import carry_out
+from shapepose_fg.runs.manifest import frames_done
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.files import write_simulated
+from shapepose_fg.stopping import Stopped
 from shapepose_fg.tracking.following import FollowingConfig
 from shapepose_fg.windows import WindowConfig
 
@@ -27,7 +32,7 @@ CONFIG = PipelineConfig(
     batch_frames=6,
     following=FollowingConfig(look_ahead_s=0.15),
     windows=WindowConfig(overlap_s=0.1),
-    offsets=OffsetConfig(frames=4),
+    offsets=OffsetConfig(source="none"),
 )
 TABLE = """
 [defaults]
@@ -73,6 +78,19 @@ def finished(*words: str | Path) -> int:
     return ended.value.code
 
 
+def stopped_behind_a_chunk(archive: Path, folder: Path) -> None:
+    """Leave the parts of a run of the recording `long`, without which it could not go on."""
+    asked = {entry.name: entry.request for entry in read_table(archive / "recordings.toml")}["long"]
+
+    def stop(done: int, _: int) -> None:
+        if done >= 12:
+            raise Stopped(signal.SIGTERM)
+
+    with pytest.raises(Stopped):
+        carry_out(asked, folder, workers=1, restart=True, watched=lambda: nullcontext(stop))
+    assert frames_done(folder) == 12
+
+
 @pytest.mark.skipif(os.name != "posix", reason="stops processes by POSIX signals")
 def test_an_archive_is_interrupted_goes_on_and_is_what_each_recording_alone_gives(archive, tmp_path, capsys):
     pytest.importorskip("distributed", reason="Dask is an extra")
@@ -86,17 +104,15 @@ def test_an_archive_is_interrupted_goes_on_and_is_what_each_recording_alone_give
         start_new_session=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
-    part, deadline = tmp_path / "long" / "parts" / "part-000001.safetensors", time.monotonic() + 300
-    while not part.exists():
+    log, deadline = tmp_path / "long" / "log.txt", time.monotonic() + 300
+    while not log.exists():
         assert first.poll() is None and time.monotonic() < deadline, first.communicate()
         time.sleep(0.01)
     os.killpg(first.pid, signal.SIGINT)  # as a terminal does, to all of its processes
     _, said = first.communicate(timeout=120)
     assert first.returncode == 130, said
     assert f"recordings are done in {tmp_path}; go on with --resume" in said and "Traceback" not in said
-    left = json.loads((tmp_path / "long" / "parts" / "manifest.json").read_text())
-    assert left["chunk_frames"] == 12
-
+    stopped_behind_a_chunk(archive, tmp_path / "long")
     assert finished(*words) == 2
     assert "a batch was begun here; go on with --resume, or begin anew with --restart" in capsys.readouterr().err
     assert finished(*words, "--resume") == 1, "one of them failed"
@@ -109,7 +125,6 @@ def test_an_archive_is_interrupted_goes_on_and_is_what_each_recording_alone_give
     assert "the file ends too early" in broken["reasons"][0]
     assert f"broken: {broken['reasons'][0]}"[:60] in " ".join(said.err.split()) and "2 done, 1 failed" in said.out
     assert "parts" not in {file.name for file in (tmp_path / "long").iterdir()}
-    assert "no run was stopped here" not in (tmp_path / "long" / "log.txt").read_text()
     for name, more in (("long", {"cuts": (18,), "chunk_frames": 12}), ("short", {})):
         rig = read_rig(archive / name / "rig.json")
         seen = read_detections(archive / name / "openpose", rig)
@@ -156,16 +171,21 @@ def test_another_program_on_a_worker_is_noticed(monkeypatch):
     from shapepose_fg import cluster
 
     class Client:
+        def __init__(self, theirs):
+            self.theirs = theirs
+
         def run(self, _, on_error):
-            return {"tcp://a:1": own, "tcp://b:2": theirs}
+            return {"tcp://a:1": own, "tcp://b:2": self.theirs}
 
     own = cluster._program()
     for theirs, words in (
         ({**own, "numpy": "1.0"}, r"its process tcp://b:2 has another version of numpy \(1\.0 there, .* here\)"),
-        ({**own, "shapepose-fg itself": "x"}, "has another version of shapepose-fg itself; install the same there"),
+        (
+            {**own, "shapepose-fg itself": "x"},
+            "has another version of shapepose-fg itself; install the same there",
+        ),
         (ModuleNotFoundError("No module named 'shapepose_fg'"), r"cannot run this program \(No module named"),
     ):
         with pytest.raises(InputError, match=words):
-            cluster._refuse_other_programs(Client(), "tcp://s:1")
-    theirs = own
-    cluster._refuse_other_programs(Client(), "tcp://s:1")
+            cluster._refuse_other_programs(Client(theirs), "tcp://s:1")
+    cluster._refuse_other_programs(Client(own), "tcp://s:1")

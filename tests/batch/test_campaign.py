@@ -92,8 +92,15 @@ def test_the_largest_are_begun_first_and_who_failed_comes_again_at_the_end(stage
     standings = run(stage, tmp_path, entries("a", "bbb", "cc"), restart=frozenset(["bbb", "cc"]))
     assert [each.name for each in stage.begun] == ["bbb", "cc", "a", "bbb", "cc"]
     # What was there goes once; what the first attempt left is kept.
-    assert [(each.restart, each.resume) for each in stage.begun if each.name == "bbb"] == [(True, False), (False, True)]
-    assert {name: each.status for name, each in standings.of.items()} == {"a": "done", "bbb": "done", "cc": "failed"}
+    assert [(each.restart, each.resume) for each in stage.begun if each.name == "bbb"] == [
+        (True, False),
+        (False, True),
+    ]
+    assert {name: each.status for name, each in standings.of.items()} == {
+        "a": "done",
+        "bbb": "done",
+        "cc": "failed",
+    }
     assert standings.of["cc"].reasons == ("no", "no again") and standings.of["cc"].attempts == 2
     assert standings.of["bbb"].frames == 10 and standings.of["bbb"].warnings == ("cam1 is late",)
     assert ("ended", "cc", "no", True) in stage.heard and ("ended", "cc", "no again", False) in stage.heard

@@ -73,7 +73,10 @@ def test_recordings_that_share_shapes_wait_for_each_other_in_the_table_s_order(t
         ("[recording.a]", r"recording is not a known table; write \[defaults\] and \[recordings.NAME\]"),
         ("recordings = 3", "recordings must be a table, got 3"),
         ("[recordings]\na = 3", r"recordings\.a must be a table, got 3; docs/batch\.md"),
-        ("[recordings.a]\nimage-size = '1x1'", r"recordings\.a\.image-size .* did you mean recordings\.a\.image_size"),
+        (
+            "[recordings.a]\nimage-size = '1x1'",
+            r"recordings\.a\.image-size .* did you mean recordings\.a\.image_size",
+        ),
         ("[recordings.a]\nfps = '25'", r"recordings\.a\.fps must be a number, got text '25'; docs/batch\.md"),
         ("[recordings.a]\nfps = nan", r"recordings\.a\.fps must be a"),
         ("[recordings.a]\ncuts = [1, 2.5]", r"recordings\.a\.cuts\[1\] must be a whole number, got 2\.5"),
