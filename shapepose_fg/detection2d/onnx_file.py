@@ -39,7 +39,7 @@ def read_onnx(file: Path) -> bytes:
         content = b"" if size > MOST_BYTES else stream.read(MOST_BYTES + 1)
     if max(size, len(content)) > MOST_BYTES:
         raise InputError(
-            f"{file}: over {MOST_BYTES >> 20} MiB are too much for a network of OpenPose's kind; check that it is one"
+            f"{file}: over {MOST_BYTES >> 20} MiB are too much for a network of this kind; check that it is one"
         )
     try:
         other = next(_external(memoryview(content)), None)

@@ -84,7 +84,7 @@ def test_a_file_that_is_too_large_is_not_read(tmp_path, monkeypatch):
     with file.open("ab") as stream:
         stream.truncate(2**40)  # a hole: takes no room on the disk
     monkeypatch.undo()
-    with pytest.raises(InputError, match=r"over 512 MiB are too much for a network of OpenPose's kind"):
+    with pytest.raises(InputError, match=r"over 512 MiB are too much for a network of this kind"):
         HeatMapNetwork.load(file)
 
 
