@@ -5,8 +5,8 @@ alternately in one run, and prints the time of every stage, the processor's time
 where stage II's time goes; then the clock with worker processes. Then a cheap recording (two people, four cameras)
 of rising `--lengths`: time a frame must not grow, nor memory beyond the rows of the result. `--stretch NAME:A:B`
 takes frames of a simulated recording instead, `--simulate NAME` times the simulator, with one worker and two.
-`--chunks FRAMES` compares chunks of so many frames on `--workers` processes with one process and no chunks: the
-ratio of their clocks, how far joints are apart at the seams and elsewhere, and who loses the identity. On a machine
+`--chunks FRAMES` compares chunks of so many frames on `--workers` processes with one process and no chunks: ratio
+of the clocks, how far joints are apart at the seams and elsewhere, and who loses the identity. On a machine
 that does nothing else.
 """
 
