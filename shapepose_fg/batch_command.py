@@ -145,10 +145,10 @@ def _standings(
 
 
 def _at_once(processes: int, cores: int) -> int:
-    """Recordings that are led side by side: following people keeps one process busy where ten solve, and while one
-    recording is read or written another fills the queue.
+    """Recordings that are led side by side: one leader keeps five processes busy where it follows people itself, and
+    ten where it does not; and while one recording is read or written another fills the queue.
     """
-    return max(2, min(1 + processes // 8, cores))
+    return max(2, min(1 + processes // 6, cores))
 
 
 def _say(scheduler: "Scheduler", count: int, todo: int, at_once: int, *, here: bool) -> None:
