@@ -145,8 +145,10 @@ def _standings(
 
 
 def _at_once(processes: int, cores: int) -> int:
-    """Recordings that are led side by side: one leader keeps five processes busy where it follows people itself, and
-    ten where it does not; and while one recording is read or written another fills the queue.
+    """Recordings that are led side by side.
+
+    One leader keeps five processes busy where it follows people itself, and ten where it does not; and while one
+    recording is read or written another fills the queue.
     """
     return max(2, min(1 + processes // 6, cores))
 

@@ -21,6 +21,8 @@ Result = TypeVar("Result")
 
 RETRIES = 2
 """So often an item whose process was lost, or that failed, is tried again."""
+_LEAST = 2
+"""So many items are always under way, so that the next one does not wait for the last."""
 _SECONDS = 10
 """A cluster that does not answer for so long is not there."""
 
@@ -31,12 +33,16 @@ class Cluster(Generic[Shared]):
     A context. Results come in order and do not depend on which process they come from, or how many there are.
     """
 
-    def __init__(self, address: str | None, count: int, shared: Shared, ahead: int = 2) -> None:
+    def __init__(
+        self, address: str | None, count: int, shared: Shared, ahead: int = 2, *, sharing: int = 1
+    ) -> None:
         """The cluster whose scheduler is at `address`, `tcp://host:8786`; None: one of `count` processes here.
 
-        `ahead` items a process are under way. InputError where Dask is not installed.
+        `ahead` items a process are under way, of all who are `sharing` the cluster together: they wait in its
+        scheduler's memory. InputError where Dask is not installed.
         """
-        self._address, self._count, self._shared, self._ahead = address, count, shared, ahead
+        self._address, self._count, self._shared = address, count, shared
+        self._ahead = ahead / sharing
         self._open = ExitStack()
         self._client: Client | None = None
         self._at: Future[Any] | None = None
@@ -74,7 +80,7 @@ class Cluster(Generic[Shared]):
             for item in items:
                 with _large():
                     waiting.append(client.submit(_work, work, self._at, item, pure=False, retries=RETRIES))
-                if len(waiting) >= self._ahead * max(1, len(client.nthreads())):
+                if len(waiting) >= max(_LEAST, self._ahead * len(client.nthreads())):
                     yield waiting.popleft().result()
             while len(waiting) > 0:
                 yield waiting.popleft().result()

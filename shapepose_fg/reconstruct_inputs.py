@@ -62,12 +62,12 @@ def cuts_of(text: str | None) -> tuple[int, ...]:
         ) from None
 
 
-def check_cuts(cuts: tuple[int, ...], count: int) -> tuple[int, ...]:
+def possible_cuts(cuts: tuple[int, ...], count: int) -> tuple[int, ...]:
     """`cuts`, if a recording of `count` frames can have them."""
-    from shapepose_fg import frame_times
+    from shapepose_fg.frame_times import check_cuts
 
     try:
-        return frame_times.check_cuts(cuts, count)
+        return check_cuts(cuts, count)
     except ValueError:
         raise InputError(
             f"--cuts {','.join(map(str, cuts))}: must be rising frame numbers between 1 and {count - 1}, such as"

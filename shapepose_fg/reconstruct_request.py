@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, cast
 from shapepose_fg.errors import InputError
 from shapepose_fg.options import check_fps, frame_range, image_size_of, refuse_no_range
 from shapepose_fg.output_folder import only_run_in
-from shapepose_fg.reconstruct_inputs import check_cuts, fitter_of, places, project_of, times_of
+from shapepose_fg.reconstruct_inputs import fitter_of, places, possible_cuts, project_of, times_of
 from shapepose_fg.result_files import OBSERVATIONS, PEOPLE, RUN
 from shapepose_fg.terminal import note, progress
 
@@ -142,13 +142,15 @@ def carry_out(
     *,
     workers: int | None = None,
     cluster: str | None = None,
+    sharing: int = 1,
     resume: bool = False,
     restart: bool = False,
     watched: "Callable[[], AbstractContextManager[Callable[[int, int], None]]] | None" = None,
 ) -> "Ended":
     """Reconstruct what is asked for into the folder `output`, or the project's, and say how it went.
 
-    `workers`, `cluster`, `resume` and `restart` are the command's options. `watched` is a context that gives what
+    `workers`, `cluster`, `resume` and `restart` are the command's options. So many runs are `sharing` the cluster.
+    `watched` is a context that gives what
     is told how many frames are done, a progress bar by default. InputError, one sentence, for what cannot be used;
     `Stopped` on Ctrl-C or a request to end.
     """
@@ -168,7 +170,7 @@ def carry_out(
     if project is not None and request.frames is None:
         span = project.span(len(recording))
     times = times_of(known.fps, timestamps, rig, len(recording))
-    cuts = check_cuts(request.cuts, len(recording))
+    cuts = possible_cuts(request.cuts, len(recording))
     refuse_corrected(output)
     with only_run_in(output, OUTPUTS):
         from shapepose_fg.reconstruct_ending import Ending
@@ -180,8 +182,8 @@ def carry_out(
         fitter = fitter_of(body, settings, recording.skeleton.joints)
         inputs = reading.checksums((calibration, *recording.sources, config, body, timestamps))
         inputs |= {} if offsets is None else checksums([offsets])
-        chunk_frames = request.chunk_frames
-        job = Job(rig, recording, settings, span, times, cuts, body, fitter, shapes, inputs, chunk_frames)
+        read = rig, recording, settings, span, times, cuts, body, fitter, shapes, inputs
+        job = Job(*read, request.chunk_frames, sharing)
         # Of its own detections `detect` knows which pictures they are of.
         own = (known.detections / "footage.json").is_file()
         videos = None if project is None or own else project.folder / "videos"

@@ -57,6 +57,8 @@ class Job:
     """Checksums of the files that were read."""
     chunk_frames: int | None = None
     """Into chunks of how many frames the recording is cut; None for one."""
+    sharing: int = 1
+    """How many runs share the cluster."""
 
     def begun(self) -> dict[str, Any]:
         """All that the result depends on, as plain values: equal for a run that goes on."""
@@ -165,6 +167,7 @@ def _run(
             workers=count,
             cluster=cluster,
             chunk_frames=job.chunk_frames,
+            sharing=job.sharing,
         )
     seconds = time.perf_counter() - start
     inputs = dict(job.inputs)

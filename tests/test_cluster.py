@@ -53,6 +53,32 @@ def test_a_killed_process_costs_only_its_own_work(tmp_path):
     assert (tmp_path / "killed").exists()
 
 
+class FakeClient:
+    """Four processes that do everything at once."""
+
+    def nthreads(self):
+        return dict.fromkeys("abcd", 1)
+
+    def submit(self, *_, **__):
+        return self
+
+    def result(self) -> int:
+        return 0
+
+    def cancel(self, _) -> None:
+        pass
+
+
+@pytest.mark.parametrize(("sharing", "under_way"), [(1, 8), (2, 4), (30, 2)])
+def test_who_shares_a_cluster_keeps_a_part_of_the_work_ready(sharing, under_way):
+    """Two items a process, of all who share them together; two at the least."""
+    taken: list[int] = []
+    cluster = Cluster("tcp://x", 1, "", sharing=sharing)
+    cluster._client = FakeClient()
+    next(cluster.map(late, (taken.append(n) or n for n in range(20))))
+    assert len(taken) == under_way
+
+
 def test_an_error_of_the_work_is_that_error():
     with Cluster(None, 1, "") as cluster, pytest.raises(ArithmeticError, match="item 0"):
         list(cluster.map(fails, range(3)))

@@ -97,7 +97,7 @@ class Campaign:
         folder = self.output / entry.name
         restart = entry.name in self.restart and standings.of[entry.name].attempts == 0
         resume = not restart and (folder / PARTS).exists()
-        return Assignment(entry.name, entry.request, folder, self.cluster, resume, restart)
+        return Assignment(entry.name, entry.request, folder, self.cluster, self.at_once, resume, restart)
 
     def _heard(self, leader: Leader, standings: Standings, watcher: Watcher) -> bool:
         """Take in what a leader tells; whether it has ended."""

@@ -41,6 +41,8 @@ class Assignment:
     """Of its results."""
     cluster: str
     """Address of the scheduler."""
+    sharing: int = 1
+    """How many recordings are led at a time."""
     resume: bool = False
     """Go on with what a run that was stopped left."""
     restart: bool = False
@@ -144,6 +146,7 @@ def _carried_out(assignment: Assignment, tell: Callable[[int, int], None]) -> Do
             assignment.request,
             assignment.folder,
             cluster=assignment.cluster,
+            sharing=assignment.sharing,
             resume=assignment.resume,
             restart=assignment.restart,
             watched=watched,
