@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from shapepose_fg.cluster import Cluster
+from shapepose_fg.cluster import Cluster, has_dashboard, local_cluster
 from shapepose_fg.errors import InputError
 
 
@@ -82,6 +82,27 @@ def test_who_shares_a_cluster_keeps_a_part_of_the_work_ready(sharing, under_way)
 def test_an_error_of_the_work_is_that_error():
     with Cluster(None, 1, "") as cluster, pytest.raises(ArithmeticError, match="item 0"):
         list(cluster.map(fails, range(3)))
+
+
+def test_processes_of_this_machine_listen_to_this_machine_and_are_deaf_to_ctrl_c():
+    import psutil
+
+    with local_cluster(1, dashboard=True) as scheduler:
+        own = psutil.Process()
+        listening = [
+            each.laddr.ip
+            for process in (own, *own.children(recursive=True))
+            for each in process.net_connections()
+            if each.status == "LISTEN"
+        ]
+        assert len(listening) >= 2 and set(listening) == {"127.0.0.1"}
+        assert scheduler.address.startswith("tcp://127.0.0.1:") and scheduler.processes == 1
+        assert (scheduler.dashboard is not None) == has_dashboard()
+        for process in own.children(recursive=True):
+            if "fork" in process.cmdline()[-1]:  # a worker; the others are Python's own helpers
+                os.kill(process.pid, signal.SIGINT)
+                time.sleep(0.2)
+                assert process.is_running() and process.status() != "zombie"
 
 
 def test_nobody_answers():
