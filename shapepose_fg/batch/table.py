@@ -97,14 +97,12 @@ def _located(request: Request, path: Path, place: str) -> Request:
 
 def _inside(given: Path, path: Path, place: str) -> Path:
     """A path relative to the table's folder, inside it; or an absolute one."""
-    if given.is_absolute():
-        return given
-    found = path.parent / given
+    found = path.parent / given  # itself, where it is absolute
     try:
         inside = found.resolve().is_relative_to(path.parent.resolve())
     except (OSError, RuntimeError, ValueError):  # links in a circle, a zero byte
         raise InputError(f"{path}: {place}: no file has the name {str(given)[:80]!r}; correct it") from None
-    if not inside:
+    if not (inside or given.is_absolute()):
         raise InputError(
             f"{path}: {place}: {given} leads out of the table's folder; if that is meant, write an absolute path"
         )

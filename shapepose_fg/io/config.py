@@ -6,6 +6,7 @@ import json
 import textwrap
 from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar, cast, get_type_hints
@@ -75,11 +76,17 @@ def _value(hint: Any, value: Any, path: Path, key: str, cure: str) -> Any:
         return _build(cast(type, hint), value, path, f"{key}.", cure)
     try:
         # As JSON, strict types still let a list be a tuple and a text be an enumeration.
-        return TypeAdapter(hint, config=_STRICT).validate_json(json.dumps(value, default=str))
+        return _adapter(hint).validate_json(json.dumps(value, default=str))
     except ValidationError as error:
         place, problem = first_problem(error)
         index = "".join(f"[{part}]" for part in place if isinstance(part, int))
         raise InputError(f"{path}: {key}{index} {problem}; {cure}") from None
+
+
+@cache
+def _adapter(hint: Any) -> TypeAdapter[Any]:
+    """Checks values of a type; made once for each, which takes a millisecond."""
+    return TypeAdapter(hint, config=_STRICT)
 
 
 def _lines(config: Any, table: str = "") -> list[str]:

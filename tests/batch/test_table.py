@@ -91,6 +91,7 @@ def test_recordings_that_share_shapes_wait_for_each_other_in_the_table_s_order(t
         ("[recordings.a]\nshapes = 'out/who.npz'", r"a\.shapes: out/who\.npz leads out of the table's folder"),
         ("[recordings.a]\nskeleton = '../s.toml'", r"a\.skeleton: \.\./s\.toml leads out"),
         ('[recordings.a]\nbody = "a\\u0000b"', r"recordings\.a\.body: no file has the name 'a\\x00b'"),
+        ('[recordings.a]\nproject = "/a\\u0000b"', r"recordings\.a\.project: no file has the name"),
         ("[recordings.a]\nproject='p'\n[recordings.b]\nproject='p'", r"recordings\.b: .*p is that of a, too"),
     ],
 )
