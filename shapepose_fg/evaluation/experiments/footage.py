@@ -1,11 +1,15 @@
-"""Real footage: Shelf's lost limbs as events, its cameras left out one by one, Pose2Sim's demo recording."""
+"""Real footage: Shelf's lost limbs as events, its cameras left out one by one, Pose2Sim's demo recording, and
+frames alone beside the same frames over time.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+from shapepose_fg.evaluation.alone_beside_time import beside
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
+from shapepose_fg.evaluation.experiments.others import SHELF_FPS
 from shapepose_fg.evaluation.experiments.scale import Scale
 from shapepose_fg.evaluation.held_out_view import held_out
 from shapepose_fg.evaluation.markdown import rule
@@ -57,6 +61,15 @@ def single_person(scale: Scale) -> Experiment | None:
         return None
     return Experiment(
         "single", [Case(name, partial(_single, scale, on)) for name, on in _MODES.items()], _single_table
+    )
+
+
+def alone_beside_time(scale: Scale) -> Experiment | None:
+    """Frames alone beside time on both recordings, and what the kernel of drafts is worth there."""
+    if scale.shelf is None or scale.pose2sim_single is None:
+        return None
+    return Experiment(
+        "beside time", [Case(name, partial(_beside, scale, name)) for name in _FOOTAGE], _beside_table
     )
 
 
@@ -131,6 +144,46 @@ def _single(scale: Scale, temporal: bool) -> Figures:
 def _single_table(found: Mapping[str, Figures]) -> list[str]:
     rows = [f"| {name} | {' | '.join(words(each) for each in found.values())} |" for name, words in SINGLE.items()]
     return [f"| pose2sim_single | {' | '.join(found)} |", rule(1 + len(found)), *rows]
+
+
+_FOOTAGE = ("Shelf", "pose2sim_single")
+_REACHES_M = (PipelineConfig().refine.draft_reach_m, 0.0)
+"""`refine.draft_reach_m`: ours, and drafts without it."""
+
+
+def _beside(scale: Scale, name: str) -> Figures:
+    folder = _there(scale.shelf if name == "Shelf" else scale.pose2sim_single)
+    places = ("calibration.json", ".") if name == "Shelf" else ("rig.json", "openpose")
+    rig = read_rig(folder / places[0])
+    recording = read_detections(folder / places[1], rig)
+    times = FrameTimes.from_fps(SHELF_FPS if name == "Shelf" else FPS, len(recording))
+    solve = partial(reconstruct, recording, rig, frames=_frames(scale, len(recording)), times=times)
+    timed, default = solve(config=PipelineConfig()), PipelineConfig()
+    figures: Figures = {}
+    for reach_m in _REACHES_M:
+        refine = replace(default.refine, draft_reach_m=reach_m)
+        found = beside(solve(config=replace(default, temporal=False, refine=refine)), timed)
+        wrists = [recording.skeleton.joints.index(joint) for joint in ("RWrist", "LWrist")]
+        figures[f"{reach_m:g}"] = {
+            "share": 100 * found.share,
+            "wrists": 100 * float(found.apart[wrists].sum() / max(found.seen[wrists].sum(), 1)),
+            "seen": int(found.seen.sum()),
+            "missing": found.missing,
+        }
+    return figures
+
+
+def _beside_table(found: Mapping[str, Figures]) -> list[str]:
+    head = "joints elsewhere, % | wrists elsewhere, % | of joints | people missing"
+    rows = [f"| frames alone beside time | {' | '.join(f'{name}: {head}' for name in found)} |"]
+    rows.append(rule(1 + 4 * len(found)))
+    words = ("**the kernel narrows to 5 cm**", "drafts without it")
+    for reach_m, name in zip(_REACHES_M, words, strict=True):
+        cells = []
+        for each in (every[f"{reach_m:g}"] for every in found.values()):
+            cells += [f"{each['share']:.2f}", f"{each['wrists']:.1f}", f"{each['seen']}", f"{each['missing']}"]
+        rows.append(f"| {name} | {' | '.join(cells)} |")
+    return rows
 
 
 def _frames(scale: Scale, count: int) -> range:

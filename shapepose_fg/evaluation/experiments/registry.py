@@ -38,7 +38,7 @@ def experiments(scale: Scale, images: Path | None = None, others: Path | None = 
         yield over_time.experiment(scale, temporal=False)
     yield crowd.experiment(scale)
     yield box.experiment(scale)
-    for make in (footage.shelf_events, footage.held_out_views, footage.single_person):
+    for make in (footage.shelf_events, footage.held_out_views, footage.single_person, footage.alone_beside_time):
         yield from _there(make(scale))
     yield from _paper(scale, images, others)
     if not scale.quick and scale.mocap is not None:
