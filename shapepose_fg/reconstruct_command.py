@@ -18,7 +18,7 @@ from shapepose_fg.options import (
     image_size_of,
 )
 from shapepose_fg.output_folder import only_run_in
-from shapepose_fg.reconstruct_inputs import cuts_of, fitter_of, places, project_of, times_of
+from shapepose_fg.reconstruct_inputs import cuts_of, fitter_of, places, project_of, recording_folder, times_of
 from shapepose_fg.result_files import OBSERVATIONS, PEOPLE, RUN
 from shapepose_fg.terminal import note
 
@@ -110,16 +110,16 @@ def reconstruct(
     reading = ReadInputs((calibration, detections, config, body, timestamps))
     size = image_size_of(image_size)
     rig = read_rig(calibration, up=cast("Axis | None", up), unit=cast("Unit | None", unit), image_size=size)
-    recording = read_detections(detections, rig, skeleton)
-    for each in recording.notes:
-        note(each)
-    span = frame_range(frames, len(recording))
-    if whole is not None and frames is None:
-        span = whole.span(len(recording))
-    times = times_of(fps, timestamps, rig, len(recording))
-    first_frames = cuts_of(cuts, len(recording))
     refuse_corrected(output)
-    with only_run_in(output, _OUTPUTS):
+    with only_run_in(output, _OUTPUTS), recording_folder(output) as kept:
+        recording = read_detections(detections, rig, skeleton, kept)
+        for each in recording.notes:
+            note(each)
+        span = frame_range(frames, len(recording))
+        if whole is not None and frames is None:
+            span = whole.span(len(recording))
+        times = times_of(fps, timestamps, rig, len(recording))
+        first_frames = cuts_of(cuts, len(recording))
         from shapepose_fg.pipeline import PipelineConfig
         from shapepose_fg.reconstruct_ending import Ending
         from shapepose_fg.reconstruct_run import Job, run_job

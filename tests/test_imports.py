@@ -28,6 +28,7 @@ LEVELS = (
     "proposal",
     "estimation",
     "tracking",
+    "person_bodies",
     "windows bodies_over_time solved_rows",
     "pipeline_config cluster",
     "runs",

@@ -88,8 +88,8 @@ def keep_block(
 ) -> None:
     """Keep block `number` of a recording: the candidates of its T frames, one frame after the other.
 
-    `pairs` count from the first candidate of their own frame; `candidate_start` and `pair_start` (T + 1,) are where
-    each frame's candidates and pairs begin.
+    `pairs` count from the first candidate of their own frame; `candidate_start` and `pair_start` (T + 1,) are
+    where each frame's candidates and pairs begin.
     """
     arrays = {name: getattr(candidates, name).astype(dtype) for name, dtype in _KEPT.items()}
     kept.keep(_name(number), arrays | {"candidate_start": candidate_start, "pair_start": pair_start})

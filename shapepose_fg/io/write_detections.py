@@ -14,8 +14,8 @@ from shapepose_fg.camera import Camera, Rig
 from shapepose_fg.detections import Detections, DetectionSequence
 from shapepose_fg.errors import InputError
 from shapepose_fg.files import write_atomically
-from shapepose_fg.io.detections.view_streams import MARGIN
 from shapepose_fg.io.detections.association_skeletons import TEXT_SKELETONS, TextSkeleton
+from shapepose_fg.io.detections.view_streams import MARGIN
 from shapepose_fg.skeleton import BODY_25
 
 SMALLEST_PERSON = 3

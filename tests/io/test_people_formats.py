@@ -249,9 +249,8 @@ def test_scores_of_other_kinds(tmp_path, rig):
     table = read_detections(tmp_path, rig)
     every = np.concatenate([person[:, 2] for frames in people.values() for found in frames for person in found])
     scale = np.quantile(every[every > 0], 0.99)
-    np.testing.assert_allclose(
-        np.sort(np.concatenate([frame.confidence for frame in table])), np.sort(np.minimum(every[every > 0] / scale, 1))
-    )
+    found = np.concatenate([frame.confidence for frame in table])
+    np.testing.assert_allclose(np.sort(found), np.sort(np.minimum(every[every > 0] / scale, 1)))
     assert f"divided by {scale:.3g}, which 1 in 100 exceeds, and cut at 1" in table.notes[0]
 
 

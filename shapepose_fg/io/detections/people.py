@@ -62,9 +62,7 @@ def candidates_of(people: CameraPeople, skeleton: Skeleton, first: int, last: in
     return ViewStream(people.source, count, _blocks(people.blocks, skeleton, first, count), first)
 
 
-def _blocks(
-    blocks: Iterator[PeopleBlock], skeleton: Skeleton, first: int, count: int
-) -> Iterator[ViewCandidates]:
+def _blocks(blocks: Iterator[PeopleBlock], skeleton: Skeleton, first: int, count: int) -> Iterator[ViewCandidates]:
     """Candidates in blocks of `BLOCK_FRAMES` frames, of people in blocks of any length."""
     waiting = PeopleBlock(np.zeros(0, dtype=np.intp), np.zeros((0, skeleton.keypoint_count, 3)))
     for start in range(0, count, BLOCK_FRAMES):
@@ -80,9 +78,7 @@ def _blocks(
         waiting = PeopleBlock(frame[own:], keypoints[own:])
 
 
-def _candidates(
-    frame: NDArray[np.intp], keypoints: NDArray[np.float64], skeleton: Skeleton
-) -> ViewCandidates:
+def _candidates(frame: NDArray[np.intp], keypoints: NDArray[np.float64], skeleton: Skeleton) -> ViewCandidates:
     """The joints of the people of some frames."""
     joints = _joints(keypoints, skeleton)
     person, joint = np.nonzero(joints[..., 2] > 0)

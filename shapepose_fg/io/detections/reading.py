@@ -53,9 +53,7 @@ def read_detections(
     return replace(table, notes=(*places.notes, *notes, *found.gaps(), *found.middles(), *table.notes))
 
 
-def _read_texts(
-    texts: Sequence[Path], rig: Rig, wanted: Skeleton | None, kept: KeptArrays
-) -> DetectionTable:
+def _read_texts(texts: Sequence[Path], rig: Rig, wanted: Skeleton | None, kept: KeptArrays) -> DetectionTable:
     """4D Association's text of every camera."""
     read = [read_association_text(text, camera) for text, camera in zip(texts, rig.cameras, strict=True)]
     skeleton = read[0][1]
