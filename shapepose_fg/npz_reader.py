@@ -73,6 +73,12 @@ class NpzFile:
         with self._telling():
             return self._member(name).shape
 
+    def row_bytes(self, name: str) -> int:
+        """What a row of an array takes in memory."""
+        with self._telling():
+            member = self._member(name)
+            return member.dtype.itemsize * math.prod(member.shape[1:])
+
     def array(self, name: str) -> NDArray[Any]:
         """All of an array."""
         with self._telling():
@@ -99,7 +105,7 @@ class NpzFile:
                 begin, end = np.searchsorted(index, (first, first + count))
                 if begin == end:
                     continue
-                member.stream.seek(member.begin + first * width)
+                _go_to(member.stream, member.begin + first * width)
                 content = member.stream.read(count * width)
                 block = np.frombuffer(content, dtype=member.dtype).reshape(count, *member.shape[1:])
                 array[begin:end] = block[index[begin:end] - first]
@@ -154,7 +160,18 @@ _MOST_PACKED = 50
 """Those of a larger one this much larger than the file; measured coordinates hardly pack at all."""
 _BLOCK_BYTES = 2**22
 """Of rows that are unpacked at a time."""
+_PASSED_BYTES = 2**18
+"""Of rows that are passed over."""
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+
+
+def _go_to(stream: IO[bytes], place: int) -> None:
+    """Pass over what is in front of `place`, a little at a time: `seek` would unpack 16 MB at once."""
+    if place < stream.tell():
+        stream.seek(0)
+    while stream.tell() < place:
+        if len(stream.read(min(_PASSED_BYTES, place - stream.tell()))) == 0:
+            raise ValueError("the file ends too early")
 
 
 def _check_members(members: Sequence[zipfile.ZipInfo], size: int) -> None:

@@ -280,12 +280,20 @@ class OpenedReconstruction:
         """Everybody in the frames from `start` to before `stop`."""
         return self.rows(np.flatnonzero((self.frame >= start) & (self.frame < stop)))
 
-    def people(self, numbers: Iterable[int]) -> Reconstruction:
-        """These people, in all their frames."""
-        return self.rows(np.flatnonzero(np.isin(self.person, list(numbers))))
+    def people(self, numbers: Iterable[int], *, observations: bool = True) -> Reconstruction:
+        """These people, in all their frames; see `rows`."""
+        return self.rows(np.flatnonzero(np.isin(self.person, list(numbers))), observations=observations)
 
-    def rows(self, index: NDArray[np.intp] | None = None) -> Reconstruction:
-        """The rows `index` (R,), rising; all of them without it."""
+    def thinned(self, most_rows: int) -> tuple[Reconstruction, int]:
+        """Every so many frames, at most so many rows; and how many: 1 where all are given."""
+        every = max(1, -(-len(self) // most_rows))
+        return self.rows(None if every == 1 else np.flatnonzero(self.frame % every == 0)), every
+
+    def rows(self, index: NDArray[np.intp] | None = None, *, observations: bool = True) -> Reconstruction:
+        """The rows `index` (R,), rising, or all; with what they were solved from, where that is wanted.
+
+        InputError where a file is damaged, or they would not fit in memory.
+        """
         try:
             people = Reconstruction(**self._people.columns(index), run=self.run)
             people._check_values()
@@ -293,7 +301,7 @@ class OpenedReconstruction:
             raise
         except ValueError as error:
             raise InputError(f"{self._people.file}: {error}; {_CURE}") from None
-        if self._observed is None:
+        if self._observed is None or not observations:
             return people
         try:
             return replace(people, observations=ObservationTable(**self._observed.columns(index)))

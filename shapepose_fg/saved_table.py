@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.filesize import decimal
 
 from shapepose_fg.errors import InputError
 from shapepose_fg.npz_reader import NpzFile
@@ -57,11 +58,34 @@ class SavedTable:
         return self._npz.array(name)
 
     def columns(self, index: NDArray[np.intp] | None) -> dict[str, NDArray[Any]]:
-        """Columns in the rows `index` (R,), rising, or in all; and what is beside them."""
+        """Columns in the rows `index` (R,), rising, or in all; and what is beside them.
+
+        InputError where they would not fit in memory.
+        """
+        self._check_memory(self._npz.shape(self._rows[0])[0] if index is None else len(index))
         if index is None:
             return {name: self._npz.array(name) for name in self._rows} | self.shared
         return {name: self._npz.rows(name, index) for name in self._rows} | self.shared
 
+    def _check_memory(self, count: int) -> None:
+        """InputError where so many rows, and as much again to work with them, are more than there is room for."""
+        needed, free = 2 * count * sum(map(self._npz.row_bytes, self._rows)), free_memory()
+        if free is not None and needed > free:
+            raise InputError(
+                f"{self.file}: {count} rows would take {decimal(needed)} of memory, and {decimal(free)} are free;"
+                " take some frames or people at a time (--frames, --person, or Reconstruction.open)"
+            )
+
     def close(self) -> None:
         """Nothing can be read any more."""
         self._npz.close()
+
+
+def free_memory() -> int | None:
+    """Bytes of memory that programs could have now; None where the system does not say."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return None
+    found = [line.split()[1] for line in lines if line.startswith("MemAvailable:")]
+    return 1024 * int(found[0]) if found else None
