@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shapepose_fg.detections import Detections, DetectionSequence
+from shapepose_fg.evaluation.speed import BackAndForth
 from shapepose_fg.io.write_detections import write_association
 from shapepose_fg.runs.manifest import PARTS
 from shapepose_fg.simulation import built_in_scene, simulate
@@ -27,23 +27,6 @@ from shapepose_fg.simulation import built_in_scene, simulate
 _FPS = 25.0
 _EVERY_S = 0.5
 _MEGABYTE = 1e6
-
-
-class PlayedOnAndOn:
-    """A recording forwards and backwards, so that nobody jumps, for so many frames."""
-
-    def __init__(self, once: DetectionSequence, count: int) -> None:
-        self._once, self._count = once, count
-        self.skeleton = once.skeleton
-        self.round = 2 * len(once) - 2
-        """Frames after which it is at its beginning again."""
-
-    def __len__(self) -> int:
-        return self._count
-
-    def __getitem__(self, frame: int, /) -> Detections:
-        at = frame % self.round
-        return self._once[min(at, self.round - at)]
 
 
 @dataclass(frozen=True)
@@ -87,12 +70,12 @@ def main(words: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory(prefix="soak-") as name:
         folder = Path(name) if given.folder is None else given.folder
         scene = built_in_scene(0, people=given.people, cameras=given.cameras, frames=given.loop, fps=_FPS)
-        long = PlayedOnAndOn(simulate(scene, seed=0), given.frames)
+        long = BackAndForth(simulate(scene, seed=0), given.frames)
         write_association(long, scene.rig, folder / "recording")
         size = sum(file.stat().st_size for file in (folder / "recording").rglob("*.txt"))
         print(f"{given.frames} frames of {given.people} people and {given.cameras} cameras, {size / 1e6:.0f} MB")
         samples = _watched(_command(folder, given.workers, given.batch_frames), folder / "out" / PARTS)
-    rounds = rounds_of(samples, given.batch_frames, long.round, given.frames)
+    rounds = rounds_of(samples, given.batch_frames, 2 * given.loop, given.frames)
     _print(samples, rounds)
     return judged(rounds, given.tolerance)
 
