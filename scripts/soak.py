@@ -25,7 +25,7 @@ from shapepose_fg.runs.manifest import PARTS
 from shapepose_fg.simulation import built_in_scene, simulate
 
 _FPS = 25.0
-_EVERY_S = 0.5
+_EVERY_S = 0.2
 _MEGABYTE = 1e6
 
 
@@ -87,7 +87,7 @@ def rounds_of(samples: Sequence[Sample], batch_frames: int, length: int, frames:
     rounds = []
     for start in range(0, frames - length + 1, length):
         inside = np.flatnonzero((done > start) & (done <= start + length))
-        if len(inside) < 2 or inside[0] == 0:
+        if len(inside) == 0 or inside[0] == 0:
             continue
         before, last = inside[0] - 1, inside[-1]
         spent = (cpu[last] - cpu[before]) / (done[last] - done[before])

@@ -49,11 +49,11 @@ def test_rounds_are_judged(capsys, memory, frame_s, code, said):
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="looks at processes as Linux shows them")
 def test_a_short_run(tmp_path, capsys):
-    """240 frames of one person: so few that a busy machine may let them differ by half."""
-    words = "--frames 240 --loop 25 --people 1 --cameras 2 --batch-frames 24 --tolerance 0.5 --folder"
+    """144 frames of one person: so few that a busy machine may let them differ by half."""
+    words = "--frames 144 --loop 12 --people 1 --cameras 2 --batch-frames 24 --tolerance 0.5 --folder"
     assert soak.main([*words.split(), str(tmp_path)]) == 0
     out = capsys.readouterr().out
-    assert "240 frames of 1 people and 2 cameras" in out
-    assert out.count("to frame") == 4 and out.count("flat: ") == 2
+    assert "144 frames of 1 people and 2 cameras" in out
+    assert out.count("to frame") >= 4 and out.count("flat: ") == 2
     assert "reading: up to " in out and "ending: up to " in out
     assert (tmp_path / "out" / "people.npz").is_file()

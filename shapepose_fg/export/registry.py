@@ -54,9 +54,7 @@ FORMATS = {
         Format("bvh", "a moving skeleton, for animation", "bvh:write_bvh"),
         Format("glb", "moving bodies with their skin, for Blender and the web", "glb:write_glb"),
         Format("csv", "joints as a table", "table:write_csv", identities=False),
-        Format(
-            "parquet", "all columns, for archives", "parquet:write_parquet", identities=False, rows=True
-        ),
+        Format("parquet", "all columns, for archives", "parquet:write_parquet", identities=False, rows=True),
         Format("rrd", "everything on a timeline, for the rerun viewer", "rrd:write_rrd", identities=False),
     )
 }
