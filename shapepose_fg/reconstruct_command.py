@@ -142,6 +142,7 @@ def reconstruct(
         fitter = fitter_of(body, settings, recording.skeleton.joints)
         inputs = reading.checksums((calibration, *recording.sources, config, body, timestamps))
         inputs |= {} if offsets is None else checksums([offsets])
+        del reading  # of half a million files it is large
         job = Job(rig, recording, settings, span, times, first_frames, body, fitter, shapes, inputs, chunk_frames)
         # Of its own detections `detect` knows which pictures they are of.
         own = (detections / "footage.json").is_file()
