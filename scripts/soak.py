@@ -26,6 +26,8 @@ from shapepose_fg.simulation import built_in_scene, simulate
 
 _FPS = 25.0
 _EVERY_S = 0.2
+_SAID_WINDOWS = 20
+"""Of a run that takes hours something is said in between."""
 _MEGABYTE = 1e6
 
 
@@ -151,6 +153,8 @@ def _watched(command: Sequence[str], parts: Path) -> list[Sample]:
         kept = max((int(file.stem.split("-")[1]) + 1 for file in parts.glob("part-*.safetensors")), default=0)
         kept = max(kept, samples[-1].parts if samples else 0)  # at its end they are removed
         memory, peak, cpu = (sum(column) for column in zip(*map(_process, _tree(process.pid)), strict=True))
+        if kept // _SAID_WINDOWS > (samples[-1].parts if samples else 0) // _SAID_WINDOWS:
+            print(f"{kept} windows: {memory / _MEGABYTE:.0f} MB, {cpu:.0f} s", file=sys.stderr)
         samples.append(Sample(kept, int(memory), int(peak), cpu))
         time.sleep(_EVERY_S)
     if process.returncode != 0:
