@@ -30,9 +30,9 @@ def read_take(
     `up` is asked for where there is no cameras.json beside people.npz. `frames` and `persons` choose rows.
     """
     cameras = results_folder(path) / CAMERAS
-    rig = read_rig(cameras) if cameras.is_file() else None
-    axis = _up(up, rig, cameras)
     with Reconstruction.open(path) as opened:
+        rig = read_rig(cameras) if cameras.is_file() else None
+        axis = _up(up, rig, cameras)
         people = opened.rows(chosen_rows(opened, path, frames, persons))
     if frames is not None:
         people = people.with_run(frames=_covered(people, frames))
