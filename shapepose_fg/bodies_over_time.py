@@ -153,7 +153,8 @@ def _together(places: Iterable[str], kept: KeptArrays, prior: Shapes | None) -> 
     before = known.information @ known.mean[..., None]
     information = known.information + sum(each.information - known.information for each in found)
     pull = before + sum(each.information @ each.mean[..., None] - before for each in found)
-    return Shapes(np.linalg.solve(information, pull)[..., 0], information)
+    mean = np.asarray(np.linalg.solve(information, pull)[..., 0], dtype=np.float64)
+    return Shapes(mean, information)
 
 
 def with_bodies_over_time(

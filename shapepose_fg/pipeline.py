@@ -431,7 +431,10 @@ def _names(parts: Parts, skeleton: Skeleton, config: PipelineConfig, cuts_s: Seq
     tracks = RowsOfPeople(parts, [parts.column(n, "person") for n in range(len(parts))])
     traces = (
         Trace.concatenate(
-            [Trace.of(track, *piece, skeleton) for piece in tracks.pieces(track, ("time_s", "joints"))]
+            [
+                Trace.of(track, time_s, joints, skeleton)
+                for time_s, joints in tracks.pieces(track, ("time_s", "joints"))
+            ]
         )
         for track in tracks.counts
     )

@@ -295,7 +295,8 @@ class OpenedReconstruction:
         InputError where a file is damaged, or they would not fit in memory.
         """
         try:
-            people = Reconstruction(**self._people.columns(index), run=self.run)
+            columns: dict[str, Any] = self._people.columns(index)
+            people = Reconstruction(**columns, run=self.run)
             people._check_values()
         except InputError:
             raise
