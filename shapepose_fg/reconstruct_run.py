@@ -192,7 +192,7 @@ def _run(
     if checked is not None:
         show_check(checked)
     warnings = () if checked is None else tuple(checked.warnings)
-    return Ended(len(job.frames), len(result), len(result.numbers()) if job.settings.temporal else None, warnings)
+    return Ended(len(job.frames), len(result), len(result.people.counts) if job.settings.temporal else None, warnings)
 
 
 def _standing(job: Job, output: Path) -> str:
