@@ -13,7 +13,7 @@ from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "licences.md"
-EXTRAS = ("viewer", "detect", "export", "view", "cluster")
+EXTRAS = ("viewer", "detect", "export", "view", "archive", "cluster")
 HEAD = """# Licences of what is installed with it
 
 `pip install shapepose-fg` brings the first table, its extras the second; what is only needed to test it is not

@@ -1,90 +1,26 @@
 """One body per person over a recording: one shape, and poses that move as people do, fitted to solved joints."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, runtime_checkable
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.body.fitting.body_sequence import SequenceFit, Shapes
-from shapepose_fg.body.fitting.fitter import BodyFitter, JointTargets
+from shapepose_fg.body.fitting.body_sequence import Shapes
 from shapepose_fg.body.fitting.weights import fingerprint
-from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.shapes import SubjectShapes, recognise
 from shapepose_fg.kept_arrays import InMemory, KeptArrays
+from shapepose_fg.person_bodies import Person, PersonBodies, SequenceFitting
 from shapepose_fg.reconstruction import Reconstruction, Status
 
-
-@runtime_checkable
-class SequenceFitting(BodyFitter, Protocol):
-    """A fitter that fits bodies over time."""
-
-    model: BodyModel
-    """The body that it fits."""
-
-    def fit_sequence(
-        self,
-        targets: JointTargets,
-        groups: NDArray[np.intp],
-        time_s: NDArray[np.float64],
-        shapes: Shapes | None = None,
-        *,
-        fixed_shapes: bool = False,
-    ) -> SequenceFit:
-        """One shape per group and poses linked over time; see `LearnedFitter.fit_sequence`."""
-        ...
-
-
-@dataclass(frozen=True)
-class Person:
-    """What one person's bodies are fitted to, N rows; plain data, which can be sent to another process."""
-
-    number: int
-    """Who it is."""
-    targets: JointTargets
-    """The joints as they were solved."""
-    time_s: NDArray[np.float64]
-    """(N,) seconds."""
-    shapes: Shapes | None = None
-    """What is known of the shape, (1)."""
-
-    @classmethod
-    def of(
-        cls,
-        number: int,
-        joints: NDArray[np.float64],
-        covariance: NDArray[np.float64],
-        time_s: NDArray[np.float64],
-    ) -> "Person":
-        """From the solved rows of one person: `joints` (N, J, 3), `covariance` (N, J, 3, 3), `time_s` (N,)."""
-        solved = np.isfinite(joints.sum(axis=-1)) & np.isfinite(covariance.sum(axis=(-1, -2)))
-        information = np.zeros_like(covariance)
-        information[solved] = np.linalg.inv(covariance[solved])
-        information = (information + information.swapaxes(-1, -2)) / 2
-        return cls(number, JointTargets(np.where(solved[..., None], joints, 0.0), information), time_s)
-
-    def fitted(self, fitter: SequenceFitting) -> "PersonBodies":
-        """The bodies, and the shape that they share."""
-        group = np.full(len(self.time_s), self.number)
-        found = fitter.fit_sequence(self.targets, group, self.time_s, self.shapes)
-        fit = found.fit
-        return PersonBodies(fit.ok, fit.betas, fit.global_orient, fit.body_pose, fit.transl, found.shapes)
-
-
-@dataclass(frozen=True)
-class PersonBodies:
-    """One person's bodies in N rows."""
-
-    ok: NDArray[np.bool_]
-    """(N,) which rows have one."""
-    betas: NDArray[np.float64]
-    """(N, 10), and the next three as in `Reconstruction`."""
-    global_orient: NDArray[np.float64]
-    body_pose: NDArray[np.float64]
-    transl: NDArray[np.float64]
-    shape: Shapes
-    """(1) what all rows say of the shape."""
+STRETCH_ROWS = 4000
+"""Rows of a person that are fitted together at the most. Of a longer track the shape is what all its stretches
+say together; poses are then fitted with that shape, stretch by stretch, so that memory does not grow with the
+recording."""
+_OVERLAP_ROWS = 32
+"""Rows that a stretch has of its neighbours, on either side, when poses are fitted."""
 
 
 Fits = Callable[[Iterable[Person]], Iterable[PersonBodies]]
@@ -95,12 +31,12 @@ _COLUMNS = ("betas", "global_orient", "body_pose", "transl")
 
 @dataclass(frozen=True)
 class BodiesOverTime:
-    """Everybody's bodies, kept person by person."""
+    """Everybody's bodies, kept stretch by stretch."""
 
     kept: KeptArrays
     """Where they are."""
-    places: Mapping[int, str]
-    """Under which name each person's are."""
+    places: Mapping[int, Mapping[str, range]]
+    """Under which names each person's are, and which of the person's own rows each name has, in order."""
     shapes: SubjectShapes
     """Everybody's shape; those who were recognised by their known names."""
 
@@ -118,39 +54,107 @@ class BodiesOverTime:
         for number in np.unique(person).tolist():
             mine = np.flatnonzero(person == number)
             first = before.get(number, 0)
-            part = slice(first, first + len(mine))
-            ok = self.kept.array(self.places[number], "ok", part)
+            part = range(first, first + len(mine))
+            ok = self._rows(number, "ok", part)
             if column == "status":
                 undetermined = values[mine] == Status.BODY_UNDETERMINED
                 values[mine[ok & undetermined]] = Status.OK
             else:
-                values[mine[ok]] = self.kept.array(self.places[number], column, part)[ok]
+                values[mine[ok]] = self._rows(number, column, part)[ok]
         return values
+
+    def _rows(self, number: int, column: str, rows: range) -> NDArray[Any]:
+        """A column of some of a person's own rows."""
+        pieces = []
+        for name, own in self.places[number].items():
+            first, last = max(rows.start, own.start), min(rows.stop, own.stop)
+            if first < last:
+                pieces.append(self.kept.array(name, column, slice(first - own.start, last - own.start)))
+        return np.concatenate(pieces)
 
 
 def fit_everybody(
-    numbers: Sequence[int],
-    person: Callable[[int], Person],
+    counts: Mapping[int, int],
+    person: Callable[[int, slice], Person],
     fits: Fits,
     kept: KeptArrays,
     known: SubjectShapes,
+    stretch_rows: int = STRETCH_ROWS,
 ) -> BodiesOverTime:
-    """Fit one body per person to the joints as they were solved; who is kept already is not fitted again.
+    """Fit one body per person to the joints as they were solved; what is kept already is not fitted again.
 
-    `known` are people from other recordings: who is recognised by shape (`recognise`) is fitted again with that as
-    the prior. `person` gives what somebody's bodies are fitted to, `fits` fits people, side by side if it likes.
+    `counts` is how many rows everybody has; `person` gives what somebody's bodies are fitted to in some of these,
+    and `fits` fits people, side by side if it likes. `known` are people from other recordings: who is recognised
+    by shape (`recognise`) is fitted again with that as the prior.
     """
-    places = {number: f"bodies-{number}" for number in numbers}
-    _fit_missing(places, lambda number: person(number), fits, kept)
-    whose = recognise(_subjects(places, kept, known.body), known)
-    met = {numbers[n]: int(whose[n]) for n in np.flatnonzero(whose >= 0).tolist()}
-    again = {number: f"recognised-{number}" for number in met}
-    _fit_missing(
-        again, lambda number: replace(person(number), shapes=_prior(known, np.array([met[number]]))), fits, kept
-    )
+    stretches = {number: _stretches(count, stretch_rows) for number, count in counts.items()}
+
+    def fitted(name: str, numbers: Iterable[int], job: Callable[[int, range], Person]) -> _Places:
+        """Fit some people stretch by stretch."""
+        places = {
+            number: {f"{name}-{number}-{n:04d}": own for n, own in enumerate(stretches[number])}
+            for number in numbers
+        }
+        wanted = [(number, place, own) for number, each in places.items() for place, own in each.items()]
+        there = set(kept.names(f"{name}-"))
+        missing = [each for each in wanted if each[1] not in there]
+        jobs = (job(number, own) for number, _, own in missing)
+        for (_, place, _), bodies in zip(missing, fits(jobs), strict=True):
+            arrays = {column: getattr(bodies, column) for column in ("ok", *_COLUMNS)}
+            kept.keep(place, arrays | {"mean": bodies.shape.mean, "information": bodies.shape.information})
+        return places
+
+    def alone(number: int, own: range) -> Person:
+        return person(number, slice(own.start, own.stop))
+
+    places = fitted("bodies", counts, alone)
+    shapes = {number: _together(each, kept, None) for number, each in places.items()}
+    whose = recognise(_subjects(shapes, known.body), known)
+    prior = {
+        number: Shapes(known.betas[[subject]], known.information[[subject]])
+        for number, subject in zip(counts, whose.tolist(), strict=True)
+        if subject >= 0
+    }
+    again = fitted("recognised", prior, lambda number, own: replace(alone(number, own), shapes=prior[number]))
     places |= again
-    names = _names(np.array(numbers, dtype=np.intp), known, whose)
-    return BodiesOverTime(kept, places, _subjects(places, kept, known.body).named(names))
+    shapes |= {number: _together(each, kept, prior[number]) for number, each in again.items()}
+
+    def joined(number: int, own: range) -> Person:
+        first = max(own.start - _OVERLAP_ROWS, 0)
+        rows = person(number, slice(first, min(own.stop + _OVERLAP_ROWS, counts[number])))
+        inside = range(own.start - first, own.stop - first)
+        return replace(rows, shapes=shapes[number], fixed_shapes=True, kept=inside)
+
+    places |= fitted("joined", [number for number, each in stretches.items() if len(each) > 1], joined)
+    names = _names(np.array(list(counts), dtype=np.intp), known, whose)
+    return BodiesOverTime(kept, places, _subjects(shapes, known.body).named(names))
+
+
+_Places = dict[int, dict[str, range]]
+"""See `BodiesOverTime.places`."""
+
+
+def _stretches(count: int, most: int) -> list[range]:
+    """So many rows in stretches of equal length, at most so long."""
+    edges = np.linspace(0, count, 1 + max(1, -(-count // most))).round().astype(int).tolist()
+    return [range(start, stop) for start, stop in pairwise(edges)]
+
+
+def _together(places: Iterable[str], kept: KeptArrays, prior: Shapes | None) -> Shapes:
+    """What the stretches of one person say of the shape together: `prior` counts once, what each adds to it once.
+
+    The product of Gaussians N(m_s, A_s⁻¹), each of which has the prior N(m, A⁻¹) in it:
+    information A + sum (A_s - A), and that times the mean is A m + sum (A_s m_s - A m).
+    """
+    found = [Shapes(*(kept.array(place, name) for name in ("mean", "information"))) for place in places]
+    if len(found) == 1:
+        return found[0]
+    known = Shapes(np.zeros((1, 10)), np.eye(10)[None]) if prior is None else prior
+    before = known.information @ known.mean[..., None]
+    information = known.information + sum(each.information - known.information for each in found)
+    pull = before + sum(each.information @ each.mean[..., None] - before for each in found)
+    mean = np.asarray(np.linalg.solve(information, pull)[..., 0], dtype=np.float64)
+    return Shapes(mean, information)
 
 
 def with_bodies_over_time(
@@ -167,12 +171,14 @@ def with_bodies_over_time(
     if known.body != fingerprint(fitter.model):
         raise ValueError("shapes must be of the same body model as the fitter's")
 
-    def person(number: int) -> Person:
-        mine = people.person == number
+    numbers, counts = np.unique(people.person, return_counts=True)
+
+    def person(number: int, part: slice) -> Person:
+        mine = np.flatnonzero(people.person == number)[part]
         return Person.of(number, people.joints[mine], people.covariance[mine], people.time_s[mine])
 
     bodies = fit_everybody(
-        np.unique(people.person).tolist(),
+        dict(zip(numbers.tolist(), counts.tolist(), strict=True)),
         person,
         lambda jobs: (job.fitted(fitter) for job in jobs),
         InMemory(),
@@ -184,31 +190,12 @@ def with_bodies_over_time(
     return replace(people, shapes=bodies.shapes, **columns)
 
 
-def _fit_missing(places: Mapping[int, str], person: Callable[[int], Person], fits: Fits, kept: KeptArrays) -> None:
-    """Fit who is not kept, and keep them."""
-    there = set(kept.names(""))
-    missing = [number for number, place in places.items() if place not in there]
-    for number, bodies in zip(missing, fits(map(person, missing)), strict=True):
-        arrays = {name: getattr(bodies, name) for name in ("ok", *_COLUMNS)}
-        kept.keep(places[number], arrays | {"mean": bodies.shape.mean, "information": bodies.shape.information})
-
-
-def _subjects(places: Mapping[int, str], kept: KeptArrays, body: str) -> SubjectShapes:
+def _subjects(shapes: Mapping[int, Shapes], body: str) -> SubjectShapes:
     """Everybody's shape, named by their numbers."""
     mean, information = (
-        np.concatenate([kept.array(place, name) for place in places.values()]) for name in ("mean", "information")
+        np.concatenate([getattr(each, name) for each in shapes.values()]) for name in ("mean", "information")
     )
-    return SubjectShapes(np.array([str(number) for number in places]), mean, information, body)
-
-
-def _prior(known: SubjectShapes, whose: NDArray[np.intp]) -> Shapes:
-    """The shapes of those of `known` whom each person is, `whose` (G,); the population's for strangers."""
-    mean, information = np.zeros((len(whose), 10)), np.tile(np.eye(10), (len(whose), 1, 1))
-    mean[whose >= 0], information[whose >= 0] = (
-        known.betas[whose[whose >= 0]],
-        known.information[whose[whose >= 0]],
-    )
-    return Shapes(mean, information)
+    return SubjectShapes(np.array([str(number) for number in shapes]), mean, information, body)
 
 
 def _names(groups: NDArray[np.intp], known: SubjectShapes, whose: NDArray[np.intp]) -> list[str]:

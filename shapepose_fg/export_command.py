@@ -20,7 +20,7 @@ def export(
     results: Annotated[Path, typer.Argument(metavar="RESULTS", help="Folder of a reconstruction.")],
     formats: Annotated[
         list[str],
-        typer.Argument(metavar="FORMAT...", help="One or more of amass trc c3d bvh glb csv rrd, or all."),
+        typer.Argument(metavar="FORMAT...", help="One or more of amass trc c3d bvh glb csv parquet rrd, or all."),
     ],
     output: Annotated[
         Path | None, typer.Option(help="Folder for the files; by default `export` in RESULTS.", show_default=False)
@@ -44,7 +44,7 @@ def export(
         Path | None, typer.Option(help="The body model of the result, where its file has moved.")
     ] = None,
 ) -> None:
-    """Write a result for other programs: shapepose-fg export RESULTS amass trc c3d bvh glb csv rrd."""
+    """Write a result for other programs: shapepose-fg export RESULTS amass trc c3d bvh glb csv parquet rrd."""
     from shapepose_fg.export.exporting import export_result
     from shapepose_fg.export.markers import MarkerSet
     from shapepose_fg.export.registry import FORMATS, chosen

@@ -49,13 +49,18 @@ def open_regular(path: Path, cure: str = "check the path") -> BinaryIO:
 def read_bytes(path: Path, most: int = LARGE) -> bytes:
     """What is in the file at `path`; InputError as of `open_regular`, and where it has more than `most` bytes."""
     with open_regular(path) as stream:
-        size = os.fstat(stream.fileno()).st_size
-        content = b"" if size > most else stream.read(most + 1)
-    if max(size, len(content)) > most:
+        check_size(path, os.fstat(stream.fileno()).st_size, most)
+        content = stream.read(most + 1)
+    check_size(path, len(content), most)
+    return content
+
+
+def check_size(path: Path, size: int, most: int) -> None:
+    """InputError where the file at `path` has more than `most` bytes."""
+    if size > most:
         raise InputError(
             f"{path}: over {most >> 20} MiB are too much for such a file; check that this is the file"
         )
-    return content
 
 
 def read_text(path: Path, *, may_be_empty: bool = False, most: int = LARGE) -> str:

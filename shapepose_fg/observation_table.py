@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.camera import Rig
-from shapepose_fg.columns import check_codes, checked, code_names, read_npz
+from shapepose_fg.columns import check_codes, checked, code_names
 from shapepose_fg.errors import InputError
 from shapepose_fg.files import write_atomically
 from shapepose_fg.npz_writer import Column, write_npz
 from shapepose_fg.observations import Observations
-from shapepose_fg.result_files import RUN_ID, check_id
+from shapepose_fg.result_files import check_id
+from shapepose_fg.saved_table import SavedTable
 from shapepose_fg.skeleton import BODY_25
 
 _CURE = "give the observations.npz of a reconstruction"
@@ -210,19 +211,32 @@ class ObservationTable:
 
         `run_id` is that of the people whose observations they must be (`result_files.check_id`).
         """
-        file = Path(file)
-        names = (*cls.ROWS, "joint_names", "view_names")
-        columns = read_npz(file, (*names, "gate_names", RUN_ID), _CURE)
-        check_id(run_id, columns.get(RUN_ID), file)
-        for name in (*names, "gate_names"):
-            if name not in columns:
-                raise InputError(f"{file}: column {name} is missing; {_CURE}")
-        if not np.array_equal(columns["gate_names"], code_names(Gate)):
-            raise InputError(f"{file}: gate_names are not those of this version; {_CURE}")
+        opened = cls.open(Path(file), run_id)
         try:
-            return cls(**{name: columns[name] for name in names})
+            return cls(**opened.columns(None))
+        except InputError:
+            raise
         except ValueError as error:
             raise InputError(f"{file}: {error}; {_CURE}") from None
+        finally:
+            opened.close()
+
+    @classmethod
+    def open(cls, file: Path, run_id: object = None) -> SavedTable:
+        """What `load` reads, of which rows come into memory when they are asked for."""
+        opened = SavedTable(
+            file,
+            rows=cls.ROWS,
+            shared=("joint_names", "view_names"),
+            code_names={"gate_names": code_names(Gate)},
+            cure=_CURE,
+        )
+        try:
+            check_id(run_id, opened.run_id, file)
+        except InputError:
+            opened.close()
+            raise
+        return opened
 
 
 def place_in_view(candidate: NDArray[np.integer], view: NDArray[np.integer]) -> NDArray[np.int32]:

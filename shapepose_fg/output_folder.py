@@ -3,7 +3,7 @@
 import os
 import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -33,10 +33,10 @@ def prepare_output(folder: Path, names: Iterable[str] = ()) -> None:
 def only_run_in(folder: Path, names: Iterable[str]) -> Iterator[None]:
     """`prepare_output`, and nobody else writes results there while the block runs; InputError where somebody does.
 
-    What a killed run was writing is removed. The lock is the system's: it ends with the process, however that
-    ends.
+    What a killed run was writing is removed, and so is a new folder into which nothing was written. The lock is
+    the system's: it ends with the process, however that ends.
     """
-    names = tuple(names)
+    names, is_new = tuple(names), not folder.exists()
     prepare_output(folder, names)
     file = folder / _LOCK
     lock = FileLock(file, timeout=0)
@@ -55,6 +55,9 @@ def only_run_in(folder: Path, names: Iterable[str]) -> Iterator[None]:
         # Before it is released: who waits for it then sees that it is gone, and makes a new one.
         file.unlink(missing_ok=True)
         lock.release()
+        if is_new:
+            with suppress(OSError):  # it has something in it
+                folder.rmdir()
 
 
 def _whose(file: Path) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from shapepose_fg.bodies_over_time import Person, PersonBodies, SequenceFitting, fit_everybody
+from shapepose_fg.bodies_over_time import fit_everybody
 from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.fitting.weights import fingerprint
@@ -31,6 +31,7 @@ from shapepose_fg.frame_times import FrameTimes, check_cuts, spans_of, stretches
 from shapepose_fg.kept_arrays import InMemory, KeptArrays
 from shapepose_fg.observation_table import place_in_view
 from shapepose_fg.observations import Observations
+from shapepose_fg.person_bodies import Person, PersonBodies, SequenceFitting
 from shapepose_fg.pipeline_config import PipelineConfig
 from shapepose_fg.proposal.thinning import ThinnedFrames
 from shapepose_fg.provenance import versions
@@ -40,10 +41,11 @@ from shapepose_fg.runs.checkpoint import Checkpoint
 from shapepose_fg.runs.chunks import Chunk, Identities, cut_in_chunks
 from shapepose_fg.runs.notes import Notebook, Notes
 from shapepose_fg.runs.parts import Part, Parts
+from shapepose_fg.runs.rows_of_people import RowsOfPeople
 from shapepose_fg.skeleton import BODY_25, Skeleton
 from shapepose_fg.solved_rows import result_rows
 from shapepose_fg.tracking.following import Input
-from shapepose_fg.tracking.stitching import Traces, stitch
+from shapepose_fg.tracking.stitching import Ends, Trace, stitch
 from shapepose_fg.windows import Engine, Solved, Span
 from shapepose_fg.workers import Pool, Workers
 
@@ -176,7 +178,7 @@ def reconstruct_parts(
                 with book.stage("bodies over time"):
                     known = SubjectShapes.empty(fingerprint(fitter.model)) if shapes is None else shapes
                     bodies = fit_everybody(
-                        result.numbers(), result.person, lambda jobs: pool.map(_bodies, jobs), kept, known
+                        result.people.counts, result.person, lambda jobs: pool.map(_bodies, jobs), kept, known
                     )
                     result = replace(result, bodies=bodies)
         notes = beginning
@@ -428,11 +430,17 @@ def _rows(solved: Solved, rig: Rig, detections: ThinnedFrames, config: PipelineC
 
 def _names(parts: Parts, skeleton: Skeleton, config: PipelineConfig, cuts_s: Sequence[float]) -> dict[int, int]:
     """What tracks are called when those of one person are joined over longer times out of sight."""
-    columns = ("person", "time_s", "joints")
-    traces = [
-        Traces.of(*(parts.column(n, name) for name in columns), skeleton=skeleton) for n in range(len(parts))
-    ]
-    return stitch(Traces.concatenate(traces), config.stitching, cuts_s)
+    tracks = RowsOfPeople(parts, [parts.column(n, "person") for n in range(len(parts))])
+    traces = (
+        Trace.concatenate(
+            [
+                Trace.of(track, time_s, joints, skeleton)
+                for time_s, joints in tracks.pieces(track, ("time_s", "joints"))
+            ]
+        )
+        for track in tracks.counts
+    )
+    return stitch(Ends.of(traces), config.stitching, cuts_s)
 
 
 def _number_in_frame(frame: np.ndarray) -> np.ndarray:

@@ -12,16 +12,13 @@ from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.pose2sim_project import Pose2SimProject
 from shapepose_fg.reconstruct_summary import summary_table
 from shapepose_fg.reconstruction import Reconstruction
-from shapepose_fg.report.writing import REPORT, write_report
+from shapepose_fg.report.writing import MOST_ROWS, REPORT, th, write_report
 from shapepose_fg.runs.assembly import Assembly
 from shapepose_fg.setup_check.diagnosis import diagnose
 from shapepose_fg.setup_check.in_result import ResultCheck, result_check
 from shapepose_fg.setup_check.pictures import other_sizes
 from shapepose_fg.setup_check.report import report_of
 from shapepose_fg.terminal import note
-
-_MOST_ROWS = 40_000
-"""Rows that check and report look at, about 400 MB: of longer results every second, third ... frame."""
 
 
 @dataclass(frozen=True)
@@ -41,10 +38,10 @@ class Ending:
 
     def looked_at(self, result: Assembly) -> Reconstruction:
         """The rows that fit in memory beside everything else."""
-        every = -(-len(result) // _MOST_ROWS)
+        every = _every(result)
         if every > 1:
-            note(f"check and report are made of every {_th(every)} frame: the result has {len(result)} rows")
-        return result.reconstruction(every=max(every, 1))
+            note(f"check and report are made of every {th(every)} frame: the result has {len(result)} rows")
+        return result.reconstruction(every=every)
 
     def checked(
         self, recording: DetectionTable, rig: Rig, frames: range, people: Reconstruction
@@ -67,7 +64,7 @@ class Ending:
         """Leave report and files for other programs; returns what is to be said of the run."""
         summary = summary_table(result, people, frames, len(rig), seconds, output)
         if self.report:
-            page = write_report(output, people, rig)
+            page = write_report(output, people, rig, every=_every(result))
             summary.add_row("", f"{page}  to look at, in a browser")
         else:  # that of an earlier result would say what is no longer true
             (output / REPORT).unlink(missing_ok=True)
@@ -81,6 +78,6 @@ class Ending:
         return summary
 
 
-def _th(number: int) -> str:
-    """An ordinal."""
-    return {2: "second", 3: "third"}.get(number, f"{number}th")
+def _every(result: Assembly) -> int:
+    """Which frames check and report look at: every so many."""
+    return max(1, -(-len(result) // MOST_ROWS))

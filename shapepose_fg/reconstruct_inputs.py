@@ -1,7 +1,9 @@
 """What `shapepose-fg reconstruct` is told by its options, and by a Pose2Sim project: places, times, people."""
 
 import re
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +17,7 @@ if TYPE_CHECKING:
     from shapepose_fg.camera import Rig
     from shapepose_fg.frame_times import FrameTimes
     from shapepose_fg.io.pose2sim_project import Pose2SimProject
+    from shapepose_fg.kept_arrays import InFolder
     from shapepose_fg.pipeline import PipelineConfig
 
 
@@ -40,6 +43,25 @@ def places(
         listed = " and ".join([", ".join(missing[:-1]), missing[-1]] if len(missing) > 1 else missing)
         raise InputError(f"{listed}: missing; give them, or --project with the folder of a Pose2Sim project")
     return calibration, detections, output
+
+
+@contextmanager
+def recording_folder(output: Path) -> "Iterator[InFolder]":
+    """Where what the cameras saw is kept while the block runs: files in `output`.
+
+    What a killed run left there is removed. They are not in memory, because they may be larger than that.
+    """
+    from shapepose_fg.kept_arrays import InFolder
+
+    folder = output / _RECORDING
+    shutil.rmtree(folder, ignore_errors=True)
+    try:
+        yield InFolder(folder)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+_RECORDING = ".detections"
 
 
 def times_of(fps: float | None, timestamps: Path | None, rig: "Rig", frames: int) -> "FrameTimes | None":

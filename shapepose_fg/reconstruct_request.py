@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, cast
 from shapepose_fg.errors import InputError
 from shapepose_fg.options import check_fps, frame_range, image_size_of, refuse_no_range
 from shapepose_fg.output_folder import only_run_in
-from shapepose_fg.reconstruct_inputs import fitter_of, places, possible_cuts, project_of, times_of
+from shapepose_fg.reconstruct_inputs import (
+    fitter_of,
+    places,
+    possible_cuts,
+    project_of,
+    recording_folder,
+    times_of,
+)
 from shapepose_fg.result_files import OBSERVATIONS, PEOPLE, RUN
 from shapepose_fg.terminal import note, progress
 
@@ -163,16 +170,16 @@ def carry_out(
     calibration, timestamps, project, output = known.calibration, known.timestamps, known.project, known.output
     reading = ReadInputs((calibration, known.detections, config, body, timestamps))
     rig = known.rig()
-    recording = read_detections(known.detections, rig, request.skeleton)
-    for each in recording.notes:
-        note(each)
-    span = frame_range(request.frames, len(recording))
-    if project is not None and request.frames is None:
-        span = project.span(len(recording))
-    times = times_of(known.fps, timestamps, rig, len(recording))
-    cuts = possible_cuts(request.cuts, len(recording))
     refuse_corrected(output)
-    with only_run_in(output, OUTPUTS):
+    with only_run_in(output, OUTPUTS), recording_folder(output) as kept:
+        recording = read_detections(known.detections, rig, request.skeleton, kept)
+        for each in recording.notes:
+            note(each)
+        span = frame_range(request.frames, len(recording))
+        if project is not None and request.frames is None:
+            span = project.span(len(recording))
+        times = times_of(known.fps, timestamps, rig, len(recording))
+        cuts = possible_cuts(request.cuts, len(recording))
         from shapepose_fg.reconstruct_ending import Ending
         from shapepose_fg.reconstruct_run import Job, run_job
 
@@ -182,6 +189,7 @@ def carry_out(
         fitter = fitter_of(body, settings, recording.skeleton.joints)
         inputs = reading.checksums((calibration, *recording.sources, config, body, timestamps))
         inputs |= {} if offsets is None else checksums([offsets])
+        del reading  # of half a million files it is large
         read = rig, recording, settings, span, times, cuts, body, fitter, shapes, inputs
         job = Job(*read, request.chunk_frames, sharing)
         # Of its own detections `detect` knows which pictures they are of.

@@ -192,7 +192,8 @@ def _run(
     if checked is not None:
         show_check(checked)
     warnings = () if checked is None else tuple(checked.warnings)
-    return Ended(len(job.frames), len(result), len(result.numbers()) if job.settings.temporal else None, warnings)
+    count = len(result.people.counts) if job.settings.temporal else None
+    return Ended(len(job.frames), len(result), count, warnings)
 
 
 def _standing(job: Job, output: Path) -> str:

@@ -33,7 +33,7 @@ def summary_table(
     table.add_column(overflow="fold")
     table.add_row("frames", f"{len(span)} ({span.start}:{span.stop}) of {camera_count} cameras{rate_words(run)}")
     over_time = run.get("configuration", {}).get("temporal", False)
-    count = f"{len(result.numbers())} people over time" if over_time else "no identities"
+    count = f"{len(result.people.counts)} people over time" if over_time else "no identities"
     table.add_row("people", f"{count}, {per_frame.mean():.1f} a frame ({per_frame.min()} to {per_frame.max()})")
     table.add_row("rows", f"{len(result)} in all")
     for status, count in sorted(counts["status"].items()):

@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.shapes import SubjectShapes
-from shapepose_fg.columns import check_codes, checked, code_names, read_npz
+from shapepose_fg.columns import check_codes, checked, code_names
 from shapepose_fg.errors import InputError
 from shapepose_fg.files import read_json
 from shapepose_fg.npz_writer import Column
 from shapepose_fg.observation_table import ObservationTable
 from shapepose_fg.result_files import OBSERVATIONS, PEOPLE, RUN, RUN_ID, check_id, write_result
 from shapepose_fg.run_summary import check_run, merged_run
+from shapepose_fg.saved_table import SavedTable
 from shapepose_fg.skeleton import BODY_25
 
 
@@ -228,41 +229,114 @@ class Reconstruction:
         `run` is empty where there is no run.json beside it, and `observations` are None where there is no
         observations.npz. Columns that files of earlier versions lack are unknown.
         """
-        path = Path(path)
+        with cls.open(path) as opened:
+            return opened.rows()
+
+    @classmethod
+    def open(cls, path: str | Path) -> "OpenedReconstruction":
+        """What `load` reads, of which rows come into memory when they are asked for."""
+        return OpenedReconstruction(Path(path))
+
+
+class OpenedReconstruction:
+    """A saved result, open: who is where is in memory, rows are read when they are asked for.
+
+    A context, at whose end the files are closed. Who asks for frames in rising order unpacks the files once. What
+    is read is checked as `Reconstruction.load` does; the files' own checksums are, where all rows are read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """InputError where there is no result, or its files are of two runs."""
         file = path / PEOPLE if path.is_dir() else path
-        every = (*cls.ROWS, "joint_names", "known_names", RUN_ID)
-        columns = read_npz(file, every, "give the people.npz of a reconstruction, or run one first")
-        needed = [name for name in (*cls.ROWS, "joint_names") if name not in _ADDED]
-        for name in (*needed, "known_names") if "known" in columns else needed:
-            if name not in columns:
-                raise InputError(f"{file}: column {name} is missing; {_CURE}")
-        if "known" in columns and not np.array_equal(columns["known_names"], code_names(Known)):
-            raise InputError(f"{file}: known_names are not those of this version; {_CURE}")
-        run_file = file.with_name(RUN)
-        run = read_json(run_file) if run_file.is_file() else {}
-        if not isinstance(run, dict):
-            raise InputError(f"{run_file}: must hold an object; restore it or delete it")
+        self._observed: SavedTable | None = None
+        self._people = SavedTable(
+            file,
+            rows=Reconstruction.ROWS,
+            shared=("joint_names",),
+            code_names={"known_names": code_names(Known)},
+            added=_ADDED,
+            cure=_CURE,
+        )
         try:
-            check_run(run)
-        except ValueError as error:
-            raise InputError(f"{run_file}: {error}; restore it or delete it") from None
-        # Whoever changes the people and saves them gives them another id.
-        check_id(columns.get(RUN_ID), run.pop(RUN_ID, None), run_file)
-        given: dict[str, Any] = {name: columns[name] for name in (*cls.ROWS, "joint_names") if name in columns}
+            self.frame: NDArray[np.integer] = self._people.column("frame")
+            """(N,) frame of each row."""
+            self.person: NDArray[np.integer] = self._people.column("person")
+            """(N,) identity of each row's person."""
+            self.run = self._read_run(file.with_name(RUN))
+            """What run.json says."""
+            if self.frame.ndim != 1 or self.person.shape != self.frame.shape:
+                raise InputError(f"{file}: frame and person must be one number a row; {_CURE}")
+            table = file.with_name(OBSERVATIONS)
+            if table.is_file():
+                self._observed = ObservationTable.open(table, self._people.run_id)
+        except InputError:
+            self.close()
+            raise
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def frames(self, start: int, stop: int) -> Reconstruction:
+        """Everybody in the frames from `start` to before `stop`."""
+        return self.rows(np.flatnonzero((self.frame >= start) & (self.frame < stop)))
+
+    def people(self, numbers: Iterable[int], *, observations: bool = True) -> Reconstruction:
+        """These people, in all their frames; see `rows`."""
+        return self.rows(np.flatnonzero(np.isin(self.person, list(numbers))), observations=observations)
+
+    def thinned(self, most_rows: int) -> tuple[Reconstruction, int]:
+        """Every so many frames, at most so many rows; and how many: 1 where all are given."""
+        every = max(1, -(-len(self) // most_rows))
+        return self.rows(None if every == 1 else np.flatnonzero(self.frame % every == 0)), every
+
+    def rows(self, index: NDArray[np.intp] | None = None, *, observations: bool = True) -> Reconstruction:
+        """The rows `index` (R,), rising, or all; with what they were solved from, where that is wanted.
+
+        InputError where a file is damaged, or they would not fit in memory.
+        """
         try:
-            people = cls(**given, run=run)
+            columns: dict[str, Any] = self._people.columns(index)
+            people = Reconstruction(**columns, run=self.run)
             people._check_values()
-        except ValueError as error:
-            raise InputError(f"{file}: {error}; {_CURE}") from None
-        table_file = file.with_name(OBSERVATIONS)
-        if not table_file.is_file():
-            return people
-        try:
-            return replace(people, observations=ObservationTable.load(table_file, columns.get(RUN_ID)))
         except InputError:
             raise
         except ValueError as error:
-            raise InputError(f"{table_file}: {error}; delete it or run the reconstruction again") from None
+            raise InputError(f"{self._people.file}: {error}; {_CURE}") from None
+        if self._observed is None or not observations:
+            return people
+        try:
+            return replace(people, observations=ObservationTable(**self._observed.columns(index)))
+        except InputError:
+            raise
+        except ValueError as error:
+            raise InputError(
+                f"{self._observed.file}: {error}; delete it or run the reconstruction again"
+            ) from None
+
+    def close(self) -> None:
+        """Nothing can be read any more."""
+        self._people.close()
+        if self._observed is not None:
+            self._observed.close()
+
+    def __enter__(self) -> "OpenedReconstruction":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _read_run(self, file: Path) -> dict[str, Any]:
+        """What run.json says, if it is of the same run; empty where there is none."""
+        run = read_json(file) if file.is_file() else {}
+        if not isinstance(run, dict):
+            raise InputError(f"{file}: must hold an object; restore it or delete it")
+        try:
+            check_run(run)
+        except ValueError as error:
+            raise InputError(f"{file}: {error}; restore it or delete it") from None
+        # Whoever changes the people and saves them gives them another id.
+        check_id(self._people.run_id, run.pop(RUN_ID, None), file)
+        return run
 
 
 _CURE = "give the people.npz of a reconstruction"

@@ -1,6 +1,7 @@
 """The command `check-calibration`: whether cameras and detections fit each other, in words."""
 
 import json
+import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
@@ -49,6 +50,7 @@ def check_calibration(
     """
     from shapepose_fg.io.calibration import read_rig
     from shapepose_fg.io.detections import read_detections
+    from shapepose_fg.kept_arrays import InFolder
     from shapepose_fg.setup_check.diagnosis import diagnose
     from shapepose_fg.setup_check.pictures import other_sizes
     from shapepose_fg.setup_check.report import report_of
@@ -56,11 +58,12 @@ def check_calibration(
 
     size = image_size_of(image_size)
     rig = read_rig(calibration, up=cast("Axis | None", up), unit=cast("Unit | None", unit), image_size=size)
-    recording = read_detections(detections, rig, skeleton)
-    for each in recording.notes:
-        note(each)
-    sizes = () if videos is None else other_sizes(videos, rig)
-    report = report_of(diagnose(recording, rig, frame_range(frames, len(recording))), rig, sizes)
+    with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
+        recording = read_detections(detections, rig, skeleton, InFolder(Path(folder)))
+        for each in recording.notes:
+            note(each)
+        sizes = () if videos is None else other_sizes(videos, rig)
+        report = report_of(diagnose(recording, rig, frame_range(frames, len(recording))), rig, sizes)
     if as_json:
         print(json.dumps(report.as_dict(), indent=2, allow_nan=False))
     else:

@@ -6,13 +6,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.bodies_over_time import SequenceFitting, with_bodies_over_time
+from shapepose_fg.bodies_over_time import with_bodies_over_time
 from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.camera import Rig
 from shapepose_fg.estimation.estimator import Estimator, ExtraFactors
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.frame_times import stretches
+from shapepose_fg.person_bodies import SequenceFitting
 from shapepose_fg.pipeline import PipelineConfig
 from shapepose_fg.reconstruction import Reconstruction
 from shapepose_fg.run_summary import covered_frames

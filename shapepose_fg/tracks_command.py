@@ -3,7 +3,7 @@
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -11,6 +11,8 @@ from shapepose_fg.errors import InputError
 from shapepose_fg.terminal import show
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from rich.console import RenderableType
 
     from shapepose_fg.body.model.smpl_file import SmplArrays
@@ -48,13 +50,13 @@ def list_people(
 ) -> None:
     """Everybody: frames, gaps, stature, how often seen, how far they walked."""
     from shapepose_fg.reconstruction import Reconstruction
-    from shapepose_fg.tracking.listing import list_tracks
+    from shapepose_fg.tracking.listing import list_saved_tracks
 
-    people = Reconstruction.load(context.obj)
     if not as_json:
-        show(_tracks_table(context.obj, people))
+        show(_tracks_table(context.obj))
         return
-    listed = [asdict(track) for track in list_tracks(people, _body_of(people))]
+    with Reconstruction.open(context.obj) as opened:
+        listed = [asdict(track) for track in list_saved_tracks(opened, _body_of(opened.run))]
     plain = [{name: None if value != value else value for name, value in track.items()} for track in listed]
     print(json.dumps(plain, indent=2, allow_nan=False))
 
@@ -102,9 +104,9 @@ def undo_correction(context: typer.Context) -> None:
     from shapepose_fg.io.corrections import take_back
 
     folder = _folder(context.obj)
-    edit, people = take_back(folder, _solver(folder))
+    edit, _ = take_back(folder, _solver(folder))
     print(f"taken back: {edit}")
-    show(_tracks_table(context.obj, people))
+    show(_tracks_table(context.obj))
     _renew_report(folder)
 
 
@@ -113,7 +115,7 @@ def _folder(results: Path) -> Path:
     return results.parent if results.name == "people.npz" else results
 
 
-def _tracks_table(results: Path, people: "Reconstruction") -> "RenderableType":
+def _tracks_table(results: Path) -> "RenderableType":
     """Everybody of a result, and what was corrected."""
     from rich.console import Group
     from rich.padding import Padding
@@ -121,9 +123,12 @@ def _tracks_table(results: Path, people: "Reconstruction") -> "RenderableType":
 
     from shapepose_fg.frame_times import rate_words
     from shapepose_fg.io.corrections import read_corrections
-    from shapepose_fg.tracking.listing import list_tracks
+    from shapepose_fg.reconstruction import Reconstruction
+    from shapepose_fg.tracking.listing import list_saved_tracks
 
-    listed = list_tracks(people, _body_of(people))
+    with Reconstruction.open(results) as opened:
+        run, rows = opened.run, len(opened)
+        listed = list_saved_tracks(opened, _body_of(run))
     table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
     for name in ("person", "frames", "rows", "gaps", "stature", "seen", "confidence", "walked"):
         table.add_column(name, justify="right")
@@ -138,8 +143,8 @@ def _tracks_table(results: Path, people: "Reconstruction") -> "RenderableType":
             f"{track.confidence:.2f}",
             f"{track.walked_m:.1f} m",
         )
-    lines = [f"{len(listed)} people, {len(people)} rows{rate_words(people.run)}"]
-    if not people.run.get("configuration", {}).get("temporal", True):
+    lines = [f"{len(listed)} people, {rows} rows{rate_words(run)}"]
+    if not run.get("configuration", {}).get("temporal", True):
         lines.append("every frame stands alone here: a number is nobody's over time")
     edits = read_corrections(_folder(results))
     if len(edits) > 0:
@@ -152,11 +157,11 @@ def _or_dash(value: float, text: str) -> str:
     return "-" if value != value else text.format(value)
 
 
-def _body_of(people: "Reconstruction") -> "SmplArrays | None":
+def _body_of(run: "Mapping[str, Any]") -> "SmplArrays | None":
     """The body model that a result was made with; None where its file is not there any more."""
     from shapepose_fg.body.shapes import read_body
 
-    file = people.run.get("body")
+    file = run.get("body")
     if file is None:
         return read_body()
     return read_body(Path(file)) if Path(file).is_file() else None
@@ -175,7 +180,7 @@ def _correct(context: typer.Context, action: str, person: int, **more: int | Non
     solve = _solver(folder)
     edited = correct(folder, edit, solve)
     print(f"done: {edit}{_solved_words(edited, solve)}")
-    show(_tracks_table(context.obj, edited.people))
+    show(_tracks_table(context.obj))
     print(f"take it back: shapepose-fg tracks {context.obj} undo")
     _renew_report(folder)
 

@@ -4,11 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
-from shapepose_fg.bodies_over_time import with_bodies_over_time
+from shapepose_fg.bodies_over_time import STRETCH_ROWS, BodiesOverTime, fit_everybody, with_bodies_over_time
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.fitting.learned import LearnedFitter
+from shapepose_fg.body.fitting.weights import fingerprint
+from shapepose_fg.body.model.body_model import BodyParameters
 from shapepose_fg.body.shapes import SubjectShapes
+from shapepose_fg.kept_arrays import InMemory
+from shapepose_fg.person_bodies import Person
 from shapepose_fg.reconstruction import Reconstruction
 from shapepose_fg.simulation import Scene, built_in_scene
 from shapepose_fg.simulation.truth import truth_of
@@ -61,3 +66,41 @@ def test_nobody_and_no_file(scene, fitter):
     other = SubjectShapes.empty("another body")
     with pytest.raises(ValueError, match="same body model"):
         with_bodies_over_time(people, fitter, other)
+
+
+def test_a_long_track_is_fitted_in_stretches_that_fit_together(fitter):
+    """240 frames at 25 a second in three stretches against one: the same person, without a step at the borders."""
+    scene = built_in_scene(people=1, frames=240)
+    people = seen(scene, slice(0, 240), 0)
+    people = replace(people, time_s=people.frame / 25)
+    given = []
+
+    def person(number: int, part: slice) -> Person:
+        given.append(part.stop - part.start)
+        return Person.of(number, people.joints[part], people.covariance[part], people.time_s[part])
+
+    def fitted(stretch_rows: int) -> tuple[BodiesOverTime, BodyParameters]:
+        nobody = SubjectShapes.empty(fingerprint(fitter.model))
+        bodies = fit_everybody(
+            {0: 240}, person, lambda jobs: (job.fitted(fitter) for job in jobs), InMemory(), nobody, stretch_rows
+        )
+        columns = ("betas", "global_orient", "body_pose", "transl")
+        parts = [bodies.filled(name, getattr(people, name), people.person, {}) for name in columns]
+        return bodies, BodyParameters(*(torch.from_numpy(part).float() for part in parts))
+
+    whole, expected = fitted(STRETCH_ROWS)
+    assert given == [240]
+    given.clear()
+    cut, found = fitted(80)
+    assert [*cut.places[0].values()] == [range(0, 80), range(80, 160), range(160, 240)]
+    assert given == [80, 80, 80, 112, 144, 112]  # 32 rows of the neighbours
+    # One shape, and that of the whole track as far as it is known: ten numbers, one each by chance.
+    assert np.ptp(found.betas.numpy(), axis=0).max() == 0
+    apart = (cut.shapes.betas - whole.shapes.betas)[0]
+    assert apart @ whole.shapes.information[0] @ apart < 10
+    joints, usual = (fitter.model.keypoints(each).numpy() for each in (found, expected))
+    assert 1e3 * np.linalg.norm(joints - usual, axis=-1).max() < 1  # the shape's share: 0.4 mm
+    # Nothing jumps at a border: steps from frame to frame are those of the whole track.
+    steps, usual_steps = np.diff(joints, axis=0), np.diff(usual, axis=0)
+    apart_mm = 1e3 * np.linalg.norm(steps - usual_steps, axis=-1)
+    assert apart_mm[[79, 159]].max() < 0.1

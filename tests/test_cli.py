@@ -161,12 +161,13 @@ def test_shapes_are_kept_from_one_recording_to_the_next(recording, pipeline, tmp
     def with_shapes(*arguments, shapes, **options):
         result = fake(*arguments, shapes=shapes, **options)
         found = SubjectShapes(np.array(["0"]), np.full((1, 10), 0.5), np.eye(10)[None], shapes.body)
-        rows = result.numbers()
+        rows = result.people.counts
         nobody = {"ok": np.zeros(1, dtype=bool), "betas": np.zeros((1, 10)), "transl": np.zeros((1, 3))}
         nobody |= {"global_orient": np.zeros((1, 3)), "body_pose": np.zeros((1, 23, 3))}
         for number in rows:
             result.parts.kept.keep(f"bodies-{number}", nobody)
-        bodies = BodiesOverTime(result.parts.kept, {number: f"bodies-{number}" for number in rows}, found)
+        places = {number: {f"bodies-{number}": range(count)} for number, count in rows.items()}
+        bodies = BodiesOverTime(result.parts.kept, places, found)
         return replace(result, bodies=bodies)
 
     monkeypatch.setattr(shapepose_fg.reconstruct_run, "reconstruct_parts", with_shapes)

@@ -99,7 +99,7 @@ def test_readme_in_the_shell(recording, tmp_path, capsys):
         assert end.value.code == 0
     assert joint_metrics(Reconstruction.load(tmp_path / "results"), recording.keypoints).everyone_once
     kinds = {path.suffix for path in (tmp_path / "results" / "export").iterdir()}
-    assert kinds == {".npz", ".trc", ".c3d", ".bvh", ".glb", ".csv"}
+    assert kinds == {".npz", ".trc", ".c3d", ".bvh", ".glb", ".csv", ".parquet"}
 
 
 def test_extending(tmp_path, monkeypatch):

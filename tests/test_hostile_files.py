@@ -21,12 +21,12 @@ from readers import READERS, tiny_body
 
 from shapepose_fg.body.fitting.weights import FitterWeights
 from shapepose_fg.body.model.smpl_file import read_smpl_file
-from shapepose_fg.columns import read_npz
 from shapepose_fg.errors import InputError
 from shapepose_fg.files import read_json, read_text, read_toml
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.config import read_config
 from shapepose_fg.io.detections import read_detections
+from shapepose_fg.npz_reader import read_npz
 from shapepose_fg.pipeline import PipelineConfig
 from shapepose_fg.reconstruction import Reconstruction
 
@@ -46,7 +46,8 @@ def in_little_memory(code: str, *arguments: object, before: str = "") -> str:
     )
     begin = (
         "import sys\nfrom pathlib import Path\nfrom shapepose_fg.errors import InputError\n"
-        "from shapepose_fg.body.model.smpl_file import read_smpl_file\nfrom shapepose_fg.columns import read_npz\n"
+        "from shapepose_fg.body.model.smpl_file import read_smpl_file\n"
+        "from shapepose_fg.npz_reader import read_npz\n"
     )
     end = f"try:\n    {code}\n    print('read')\nexcept InputError as error:\n    print(error)\n"
     command = [sys.executable, "-c", begin + before + limit + end, *map(str, arguments)]

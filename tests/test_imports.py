@@ -15,9 +15,10 @@ LEVELS = (
     "factors errors",
     "camera skeleton",
     "files bounds",
-    "output_folder npz_writer kept_arrays provenance result_options rendering run_summary columns workers"
-    " body.threads options terminal stopping",
+    "output_folder npz_writer npz_reader kept_arrays provenance result_options rendering run_summary columns"
+    " workers body.threads options terminal stopping",
     "result_files",
+    "saved_table",
     "body.model",
     "body.fitting body.shapes",
     "body.offsets",
@@ -28,6 +29,7 @@ LEVELS = (
     "proposal",
     "estimation",
     "tracking",
+    "person_bodies",
     "windows bodies_over_time solved_rows",
     "pipeline_config cluster",
     "runs",

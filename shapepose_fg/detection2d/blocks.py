@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.camera import Rig
-from shapepose_fg.columns import read_npz
 from shapepose_fg.detection2d.detector import CameraDetector
 from shapepose_fg.errors import InputError
 from shapepose_fg.files import write_atomically
@@ -18,6 +17,7 @@ from shapepose_fg.io.detections.association_skeletons import TEXT_SKELETONS
 from shapepose_fg.io.footage.footage import Footage
 from shapepose_fg.io.footage.lockstep import Lockstep
 from shapepose_fg.io.write_detections import association_lines
+from shapepose_fg.npz_reader import read_npz
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,9 @@ from shapepose_fg.camera import Axis
 from shapepose_fg.errors import InputError
 from shapepose_fg.export.job import Job, Written
 from shapepose_fg.export.markers import MarkerSet
-from shapepose_fg.export.reading import body_file, read_take
+from shapepose_fg.export.reading import body_file, chosen_rows, read_take
 from shapepose_fg.export.registry import Format
+from shapepose_fg.reconstruction import Reconstruction
 
 
 def export_result(
@@ -30,20 +31,26 @@ def export_result(
     The options are those of `read_take` and `Job`; `body` is where the body model's file is now. Files that are
     there already are replaced. A format of which no file came out is an InputError too.
     """
-    identities = any(each.identities for each in formats)
-    take = read_take(
-        results,
-        up=up,
-        fps=fps,
-        seen_only=seen_only,
-        frames=frames,
-        persons=persons,
-        identities=identities,
-    )
-    job = Job(take, folder, body_file(take, body), markers, fill_gaps_s)
+    job: Job | None = None
+    if not all(each.rows for each in formats):
+        take = read_take(
+            results,
+            up=up,
+            fps=fps,
+            seen_only=seen_only,
+            frames=frames,
+            persons=persons,
+            identities=any(each.identities for each in formats),
+        )
+        job = Job(take, folder, body_file(take, body), markers, fill_gaps_s)
     done = {}
     for each in formats:
-        done[each.name] = each.write(job)
+        if each.rows or job is None:
+            with Reconstruction.open(results) as opened:
+                rows = chosen_rows(opened, results, frames, persons)
+                done[each.name] = each.write_rows(opened, rows, folder)
+        else:
+            done[each.name] = each.write(job)
         if len(done[each.name].files) == 0:
             raise InputError(f"{results}: {'; '.join(done[each.name].notes)}; leave out {each.name}")
     return done

@@ -3,20 +3,16 @@
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shapepose_fg.camera import Axis, Rig
 from shapepose_fg.errors import InputError
 from shapepose_fg.export.take import Take
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.solved_setup import CAMERAS
-from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.reconstruction import OpenedReconstruction, Reconstruction
+from shapepose_fg.result_options import results_folder
 from shapepose_fg.run_summary import covered_frames
-
-
-def read_result(path: Path) -> tuple[Path, Reconstruction]:
-    """The folder of a result, which may be given as its people.npz too, and what is in it."""
-    people = Reconstruction.load(path)
-    return (path if path.is_dir() else path.parent), people
 
 
 def read_take(
@@ -33,23 +29,35 @@ def read_take(
 
     `up` is asked for where there is no cameras.json beside people.npz. `frames` and `persons` choose rows.
     """
-    folder, people = read_result(path)
-    cameras = folder / CAMERAS
-    rig = read_rig(cameras) if cameras.is_file() else None
-    axis = _up(up, rig, cameras)
-    if persons is not None:
-        strangers = sorted(set(persons) - set(people.person.tolist()))
-        if strangers:
-            there = " ".join(map(str, np.unique(people.person).tolist()))
-            raise InputError(f"--person {strangers[0]}: {path} has no such person; it has {there}")
-        people = people.rows(np.isin(people.person, persons))
+    cameras = results_folder(path) / CAMERAS
+    with Reconstruction.open(path) as opened:
+        rig = read_rig(cameras) if cameras.is_file() else None
+        axis = _up(up, rig, cameras)
+        people = opened.rows(chosen_rows(opened, path, frames, persons))
     if frames is not None:
-        inside = (people.frame >= frames.start) & (people.frame < frames.stop)
-        people = people.rows(inside).with_run(frames=_covered(people, frames))
+        people = people.with_run(frames=_covered(people, frames))
     try:
         return Take.of(people, axis, rig=rig, fps=fps, seen_only=seen_only, identities=identities)
     except ValueError as error:
         raise InputError(f"{path}: {error}") from None
+
+
+def chosen_rows(
+    opened: OpenedReconstruction, path: Path, frames: range | None, persons: tuple[int, ...] | None
+) -> NDArray[np.intp] | None:
+    """(R,) rows of these frames and people; None for all. InputError for somebody who is not there."""
+    if frames is None and persons is None:
+        return None
+    chosen = np.ones(len(opened), dtype=bool)
+    if persons is not None:
+        strangers = sorted(set(persons) - set(opened.person.tolist()))
+        if strangers:
+            there = " ".join(map(str, np.unique(opened.person).tolist()))
+            raise InputError(f"--person {strangers[0]}: {path} has no such person; it has {there}")
+        chosen &= np.isin(opened.person, persons)
+    if frames is not None:
+        chosen &= (opened.frame >= frames.start) & (opened.frame < frames.stop)
+    return np.flatnonzero(chosen)
 
 
 def _covered(people: Reconstruction, frames: range) -> list[list[int]]:

@@ -3,9 +3,15 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from shapepose_fg.errors import InputError
 from shapepose_fg.export.job import Job, Written
+from shapepose_fg.reconstruction import OpenedReconstruction
 
 
 @dataclass(frozen=True)
@@ -17,15 +23,26 @@ class Format:
     about: str
     """What it holds and who reads it, in a few words."""
     writer: str
-    """Module and function that writes it: `write(job: Job) -> Written`."""
+    """Module and function that writes it: `write(job: Job) -> Written`; with `rows` it is `write(opened, rows,
+    folder) -> Written` of an `OpenedReconstruction` and the rows of it (R,), None for all."""
     identities: bool = True
     """Whether it follows people over frames, and so needs a result over time."""
+    rows: bool = False
+    """Whether it holds the result's rows as they are, and is written without having them all in memory."""
 
     def write(self, job: Job) -> Written:
         """Write the files of a take; InputError where a package is missing or the take lacks what it needs."""
-        module, function = self.writer.split(":")
-        write: Callable[[Job], Written] = getattr(import_module(f"shapepose_fg.export.{module}"), function)
+        write: Callable[[Job], Written] = self._function()
         return write(job)
+
+    def write_rows(self, opened: OpenedReconstruction, rows: NDArray[np.intp] | None, folder: Path) -> Written:
+        """Write a format of `rows`."""
+        write: Callable[[OpenedReconstruction, NDArray[np.intp] | None, Path], Written] = self._function()
+        return write(opened, rows, folder)
+
+    def _function(self) -> Any:
+        module, function = self.writer.split(":")
+        return getattr(import_module(f"shapepose_fg.export.{module}"), function)
 
 
 FORMATS = {
@@ -37,6 +54,7 @@ FORMATS = {
         Format("bvh", "a moving skeleton, for animation", "bvh:write_bvh"),
         Format("glb", "moving bodies with their skin, for Blender and the web", "glb:write_glb"),
         Format("csv", "joints as a table", "table:write_csv", identities=False),
+        Format("parquet", "all columns, for archives", "parquet:write_parquet", identities=False, rows=True),
         Format("rrd", "everything on a timeline, for the rerun viewer", "rrd:write_rrd", identities=False),
     )
 }

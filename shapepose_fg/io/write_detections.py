@@ -5,7 +5,9 @@ Both hold the pixels that the real lens gives: a rig with distortion distorts th
 
 import json
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +16,8 @@ from shapepose_fg.camera import Camera, Rig
 from shapepose_fg.detections import Detections, DetectionSequence
 from shapepose_fg.errors import InputError
 from shapepose_fg.files import write_atomically
-from shapepose_fg.io.detection_table import MARGIN
 from shapepose_fg.io.detections.association_skeletons import TEXT_SKELETONS, TextSkeleton
+from shapepose_fg.io.detections.view_streams import MARGIN
 from shapepose_fg.skeleton import BODY_25
 
 SMALLEST_PERSON = 3
@@ -41,13 +43,9 @@ def write_association(recording: DetectionSequence, rig: Rig, folder: str | Path
     folder = Path(folder)
     calibration = {camera.name: _calibration(camera) for camera in rig.cameras}
     _write(folder / "calibration.json", json.dumps(calibration, indent=1, allow_nan=False))
-    texts = [[f"{TEXT_SKELETONS[BODY_25.name].number} {len(recording)}"] for _ in rig.cameras]
-    for frame in range(len(recording)):
-        found = recording[frame]
-        for view, camera in enumerate(rig.cameras):
-            texts[view] += _frame_lines(found, view, camera)
-    for camera, lines in zip(rig.cameras, texts, strict=True):
-        _write(folder / "detection" / f"{camera.name}.txt", "\n".join(lines) + "\n")
+    for view, camera in enumerate(rig.cameras):
+        content = partial(_write_frames, recording=recording, view=view, camera=camera)
+        write_atomically(folder / "detection" / f"{camera.name}.txt", content)
 
 
 def write_openpose(
@@ -117,6 +115,13 @@ def _calibration(camera: Camera) -> dict[str, list[float] | list[int]]:
     if camera.distortion.any():
         entry["distCoeff"] = camera.distortion[:5].tolist()
     return entry
+
+
+def _write_frames(stream: BinaryIO, recording: DetectionSequence, view: int, camera: Camera) -> None:
+    """The text of one camera, frame by frame: the recording may be larger than memory."""
+    stream.write(f"{TEXT_SKELETONS[BODY_25.name].number} {len(recording)}\n".encode())
+    for frame in range(len(recording)):
+        stream.write("".join(f"{line}\n" for line in _frame_lines(recording[frame], view, camera)).encode())
 
 
 def _frame_lines(found: Detections, view: int, camera: Camera) -> Iterable[str]:

@@ -20,6 +20,8 @@ from shapepose_fg.report.scene import Scene, scene_of
 from shapepose_fg.result_options import results_folder
 from shapepose_fg.tracking.listing import list_tracks
 
+MOST_ROWS = 40_000
+"""Rows that check and report look at, about 400 MB: of longer results every second, third ... frame."""
 REPORT = "report.html"
 """The report of a result, beside its people.npz."""
 _SCENE_BYTES = 8_000_000
@@ -35,16 +37,20 @@ def write_report(
     fps: float | None = None,
     body: Path | None = None,
     scene_bytes: int = _SCENE_BYTES,
+    every: int = 1,
 ) -> Path:
     """Write report.html of `people` into `folder`, whole or not at all; returns its path.
 
     `rig` are the cameras, None where they are not known. `up` is the axis that is up where they are not, by
     default the one along which people stand. `fps` takes the place of the result's times. `body` is the body
     model's file where it is no longer where run.json says. `scene_bytes` is what the scene may take; of longer
-    recordings every second, third ... frame is drawn. Where people cannot be put on one timeline, the page has no
+    recordings every second, third ... frame is drawn. `people` are those of every frame of the result, or of
+    `every` so many. Where people cannot be put on one timeline, the page has no
     scene and says why.
     """
     arrays, remarks = _body(people, body)
+    if every > 1:
+        remarks.append(f"the result is long: all on this page is of every {th(every)} frame")
     if rig is None:
         up = up or _standing(people)
         remarks.append(f"{CAMERAS} is not there: no cameras are drawn, and {up} is taken to be up")
@@ -60,7 +66,7 @@ def write_report(
         except ValueError as error:
             remarks.append(f"there is no scene: {error}")
     title = folder.resolve().name or str(folder)
-    tracks = list_tracks(people, arrays)
+    tracks = list_tracks(people, arrays, every)
     text = page_text(Content(title, people, tracks, camera_figures(people), scene, remarks))
     file = folder / REPORT
     # A name may hold half of a pair of surrogates, which no file can.
@@ -72,12 +78,19 @@ def report_of(
     results: Path, *, up: Axis | None = None, fps: float | None = None, body: Path | None = None
 ) -> Path:
     """Write report.html of the saved result at `results` anew; InputError where it cannot be read."""
-    people, folder = Reconstruction.load(results), results_folder(results)
+    folder = results_folder(results)
+    with Reconstruction.open(results) as opened:
+        people, every = opened.thinned(MOST_ROWS)
     if up is not None and up not in ("x", "-x", "y", "-y", "z", "-z"):
         raise InputError(f"--up {up}: must be one of x -x y -y z -z")
     cameras = folder / CAMERAS
     rig = read_rig(cameras) if cameras.is_file() else None
-    return write_report(folder, people, rig, up=up, fps=fps, body=body)
+    return write_report(folder, people, rig, up=up, fps=fps, body=body, every=every)
+
+
+def th(number: int) -> str:
+    """An ordinal."""
+    return {2: "second", 3: "third"}.get(number, f"{number}th")
 
 
 def _body(people: Reconstruction, given: Path | None) -> tuple[SmplArrays | None, list[str]]:

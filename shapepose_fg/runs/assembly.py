@@ -9,13 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.bodies_over_time import BodiesOverTime, Person
+from shapepose_fg.bodies_over_time import BodiesOverTime
 from shapepose_fg.body.shapes import SubjectShapes
 from shapepose_fg.npz_writer import Column
 from shapepose_fg.observation_table import ObservationTable
+from shapepose_fg.person_bodies import Person
 from shapepose_fg.reconstruction import Reconstruction, count_rows, shared_columns
 from shapepose_fg.result_files import write_result
 from shapepose_fg.runs.parts import OBSERVED, Parts
+from shapepose_fg.runs.rows_of_people import RowsOfPeople
 
 
 @dataclass(frozen=True)
@@ -48,18 +50,15 @@ class Assembly:
         """For each part (R,) who its rows are."""
         return [self._named(self.parts.column(n, "person")) for n in range(len(self.parts))]
 
-    def numbers(self) -> list[int]:
-        """Everybody, by number."""
-        return sorted({number for persons in self.persons for number in np.unique(persons).tolist()})
+    @cached_property
+    def people(self) -> RowsOfPeople:
+        """Everybody's rows."""
+        return RowsOfPeople(self.parts, self.persons)
 
-    def person(self, number: int) -> Person:
-        """What somebody's bodies are fitted to."""
-        rows = [(n, np.flatnonzero(persons == number)) for n, persons in enumerate(self.persons)]
-        joints, covariance, time_s = (
-            np.concatenate([self.parts.column(n, name)[mine] for n, mine in rows if len(mine) > 0])
-            for name in ("joints", "covariance", "time_s")
-        )
-        return Person.of(number, joints, covariance, time_s)
+    def person(self, number: int, rows: slice) -> Person:
+        """What somebody's bodies are fitted to, in some of somebody's own rows."""
+        pieces = self.people.pieces(number, ("joints", "covariance", "time_s"), rows)
+        return Person.of(number, *(np.concatenate(column) for column in zip(*pieces, strict=True)))
 
     def pieces(self, name: str) -> Iterator[NDArray[Any]]:
         """A column of people.npz, or of observations.npz (`OBSERVED`), part by part."""

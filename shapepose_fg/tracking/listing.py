@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from shapepose_fg.body.model.smpl_file import SmplArrays
 from shapepose_fg.body.shapes import statures_m
 from shapepose_fg.frame_times import ASSUMED_FPS
-from shapepose_fg.reconstruction import Known, Reconstruction
+from shapepose_fg.reconstruction import Known, OpenedReconstruction, Reconstruction
 
 _STEP_S = 0.5
 """Walked distance is measured between mean places of this long: a joint's noise, summed up, is no walk."""
@@ -40,8 +40,26 @@ class TrackSummary:
     """How far it walked, metres: from half second to half second, steps under 5 cm left out."""
 
 
-def list_tracks(people: Reconstruction, body: SmplArrays | None = None) -> list[TrackSummary]:
-    """The identities of `people`, by number; statures on the model `body`, and NaN without one."""
+_TOGETHER = 40_000
+"""Rows of a saved result that are in memory together, but for those of one person."""
+
+
+def list_saved_tracks(opened: OpenedReconstruction, body: SmplArrays | None = None) -> list[TrackSummary]:
+    """`list_tracks` of a saved result, some people at a time."""
+    numbers, counts = np.unique(opened.person, return_counts=True)
+    group = (np.cumsum(counts) - counts) // _TOGETHER
+    return [
+        track
+        for n in np.unique(group)
+        for track in list_tracks(opened.people(numbers[group == n].tolist(), observations=False), body)
+    ]
+
+
+def list_tracks(people: Reconstruction, body: SmplArrays | None = None, every: int = 1) -> list[TrackSummary]:
+    """The identities of `people`, by number; statures on the model `body`, and NaN without one.
+
+    `people` are those of every frame, or of `every` so many.
+    """
     order = np.lexsort((people.frame, people.person))
     persons, first = np.unique(people.person[order], return_index=True)
     if len(persons) == 0:
@@ -50,7 +68,7 @@ def list_tracks(people: Reconstruction, body: SmplArrays | None = None) -> list[
     betas = np.stack([_mean_betas(people.betas[rows]) for rows in tracks])
     statures = np.full(len(tracks), np.nan) if body is None else statures_m(betas, body)
     return [
-        _summary(people, int(person), rows, float(stature))
+        _summary(people, int(person), rows, float(stature), every)
         for person, rows, stature in zip(persons, tracks, statures, strict=True)
     ]
 
@@ -61,7 +79,9 @@ def _mean_betas(betas: NDArray[np.float64]) -> NDArray[np.float64]:
     return betas[fitted].mean(axis=0) if fitted.any() else np.full(betas.shape[1], np.nan)
 
 
-def _summary(people: Reconstruction, person: int, rows: NDArray[np.intp], stature_m: float) -> TrackSummary:
+def _summary(
+    people: Reconstruction, person: int, rows: NDArray[np.intp], stature_m: float, every: int
+) -> TrackSummary:
     """The summary of the identity in `rows`, which are sorted by frame."""
     frame, known = people.frame[rows], people.known[rows]
     placed = np.isfinite(people.joints[rows]).all(axis=-1)
@@ -71,7 +91,7 @@ def _summary(people: Reconstruction, person: int, rows: NDArray[np.intp], statur
         first=int(frame[0]),
         last=int(frame[-1]),
         rows=len(rows),
-        gaps=int((np.diff(frame) > 1).sum()),
+        gaps=int((np.diff(frame) > every).sum()),
         stature_m=stature_m,
         confidence=float(people.confidence[rows].mean()),
         seen=float((known[told] == Known.SEEN).mean()) if told.any() else float("nan"),

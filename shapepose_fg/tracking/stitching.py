@@ -1,6 +1,6 @@
 """Who comes back after a longer time out of sight: tracks are joined whose ends fit in place, time and build."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -37,6 +37,36 @@ class StitchingConfig(Settings):
 
 
 @dataclass(frozen=True)
+class Trace:
+    """What stitching looks at, of the N solved rows of one track."""
+
+    track: int
+    """The identity."""
+    time_s: Array
+    """(N,) when each row is; rising."""
+    centre: Array
+    """(N, 3) centre of the core joints, metres."""
+    bones: Array
+    """(N, B) length of each bone between core joints, metres; NaN where unknown."""
+
+    @classmethod
+    def of(cls, track: int, time_s: Array, joints: Array, skeleton: Skeleton) -> "Trace":
+        """Of solved rows with `joints` (N, J, 3)."""
+        core = list(skeleton.core)
+        bone = np.array([(j, p) for j, p in enumerate(skeleton.parents) if j in core and p in core])
+        known = np.asarray(np.isfinite(joints[:, core]).all(axis=-1))[..., None]
+        centre = np.where(known, joints[:, core], 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+        length = np.linalg.norm(joints[:, bone[:, 0]] - joints[:, bone[:, 1]], axis=-1)
+        return cls(track, time_s, centre, length)
+
+    @classmethod
+    def concatenate(cls, parts: Sequence["Trace"]) -> "Trace":
+        """The rows of several parts of a track, one after the other."""
+        names = ("time_s", "centre", "bones")
+        return cls(parts[0].track, *(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+@dataclass(frozen=True)
 class Ends:
     """Where and when G tracks begin and end, and how their people are built."""
 
@@ -47,46 +77,35 @@ class Ends:
     place: Array
     """(G, 2, 3) centre of the core joints there, metres."""
     bones: Array
-    """(G, B) mean length of each bone between core joints, metres; NaN where it is not known."""
-
-
-@dataclass(frozen=True)
-class Traces:
-    """What stitching looks at, of N solved rows: small enough to be in memory for hours of footage."""
-
-    track: NDArray[np.intp]
-    """(N,) identity of each row."""
-    time_s: Array
-    """(N,) when it is."""
-    centre: Array
-    """(N, 3) centre of the core joints, metres."""
-    bones: Array
-    """(N, B) length of each bone between core joints, metres; NaN where unknown."""
+    """(G, B) median length of each bone between core joints, metres; NaN where it is not known."""
 
     @classmethod
-    def of(cls, track: NDArray[np.integer], time_s: Array, joints: Array, skeleton: Skeleton) -> "Traces":
-        """Of solved rows with `joints` (N, J, 3)."""
-        core = list(skeleton.core)
-        bone = np.array([(j, p) for j, p in enumerate(skeleton.parents) if j in core and p in core])
-        known = np.asarray(np.isfinite(joints[:, core]).all(axis=-1))[..., None]
-        centre = np.where(known, joints[:, core], 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
-        length = np.linalg.norm(joints[:, bone[:, 0]] - joints[:, bone[:, 1]], axis=-1)
-        return cls(track.astype(np.intp), time_s, centre, length)
+    def of(cls, traces: Iterable[Trace]) -> "Ends":
+        """Of tracks, of which one at a time is in memory."""
+        tracks, times, places, bones = [], [], [], []
+        for each in traces:
+            tracks.append(each.track)
+            times.append(each.time_s[[0, -1]])
+            places.append(each.centre[[0, -1]])
+            enough = np.isfinite(each.bones).sum(axis=0) >= _LEAST_ROWS
+            median = np.full(each.bones.shape[1], np.nan)
+            median[enough] = np.nanmedian(each.bones[:, enough], axis=0)
+            bones.append(median)
+        count = len(tracks)
+        return cls(
+            np.array(tracks, dtype=np.intp),
+            np.array(times).reshape(count, 2),
+            np.array(places).reshape(count, 2, 3),
+            np.array(bones) if count > 0 else np.zeros((0, 0)),
+        )
 
-    @classmethod
-    def concatenate(cls, parts: Sequence["Traces"]) -> "Traces":
-        """The rows of several parts, one after the other."""
-        names = ("track", "time_s", "centre", "bones")
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
-
-def stitch(traces: Traces, config: StitchingConfig, cuts_s: Sequence[float] = ()) -> dict[int, int]:
+def stitch(ends: Ends, config: StitchingConfig, cuts_s: Sequence[float] = ()) -> dict[int, int]:
     """What each track is called after tracks are joined: of two that are one the smaller number stays.
 
     Each track has one before it and one after it at the most; which, is decided for all together. Nothing is
     joined across `cuts_s`.
     """
-    ends = _ends(traces)
     if len(ends.track) < 2 or config.longest_gap_s == 0:
         return {track: track for track in ends.track.tolist()}
     gap_s = ends.time_s[None, :, 0] - ends.time_s[:, None, 1]
@@ -104,28 +123,6 @@ def stitch(traces: Traces, config: StitchingConfig, cuts_s: Sequence[float] = ()
         earlier = joined.get(place)
         names[place] = ends.track[place] if earlier is None else names[earlier]
     return {int(ends.track[place]): int(name) for place, name in names.items()}
-
-
-def _ends(traces: Traces) -> Ends:
-    """Ends and builds of all tracks."""
-    ids, count = np.unique(traces.track), traces.bones.shape[1]
-    times, places, bones = [], [], []
-    for each in ids.tolist():
-        rows = np.flatnonzero(traces.track == each)
-        rows = rows[np.argsort(traces.time_s[rows], kind="stable")]
-        times.append(traces.time_s[rows[[0, -1]]])
-        places.append(traces.centre[rows[[0, -1]]])
-        enough = np.isfinite(traces.bones[rows]).sum(axis=0) >= _LEAST_ROWS
-        median = np.full(count, np.nan)
-        median[enough] = np.nanmedian(traces.bones[rows][:, enough], axis=0)
-        bones.append(median)
-    none = len(ids) == 0
-    return Ends(
-        ids.astype(np.intp),
-        np.zeros((0, 2)) if none else np.stack(times),
-        np.zeros((0, 2, 3)) if none else np.stack(places),
-        np.zeros((0, count)) if none else np.stack(bones),
-    )
 
 
 def _alike(bones: Array) -> NDArray[np.bool_]:

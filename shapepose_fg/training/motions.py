@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.columns import read_npz
 from shapepose_fg.errors import InputError
+from shapepose_fg.npz_reader import read_npz
 from shapepose_fg.simulation.mocap import Clip, Mocap
 from shapepose_fg.simulation.shoulder import COLLARS, shoulder_rhythm
 from shapepose_fg.skeleton import SMPL_24

@@ -55,7 +55,7 @@ def test_options(copied, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["fbx"], "format fbx: there is none of this name; there are amass trc c3d bvh glb csv rrd"),
+        (["fbx"], "format fbx: there is none of this name; there are amass trc c3d bvh glb csv parquet rrd"),
         (["trc", "--markers", "skin"], "--markers skin: must be one of opensim joints body"),
         (["trc", "--frames", "9:3"], "--frames 9:3: must be A:B"),
         (["trc", "--frames", "500:600"], "nobody was found, so there is nothing to export"),

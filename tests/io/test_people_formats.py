@@ -197,7 +197,7 @@ def test_every_joint_and_limb_arrives(tmp_path, rig, program, skeleton):
                 }
                 own = np.isin(detections.pairs[:, 0], list(place.values()))
                 assert {tuple(pair) for pair in detections.pairs[own].tolist()} == links
-    assert np.all(table.candidates.affinity == 1)
+    assert all(np.all(frame.affinity == 1) for frame in table)
 
 
 def test_pose2sim_s_own_writer(rig):
@@ -206,7 +206,7 @@ def test_pose2sim_s_own_writer(rig):
     assert table.skeleton is HALPE_26
     # One whole person in frame 0; in frame 2 one whose first two joints have scores of 1.3 and -0.1.
     assert [np.bincount(frame.view, minlength=2).tolist() for frame in table] == [[26, 26], [0, 0], [25, 25]]
-    assert table.candidates.confidence.max() == 1.0
+    assert max(frame.confidence.max(initial=0) for frame in table) == 1.0
     (note,) = table.notes
     assert "scores reach 1.3, so they are no probabilities" in note
 
@@ -249,9 +249,8 @@ def test_scores_of_other_kinds(tmp_path, rig):
     table = read_detections(tmp_path, rig)
     every = np.concatenate([person[:, 2] for frames in people.values() for found in frames for person in found])
     scale = np.quantile(every[every > 0], 0.99)
-    np.testing.assert_allclose(
-        np.sort(table.candidates.confidence), np.sort(np.minimum(every[every > 0] / scale, 1))
-    )
+    found = np.concatenate([frame.confidence for frame in table])
+    np.testing.assert_allclose(np.sort(found), np.sort(np.minimum(every[every > 0] / scale, 1)))
     assert f"divided by {scale:.3g}, which 1 in 100 exceeds, and cut at 1" in table.notes[0]
 
 
@@ -261,7 +260,7 @@ def test_coco_s_visibilities(tmp_path, rig):
         each[:, 2] = np.where(each[:, 2] > 0.6, 2, np.where(each[:, 2] > 0, 1, 0))
     coco(tmp_path, people)
     table = read_detections(tmp_path, rig)
-    assert set(table.candidates.confidence.tolist()) == {0.5, 1.0}
+    assert {score for frame in table for score in frame.confidence.tolist()} == {0.5, 1.0}
     assert "COCO's visibilities" in table.notes[0]
 
 

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 
 from shapepose_fg.skeleton import BODY_25
-from shapepose_fg.tracking.stitching import StitchingConfig, Traces
+from shapepose_fg.tracking.stitching import Ends, StitchingConfig, Trace
 from shapepose_fg.tracking.stitching import stitch as stitch_traces
 
 
 def stitch(track, time_s, joints, skeleton, config, cuts_s=()):
     """The identity of each row."""
-    names = stitch_traces(Traces.of(track, time_s, joints, skeleton), config, cuts_s)
+    traces = (Trace.of(n, time_s[track == n], joints[track == n], skeleton) for n in np.unique(track).tolist())
+    names = stitch_traces(Ends.of(traces), config, cuts_s)
     return np.array([names[each] for each in track.tolist()], dtype=int)
 
 

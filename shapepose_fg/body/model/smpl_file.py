@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from shapepose_fg.body.model.pickle_records import RefusedPickle
 from shapepose_fg.body.model.plausible_body import implausible
 from shapepose_fg.body.model.smpl_pickle import as_array, read_smpl_pickle
-from shapepose_fg.columns import read_npz
 from shapepose_fg.errors import InputError
+from shapepose_fg.npz_reader import read_npz
 from shapepose_fg.skeleton import BODY_25
 
 NUM_BETAS = 10

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.io.detection_table import ViewCandidates
+from shapepose_fg.io.detections.view_streams import ViewCandidates
 from shapepose_fg.proposal.assignment import match_best_first
 from shapepose_fg.skeleton import BODY_25, COCO_18, Skeleton
 

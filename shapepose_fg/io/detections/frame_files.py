@@ -5,15 +5,16 @@ camera does not see.
 """
 
 import re
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, FiniteFloat, TypeAdapter, ValidationError
 
 from shapepose_fg.errors import InputError
 from shapepose_fg.files import MIDDLE, read_json, read_text
-from shapepose_fg.io.detections.people import CameraPeople
+from shapepose_fg.io.detection_table import BLOCK_FRAMES
+from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock
 from shapepose_fg.io.validation import first_problem, key_text
 
 _FILE = re.compile(r"(\d+)(_keypoints)?\.json$")
@@ -64,31 +65,36 @@ def frame_number(file: Path) -> int:
 
 
 def read_frame_files(folder: Path) -> CameraPeople:
-    """Read the frames that one camera saw; InputError naming file, key and cure.
+    """The frames that one camera saw; InputError naming file, key and cure.
 
     A frame's number is in its file's name. Nobody is seen in frames whose files are missing in between (`gaps`).
     """
     program = _program(folder)
-    rerun = _RERUN[program]
     files = _numbered(folder, program)
-    read = _instances if program.startswith("MMPose") else _people
-    frames, people = [], []
-    for number, file in files.items():
-        found = read(file, program)
-        people += found
-        frames += [number] * len(found)
-    counts = {len(person) // 3 for person in people}
-    if len(counts) > 1:
-        listing = " and ".join(map(str, sorted(counts)))
-        raise InputError(
-            f"{folder}: recognised as {program}, with people of {listing} keypoints; give those of one model"
-        )
-    count = counts.pop() if counts else 0
-    keypoints = np.array(people, dtype=np.float64).reshape(len(people), count, 3)
-    frame = np.array(frames, dtype=np.intp)
     numbers = list(files) or [0]
     gaps = tuple((one + 1, other - 1) for one, other in pairwise(numbers) if other > one + 1)
-    return CameraPeople(folder, program, frame, keypoints, numbers[0], numbers[-1], gaps=gaps, rerun=rerun)
+    blocks = _blocks(folder, program, files)
+    return CameraPeople(folder, program, blocks, numbers[0], numbers[-1], gaps=gaps, rerun=_RERUN[program])
+
+
+def _blocks(folder: Path, program: str, files: dict[int, Path]) -> Iterator[PeopleBlock]:
+    """The people of the files, block by block."""
+    read = _instances if program.startswith("MMPose") else _people
+    counts = set[int]()
+    numbers = list(files)
+    for start in range(0, len(numbers), BLOCK_FRAMES):
+        frames, people = [], []
+        for number in numbers[start : start + BLOCK_FRAMES]:
+            found = read(files[number], program)
+            people += found
+            frames += [number] * len(found)
+        counts |= {len(person) // 3 for person in people}
+        if len(counts) > 1:
+            listing = " and ".join(map(str, sorted(counts)))
+            raise InputError(
+                f"{folder}: recognised as {program}, with people of {listing} keypoints; give those of one model"
+            )
+        yield PeopleBlock.of(frames, people)
 
 
 def _program(folder: Path) -> str:

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, Val
 
 from shapepose_fg.errors import InputError
 from shapepose_fg.files import read_json
-from shapepose_fg.io.detections.people import CameraPeople
+from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock
 from shapepose_fg.io.validation import describe, first_problem, key_text
 
 _COCO, _ALPHAPOSE, _MMPOSE = "COCO's keypoint results", "AlphaPose's JSON", "MMPose's JSON of a video"
@@ -124,13 +124,11 @@ def _camera(
             f"{path}: recognised as {program}, with people of {' and '.join(map(str, counts))} keypoints; give the"
             " detections of one model"
         )
-    keypoints = np.array(rows, dtype=np.float64).reshape(len(rows), counts[0] if counts else 0, 3)
-    frame = np.array(frames, dtype=np.intp)
-    order = np.argsort(frame, kind="stable")
+    every = PeopleBlock.of(frames, rows)
+    order = np.argsort(every.frame, kind="stable")
+    blocks = iter([PeopleBlock(every.frame[order], every.keypoints[order])])
     first, last = (min(listed), max(listed)) if listed else (0, -1)
-    return CameraPeople(
-        path, program, frame[order], keypoints[order], first, last, every_frame=False, rerun=_RERUN[program]
-    )
+    return CameraPeople(path, program, blocks, first, last, every_frame=False, rerun=_RERUN[program])
 
 
 def _validated(adapter: TypeAdapter, value: Any, path: Path, program: str) -> Any:

@@ -4,47 +4,56 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from shapepose_fg.camera import Rig
 from shapepose_fg.errors import InputError
 from shapepose_fg.files import read_json
-from shapepose_fg.io.detection_table import DetectionTable, assemble
+from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.detections.association_text import read_association_text
 from shapepose_fg.io.detections.frame_files import frame_files, read_frame_files
 from shapepose_fg.io.detections.one_file import is_one_file, read_one_file
 from shapepose_fg.io.detections.people import CameraPeople, candidates_of
 from shapepose_fg.io.detections.places import find_places
-from shapepose_fg.io.detections.scores import as_probabilities
+from shapepose_fg.io.detections.read_people import ReadPeople, read_whole
+from shapepose_fg.io.detections.scores import Scores, as_probabilities
+from shapepose_fg.io.detections.view_streams import assemble
 from shapepose_fg.io.skeleton_file import find_skeleton
+from shapepose_fg.kept_arrays import InMemory, KeptArrays
 from shapepose_fg.skeleton import BODY_25, SKELETONS, Skeleton
 
 
-def read_detections(path: str | Path, rig: Rig, skeleton: Skeleton | str | Path | None = None) -> DetectionTable:
+def read_detections(
+    path: str | Path, rig: Rig, skeleton: Skeleton | str | Path | None = None, kept: KeptArrays | None = None
+) -> DetectionTable:
     """Read what every camera of `rig` saw from the folder `path`, undistorted.
 
     The formats are told by the files (docs/conventions.md): `<camera>.txt` of 4D Association; a folder per camera
     with a JSON file per frame (OpenPose, Pose2Sim, MMPose); a JSON file per camera (COCO's results, AlphaPose,
     MMPose). Cameras that the rig does not have are passed over. `skeleton` is a `Skeleton`, the name of one in
     `SKELETONS`, or a TOML file that describes it; without it the number of keypoints tells. `notes` of the table
-    say what was made of the files. Raises InputError, one sentence that names file, place and cure.
+    say what was made of the files. `kept` holds the recording, in memory by default: with an empty `InFolder` it
+    may be larger than that. Raises InputError, one sentence that names file, place and cure.
     """
+    kept = InMemory() if kept is None else kept
     places = find_places(Path(path), rig)
     wanted = find_skeleton(skeleton)
     if places.kind == "text":
-        table = _read_texts(places.paths, rig, wanted)
+        table = _read_texts(places.paths, rig, wanted, kept)
         return replace(table, notes=(*places.notes, *table.notes))
-    people = [_camera(each) for each in places.paths]
+    people = [read_whole(_camera(each), kept, f"camera-{n:04d}") for n, each in enumerate(places.paths)]
     found = _Found(people, _skeleton_of(people, wanted))
     first, last = found.span()
-    found, notes = found.with_probabilities()
+    rule = as_probabilities(found.scores(), (block.keypoints for each in people for block in each.blocks()))
     found.refuse_normalised()
-    views = [candidates_of(each, found.skeleton, *(_own_span(each) or (first, last))) for each in found.people]
-    table = assemble(views, rig, found.skeleton)
+    views = [
+        candidates_of(each.with_scores(rule), found.skeleton, *(_own_span(each.camera) or (first, last)))
+        for each in people
+    ]
+    table = assemble(views, rig, found.skeleton, kept)
+    notes = () if rule.note is None else (rule.note,)
     return replace(table, notes=(*places.notes, *notes, *found.gaps(), *found.middles(), *table.notes))
 
 
-def _read_texts(texts: Sequence[Path], rig: Rig, wanted: Skeleton | None) -> DetectionTable:
+def _read_texts(texts: Sequence[Path], rig: Rig, wanted: Skeleton | None, kept: KeptArrays) -> DetectionTable:
     """4D Association's text of every camera."""
     read = [read_association_text(text, camera) for text, camera in zip(texts, rig.cameras, strict=True)]
     skeleton = read[0][1]
@@ -56,7 +65,7 @@ def _read_texts(texts: Sequence[Path], rig: Rig, wanted: Skeleton | None) -> Det
             )
     if wanted is not None and wanted.joints != skeleton.joints:
         raise InputError(f"{texts[0]}: these are joints of {skeleton.name}, not of {wanted.name}")
-    table = assemble([view for view, _ in read], rig, skeleton)
+    table = assemble([view for view, _ in read], rig, skeleton, kept)
     made = [skeleton.joints[joint] for joint, _, _ in skeleton.middles]
     if len(made) > 0:
         note = f"{skeleton.name} has no {' and no '.join(made)}: made between the two that one neighbour links"
@@ -85,15 +94,16 @@ _MOST_FRAMES = 2_000_000
 class _Found:
     """The people of all cameras, in one skeleton."""
 
-    people: Sequence[CameraPeople]
+    people: Sequence[ReadPeople]
     skeleton: Skeleton
 
     def span(self) -> tuple[int, int]:
         """Numbers of the first and last frame that any camera lists."""
-        listed = [each for each in self.people if each.last >= each.first]
+        cameras = [each.camera for each in self.people]
+        listed = [each for each in cameras if each.last >= each.first]
         if len(listed) == 0:
             raise InputError(
-                f"{self.people[0].source}: recognised as {self.people[0].program}, where no camera lists a frame;"
+                f"{cameras[0].source}: recognised as {cameras[0].program}, where no camera lists a frame;"
                 " give detections of people"
             )
         first, last = min(each.first for each in listed), max(each.last for each in listed)
@@ -104,30 +114,28 @@ class _Found:
             )
         return first, last
 
-    def with_probabilities(self) -> tuple["_Found", list[str]]:
-        """The same people with scores from 0 to 1, and what was done to them."""
-        count = self.skeleton.keypoint_count
-        keypoints = [
-            each.keypoints if len(each.keypoints) > 0 else np.zeros((0, count, 3)) for each in self.people
-        ]
-        scored, note = as_probabilities(keypoints)
-        people = [replace(each, keypoints=new) for each, new in zip(self.people, scored, strict=True)]
-        return _Found(people, self.skeleton), [] if note is None else [note]
+    def scores(self) -> Scores:
+        """What is known of all scores."""
+        every = [each.scores for each in self.people]
+        return Scores(
+            sum(each.count for each in every),
+            max(each.top for each in every),
+            all(each.visibilities for each in every),
+        )
 
     def refuse_normalised(self) -> None:
         """Refuse keypoints that are parts of the picture's size instead of pixels."""
         for each in self.people:
-            xy = each.keypoints[each.keypoints[..., 2] > 0][:, :2]
-            if len(xy) > 0 and np.nanmax(np.abs(xy)) <= 1:
+            if each.farthest is not None and each.farthest <= 1:
                 raise InputError(
-                    f"{each.source}: recognised as {each.program}, but all keypoints lie between -1 and 1,"
-                    f" and pixels were expected; {each.rerun}"
+                    f"{each.camera.source}: recognised as {each.camera.program}, but all keypoints lie between -1"
+                    f" and 1, and pixels were expected; {each.camera.rerun}"
                 )
 
     def gaps(self) -> list[str]:
         """Which cameras lack frames in between."""
         notes = []
-        for each in self.people:
+        for each in (each.camera for each in self.people):
             if len(each.gaps) > 0:
                 count = sum(last - first + 1 for first, last in each.gaps)
                 (first, last), more = each.gaps[0], ", and others" if len(each.gaps) > 1 else ""
@@ -150,12 +158,12 @@ def _own_span(people: CameraPeople) -> tuple[int, int] | None:
     return (people.first, people.last) if people.every_frame else None
 
 
-def _skeleton_of(people: Sequence[CameraPeople], wanted: Skeleton | None) -> Skeleton:
+def _skeleton_of(people: Sequence[ReadPeople], wanted: Skeleton | None) -> Skeleton:
     """The skeleton that all files have, by the number of keypoints."""
-    seen = [each for each in people if len(each.keypoints) > 0]
     counts: dict[int, CameraPeople] = {}
-    for each in seen:
-        counts.setdefault(each.keypoints.shape[1], each)
+    for each in people:
+        if each.keypoint_count is not None:
+            counts.setdefault(each.keypoint_count, each.camera)
     if len(counts) > 1:
         (one, first), (other, second) = list(counts.items())[:2]
         raise InputError(

@@ -1,0 +1,133 @@
+"""The numbers of a text file, read piece by piece, so that the file may be larger than memory."""
+
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.errors import InputError
+from shapepose_fg.files import LARGE, check_size, open_regular
+
+_PIECE = 2**20
+"""Bytes that are read at a time."""
+_SPACE = b" \n\t"
+"""Pieces end behind one of these, so that no number, letter or end of line is cut."""
+
+
+def text_pieces(path: Path) -> Iterator[str]:
+    """Text of the UTF-8 file at `path` in pieces that end at white space.
+
+    InputError as of `read_text`, where it is too large, no text, or empty.
+    """
+    at, empty, left = 0, True, b""
+    with open_regular(path) as stream:
+        check_size(path, os.fstat(stream.fileno()).st_size, LARGE)
+        while True:
+            read = stream.read(_PIECE)
+            check_size(path, at + len(left) + len(read), LARGE)
+            cut = 1 + max(read.rfind(space) for space in _SPACE)
+            if len(read) > 0 and cut == 0:
+                if len(left) < _PIECE:
+                    left += read
+                    continue
+                cut = len(read)  # no number is as long
+            piece, left = left + read[:cut], read[cut:]
+            if len(read) == 0:
+                piece, left = piece + left, b""
+            try:
+                text = piece.decode("utf-8-sig" if at == 0 else "utf-8")
+            except UnicodeDecodeError as error:
+                raise InputError(
+                    f"{path}: byte {at + error.start} is not UTF-8 text; check that this is the file that you mean"
+                ) from None
+            at, empty = at + len(piece), empty and not text.strip()
+            if len(piece) > 0:
+                yield text
+            if len(read) == 0:
+                break
+    if empty:
+        raise InputError(f"{path}: the file is empty; write or copy it again")
+
+
+class NumberStream:
+    """The numbers of a file in order. Only some of them are in memory: those since the last `forget`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.first = 0
+        """How many numbers were forgotten."""
+        self.values: NDArray[np.float64] = np.zeros(0)
+        """Numbers from the first that is not forgotten on."""
+        self._pieces = text_pieces(path)
+        self._most = path.stat().st_size // 2 + 1
+
+    @property
+    def read(self) -> int:
+        """How many numbers were read, forgotten ones too."""
+        return self.first + len(self.values)
+
+    def reaches(self, count: int) -> bool:
+        """Whether the file has so many numbers; they are in memory then."""
+        if count > self._most:  # no room in the file: it is not read to its end for that
+            return False
+        parts, known = [self.values], self.read
+        while known < count and (text := next(self._pieces, None)) is not None:
+            parts.append(self._numbers(text, known))
+            known += len(parts[-1])
+        if len(parts) > 1:
+            self.values = np.concatenate(parts)
+        return known >= count
+
+    def forget(self, count: int) -> None:
+        """The first `count` numbers of the file are done with."""
+        self.values, self.first = self.values[count - self.first :].copy(), count
+
+    def count(self) -> int:
+        """How many numbers the file has; all are forgotten."""
+        self.forget(self.read)
+        while self.reaches(self.read + 1):
+            self.forget(self.read)
+        return self.first
+
+    def refuse(self, index: int | None, problem: str, cure: str) -> InputError:
+        """An error about number `index`; None is what should be behind the last."""
+        return InputError(f"{self.path}: line {self._line(index)}: {problem}; {cure}")
+
+    def _numbers(self, text: str, first: int) -> NDArray[np.float64]:
+        """The numbers of a piece, finite; `first` are before it."""
+        tokens = text.split()
+        try:
+            values = np.array(tokens, dtype=np.float64)
+            bad = int(np.argmin(np.isfinite(values))) if not np.isfinite(values).all() else None
+        except ValueError:
+            values, bad = np.zeros(0), _first_bad(tokens)
+        if bad is not None:
+            problem = f"{tokens[bad][:20]!r} is not a finite number"
+            raise self.refuse(first + bad, problem, "write the detections again")
+        return values
+
+    def _line(self, index: int | None) -> int:
+        """The line, from 1, on which a number stands; None, and what is behind the last: the last line."""
+        lines, numbers, last = 0, 0, 1
+        for text in text_pieces(self.path):
+            counts = [len(line.split()) for line in text.splitlines()]
+            ends = numbers + np.cumsum(counts)
+            if index is not None and len(ends) > 0 and index < ends[-1]:
+                return lines + int(np.searchsorted(ends, index, side="right")) + 1
+            numbers += sum(counts)
+            last = lines + max(len(counts), 1)
+            # A line that goes on in the next piece is not over.
+            lines += len((text + "|").splitlines()) - 1
+        return last
+
+
+def _first_bad(tokens: Sequence[str]) -> int:
+    """The first token that is no number."""
+    for index, token in enumerate(tokens):
+        try:
+            np.float64(token)
+        except ValueError:
+            return index
+    raise AssertionError("one of the tokens is no number")

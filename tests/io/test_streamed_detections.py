@@ -1,0 +1,157 @@
+"""Recordings larger than memory: read block by block, kept as files, the same as when they are read at once."""
+
+import json
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import shapepose_fg.io.detections.number_stream as number_stream
+from shapepose_fg.detections import Recording
+from shapepose_fg.errors import InputError
+from shapepose_fg.io.detection_table import BLOCK_FRAMES
+from shapepose_fg.io.detections import read_detections
+from shapepose_fg.io.write_detections import write_association
+from shapepose_fg.kept_arrays import InFolder
+from shapepose_fg.simulation import Scene, built_in_scene, simulate
+
+COLUMNS = ("view", "joint", "xy", "confidence", "pairs", "affinity")
+FRAMES = 2 * BLOCK_FRAMES + 40
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return built_in_scene(people=2, cameras=2, frames=12)
+
+
+@pytest.fixture(scope="module")
+def once(scene) -> Recording:
+    return simulate(scene)
+
+
+def repeated(once: Recording, count: int) -> Recording:
+    """The frames over and over, but for the last, in which nobody is."""
+    frames = [once[frame % len(once)] for frame in range(count - 1)]
+    return Recording(once.skeleton, [*frames, once[0].only(np.zeros(len(once[0]), dtype=bool))])
+
+
+@pytest.fixture(scope="module")
+def text(scene, once, tmp_path_factory) -> Path:
+    """Three blocks of frames as text."""
+    folder = tmp_path_factory.mktemp("text")
+    write_association(repeated(once, FRAMES), scene.rig, folder)
+    return folder
+
+
+def same(one, other) -> None:
+    assert len(one) == len(other)
+    for frame in range(len(one)):
+        for name in COLUMNS:
+            found, expected = getattr(one[frame], name), getattr(other[frame], name)
+            assert found.dtype == expected.dtype
+            np.testing.assert_array_equal(found, expected)
+
+
+def test_pieces_of_any_length_and_files_give_the_same(text, scene, once, tmp_path, monkeypatch):
+    whole = read_detections(text, scene.rig)
+    assert len(whole) == FRAMES and len(whole[FRAMES - 1]) == 0
+    # But for their order and the digits written, frames are those that were written, whichever block they are in.
+    for frame in (0, BLOCK_FRAMES - 1, BLOCK_FRAMES, 2 * BLOCK_FRAMES + 3):
+        given = once[frame % len(once)]
+        np.testing.assert_allclose(np.sort(whole[frame].xy[:, 0]), np.sort(given.xy[:, 0]), atol=2e-3)
+        np.testing.assert_allclose(np.sort(whole[frame].affinity), np.sort(given.affinity), atol=1e-6)
+    monkeypatch.setattr(number_stream, "_PIECE", 777)
+    kept = read_detections(text, scene.rig, kept=InFolder(tmp_path / "kept"))
+    same(kept, whole)
+    assert sorted(file.name for file in (tmp_path / "kept").iterdir()) == [
+        f"seen-{n:07d}.safetensors" for n in range(3)
+    ]
+    backwards = [kept[frame].xy.sum() for frame in range(FRAMES - 1, -1, -1)]
+    assert backwards[::-1] == [whole[frame].xy.sum() for frame in range(FRAMES)]
+
+
+def test_people_in_files_give_the_same_and_scores_are_judged_over_all(rig, tmp_path):
+    """A JSON file per frame and per camera; scores of the last block alone say that they are per cent."""
+    rng = np.random.default_rng(0)
+    for name in ("left", "right"):
+        (tmp_path / "frames" / name).mkdir(parents=True)
+        results = []
+        for frame in range(FRAMES):
+            score = 100.0 if frame > 2 * BLOCK_FRAMES else 0.9
+            people = [
+                np.column_stack([rng.uniform(300, 700, (25, 2)), np.full(25, score)]).ravel().tolist()
+                for _ in range((frame + 1) % 3)
+            ]
+            content = {"people": [{"pose_keypoints_2d": each} for each in people]}
+            (tmp_path / "frames" / name / f"v_{frame:012d}_keypoints.json").write_text(json.dumps(content))
+            results += [{"image_id": frame, "keypoints": each} for each in people]
+        (tmp_path / "files").mkdir(exist_ok=True)
+        (tmp_path / "files" / f"{name}.json").write_text(json.dumps(results))
+    frames = read_detections(tmp_path / "frames", rig)
+    same(read_detections(tmp_path / "frames", rig, kept=InFolder(tmp_path / "a")), frames)
+    files = read_detections(tmp_path / "files", rig, kept=InFolder(tmp_path / "b"))
+    same(files, frames)
+    assert "scores reach 100" in frames.notes[0] and "divided by 100" in frames.notes[0]
+    assert frames[0].confidence.max() == pytest.approx(0.009) and frames[FRAMES - 2].confidence.max() == 1
+    # People are not kept beside their candidates.
+    assert {file.name.split("-")[0] for file in (tmp_path / "a").iterdir()} == {"seen"}
+
+
+@pytest.mark.parametrize(
+    ("place", "word", "sentence"),
+    [
+        (-60, "x1", "'x1' is not a finite number"),
+        (-60, "nan", "'nan' is not a finite number"),
+        (-60, "", "the file ends in frame"),
+        (0, "4 1", "numbers follow the last of the 1 frames"),
+    ],
+)
+def test_the_line_of_a_mistake_is_told_wherever_it_is(text, scene, tmp_path, monkeypatch, place, word, sentence):
+    """In the last block, whose pieces are read when the lines before are forgotten."""
+    detections = tmp_path / "detection"
+    detections.mkdir()
+    for name in scene.rig.names:
+        (detections / f"{name}.txt").write_text((text / "detection" / f"{name}.txt").read_text())
+    file = detections / f"{scene.rig.names[0]}.txt"
+    lines = file.read_text().splitlines()
+    lines[place] = word
+    line = len(lines) + 1 + place
+    file.write_text("\n".join(lines) + "\n")
+    said = []
+    for piece in (2**20, 501):
+        monkeypatch.setattr(number_stream, "_PIECE", piece)
+        with pytest.raises(InputError) as caught:
+            read_detections(tmp_path, scene.rig)
+        said.append(str(caught.value))
+    assert said[0] == said[1] and sentence in said[0] and said[0].startswith(f"{file}: line ")
+    if "finite" in sentence:
+        assert f": line {line}: " in said[0]
+
+
+def test_text_is_utf_8_and_may_have_a_mark_and_other_ends_of_lines(text, scene, tmp_path, monkeypatch):
+    name = scene.rig.names[0]
+    content = (text / "detection" / f"{name}.txt").read_bytes()
+    for each in scene.rig.names:
+        (tmp_path / f"{each}.txt").write_bytes((text / "detection" / f"{each}.txt").read_bytes())
+    monkeypatch.setattr(number_stream, "_PIECE", 4096)
+    (tmp_path / f"{name}.txt").write_bytes(b"\xef\xbb\xbf" + content.replace(b"\n", b"\r\n"))
+    same(read_detections(tmp_path, scene.rig), read_detections(text, scene.rig))
+    (tmp_path / f"{name}.txt").write_bytes(content[:100_000] + b"\xff" + content[100_000:])
+    with pytest.raises(InputError, match=r"byte 100000 is not UTF-8 text"):
+        read_detections(tmp_path, scene.rig)
+
+
+def test_memory_does_not_grow_with_the_recording(scene, once, tmp_path, monkeypatch):
+    """Three times the frames in as much memory."""
+    monkeypatch.setattr(number_stream, "_PIECE", 2**15)  # a tenth of a block
+    peaks = []
+    for blocks in (2, 6):
+        folder = tmp_path / str(blocks)
+        write_association(repeated(once, blocks * BLOCK_FRAMES), scene.rig, folder)
+        tracemalloc.start()
+        table = read_detections(folder, scene.rig, kept=InFolder(folder / "kept"))
+        assert [len(table[n * BLOCK_FRAMES]) > 0 for n in range(blocks)] == blocks * [True]
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.1 * peaks[0]
