@@ -14,16 +14,17 @@ from multiprocessing import get_context, resource_tracker
 from typing import Any, Generic, Protocol, TypeVar
 
 Shared = TypeVar("Shared")
+Given = TypeVar("Given", covariant=True)
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
-class Pool(Protocol[Shared]):
+class Pool(Protocol[Given]):
     """Processes that do the same work for many items, each with what is shared."""
 
-    def map(self, work: Callable[[Shared, Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+    def map(self, work: Callable[[Given, Item], Result], items: Iterable[Item]) -> Iterator[Result]:
         """`work(shared, item)` for each item, in order; `items` are taken as they are needed."""
         ...
 
