@@ -1,0 +1,195 @@
+"""Change the code at random places; do the tests notice? python scripts/mutants.py --sample 60 [--minutes 30].
+
+Changes are Cosmic Ray's (pip install -e ".[mutants]"): another operator or comparison, a number one more or less, a
+condition the other way round, a loop that is not gone through, an exception that is not caught. A place of the code
+is drawn, each as likely, then one of its changes. Left out by rule: words for people, types, decorators, `strict=`,
+`==` for `is`, and changes that no float or mask could take. For every change the tests that reach its line are run,
+the quickest first, until one fails or 20 s are full. Noticed is what fails, or takes three times its time.
+
+Results are kept in .mutants, and a run that is stopped goes on there. `--again` tries the survivors anew, with the
+tests of today. scripts/equivalent_mutants.txt lists survivors that no test can notice, with the reason.
+"""
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections import Counter
+from itertools import islice
+from pathlib import Path
+
+os.environ["OMP_NUM_THREADS"] = "1"  # before torch is loaded: forks must not share its threads
+
+from scipy.stats import binomtest
+
+try:
+    from mutant_places import Mutant, Source, sample
+except ImportError:
+    sys.exit('error: mutation testing needs Cosmic Ray; pip install -e ".[mutants]"')
+from mutant_tests import ROOT, Reached, Tree
+
+PACKAGES = {
+    "stage I": ("shapepose_fg/proposal/*.py",),
+    "estimation": ("shapepose_fg/estimation/*.py",),
+    "tracking": ("shapepose_fg/tracking/*.py",),
+    "readers": (
+        "shapepose_fg/io/**/*.py",
+        "shapepose_fg/files.py",
+        "shapepose_fg/body/model/smpl_*.py",
+        "shapepose_fg/body/model/pickle_records.py",
+    ),
+}
+TESTS = (
+    "tests/proposal/test_*.py",
+    "tests/tracking/test_*.py",
+    "tests/estimation/test_*.py",
+    "tests/io/test_*.py",
+    "tests/body/test_smpl_*.py",
+    "tests/test_*.py",
+)
+NOT_FOR_THIS = {"tests/test_documents.py", "tests/test_imports.py", "tests/test_licences.py", "tests/test_cluster.py"}
+"""Tests of documents and packages, not of what the code does; and such as start a cluster."""
+EQUIVALENT = Path(__file__).with_name("equivalent_mutants.txt")
+
+
+def main() -> None:
+    """Draw, try, count."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sample", type=int, default=60, help="changes in each package")
+    parser.add_argument("--package", choices=[*PACKAGES], action="append", help="of one package; of all by default")
+    parser.add_argument("--seed", type=int, default=0, help="of the sample")
+    parser.add_argument("--minutes", type=float, default=1e9, help="stop after so long")
+    parser.add_argument("--again", action="store_true", help="try the survivors anew")
+    parser.add_argument("--survivors", action="store_true", help="only print them, and the counts")
+    parser.add_argument("--state", type=Path, default=ROOT / ".mutants", help="where results are kept")
+    given = parser.parse_args()
+    names = given.package or list(PACKAGES)
+    sources = {name: [Source(ROOT, path) for path in _files(PACKAGES[name])] for name in names}
+    drawn = {name: list(islice(sample(sources[name], given.seed), given.sample)) for name in names}
+    codes = {source.path: source.code for each in sources.values() for source in each}
+    campaign = Campaign(given.state, codes)
+    if not given.survivors:
+        # A change of each package in turn: what is stopped has tried some of all.
+        turns = [mutant for turn in zip(*_filled(list(drawn.values())), strict=True) for mutant in turn if mutant]
+        by_path = {source.path: source for each in sources.values() for source in each}
+        campaign.run(turns, by_path, again=given.again, until=time.monotonic() + 60 * given.minutes)
+    campaign.show(drawn)
+
+
+def _files(patterns: tuple[str, ...]) -> list[str]:
+    return sorted({str(file.relative_to(ROOT)) for each in patterns for file in ROOT.glob(each)})
+
+
+def _filled(lists: list[list[Mutant]]) -> list[list[Mutant | None]]:
+    longest = max(map(len, lists))
+    return [[*each, *[None] * (longest - len(each))] for each in lists]
+
+
+class Campaign:
+    """What was tried, and what came of it."""
+
+    def __init__(self, folder: Path, codes: dict[str, str]) -> None:
+        """Go on with what is kept in `folder`."""
+        self.folder, self.codes = folder, codes
+        self.results: dict[str, str] = {}
+        """By the change's line before and after: survived, noticed, too long, or not reached."""
+        if (folder / "results.jsonl").exists():
+            for line in (folder / "results.jsonl").read_text().splitlines():
+                entry = json.loads(line)
+                self.results[entry["id"]] = entry["outcome"]
+
+    def identity(self, mutant: Mutant) -> str:
+        """What is changed: the same after lines above it have changed."""
+        before, after = mutant.changed_lines(self.codes[mutant.path])
+        return f"{mutant.path} | {before} | {after}"
+
+    def run(self, mutants: list[Mutant], sources: dict[str, Source], *, again: bool, until: float) -> None:
+        """Try those that have no result yet; with `again` those that survived, too."""
+        left = [each for each in mutants if self._open(each, again)]
+        if len(left) == 0:
+            return
+        self.folder.mkdir(parents=True, exist_ok=True)
+        tree = Tree(self.folder / "tree")
+        tests = [file for file in _files(TESTS) if file not in NOT_FOR_THIS]
+        reached = Reached(tree, self.folder / "reached", tests)
+        everything = {str(file.relative_to(ROOT)): file.read_text() for file in ROOT.glob("shapepose_fg/**/*.py")}
+        for n, mutant in enumerate(left):
+            if time.monotonic() > until:
+                print(f"{len(left) - n} are left for another run")
+                return
+            began = time.monotonic()
+            outcome, count = self._tried(mutant, sources[mutant.path], tree, reached, everything)
+            identity = self.identity(mutant)
+            self.results[identity] = outcome
+            seconds = time.monotonic() - began
+            with (self.folder / "results.jsonl").open("a") as stream:
+                entry = {"id": identity, "outcome": outcome, "tests": count, "seconds": round(seconds, 1)}
+                stream.write(json.dumps(entry) + "\n")
+            print(f"{outcome:<11} {count:3d} tests {seconds:5.1f} s  {mutant.key}", flush=True)
+
+    def _open(self, mutant: Mutant, again: bool) -> bool:
+        outcome = self.results.get(self.identity(mutant))
+        return outcome is None or (again and outcome in ("survived", "not reached"))
+
+    def _tried(
+        self, mutant: Mutant, source: Source, tree: Tree, reached: Reached, everything: dict[str, str]
+    ) -> tuple[str, int]:
+        """What came of a change, and of how many tests."""
+        lines, names, inside = source.statement(mutant.line)
+        tests = reached.tests(mutant.path, lines)
+        if not inside:  # run when the file is loaded: who uses it?
+            tests = set().union(*(reached.users(name, everything) for name in names)) or reached.of_file(mutant.path)
+        chosen, seconds = reached.in_order(tests)
+        changed = mutant.applied(source.code)
+        if len(chosen) == 0 or changed is None:
+            return "not reached", 0
+        code = tree.test_changed(mutant.path, changed, chosen, 15.0 + 3.0 * seconds, self.folder / "said")
+        return ("too long" if code is None else "survived" if code == 0 else "noticed"), len(chosen)
+
+    def show(self, drawn: dict[str, list[Mutant]]) -> None:
+        """Survivors, and the share that is noticed."""
+        known = _equivalent()
+        for name, mutants in drawn.items():
+            for mutant in mutants:
+                identity = self.identity(mutant)
+                if self.results.get(identity) in ("survived", "not reached") and identity not in known:
+                    before, after = mutant.changed_lines(self.codes[mutant.path])
+                    print(f"\n{name}: {mutant.path}:{mutant.line} {self.results[identity]}\n- {before}\n+ {after}")
+        print(f"\n{'package':<12}{'tried':>7}{'noticed':>9}{'share':>8}{'95 %':>16}{'equivalent':>12}{'share of others':>17}")
+        total: Counter[str] = Counter()
+        for name, mutants in drawn.items():
+            counts: Counter[str] = Counter()
+            for mutant in mutants:
+                identity = self.identity(mutant)
+                outcome = self.results.get(identity)
+                counts["tried"] += outcome is not None
+                counts["noticed"] += outcome in ("noticed", "too long")
+                counts["equivalent"] += outcome in ("survived", "not reached") and identity in known
+            _print(name, counts)
+            total += counts
+        _print("all", total)
+
+
+def _print(name: str, counts: Counter[str]) -> None:
+    tried, noticed, equivalent = (counts[each] for each in ("tried", "noticed", "equivalent"))
+    if tried == 0:
+        return
+    between = binomtest(noticed, tried).proportion_ci(method="wilson")
+    interval = f"{100 * between.low:.0f} to {100 * between.high:.0f} %"
+    print(
+        f"{name:<12}{tried:>7}{noticed:>9}{100 * noticed / tried:>6.1f} %{interval:>16}{equivalent:>12}"
+        f"{100 * noticed / max(tried - equivalent, 1):>15.1f} %"
+    )
+
+
+def _equivalent() -> dict[str, str]:
+    """Changes that no test can notice, with the reason: four columns with | between them."""
+    if not EQUIVALENT.exists():
+        return {}
+    lines = [line for line in EQUIVALENT.read_text().splitlines() if line and not line.startswith("#")]
+    return {identity.strip(): reason.strip() for identity, reason in (line.rsplit(" | ", 1) for line in lines)}
+
+
+if __name__ == "__main__":
+    main()
