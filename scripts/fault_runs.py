@@ -37,7 +37,11 @@ class Command:
         written = write_simulated(scene, simulate(scene, seed=0), folder / "recording", "association")
         settings = folder / "settings.toml"
         settings.write_text(f"batch_frames = {WINDOW}\n")
-        options = {"--calibration": written["cameras"], "--detections": written["detections"], "--config": settings}
+        options = {
+            "--calibration": written["cameras"],
+            "--detections": written["detections"],
+            "--config": settings,
+        }
         words = [str(word) for option in options.items() for word in option]
         return cls(("reconstruct", *words, "--fps", "25", "--workers", "1"))
 

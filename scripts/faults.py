@@ -64,7 +64,9 @@ def main() -> int:
         print(f"without a fault: {seconds:.1f} s, {len(expected)} files", flush=True)
         wrong = kill(command, folder, expected, arguments, rng) if arguments.kills > 0 else 0
         wrong += fill(command, folder, expected, arguments, rng) if arguments.full > 0 else 0
-        wrong += race(command, folder, arguments.races, rng) + race_for_the_lock(folder) if arguments.races > 0 else 0
+        wrong += (
+            race(command, folder, arguments.races, rng) + race_for_the_lock(folder) if arguments.races > 0 else 0
+        )
     return 1 if wrong > 0 else 0
 
 
@@ -225,7 +227,9 @@ def race_for_the_lock(folder: Path, processes: int = 8, times: int = 500) -> int
         children.append(child)
     both = sum(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children)
     left = [file.name for file in out.iterdir()]
-    print(f"locks: {processes} processes, {times} times each: {both} processes met another; left: {left or 'nothing'}")
+    print(
+        f"locks: {processes} processes, {times} times each: {both} processes met another; left: {left or 'nothing'}"
+    )
     return both + len(left)
 
 

@@ -4,7 +4,7 @@ Changes are Cosmic Ray's (pip install -e ".[mutants]"): another operator or comp
 condition the other way round, a loop that is not gone through, an exception that is not caught. A place of the code
 is drawn, each as likely, then one of its changes. Left out by rule: words for people, types, decorators, `strict=`,
 `==` for `is`, and changes that no float or mask could take. For every change the tests that reach its line are run,
-the quickest first, until one fails or 20 s are full. Noticed is what fails, or takes three times its time.
+those of its own package and the quickest first, until one fails or 12 s are full. Noticed is what fails, or takes three times its time.
 
 Results are kept in .mutants, and a run that is stopped goes on there. `--again` tries the survivors anew, with the
 tests of today. scripts/equivalent_mutants.txt lists survivors that no test can notice, with the reason.
@@ -48,7 +48,12 @@ TESTS = (
     "tests/body/test_smpl_*.py",
     "tests/test_*.py",
 )
-NOT_FOR_THIS = {"tests/test_documents.py", "tests/test_imports.py", "tests/test_licences.py", "tests/test_cluster.py"}
+NOT_FOR_THIS = {
+    "tests/test_documents.py",
+    "tests/test_imports.py",
+    "tests/test_licences.py",
+    "tests/test_cluster.py",
+}
 """Tests of documents and packages, not of what the code does; and such as start a cluster."""
 EQUIVALENT = Path(__file__).with_name("equivalent_mutants.txt")
 
@@ -57,7 +62,9 @@ def main() -> None:
     """Draw, try, count."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sample", type=int, default=60, help="changes in each package")
-    parser.add_argument("--package", choices=[*PACKAGES], action="append", help="of one package; of all by default")
+    parser.add_argument(
+        "--package", choices=[*PACKAGES], action="append", help="of one package; of all by default"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the sample")
     parser.add_argument("--minutes", type=float, default=1e9, help="stop after so long")
     parser.add_argument("--again", action="store_true", help="try the survivors anew")
@@ -139,8 +146,10 @@ class Campaign:
         lines, names, inside = source.statement(mutant.line)
         tests = reached.tests(mutant.path, lines)
         if not inside:  # run when the file is loaded: who uses it?
-            tests = set().union(*(reached.users(name, everything) for name in names)) or reached.of_file(mutant.path)
-        chosen, seconds = reached.in_order(tests)
+            tests = set().union(*(reached.users(name, everything) for name in names)) or reached.of_file(
+                mutant.path
+            )
+        chosen, seconds = reached.in_order(tests, mutant.path)
         changed = mutant.applied(source.code)
         if len(chosen) == 0 or changed is None:
             return "not reached", 0
@@ -156,7 +165,9 @@ class Campaign:
                 if self.results.get(identity) in ("survived", "not reached") and identity not in known:
                     before, after = mutant.changed_lines(self.codes[mutant.path])
                     print(f"\n{name}: {mutant.path}:{mutant.line} {self.results[identity]}\n- {before}\n+ {after}")
-        print(f"\n{'package':<12}{'tried':>7}{'noticed':>9}{'share':>8}{'95 %':>16}{'equivalent':>12}{'share of others':>17}")
+        print(
+            f"\n{'package':<12}{'tried':>7}{'noticed':>9}{'share':>8}{'95 %':>16}{'equivalent':>12}{'share of others':>17}"
+        )
         total: Counter[str] = Counter()
         for name, mutants in drawn.items():
             counts: Counter[str] = Counter()
