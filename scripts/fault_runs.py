@@ -1,4 +1,4 @@
-"""Runs of `shapepose-fg reconstruct` to be disturbed, for faults.py: made cheap by a fork, compared to the byte."""
+"""Runs of `shapepose-fg reconstruct` to be disturbed by faults.py: cheap by a fork, compared to the byte."""
 
 import contextlib
 import hashlib
@@ -178,10 +178,12 @@ def phase(output: Path, windows: int) -> str:
     if not (output / PARTS / "manifest.json").exists():
         return "done" if (output / "run.json").exists() else "reading"
     if any(file.name.endswith(".part") for file in (output / PARTS).glob(".*")):
-        return "writing a window"
-    if any(file.name.endswith(".part") for file in output.glob(".*")) or (output / "people.npz").exists():
+        return "writing a window or a body"
+    if any(file.name.endswith(".part") for file in output.glob(".*")):
         return "writing the results"
-    return "after the last window" if kept == windows else f"window {kept + 1}"
+    if (output / "run.json").exists():
+        return "results written, parts not yet removed"
+    return "bodies over time, check" if kept == windows else f"window {kept + 1:2d}"
 
 
 def emptied(folder: Path) -> Path:

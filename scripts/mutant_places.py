@@ -1,11 +1,10 @@
-"""Which changes of the code mutants.py may make: Cosmic Ray's, less those that change nothing that is to be tested."""
+"""Which changes of the code mutants.py may make: Cosmic Ray's, less those that change nothing to be tested."""
 
 import ast
-import difflib
 import random
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -39,11 +38,17 @@ class Mutant:
     """Which place of the file, of those where it can be made."""
     line: int
     """Its line, from 1."""
+    inside: str = ""
+    """The function or class before it."""
+    before: str = ""
+    """What it changes."""
+    after: str = ""
+    """What that becomes."""
 
     @property
-    def key(self) -> str:
-        """Names it, as long as the file stays as it is."""
-        return f"{self.path}:{self.line} {self.operator} {self.occurrence}"
+    def identity(self) -> str:
+        """Names it, also when lines above it have changed."""
+        return f"{self.path} {self.inside} | {self.before} | {self.after}"
 
     def applied(self, code: str) -> str | None:
         """The file's text with the change; None where that is no Python, or nothing changes."""
@@ -57,11 +62,20 @@ class Mutant:
             return None
         return changed
 
-    def changed_lines(self, code: str) -> tuple[str, str]:
-        """The lines as they are and as they become."""
-        lines = list(difflib.ndiff(code.splitlines(), (self.applied(code) or "").splitlines()))
-        before, after = ([line[2:].strip() for line in lines if line.startswith(sign)] for sign in "-+")
-        return " ".join(before), " ".join(after)
+
+def _told(mutant: Mutant, code: str, changed: str) -> Mutant:
+    """The same, with the lines as they are and as they become."""
+    lines, others = code.splitlines(), changed.splitlines()
+    first = next(n for n, (one, other) in enumerate(zip(lines, others, strict=False)) if one != other)
+    last = next(n for n, (one, other) in enumerate(zip(lines[::-1], others[::-1], strict=False)) if one != other)
+    before, after = lines[first : len(lines) - last], others[first : len(others) - last]
+    names = [found[1] for line in lines[: first + 1] if (found := re.match(r"\s*(?:def|class) (\w+)", line))]
+    return replace(
+        mutant,
+        inside=names[-1] if names else "",
+        before=" ".join(map(str.strip, before)),
+        after=" ".join(map(str.strip, after)),
+    )
 
 
 class Source:
@@ -90,7 +104,7 @@ class Source:
         yield from (found[place] for place in sorted(found))
 
     def statement(self, line: int) -> tuple[range, list[str], bool]:
-        """Lines of the innermost statement at a line (of a compound one its head), what it names, is it in a function.
+        """The innermost statement at a line: its lines (or its head's), what it names, whether in a function.
 
         It names what it gives a value, as a constant or a setting does.
         """
@@ -137,8 +151,6 @@ class Source:
                 nodes.append(node.annotation)
             elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):
                 nodes.append(node)
-            elif isinstance(node, ast.ImportFrom | ast.Import):
-                nodes.append(node)
             if isinstance(node, ast.FunctionDef):
                 nodes += [*node.decorator_list, *([node.returns] if node.returns is not None else [])]
             if isinstance(node, ast.ClassDef):
@@ -160,12 +172,14 @@ def _is_text(value: ast.expr) -> bool:
 
 
 def sample(sources: list[Source], seed: int) -> Iterator[Mutant]:
-    """Mutants in random order: first a place, each as likely, then one of its changes that is Python and changes it."""
+    """Mutants in random order: first a place, each as likely, then one of its changes that is Python."""
     rng = random.Random(seed)
     places = [(source, changes) for source in sources for changes in source.places()]
     rng.shuffle(places)
     for source, changes in places:
         rng.shuffle(changes)
-        mutant = next((each for each in changes if each.applied(source.code) is not None), None)
-        if mutant is not None:
-            yield mutant
+        for mutant in changes:
+            changed = mutant.applied(source.code)
+            if changed is not None:
+                yield _told(mutant, source.code, changed)
+                break

@@ -1,21 +1,24 @@
 """Change the code at random places; do the tests notice? python scripts/mutants.py --sample 60 [--minutes 30].
 
-Changes are Cosmic Ray's (pip install -e ".[mutants]"): another operator or comparison, a number one more or less, a
-condition the other way round, a loop that is not gone through, an exception that is not caught. A place of the code
-is drawn, each as likely, then one of its changes. Left out by rule: words for people, types, decorators, `strict=`,
-`==` for `is`, and changes that no float or mask could take. For every change the tests that reach its line are run,
-those of its own package and the quickest first, until one fails or 12 s are full. Noticed is what fails, or takes three times its time.
+Changes are Cosmic Ray's (pip install -e ".[mutants]"): another operator or comparison, a number one more or less,
+a condition the other way round, a loop that is not gone through, an exception that is not caught. A place of the
+code is drawn, each as likely, then one of its changes. Left out by rule: words for people, types, decorators,
+`strict=`, `==` for `is`, and changes that no float or mask could take. For every change the tests that reach its
+line are run, those of its own package and the quickest first, until one fails or 12 s are full. Noticed is what
+fails, or takes three times its time.
 
 Results are kept in .mutants, and a run that is stopped goes on there. `--again` tries the survivors anew, with the
 tests of today. scripts/equivalent_mutants.txt lists survivors that no test can notice, with the reason.
 """
 
 import argparse
+import hashlib
 import json
 import os
 import sys
 import time
 from collections import Counter
+from dataclasses import astuple
 from itertools import islice
 from pathlib import Path
 
@@ -73,9 +76,8 @@ def main() -> None:
     given = parser.parse_args()
     names = given.package or list(PACKAGES)
     sources = {name: [Source(ROOT, path) for path in _files(PACKAGES[name])] for name in names}
-    drawn = {name: list(islice(sample(sources[name], given.seed), given.sample)) for name in names}
-    codes = {source.path: source.code for each in sources.values() for source in each}
-    campaign = Campaign(given.state, codes)
+    drawn = {name: _drawn(sources[name], given.seed, given.sample, given.state) for name in names}
+    campaign = Campaign(given.state)
     if not given.survivors:
         # A change of each package in turn: what is stopped has tried some of all.
         turns = [mutant for turn in zip(*_filled(list(drawn.values())), strict=True) for mutant in turn if mutant]
@@ -88,6 +90,18 @@ def _files(patterns: tuple[str, ...]) -> list[str]:
     return sorted({str(file.relative_to(ROOT)) for each in patterns for file in ROOT.glob(each)})
 
 
+def _drawn(sources: list[Source], seed: int, count: int, folder: Path) -> list[Mutant]:
+    """The first mutants of a sample; drawing takes its time, so they are kept."""
+    code = "".join(f"{seed} {source.path}\n{source.code}" for source in sources)
+    kept = folder / "drawn" / f"{hashlib.sha256(code.encode()).hexdigest()[:16]}.json"
+    known = [Mutant(*each) for each in json.loads(kept.read_text())] if kept.exists() else []
+    if len(known) < count:
+        known = list(islice(sample(sources, seed), count))
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        kept.write_text(json.dumps([astuple(each) for each in known]))
+    return known[:count]
+
+
 def _filled(lists: list[list[Mutant]]) -> list[list[Mutant | None]]:
     longest = max(map(len, lists))
     return [[*each, *[None] * (longest - len(each))] for each in lists]
@@ -96,20 +110,15 @@ def _filled(lists: list[list[Mutant]]) -> list[list[Mutant | None]]:
 class Campaign:
     """What was tried, and what came of it."""
 
-    def __init__(self, folder: Path, codes: dict[str, str]) -> None:
+    def __init__(self, folder: Path) -> None:
         """Go on with what is kept in `folder`."""
-        self.folder, self.codes = folder, codes
+        self.folder = folder
         self.results: dict[str, str] = {}
         """By the change's line before and after: survived, noticed, too long, or not reached."""
         if (folder / "results.jsonl").exists():
             for line in (folder / "results.jsonl").read_text().splitlines():
                 entry = json.loads(line)
                 self.results[entry["id"]] = entry["outcome"]
-
-    def identity(self, mutant: Mutant) -> str:
-        """What is changed: the same after lines above it have changed."""
-        before, after = mutant.changed_lines(self.codes[mutant.path])
-        return f"{mutant.path} | {before} | {after}"
 
     def run(self, mutants: list[Mutant], sources: dict[str, Source], *, again: bool, until: float) -> None:
         """Try those that have no result yet; with `again` those that survived, too."""
@@ -127,16 +136,18 @@ class Campaign:
                 return
             began = time.monotonic()
             outcome, count = self._tried(mutant, sources[mutant.path], tree, reached, everything)
-            identity = self.identity(mutant)
-            self.results[identity] = outcome
+            self.results[mutant.identity] = outcome
             seconds = time.monotonic() - began
             with (self.folder / "results.jsonl").open("a") as stream:
-                entry = {"id": identity, "outcome": outcome, "tests": count, "seconds": round(seconds, 1)}
+                entry = {"id": mutant.identity, "outcome": outcome, "tests": count, "seconds": round(seconds, 1)}
                 stream.write(json.dumps(entry) + "\n")
-            print(f"{outcome:<11} {count:3d} tests {seconds:5.1f} s  {mutant.key}", flush=True)
+            print(
+                f"{outcome:<11} {count:3d} tests {seconds:5.1f} s  {mutant.path}:{mutant.line} {mutant.operator}",
+                flush=True,
+            )
 
     def _open(self, mutant: Mutant, again: bool) -> bool:
-        outcome = self.results.get(self.identity(mutant))
+        outcome = self.results.get(mutant.identity)
         return outcome is None or (again and outcome in ("survived", "not reached"))
 
     def _tried(
@@ -161,22 +172,26 @@ class Campaign:
         known = _equivalent()
         for name, mutants in drawn.items():
             for mutant in mutants:
-                identity = self.identity(mutant)
-                if self.results.get(identity) in ("survived", "not reached") and identity not in known:
-                    before, after = mutant.changed_lines(self.codes[mutant.path])
-                    print(f"\n{name}: {mutant.path}:{mutant.line} {self.results[identity]}\n- {before}\n+ {after}")
-        print(
-            f"\n{'package':<12}{'tried':>7}{'noticed':>9}{'share':>8}{'95 %':>16}{'equivalent':>12}{'share of others':>17}"
+                outcome = self.results.get(mutant.identity)
+                if outcome in ("survived", "not reached") and mutant.identity not in known:
+                    print(f"\n{name}: {mutant.path}:{mutant.line} {outcome}\n- {mutant.before}\n+ {mutant.after}")
+        heads = (
+            ("tried", 7),
+            ("noticed", 9),
+            ("share", 8),
+            ("95 %", 16),
+            ("equivalent", 12),
+            ("share of others", 17),
         )
+        print(f"\n{'package':<12}" + "".join(f"{head:>{width}}" for head, width in heads))
         total: Counter[str] = Counter()
         for name, mutants in drawn.items():
             counts: Counter[str] = Counter()
             for mutant in mutants:
-                identity = self.identity(mutant)
-                outcome = self.results.get(identity)
+                outcome = self.results.get(mutant.identity)
                 counts["tried"] += outcome is not None
                 counts["noticed"] += outcome in ("noticed", "too long")
-                counts["equivalent"] += outcome in ("survived", "not reached") and identity in known
+                counts["equivalent"] += outcome in ("survived", "not reached") and mutant.identity in known
             _print(name, counts)
             total += counts
         _print("all", total)

@@ -11,7 +11,7 @@ from shapepose_fg.skeleton import BODY_25
 def crowded(five_cameras, two_people) -> Detections:
     """Four people close to each other: 4 px of noise, a fifth missed, a false candidate for every third joint."""
     rng = np.random.default_rng(5)
-    people = np.concatenate([two_people, two_people[::-1] + [0.1, 0.5, 0.0]])
+    people = np.concatenate([two_people, two_people[::-1] + np.array([0.1, 0.5, 0.0])])
     xy, _ = five_cameras.project(people)
     view, person, joint = (index.ravel() for index in np.indices(xy.shape[:3]))
     xy = xy.reshape(-1, 2) + rng.normal(0, 4, (len(view), 2))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from shapepose_fg.proposal.association import mean_affinity
 from shapepose_fg.proposal.candidates import CandidateConfig, Candidates, PairPoints, triangulate_pairs, vote
 from shapepose_fg.proposal.growth import GrowthConfig, Links, grow, link
+from shapepose_fg.proposal.proposals import ProposalConfig, _apart, _Search
 from shapepose_fg.skeleton import BODY_25
 
 CONFIG = CandidateConfig()
@@ -248,3 +249,174 @@ def test_mean_affinity_is_over_the_neighbours_that_the_person_owns_in_that_view(
                 total += listed.get((row, other), listed.get((other, row), 0.0))
         assert neighbours[person, row] == len(there)
         assert affinity[person, row] == pytest.approx(total / max(len(there), 1))
+
+
+def boxes(roots, candidates: Candidates, config: ProposalConfig) -> list[tuple[float, float]]:
+    """Share of core joints with a candidate in each root's box, and the mean confidence of the best of each."""
+    found = []
+    for root in roots:
+        best: dict[int, float] = {}
+        for xyz, joint, score in zip(candidates.xyz, candidates.joint.tolist(), candidates.score, strict=True):
+            x, y, z = np.abs(xyz - candidates.xyz[root])
+            if math.hypot(x, y) < config.box_horizontal_m and z < config.box_vertical_m and joint in BODY_25.core:
+                best[joint] = max(best.get(joint, 0.0), score)
+        found.append((len(best) / len(BODY_25.core), sum(best.values()) / max(len(best), 1)))
+    return found
+
+
+def apart(anchors, taken, candidates: Candidates, crowded, config: ProposalConfig) -> list[int]:
+    """Anchors by falling confidence of their own detections, without those near a better one."""
+    made_of = {n: set(candidates.support[candidates.support[:, 0] == n, 1].tolist()) for n in [*taken, *anchors]}
+    kept, waiting, first = [], list(anchors), list(taken)
+    while True:
+        own = [n for n in waiting if len(made_of[n]) >= config.min_own_views]
+        if first:
+            best = first.pop(0)
+        elif own:
+            best = max(own, key=lambda n: sum(crowded.confidence[row] for row in made_of[n]))
+            kept.append(best)
+        else:
+            return kept
+        used = set(made_of[best])
+        made_of = {n: each - used for n, each in made_of.items()}
+        far = np.linalg.norm(candidates.xyz - candidates.xyz[best], axis=1) >= config.separation_m
+        waiting = [n for n in waiting if n != best and far[n]]
+
+
+@pytest.mark.parametrize("own_views", [0, 2, 4])
+def test_anchors_stand_apart_in_space_and_by_their_detections(candidates, crowded, own_views):
+    config = ProposalConfig(min_own_views=own_views)
+    hips = np.flatnonzero(candidates.joint == BODY_25.root)
+    assert len(hips) > 6
+    expected = apart(hips.tolist(), [], candidates, crowded, config)
+    assert _apart(hips, hips[:0], candidates, crowded, config).tolist() == expected
+    taken = expected[1:2]
+    others = [n for n in hips.tolist() if n not in taken]
+    beside = apart(others, taken, candidates, crowded, config)
+    assert _apart(np.array(others), np.array(taken), candidates, crowded, config).tolist() == beside
+    assert 1 <= len(expected) < len(hips)
+
+
+def search(candidates: Candidates, links: Links, crowded, **settings) -> _Search:
+    up = np.array([0.0, 0.0, 1.0])
+    return _Search(candidates, links, crowded, BODY_25, up, ProposalConfig(**settings), Counter())
+
+
+@pytest.mark.parametrize("config", [ProposalConfig(), ProposalConfig(box_horizontal_m=0.3, box_vertical_m=0.5)])
+def test_boxes_are_as_wide_and_as_high_as_is_said(candidates, links, crowded, config):
+    roots = np.flatnonzero(candidates.joint == BODY_25.root)
+    here = search(
+        candidates, links, crowded, box_horizontal_m=config.box_horizontal_m, box_vertical_m=config.box_vertical_m
+    )
+    parts, score = here.boxes(roots)
+    expected = boxes(roots, candidates, config)
+    np.testing.assert_allclose(np.column_stack([parts, score]), expected)
+    assert len(set(score.tolist())) > 1
+
+
+def test_reasons_are_counted_once_for_each_anchor(candidates, links, crowded):
+    """Two bounds that some of the hips miss; 1 of those that are left is looked for."""
+    roots = np.flatnonzero(candidates.joint == BODY_25.root)
+    parts, score = np.array(boxes(roots, candidates, ProposalConfig(box_horizontal_m=0.3))).T
+    least, doubt = np.median(parts), np.median(score)
+    here = search(
+        candidates, links, crowded, box_horizontal_m=0.3, min_parts=least, min_confidence=doubt, most_people=1
+    )
+    kept = here.anchors(roots, roots[:0])
+    good = roots[(parts >= least) & (score >= doubt)]
+    stand = apart(good.tolist(), [], candidates, crowded, here.config)
+    assert kept.tolist() == stand[:1] and len(stand) > 1
+    assert +here.dropped == +Counter(
+        {
+            "too few parts in the box": int((parts < least).sum()),
+            "low confidence": int(((parts >= least) & (score < doubt)).sum()),
+            "hip seen as a better one's": len(good) - len(stand),
+            "more people than are looked for": len(stand) - 1,
+        }
+    )
+
+
+def test_middles_of_two_hips_are_roots_of_last_resort(candidates, links, crowded):
+    """Between a free right and a free left hip at most 40 cm apart, one of them strong; of too many the best."""
+    free = np.random.default_rng(0).random(len(candidates)) < 0.8
+    right, left = BODY_25.hips
+    pairs = [
+        (first, second)
+        for first in np.flatnonzero(free & (candidates.joint == right)).tolist()
+        for second in np.flatnonzero(free & (candidates.joint == left)).tolist()
+        if np.linalg.norm(candidates.xyz[first] - candidates.xyz[second]) < 0.4
+        and (candidates.strong[first] or candidates.strong[second])
+    ]
+    score = np.array([candidates.score[list(pair)].mean() for pair in pairs])
+    for most in (64, 1):
+        more = search(candidates, links, crowded, most_people=most).with_middles(free)
+        chosen = sorted(np.argsort(-score, kind="stable")[: 4 * most].tolist())
+        assert len(pairs) > 4 and len(chosen) == min(4 * most, len(pairs))
+        count, added = len(candidates), more.candidates
+        assert len(added) == count + len(chosen)
+        ends = []
+        for n, (first, second) in enumerate((pairs[k] for k in chosen), count):
+            np.testing.assert_allclose(added.xyz[n], (candidates.xyz[first] + candidates.xyz[second]) / 2)
+            assert added.score[n] == pytest.approx(candidates.score[[first, second]].mean())
+            assert added.votes[n] == candidates.votes[[first, second]].min()
+            assert (added.joint[n], added.strong[n]) == (BODY_25.root, False)
+            rows = [candidates.support[candidates.support[:, 0] == each, 1].tolist() for each in (n, first)]
+            assert added.support[added.support[:, 0] == n, 1].tolist() == rows[1]
+            ends += [(n, first), (n, second)]
+        new = more.links.ends[len(links.ends) :]
+        assert sorted(map(tuple, new.tolist())) == sorted(ends)
+        assert (more.links.score[len(links.ends) :] == 1.0).all()
+
+
+def test_halves_of_one_person_are_those_that_share_hardly_a_joint(links, crowded):
+    """Four anchors: legs 0.3 m from a trunk, legs 0.5 m from one, and somebody who shares three joints with it."""
+    core = len(BODY_25.core)
+    hips = np.array([[0.0, 0, 1], [0.3, 0, 1], [0.5, 0, 1], [0.0, 0.35, 1]])
+    none = np.zeros((0, 2), dtype=np.intp)
+    anchors = Candidates(hips, np.full(4, BODY_25.root), np.ones(4), np.full(4, 3), np.ones(4, dtype=bool), none)
+    has = np.zeros((4, core), dtype=bool)
+    has[0, :9] = True
+    has[1, 7:13] = has[2, 7:13] = True  # two shared with the first
+    has[3, 6:12] = True  # three shared with the first, five with the legs
+    here = search(anchors, links, crowded)
+    assert here._halves(np.arange(4), has).tolist() == [False, True, False, False]
+    assert search(anchors, links, crowded, split_m=0.6)._halves(np.arange(4), has).tolist() == [
+        False,
+        True,
+        True,
+        False,
+    ]
+    assert search(anchors, links, crowded, split_shared=3)._halves(np.arange(4), has).tolist() == [
+        False,
+        True,
+        False,
+        True,
+    ]
+    assert not search(anchors, links, crowded, split_m=0.0)._halves(np.arange(4), has).any()
+    # Of two that have equally much the later one goes.
+    equal = np.zeros((2, core), dtype=bool)
+    equal[0, :5] = equal[1, 5:10] = True
+    pair = search(anchors, links, crowded)
+    assert pair._halves(np.array([0, 1]), equal).tolist() == [False, True]
+
+
+def test_unclaimed_are_candidates_with_detections_of_their_own(candidates, links, crowded):
+    """Two views' worth of detections that nobody's chosen candidate is made of."""
+    hips = np.flatnonzero((candidates.joint == BODY_25.root) & candidates.strong)[:2]
+    chosen = grow(hips, candidates, links, BODY_25, GrowthConfig())
+    claimed = set(chosen[chosen >= 0].tolist())
+    used = {row for n, row in candidates.support.tolist() if n in claimed}
+    own = Counter(n for n, row in candidates.support.tolist() if row not in used)
+    free = search(candidates, links, crowded).unclaimed(chosen)
+    assert free is not None and free.tolist() == [own[n] >= 2 for n in range(len(candidates))]
+    joints = {
+        int(candidates.joint[n])
+        for n in range(len(candidates))
+        if free[n] and candidates.strong[n] and candidates.joint[n] in BODY_25.core
+    }
+    share = len(joints) / len(BODY_25.core)
+    assert search(candidates, links, crowded, min_grown_parts=share).unclaimed(chosen) is not None
+    assert (
+        search(candidates, links, crowded, min_grown_parts=min(1.0, share + 0.01)).unclaimed(chosen) is None
+        or share == 1
+    )
