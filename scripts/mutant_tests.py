@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[1]
 _LIBRARIES = (
     "numpy scipy.optimize scipy.spatial torch gtsam cv2 pydantic yaml safetensors hypothesis pytest typer rich"
 )
-_MOST_S, _MOST_TESTS = 12.0, 100
+_MOST_S, _MOST_TESTS = 10.0, 100
 
 
 class Tree:
