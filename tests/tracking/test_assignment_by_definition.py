@@ -100,7 +100,7 @@ def test_the_own_share_is_of_places_in_front_of_a_camera_and_in_its_picture(
     predicted, crowded, five_cameras, two_people
 ):
     """A detection that two people have is nobody's own."""
-    places, sigma, lost = predicted
+    places, _, _ = predicted
     places = np.concatenate(
         [places, two_people[:1] + np.array([0.0, 0.0, 1.5]), two_people[:1] + np.array([40.0, 0, 0])]
     )
