@@ -180,7 +180,7 @@ class Beside:
 
     def fit(self, targets, initial=None, groups=None):
         self.targets = targets
-        return SimpleNamespace(joints=targets.xyz + [0.0, 0.0, 0.3])
+        return SimpleNamespace(joints=targets.xyz + np.array([0.0, 0.0, 0.3]))
 
 
 def test_unseen_joints_go_towards_the_body_the_more_the_less_they_are_known():

@@ -296,3 +296,25 @@ def test_refuses_settings_that_make_no_sense():
         WindowGraphConfig(weight_2d=0.0)
     with pytest.raises(ValueError, match="rho_3d must be between 0 and 1"):
         WindowGraphConfig(rho_3d=1.5)
+
+
+@pytest.mark.parametrize(("error", "failure"), [(RuntimeError, "singular"), (None, "left the finite numbers")])
+def test_a_solver_that_fails_says_so_and_leaves_the_joints(five_cameras, person, monkeypatch, error, failure):
+    """GTSAM raises RuntimeError where its system is indeterminate, and may end with an error that is NaN."""
+    truth, xy, sigmas = person
+
+    class Failing(gtsam.LevenbergMarquardtOptimizer):
+        def optimize(self):
+            if error is not None:
+                raise error("Indeterminant linear system")
+            return super().optimize()
+
+        def error(self):
+            return np.nan
+
+    monkeypatch.setattr(gtsam, "LevenbergMarquardtOptimizer", Failing)
+    graph = OneFrame(five_cameras, xy, sigmas, EXACT, "cauchy", 0, 0)
+    found = graph.solve(truth)
+    assert failure in graph.window.failure
+    if error is not None:
+        np.testing.assert_array_equal(found, truth)

@@ -2,6 +2,7 @@
 
 import math
 from collections import Counter, defaultdict
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -420,3 +421,18 @@ def test_unclaimed_are_candidates_with_detections_of_their_own(candidates, links
         search(candidates, links, crowded, min_grown_parts=min(1.0, share + 0.01)).unclaimed(chosen) is None
         or share == 1
     )
+
+
+def test_the_least_share_of_grown_joints_counts_every_candidate(crowded):
+    """Six of the 15 core joints are linked to the hip, 40 %: one fewer, and nobody is there."""
+    names = ("RHip", "LHip", "Neck", "RKnee", "LKnee", "MidHip")
+    joint = np.array([BODY_25.index(name) for name in names])
+    assert set(joint.tolist()) <= set(BODY_25.core) and len(BODY_25.core) == 15
+    none = np.zeros((0, 2), dtype=np.intp)
+    six = Candidates(np.zeros((6, 3)), joint, np.full(6, 0.8), np.full(6, 3), np.ones(6, dtype=bool), none)
+    limbs = Links(np.array([[5, 0], [5, 1], [5, 2], [0, 3], [1, 4]]), np.full(5, 2.0))
+    here = search(six, limbs, crowded)
+    anchors, chosen = here.linked(np.array([5]))
+    assert anchors.tolist() == [5] and chosen[0, joint].tolist() == list(range(6))
+    weak = replace(six, strong=np.arange(6) != 0)
+    assert len(search(weak, limbs, crowded).linked(np.array([5]))[0]) == 0

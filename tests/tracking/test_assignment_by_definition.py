@@ -9,7 +9,7 @@ import pytest
 from shapepose_fg.observations import Observations
 from shapepose_fg.skeleton import BODY_25
 from shapepose_fg.tracking.following import Input
-from shapepose_fg.tracking.reassociation import Lasting, Survival, _gone, _nobody, _own_share
+from shapepose_fg.tracking.reassociation import Lasting, Survival, _gone, _nobody, _own_share, reassociate
 from shapepose_fg.tracking.view_assignment import AssignmentConfig, assign
 
 CORE = list(BODY_25.core)
@@ -180,3 +180,16 @@ def test_the_track_with_the_least_of_its_own_is_nobody(three):
     assert _nobody(given, alone, BODY_25, Lasting(min_share=share[1] + 0.01, min_seen_twice=11.1)) == 5
     assert _nobody(given, alone, BODY_25, Lasting(min_share=share[1] - 0.01, min_seen_twice=11.1)) is None
     assert _nobody(given, alone, BODY_25, Lasting(min_share=share[1] + 0.01, min_seen_twice=11.0)) is None
+
+
+def test_rows_without_a_joint_are_carried_by_motion_unless_they_must_survive(three, two_people):
+    """A third row whose joints are not known at all: kept without detections, or gone."""
+    frame, _, _ = three
+    joints = np.stack([*two_people, np.full((25, 3), np.nan)])
+    rows = Observations.of(np.full((3, 25, 5), -1), frame.detections, joints)
+    rows = replace(rows, track=np.array([4, 5, 6]), frame=np.zeros(3, dtype=int))
+    covariance = np.where(np.isnan(joints)[..., None], np.nan, 0.02**2 * np.eye(3))
+    kept = reassociate([frame], rows, joints, covariance, BODY_25, AssignmentConfig())
+    assert kept.track.tolist() == [4, 5, 6] and not kept.seen[2].any() and kept.seen[:2].all()
+    left = reassociate([frame], rows, joints, covariance, BODY_25, AssignmentConfig(), Survival())
+    assert left.track.tolist() == [4, 5]
