@@ -1,17 +1,23 @@
 """Which changes of the code mutants.py may make: Cosmic Ray's, less those that change nothing to be tested."""
 
 import ast
+import importlib
 import random
 import re
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
-from cosmic_ray.ast import ast_nodes, get_ast
-from cosmic_ray.mutating import mutate_code
-from cosmic_ray.operators.provider import OperatorProvider
-
+try:
+    _tree, _mutating, _provider = (
+        importlib.import_module(f"cosmic_ray.{name}") for name in ("ast", "mutating", "operators.provider")
+    )
+except ImportError:
+    sys.exit('error: mutation testing needs Cosmic Ray and coverage; pip install -e ".[mutants]"')
+OPERATORS: Any = _provider.OperatorProvider()
 _WORDS_ONLY = {"InputError", "ValueError", "RuntimeError", "note", "print"}
 """What is called with words for people."""
 _ARITHMETIC = "(Add|Sub|Mul|Div|FloorDiv|Mod|Pow)"
@@ -52,9 +58,9 @@ class Mutant:
 
     def applied(self, code: str) -> str | None:
         """The file's text with the change; None where that is no Python, or nothing changes."""
-        operator = OperatorProvider()[self.operator]()
+        operator = OPERATORS[self.operator]()
         try:
-            changed = mutate_code(code, operator, self.occurrence)
+            changed = _mutating.mutate_code(code, operator, self.occurrence)
             if changed is None or ast.dump(ast.parse(changed)) == ast.dump(ast.parse(code)):
                 return None
             compile(changed, self.path, "exec")
@@ -87,14 +93,14 @@ class Source:
 
     def places(self) -> Iterator[list[Mutant]]:
         """Of every place of the code the changes that can be made there; cosmetic ones are left out."""
-        tree = get_ast(self.code)
+        tree = _tree.get_ast(self.code)
         found: dict[tuple[int, int, str], list[Mutant]] = {}
-        nodes = list(ast_nodes(tree))
-        for name in OperatorProvider():
+        nodes = list(_tree.ast_nodes(tree))
+        for name in OPERATORS:
             if _NOT_USED.fullmatch(name):
                 continue
             of_types = name.startswith("ReplaceBinaryOperator_BitOr")
-            operator = OperatorProvider()[name]()
+            operator = OPERATORS[name]()
             starts = (start for node in nodes for start, _ in operator.mutation_positions(node))
             for occurrence, (line, column) in enumerate(starts):
                 if not self._cosmetic(line, column) and not (of_types and not self.statement(line)[2]):

@@ -15,7 +15,6 @@ import argparse
 import hashlib
 import json
 import os
-import sys
 import time
 from collections import Counter
 from dataclasses import astuple
@@ -26,10 +25,7 @@ os.environ["OMP_NUM_THREADS"] = "1"  # before torch is loaded: forks must not sh
 
 from scipy.stats import binomtest
 
-try:
-    from mutant_places import Mutant, Source, sample
-except ImportError:
-    sys.exit('error: mutation testing needs Cosmic Ray; pip install -e ".[mutants]"')
+from mutant_places import Mutant, Source, sample
 from mutant_tests import ROOT, Reached, Tree
 
 PACKAGES = {

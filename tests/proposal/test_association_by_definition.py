@@ -77,7 +77,7 @@ def chosen_for(places, owns, crowded, rig) -> np.ndarray:
 
 @pytest.mark.parametrize("least", [0.0, 0.35, 0.9])
 def test_observations_are_chosen_again_until_nobody_more_is_dropped(least, proposed, crowded, five_cameras):
-    """First by what supports the candidates, then twice by what was chosen; what the dropped had goes to others."""
+    """First by what supports the candidates, then twice by what was chosen; what the dropped had is free."""
     proposals, candidates = proposed
     owns = np.zeros((len(proposals), len(crowded)), dtype=bool)
     for person, joints in enumerate(proposals.candidate.tolist()):
