@@ -4,7 +4,7 @@ Changes are Cosmic Ray's (pip install -e ".[mutants]"): another operator or comp
 a condition the other way round, a loop that is not gone through, an exception that is not caught. A place of the
 code is drawn, each as likely, then one of its changes. Left out by rule: words for people, types, decorators,
 `strict=`, `==` for `is`, and changes that no float or mask could take. For every change the tests that reach its
-line are run, those of its own package and the quickest first, until one fails or 10 s are full. Noticed is what
+line are run, those of its own package and the quickest first, until one fails or 8 s are full. Noticed is what
 fails, or takes three times its time.
 
 Results are kept in .mutants, and a run that is stopped goes on there. `--again` tries the survivors anew, with the
@@ -23,10 +23,9 @@ from pathlib import Path
 
 os.environ["OMP_NUM_THREADS"] = "1"  # before torch is loaded: forks must not share its threads
 
-from scipy.stats import binomtest
-
 from mutant_places import Mutant, Source, sample
 from mutant_tests import ROOT, Reached, Tree
+from scipy.stats import binomtest
 
 PACKAGES = {
     "stage I": ("shapepose_fg/proposal/*.py",),

@@ -318,3 +318,20 @@ def test_a_solver_that_fails_says_so_and_leaves_the_joints(five_cameras, person,
     assert failure in graph.window.failure
     if error is not None:
         np.testing.assert_array_equal(found, truth)
+
+
+def test_of_a_joint_that_one_view_saw_there_is_no_covariance_and_the_others_have_theirs(five_cameras, person):
+    """Its depth is open, so that the whole system is singular; what hangs together with it is nothing."""
+    truth, xy, sigmas = person
+    graph = OneFrame(five_cameras, xy, sigmas, EXACT, None, 0, 0)
+    inlier = np.ones(sigmas.shape, dtype=bool)
+    graph.set_gates(inlier)
+    graph.solve(truth)
+    whole = graph.covariance()
+    inlier[4, 1:] = False
+    graph.set_gates(inlier)
+    graph.solve(truth)
+    covariance = graph.covariance()
+    assert np.isnan(covariance[4]).all() and np.isfinite(whole).all()
+    # With a prior of 100 m on each joint: a relative difference of (1 cm / 100 m)^2.
+    np.testing.assert_allclose(np.delete(covariance, 4, axis=0), np.delete(whole, 4, axis=0), rtol=1e-6)

@@ -4,6 +4,7 @@ import math
 from collections import Counter, defaultdict
 from dataclasses import replace
 from itertools import combinations
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,10 @@ from shapepose_fg.proposal.proposals import ProposalConfig, _apart, _Search
 from shapepose_fg.skeleton import BODY_25
 
 CONFIG = CandidateConfig()
+GATE_M, ANGLE_DEG, RHO_M = 0.07, 3.0, 0.12
+GROWTH = {"view_weight": 0.5, "sweeps": 2, "bridge_m": 0.55}
+PROPOSALS = {"box_horizontal_m": 1.0, "box_vertical_m": 1.2, "separation_m": 0.2, "min_own_views": 2}
+"""What is documented, so that another default is noticed."""
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +60,7 @@ def test_points_are_the_pairs_whose_rays_meet(points, crowded, five_cameras):
         rays = np.einsum("vji,vj->vi", P[:, :, :3], np.column_stack([normalised[[first, second]], np.ones(2)]))
         cosine = rays[0] @ rays[1] / np.prod(np.linalg.norm(rays, axis=1))
         angle = math.degrees(math.acos(min(1.0, abs(cosine))))
-        fits = error < CONFIG.gate_m and (at[:, 2] > 0).all() and angle > CONFIG.min_angle_deg
+        fits = error < GATE_M and (at[:, 2] > 0).all() and angle > ANGLE_DEG
         assert ((first, second) in found) == fits, (error, angle)
         if fits:
             n = found[first, second]
@@ -99,7 +104,7 @@ def voted(points: PairPoints, crowded, radius_m: float, needed: int, power: int)
 def test_candidates_are_the_clusters_of_the_papers_loop(points, crowded, weighted, views, needed):
     """Before 2 cameras 1 vote makes a candidate strong, before 30 the 10 pairs of 5 views do."""
     candidates = vote(points, crowded, views, CandidateConfig(weighted_centre=weighted))
-    expected = voted(points, crowded, CONFIG.vote_radius_m, needed, 2 if weighted else 0)
+    expected = voted(points, crowded, RHO_M, needed, 2 if weighted else 0)
     assert len(candidates) == len(expected) > 100
     for n, (centre, joint, score, votes, strong, support) in enumerate(expected):
         np.testing.assert_allclose(candidates.xyz[n], centre, atol=1e-9)
@@ -135,7 +140,7 @@ def test_links_are_the_affinities_of_all_pairs_of_supporting_detections(links, c
     assert found == pytest.approx(expected)
 
 
-def grown(anchors, candidates: Candidates, links: Links, config: GrowthConfig) -> NDArray[np.intp]:
+def grown(anchors, candidates: Candidates, links: Links, config: SimpleNamespace) -> NDArray[np.intp]:
     """Outwards from the hip joint by joint level, then all joints again `sweeps` times, then beyond gaps."""
     depth, parent = {BODY_25.root: 0}, dict(enumerate(BODY_25.parents))
     for level in range(1, 25):
@@ -212,19 +217,31 @@ def grown(anchors, candidates: Candidates, links: Links, config: GrowthConfig) -
 
 
 @pytest.mark.parametrize(
-    "config",
+    "settings",
     [
-        GrowthConfig(),
-        GrowthConfig(sweeps=0, bridge_m=0.0),
-        GrowthConfig(sweeps=1, view_weight=0.0, bridge_m=0.0),
-        GrowthConfig(sweeps=3, view_weight=2.0, bridge_m=1.5),
+        {},
+        {"sweeps": 0, "bridge_m": 0.0},
+        {"sweeps": 1, "view_weight": 0.0, "bridge_m": 0.0},
+        {"sweeps": 3, "view_weight": 2.0, "bridge_m": 1.5},
     ],
 )
-def test_people_are_grown_level_by_level_then_all_at_once(config, candidates, links):
+def test_people_are_grown_level_by_level_then_all_at_once(settings, candidates, links):
     hips = np.flatnonzero((candidates.joint == BODY_25.root) & candidates.strong)
     assert len(hips) >= 4
-    expected = grown(hips, candidates, links, config)
-    np.testing.assert_array_equal(grow(hips, candidates, links, BODY_25, config), expected)
+    expected = grown(hips, candidates, links, SimpleNamespace(**GROWTH | settings))
+    np.testing.assert_array_equal(grow(hips, candidates, links, BODY_25, GrowthConfig(**settings)), expected)
+
+
+def test_only_what_hangs_on_the_person_is_grown():
+    """A wrist that hangs on an elbow, the last candidate of all, that hangs on nobody."""
+    hip, elbow, wrist = (BODY_25.index(name) for name in ("MidHip", "RElbow", "RWrist"))
+    none = np.zeros((0, 2), dtype=np.intp)
+    three = Candidates(
+        np.zeros((3, 3)), np.array([hip, wrist, elbow]), np.ones(3), np.full(3, 9), np.ones(3, dtype=bool), none
+    )
+    forearm = Links(np.array([[2, 1]]), np.array([3.0]))
+    chosen = grow(np.array([0]), three, forearm, BODY_25, GrowthConfig(bridge_m=0.0))
+    assert np.flatnonzero(chosen[0] >= 0).tolist() == [hip]
 
 
 def test_the_settings_of_growth_make_a_difference_here(candidates, links):
@@ -252,7 +269,7 @@ def test_mean_affinity_is_over_the_neighbours_that_the_person_owns_in_that_view(
         assert affinity[person, row] == pytest.approx(total / max(len(there), 1))
 
 
-def boxes(roots, candidates: Candidates, config: ProposalConfig) -> list[tuple[float, float]]:
+def boxes(roots, candidates: Candidates, config: SimpleNamespace) -> list[tuple[float, float]]:
     """Share of core joints with a candidate in each root's box, and the mean confidence of the best of each."""
     found = []
     for root in roots:
@@ -265,7 +282,7 @@ def boxes(roots, candidates: Candidates, config: ProposalConfig) -> list[tuple[f
     return found
 
 
-def apart(anchors, taken, candidates: Candidates, crowded, config: ProposalConfig) -> list[int]:
+def apart(anchors, taken, candidates: Candidates, crowded, config: SimpleNamespace) -> list[int]:
     """Anchors by falling confidence of their own detections, without those near a better one."""
     made_of = {n: set(candidates.support[candidates.support[:, 0] == n, 1].tolist()) for n in [*taken, *anchors]}
     kept, waiting, first = [], list(anchors), list(taken)
@@ -287,13 +304,14 @@ def apart(anchors, taken, candidates: Candidates, crowded, config: ProposalConfi
 @pytest.mark.parametrize("own_views", [0, 2, 4])
 def test_anchors_stand_apart_in_space_and_by_their_detections(candidates, crowded, own_views):
     config = ProposalConfig(min_own_views=own_views)
+    stated = SimpleNamespace(**PROPOSALS | {"min_own_views": own_views})
     hips = np.flatnonzero(candidates.joint == BODY_25.root)
     assert len(hips) > 6
-    expected = apart(hips.tolist(), [], candidates, crowded, config)
+    expected = apart(hips.tolist(), [], candidates, crowded, stated)
     assert _apart(hips, hips[:0], candidates, crowded, config).tolist() == expected
     taken = expected[1:2]
     others = [n for n in hips.tolist() if n not in taken]
-    beside = apart(others, taken, candidates, crowded, config)
+    beside = apart(others, taken, candidates, crowded, stated)
     assert _apart(np.array(others), np.array(taken), candidates, crowded, config).tolist() == beside
     assert 1 <= len(expected) < len(hips)
 
@@ -303,14 +321,11 @@ def search(candidates: Candidates, links: Links, crowded, **settings) -> _Search
     return _Search(candidates, links, crowded, BODY_25, up, ProposalConfig(**settings), Counter())
 
 
-@pytest.mark.parametrize("config", [ProposalConfig(), ProposalConfig(box_horizontal_m=0.3, box_vertical_m=0.5)])
-def test_boxes_are_as_wide_and_as_high_as_is_said(candidates, links, crowded, config):
+@pytest.mark.parametrize("settings", [{}, {"box_horizontal_m": 0.3, "box_vertical_m": 0.5}])
+def test_boxes_are_as_wide_and_as_high_as_is_said(candidates, links, crowded, settings):
     roots = np.flatnonzero(candidates.joint == BODY_25.root)
-    here = search(
-        candidates, links, crowded, box_horizontal_m=config.box_horizontal_m, box_vertical_m=config.box_vertical_m
-    )
-    parts, score = here.boxes(roots)
-    expected = boxes(roots, candidates, config)
+    parts, score = search(candidates, links, crowded, **settings).boxes(roots)
+    expected = boxes(roots, candidates, SimpleNamespace(**PROPOSALS | settings))
     np.testing.assert_allclose(np.column_stack([parts, score]), expected)
     assert len(set(score.tolist())) > 1
 
@@ -318,14 +333,14 @@ def test_boxes_are_as_wide_and_as_high_as_is_said(candidates, links, crowded, co
 def test_reasons_are_counted_once_for_each_anchor(candidates, links, crowded):
     """Two bounds that some of the hips miss; 1 of those that are left is looked for."""
     roots = np.flatnonzero(candidates.joint == BODY_25.root)
-    parts, score = np.array(boxes(roots, candidates, ProposalConfig(box_horizontal_m=0.3))).T
+    parts, score = np.array(boxes(roots, candidates, SimpleNamespace(**PROPOSALS | {"box_horizontal_m": 0.3}))).T
     least, doubt = np.median(parts), np.median(score)
     here = search(
         candidates, links, crowded, box_horizontal_m=0.3, min_parts=least, min_confidence=doubt, most_people=1
     )
     kept = here.anchors(roots, roots[:0])
     good = roots[(parts >= least) & (score >= doubt)]
-    stand = apart(good.tolist(), [], candidates, crowded, here.config)
+    stand = apart(good.tolist(), [], candidates, crowded, SimpleNamespace(**PROPOSALS))
     assert kept.tolist() == stand[:1] and len(stand) > 1
     assert +here.dropped == +Counter(
         {
