@@ -28,6 +28,7 @@ from marked_tables import ROOT
 
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import DetectionSequence, Recording
+from shapepose_fg.evaluation.experiments.interactions import contacts
 from shapepose_fg.evaluation.experiments.others import FILTERED, RAW, SHELF_FPS, folder_name
 from shapepose_fg.evaluation.experiments.scale import Scale
 from shapepose_fg.io.calibration import read_rig
@@ -84,7 +85,7 @@ def main() -> None:
     if "shelf" in wanted and scale.shelf is not None:
         rig, output = read_rig(scale.shelf / "calibration.json"), arguments.output / "shelf"
         run(python, read_detections(scale.shelf, rig), rig, SHELF_FPS, output, arguments.frames, SHELF)
-    for stretch in scale.stretches if scale.has_scenes else ():
+    for stretch in contacts(scale) if scale.has_scenes else ():
         if stretch.name in wanted:
             output = arguments.output / folder_name(stretch)
             rig, fps = stretch.scene.rig, stretch.scene.fps

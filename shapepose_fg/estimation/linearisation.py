@@ -184,19 +184,26 @@ def linearise(
     points: NDArray[np.float64],
     views: Views,
     config: ObservationConfig,
+    reach_m: float | None = None,
 ) -> ViewEvidence:
     """Decide the gates (Eq. 2) at `points` (N, J, 3) and sum up what the inliers say of each joint.
 
-    `sigmas` (N, J, V) in pixels come from `observation_sigmas`.
+    `sigmas` (N, J, V) in pixels come from `observation_sigmas`. With `reach_m` a Geman-McClure kernel takes the
+    place of gates and kernel: a weight of a quarter at this distance from the projection, as a length at the
+    joint's depth. `inlier` is then every observation before its camera.
     """
     projected, depth, jacobian = views.project(points)
     usable = observations.seen & in_front(depth, config.min_depth_m)
     residual = np.where(usable[..., None], projected - observations.xy, np.nan)
     distance = np.linalg.norm(residual, axis=-1)
-    focal = _per_joint(views.focal_px, depth.shape)
-    inlier = inlier_gate(distance, config.rho_2d_m * focal / config.depth(np.where(usable, depth, 1.0)))
-    sigma = np.where(inlier, sigmas, 1.0)
-    weight = inlier * kernel_weight(config.robust_kernel, np.where(inlier, distance, 0.0) / sigma) / sigma**2
+    px_per_m = _per_joint(views.focal_px, depth.shape) / config.depth(np.where(usable, depth, 1.0))
+    inlier = inlier_gate(distance, config.rho_2d_m * px_per_m) if reach_m is None else usable
+    sigma, far = np.where(inlier, sigmas, 1.0), np.where(inlier, distance, 0.0)
+    if reach_m is None:
+        weight = kernel_weight(config.robust_kernel, far / sigma)
+    else:
+        weight = kernel_weight("geman_mcclure", far / (reach_m * px_per_m), 1.0)
+    weight = inlier * weight / sigma**2
     jacobian = np.where(inlier[..., None, None], jacobian, 0.0)
     weighted = jacobian * weight[..., None, None]
     information = np.einsum("pqvki,pqvkj->pqij", weighted, jacobian)

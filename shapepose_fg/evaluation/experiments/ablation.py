@@ -34,7 +34,8 @@ SWITCHES: dict[str, tuple[str, ...]] = {
         "tracking.min_new_joints",
     ),
     "gaps are bridged": ("proposals.growth.bridge_m",),
-    "detections are given out again": ("windows.again_alone",),
+    "detections are given out again": ("windows.again_alone", "refine.draft_reach_m"),
+    "around bodies that others' limbs do not pull": ("refine.draft_reach_m",),
     "X_0 is made complete": ("refine.complete_start",),
     "sigma as measured": (
         "observations.confidence_power",

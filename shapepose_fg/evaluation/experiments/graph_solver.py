@@ -20,7 +20,7 @@ from shapepose_fg.evaluation.matching import match_people
 from shapepose_fg.observations import Observations
 from shapepose_fg.pipeline import PipelineConfig, find_people
 
-FRAMES = 60
+FRAMES = 20
 """Of each stretch."""
 STEPS_M2 = (1e-5, 3e-5, 1e-4, 3e-4, 1e-3)
 """Step sizes lambda. Too large ones diverge: lambda times the information of six sure views must stay under 2."""

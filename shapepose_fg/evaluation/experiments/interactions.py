@@ -19,7 +19,7 @@ from shapepose_fg.evaluation.experiments.others import (
     read_others,
     scored,
 )
-from shapepose_fg.evaluation.experiments.scale import Scale, Stretch
+from shapepose_fg.evaluation.experiments.scale import Scale, Stretch, shorter
 from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.opponent.opponent import find_everybody
 from shapepose_fg.evaluation.opponent.over_time import over_time
@@ -41,6 +41,8 @@ ROWS = {
 }
 """The methods, and precision, recall and F1 at 0.2 m that the paper has for them on its own recording; for the
 opponent, those of Dong et al. 2019."""
+FRAMES = 100
+"""Of each stretch."""
 _FRAME_BY_FRAME = replace(PipelineConfig(), temporal=False)
 
 
@@ -49,12 +51,17 @@ def interactions(scale: Scale, others: Path | None = None) -> Experiment | None:
     if not scale.has_scenes:
         return None
     cases = []
-    for stretch in scale.stretches:
+    for stretch in contacts(scale):
         made: dict[str, Callable[[], Figures]] = {name: partial(make, stretch) for name, make in _MEASURES.items()}
         if others is not None and (others / folder_name(stretch)).is_dir():
             made["others"] = partial(_others, stretch, others)
         cases += [Case(f"{stretch.label} {name}", measure) for name, measure in made.items()]
     return Experiment("interactions", cases, _table)
+
+
+def contacts(scale: Scale) -> list[Stretch]:
+    """The frames that all methods are given."""
+    return [shorter(stretch, FRAMES) for stretch in scale.stretches]
 
 
 def _stage_one(stretch: Stretch) -> Figures:

@@ -13,7 +13,7 @@ from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.metrics import joint_metrics
 from shapepose_fg.pipeline import PipelineConfig, find_people
 
-FRAMES = 60
+FRAMES = 30
 """Of each stretch."""
 COUNTS = (0, 1, 2, 3, 5, 10, 15)
 """Alternations; 0 are the proposals of stage I."""

@@ -23,7 +23,7 @@ from shapepose_fg.pipeline import PipelineConfig, find_people, reconstruct
 from shapepose_fg.simulation import DetectorConfig, Scene, simulate
 from shapepose_fg.simulation.foreign import DETECTOR_S_OWN, people_of, recast
 
-FRAMES = 100
+FRAMES = 60
 """Of each stretch."""
 BINS = (0.0, 0.1, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 1.0)
 """Borders of w_i, the mean confidence of a joint over all views."""

@@ -1,0 +1,61 @@
+"""Drafts: where a body has the joints when some views' detections are another person's."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from shapepose_fg.body.fitting.fitters import BodyConfig, make_fitter
+from shapepose_fg.estimation.estimator import Estimator
+from shapepose_fg.estimation.estimator_config import EstimatorConfig, RefineConfig
+from shapepose_fg.observations import Observations
+from shapepose_fg.simulation import built_in_scene
+from shapepose_fg.skeleton import BODY_25
+
+LEG = [BODY_25.joints.index(name) for name in ("RKnee", "RAnkle", "RHeel", "RBigToe", "RSmallToe")]
+FRAMES = range(0, 40, 4)
+SCENE = built_in_scene(3, people=2, frames=40, cameras=6)
+
+
+@pytest.fixture(scope="module")
+def fitter():
+    return make_fitter(BodyConfig())
+
+
+def with_a_neighbour_s_leg(alone: bool) -> tuple[Observations, np.ndarray]:
+    """A person in ten frames, 5 mm of noise, and where the joints are, (N, J, 3).
+
+    Of six views three see the leg below the right hip where it is half a metre aside.
+    """
+    truth = SCENE.keypoints[list(FRAMES), 0]
+    noisy = truth + np.random.default_rng(0).normal(0, 5e-3, truth.shape)
+    aside = noisy.copy()
+    aside[:, LEG] += [0.5, 0.0, 0.0]
+    xy, wrong = (np.moveaxis(SCENE.rig.project(joints)[0], 0, 2) for joints in (noisy, aside))
+    xy[:, LEG, 3:] = wrong[:, LEG, 3:]
+    N = len(truth)
+    rows = Observations(xy, np.full(xy.shape[:3], 0.8), np.full(truth.shape, np.nan), frame=np.array(FRAMES))
+    rows = replace(rows, track=np.arange(N) if alone else np.zeros(N, dtype=int))
+    return replace(rows, time_s=np.broadcast_to(np.array(FRAMES)[:, None] / SCENE.fps, rows.time_s.shape)), truth
+
+
+def ankle_errors(fitter, reach_m: float, alone: bool) -> np.ndarray:
+    """Distance (N,) of the right ankle's draft from the truth, metres."""
+    config = EstimatorConfig(refine=RefineConfig(draft_reach_m=reach_m))
+    rows, truth = with_a_neighbour_s_leg(alone)
+    joints, covariance = Estimator(SCENE.rig, fitter, BODY_25.joints, config).draft(rows)
+    assert np.isfinite(joints).all() and (np.linalg.eigvalsh(covariance) > 0).all()
+    return np.linalg.norm(joints - truth, axis=-1)[:, LEG[1]]
+
+
+def test_a_neighbour_s_leg_loses_its_hold_on_the_body(fitter):
+    """Half of the views say it is half a metre aside, and nothing but the rest of the body can tell.
+
+    Measured 277 mm without, 22 with (median 9) in frames that stand alone; 130 over time, where priors stay as
+    they are, for people there begin where motion has them.
+    """
+    for alone in (True, False):
+        before, after = (ankle_errors(fitter, reach_m, alone) for reach_m in (0.0, 0.05))
+        assert before.min() > 0.2
+        assert after.mean() < (0.05 if alone else 0.2)
+        assert np.median(after) < (0.02 if alone else 0.15)
