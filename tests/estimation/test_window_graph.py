@@ -316,6 +316,7 @@ def test_a_solver_that_fails_says_so_and_leaves_the_joints(five_cameras, person,
     graph = OneFrame(five_cameras, xy, sigmas, EXACT, "cauchy", 0, 0)
     found = graph.solve(truth)
     assert failure in graph.window.failure
+    assert np.isnan(graph.covariance()).all(), "of what is not solved nothing is known"
     if error is not None:
         np.testing.assert_array_equal(found, truth)
 

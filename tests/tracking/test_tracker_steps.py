@@ -128,8 +128,8 @@ def test_who_comes_back_is_as_far_off_as_a_person_walks(tracker, two_people, wai
     places[0, CORE[:3]] = np.nan  # the centre is of what is placed, of both
     track, person = tracker._returned(places, np.array([True]), state, evident)
     assert (track.tolist(), person.tolist()) == (([0], [0]) if back else ([], []))
-    none, _ = tracker._returned(places, np.array([False]), state, evident)
-    assert len(none) == 0
+    none = tracker._returned(places, np.array([False]), state, evident)
+    assert len(none[0]) == len(none[1]) == 0
 
 
 def test_two_who_come_back_are_told_apart_together(tracker, two_people):
@@ -195,3 +195,24 @@ def test_tracks_on_trial_get_what_the_others_leave(tracker, five_cameras, two_pe
     assert (taken[1] >= 0).all() and (taken[0] < 0).all()
     both = tracker._assign(joints, lost, np.array([False, False]), detections, five_cameras)
     assert (both[0] >= 0).sum() > (both[1] >= 0).sum()
+
+
+def test_hips_that_two_views_saw_are_asked_for_last(tracker, five_cameras, two_people, seen_exactly):
+    """Stage I is asked for weak hips among what is left; who comes of them is on trial."""
+    detections = seen_exactly(five_cameras, two_people[:1])
+    asked = []
+
+    def find(left, rig, weak):
+        asked.append((len(left), weak))
+        everybody = tracker.find(left, rig, False)
+        return everybody if weak else everybody.rows(np.zeros(0, dtype=int))
+
+    state = TrackerState.start(BODY_25)
+    state, frame = replace(tracker, find=find).step(state, detections, five_cameras, 0.0)
+    assert asked == [(125, False), (125, True)]
+    assert state.weak.tolist() == [True] and frame.evident.tolist() == [True]
+    asked.clear()
+    state, _ = replace(tracker, find=find, weak_births=False).step(
+        TrackerState.start(BODY_25), detections, five_cameras, 0.0
+    )
+    assert asked == [(125, False)] and len(state.ids) == 0
