@@ -47,7 +47,7 @@ class Tree:
     def forked(self, work: Callable[[], int], seconds: float, said: Path) -> int | None:
         """The exit code of `work` in a fork inside the copy; None where it takes more of a processor than that.
 
-        By the clock it may take ten times as long: others may need the machine, too.
+        By the clock it may take a hundred times as long: others may need the machine, too.
         """
         for name in _LIBRARIES.split():
             importlib.import_module(name)
@@ -68,7 +68,7 @@ class Tree:
                 code = work()
             finally:
                 os._exit(code)
-        deadline = time.monotonic() + 10 * seconds
+        deadline = time.monotonic() + 100 * seconds
         while time.monotonic() < deadline:
             ended, status = os.waitpid(child, os.WNOHANG)
             if ended != 0:

@@ -5,7 +5,7 @@ a condition the other way round, a loop that is not gone through, an exception t
 code is drawn, each as likely, then one of its changes. Left out by rule: words for people, types, decorators,
 `strict=`, `==` for `is`, and changes that no float or mask could take. For every change the tests that reach its
 line are run, those of its own package and the quickest first, until one fails or 8 s are full. Noticed is what
-fails, or takes three times its time.
+fails, or does not end.
 
 Results are kept in .mutants, and a run that is stopped goes on there. `--again` tries the survivors anew, with the
 tests of today. scripts/equivalent_mutants.txt lists survivors that no test can notice, with the reason.
@@ -159,7 +159,7 @@ class Campaign:
         changed = mutant.applied(source.code)
         if len(chosen) == 0 or changed is None:
             return "not reached", 0
-        code = tree.test_changed(mutant.path, changed, chosen, 15.0 + 3.0 * seconds, self.folder / "said")
+        code = tree.test_changed(mutant.path, changed, chosen, 8.0 + 1.5 * seconds, self.folder / "said")
         return ("too long" if code is None else "survived" if code == 0 else "noticed"), len(chosen)
 
     def show(self, drawn: dict[str, list[Mutant]]) -> None:

@@ -451,3 +451,20 @@ def test_the_least_share_of_grown_joints_counts_every_candidate(crowded):
     assert anchors.tolist() == [5] and chosen[0, joint].tolist() == list(range(6))
     weak = replace(six, strong=np.arange(6) != 0)
     assert len(search(weak, limbs, crowded).linked(np.array([5]))[0]) == 0
+
+
+def test_among_the_free_only_these_count(candidates, links, crowded):
+    """In boxes, as roots and in links: what is not free is no joint at all."""
+    free = np.random.default_rng(1).random(len(candidates)) < 0.5
+    whole = search(candidates, links, crowded)
+    whole.dropped["low confidence"] = 1
+    here = whole.among(free)
+    hidden = np.where(free, candidates.joint, -1)
+    np.testing.assert_array_equal(here.candidates.joint, hidden)
+    both = np.array([free[a] and free[b] for a, b in links.ends.tolist()])
+    np.testing.assert_array_equal(here.links.ends, links.ends[both])
+    np.testing.assert_array_equal(here.links.score, links.score[both])
+    roots = np.flatnonzero(hidden == BODY_25.root)
+    expected = boxes(roots, replace(candidates, joint=hidden), SimpleNamespace(**PROPOSALS))
+    np.testing.assert_allclose(np.column_stack(here.boxes(roots)), expected)
+    assert here.dropped == Counter(), "what it drops is counted by itself"
