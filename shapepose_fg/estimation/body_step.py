@@ -74,15 +74,9 @@ class BodyStep:
         return Message(np.where(pulled[..., None], xyz, np.nan), information)
 
 
-def joint_targets(
-    evidence: ViewEvidence, enough: NDArray[np.bool_], share: NDArray[np.float64] | None = None
-) -> JointTargets:
-    """What the body is fitted to: what the views say of all joints, of rows whom they determine (`enough`).
-
-    `share` (N,) is that of their information which counts; None: all of it.
-    """
-    counted = enough.astype(np.float64) if share is None else np.where(enough, share, 0.0)
-    information = counted[:, None, None, None] * evidence.information
+def joint_targets(evidence: ViewEvidence, enough: NDArray[np.bool_]) -> JointTargets:
+    """What the body is fitted to: what the views say of all joints, of rows whom they determine (`enough`)."""
+    information = np.where(enough[:, None, None, None], evidence.information, 0.0)
     return JointTargets(np.nan_to_num(evidence.target), information)
 
 

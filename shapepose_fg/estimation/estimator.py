@@ -12,7 +12,7 @@ from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter
 from shapepose_fg.camera import Rig, Views
 from shapepose_fg.estimation.alternation import Solution, Window, alternate, final_bodies
 from shapepose_fg.estimation.body_step import joint_targets
-from shapepose_fg.estimation.draft import ANNEALED, WholeFitter, drafted, limb_steps, smoothed_in_time
+from shapepose_fg.estimation.draft import NARROWING, WholeFitter, drafted, limb_steps, smoothed_in_time
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.limb_lengths import limb_lengths, limbs_of, with_lengths
 from shapepose_fg.estimation.linearisation import (
@@ -114,7 +114,7 @@ class Estimator:
         X = observations.initial
         if config.refine.complete_start:
             X = triangulate(observations, views, config.observations)
-        if not _alone(observations).all():
+        if len(np.unique(observations.track)) < len(observations):
             X = self._completed(X, observations, views)
         sigmas = observation_sigmas(observations, X, views, config.observations, self.joints)
         windows = self._windows(observations, sigmas, views, extra_factors)
@@ -138,15 +138,12 @@ class Estimator:
         evidence = linearise(observations, sigmas, X, views, config.observations)
         enough = (evidence.sigma_m <= config.refine.max_sigma_m).sum(axis=1) >= config.refine.min_joints
         whole = self.fitter.fit_whole if isinstance(self.fitter, WholeFitter) else self.fitter.fit
-        if config.refine.draft_reach_m == 0:
-            return drafted(evidence, whole(joint_targets(evidence, enough)), config.refine.contradiction)
-        alone = _alone(observations)
-        body = whole(joint_targets(evidence, enough, np.where(alone, ANNEALED[0][1], 1.0)))
-        for wider, share in ANNEALED:
+        body = whole(joint_targets(evidence, enough))
+        for wider in NARROWING if config.refine.draft_reach_m > 0 else ():
             around = np.where(body.ok[:, None, None], body.joints, X)
             reach_m = wider * config.refine.draft_reach_m
             evidence = linearise(observations, sigmas, around, views, config.observations, reach_m)
-            again = whole(joint_targets(evidence, enough, np.where(alone, share, 1.0)))
+            again = whole(joint_targets(evidence, enough))
             placed = np.flatnonzero(again.ok)
             body = body.with_rows(placed, again.rows(placed))
         return drafted(evidence, body, config.refine.contradiction)
@@ -286,12 +283,6 @@ def window_rows(observations: Observations) -> list[NDArray[np.intp]]:
     if np.any((np.diff(track) == 0) & (np.diff(frame) == 0)):
         raise ValueError("a track may have one row a frame: tell people apart by their track")
     return np.split(order, np.flatnonzero(np.diff(track)) + 1) if len(order) else []
-
-
-def _alone(observations: Observations) -> NDArray[np.bool_]:
-    """(N,) rows whose track has no other."""
-    _, track, count = np.unique(observations.track, return_inverse=True, return_counts=True)
-    return np.asarray(count[track] == 1)
 
 
 def _cameras(views: Views, row: int = 0) -> tuple[gtsam.PinholeCameraCal3_S2, ...]:
