@@ -336,3 +336,16 @@ def test_of_a_joint_that_one_view_saw_there_is_no_covariance_and_the_others_have
     assert np.isnan(covariance[4]).all() and np.isfinite(whole).all()
     # With a prior of 100 m on each joint: a relative difference of (1 cm / 100 m)^2.
     np.testing.assert_allclose(np.delete(covariance, 4, axis=0), np.delete(whole, 4, axis=0), rtol=1e-6)
+
+
+def test_in_a_frame_alone_a_joint_lost_from_sight_is_pulled_as_any_other(five_cameras, person):
+    """Offsets are for windows of several frames: here the body's pull counts, whatever is said to be lost."""
+    truth, xy, sigmas = person
+    graph = OneFrame(five_cameras, xy, sigmas, EXACT, None, 0, 0)
+    pulled = np.arange(25) == 4
+    body = message(pulled, truth + 0.1, np.tile(0.01**2 * np.eye(3), (25, 1, 1)))
+    whole = Message(body.xyz[None], body.information[None])
+    asked = np.ones((1, *sigmas.shape), dtype=bool), whole, whole, truth[None]
+    plain = graph.window.solve(*asked).copy()
+    np.testing.assert_array_equal(graph.window.solve(*asked, pulled[None]), plain)
+    assert np.linalg.norm(plain[0, 4] - truth[4]) > 0.02, "it is pulled"
