@@ -4,8 +4,10 @@ Reconstructs the Shelf recording (or another one, or the built-in scene where th
 alternately in one run, and prints the time of every stage, the processor's time and the clock's, their ratios, and
 where stage II's time goes; then the clock with worker processes. Then a cheap recording (two people, four cameras)
 of rising `--lengths`: time a frame must not grow, nor memory beyond the rows of the result. `--stretch NAME:A:B`
-takes frames of a simulated recording instead, `--simulate NAME` times the simulator, with one worker and two. On a
-machine that does nothing else.
+takes frames of a simulated recording instead, `--simulate NAME` times the simulator, with one worker and two.
+`--chunks FRAMES` compares chunks of so many frames on `--workers` processes with one process and no chunks: ratio
+of the clocks, how far joints are apart at the seams and elsewhere, and who loses the identity. On a machine
+that does nothing else.
 """
 
 import argparse
@@ -15,17 +17,21 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from rich.console import Console
 from rich.table import Table
 
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import DetectionSequence
+from shapepose_fg.evaluation.seams import compare_seams
 from shapepose_fg.evaluation.speed import STAGES, BackAndForth, Spent, peak_mib, rows_mib, spend, stage_two
+from shapepose_fg.frame_times import FrameTimes
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.pipeline import PipelineConfig
 from shapepose_fg.provenance import versions
+from shapepose_fg.runs.chunks import cut_in_chunks
 from shapepose_fg.simulation import Scene, built_in_scene, simulate
 from shapepose_fg.simulation.files import NAMES, cut, named_scene
 
@@ -60,6 +66,8 @@ def main() -> None:
     parser.add_argument(
         "--simulate", metavar="NAME", choices=NAMES, help="time the simulator on this scene instead"
     )
+    parser.add_argument("--chunks", type=int, metavar="FRAMES", help="compare chunks of so many frames instead")
+    parser.add_argument("--times", type=int, default=8, help="with --chunks, how often the recording is played")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     console = Console()
@@ -67,6 +75,12 @@ def main() -> None:
     console.print(_machine(config), highlight=False)
     if arguments.simulate is not None:
         console.print(_simulation_table(arguments.simulate, arguments.frames or 600))
+        return
+    if arguments.chunks is not None:
+        recording = _recording(arguments)
+        count = arguments.times * min(arguments.frames or len(recording.detections), len(recording.detections))
+        for line in chunked(recording, config, count, arguments.chunks, arguments.workers):
+            console.print(line, highlight=False)
         return
     if arguments.rounds > 0:
         recording = _recording(arguments)
@@ -107,6 +121,33 @@ def side_by_side(recording: Timed, config: PipelineConfig, count: int, workers: 
                 f"{length} frames, {number} workers: clock {now.wall_ms:.1f} ms a frame,"
                 f" {alone.wall_ms:.1f} with one, ratio {alone.wall_ms / now.wall_ms:.2f}"
             )
+
+
+def chunked(recording: Timed, config: PipelineConfig, count: int, chunk_frames: int, workers: list[int]):
+    """Lines about chunks on several processes against one process and no chunks.
+
+    The recording is played up to `count` frames, back and forth: seams are at other places of it each time.
+    """
+    played = BackAndForth(recording.detections, count)
+    span, times = range(count), FrameTimes.assumed(count)
+    chunks = cut_in_chunks(span, (), times.frame_s, config, chunk_frames)
+    borders = [chunk.own.start for chunk in chunks[1:]]
+    overlap = int(np.searchsorted(times.frame_s, config.windows.overlap_s, side="right"))
+    spend(played, recording.rig, config, range(8))  # warm-up
+    alone = spend(played, recording.rig, config, span)
+    for number in workers:
+        now = spend(played, recording.rig, config, span, number, chunk_frames)
+        found = compare_seams(alone.people, now.people, borders, overlap)
+        yield (
+            f"{count} frames in {len(chunks)} chunks, {number} workers: clock {now.wall_ms:.1f} ms a frame,"
+            f" {alone.wall_ms:.1f} in one process uncut, ratio {alone.wall_ms / now.wall_ms:.2f};"
+            f" processor {now.cpu_ms:.1f} and {alone.cpu_ms:.1f}"
+        )
+        yield (
+            f"joints at most {found.at_seams_mm:.3f} mm apart within an overlap ({overlap} frames) of"
+            f" {found.seams} seams, {found.away_mm:.3f} mm elsewhere; {found.lost} of {found.crossings} people"
+            f" lose their identity at a seam; {found.unmatched} rows are in one result only"
+        )
 
 
 def linearity(config: PipelineConfig, lengths: list[int]):

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
+from shapepose_fg.batch_command import batch
 from shapepose_fg.detect_command import detect
 from shapepose_fg.errors import InputError
 from shapepose_fg.export_command import export
@@ -42,6 +43,7 @@ evaluate = typer.Typer(help="Score a reconstruction against an annotation.")
 app.add_typer(evaluate, name="evaluate")
 app.add_typer(tracks, name="tracks")
 app.command()(reconstruct)
+app.command()(batch)
 app.command()(detect)
 app.command("check-calibration")(check_calibration)
 app.command()(overlay)

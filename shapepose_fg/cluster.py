@@ -1,10 +1,16 @@
 """The same work for many items on the processes of a Dask cluster: this machine's, or that of many machines."""
 
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from shapepose_fg.errors import InputError
+from shapepose_fg.provenance import program_digest, versions
+from shapepose_fg.workers import what_workers_inherit
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -15,6 +21,8 @@ Result = TypeVar("Result")
 
 RETRIES = 2
 """So often an item whose process was lost, or that failed, is tried again."""
+_LEAST = 2
+"""So many items are always under way, so that the next one does not wait for the last."""
 _SECONDS = 10
 """A cluster that does not answer for so long is not there."""
 
@@ -25,47 +33,37 @@ class Cluster(Generic[Shared]):
     A context. Results come in order and do not depend on which process they come from, or how many there are.
     """
 
-    def __init__(self, address: str | None, count: int, shared: Shared, ahead: int = 2) -> None:
+    def __init__(
+        self, address: str | None, count: int, shared: Shared, ahead: int = 2, *, sharing: int = 1
+    ) -> None:
         """The cluster whose scheduler is at `address`, `tcp://host:8786`; None: one of `count` processes here.
 
-        `ahead` items a process are under way. InputError where Dask is not installed.
+        `ahead` items a process are under way, of all who are `sharing` the cluster together: they wait in its
+        scheduler's memory. InputError where Dask is not installed.
         """
-        self._address, self._count, self._shared, self._ahead = address, count, shared, ahead
+        self._address, self._count, self._shared = address, count, shared
+        self._ahead = ahead / sharing
+        self._open = ExitStack()
         self._client: Client | None = None
         self._at: Future[Any] | None = None
 
     def __enter__(self) -> "Cluster[Shared]":
-        Client, LocalCluster = _dask()
-        try:
-            if self._address is None:
-                # One thread a process: GTSAM holds Python's lock, and Dask leaves linear algebra one by itself.
-                local = LocalCluster(
-                    n_workers=self._count,
-                    threads_per_worker=1,
-                    processes=True,
-                    dashboard_address=None,
-                    silence_logs=50,
-                )
-                client = Client(local, timeout=_SECONDS)
-            else:
-                client = Client(self._address, timeout=_SECONDS)
-        except (OSError, ValueError, TimeoutError) as error:
-            reason = " ".join(str(error).split())
-            raise InputError(
-                f"--cluster {self._address or 'local'}: no Dask scheduler answers there ({reason}); start one with"
-                " `dask scheduler`, or leave it out"
-            ) from None
-        with _large():
-            # A task, not data that was scattered: what is lost with a process can be made again.
-            self._client, self._at = client, client.submit(_same, self._shared, pure=False)
+        with ExitStack() as opened:
+            address = self._address
+            if address is None:
+                address = opened.enter_context(local_cluster(self._count)).address
+            client = opened.enter_context(_client(address))
+            if self._address is not None:
+                _refuse_other_programs(client, address)
+            with _large():
+                # A task, not data that was scattered: what is lost with a process can be made again.
+                self._client, self._at = client, client.submit(_same, self._shared, pure=False)
+            self._open = opened.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
-        client, self._client, self._at = self._client, None, None
-        if client is not None:
-            if self._address is None:
-                client.shutdown()
-            client.close()
+        self._client = self._at = None
+        self._open.close()
 
     def map(self, work: Callable[[Shared, Item], Result], items: Iterable[Item]) -> Iterator[Result]:
         """`work(shared, item)` for each item, in order; `items` are taken as they are needed.
@@ -82,7 +80,7 @@ class Cluster(Generic[Shared]):
             for item in items:
                 with _large():
                     waiting.append(client.submit(_work, work, self._at, item, pure=False, retries=RETRIES))
-                if len(waiting) >= self._ahead * max(1, len(client.nthreads())):
+                if len(waiting) >= max(_LEAST, self._ahead * len(client.nthreads())):
                     yield waiting.popleft().result()
             while len(waiting) > 0:
                 yield waiting.popleft().result()
@@ -93,6 +91,99 @@ class Cluster(Generic[Shared]):
             ) from None
         finally:
             client.cancel(list(waiting))
+
+
+@dataclass(frozen=True)
+class Scheduler:
+    """A Dask scheduler that answers."""
+
+    address: str
+    """`tcp://host:8786`."""
+    processes: int
+    """How many there are at present."""
+    dashboard: str | None
+    """Where its dashboard is; None where it has none."""
+
+
+@contextmanager
+def local_cluster(count: int, *, dashboard: bool = False) -> Iterator[Scheduler]:
+    """`count` processes of this machine, which nobody reaches from another, while the block runs.
+
+    InputError where Dask is not installed. With `dashboard`, and bokeh installed, the scheduler has one.
+    """
+    _, LocalCluster = _dask()
+    shown = dashboard and has_dashboard()
+    # One thread a process: GTSAM holds Python's lock, and Dask leaves linear algebra one by itself. Ctrl-C is for
+    # this process alone.
+    with what_workers_inherit(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # another port is taken where the dashboard's usual one is
+        cluster = LocalCluster(
+            n_workers=count,
+            threads_per_worker=1,
+            processes=True,
+            host="127.0.0.1",
+            dashboard_address="127.0.0.1:8787" if shown else None,
+            silence_logs=50,
+        )
+    try:
+        yield Scheduler(cluster.scheduler_address, count, cluster.dashboard_link if shown else None)
+    finally:
+        cluster.close()
+
+
+def has_dashboard() -> bool:
+    """Whether a scheduler of this machine can show one."""
+    return find_spec("bokeh") is not None
+
+
+def look_at(address: str) -> Scheduler:
+    """The scheduler at an address, whose processes have this very program; InputError otherwise."""
+    with _client(address) as client:
+        _refuse_other_programs(client, address)
+        shown = "dashboard" in client.scheduler_info().get("services", {})
+        return Scheduler(address, len(client.nthreads()), client.dashboard_link if shown else None)
+
+
+@contextmanager
+def _client(address: str) -> Iterator[Any]:
+    """A connexion to the scheduler at an address."""
+    Client, _ = _dask()
+    try:
+        client = Client(address, timeout=_SECONDS)
+    except (OSError, ValueError, TimeoutError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(
+            f"--cluster {address}: no Dask scheduler answers there ({reason}); start one with"
+            " `dask scheduler`, or leave it out"
+        ) from None
+    try:
+        yield client
+    finally:
+        client.close()
+
+
+def _refuse_other_programs(client: Any, address: str) -> None:
+    """InputError where a process has another version of this program, or of what decides on numbers."""
+    own = _program()
+    for process, theirs in client.run(_program, on_error="return").items():
+        if not isinstance(theirs, dict):
+            reason = " ".join(str(theirs).split())[:200]
+            raise InputError(
+                f"--cluster {address}: its process {process} cannot run this program ({reason}); install"
+                ' "shapepose-fg[cluster]" there'
+            )
+        other = next((name for name in own if theirs.get(name) != own[name]), None)
+        if other is not None:
+            which = f" ({theirs.get(other)} there, {own[other]} here)" if other != "shapepose-fg itself" else ""
+            raise InputError(
+                f"--cluster {address}: its process {process} has another version of {other}{which}; install the"
+                " same there, or results would depend on who did what"
+            )
+
+
+def _program() -> dict[str, str]:
+    """What decides about the numbers of a process."""
+    return {**versions(), "shapepose-fg itself": program_digest()}
 
 
 def _dask() -> tuple[Any, Any]:

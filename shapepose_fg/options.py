@@ -31,19 +31,37 @@ def image_size_of(text: str | None) -> tuple[int, int] | None:
     return int(match[1]), int(match[2])
 
 
+def check_fps(fps: float | None) -> None:
+    """Refuse frames a second that make no sense."""
+    if fps is not None and not 0.01 <= fps <= 1e5:
+        raise InputError(f"--fps {fps:g}: must be a number of frames a second, such as 25")
+
+
+def refuse_no_range(text: str | None) -> None:
+    """Refuse what is not of the form `A:B`, whatever the recording."""
+    if text is not None:
+        _ends(text)
+
+
 def frame_range(text: str | None, count: int) -> range:
     """Frames that `A:B` selects of a recording of `count` frames: half-open, either end optional."""
     if text is None:
         return range(count)
-    match = re.fullmatch(r"(\d{0,18}):(\d{0,18})", text.strip())
-    if match is None:
-        raise InputError(f"--frames {text}: must be A:B, two frame numbers with a colon between, such as 0:100")
+    match = _ends(text)
     start, stop = int(match[1] or 0), int(match[2] or count)
     if not start < stop <= count:
         raise InputError(
             f"--frames {text}: not in the recording, which has {count} frames; give A:B with 0 <= A < B <= {count}"
         )
     return range(start, stop)
+
+
+def _ends(text: str) -> re.Match[str]:
+    """Both ends of `A:B`, as text."""
+    match = re.fullmatch(r"(\d{0,18}):(\d{0,18})", text.strip())
+    if match is None:
+        raise InputError(f"--frames {text}: must be A:B, two frame numbers with a colon between, such as 0:100")
+    return match
 
 
 def check_workers(workers: int | None) -> None:

@@ -120,9 +120,11 @@ def reconstruct_parts(
     workers: int = 1,
     cluster: str | None = None,
     chunk_frames: int | None = None,
+    sharing: int = 1,
 ) -> Assembly:
     """`reconstruct` whose windows leave memory for `kept` as they are solved, and whose result is made of them.
 
+    So many runs are `sharing` the cluster: each keeps its part of the work ready there.
     What an earlier call with the same arguments left in `kept`, wherever it was stopped, is not done again, and
     the result is the same to the byte.
     """
@@ -151,7 +153,7 @@ def reconstruct_parts(
         parts = Parts(kept)
         read = _inputs(detections, rig, frames, times, book)
         done = parts.notes().frames
-        with _pool(cluster, workers, setup) as pool:
+        with _pool(cluster, workers, setup, sharing) as pool:
             beginning = book.torn_off()
             begin = parts.checkpoint(read)
             if chunk_frames is None:
@@ -352,11 +354,11 @@ def _solved_in_chunks(
             yield _Done(replace(solved, observations=rows), of_window, behind)
 
 
-def _pool(cluster: str | None, workers: int, setup: Setup) -> "Workers[Setup] | Cluster[Setup]":
+def _pool(cluster: str | None, workers: int, setup: Setup, sharing: int) -> "Workers[Setup] | Cluster[Setup]":
     """The processes that take part."""
     if cluster is None:
         return Workers(workers, setup)
-    return Cluster(None if cluster == "local" else cluster, workers, setup)
+    return Cluster(None if cluster == "local" else cluster, workers, setup, sharing=sharing)
 
 
 def _bodies(setup: Setup, person: Person) -> PersonBodies:

@@ -1,8 +1,7 @@
 """`shapepose-fg reconstruct`: from the cameras and detections of a recording to a folder of results."""
 
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import Annotated
 
 import typer
 
@@ -14,22 +13,9 @@ from shapepose_fg.options import (
     UnitOption,
     UpOption,
     check_workers,
-    frame_range,
-    image_size_of,
 )
-from shapepose_fg.output_folder import only_run_in
-from shapepose_fg.reconstruct_inputs import cuts_of, fitter_of, places, project_of, times_of
-from shapepose_fg.result_files import OBSERVATIONS, PEOPLE, RUN
-from shapepose_fg.terminal import note
-
-if TYPE_CHECKING:
-    from shapepose_fg.camera import Axis
-    from shapepose_fg.io.calibration import Unit
-
-_OUTPUTS = (PEOPLE, RUN, OBSERVATIONS, "cameras.json", "report.html")
-"""The files that are left in the folder of results."""
-
-# Everything else is imported inside the functions: `--help` must not wait for torch.
+from shapepose_fg.reconstruct_inputs import cuts_of
+from shapepose_fg.reconstruct_request import Request, carry_out
 
 
 def reconstruct(
@@ -94,57 +80,27 @@ def reconstruct(
     ] = False,
 ) -> None:
     """Reconstruct the people of a recording: 3D joints with covariances, and bodies."""
-    from shapepose_fg.io.calibration import read_rig
-    from shapepose_fg.io.config import read_config
-    from shapepose_fg.io.corrections import refuse_corrected
-    from shapepose_fg.io.detections import read_detections
-    from shapepose_fg.provenance import ReadInputs, checksums
-
     check_workers(workers)
     if resume and restart:
         raise InputError("--resume and --restart: a run goes on or begins anew; give one of them")
-    whole = None if project is None else project_of(project)
-    calibration, detections, output = places(calibration, detections, output, whole)
-    if whole is not None and fps is None and timestamps is None:
-        fps, timestamps = whole.fps, whole.times
-    reading = ReadInputs((calibration, detections, config, body, timestamps))
-    size = image_size_of(image_size)
-    rig = read_rig(calibration, up=cast("Axis | None", up), unit=cast("Unit | None", unit), image_size=size)
-    recording = read_detections(detections, rig, skeleton)
-    for each in recording.notes:
-        note(each)
-    span = frame_range(frames, len(recording))
-    if whole is not None and frames is None:
-        span = whole.span(len(recording))
-    times = times_of(fps, timestamps, rig, len(recording))
-    first_frames = cuts_of(cuts, len(recording))
-    refuse_corrected(output)
-    with only_run_in(output, _OUTPUTS):
-        from shapepose_fg.pipeline import PipelineConfig
-        from shapepose_fg.reconstruct_ending import Ending
-        from shapepose_fg.reconstruct_run import Job, run_job
-
-        settings = PipelineConfig() if config is None else read_config(config, PipelineConfig)
-        settings = settings if temporal is None else replace(settings, temporal=temporal)
-        if shapes is not None and not settings.temporal:
-            raise InputError(
-                "--shapes: a person's shape is known over time only; leave out --shapes or --no-temporal"
-            )
-        if chunk_frames is not None and not (settings.temporal and chunk_frames >= settings.batch_frames):
-            raise InputError(
-                f"--chunk-frames {chunk_frames}: must be {settings.batch_frames} (batch_frames) or more, and needs"
-                " people over time"
-            )
-        if whole is not None and not settings.temporal:
-            raise InputError("--project: its files need people over time; leave out --no-temporal, or --project")
-        source = settings.offsets.source
-        offsets = None if source in ("recording", "none") else Path(source)
-        fitter = fitter_of(body, settings, recording.skeleton.joints)
-        inputs = reading.checksums((calibration, *recording.sources, config, body, timestamps))
-        inputs |= {} if offsets is None else checksums([offsets])
-        job = Job(rig, recording, settings, span, times, first_frames, body, fitter, shapes, inputs, chunk_frames)
-        # Of its own detections `detect` knows which pictures they are of.
-        own = (detections / "footage.json").is_file()
-        videos = None if whole is None or own else whole.folder / "videos"
-        ending = Ending(calibration, whole, videos, report=report, check=check)
-        run_job(job, output, ending, workers=workers, cluster=cluster, resume=resume, restart=restart)
+    request = Request(
+        calibration=calibration,
+        detections=detections,
+        project=project,
+        config=config,
+        frames=frames,
+        up=up,
+        unit=unit,
+        image_size=image_size,
+        skeleton=skeleton,
+        body=body,
+        fps=fps,
+        timestamps=timestamps,
+        cuts=cuts_of(cuts),
+        temporal=temporal,
+        shapes=shapes,
+        chunk_frames=chunk_frames,
+        report=report,
+        check=check,
+    )
+    carry_out(request, output, workers=workers, cluster=cluster, resume=resume, restart=restart)

@@ -1,6 +1,7 @@
 """What `shapepose-fg reconstruct` is told by its options, and by a Pose2Sim project: places, times, people."""
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,13 +18,13 @@ if TYPE_CHECKING:
     from shapepose_fg.pipeline import PipelineConfig
 
 
-def project_of(folder: Path) -> "Pose2SimProject":
-    """The Pose2Sim project in a folder, and a note of what was taken to be what."""
+def project_of(folder: Path, tell: Callable[[str], None] = note) -> "Pose2SimProject":
+    """The Pose2Sim project in a folder; `tell` is given what was taken to be what."""
     from shapepose_fg.io.pose2sim_project import read_pose2sim_project
 
     found = read_pose2sim_project(folder)
     for each in found.notes:
-        note(each)
+        tell(each)
     return found
 
 
@@ -47,28 +48,30 @@ def times_of(fps: float | None, timestamps: Path | None, rig: "Rig", frames: int
     from shapepose_fg.io.timestamps import read_timestamps
 
     if timestamps is not None:
-        if fps is not None:
-            raise InputError("--fps and --timestamps: both say when frames were taken; give one of them")
         return read_timestamps(timestamps, rig, frames)
-    if fps is None:
-        return None
-    if not 0.01 <= fps <= 1e5:
-        raise InputError(f"--fps {fps:g}: must be a number of frames a second, such as 25")
-    return FrameTimes.from_fps(fps, frames)
+    return None if fps is None else FrameTimes.from_fps(fps, frames)
 
 
-def cuts_of(text: str | None, count: int) -> tuple[int, ...]:
+def cuts_of(text: str | None) -> tuple[int, ...]:
     """The frames that `A,B,...` names."""
-    from shapepose_fg.frame_times import check_cuts
-
-    if text is None:
-        return ()
-    words = re.split(r"[,\s]+", text.strip())
     try:
-        return check_cuts([int(word) for word in words], count)
+        return () if text is None else tuple(int(word) for word in re.split(r"[,\s]+", text.strip()))
     except ValueError:
         raise InputError(
-            f"--cuts {text}: must be rising frame numbers between 1 and {count - 1}, such as 300,600"
+            f"--cuts {text}: must be rising frame numbers with commas between, such as 300,600"
+        ) from None
+
+
+def possible_cuts(cuts: tuple[int, ...], count: int) -> tuple[int, ...]:
+    """`cuts`, if a recording of `count` frames can have them."""
+    from shapepose_fg.frame_times import check_cuts
+
+    try:
+        return check_cuts(cuts, count)
+    except ValueError:
+        raise InputError(
+            f"--cuts {','.join(map(str, cuts))}: must be rising frame numbers between 1 and {count - 1}, such as"
+            " 300,600"
         ) from None
 
 

@@ -3,6 +3,8 @@
 import hashlib
 import json
 import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,7 @@ from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.solved_setup import CAMERAS
 from shapepose_fg.kept_arrays import KeptArrays
-from shapepose_fg.pipeline import FRAMES_WORTH_A_WORKER, PipelineConfig, reconstruct_parts
+from shapepose_fg.pipeline import FRAMES_WORTH_A_WORKER, PipelineConfig, Progress, reconstruct_parts
 from shapepose_fg.provenance import program_digest, versions
 from shapepose_fg.reconstruct_ending import Ending
 from shapepose_fg.reconstruct_inputs import known_shapes
@@ -26,7 +28,6 @@ from shapepose_fg.runs.manifest import PARTS, end_run, frames_done, open_run
 from shapepose_fg.runs.room import check_room, expected_bytes
 from shapepose_fg.stopping import Stopped
 from shapepose_fg.terminal import note, show
-from shapepose_fg.terminal import progress as progress_bar
 from shapepose_fg.workers import suitable_workers
 
 
@@ -56,6 +57,8 @@ class Job:
     """Checksums of the files that were read."""
     chunk_frames: int | None = None
     """Into chunks of how many frames the recording is cut; None for one."""
+    sharing: int = 1
+    """How many runs share the cluster."""
 
     def begun(self) -> dict[str, Any]:
         """All that the result depends on, as plain values: equal for a run that goes on."""
@@ -86,6 +89,20 @@ class Job:
         }
 
 
+@dataclass(frozen=True)
+class Ended:
+    """What came of a job."""
+
+    frames: int
+    """How many frames were reconstructed."""
+    rows: int
+    """Rows of people.npz."""
+    people: int | None
+    """How many there are over time; None without time."""
+    warnings: tuple[str, ...]
+    """What looks wrong with cameras and detections."""
+
+
 def run_job(
     job: Job,
     output: Path,
@@ -95,8 +112,11 @@ def run_job(
     cluster: str | None,
     resume: bool,
     restart: bool,
-) -> None:
+    watched: Callable[[], AbstractContextManager[Progress]],
+) -> Ended:
     """Reconstruct, and leave the results in `output`, where the caller is the only one.
+
+    `watched` gives what is told how many frames are done.
 
     Whatever stops it, what is done is kept there, and the next call with `resume` goes on. InputError where that
     cannot be, or the disk is full; `Stopped`, with where it stands, on Ctrl-C or a request to end.
@@ -108,7 +128,7 @@ def run_job(
             note(f"{output}: no run was stopped here; this one begins anew")
     kept = open_run(output, begun, resume=resume, restart=restart)
     try:
-        _run(job, output, ending, kept, workers, cluster)
+        return _run(job, output, ending, kept, workers, cluster, watched)
     except Stopped as stop:
         raise Stopped(stop.number, _standing(job, output)) from None
     except OSError as error:
@@ -117,8 +137,14 @@ def run_job(
 
 
 def _run(
-    job: Job, output: Path, ending: Ending, kept: KeptArrays, workers: int | None, cluster: str | None
-) -> None:
+    job: Job,
+    output: Path,
+    ending: Ending,
+    kept: KeptArrays,
+    workers: int | None,
+    cluster: str | None,
+    watched: Callable[[], AbstractContextManager[Progress]],
+) -> Ended:
     """The reconstruction, its files, and what is said of it."""
     file = job.shapes
     known: SubjectShapes | None = None
@@ -126,7 +152,7 @@ def _run(
         known = people_at_start(kept, file, lambda: known_shapes(file, job.body))
     start = time.perf_counter()
     count = suitable_workers(len(job.frames), FRAMES_WORTH_A_WORKER) if workers is None else workers
-    with progress_bar("reconstructing") as progress:
+    with watched() as progress:
         result = reconstruct_parts(
             kept,
             job.recording,
@@ -141,6 +167,7 @@ def _run(
             workers=count,
             cluster=cluster,
             chunk_frames=job.chunk_frames,
+            sharing=job.sharing,
         )
     seconds = time.perf_counter() - start
     inputs = dict(job.inputs)
@@ -164,6 +191,8 @@ def _run(
     show(summary)
     if checked is not None:
         show_check(checked)
+    warnings = () if checked is None else tuple(checked.warnings)
+    return Ended(len(job.frames), len(result), len(result.numbers()) if job.settings.temporal else None, warnings)
 
 
 def _standing(job: Job, output: Path) -> str:

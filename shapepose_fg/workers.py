@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from multiprocessing import get_context
+from multiprocessing import get_context, resource_tracker
 from typing import Any, Generic, Protocol, TypeVar
 
 Shared = TypeVar("Shared")
@@ -60,7 +60,7 @@ class Workers(Generic[Shared]):
             held, self._lifeline = spawn.Pipe(duplex=False)
             given: tuple[Any, ...] = (content, held)  # one end of a pipe, of one class or another by the system
             self._pool = ProcessPoolExecutor(self.count, spawn, initializer=_begin, initargs=given)
-            with _what_workers_inherit():
+            with what_workers_inherit():
                 for _ in range(self.count):  # the pool starts a process for each of its first jobs
                     self._pool.submit(_nothing)
         return self
@@ -100,12 +100,16 @@ class Workers(Generic[Shared]):
 
 def suitable_workers(items: int, worth: int) -> int:
     """One for each core that this process may use, but no more than pay: `worth` items each."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, min(cores, items // worth))
+    return max(1, min(cores(), items // worth))
+
+
+def cores() -> int:
+    """How many this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextmanager
-def _what_workers_inherit() -> Iterator[None]:
+def what_workers_inherit() -> Iterator[None]:
     """Processes that start now have one thread each for linear algebra, and are deaf to ctrl-C.
 
     The terminal sends it to all of them; it is this process that ends them.
@@ -113,6 +117,8 @@ def _what_workers_inherit() -> Iterator[None]:
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
     can_block = hasattr(signal, "pthread_sigmask")
+    # Python's own helper of spawned processes lets the signal through again when it starts: it has to run by then.
+    resource_tracker.ensure_running()
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if can_block else set()
     try:
         yield
@@ -134,7 +140,7 @@ def _begin(content: bytes, lifeline: Any) -> None:
     """What a worker does first."""
     global _shared
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with, args=(lifeline,), daemon=True).start()
+    threading.Thread(target=end_with, args=(lifeline,), daemon=True).start()
     _shared = pickle.loads(content)  # made by this program a moment ago
     if "cv2" in sys.modules:
         sys.modules["cv2"].setNumThreads(1)
@@ -142,7 +148,7 @@ def _begin(content: bytes, lifeline: Any) -> None:
         sys.modules["torch"].set_num_threads(1)
 
 
-def _end_with(lifeline: Any) -> None:
+def end_with(lifeline: Any) -> None:
     """End this process, whatever it is at, when the one that started it lets go of the other end, or is killed.
 
     A pipe and no event: whoever is killed while it waits for an event leaves its lock to nobody.

@@ -16,10 +16,13 @@ import test_calibration_formats as rigs
 import test_people_formats as people
 import test_reconstruction as results
 
+from shapepose_fg.batch.standing import Standing, Standings, read_standings
+from shapepose_fg.batch.table import read_table
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS, read_smpl_file
 from shapepose_fg.body.shapes import SubjectShapes
 from shapepose_fg.camera import Rig
+from shapepose_fg.detection2d.onnx_file import read_onnx
 from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
 from shapepose_fg.evaluation.other_results.reading import read_people
 from shapepose_fg.export.markers import Markers, opensim_names
@@ -131,6 +134,32 @@ def _project(folder: Path, seed: int) -> Read:
     text = "[project]\nmulti_person = false\nframe_rate = 50\nframe_range = [3, 4]\n[pose]\npose_model = 'Body'\n"
     (folder / "Config.toml").write_text(text)
     return lambda: read_pose2sim_project(folder)
+
+
+def _recordings(folder: Path, seed: int) -> Read:
+    text = '[defaults]\nfps = 25\ncalibration = "cameras.toml"\n'
+    text += '[recordings.walk]\ndetections = "walk"\ncuts = [300, 600]\nskeleton = "COCO_17"\n'
+    text += '[recordings.dance-2]\nproject = "/data/dance"\nframes = "0:100"\nshapes = "who.npz"\n'
+    (folder / "recordings.toml").write_text(text)
+    return lambda: read_table(folder / "recordings.toml")
+
+
+def _batch(folder: Path, seed: int) -> Read:
+    standings = Standings(folder / "batch.json", "recordings.toml", {"walk": Standing({"fps": 25.0, "cuts": [3]})})
+    standings.set("dance", Standing({}).failed("no", 1.5, 1))
+    return lambda: read_standings(folder / "batch.json")
+
+
+def _network(folder: Path, seed: int) -> Read:
+    """A graph in a node's attribute, and a tensor in each."""
+
+    def field(number: int, content: bytes) -> bytes:
+        return bytes([number << 3 | 2, len(content)]) + content
+
+    tensor = field(9, bytes(40)) + bytes([2 << 3, 1])
+    inside = field(6, field(5, tensor))
+    (folder / "n.onnx").write_bytes(field(7, field(5, tensor) + field(1, field(5, inside))))
+    return lambda: read_onnx(folder / "n.onnx")
 
 
 def _corrections(folder: Path, seed: int) -> Read:
@@ -273,6 +302,9 @@ READERS: dict[str, Prepare] = {
     "settings": _settings,
     "times": _times,
     "project of Pose2Sim": _project,
+    "recordings": _recordings,
+    "batch": _batch,
+    "network": _network,
     "corrections": _corrections,
     "footage": _footage,
     "offsets": _offsets,

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from shapepose_fg.cluster import Cluster
+from shapepose_fg.cluster import Cluster, has_dashboard, local_cluster
 from shapepose_fg.errors import InputError
 
 
@@ -53,9 +53,56 @@ def test_a_killed_process_costs_only_its_own_work(tmp_path):
     assert (tmp_path / "killed").exists()
 
 
+class FakeClient:
+    """Four processes that do everything at once."""
+
+    def nthreads(self):
+        return dict.fromkeys("abcd", 1)
+
+    def submit(self, *_, **__):
+        return self
+
+    def result(self) -> int:
+        return 0
+
+    def cancel(self, _) -> None:
+        pass
+
+
+@pytest.mark.parametrize(("sharing", "under_way"), [(1, 8), (2, 4), (30, 2)])
+def test_who_shares_a_cluster_keeps_a_part_of_the_work_ready(sharing, under_way):
+    """Two items a process, of all who share them together; two at the least."""
+    taken: list[int] = []
+    cluster = Cluster("tcp://x", 1, "", sharing=sharing)
+    cluster._client = FakeClient()
+    next(cluster.map(late, (taken.append(n) or n for n in range(20))))
+    assert len(taken) == under_way
+
+
 def test_an_error_of_the_work_is_that_error():
     with Cluster(None, 1, "") as cluster, pytest.raises(ArithmeticError, match="item 0"):
         list(cluster.map(fails, range(3)))
+
+
+def test_processes_of_this_machine_listen_to_this_machine_and_are_deaf_to_ctrl_c():
+    import psutil
+
+    with local_cluster(1, dashboard=True) as scheduler:
+        own = psutil.Process()
+        listening = [
+            each.laddr.ip
+            for process in (own, *own.children(recursive=True))
+            for each in process.net_connections()
+            if each.status == "LISTEN"
+        ]
+        assert len(listening) >= 2 and set(listening) == {"127.0.0.1"}
+        assert scheduler.address.startswith("tcp://127.0.0.1:") and scheduler.processes == 1
+        assert (scheduler.dashboard is not None) == has_dashboard()
+        for process in own.children(recursive=True):
+            if "fork" in process.cmdline()[-1]:  # a worker; the others are Python's own helpers
+                os.kill(process.pid, signal.SIGINT)
+                time.sleep(0.2)
+                assert process.is_running() and process.status() != "zombie"
 
 
 def test_nobody_answers():

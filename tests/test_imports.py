@@ -43,8 +43,10 @@ LEVELS = (
     "reconstruct_summary reconstruct_inputs",
     "reconstruct_ending",
     "reconstruct_run",
+    "reconstruct_request",
+    "batch",
     "demo tracks_command detect_command overlay_command export_command report_command view_command"
-    " setup_command reconstruct_command",
+    " setup_command reconstruct_command batch_command",
     "cli",
     "__main__",
 )

@@ -5,7 +5,7 @@ import signal
 
 import pytest
 
-from shapepose_fg.workers import Workers, _what_workers_inherit, suitable_workers
+from shapepose_fg.workers import Workers, suitable_workers, what_workers_inherit
 
 
 def times(shared: int, item: int) -> int:
@@ -42,10 +42,10 @@ def test_workers_pay_for_much_work_only(monkeypatch: pytest.MonkeyPatch):
     assert [suitable_workers(items, 100) for items in (0, 1, 60, 300, 3000)] == [1, 1, 1, 3, 8]
 
 
-def test_what_workers_inherit_is_put_back(monkeypatch: pytest.MonkeyPatch):
+def testwhat_workers_inherit_is_put_back(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
-    with _what_workers_inherit():
+    with what_workers_inherit():
         assert os.environ["OMP_NUM_THREADS"] == os.environ["OPENBLAS_NUM_THREADS"] == "1"
         assert signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])
     assert os.environ["OMP_NUM_THREADS"] == "7" and "OPENBLAS_NUM_THREADS" not in os.environ

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.detection2d.networks import NetworkLayout, find_layout
+from shapepose_fg.detection2d.onnx_file import read_onnx
 from shapepose_fg.errors import InputError
-from shapepose_fg.files import open_regular
 
 Backend = Literal["opencv", "onnxruntime"]
 """What runs the network."""
@@ -43,7 +43,7 @@ class HeatMapNetwork:
         InputError where the file is missing, is no ONNX network, or does not fit the layout.
         """
         file = Path(file)
-        content = _read(file)
+        content = read_onnx(file)
         sha256 = hashlib.sha256(content).hexdigest()
         forward, only_size = (_with_onnxruntime if backend == "onnxruntime" else _with_opencv)(file, content)
         width, height = only_size or (_TRIAL, _TRIAL)
@@ -73,12 +73,6 @@ class HeatMapNetwork:
         if (self.layout.scale, self.layout.offset) != (1.0, 0.0):
             blob = blob * np.float32(self.layout.scale) + np.float32(self.layout.offset)
         return self._forward(blob)[0]
-
-
-def _read(file: Path) -> bytes:
-    """The bytes of a network's file."""
-    with open_regular(file, "give the ONNX file of a network") as stream:
-        return stream.read()
 
 
 def _with_opencv(file: Path, content: bytes) -> tuple[_Forward, None]:

@@ -144,7 +144,12 @@ class BackAndForth:
 
 
 def spend(
-    recording: DetectionSequence, rig: Rig, config: PipelineConfig, frames: range, workers: int = 1
+    recording: DetectionSequence,
+    rig: Rig,
+    config: PipelineConfig,
+    frames: range,
+    workers: int = 1,
+    chunk_frames: int | None = None,
 ) -> Spent:
     """Reconstruct, and look at the clocks before and after; loading the body counts for nothing.
 
@@ -152,7 +157,9 @@ def spend(
     """
     fitter = TimedFitter(make_fitter(config.body, BodyModel.default().with_keypoints(recording.skeleton.joints)))
     before, start = os.times(), time.perf_counter()
-    people = reconstruct(recording, rig, config, frames=frames, fitter=fitter, workers=workers)
+    people = reconstruct(
+        recording, rig, config, frames=frames, fitter=fitter, workers=workers, chunk_frames=chunk_frames
+    )
     wall_s, after = time.perf_counter() - start, os.times()
     seconds = dict(people.run["seconds"])
     return Spent(

@@ -6,6 +6,7 @@ import json
 import textwrap
 from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar, cast, get_type_hints
@@ -32,12 +33,18 @@ def read_config(path: str | Path, kind: type[T]) -> T:
     return _build(kind, read_toml(path, may_be_empty=True), path)
 
 
-def config_from(table: dict[str, Any], kind: type[T], path: str | Path) -> T:
+_CURE = "`shapepose-fg config` shows the defaults"
+
+
+def config_from(
+    table: dict[str, Any], kind: type[T], path: str | Path, *, place: str = "", cure: str = _CURE
+) -> T:
     """Settings of the dataclass `kind` from nested plain values, as run.json has them (`asdict`) in `path`.
 
-    Raises InputError naming file and key, as `read_config` does.
+    `place` is the dotted name of the table in the file. Raises InputError naming file and key, as `read_config`
+    does, with `cure` at its end.
     """
-    return _build(kind, table, Path(path))
+    return _build(kind, table, Path(path), f"{place}." if place else "", cure)
 
 
 def toml_text(config: object) -> str:
@@ -45,7 +52,7 @@ def toml_text(config: object) -> str:
     return "\n".join(_lines(config)).strip() + "\n"
 
 
-def _build(kind: type[T], table: dict[str, Any], path: Path, prefix: str = "") -> T:
+def _build(kind: type[T], table: dict[str, Any], path: Path, prefix: str = "", cure: str = _CURE) -> T:
     """A dataclass from its table; `prefix` is the dotted name of the table, with its dot."""
     hints = get_type_hints(kind)
     known = [field.name for field in fields(cast(Any, kind)) if field.init]
@@ -54,26 +61,32 @@ def _build(kind: type[T], table: dict[str, Any], path: Path, prefix: str = "") -
         if key not in known:
             near = get_close_matches(key, known, n=1, cutoff=0)[0]
             raise InputError(f"{path}: {prefix}{key} is not a known key; did you mean {prefix}{near}?")
-        values[key] = _value(hints[key], value, path, f"{prefix}{key}")
+        values[key] = _value(hints[key], value, path, f"{prefix}{key}", cure)
     try:
         return kind(**values)
     except ValueError as error:
-        raise InputError(f"{path}: {prefix}{error}; `shapepose-fg config` shows the defaults") from None
+        raise InputError(f"{path}: {prefix}{error}; {cure}") from None
 
 
-def _value(hint: Any, value: Any, path: Path, key: str) -> Any:
+def _value(hint: Any, value: Any, path: Path, key: str, cure: str) -> Any:
     """One setting, in the type that its field has."""
     if is_dataclass(hint):
         if not isinstance(value, dict):
             raise InputError(f"{path}: {key} must be a table, got {describe(value)}; write [{key}] above its keys")
-        return _build(cast(type, hint), value, path, f"{key}.")
+        return _build(cast(type, hint), value, path, f"{key}.", cure)
     try:
         # As JSON, strict types still let a list be a tuple and a text be an enumeration.
-        return TypeAdapter(hint, config=_STRICT).validate_json(json.dumps(value, default=str))
+        return _adapter(hint).validate_json(json.dumps(value, default=str))
     except ValidationError as error:
         place, problem = first_problem(error)
         index = "".join(f"[{part}]" for part in place if isinstance(part, int))
-        raise InputError(f"{path}: {key}{index} {problem}; `shapepose-fg config` shows the default") from None
+        raise InputError(f"{path}: {key}{index} {problem}; {cure}") from None
+
+
+@cache
+def _adapter(hint: Any) -> TypeAdapter[Any]:
+    """Checks values of a type; made once for each, which takes a millisecond."""
+    return TypeAdapter(hint, config=_STRICT)
 
 
 def _lines(config: Any, table: str = "") -> list[str]:

@@ -3,10 +3,11 @@ import re
 import numpy as np
 import pytest
 
+from shapepose_fg.detection2d import onnx_file as onnx_file_reader
 from shapepose_fg.detection2d.network import HeatMapNetwork
 from shapepose_fg.detection2d.networks import layouts
 from shapepose_fg.errors import InputError
-from tests.detection2d.conftest import onnx_file
+from tests.detection2d.conftest import _bytes, _number, onnx_file
 
 
 def means(channels: int, gain: float = 1.0) -> np.ndarray:
@@ -74,6 +75,46 @@ def test_what_is_no_such_network_is_said(tmp_path, backend):
         HeatMapNetwork.load(other, "tf-pose", backend)
     with pytest.raises(InputError, match="--layout mine: not known; known are tf-pose"):
         HeatMapNetwork.load(other, "mine", backend)
+
+
+def test_a_file_that_is_too_large_is_not_read(tmp_path, monkeypatch):
+    file = onnx_file(tmp_path / "n.onnx", means(78))
+    monkeypatch.setattr(onnx_file_reader, "MOST_BYTES", file.stat().st_size)
+    assert onnx_file_reader.read_onnx(file) == file.read_bytes()
+    with file.open("ab") as stream:
+        stream.truncate(2**40)  # a hole: takes no room on the disk
+    monkeypatch.undo()
+    with pytest.raises(InputError, match=r"over 512 MiB are too much for a network of this kind"):
+        HeatMapNetwork.load(file)
+
+
+def test_weights_in_other_files_are_refused_wherever_they_stand(tmp_path):
+    """In the graph, in a node's attribute, in a graph inside of it, in a function, in a sparse tensor."""
+    place = _bytes(1, b"location") + _bytes(2, b"../../etc/passwd")
+    tensor = _number(1, 3) + _bytes(13, place) + _number(14, 1)
+    inside = _bytes(6, _bytes(15, _bytes(1, tensor)))
+    models = [_bytes(7, _bytes(5, tensor)), _bytes(7, _bytes(1, _bytes(5, _bytes(5, tensor))))]
+    models += [_bytes(7, _bytes(1, _bytes(5, inside))), _bytes(25, _bytes(7, _bytes(5, _bytes(10, tensor))))]
+    file, whole = tmp_path / "n.onnx", onnx_file(tmp_path / "whole.onnx", means(78)).read_bytes()
+    for model in models:
+        file.write_bytes(whole + model)
+        with pytest.raises(
+            InputError, match=r"its weights lie in another file \('\.\./\.\./etc/passwd'\); give a"
+        ):
+            HeatMapNetwork.load(file)
+
+
+def test_graphs_without_end_are_no_network(tmp_path, monkeypatch):
+    file, graph = tmp_path / "n.onnx", b""
+    for _ in range(200):
+        graph = _bytes(1, _bytes(5, _bytes(6, graph)))
+    file.write_bytes(_bytes(7, graph))
+    with pytest.raises(InputError, match="not an ONNX network"):
+        HeatMapNetwork.load(file)
+    monkeypatch.setattr(onnx_file_reader, "_MOST_FIELDS", 1000)
+    file.write_bytes(_bytes(7, 1001 * _number(3, 1)))
+    with pytest.raises(InputError, match="not an ONNX network"):
+        HeatMapNetwork.load(file)
 
 
 def test_the_real_network_is_known_by_its_checksum(shared_data):

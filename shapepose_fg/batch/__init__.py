@@ -1,0 +1,1 @@
+"""An archive of recordings: a table of them, reconstructed on many processes, one queue of work for all."""
