@@ -194,3 +194,12 @@ def test_the_paper_s_candidate_is_the_mean_of_its_points(five_cameras, two_peopl
         if means.votes[largest] == own.sum():  # no point is an outlier
             np.testing.assert_allclose(means.xyz[largest], points.xyz[own].mean(axis=0), atol=1e-9)
             assert np.abs(means.xyz[largest] - weighted.xyz[largest]).max() > 1e-4
+
+
+def test_stage_one_s_settings_of_the_paper():
+    """Section 3.1: three votes, 90 % of the parts; what it does not have is off. Chosen on `tune`: 6 and 60 cm."""
+    c, p = PAPER.candidates, PAPER.proposals
+    assert (c.min_votes, c.vote_radius_m, c.weak, c.weighted_centre) == (3, 0.06, False, False)
+    assert c.gate_m >= 10 and c.min_angle_deg < 0.01 and c.min_view_fraction < 0.01
+    assert (p.min_parts, p.separation_m, p.min_own_views, p.min_grown_parts) == (0.9, 0.6, 0, 0.0)
+    assert (p.split_m, p.weak_anchors, p.growth.bridge_m) == (0.0, False, 0.0)

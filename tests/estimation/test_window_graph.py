@@ -296,3 +296,56 @@ def test_refuses_settings_that_make_no_sense():
         WindowGraphConfig(weight_2d=0.0)
     with pytest.raises(ValueError, match="rho_3d must be between 0 and 1"):
         WindowGraphConfig(rho_3d=1.5)
+
+
+@pytest.mark.parametrize(("error", "failure"), [(RuntimeError, "singular"), (None, "left the finite numbers")])
+def test_a_solver_that_fails_says_so_and_leaves_the_joints(five_cameras, person, monkeypatch, error, failure):
+    """GTSAM raises RuntimeError where its system is indeterminate, and may end with an error that is NaN."""
+    truth, xy, sigmas = person
+
+    class Failing(gtsam.LevenbergMarquardtOptimizer):
+        def optimize(self):
+            if error is not None:
+                raise error("Indeterminant linear system")
+            return super().optimize()
+
+        def error(self):
+            return np.nan
+
+    monkeypatch.setattr(gtsam, "LevenbergMarquardtOptimizer", Failing)
+    graph = OneFrame(five_cameras, xy, sigmas, EXACT, "cauchy", 0, 0)
+    found = graph.solve(truth)
+    assert failure in graph.window.failure
+    assert np.isnan(graph.covariance()).all(), "of what is not solved nothing is known"
+    if error is not None:
+        np.testing.assert_array_equal(found, truth)
+
+
+def test_of_a_joint_that_one_view_saw_there_is_no_covariance_and_the_others_have_theirs(five_cameras, person):
+    """Its depth is open, so that the whole system is singular; what hangs together with it is nothing."""
+    truth, xy, sigmas = person
+    graph = OneFrame(five_cameras, xy, sigmas, EXACT, None, 0, 0)
+    inlier = np.ones(sigmas.shape, dtype=bool)
+    graph.set_gates(inlier)
+    graph.solve(truth)
+    whole = graph.covariance()
+    inlier[4, 1:] = False
+    graph.set_gates(inlier)
+    graph.solve(truth)
+    covariance = graph.covariance()
+    assert np.isnan(covariance[4]).all() and np.isfinite(whole).all()
+    # With a prior of 100 m on each joint: a relative difference of (1 cm / 100 m)^2.
+    np.testing.assert_allclose(np.delete(covariance, 4, axis=0), np.delete(whole, 4, axis=0), rtol=1e-6)
+
+
+def test_in_a_frame_alone_a_joint_lost_from_sight_is_pulled_as_any_other(five_cameras, person):
+    """Offsets are for windows of several frames: here the body's pull counts, whatever is said to be lost."""
+    truth, xy, sigmas = person
+    graph = OneFrame(five_cameras, xy, sigmas, EXACT, None, 0, 0)
+    pulled = np.arange(25) == 4
+    body = message(pulled, truth + 0.1, np.tile(0.01**2 * np.eye(3), (25, 1, 1)))
+    whole = Message(body.xyz[None], body.information[None])
+    asked = np.ones((1, *sigmas.shape), dtype=bool), whole, whole, truth[None]
+    plain = graph.window.solve(*asked).copy()
+    np.testing.assert_array_equal(graph.window.solve(*asked, pulled[None]), plain)
+    assert np.linalg.norm(plain[0, 4] - truth[4]) > 0.02, "it is pulled"

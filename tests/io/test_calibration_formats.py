@@ -419,6 +419,14 @@ def test_colmap_as_pycolmap_wrote_it():
     refuses(DATA / "colmap", "unit and up are missing", "to no scale until colmap model_aligner")
 
 
+@pytest.mark.parametrize("line", ["1 1 0 0 0 0 0 0 1", "1 1 0 0 0 0 0 0", "1 1 0 0 0 0 0 0 7 a.jpg"])
+def test_colmap_s_pictures_have_ten_words_and_a_camera_that_is_there(tmp_path, line):
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 100 80 90 90 50 40\n")
+    (tmp_path / "images.txt").write_text(f"# pictures\n{line}\n\n")
+    with pytest.raises(InputError, match=r"images\.txt: line 2: must hold id, quaternion, translation, camera id"):
+        read_rig(tmp_path, unit="m", up="z")
+
+
 def test_colmap_that_cannot_be_read(tmp_path):
     (tmp_path / "cameras.bin").write_bytes(b"\x01")
     with pytest.raises(InputError, match="run colmap model_converter --output_type TXT"):

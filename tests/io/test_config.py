@@ -8,6 +8,7 @@ import pytest
 
 from shapepose_fg.errors import InputError
 from shapepose_fg.io.config import read_config, toml_text
+from shapepose_fg.io.validation import describe
 from shapepose_fg.pipeline import PipelineConfig
 
 
@@ -118,3 +119,10 @@ def test_the_pipelines_own_settings(tmp_path):
     assert config == replace(
         PipelineConfig(), batch_frames=7, candidates=replace(PipelineConfig().candidates, gate_m=0.2)
     )
+
+
+def test_values_are_described_in_a_word_or_two():
+    values = [None, True, {"a": 1}, [1, 2, 3], "x" * 21, "x" * 20, float("nan"), float("inf"), float("-inf"), 0.5]
+    words = ["null", "true", "an object", "a list of 3", f"text {'x' * 20!r}...", f"text {'x' * 20!r}"]
+    words += ["NaN", "Infinity", "-Infinity", "0.5"]
+    assert [describe(value) for value in values] == words

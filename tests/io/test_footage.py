@@ -8,6 +8,7 @@ import pytest
 
 from shapepose_fg.errors import InputError
 from shapepose_fg.io.footage.footage import PictureFiles, Video, open_footage
+from shapepose_fg.io.footage.given import _rate, _start
 from shapepose_fg.io.footage.placement import Placement, PlacementKind, place
 from shapepose_fg.io.footage.places import find_footage
 from shapepose_fg.io.footage.used import CameraFootage, read_used_footage, write_used_footage
@@ -230,3 +231,22 @@ def test_what_was_used_is_read_back(tmp_path):
         file.write_text(spoilt)
         with pytest.raises(InputError, match=problem):
             read_used_footage(file)
+
+
+GOOD_RATES = {"0.01": 0.01, "100000": 1e5, "29.97": 29.97}
+
+
+@pytest.mark.parametrize("text", [*GOOD_RATES, "0.005", "0", "-25", "1e5.", "100000.5", "nan"])
+def test_rates_are_a_hundredth_to_a_hundred_thousand_frames_a_second(text):
+    if text in GOOD_RATES:
+        assert _rate(text) == GOOD_RATES[text]
+        return
+    with pytest.raises(InputError, match=f"--fps {text}: must be a number of frames a second"):
+        _rate(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"), [(None, 0.0), ("0.2s", 0.2), ("-3f", -0.12), (" .5 s ", 0.5), ("12 f", 0.48)]
+)
+def test_starts_are_seconds_or_the_camera_s_own_frames(text, seconds):
+    assert _start(text, 0.04, True) == pytest.approx(seconds)

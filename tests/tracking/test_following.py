@@ -70,11 +70,14 @@ def test_people_in_view_for_five_frames_at_either_end(followed, five_cameras, se
     assert sorted(np.unique(rows.frame[person == 1]).tolist()) == [*range(5), *range(last, len(frames))]
 
 
-def test_three_frames_in_the_middle_are_a_phantom(followed, five_cameras, seen_exactly, walking):
-    frames, truth = walking
-    seen = [seen_exactly(five_cameras, truth[t, [0, 1] if 20 <= t < 23 else [0]]) for t in range(len(frames))]
+@pytest.mark.parametrize(("count", "people"), [(3, 1), (4, 1), (5, 2)])
+def test_fewer_than_five_frames_in_the_middle_are_a_phantom(
+    followed, five_cameras, seen_exactly, walking, count, people
+):
+    _, truth = walking
+    seen = [seen_exactly(five_cameras, truth[t, [0, 1] if 8 <= t < 8 + count else [0]]) for t in range(30)]
     rows = followed(five_cameras, seen)
-    assert len(np.unique(rows.track)) == 1 and len(rows) == len(frames)
+    assert len(np.unique(rows.track)) == people and len(rows) == 30 + (count if people == 2 else 0)
 
 
 def test_who_is_found_late_was_there_before(followed, five_cameras, seen_exactly, walking):
@@ -92,6 +95,9 @@ def test_who_is_found_late_was_there_before(followed, five_cameras, seen_exactly
     rows = followed(five_cameras, seen)
     tracks = identities(rows, truth)
     assert all(len(own) == 1 for own in tracks.values()) and len(rows) == 2 * len(frames)
+    before = (rows.frame < 12) & (who(rows, truth)[0] == 1)
+    counts = (rows.candidate[before] >= 0).sum(axis=(1, 2))
+    assert (counts == 5 * 22).all(), "on the way back, too, they have all their detections"
 
 
 def test_a_camera_that_fails_half_way_costs_nobody(followed, five_cameras, walking):

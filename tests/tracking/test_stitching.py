@@ -71,3 +71,49 @@ def test_nobody_is_nobody():
     none = np.zeros(0)
     named = stitch(none.astype(int), none, np.zeros((0, 25, 3)), BODY_25, StitchingConfig())
     assert len(named) == 0
+
+
+def two_tracks(gap_s, apart_m, longer_m=0.0, rows=20, known=14) -> Traces:
+    """Two tracks of one second each; of 14 bones some are `known`, the second person's are `longer_m` longer."""
+    time_s = np.concatenate([np.linspace(0, 1, rows), np.linspace(0, 1, rows) + 1 + gap_s])
+    track = np.repeat([3, 7], rows)
+    centre = np.zeros((2 * rows, 3))
+    centre[:rows, 0] = np.linspace(-2.0, 0.0, rows)  # the last row's place counts, and the first of the other
+    centre[rows:, 0] = apart_m + np.linspace(0.0, 5.0, rows)
+    bones = np.where(track[:, None] == 3, 0.4, 0.4 + longer_m) * np.ones(14)
+    bones[:, known:] = np.nan
+    order = np.random.default_rng(0).permutation(2 * rows)
+    return Traces(track[order], time_s[order], centre[order], bones[order])
+
+
+@pytest.mark.parametrize(
+    ("change", "joined"),
+    [
+        ({}, True),
+        ({"gap_s": 9.9, "apart_m": 0.0}, True),
+        ({"gap_s": 10.1, "apart_m": 0.0}, False),
+        ({"apart_m": 3.45}, True),  # 0.5 m and 1.5 m/s for 2 s
+        ({"apart_m": 3.55}, False),
+        ({"longer_m": 0.029}, True),  # d^2 / (2 x 0.015^2) is 2 at 3 cm
+        ({"longer_m": 0.031}, False),
+        ({"rows": 10}, True),
+        ({"rows": 9}, False),
+        ({"known": 7}, True),
+        ({"known": 6}, False),
+    ],
+)
+def test_how_long_how_far_and_how_alike(change, joined):
+    traces = two_tracks(**{"gap_s": 2.0, "apart_m": 1.0} | change)
+    assert stitch_traces(traces, StitchingConfig()) == {3: 3, 7: 3 if joined else 7}
+
+
+def test_a_trace_is_the_centre_of_the_core_joints_that_are_known_and_the_core_bones(two_people):
+    joints = np.stack([two_people[0], two_people[1]])
+    core = list(BODY_25.core)
+    joints[1, core[:4]] = np.nan
+    traces = Traces.of(np.array([1, 2]), np.zeros(2), joints, BODY_25)
+    np.testing.assert_allclose(traces.centre, [joints[0, core].mean(axis=0), joints[1, core[4:]].mean(axis=0)])
+    lengths = [
+        np.linalg.norm(joints[0, j] - joints[0, BODY_25.parents[j]]) for j in core if BODY_25.parents[j] in core
+    ]
+    np.testing.assert_allclose(np.sort(traces.bones[0]), np.sort(lengths))

@@ -1,0 +1,225 @@
+"""What is said of solved joints: how each is known, what its covariance leaves out, what went wrong."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from shapepose_fg.body.fitting.fitter import BodyFit
+from shapepose_fg.estimation.draft import drafted, limb_steps, smoothed_in_time
+from shapepose_fg.estimation.limb_lengths import with_lengths
+from shapepose_fg.estimation.linearisation import ViewEvidence
+from shapepose_fg.estimation.motion_model import Lasting
+from shapepose_fg.estimation.outcome import how_known, problems, reported_covariance
+from shapepose_fg.reconstruction import Known
+
+I3 = np.eye(3)
+
+
+def message(sigma_m, known=None):
+    """Information of joints (N, J) known alike in all directions, at the origin; sigma infinite: none."""
+    sigma = np.asarray(sigma_m, dtype=float)
+    information = np.where(np.isfinite(sigma), sigma, np.inf)[..., None, None] ** -2.0 * I3
+    known = np.isfinite(sigma) if known is None else np.asarray(known)
+    return SimpleNamespace(information=information, known=known, xyz=np.zeros((*sigma.shape, 3)))
+
+
+def test_a_joint_is_seen_or_the_body_s_or_carried_by_motion():
+    """Seen by one view of three; by none, with 70 % and 72 % of the body's sigma; without a body; not placed."""
+    sigma = np.array([[0.09, 0.07, 0.072, 0.07, 0.07]])
+    covariance = sigma[..., None, None] ** 2 * I3
+    inlier = np.zeros((1, 5, 3), dtype=bool)
+    inlier[0, 0, 1] = inlier[0, 4, :] = True
+    joints = np.zeros((1, 5, 3))
+    joints[0, 4, 2] = np.nan
+    body = message(np.full((1, 5), 0.1), [[True, True, True, False, True]])
+    solution = SimpleNamespace(body=body, inlier=inlier, joints=joints)
+    found = how_known(solution, covariance)
+    assert found.tolist() == [[Known.SEEN, Known.MOTION, Known.BODY, Known.MOTION, Known.UNKNOWN]]
+    assert found.dtype == np.uint8
+
+
+def window(times_s, with_offsets):
+    graph = SimpleNamespace(
+        times_s=np.asarray(times_s),
+        with_offsets=np.asarray(with_offsets),
+        touched=np.zeros(len(with_offsets), bool),
+    )
+    graph.failure = ""
+    return SimpleNamespace(graph=graph, rows=np.arange(len(times_s)))
+
+
+def test_errors_that_last_are_added_to_what_the_graph_knows():
+    """Joint 0 is seen in all four frames; joint 1 in the second and the last; joint 2 is solved with offsets.
+
+    Of a share f of the views' error that is new in every frame, the graph's marginal holds all, of which motion
+    takes too much by `kept`; what lasts is that of the nearest frame in which the joint was seen, and a view that
+    sees a little of it brings its own, (1 - f) / f² M L M.
+    """
+    f, kept = 0.3, 0.2
+    sigma = np.full((4, 3), 0.02)
+    sigma[[0, 2], 1] = 0.15  # over 10 cm: not seen, but a little
+    body = np.full((4, 3), 0.05)
+    solution = SimpleNamespace(views=message(sigma), body=message(body))
+    rng = np.random.default_rng(0)
+    root = rng.normal(0, 0.01, (4, 3, 3, 3))
+    marginal = root @ root.swapaxes(2, 3) + 1e-4 * I3
+    here = window([0.0, 0.1, 0.4, 0.5], [False, False, True])
+    found = reported_covariance(solution, here, marginal, Lasting(f, 1.0, kept))
+    left = I3 / (0.02**-2 + 0.05**-2)
+    for frame in range(4):
+        lasting = (1 - f + kept * f) * left
+        np.testing.assert_allclose(found[frame, 0], (1 - kept) * marginal[frame, 0] + lasting)
+        if frame in (1, 3):
+            np.testing.assert_allclose(found[frame, 1], (1 - kept) * marginal[frame, 1] + lasting)
+        else:
+            own = (1 - f) / f**2 * marginal[frame, 1] @ marginal[frame, 1] / 0.15**2
+            np.testing.assert_allclose(found[frame, 1], marginal[frame, 1] + own + lasting)
+        np.testing.assert_allclose(found[frame, 2], marginal[frame, 2])
+
+
+def test_the_nearest_frame_in_which_it_was_seen_is_carried_along():
+    """Seen in the first frame to 1 cm and in the last to 8: between them by the clock, not by the count."""
+    sigma = np.array([[0.01], [np.inf], [np.inf], [0.08]])
+    nobody = message(np.full((4, 1), np.inf))
+    marginal = np.broadcast_to(0.03**2 * I3, (4, 1, 3, 3))
+    here = window([0.0, 0.1, 0.2, 1.0], [False])
+    found = reported_covariance(
+        SimpleNamespace(views=message(sigma), body=nobody), here, marginal, Lasting(0.5, 1.0)
+    )
+    extra = np.sqrt(np.diagonal(found - marginal, axis1=2, axis2=3))[:, 0, 0]
+    np.testing.assert_allclose(extra, np.sqrt(0.5) * np.array([0.01, 0.01, 0.01, 0.08]), rtol=1e-6)
+
+
+def solved(away_m, sigma_m=0.02, body_sigma_m=np.inf):
+    """One frame: joints at the origin but for `away_m` (J,) along x, views and body at the origin."""
+    away = np.asarray(away_m, dtype=float)
+    joints = np.zeros((1, len(away), 3))
+    joints[0, :, 0] = away
+    shape = np.ones((1, len(away)))
+    return SimpleNamespace(joints=joints, views=message(sigma_m * shape), body=message(body_sigma_m * shape))
+
+
+def reasons(solution, here, covariance=None, first=None):
+    count = solution.joints.shape[1]
+    observations = SimpleNamespace(track=np.array([7]), frame=np.array([12]))
+    covariance = np.broadcast_to(I3, (1, count, 3, 3)) if covariance is None else covariance
+    first = np.zeros((1, count, 3)) if first is None else first
+    found = problems(observations, [here], solution, first, covariance)
+    assert all((each.row, each.track, each.frame) == (0, 7, 12) for each in found)
+    return {each.joint: each.reason for each in found}
+
+
+def test_a_joint_far_from_all_that_is_said_of_it_ran_away():
+    """Half a metre and 20 standard deviations, both: 0.49 m is 24 of 2 cm, 0.6 m only 15 of 4 cm."""
+    here = window([0.0], [False, False])
+    assert set(reasons(solved([0.51, 0.49]), here)) == {0}
+    assert reasons(solved([0.6, 0.0], sigma_m=0.04), here) == {}
+    assert set(reasons(solved([0.9, 0.0], sigma_m=0.04), here)) == {0}
+    # With the body beside the views 4 cm is 2.8 cm: 0.6 m are 21 of them.
+    both = reasons(solved([0.6, 0.0], sigma_m=0.04, body_sigma_m=0.04), here)
+    assert both == {0: "ran away from what views and body say of it"}
+
+
+def test_a_joint_with_a_factor_of_one_s_own_ran_away_after_a_metre():
+    here = window([0.0], [False, False, False])
+    here.graph.touched = np.array([True, True, False])
+    first = np.array([[[1.01, 0, 0], [0.99, 0, 0], [5.0, 0, 0]]])
+    assert reasons(solved([0.0, 0.0, 0.0]), here, first=first) == {0: "ran away from its views"}
+
+
+def test_what_nothing_determines_and_what_the_solver_says():
+    here = window([0.0], [False, False])
+    covariance = np.full((1, 2, 3, 3), np.nan)
+    covariance[0, 1] = I3
+    assert reasons(solved([0.0, 0.0]), here, covariance) == {0: "nothing determines it: its system is singular"}
+    here.graph.failure = "the solver left the finite numbers"
+    solution = solved([0.0, np.nan])
+    assert reasons(solution, here, covariance) == {0: here.graph.failure}, "who is not placed has no problem"
+
+
+def evidence(points, sigma_m) -> ViewEvidence:
+    """Views that put joints exactly at `points` (N, J, 3), known to `sigma_m` (N, J); infinite: not at all."""
+    information = message(sigma_m).information
+    none = np.zeros((*np.shape(sigma_m), 1))
+    return ViewEvidence(points, none > 0, none, information, np.zeros_like(points))
+
+
+def body_at(joints, sigma_m, ok=True) -> BodyFit:
+    covariance = np.broadcast_to(sigma_m**2 * I3, (*joints.shape, 3))
+    return SimpleNamespace(joints=joints, covariance=covariance, ok=np.full(len(joints), ok))  # type: ignore[return-value]
+
+
+def test_a_draft_is_between_views_and_body_by_what_each_knows():
+    """A body 4 cm off, known to 3 cm and 2 for the model; views to 2 cm: 13 to 4. Views 20 cm off do not count."""
+    views = np.array([[[0.04, 0, 0], [0.2, 0, 0], [0.04, 0, 0]]])
+    sigma = np.array([[0.02, 0.02, np.inf]])
+    at, covariance = drafted(evidence(views, sigma), body_at(np.zeros((1, 3, 3)), 0.03), disagreement=4.8)
+    whole = 0.03**2 + 0.02**2
+    share = whole / (whole + 0.02**2)
+    np.testing.assert_allclose(at[0], [[share * 0.04, 0, 0], [0, 0, 0], [0, 0, 0]], atol=1e-12)
+    np.testing.assert_allclose(covariance[0, 0], I3 * whole * 0.02**2 / (whole + 0.02**2))
+    np.testing.assert_allclose(covariance[0, 1:], np.stack([whole * I3] * 2))
+    # 20 cm are sqrt(17) x 1 cm, 4.85 times: with a little more patience the views count.
+    np.testing.assert_allclose(np.hypot(np.sqrt(whole), 0.02), np.sqrt(17) / 100)
+    patient, _ = drafted(evidence(views[:, 1:2], sigma[:, 1:2]), body_at(np.zeros((1, 1, 3)), 0.03), 4.9)
+    np.testing.assert_allclose(patient[0, 0, 0], share * 0.2)
+
+
+def test_a_draft_without_a_body_is_the_views_and_without_both_nothing():
+    views = np.array([[[1.0, 2, 3], [4, 5, 6], [7, 8, 9]]])
+    fit = body_at(np.full((1, 3, 3), np.nan), 0.03, ok=False)
+    at, covariance = drafted(evidence(views, np.array([[0.02, 0.9, 1.1]])), fit, disagreement=6.0)
+    np.testing.assert_allclose(at[0, :2], views[0, :2])
+    np.testing.assert_allclose(covariance[0, :2], np.stack([0.02**2 * I3, 0.9**2 * I3]))
+    assert np.isnan(at[0, 2]).all() and np.isnan(covariance[0, 2]).all(), "determined to a metre, or not at all"
+
+
+class Beside:
+    """A fitter whose body has every joint 30 cm higher; remembers what it was given."""
+
+    def fit(self, targets, initial=None, groups=None):
+        self.targets = targets
+        return SimpleNamespace(joints=targets.xyz + np.array([0.0, 0.0, 0.3]))
+
+
+def test_unseen_joints_go_towards_the_body_the_more_the_less_they_are_known():
+    """C / (C + (3 cm)²) of 30 cm: half at 3 cm, nine tenths at 9; seen joints and those not placed stay."""
+    joints = np.zeros((2, 4, 3))
+    joints[0, 3] = np.nan
+    sigma = np.array([[0.03, 0.09, 0.09, 0.09], [0.03] * 4])
+    unseen = np.array([[True, True, False, True], [False] * 4])
+    fitter = Beside()
+    steps = limb_steps(joints, sigma[..., None, None] ** 2 * I3, unseen, fitter)  # type: ignore[arg-type]
+    np.testing.assert_allclose(steps[0, :, 2], [0.15, 0.27, 0.0, 0.0])
+    assert (steps[1] == 0).all() and (steps[..., :2] == 0).all()
+    assert fitter.targets.xyz.shape == (1, 4, 3), "only people with such a joint are fitted"
+    np.testing.assert_allclose(fitter.targets.information[0, :3], sigma[0, :3, None, None] ** -2.0 * I3)
+    assert (fitter.targets.information[0, 3] == 0).all()
+    assert (limb_steps(joints, sigma[..., None, None] ** 2 * I3, unseen & False, fitter) == 0).all()  # type: ignore[arg-type]
+
+
+def test_smoothing_in_time_is_a_gaussian_mean():
+    values, times = np.array([[0.0], [1.0], [4.0]]), np.array([0.0, 0.1, 0.3])
+    weight = np.exp([0.0, -0.5, -4.5])  # 0, 1 and 3 widths off
+    smooth = smoothed_in_time(values, times, 0.1)
+    assert smooth[0, 0] == pytest.approx((weight[1] + 4 * weight[2]) / weight.sum())
+
+
+@pytest.mark.parametrize(("first_sigma", "second_sigma"), [(0.3, 0.3), (0.1, 0.5), (0.0, 0.3)])
+def test_the_ends_of_a_limb_share_what_is_missing_by_what_is_not_known(first_sigma, second_sigma):
+    """One limb of 50 cm that should be 30: in each of four sweeps v / (v + (10 cm)²) of what is left goes."""
+    joints = np.array([[[0.0, 0, 0], [0.5, 0, 0]]])
+    sigma = np.array([[max(first_sigma, 1e-9), second_sigma]])
+    covariance = sigma[..., None, None] ** 2 * I3
+    moved = np.array([[first_sigma > 0, True]])
+    found = with_lengths(joints, covariance, moved, np.array([0.3]), [(0, 1)])
+    variance = first_sigma**2 + second_sigma**2
+    missing = 0.2 * (1 - (0.1**2 / (variance + 0.1**2)) ** 4)
+    np.testing.assert_allclose(
+        found[0, :, 0], [missing * first_sigma**2 / variance, 0.5 - missing * second_sigma**2 / variance]
+    )
+    unknown = with_lengths(joints, covariance, moved, np.array([np.nan]), [(0, 1)])
+    np.testing.assert_array_equal(unknown, joints)
+    lost = with_lengths(np.where(joints == 0.5, np.nan, joints), covariance, moved, np.array([0.3]), [(0, 1)])
+    np.testing.assert_array_equal(lost[0, 0], joints[0, 0])

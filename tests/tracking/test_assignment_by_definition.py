@@ -1,0 +1,262 @@
+"""Detections of predicted joints on a crowded frame, against what they are defined to be, one thing at a time."""
+
+from collections import Counter
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from shapepose_fg.observations import Observations
+from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.tracking.following import Input
+from shapepose_fg.tracking.reassociation import Lasting, Survival, _gone, _nobody, _own_share, reassociate
+from shapepose_fg.tracking.view_assignment import AssignmentConfig, assign
+
+CORE = list(BODY_25.core)
+LIMBS = {tuple(sorted(limb)) for limb in BODY_25.limbs}
+
+
+@pytest.fixture(scope="module")
+def predicted(two_people):
+    """Where the four people of the crowded frame are thought to be, how surely, and which joints are lost."""
+    rng = np.random.default_rng(2)
+    people = np.concatenate([two_people, two_people[::-1] + np.array([0.1, 0.5, 0.0])])
+    sigma = rng.uniform(0.01, 0.2, (4, 25))
+    lost = rng.random((4, 25)) < 0.2
+    places = people + rng.normal(0, 0.04, people.shape)
+    for person, joint in np.argwhere(lost).tolist():
+        places[person, joint] = people[person, max(BODY_25.parents[joint], 0)]
+    places[3, 4] = np.nan
+    return places, sigma, lost
+
+
+DEFAULTS = {
+    "near_m": 0.06,
+    "far_m": 0.12,
+    "farthest_m": 0.5,
+    "least_affinity": 0.3,
+    "reach_m": 0.8,
+    "overlap_px": 6.0,
+    "passes": 2,
+}
+"""What is documented, so that another default is noticed."""
+
+
+def assigned(places, sigma, lost, crowded, rig, config: SimpleNamespace) -> np.ndarray:
+    """Score every detection for every person, take the best first; again with the affinities to what was taken."""
+    xy, depth = rig.project(places)
+    listed = {tuple(pair): value for pair, value in zip(crowded.pairs.tolist(), crowded.affinity, strict=True)}
+    near = [
+        [
+            other
+            for other in np.flatnonzero(crowded.view == crowded.view[row]).tolist()
+            if tuple(sorted((int(crowded.joint[row]), int(crowded.joint[other])))) in LIMBS
+        ]
+        for row in range(len(crowded))
+    ]
+    owned: list[set[int]] = [set() for _ in places]
+    chosen = np.full((*lost.shape, len(rig)), -1)
+    for _ in range(1 + config.passes):
+        offers, shared = [], []
+        for person in range(len(places)):
+            for row in range(len(crowded)):
+                view, joint = int(crowded.view[row]), int(crowded.joint[row])
+                px = float(np.linalg.norm(xy[view, person, joint] - crowded.xy[row]))
+                metres = px * depth[view, person, joint] / rig.focal_px[view]
+                mine = [other for other in near[row] if other in owned[person]]
+                joints = {int(crowded.joint[other]) for other in mine}
+                total = sum(listed.get((row, other), listed.get((other, row), 0.0)) for other in mine)
+                affinity = total / max(len(joints), 1)
+                if np.isnan(px):
+                    px = metres = np.inf
+                sure = sigma[person, joint]
+                score = np.exp(-0.5 * metres**2 / (config.near_m**2 + sure**2))
+                score += affinity if joints else config.least_affinity
+                gate = min(config.far_m + 2 * sure, config.farthest_m)
+                if lost[person, joint]:
+                    likely = metres < config.reach_m and bool(joints) and affinity >= config.least_affinity
+                else:
+                    likely = metres < gate and score >= 2 * config.least_affinity
+                if likely:
+                    offers.append((score, person, row))
+                if px < config.overlap_px and affinity >= config.least_affinity:
+                    shared.append((px, person, row))
+        chosen[:], used = -1, set()
+        for _, person, row in sorted(offers, key=lambda offer: -offer[0]):
+            slot = person, int(crowded.joint[row]), int(crowded.view[row])
+            if chosen[slot] < 0 and row not in used:
+                chosen[slot] = row
+                used.add(row)
+        owned = [set(each[each >= 0].tolist()) for each in chosen]
+    empty = chosen < 0
+    for _, person, row in sorted(shared, key=lambda each: -each[0]):
+        slot = person, int(crowded.joint[row]), int(crowded.view[row])
+        if empty[slot]:
+            chosen[slot] = row
+    return chosen
+
+
+@pytest.mark.parametrize(
+    "settings", [{}, {"passes": 1, "overlap_px": 60.0, "farthest_m": 0.2}, {"least_affinity": 0.0}]
+)
+def test_detections_are_taken_best_first_by_nearness_and_affinity(settings, predicted, crowded, five_cameras):
+    expected = assigned(*predicted, crowded, five_cameras, SimpleNamespace(**DEFAULTS | settings))
+    found = assign(*predicted, crowded, five_cameras, BODY_25, AssignmentConfig(**settings))
+    np.testing.assert_array_equal(found, expected)
+    assert (found >= 0).mean() > 0.5 and (found[predicted[2]] >= 0).any(), "lost joints are found, too"
+    wider = assign(*predicted, crowded, five_cameras, BODY_25, AssignmentConfig(overlap_px=1.0))
+    assert (wider != found).any() or "overlap_px" not in settings, "overlaps happen here"
+
+
+def test_the_own_share_is_of_places_in_front_of_a_camera_and_in_its_picture(
+    predicted, crowded, five_cameras, two_people
+):
+    """A detection that two people have is nobody's own."""
+    places, _, _ = predicted
+    places = np.concatenate(
+        [places, two_people[:1] + np.array([0.0, 0.0, 1.5]), two_people[:1] + np.array([40.0, 0, 0])]
+    )
+    candidate = np.full((6, 25, 5), -1)
+    candidate[:4] = assign(*predicted, crowded, five_cameras, BODY_25, AssignmentConfig())
+    candidate[4] = np.where(np.arange(5) < 2, candidate[0], -1)
+    frame = Input(0, np.zeros(5), crowded, five_cameras)
+    share = _own_share(frame, candidate, places)
+    count = Counter(candidate[candidate >= 0].tolist())
+    xy, depth = five_cameras.project(places)
+    for person in range(6):
+        own = expected = 0
+        for view, joint in np.ndindex(5, 25):
+            width, height = five_cameras.image_sizes[view]
+            x, y = xy[view, person, joint]
+            if depth[view, person, joint] > 0 and 0 <= x < width and 0 <= y < height:
+                expected += 1
+                own += count[int(candidate[person, joint, view])] == 1 and candidate[person, joint, view] >= 0
+        assert share[person] == pytest.approx(own / max(expected, 1)), person
+    assert 0 < share[4] < share[1] or share[4] == 0
+    nobody = Input(0, np.zeros(5), crowded.only(np.zeros(len(crowded), dtype=bool)), five_cameras)
+    assert (_own_share(nobody, np.full((6, 25, 5), -1), places) == 0).all()
+
+
+@pytest.fixture
+def three(five_cameras, two_people, seen_exactly):
+    """A frame, and all detections of two people; a third is 15 cm beside the first and has none."""
+    detections = seen_exactly(five_cameras, two_people)
+    places = np.stack([*two_people, two_people[0] + [0.15, 0.0, 0.0]])
+    candidate = np.full((3, 25, 5), -1)
+    sure = np.full((2, 25), 0.02), np.zeros((2, 25), dtype=bool)
+    candidate[:2] = assign(two_people, *sure, detections, five_cameras, BODY_25, AssignmentConfig())
+    return Input(0, np.zeros(5), detections, five_cameras), candidate, places
+
+
+def test_who_has_too_little_or_is_a_double_goes(three):
+    frame, candidate, places = three
+    any_share = Survival(min_seen_twice=0, min_share=0.0)
+    assert _gone(frame, candidate, places, BODY_25, any_share).tolist() == [False, False, True], "a double"
+    closer = replace(any_share, double_m=0.14)
+    assert not _gone(frame, candidate, places, BODY_25, closer).any()
+    assert _gone(frame, candidate, places, BODY_25, replace(closer, min_share=0.01)).tolist() == [
+        False,
+        False,
+        True,
+    ]
+    # Five core joints that two views see, and more that one sees.
+    few = candidate.copy()
+    few[1, CORE[5:], 1:] = -1
+    assert _gone(frame, few, places, BODY_25, replace(closer, min_seen_twice=5)).tolist() == [False] * 2 + [True]
+    assert _gone(frame, few, places, BODY_25, replace(closer, min_seen_twice=6)).tolist() == [False] + [True] * 2
+    # Of two that have equally much the later one goes; who is not placed is nobody's double.
+    equal = np.stack([candidate[0], candidate[1], candidate[0]])
+    assert _gone(frame, equal, places, BODY_25, any_share).tolist() == [False, False, True]
+    lost = places.copy()
+    lost[2] = np.nan
+    assert not _gone(frame, candidate, lost, BODY_25, any_share).any()
+    part = places.copy()
+    part[2, CORE[:10]] = np.nan  # the distance is of the joints that both have
+    assert _gone(frame, candidate, part, BODY_25, any_share).tolist() == [False, False, True]
+
+
+def test_the_track_with_the_least_of_its_own_is_nobody(three):
+    """Over two frames: the mean share, and the mean of core joints that two views see, must both be too small."""
+    frame, candidate, places = three
+    half = candidate.copy()
+    half[1, CORE[7:], 1:] = -1  # 7 of 15 core joints are seen twice
+    half[1, [joint for joint in range(25) if joint not in CORE]] = -1
+    rows = [Observations.of(each, frame.detections, places) for each in (half, candidate)]
+    rows = [replace(each, track=np.array([4, 5, 6]), frame=np.full(3, n)) for n, each in enumerate(rows)]
+    both = Observations.concatenate(rows)
+    given = [frame, replace(frame, frame=1)]
+    assert _nobody(given, both, BODY_25, Lasting()) == 6
+    share = np.stack([_own_share(frame, each, places) for each in (half, candidate)]).mean(axis=0)
+    assert share[2] == 0 < share[1] < share[0]
+    alone = both.rows(np.flatnonzero(both.track != 6))
+    assert _nobody(given, alone, BODY_25, Lasting(min_share=share[1] + 0.01, min_seen_twice=11.1)) == 5
+    assert _nobody(given, alone, BODY_25, Lasting(min_share=share[1] - 0.01, min_seen_twice=11.1)) is None
+    assert _nobody(given, alone, BODY_25, Lasting(min_share=share[1] + 0.01, min_seen_twice=11.0)) is None
+
+
+def test_rows_without_a_joint_are_carried_by_motion_unless_they_must_survive(three, two_people):
+    """A third row whose joints are not known at all: kept without detections, or gone."""
+    frame, _, _ = three
+    joints = np.stack([*two_people, np.full((25, 3), np.nan)])
+    rows = Observations.of(np.full((3, 25, 5), -1), frame.detections, joints)
+    rows = replace(rows, track=np.array([4, 5, 6]), frame=np.zeros(3, dtype=int))
+    covariance = np.where(np.isnan(joints)[..., None], np.nan, 0.02**2 * np.eye(3))
+    kept = reassociate([frame], rows, joints, covariance, BODY_25, AssignmentConfig())
+    assert kept.track.tolist() == [4, 5, 6] and not kept.seen[2].any() and kept.seen[:2].all()
+    left = reassociate([frame], rows, joints, covariance, BODY_25, AssignmentConfig(), Survival())
+    assert left.track.tolist() == [4, 5]
+
+
+@pytest.mark.parametrize(
+    ("sigma_m", "away_m", "taken"),
+    [(0.0, 0.115, True), (0.0, 0.125, False), (0.2, 0.49, True), (0.2, 0.51, False)],
+)
+def test_nothing_farther_than_12_cm_and_two_sigma_or_half_a_metre_is_taken(
+    five_cameras, two_people, seen_exactly, sigma_m, away_m, taken
+):
+    """However well its limbs fit: a wrist that is beside where it is predicted."""
+    detections = seen_exactly(five_cameras, two_people[:1])
+    wrist = BODY_25.index("RWrist")
+    right = five_cameras.cTw[0, 0, :3]  # to the right in the first picture: there it is as long as it is
+    predicted = two_people[:1].copy()
+    predicted[0, wrist] += away_m * right
+    sigma = np.full((1, 25), 1e-6)
+    sigma[0, wrist] = sigma_m
+    lost = np.zeros((1, 25), dtype=bool)
+    found = assign(predicted, sigma, lost, detections, five_cameras, BODY_25, AssignmentConfig())
+    assert (found[0, wrist, 0] >= 0) == taken
+    assert (np.delete(found, wrist, axis=1) >= 0).all()
+
+
+def test_somebody_alone_in_a_frame_may_be_nobody(five_cameras, two_people, seen_exactly):
+    """Two metres beside the only one who is seen."""
+    detections = seen_exactly(five_cameras, two_people[:1])
+    frame = Input(0, np.zeros(5), detections, five_cameras)
+    joints = two_people[:1] + np.array([0.0, 2.0, 0.0])
+    rows = replace(
+        Observations.of(np.full((1, 25, 5), -1), detections, joints),
+        track=np.array([4]),
+        frame=np.zeros(1, dtype=int),
+    )
+    covariance = np.broadcast_to(0.02**2 * np.eye(3), (1, 25, 3, 3))
+    asked = [frame], rows, joints, covariance, BODY_25, AssignmentConfig()
+    assert len(reassociate(*asked)) == 1 and len(reassociate(*asked, Survival())) == 0
+
+
+@pytest.mark.parametrize(("away_m", "taken"), [(0.155, True), (0.165, False)])
+def test_detections_are_given_out_again_within_two_sigma(five_cameras, two_people, seen_exactly, away_m, taken):
+    """Sigma is of one axis, the root mean square of three: 2 cm here, so that the gate is 16 cm wide."""
+    detections = seen_exactly(five_cameras, two_people[:1])
+    wrist = BODY_25.index("RWrist")
+    joints = two_people[:1].copy()
+    joints[0, wrist] += away_m * five_cameras.cTw[0, 0, :3]
+    rows = replace(
+        Observations.of(np.full((1, 25, 5), -1), detections, joints),
+        track=np.array([4]),
+        frame=np.zeros(1, dtype=int),
+    )
+    covariance = np.broadcast_to(np.diag([0.0, 0.0012 - 0.0004, 0.0004]), (1, 25, 3, 3))
+    frame = Input(0, np.zeros(5), detections, five_cameras)
+    found = reassociate([frame], rows, joints, covariance, BODY_25, AssignmentConfig())
+    assert found.seen[0, wrist, 0] == taken
