@@ -73,7 +73,7 @@ def test_nobody_is_nobody():
     assert len(named) == 0
 
 
-def two_tracks(gap_s, apart_m, longer_m=0.0, rows=20, known=14) -> Traces:
+def two_tracks(gap_s, apart_m, longer_m=0.0, rows=20, known=14) -> Ends:
     """Two tracks of one second each; of 14 bones some are `known`, the second person's are `longer_m` longer."""
     time_s = np.concatenate([np.linspace(0, 1, rows), np.linspace(0, 1, rows) + 1 + gap_s])
     track = np.repeat([3, 7], rows)
@@ -82,8 +82,8 @@ def two_tracks(gap_s, apart_m, longer_m=0.0, rows=20, known=14) -> Traces:
     centre[rows:, 0] = apart_m + np.linspace(0.0, 5.0, rows)
     bones = np.where(track[:, None] == 3, 0.4, 0.4 + longer_m) * np.ones(14)
     bones[:, known:] = np.nan
-    order = np.random.default_rng(0).permutation(2 * rows)
-    return Traces(track[order], time_s[order], centre[order], bones[order])
+    parts = ((each, track == each) for each in (3, 7))
+    return Ends.of(Trace(each, time_s[mine], centre[mine], bones[mine]) for each, mine in parts)
 
 
 @pytest.mark.parametrize(
@@ -103,17 +103,17 @@ def two_tracks(gap_s, apart_m, longer_m=0.0, rows=20, known=14) -> Traces:
     ],
 )
 def test_how_long_how_far_and_how_alike(change, joined):
-    traces = two_tracks(**{"gap_s": 2.0, "apart_m": 1.0} | change)
-    assert stitch_traces(traces, StitchingConfig()) == {3: 3, 7: 3 if joined else 7}
+    ends = two_tracks(**{"gap_s": 2.0, "apart_m": 1.0} | change)
+    assert stitch_traces(ends, StitchingConfig()) == {3: 3, 7: 3 if joined else 7}
 
 
 def test_a_trace_is_the_centre_of_the_core_joints_that_are_known_and_the_core_bones(two_people):
     joints = np.stack([two_people[0], two_people[1]])
     core = list(BODY_25.core)
     joints[1, core[:4]] = np.nan
-    traces = Traces.of(np.array([1, 2]), np.zeros(2), joints, BODY_25)
-    np.testing.assert_allclose(traces.centre, [joints[0, core].mean(axis=0), joints[1, core[4:]].mean(axis=0)])
+    trace = Trace.of(1, np.zeros(2), joints, BODY_25)
+    np.testing.assert_allclose(trace.centre, [joints[0, core].mean(axis=0), joints[1, core[4:]].mean(axis=0)])
     lengths = [
         np.linalg.norm(joints[0, j] - joints[0, BODY_25.parents[j]]) for j in core if BODY_25.parents[j] in core
     ]
-    np.testing.assert_allclose(np.sort(traces.bones[0]), np.sort(lengths))
+    np.testing.assert_allclose(np.sort(trace.bones[0]), np.sort(lengths))
