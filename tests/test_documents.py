@@ -148,6 +148,8 @@ def test_files_that_are_named_exist(page):
 NOT_MEASURED_AGAIN = frozenset(
     {
         "ablation",
+        "alternation",
+        "covariances",
         "detector",
         "difficulty",
         "fitter",
@@ -158,11 +160,11 @@ NOT_MEASURED_AGAIN = frozenset(
         "fitter sigmas",
         "fitter speed",
         "fitter time",
-        "graph solver",
         "hip_views",
         "interactions",
         "iterations",
         "prior confidence",
+        "scenes",
         "sweeps",
     }
 )
