@@ -148,8 +148,6 @@ def test_files_that_are_named_exist(page):
 NOT_MEASURED_AGAIN = frozenset(
     {
         "ablation",
-        "alternation",
-        "covariances",
         "detector",
         "difficulty",
         "fitter",
@@ -161,7 +159,6 @@ NOT_MEASURED_AGAIN = frozenset(
         "fitter speed",
         "fitter time",
         "hip_views",
-        "interactions",
         "iterations",
         "prior confidence",
         "scenes",

@@ -1,6 +1,7 @@
 """`scripts/soak.py`: what it makes of its looks at a run, and a short run."""
 
 import importlib.util
+import re
 import sys
 from pathlib import Path
 
@@ -49,11 +50,15 @@ def test_rounds_are_judged(capsys, memory, frame_s, code, said):
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="looks at processes as Linux shows them")
 def test_a_short_run(tmp_path, capsys):
-    """144 frames of one person: so few that a busy machine may let them differ by half."""
-    words = "--frames 144 --loop 12 --people 1 --cameras 2 --batch-frames 24 --tolerance 0.5 --folder"
+    """144 frames of one person. Memory is judged, to 20 % because they are few; what a frame takes is only said:
+    that depends on what else the machine does.
+    """
+    words = "--frames 144 --loop 12 --people 1 --cameras 2 --batch-frames 24 --tolerance 100 --folder"
     assert soak.main([*words.split(), str(tmp_path)]) == 0
     out = capsys.readouterr().out
+    change = re.search(r"flat: [\d.]+ MB, changes by ([-+.\d]+) %", out)
+    assert change is not None and abs(float(change[1])) < 20
     assert "144 frames of 1 people and 2 cameras" in out
-    assert out.count("to frame") >= 4 and out.count("flat: ") == 2
+    assert out.count("to frame") >= 4 and " ms a frame, changes by " in out
     assert "reading: up to " in out and "ending: up to " in out
     assert (tmp_path / "out" / "people.npz").is_file()
