@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from shapepose_fg.io.calibration import Unit
     from shapepose_fg.io.pose2sim_project import Pose2SimProject
     from shapepose_fg.pipeline_config import PipelineConfig
-    from shapepose_fg.reconstruct_run import Ended
+    from shapepose_fg.reconstruct_outcome import Ended
 
 OUTPUTS = (PEOPLE, RUN, OBSERVATIONS, "cameras.json", "report.html")
 """The files that are left in the folder of results."""
@@ -157,9 +157,8 @@ def carry_out(
     """Reconstruct what is asked for into the folder `output`, or the project's, and say how it went.
 
     `workers`, `cluster`, `resume` and `restart` are the command's options. So many runs are `sharing` the cluster.
-    `watched` is a context that gives what
-    is told how many frames are done, a progress bar by default. InputError, one sentence, for what cannot be used;
-    `Stopped` on Ctrl-C or a request to end.
+    `watched` is a context that gives what is told how many frames are done, a progress bar by default. InputError,
+    one sentence, for what cannot be used; `Stopped` on Ctrl-C or a request to end.
     """
     from shapepose_fg.io.corrections import refuse_corrected
     from shapepose_fg.io.detections import read_detections

@@ -22,6 +22,7 @@ from shapepose_fg.pipeline import FRAMES_WORTH_A_WORKER, PipelineConfig, Progres
 from shapepose_fg.provenance import program_digest, versions
 from shapepose_fg.reconstruct_ending import Ending
 from shapepose_fg.reconstruct_inputs import known_shapes
+from shapepose_fg.reconstruct_outcome import Ended
 from shapepose_fg.reconstruct_summary import show_check
 from shapepose_fg.runs.known_people import checksum_at_start, people_at_start, write_people
 from shapepose_fg.runs.manifest import PARTS, end_run, frames_done, open_run
@@ -87,20 +88,6 @@ class Job:
             "versions": versions(),
             "program": program_digest(),
         }
-
-
-@dataclass(frozen=True)
-class Ended:
-    """What came of a job."""
-
-    frames: int
-    """How many frames were reconstructed."""
-    rows: int
-    """Rows of people.npz."""
-    people: int | None
-    """How many there are over time; None without time."""
-    warnings: tuple[str, ...]
-    """What looks wrong with cameras and detections."""
 
 
 def run_job(

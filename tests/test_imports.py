@@ -42,7 +42,7 @@ LEVELS = (
     "training export",
     "report",
     "evaluation",
-    "reconstruct_summary reconstruct_inputs",
+    "reconstruct_outcome reconstruct_summary reconstruct_inputs",
     "reconstruct_ending",
     "reconstruct_run",
     "reconstruct_request",

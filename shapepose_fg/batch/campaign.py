@@ -7,9 +7,10 @@ from pathlib import Path
 from time import monotonic
 from typing import Protocol
 
-from shapepose_fg.batch.leader import Assignment, Done, Leader
+from shapepose_fg.batch.leader import Assignment, Leader
 from shapepose_fg.batch.standing import Standing, Standings
 from shapepose_fg.batch.table import Entry
+from shapepose_fg.reconstruct_outcome import Ended
 from shapepose_fg.runs.manifest import PARTS
 
 ATTEMPTS = 2
@@ -106,7 +107,7 @@ class Campaign:
             watcher.frames(name, *told)
             return False
         leader.end()
-        if isinstance(told, Done):
+        if isinstance(told, Ended):
             standings.set(name, self._done(leader, told, standings))
             watcher.ended(name, failed=None, again=False)
         else:
@@ -115,6 +116,6 @@ class Campaign:
             watcher.ended(name, failed=told.reason, again=now.status == "waiting")
         return True
 
-    def _done(self, leader: Leader, found: Done, standings: Standings) -> Standing:
+    def _done(self, leader: Leader, found: Ended, standings: Standings) -> Standing:
         """How a recording stands that is done."""
         return standings.of[leader.assignment.name].done(found, monotonic() - leader.began)

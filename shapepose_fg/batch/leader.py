@@ -20,6 +20,7 @@ from typing import Any
 
 from shapepose_fg.batch.check import LOG
 from shapepose_fg.errors import InputError
+from shapepose_fg.reconstruct_outcome import Ended
 from shapepose_fg.reconstruct_request import Request, carry_out
 from shapepose_fg.stopping import Stopped, stoppable
 from shapepose_fg.terminal import use_any_streams
@@ -50,20 +51,6 @@ class Assignment:
 
 
 @dataclass(frozen=True)
-class Done:
-    """A recording is reconstructed."""
-
-    frames: int
-    """How many it has."""
-    rows: int
-    """Rows of people.npz."""
-    people: int | None
-    """How many there are over time; None without time."""
-    warnings: tuple[str, ...]
-    """What looks wrong with its cameras and detections."""
-
-
-@dataclass(frozen=True)
 class Failed:
     """A recording is not."""
 
@@ -81,7 +68,7 @@ class Leader:
         self.began = time.monotonic()
         """When it was started, by the clock of `time.monotonic`."""
         self.told, tell = spawn.Pipe(duplex=False)
-        """What it tells: (frames done, all frames), in the end `Done` or `Failed`."""
+        """What it tells: (frames done, all frames), in the end `Ended` or `Failed`."""
         held, self._lifeline = spawn.Pipe(duplex=False)
         self._process = spawn.Process(target=_lead, args=(assignment, tell, held), name=assignment.name)
         with what_workers_inherit():
@@ -89,7 +76,7 @@ class Leader:
         tell.close()
         held.close()
 
-    def next(self) -> tuple[int, int] | Done | Failed:
+    def next(self) -> tuple[int, int] | Ended | Failed:
         """What it tells next; `Failed` too where it has died."""
         try:
             return self.told.recv()
@@ -99,8 +86,8 @@ class Leader:
             how = f"was killed by signal {-code}" if code is not None and code < 0 else f"ended with code {code}"
             return Failed(f"its process {how}; there may be too little memory")
 
-    def end(self) -> Done | None:
-        """Wait for its end, or bring it about where it does not come; whether it was `Done` after all."""
+    def end(self) -> Ended | None:
+        """Wait for its end, or bring it about where it does not come; whether it was `Ended` after all."""
         self._process.join(_PATIENCE_S)
         if self._process.is_alive():
             self._process.kill()
@@ -109,7 +96,7 @@ class Leader:
         try:
             while self.told.poll():
                 told = self.told.recv()
-                found = told if isinstance(told, Done) else found
+                found = told if isinstance(told, Ended) else found
         except (EOFError, OSError):
             pass
         self.told.close()
@@ -134,7 +121,7 @@ def _lead(assignment: Assignment, tell: Connection, lifeline: Connection) -> Non
         print(f"stopped: {stop.message}", flush=True)
 
 
-def _carried_out(assignment: Assignment, tell: Callable[[int, int], None]) -> Done | Failed:
+def _carried_out(assignment: Assignment, tell: Callable[[int, int], None]) -> Ended | Failed:
     """The recording, reconstructed, or why it is not."""
 
     @contextmanager
@@ -142,7 +129,7 @@ def _carried_out(assignment: Assignment, tell: Callable[[int, int], None]) -> Do
         yield tell
 
     try:
-        ended = carry_out(
+        return carry_out(
             assignment.request,
             assignment.folder,
             cluster=assignment.cluster,
@@ -158,7 +145,6 @@ def _carried_out(assignment: Assignment, tell: Callable[[int, int], None]) -> Do
         traceback.print_exc()
         words = " ".join(str(error).split())[:300]
         return Failed(f"{type(error).__name__}: {words} (all of it in {assignment.folder / LOG})")
-    return Done(ended.frames, ended.rows, ended.people, ended.warnings)
 
 
 def _write_into(log: Path) -> None:

@@ -7,11 +7,11 @@ from typing import Any, Literal
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from shapepose_fg.batch.leader import Done
 from shapepose_fg.errors import InputError
 from shapepose_fg.files import read_json, write_atomically
 from shapepose_fg.io.validation import first_problem, key_text
 from shapepose_fg.provenance import versions
+from shapepose_fg.reconstruct_outcome import Ended
 
 BATCH = "batch.json"
 _FORMAT = "shapepose-fg batch 1"
@@ -37,7 +37,7 @@ class Standing:
     people: int | None = None
     warnings: tuple[str, ...] = ()
 
-    def done(self, found: Done, seconds: float) -> "Standing":
+    def done(self, found: Ended, seconds: float) -> "Standing":
         """After it was done, in so many seconds."""
         seconds += self.seconds
         return replace(self, status="done", attempts=self.attempts + 1, seconds=seconds, **asdict(found))

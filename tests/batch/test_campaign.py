@@ -8,14 +8,15 @@ import pytest
 
 from shapepose_fg.batch import campaign as module
 from shapepose_fg.batch.campaign import Campaign
-from shapepose_fg.batch.leader import Assignment, Done, Failed, Leader
+from shapepose_fg.batch.leader import Assignment, Failed, Leader
 from shapepose_fg.batch.standing import Standing, Standings, read_standings
 from shapepose_fg.batch.table import Entry
 from shapepose_fg.errors import InputError
+from shapepose_fg.reconstruct_outcome import Ended
 from shapepose_fg.reconstruct_request import Request
 from shapepose_fg.stopping import Stopped
 
-DONE = Done(10, 20, 2, ("cam1 is late",))
+DONE = Ended(10, 20, 2, ("cam1 is late",))
 
 
 class Stage:
@@ -23,7 +24,7 @@ class Stage:
 
     def __init__(self) -> None:
         self.begun: list[Assignment] = []
-        self.ends: dict[str, list[Done | Failed]] = {}
+        self.ends: dict[str, list[Ended | Failed]] = {}
         self.heard: list[tuple] = []
         self.together = 0
         self.alive = 0
@@ -64,7 +65,7 @@ class FakeLeader:
         if self.asked and self.told.poll():
             while self.told.poll():
                 last = self.told.recv()
-            return last if isinstance(last, Done) else None
+            return last if isinstance(last, Ended) else None
         return None
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+from shapepose_fg.camera import Rig
 from shapepose_fg.evaluation.alone_beside_time import beside
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
 from shapepose_fg.evaluation.experiments.others import SHELF_FPS
@@ -18,6 +19,7 @@ from shapepose_fg.evaluation.shelf_events import identity_switches, lost_limbs, 
 from shapepose_fg.evaluation.single_person import FPS, measure_single_person
 from shapepose_fg.frame_times import FrameTimes
 from shapepose_fg.io.calibration import read_rig
+from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.pipeline import PipelineConfig, reconstruct
 
@@ -77,12 +79,10 @@ _MODES = {"with time": True, "without time": False}
 
 
 def _shelf(scale: Scale, temporal: bool) -> Figures:
-    folder = _there(scale.shelf)
-    rig = read_rig(folder / "calibration.json")
-    recording = read_detections(folder, rig)
+    rig, recording = _shelf_recording(scale)
     config = replace(PipelineConfig(), temporal=temporal)
     people = reconstruct(recording, rig, config, frames=_frames(scale, len(recording)))
-    truth = read_shelf_ground_truth(folder / "gt_dev.txt")
+    truth = read_shelf_ground_truth(_there(scale.shelf) / "gt_dev.txt")
     matched = match_actors(people, truth)
     return {
         "average": evaluate_shelf(people, truth).pcp_average,
@@ -107,9 +107,7 @@ def _events_table(found: Mapping[str, Figures]) -> list[str]:
 
 
 def _views(scale: Scale) -> Figures:
-    folder = _there(scale.shelf)
-    rig = read_rig(folder / "calibration.json")
-    recording = read_detections(folder, rig)
+    rig, recording = _shelf_recording(scale)
     frames = _frames(scale, len(recording))
     config = PipelineConfig()
     solve: Callable = partial(reconstruct, config=config, frames=frames)
@@ -132,9 +130,7 @@ def _view_table(found: Mapping[str, Figures]) -> list[str]:
 
 
 def _single(scale: Scale, temporal: bool) -> Figures:
-    folder = _there(scale.pose2sim_single)
-    rig = read_rig(folder / "rig.json")
-    recording = read_detections(folder / "openpose", rig)
+    rig, recording = _single_recording(scale)
     times = FrameTimes.from_fps(FPS, len(recording))
     config = replace(PipelineConfig(), temporal=temporal)
     people = reconstruct(recording, rig, config, frames=_frames(scale, len(recording)), times=times)
@@ -146,24 +142,24 @@ def _single_table(found: Mapping[str, Figures]) -> list[str]:
     return [f"| pose2sim_single | {' | '.join(found)} |", rule(1 + len(found)), *rows]
 
 
-_FOOTAGE = ("Shelf", "pose2sim_single")
+_FOOTAGE: dict[str, Callable[[Scale], tuple[tuple[Rig, DetectionTable], float]]] = {
+    "Shelf": lambda scale: (_shelf_recording(scale), SHELF_FPS),
+    "pose2sim_single": lambda scale: (_single_recording(scale), FPS),
+}
 _REACHES_M = (PipelineConfig().refine.draft_reach_m, 0.0)
 """`refine.draft_reach_m`: ours, and drafts without it."""
 
 
 def _beside(scale: Scale, name: str) -> Figures:
-    folder = _there(scale.shelf if name == "Shelf" else scale.pose2sim_single)
-    places = ("calibration.json", ".") if name == "Shelf" else ("rig.json", "openpose")
-    rig = read_rig(folder / places[0])
-    recording = read_detections(folder / places[1], rig)
-    times = FrameTimes.from_fps(SHELF_FPS if name == "Shelf" else FPS, len(recording))
+    (rig, recording), fps = _FOOTAGE[name](scale)
+    times = FrameTimes.from_fps(fps, len(recording))
     solve = partial(reconstruct, recording, rig, frames=_frames(scale, len(recording)), times=times)
-    timed, default = solve(config=PipelineConfig()), PipelineConfig()
-    figures: Figures = {}
+    default, figures = PipelineConfig(), {}
+    timed = solve(config=default)
+    wrists = [recording.skeleton.joints.index(joint) for joint in ("RWrist", "LWrist")]
     for reach_m in _REACHES_M:
         refine = replace(default.refine, draft_reach_m=reach_m)
         found = beside(solve(config=replace(default, temporal=False, refine=refine)), timed)
-        wrists = [recording.skeleton.joints.index(joint) for joint in ("RWrist", "LWrist")]
         figures[f"{reach_m:g}"] = {
             "share": 100 * found.share,
             "wrists": 100 * float(found.apart[wrists].sum() / max(found.seen[wrists].sum(), 1)),
@@ -184,6 +180,18 @@ def _beside_table(found: Mapping[str, Figures]) -> list[str]:
             cells += [f"{each['share']:.2f}", f"{each['wrists']:.1f}", f"{each['seen']}", f"{each['missing']}"]
         rows.append(f"| {name} | {' | '.join(cells)} |")
     return rows
+
+
+def _shelf_recording(scale: Scale) -> tuple[Rig, DetectionTable]:
+    folder = _there(scale.shelf)
+    rig = read_rig(folder / "calibration.json")
+    return rig, read_detections(folder, rig)
+
+
+def _single_recording(scale: Scale) -> tuple[Rig, DetectionTable]:
+    folder = _there(scale.pose2sim_single)
+    rig = read_rig(folder / "rig.json")
+    return rig, read_detections(folder / "openpose", rig)
 
 
 def _frames(scale: Scale, count: int) -> range:
