@@ -42,7 +42,7 @@ class BodyStep:
         """Bodies of some `rows` (K,) or of all, from the `last` ones (R) on."""
         groups = self.groups
         if rows is not None:
-            targets = JointTargets(targets.xyz[rows], targets.information[rows])
+            targets = targets.rows(rows)
             last, groups = last.rows(rows), None if groups is None else groups[rows]
         if self.config.refine.leave_one_out:
             return self.fitter.fit(targets, last, groups)

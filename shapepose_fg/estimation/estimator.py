@@ -12,7 +12,14 @@ from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter
 from shapepose_fg.camera import Rig, Views
 from shapepose_fg.estimation.alternation import Solution, Window, alternate, final_bodies
 from shapepose_fg.estimation.body_step import joint_targets
-from shapepose_fg.estimation.draft import NARROWING, WholeFitter, drafted, limb_steps, smoothed_in_time
+from shapepose_fg.estimation.draft import (
+    NARROWING,
+    WholeFitter,
+    changed_targets,
+    drafted,
+    limb_steps,
+    smoothed_in_time,
+)
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.limb_lengths import limb_lengths, limbs_of, with_lengths
 from shapepose_fg.estimation.linearisation import (
@@ -138,14 +145,18 @@ class Estimator:
         evidence = linearise(observations, sigmas, X, views, config.observations)
         enough = (evidence.sigma_m <= config.refine.max_sigma_m).sum(axis=1) >= config.refine.min_joints
         whole = self.fitter.fit_whole if isinstance(self.fitter, WholeFitter) else self.fitter.fit
-        body = whole(joint_targets(evidence, enough))
+        fitted = joint_targets(evidence, enough)
+        body = whole(fitted)
         for wider in NARROWING if config.refine.draft_reach_m > 0 else ():
             around = np.where(body.ok[:, None, None], body.joints, X)
             reach_m = wider * config.refine.draft_reach_m
             evidence = linearise(observations, sigmas, around, views, config.observations, reach_m)
-            again = whole(joint_targets(evidence, enough))
+            targets = joint_targets(evidence, enough)
+            rows = changed_targets(fitted, targets)
+            again = whole(targets.rows(rows))
+            fitted = fitted.with_rows(rows, targets.rows(rows))
             placed = np.flatnonzero(again.ok)
-            body = body.with_rows(placed, again.rows(placed))
+            body = body.with_rows(rows[placed], again.rows(placed))
         return drafted(evidence, body, config.refine.contradiction)
 
     def _completed(self, X: NDArray[np.float64], observations: Observations, views: Views) -> NDArray[np.float64]:

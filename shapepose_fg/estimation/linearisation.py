@@ -203,11 +203,12 @@ def linearise(
         weight = kernel_weight(config.robust_kernel, far / sigma)
     else:
         weight = kernel_weight("geman_mcclure", far / (reach_m * px_per_m), 1.0)
-    weight = inlier * weight / sigma**2
-    jacobian = np.where(inlier[..., None, None], jacobian, 0.0)
-    weighted = jacobian * weight[..., None, None]
-    information = np.einsum("pqvki,pqvkj->pqij", weighted, jacobian)
-    gradient = np.einsum("pqvki,pqvk->pqi", weighted, np.where(inlier[..., None], residual, 0.0))
+    # Whitened rows of all views one below the other: A and b of least squares, zero where there is no inlier.
+    root, rows = (inlier * np.sqrt(weight) / sigma)[..., None], (*points.shape[:2], 2 * inlier.shape[2])
+    A = np.where(inlier[..., None, None], jacobian * root[..., None], 0.0).reshape(*rows, 3)
+    b = np.where(inlier[..., None], residual * root, 0.0).reshape(*rows, 1)
+    information = A.mT @ A
+    gradient = (A.mT @ b)[..., 0]
     return ViewEvidence(points, inlier, residual, information, gradient)
 
 

@@ -44,6 +44,16 @@ class JointTargets:
     def __len__(self) -> int:
         return len(self.xyz)
 
+    def rows(self, index: NDArray[np.intp]) -> "JointTargets":
+        """The rows `index` (R,)."""
+        return JointTargets(self.xyz[index], self.information[index])
+
+    def with_rows(self, index: NDArray[np.intp], other: "JointTargets") -> "JointTargets":
+        """The same, with the rows `index` (R,) from `other`."""
+        xyz, information = self.xyz.copy(), self.information.copy()
+        xyz[index], information[index] = other.xyz, other.information
+        return JointTargets(xyz, information)
+
 
 @dataclass(frozen=True)
 class BodyFit:
