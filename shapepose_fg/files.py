@@ -68,9 +68,7 @@ def read_text(path: Path, *, may_be_empty: bool = False, most: int = LARGE) -> s
     try:
         text = read_bytes(path, most).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(
-            f"{path}: byte {error.start} is not UTF-8 text; check that this is the file that you mean"
-        ) from None
+        raise not_text(path, error.start) from None
     if not may_be_empty and not text.strip():
         raise InputError(f"{path}: the file is empty; write or copy it again")
     return text
@@ -83,18 +81,33 @@ def read_json(path: Path, *, most: int = LARGE) -> Any:
     """
     text = read_text(path, most=most)
     try:
-        value = json.loads(text, object_pairs_hook=lambda pairs: _unique(pairs, path))
+        value = json.loads(text, object_pairs_hook=lambda pairs: unique_keys(pairs, path))
     except json.JSONDecodeError as error:
-        cut = " (the file ends too early)" if error.pos >= len(text.rstrip()) else ""
-        raise InputError(
-            f"{path}: line {error.lineno} column {error.colno} is not JSON: {error.msg}{cut};"
-            " correct it there or write the file again"
-        ) from None
+        raise not_json(path, error.lineno, error.colno, error.msg, cut=error.pos >= len(text.rstrip())) from None
     except InputError:
         raise
     except (ValueError, RecursionError) as error:  # an integer of 5,000 digits, or 10,000 open brackets
         raise InputError(f"{path}: cannot be read as JSON ({error}); write the file again") from None
-    return bounded(value, path, numbers=_LONG_NUMBER.search(text) is not None)
+    return bounded(value, path, numbers=has_long_number(text))
+
+
+def not_text(path: Path, byte: int) -> InputError:
+    """An error about a file whose `byte` is none of UTF-8 text."""
+    return InputError(f"{path}: byte {byte} is not UTF-8 text; check that this is the file that you mean")
+
+
+def not_json(path: Path, line: int, column: int, problem: str, *, cut: bool) -> InputError:
+    """An error about JSON text, at a line and column from 1; `cut` says that the text ends there."""
+    ends = " (the file ends too early)" if cut else ""
+    return InputError(
+        f"{path}: line {line} column {column} is not JSON: {problem}{ends};"
+        " correct it there or write the file again"
+    )
+
+
+def has_long_number(text: str, start: int = 0, stop: int | None = None) -> bool:
+    """Whether some number of a JSON text may have more than 64 bits."""
+    return _LONG_NUMBER.search(text, start, len(text) if stop is None else stop) is not None
 
 
 def read_toml(path: Path, *, may_be_empty: bool = False) -> dict[str, Any]:
@@ -219,7 +232,7 @@ def _naming(path: Path) -> Iterator[None]:
         raise OSError(error.errno, error.strerror, str(path)) from error
 
 
-def _unique(pairs: list[tuple[str, Any]], path: Path) -> dict[str, Any]:
+def unique_keys(pairs: list[tuple[str, Any]], path: Path) -> dict[str, Any]:
     """An object's members, if no key occurs twice: JSON itself would keep the last one in silence."""
     members = dict(pairs)
     if len(members) < len(pairs):

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.errors import InputError
-from shapepose_fg.files import LARGE, check_size, open_regular
+from shapepose_fg.files import LARGE, check_size, not_text, open_regular
 
 _PIECE = 2**20
 """Bytes that are read at a time."""
@@ -39,9 +39,7 @@ def text_pieces(path: Path) -> Iterator[str]:
             try:
                 text = piece.decode("utf-8-sig" if at == 0 else "utf-8")
             except UnicodeDecodeError as error:
-                raise InputError(
-                    f"{path}: byte {at + error.start} is not UTF-8 text; check that this is the file that you mean"
-                ) from None
+                raise not_text(path, at + error.start) from None
             at, empty = at + len(piece), empty and not text.strip()
             if len(piece) > 0:
                 yield text

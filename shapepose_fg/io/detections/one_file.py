@@ -1,15 +1,20 @@
 """A JSON file per camera with all its frames: COCO's keypoint results, AlphaPose's, and MMPose's of a video."""
 
 import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import chain, islice
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError
 
 from shapepose_fg.errors import InputError
-from shapepose_fg.files import read_json
+from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock
+from shapepose_fg.io.json_items import JsonItems
 from shapepose_fg.io.validation import describe, first_problem, key_text
 
 _COCO, _ALPHAPOSE, _MMPOSE = "COCO's keypoint results", "AlphaPose's JSON", "MMPose's JSON of a video"
@@ -54,92 +59,154 @@ _RESULTS = TypeAdapter(list[_Result])
 _FRAMES = TypeAdapter(list[_VideoFrame])
 
 
-def is_one_file(value: Any) -> bool:
+_LISTS = ("annotations", "instance_info")
+"""Keys of the list where the file is an object: those of COCO's data sets and of MMPose."""
+_AT_ONCE = 1024
+"""Items that are checked together: as Python's numbers they take several times the memory of an array."""
+
+
+def is_one_file(path: Path) -> bool:
     """Whether a JSON file of one camera holds all its frames."""
-    if isinstance(value, dict):
-        return "instance_info" in value or "annotations" in value
-    return isinstance(value, list) and all(
-        isinstance(each, dict) and ("image_id" in each or "instances" in each) for each in value[:1]
-    )
+    items = JsonItems(path, _LISTS)
+    if not items.found:
+        return items.key is not None
+    return items.key is not None or _known(next(iter(items), {"image_id": None}))
 
 
 def read_one_file(path: Path) -> CameraPeople:
     """Read all frames that one camera saw; InputError naming file, key and cure."""
-    value = read_json(path)
-    if not is_one_file(value):
+    items = JsonItems(path, _LISTS)
+    if items.key is not None and not items.found:
+        raise InputError(f"{path}: the file must be a list, got {describe(items.value)}; {_RERUN[_COCO]}")
+    every = iter(items)
+    first = next(every, None)
+    if not items.found or (items.key is None and first is not None and not _known(first)):
+        found = "a list" if items.found else describe(items.value)
         raise InputError(
-            f"{path}: recognised as JSON ({describe(value)}), expected a list of people with image_id (COCO,"
+            f"{path}: recognised as JSON ({found}), expected a list of people with image_id (COCO,"
             " AlphaPose) or of frames with instances (MMPose); give one of these"
         )
-    if isinstance(value, dict) and "annotations" in value:
-        return _results(path, value["annotations"], _picture_names(value))
-    if isinstance(value, dict):
-        return _video(path, value["instance_info"])
-    if len(value) > 0 and "instances" in value[0]:
-        return _video(path, value)
-    return _results(path, value, {})
-
-
-def _results(path: Path, value: Any, names: dict[int, str]) -> CameraPeople:
-    """A list of people, each with the picture that it is of. Pictures without people are not in it."""
-    first = value[0] if isinstance(value, list) and len(value) > 0 else None
+    again = every if first is None else chain([first], every)
+    if items.key == "instance_info" or (isinstance(first, dict) and "instances" in first):
+        return _video(path, again)
     program = _ALPHAPOSE if isinstance(first, dict) and isinstance(first.get("image_id"), str) else _COCO
-    people = _validated(_RESULTS, value, path, program)
-    frames, rows = [], []
-    for index, person in enumerate(people):
-        if len(person.keypoints) % 3 != 0 or len(person.keypoints) == 0:
+    return _results(path, program, again, items.others)
+
+
+def _known(item: Any) -> bool:
+    """Whether this is an item of one of the programs' lists."""
+    return isinstance(item, dict) and ("image_id" in item or "instances" in item)
+
+
+@dataclass
+class _People:
+    """People as they are read, in arrays."""
+
+    path: Path
+    program: str
+    frames: list[NDArray[np.intp]] = field(default_factory=list)
+    """(n,) the frame of each, some at a time."""
+    keypoints: list[NDArray[np.float64]] = field(default_factory=list)
+    """(n, K, 3) theirs."""
+    counts: set[int] = field(default_factory=set)
+    """K of all so far."""
+
+    def add(self, frames: list[int], rows: list[list[float]]) -> None:
+        """Take in people with flat keypoints."""
+        self.counts |= {len(row) // 3 for row in rows}
+        if len(self.counts) > 1:
             raise InputError(
-                f"{path}: [{index}].keypoints must hold x, y and score of each keypoint, got"
-                f" {len(person.keypoints)} numbers; {_RERUN[program]}"
+                f"{self.path}: recognised as {self.program}, with people of"
+                f" {' and '.join(map(str, sorted(self.counts)))} keypoints; give the detections of one model"
             )
-        frames.append(_number(person.image_id, names, f"{path}: [{index}].image_id", program))
-        rows.append(person.keypoints)
-    return _camera(path, program, frames, rows, frames)
+        block = PeopleBlock.of(frames, rows)
+        self.frames.append(block.frame)
+        self.keypoints.append(block.keypoints)
 
-
-def _video(path: Path, value: Any) -> CameraPeople:
-    """A list of frames, each with its people."""
-    frames, rows, numbers = [], [], []
-    for index, frame in enumerate(_validated(_FRAMES, value, path, _MMPOSE)):
-        numbers.append(frame.frame_id)
-        for person in frame.instances:
-            if len(person.keypoints) != len(person.keypoint_scores):
-                raise InputError(
-                    f"{path}: [{index}].instances: {len(person.keypoints)} keypoints have"
-                    f" {len(person.keypoint_scores)} keypoint_scores; {_RERUN[_MMPOSE]}"
-                )
-            frames.append(frame.frame_id)
-            pairs = zip(person.keypoints, person.keypoint_scores, strict=True)
-            rows.append([number for (x, y), score in pairs for number in (x, y, score)])
-    return _camera(path, _MMPOSE, frames, rows, numbers)
-
-
-def _camera(
-    path: Path, program: str, frames: list[int], rows: list[list[float]], listed: list[int]
-) -> CameraPeople:
-    """The people `rows` in the order of their `frames`; `listed` are all frames that the file knows."""
-    counts = sorted({len(row) // 3 for row in rows})
-    if len(counts) > 1:
-        raise InputError(
-            f"{path}: recognised as {program}, with people of {' and '.join(map(str, counts))} keypoints; give the"
-            " detections of one model"
+    def camera(self, frames: NDArray[np.intp], listed: tuple[int, int]) -> CameraPeople:
+        """All of them, whose `frames` (N,) these are; `listed` are the first and last that the file knows."""
+        blocks = _in_order(frames, self.keypoints)
+        first, last = listed
+        return CameraPeople(
+            self.path, self.program, blocks, first, last, every_frame=False, rerun=_RERUN[self.program]
         )
-    every = PeopleBlock.of(frames, rows)
-    order = np.argsort(every.frame, kind="stable")
-    blocks = iter([PeopleBlock(every.frame[order], every.keypoints[order])])
-    first, last = (min(listed), max(listed)) if listed else (0, -1)
-    return CameraPeople(path, program, blocks, first, last, every_frame=False, rerun=_RERUN[program])
 
 
-def _validated(adapter: TypeAdapter, value: Any, path: Path, program: str) -> Any:
-    try:
-        return adapter.validate_python(value)
-    except ValidationError as error:
-        place, problem = first_problem(error)
-        raise InputError(f"{path}: {key_text(place)} {problem}; {_RERUN[program]}") from None
+def _in_order(frames: NDArray[np.intp], parts: list[NDArray[np.float64]]) -> Iterator[PeopleBlock]:
+    """People in the order of their frames (N,), some frames at a time; `parts` are their keypoints."""
+    if len(frames) == 0:
+        return
+    order = np.argsort(frames, kind="stable")
+    cuts = np.flatnonzero(np.diff(frames[order] // BLOCK_FRAMES)) + 1
+    starts = np.cumsum([0, *map(len, parts)])
+    for index in np.split(order, cuts):
+        part = np.searchsorted(starts, index, side="right") - 1
+        keypoints = np.empty((len(index), *parts[0].shape[1:]))
+        for n in np.unique(part).tolist():
+            keypoints[part == n] = parts[n][index[part == n] - starts[n]]
+        yield PeopleBlock(frames[index], keypoints)
 
 
-def _picture_names(value: dict[str, Any]) -> dict[int, str]:
+def _results(path: Path, program: str, items: Iterable[Any], others: Mapping[str, Any]) -> CameraPeople:
+    """A list of people, each with the picture that it is of. Pictures without people are not in it.
+
+    `others` has the pictures' names when all items have been read.
+    """
+    people, images = _People(path, program), list[int | str]()
+    for start, results in _checked(_RESULTS, items, path, program):
+        for index, person in enumerate(results, start):
+            if len(person.keypoints) % 3 != 0 or len(person.keypoints) == 0:
+                raise InputError(
+                    f"{path}: [{index}].keypoints must hold x, y and score of each keypoint, got"
+                    f" {len(person.keypoints)} numbers; {_RERUN[program]}"
+                )
+        images += [person.image_id for person in results]
+        people.add([0] * len(results), [person.keypoints for person in results])
+    names = _picture_names(others)
+    places = (f"{path}: [{index}].image_id" for index in range(len(images)))
+    numbers = [_number(image, names, place, program) for image, place in zip(images, places, strict=True)]
+    listed = (min(numbers), max(numbers)) if numbers else (0, -1)
+    return people.camera(np.array(numbers, dtype=np.intp), listed)
+
+
+def _video(path: Path, items: Iterable[Any]) -> CameraPeople:
+    """A list of frames, each with its people."""
+    people, first, last = _People(path, _MMPOSE), _MOST, -1
+    for start, found in _checked(_FRAMES, items, path, _MMPOSE):
+        frames, rows = list[int](), list[list[float]]()
+        for index, frame in enumerate(found, start):
+            first, last = min(first, frame.frame_id), max(last, frame.frame_id)
+            for person in frame.instances:
+                if len(person.keypoints) != len(person.keypoint_scores):
+                    raise InputError(
+                        f"{path}: [{index}].instances: {len(person.keypoints)} keypoints have"
+                        f" {len(person.keypoint_scores)} keypoint_scores; {_RERUN[_MMPOSE]}"
+                    )
+                frames.append(frame.frame_id)
+                pairs = zip(person.keypoints, person.keypoint_scores, strict=True)
+                rows.append([number for (x, y), score in pairs for number in (x, y, score)])
+        if len(rows) > 0:
+            people.add(frames, rows)
+    every = np.concatenate([np.zeros(0, dtype=np.intp), *people.frames])
+    return people.camera(every, (first, last) if last >= 0 else (0, -1))
+
+
+def _checked(
+    adapter: TypeAdapter[list[Any]], items: Iterable[Any], path: Path, program: str
+) -> Iterator[tuple[int, list[Any]]]:
+    """The items, some at a time, and the index of the first of them."""
+    items, start = iter(items), 0
+    while len(some := list(islice(items, _AT_ONCE))) > 0:
+        try:
+            yield start, adapter.validate_python(some)
+        except ValidationError as error:
+            (index, *place), problem = first_problem(error)
+            where = key_text((start + int(index), *place))
+            raise InputError(f"{path}: {where} {problem}; {_RERUN[program]}") from None
+        start += len(some)
+
+
+def _picture_names(value: Mapping[str, Any]) -> dict[int, str]:
     """Names of the pictures of a COCO data set by their ids."""
     images = value.get("images")
     if not isinstance(images, list) or not all(isinstance(each, dict) for each in images):

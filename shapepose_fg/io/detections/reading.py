@@ -6,7 +6,6 @@ from pathlib import Path
 
 from shapepose_fg.camera import Rig
 from shapepose_fg.errors import InputError
-from shapepose_fg.files import read_json
 from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.detections.association_text import read_association_text
 from shapepose_fg.io.detections.frame_files import frame_files, read_frame_files
@@ -78,7 +77,7 @@ def _camera(place: Path) -> CameraPeople:
     if place.is_file():
         return read_one_file(place)
     lists = [each for each in place.glob("*.json") if not each.name.startswith(".")]
-    if len(lists) == 1 and is_one_file(read_json(lists[0])):
+    if len(lists) == 1 and is_one_file(lists[0]):
         return read_one_file(lists[0])
     if len(frame_files(place)) == 0 and len(lists) > 1:
         names = " ".join(sorted(each.name for each in lists)[:4])

@@ -1,0 +1,221 @@
+"""The items of a list in a JSON file, decoded one at a time, so that the file may be larger than memory."""
+
+import codecs
+import json
+import os
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import Any
+
+from shapepose_fg.errors import InputError
+from shapepose_fg.files import (
+    LARGE,
+    MIDDLE,
+    bounded,
+    check_size,
+    has_long_number,
+    not_json,
+    not_text,
+    open_regular,
+    unique_keys,
+)
+
+_PIECE = 2**20
+"""Bytes that are read at a time."""
+_SPACE = " \t\n\r"
+_NEAR = 16
+"""Characters from the end of what was read: a mistake there may be a value that is cut, `\\u00` of `\\u00e9`."""
+
+
+class JsonItems:
+    """A JSON file that is a list, or an object with a list under one of some keys: its items, one after the other.
+
+    What is wrong with the file is an InputError as of `files.read_json`, raised when it is met.
+    """
+
+    def __init__(self, path: Path, keys: Collection[str]) -> None:
+        """Read up to the list's first item, or to the end where there is no such list."""
+        self.path = path
+        self.key: str | None = None
+        """The key under which the list is; None where the file is the list, or there is none."""
+        self.found = False
+        """Whether there is one."""
+        self.value: Any = None
+        """What is there instead: under the key, or as the whole file, an object without its values."""
+        self.others: dict[str, Any] = {}
+        """Values under other keys, those behind the list when all items have been read."""
+        self._text = _Text(path)
+        self._in_object = False
+        begin = self._text.peek()
+        if begin == "[":
+            self.found = True
+        elif begin == "{":
+            self.value, self._in_object = {}, True
+            self._text.skip("{")
+            if self._text.peek() == "}":
+                self._text.skip("}")
+                self._text.end()
+            else:
+                self._members(keys)
+        else:
+            self.value = self._text.value()
+            self._text.end()
+        if self.found:
+            self._text.skip("[")
+
+    def __iter__(self) -> Iterator[Any]:
+        """The items, once."""
+        if not self.found:
+            return
+        yield from self._listed()
+        if self._in_object and self._text.one_of(",}") == ",":
+            self._members(())
+        elif self._text.peek() != "":
+            self._text.end()
+
+    def _listed(self) -> Iterator[Any]:
+        text = self._text
+        if text.peek() == "]":
+            text.skip("]")
+            return
+        while True:
+            yield text.value()
+            if text.one_of(",]") == "]":
+                return
+
+    def _members(self, keys: Collection[str]) -> None:
+        """Take in keys and values of the object, to the list under one of `keys` or to the object's end."""
+        text = self._text
+        while True:
+            if text.peek() != '"':
+                raise text.refuse("Expecting property name enclosed in double quotes")
+            key = text.value()
+            text.one_of(":")
+            if key in self.others or key == self.key:
+                unique_keys([(key, None), (key, None)], self.path)
+            if key in keys:
+                self.key = key
+                self.found = text.peek() == "["
+                if self.found:
+                    return
+                self.value = text.value()
+            else:
+                self.others[key] = text.value()
+            if text.one_of(",}") == "}":
+                text.end()
+                return
+
+
+class _Text:
+    """A JSON text, of which only what has not been decoded is in memory."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._pieces = _decoded(path)
+        self._left, self._at = "", 0
+        self._lines, self._column = 0, 0
+        self._over = False
+        self._decoder = json.JSONDecoder(object_pairs_hook=lambda pairs: unique_keys(pairs, path))
+
+    def peek(self) -> str:
+        """The next character that is not white space; none at the end."""
+        while True:
+            while self._at < len(self._left) and self._left[self._at] in _SPACE:
+                self._at += 1
+            if self._at < len(self._left):
+                return self._left[self._at]
+            if not self._more():
+                return ""
+
+    def skip(self, character: str) -> None:
+        """Go on behind this character, which is the next."""
+        if self.peek() != character:
+            raise self.refuse(f"Expecting {character!r}")
+        self._at += 1
+
+    def one_of(self, characters: str) -> str:
+        """The next character, which must be one of these."""
+        found = self.peek()
+        if found == "" or found not in characters:
+            wanted = "',' delimiter" if "," in characters else "':' delimiter"
+            raise self.refuse(f"Expecting {wanted}")
+        self._at += 1
+        return found
+
+    def value(self) -> Any:
+        """The next value, decoded."""
+        self.peek()
+        while True:
+            try:
+                value, end = self._decoder.raw_decode(self._left, self._at)
+            except json.JSONDecodeError as error:
+                cut = error.msg.startswith("Unterminated string") or error.pos >= len(self._left) - _NEAR
+                if cut and self._more():
+                    continue
+                raise self.refuse(error.msg, error.pos) from None
+            except InputError:
+                raise
+            except (ValueError, RecursionError) as error:  # an integer of 5,000 digits, or 10,000 open brackets
+                raise InputError(f"{self._path}: cannot be read as JSON ({error}); write the file again") from None
+            number = isinstance(value, int | float) and end >= len(self._left) - len("e-")
+            if number and self._more():  # it may go on
+                continue
+            long = has_long_number(self._left, self._at, end)
+            self._at = end
+            return bounded(value, self._path, numbers=long)
+
+    def end(self) -> None:
+        """InputError where anything is left."""
+        if self.peek() != "":
+            raise self.refuse("Extra data")
+
+    def refuse(self, problem: str, at: int | None = None) -> InputError:
+        """An error at a place of what is in memory, by default where the next value begins."""
+        at = self._at if at is None else at
+        line = self._lines + self._left.count("\n", 0, at) + 1
+        begin = self._left.rfind("\n", 0, at)
+        column = at - begin if begin >= 0 else self._column + at + 1
+        return not_json(self._path, line, column, problem, cut=self._over and not self._left[at:].strip())
+
+    def _more(self) -> bool:
+        """Read on, as much again as there is; whether there was more. What is decoded is forgotten."""
+        left = len(self._left) - self._at
+        if left > MIDDLE:
+            line = self._lines + self._left.count("\n", 0, self._at) + 1
+            problem = f"one value has over {MIDDLE >> 20} MiB"
+            raise InputError(f"{self._path}: line {line}: {problem}; write the file again")
+        parts, wanted = [self._left[self._at :]], max(left, 1)
+        while wanted > 0 and (piece := next(self._pieces, None)) is not None:
+            parts.append(piece)
+            wanted -= len(piece)
+        if len(parts) == 1:
+            self._over = True
+            return False
+        done = self._left[: self._at]
+        breaks = done.count("\n")
+        self._lines += breaks
+        self._column = len(done) - 1 - done.rfind("\n") if breaks else self._column + len(done)
+        self._left, self._at = "".join(parts), 0
+        return True
+
+
+def _decoded(path: Path) -> Iterator[str]:
+    """The text of a file in pieces; InputError as of `files.read_text`."""
+    decoder, at, empty = codecs.getincrementaldecoder("utf-8-sig")(), 0, True
+    with open_regular(path) as stream:
+        check_size(path, os.fstat(stream.fileno()).st_size, LARGE)
+        while True:
+            read = stream.read(_PIECE)
+            check_size(path, at + len(read), LARGE)
+            waiting = len(decoder.getstate()[0])
+            try:
+                text = decoder.decode(read, final=len(read) == 0)
+            except UnicodeDecodeError as error:
+                raise not_text(path, at - waiting + error.start) from None
+            at, empty = at + len(read), empty and not text.strip()
+            if len(text) > 0:
+                yield text
+            if len(read) == 0:
+                break
+    if empty:
+        raise InputError(f"{path}: the file is empty; write or copy it again")
