@@ -14,9 +14,12 @@ from shapepose_fg.runs.chunks import cut_in_chunks
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.stopping import Stopped
 from shapepose_fg.tracking.following import FollowingConfig
+from shapepose_fg.windows import WindowConfig
 
-CONFIG = PipelineConfig(batch_frames=12, following=FollowingConfig(look_ahead_s=0.3))
-CUTS = (50,)
+CONFIG = PipelineConfig(
+    batch_frames=12, following=FollowingConfig(look_ahead_s=0.3), windows=WindowConfig(overlap_s=0.16)
+)
+CUTS = (30,)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -29,8 +32,8 @@ def short_warm_up():
 
 @pytest.fixture(scope="module")
 def scene():
-    """Three people before four cameras, 80 frames with a cut after 50."""
-    return built_in_scene(seed=3, people=3, cameras=4, frames=80)
+    """Two people before four cameras, 54 frames with a cut after 30."""
+    return built_in_scene(seed=3, people=2, cameras=4, frames=54)
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +77,7 @@ def test_a_dask_cluster_changes_no_byte_of_it(scene, recording, in_chunks):
 
 def test_a_run_in_chunks_that_was_stopped_goes_on(scene, recording, in_chunks, tmp_path):
     def stop(done: int, _: int) -> None:
-        if done >= 30:
+        if done >= 20:
             raise Stopped(15)
 
     arguments = {"cuts": CUTS, "chunk_frames": 12}
@@ -84,7 +87,7 @@ def test_a_run_in_chunks_that_was_stopped_goes_on(scene, recording, in_chunks, t
     found = reconstruct_parts(
         InFolder(tmp_path), recording, scene.rig, CONFIG, progress=lambda n, _: done.append(n), **arguments
     ).reconstruction()
-    assert done[0] > 30
+    assert done[0] > 20
     for name in ("joints", "covariance", "person", "body_pose", "frame"):
         equal_nan = name not in ("person", "frame")
         assert np.array_equal(getattr(found, name), getattr(in_chunks, name), equal_nan=equal_nan), name
