@@ -1,5 +1,6 @@
 """Files, read within bounds and with one clear error, and written whole or not at all."""
 
+import codecs
 import glob
 import json
 import os
@@ -16,6 +17,8 @@ from shapepose_fg.errors import InputError
 
 SMALL, MIDDLE, LARGE = 2**20, 2**26, 2**32
 """Bytes that a file may have: settings and tables of a few lines; cameras, or one frame; a recording."""
+PIECE = 2**20
+"""Bytes that are read at a time where a file may be larger than memory."""
 _MOST_DEPTH = 64
 """Lists in lists and objects in objects: no format goes a fifth as deep."""
 _MOST_DOTS = 100
@@ -72,6 +75,28 @@ def read_text(path: Path, *, may_be_empty: bool = False, most: int = LARGE) -> s
     if not may_be_empty and not text.strip():
         raise InputError(f"{path}: the file is empty; write or copy it again")
     return text
+
+
+def text_pieces(path: Path) -> Iterator[str]:
+    """Text of the UTF-8 file at `path` in pieces of up to `PIECE` bytes; InputError as of `read_text`."""
+    decoder, at, empty = codecs.getincrementaldecoder("utf-8-sig")(), 0, True
+    with open_regular(path) as stream:
+        check_size(path, os.fstat(stream.fileno()).st_size, LARGE)
+        while True:
+            read = stream.read(PIECE)
+            check_size(path, at + len(read), LARGE)
+            waiting = len(decoder.getstate()[0])
+            try:
+                text = decoder.decode(read, final=len(read) == 0)
+            except UnicodeDecodeError as error:
+                raise not_text(path, at - waiting + error.start) from None
+            at, empty = at + len(read), empty and not text.strip()
+            if len(text) > 0:
+                yield text
+            if len(read) == 0:
+                break
+    if empty:
+        raise InputError(f"{path}: the file is empty; write or copy it again")
 
 
 def read_json(path: Path, *, most: int = LARGE) -> Any:

@@ -1,27 +1,13 @@
 """The items of a list in a JSON file, decoded one at a time, so that the file may be larger than memory."""
 
-import codecs
 import json
-import os
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
 from shapepose_fg.errors import InputError
-from shapepose_fg.files import (
-    LARGE,
-    MIDDLE,
-    bounded,
-    check_size,
-    has_long_number,
-    not_json,
-    not_text,
-    open_regular,
-    unique_keys,
-)
+from shapepose_fg.files import MIDDLE, bounded, has_long_number, not_json, text_pieces, unique_keys
 
-_PIECE = 2**20
-"""Bytes that are read at a time."""
 _SPACE = " \t\n\r"
 _NEAR = 16
 """Characters from the end of what was read: a mistake there may be a value that is cut, `\\u00` of `\\u00e9`."""
@@ -111,7 +97,7 @@ class _Text:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._pieces = _decoded(path)
+        self._pieces = text_pieces(path)
         self._left, self._at = "", 0
         self._lines, self._column = 0, 0
         self._over = False
@@ -197,25 +183,3 @@ class _Text:
         self._column = len(done) - 1 - done.rfind("\n") if breaks else self._column + len(done)
         self._left, self._at = "".join(parts), 0
         return True
-
-
-def _decoded(path: Path) -> Iterator[str]:
-    """The text of a file in pieces; InputError as of `files.read_text`."""
-    decoder, at, empty = codecs.getincrementaldecoder("utf-8-sig")(), 0, True
-    with open_regular(path) as stream:
-        check_size(path, os.fstat(stream.fileno()).st_size, LARGE)
-        while True:
-            read = stream.read(_PIECE)
-            check_size(path, at + len(read), LARGE)
-            waiting = len(decoder.getstate()[0])
-            try:
-                text = decoder.decode(read, final=len(read) == 0)
-            except UnicodeDecodeError as error:
-                raise not_text(path, at - waiting + error.start) from None
-            at, empty = at + len(read), empty and not text.strip()
-            if len(text) > 0:
-                yield text
-            if len(read) == 0:
-                break
-    if empty:
-        raise InputError(f"{path}: the file is empty; write or copy it again")

@@ -5,6 +5,7 @@ import re
 
 import pytest
 
+from shapepose_fg import files
 from shapepose_fg.errors import InputError
 from shapepose_fg.files import read_json
 from shapepose_fg.io import json_items
@@ -28,7 +29,7 @@ PIECES = (1, 2, 3, 7, 50, 2**20)
 @pytest.fixture(params=PIECES)
 def piece(request, monkeypatch) -> int:
     """Bytes that are read at a time: every place of the files below is a border of two pieces once."""
-    monkeypatch.setattr(json_items, "_PIECE", request.param)
+    monkeypatch.setattr(files, "PIECE", request.param)
     return request.param
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import shapepose_fg.io.detections.number_stream as number_stream
+from shapepose_fg import files
 from shapepose_fg.detections import Recording
 from shapepose_fg.errors import InputError
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
@@ -62,7 +62,7 @@ def test_pieces_of_any_length_and_files_give_the_same(text, scene, once, tmp_pat
         given = once[frame % len(once)]
         np.testing.assert_allclose(np.sort(whole[frame].xy[:, 0]), np.sort(given.xy[:, 0]), atol=2e-3)
         np.testing.assert_allclose(np.sort(whole[frame].affinity), np.sort(given.affinity), atol=1e-6)
-    monkeypatch.setattr(number_stream, "_PIECE", 777)
+    monkeypatch.setattr(files, "PIECE", 777)
     kept = read_detections(text, scene.rig, kept=InFolder(tmp_path / "kept"))
     same(kept, whole)
     assert sorted(file.name for file in (tmp_path / "kept").iterdir()) == [
@@ -144,7 +144,7 @@ def test_the_line_of_a_mistake_is_told_wherever_it_is(text, scene, tmp_path, mon
     file.write_text("\n".join(lines) + "\n")
     said = []
     for piece in (2**20, 501):
-        monkeypatch.setattr(number_stream, "_PIECE", piece)
+        monkeypatch.setattr(files, "PIECE", piece)
         with pytest.raises(InputError) as caught:
             read_detections(tmp_path, scene.rig)
         said.append(str(caught.value))
@@ -158,7 +158,7 @@ def test_text_is_utf_8_and_may_have_a_mark_and_other_ends_of_lines(text, scene, 
     content = (text / "detection" / f"{name}.txt").read_bytes()
     for each in scene.rig.names:
         (tmp_path / f"{each}.txt").write_bytes((text / "detection" / f"{each}.txt").read_bytes())
-    monkeypatch.setattr(number_stream, "_PIECE", 4096)
+    monkeypatch.setattr(files, "PIECE", 4096)
     (tmp_path / f"{name}.txt").write_bytes(b"\xef\xbb\xbf" + content.replace(b"\n", b"\r\n"))
     same(read_detections(tmp_path, scene.rig), read_detections(text, scene.rig))
     (tmp_path / f"{name}.txt").write_bytes(content[:100_000] + b"\xff" + content[100_000:])
@@ -168,7 +168,7 @@ def test_text_is_utf_8_and_may_have_a_mark_and_other_ends_of_lines(text, scene, 
 
 def test_memory_does_not_grow_with_the_recording(scene, once, tmp_path, monkeypatch):
     """Three times the frames in as much memory."""
-    monkeypatch.setattr(number_stream, "_PIECE", 2**15)  # a tenth of a block
+    monkeypatch.setattr(files, "PIECE", 2**15)  # a tenth of a block
     peaks = []
     for blocks in (2, 6):
         folder = tmp_path / str(blocks)

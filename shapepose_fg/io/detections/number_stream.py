@@ -1,6 +1,5 @@
 """The numbers of a text file, read piece by piece, so that the file may be larger than memory."""
 
-import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -8,45 +7,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.errors import InputError
-from shapepose_fg.files import LARGE, check_size, not_text, open_regular
+from shapepose_fg.files import text_pieces
 
-_PIECE = 2**20
-"""Bytes that are read at a time."""
-_SPACE = b" \n\t"
+_LONGEST_WORD = 2**20
+"""No number is as long."""
+_SPACE = " \n\t"
 """Pieces end behind one of these, so that no number, letter or end of line is cut."""
 
 
-def text_pieces(path: Path) -> Iterator[str]:
-    """Text of the UTF-8 file at `path` in pieces that end at white space.
-
-    InputError as of `read_text`, where it is too large, no text, or empty.
-    """
-    at, empty, left = 0, True, b""
-    with open_regular(path) as stream:
-        check_size(path, os.fstat(stream.fileno()).st_size, LARGE)
-        while True:
-            read = stream.read(_PIECE)
-            check_size(path, at + len(left) + len(read), LARGE)
-            cut = 1 + max(read.rfind(space) for space in _SPACE)
-            if len(read) > 0 and cut == 0:
-                if len(left) < _PIECE:
-                    left += read
-                    continue
-                cut = len(read)  # no number is as long
-            piece, left = left + read[:cut], read[cut:]
-            if len(read) == 0:
-                piece, left = piece + left, b""
-            try:
-                text = piece.decode("utf-8-sig" if at == 0 else "utf-8")
-            except UnicodeDecodeError as error:
-                raise not_text(path, at + error.start) from None
-            at, empty = at + len(piece), empty and not text.strip()
-            if len(piece) > 0:
-                yield text
-            if len(read) == 0:
-                break
-    if empty:
-        raise InputError(f"{path}: the file is empty; write or copy it again")
+def _whole_words(path: Path) -> Iterator[str]:
+    """Text of the file at `path` in pieces that end at white space; InputError as of `files.text_pieces`."""
+    left = ""
+    for piece in text_pieces(path):
+        left += piece
+        cut = 1 + max(left.rfind(space) for space in _SPACE)
+        if cut == 0 and len(left) > _LONGEST_WORD:
+            cut = len(left)
+        if cut > 0:
+            yield left[:cut]
+            left = left[cut:]
+    if left:
+        yield left
 
 
 class NumberStream:
@@ -58,7 +39,7 @@ class NumberStream:
         """How many numbers were forgotten."""
         self.values: NDArray[np.float64] = np.zeros(0)
         """Numbers from the first that is not forgotten on."""
-        self._pieces = text_pieces(path)
+        self._pieces = _whole_words(path)
         self._most = path.stat().st_size // 2 + 1
 
     @property
@@ -109,7 +90,7 @@ class NumberStream:
     def _line(self, index: int | None) -> int:
         """The line, from 1, on which a number stands; None, and what is behind the last: the last line."""
         lines, numbers, last = 0, 0, 1
-        for text in text_pieces(self.path):
+        for text in _whole_words(self.path):
             counts = [len(line.split()) for line in text.splitlines()]
             ends = numbers + np.cumsum(counts)
             if index is not None and len(ends) > 0 and index < ends[-1]:
