@@ -1,6 +1,7 @@
 """Shared fixtures: where the real recordings are, cameras around a room, and people seen without error."""
 
 import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,10 @@ from numpy.typing import NDArray
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections
 from shapepose_fg.skeleton import BODY_25, Skeleton
+
+# Some tests import others from this folder, where `factors` is the folder of the library's tests: the project goes
+# first, for processes that are begun by a test, too.
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 # A person who stands with the arms a little out: BODY_25, metres, x to their left, z up, facing -y.
 STANDING = np.array(
