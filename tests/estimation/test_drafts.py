@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from shapepose_fg.body.fitting.fitters import BodyConfig, make_fitter
+from shapepose_fg.estimation import draft
 from shapepose_fg.estimation.estimator import Estimator
 from shapepose_fg.estimation.estimator_config import EstimatorConfig, RefineConfig
 from shapepose_fg.observations import Observations
@@ -57,3 +58,34 @@ def test_a_neighbour_s_leg_loses_its_hold_on_the_body(fitter):
         before, after = (ankle_errors(fitter, reach_m, alone) for reach_m in (0.0, 0.05))
         assert before.min() > 0.2
         assert after.mean() < 0.2 and np.median(after) < 0.15
+
+
+class Counting:
+    """A fitter that counts the rows that it is given."""
+
+    def __init__(self, fitter) -> None:
+        self.fitter, self.rows = fitter, []
+
+    def fit(self, targets, initial=None, groups=None):
+        return self.fitter.fit(targets, initial, groups)
+
+    def fit_whole(self, targets, initial=None):
+        self.rows.append(len(targets))
+        return self.fitter.fit_whole(targets, initial)
+
+
+def test_bodies_are_fitted_again_only_where_their_targets_have_changed(fitter, monkeypatch):
+    """Twenty rows, half of them with the neighbour's leg in three views: as when all are fitted every time."""
+    (disturbed, truth), count = with_a_neighbour_s_leg(True), len(FRAMES)
+    xy = np.moveaxis(SCENE.rig.project(truth + np.random.default_rng(1).normal(0, 5e-3, truth.shape))[0], 0, 2)
+    clean = replace(disturbed, xy=xy, track=disturbed.track + count)
+    rows, drafts, fitted = Observations.concatenate([disturbed, clean]), [], []
+    for moved_m in (draft.MOVED_M, -1.0):
+        monkeypatch.setattr(draft, "MOVED_M", moved_m)
+        counting = Counting(fitter)
+        drafts.append(Estimator(SCENE.rig, counting, BODY_25.joints).draft(rows)[0])
+        fitted.append(counting.rows)
+    assert fitted[1] == [2 * count] * (1 + len(draft.NARROWING))
+    # Measured: every disturbed row each time, a clean one never.
+    assert fitted[0][0] == 2 * count and all(count <= again < 1.5 * count for again in fitted[0][1:])
+    assert np.linalg.norm(drafts[0] - drafts[1], axis=-1).max() < 5e-3
