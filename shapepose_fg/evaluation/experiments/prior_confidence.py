@@ -97,23 +97,27 @@ def crosses(before: NDArray[np.float64], after: NDArray[np.float64]) -> float | 
 def draw_prior_confidence(figures: Mapping[str, Figures], file: Path) -> None:
     """The picture that goes with the table, in the manner of the paper's figure 5."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import NullFormatter, ScalarFormatter
 
     middle = [(a + b) / 2 for a, b in pairwise(BINS)]
-    figure = Figure(figsize=(7.2, 2.9), layout="constrained")
+    figure = Figure(figsize=(7.2, 3.8), layout="constrained")
     axes = dict(zip(CURVES, figure.subplots(1, 2, sharey=True), strict=True))
     for (world, setting), found in curves(figures).items():
         colour = "C0" if world == "own" else "C1"
         for (name, errors), style in zip(found.items(), ("o:", "D-"), strict=True):
             label = f"{name}; {WORLDS[world]}"
             axes[setting].plot(middle, errors, style, color=colour, label=label, markersize=4)
+    axes["paper"].axvline(PAPER_CROSSES, color="0.5", linewidth=0.8, label="where the paper's curves cross")
     for setting, each in axes.items():
         each.set_title(SETTINGS[setting], fontsize=9)
-        each.set_xlabel("mean confidence of the joint over all views")
+        each.set_xlabel("mean confidence of a joint over all views", fontsize=9)
         each.set_yscale("log")
-        each.grid(alpha=0.3, which="both")
-        each.legend(fontsize=6)
-    axes["paper"].set_ylabel("mean error, mm")
-    axes["paper"].axvline(PAPER_CROSSES, color="0.5", linewidth=0.8)
+        each.set_yticks([10, 20, 50, 100, 200, 500])
+        each.yaxis.set_major_formatter(ScalarFormatter())
+        each.yaxis.set_minor_formatter(NullFormatter())
+        each.grid(alpha=0.3)
+        each.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.18), frameon=False)
+    axes["paper"].set_ylabel("mean error, mm", fontsize=9)
     figure.savefig(file, dpi=130)
 
 
