@@ -5,7 +5,7 @@ A run of the built-in scene (300 frames) is made once without a fault. Then it i
 --kills 200   SIGKILL at random moments of the whole run, the writing of the results included. After each kill
               the windows that are kept must be those of the first run. It goes on with `--resume`, is killed
               again, and so on. In the end all files must be those of the first run, to the byte; of run.json
-              all but the times.
+              all but the times. With --once each run is killed once, and goes on to its end: a result a kill.
 --full 20     The disk is full at a random byte of what the run writes in all. It must end with one sentence and
               exit code 2; what it says is kept must be there, to the byte; an earlier result beside it must be
               whole or replaced whole; when there is room again `--resume` must end with the files of the first
@@ -47,6 +47,7 @@ def main() -> int:
     """Run what was asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=0, help="how many kills in all")
+    parser.add_argument("--once", action="store_true", help="kill each run once only")
     parser.add_argument("--full", type=int, default=0, help="how often the disk is full")
     parser.add_argument("--races", type=int, default=0, help="how many pairs of runs")
     parser.add_argument("--frames", type=int, default=300, help="frames of the recording")
@@ -89,7 +90,12 @@ def kill(
         while True:
             run = Run(command.into(out, *more), folder / "said")
             solved = len(parts(out)) == len(windows)
-            if kills + len(own) < arguments.kills and not (solved and rng.random() < 0.5):
+            if kills + len(own) >= arguments.kills or (arguments.once and len(own) > 0):
+                code = run.wait()
+            elif arguments.once:
+                run.wait(rng.uniform(0.0, watched.seconds))
+                code = run.kill()
+            elif not (solved and rng.random() < 0.5):
                 # A leg is a quarter of a run at the most, so that a run is killed all along its way.
                 run.wait(rng.uniform(0.0, 1.1 * watched.ending_s if solved else 0.25 * watched.seconds))
                 code = run.kill()
