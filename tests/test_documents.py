@@ -147,7 +147,6 @@ def test_files_that_are_named_exist(page):
 
 NOT_MEASURED_AGAIN = frozenset(
     {
-        "ablation",
         "detector",
         "difficulty",
         "fitter",
@@ -158,11 +157,7 @@ NOT_MEASURED_AGAIN = frozenset(
         "fitter sigmas",
         "fitter speed",
         "fitter time",
-        "hip_views",
-        "iterations",
-        "prior confidence",
         "scenes",
-        "sweeps",
     }
 )
 """Tables that are older than their marks can say; to be measured with the next change of a default."""
