@@ -19,7 +19,7 @@ from shapepose_fg.skeleton import BODY_25
 CONFIG = CandidateConfig()
 GATE_M, ANGLE_DEG, RHO_M = 0.07, 3.0, 0.12
 GROWTH = {"view_weight": 0.5, "sweeps": 2, "bridge_m": 0.55}
-PROPOSALS = {"box_horizontal_m": 1.0, "box_vertical_m": 1.2, "separation_m": 0.2, "min_own_views": 2}
+PROPOSALS = {"box_horizontal_m": 1.0, "box_vertical_m": 1.2, "separation_m": 0.2, "min_own_views": 0}
 """What is documented, so that another default is noticed."""
 
 

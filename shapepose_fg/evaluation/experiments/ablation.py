@@ -27,7 +27,6 @@ SWITCHES: dict[str, tuple[str, ...]] = {
     "what two views see is kept": ("candidates.weak", "candidates.min_view_fraction", "proposals.weak_anchors"),
     "60 % of the parts": ("proposals.min_parts",),
     "phantoms end early": (
-        "proposals.min_own_views",
         "proposals.min_grown_parts",
         "proposals.split_m",
         "association.min_observed_parts",
