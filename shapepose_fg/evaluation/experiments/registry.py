@@ -20,7 +20,7 @@ from shapepose_fg.evaluation.experiments.interactions import interactions
 from shapepose_fg.evaluation.experiments.iterations import iterations
 from shapepose_fg.evaluation.experiments.prior_confidence import prior_confidence
 from shapepose_fg.evaluation.experiments.proposals import hip_views, proposals
-from shapepose_fg.evaluation.experiments.scale import Scale
+from shapepose_fg.evaluation.experiments.scale import QUICK_FRAMES, Scale
 from shapepose_fg.evaluation.experiments.shelf_others import shelf_others
 from shapepose_fg.evaluation.experiments.smpl_only import smpl_only
 from shapepose_fg.evaluation.experiments.sweeps import sweeps
@@ -76,10 +76,9 @@ def _shelf(scale: Scale) -> Iterator[Experiment]:
 
 def _scenes(scale: Scale) -> Iterator[Experiment]:
     """The built-in scene, every frame by itself."""
-    seeds = (scene_tables.DEMO, *scene_tables.SEEDS)
-    trials = [
-        scene_tables.Trial(seed, frames=10 if scale.quick else 60) for seed in seeds[: 2 if scale.quick else None]
-    ]
+    every = (scene_tables.DEMO, *scene_tables.SEEDS)
+    seeds, frames = (every[:2], QUICK_FRAMES) if scale.quick else (every, 60)
+    trials = [scene_tables.Trial(seed, frames=frames) for seed in seeds]
     yield whole("scenes", lambda: scene_tables.scene_table(trials))
     yield whole("alternation", lambda: scene_tables.alternation_table(trials))
     yield whole("covariances", lambda: scene_tables.covariance_table(trials))

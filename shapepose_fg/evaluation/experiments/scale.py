@@ -27,7 +27,7 @@ STRETCHES: dict[Split, dict[str, tuple[range, ...]]] = {
 }
 """Stretches of the named sequences without a cut, 300 frames each."""
 
-QUICK_FRAMES = 10
+QUICK_FRAMES = 6
 """Frames of the scene that a quick run takes."""
 
 
