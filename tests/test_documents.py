@@ -149,22 +149,16 @@ NOT_MEASURED_AGAIN = frozenset(
     {
         "ablation",
         "alternation",
-        "box",
-        "cameras",
-        "covariances",
         "detector",
         "difficulty",
         "fitter alternation",
         "foreign",
         "graph solver",
         "hip_views",
-        "interactions",
         "iterations",
         "prior confidence",
         "proposals",
-        "scenes",
         "sweeps",
-        "views",
     }
 )
 """Tables that are older than their marks can say; to be measured with the next change of a default."""
