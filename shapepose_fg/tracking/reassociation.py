@@ -47,6 +47,9 @@ class Lasting:
     min_seen_twice: float = 9.0
     """Whoever has this many core joints that two views see stays all the same: an upper body, which only two of
     many views may see."""
+    double_m: float = Survival.double_m
+    """Of two tracks that are nearer in more than half of the lesser one's frames, it is nobody: they share one
+    person's detections, and each may have enough of them."""
 
 
 def reassociate_over_time(
@@ -72,16 +75,32 @@ def reassociate_over_time(
 
 
 def _nobody(given: Sequence[Input], rows: Observations, skeleton: Skeleton, lasting: Lasting) -> int | None:
-    """The track with the least detections of its own, if it is nobody."""
-    share = np.zeros(len(rows))
+    """The track with the least detections of its own among those that are nobody, or somebody else's double."""
+    tracks, place, count = np.unique(rows.track, return_inverse=True, return_counts=True)
+    share, near = np.zeros(len(rows)), np.zeros((len(tracks), len(tracks)))
     for frame in given:
         index = np.flatnonzero(rows.frame == frame.frame)
         share[index] = _own_share(frame, rows.candidate[index], rows.initial[index])
+        near[np.ix_(place[index], place[index])] += _apart(rows.initial[index], skeleton) < lasting.double_m
     seen = (rows.seen.sum(axis=-1) >= 2)[:, list(skeleton.core)].sum(axis=1)
-    tracks, place, count = np.unique(rows.track, return_inverse=True, return_counts=True)
     means = [np.bincount(place, value, len(tracks)) / count for value in (share, seen)]
     few = (means[0] < lasting.min_share) & (means[1] < lasting.min_seen_twice)
+    few |= ((near > count[:, None] / 2) & _lesser(means[0])).any(axis=1)
     return int(tracks[np.where(few, means[0], np.inf).argmin()]) if few.any() else None
+
+
+def _apart(joints: NDArray[np.float64], skeleton: Skeleton) -> NDArray[np.float64]:
+    """(P, P) mean distance of people's core joints (P, J, 3), metres; infinite where none are known of both."""
+    core = list(skeleton.core)
+    distance = np.linalg.norm(joints[:, None, core] - joints[None, :, core], axis=-1)
+    known = np.isfinite(distance)
+    apart = np.where(known, distance, 0.0).sum(axis=-1) / np.maximum(known.sum(axis=-1), 1)
+    return np.where(known.any(axis=-1), apart, np.inf)
+
+
+def _lesser(value: NDArray[np.floating] | NDArray[np.integer]) -> NDArray[np.bool_]:
+    """(P, P) whether one has less of `value` (P,) than another; of equal ones the later has."""
+    return (value[:, None] < value) | ((value[:, None] == value) & np.tri(len(value), k=-1, dtype=bool))
 
 
 def reassociate(
@@ -140,13 +159,8 @@ def _gone(
     """(P,) who has too few detections of their own, or is a double of one who has more."""
     core = list(skeleton.core)
     seen = ((candidate >= 0).sum(axis=-1) >= 2)[:, core].sum(axis=1)
-    distance = np.linalg.norm(joints[:, None, core] - joints[None, :, core], axis=-1)
-    known = np.isfinite(distance)
-    apart = np.where(known, distance, 0.0).sum(axis=-1) / np.maximum(known.sum(axis=-1), 1)
-    apart = np.where(known.any(axis=-1), apart, np.inf)
-    lesser = (seen[:, None] < seen) | ((seen[:, None] == seen) & np.tri(len(seen), k=-1, dtype=bool))
     few = (seen < survival.min_seen_twice) | (_own_share(frame, candidate, joints) < survival.min_share)
-    return few | ((apart < survival.double_m) & lesser).any(axis=1)
+    return few | ((_apart(joints, skeleton) < survival.double_m) & _lesser(seen)).any(axis=1)
 
 
 def _own_share(frame: Input, candidate: NDArray[np.intp], joints: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from shapepose_fg.observations import Observations
 from shapepose_fg.skeleton import BODY_25
@@ -135,3 +136,21 @@ def test_of_two_tracks_on_one_person_the_lesser_goes_and_the_other_has_all(five_
     kept = reassociate_over_time(*asked, Lasting(min_share=0.9, min_seen_twice=26.0))
     assert kept.track.tolist() == [1]
     assert (kept.candidate >= 0).mean() > 0.9, "but for joints that are too far off"
+
+
+@pytest.mark.parametrize(("near", "left"), [(4, {4, 5}), (3, {4, 5}), (2, {4, 5, 6})])
+def test_a_track_that_is_in_somebody_else_s_place_for_most_of_a_window_is_their_double(
+    five_cameras, two_people, seen_exactly, near, left
+):
+    """8 cm beside the second person in `near` of four frames, and 60 cm in the others; all are seen."""
+    given, parts = [], []
+    for frame in range(4):
+        third = two_people[1] + [0.08 if frame < near else 0.6, 0.0, 0.0]
+        detections = seen_exactly(five_cameras, np.stack([*two_people, third]))
+        given.append(Input(frame, np.full(5, frame / 30), detections, five_cameras))
+        rows = Observations.of(np.full((3, 25, 5), -1), detections, np.stack([*two_people, third]))
+        parts.append(replace(rows, track=np.array([4, 5, 6]), frame=np.full(3, frame)))
+    rows = Observations.concatenate(parts)
+    covariance = np.broadcast_to(0.02**2 * np.eye(3), (len(rows), 25, 3, 3))
+    kept = reassociate_over_time(given, rows, rows.initial, covariance, BODY_25, AssignmentConfig())
+    assert set(kept.track.tolist()) == left
