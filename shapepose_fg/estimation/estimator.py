@@ -153,6 +153,8 @@ class Estimator:
             evidence = linearise(observations, sigmas, around, views, config.observations, reach_m)
             targets = joint_targets(evidence, enough)
             rows = changed_targets(fitted, targets)
+            if len(rows) == 0:
+                continue
             again = whole(targets.rows(rows))
             fitted = fitted.with_rows(rows, targets.rows(rows))
             placed = np.flatnonzero(again.ok)

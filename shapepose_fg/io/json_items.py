@@ -56,7 +56,7 @@ class JsonItems:
         yield from self._listed()
         if self._in_object and self._text.one_of(",}") == ",":
             self._members(())
-        elif self._text.peek() != "":
+        else:
             self._text.end()
 
     def _listed(self) -> Iterator[Any]:

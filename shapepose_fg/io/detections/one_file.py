@@ -104,14 +104,12 @@ class _People:
 
     path: Path
     program: str
-    frames: list[NDArray[np.intp]] = field(default_factory=list)
-    """(n,) the frame of each, some at a time."""
     keypoints: list[NDArray[np.float64]] = field(default_factory=list)
-    """(n, K, 3) theirs."""
+    """(n, K, 3), some people at a time."""
     counts: set[int] = field(default_factory=set)
     """K of all so far."""
 
-    def add(self, frames: list[int], rows: list[list[float]]) -> None:
+    def add(self, rows: list[list[float]]) -> None:
         """Take in people with flat keypoints."""
         self.counts |= {len(row) // 3 for row in rows}
         if len(self.counts) > 1:
@@ -119,13 +117,12 @@ class _People:
                 f"{self.path}: recognised as {self.program}, with people of"
                 f" {' and '.join(map(str, sorted(self.counts)))} keypoints; give the detections of one model"
             )
-        block = PeopleBlock.of(frames, rows)
-        self.frames.append(block.frame)
-        self.keypoints.append(block.keypoints)
+        if len(rows) > 0:
+            self.keypoints.append(np.array(rows, dtype=np.float64).reshape(len(rows), len(rows[0]) // 3, 3))
 
-    def camera(self, frames: NDArray[np.intp], listed: tuple[int, int]) -> CameraPeople:
-        """All of them, whose `frames` (N,) these are; `listed` are the first and last that the file knows."""
-        blocks = _in_order(frames, self.keypoints)
+    def camera(self, frames: list[int], listed: tuple[int, int]) -> CameraPeople:
+        """All of them, who are in these `frames` (N); `listed` are the first and last that the file knows."""
+        blocks = _in_order(np.array(frames, dtype=np.intp), self.keypoints)
         first, last = listed
         return CameraPeople(
             self.path, self.program, blocks, first, last, every_frame=False, rerun=_RERUN[self.program]
@@ -161,19 +158,19 @@ def _results(path: Path, program: str, items: Iterable[Any], others: Mapping[str
                     f" {len(person.keypoints)} numbers; {_RERUN[program]}"
                 )
         images += [person.image_id for person in results]
-        people.add([0] * len(results), [person.keypoints for person in results])
+        people.add([person.keypoints for person in results])
     names = _picture_names(others)
     places = (f"{path}: [{index}].image_id" for index in range(len(images)))
     numbers = [_number(image, names, place, program) for image, place in zip(images, places, strict=True)]
     listed = (min(numbers), max(numbers)) if numbers else (0, -1)
-    return people.camera(np.array(numbers, dtype=np.intp), listed)
+    return people.camera(numbers, listed)
 
 
 def _video(path: Path, items: Iterable[Any]) -> CameraPeople:
     """A list of frames, each with its people."""
-    people, first, last = _People(path, _MMPOSE), _MOST, -1
+    people, frames, first, last = _People(path, _MMPOSE), list[int](), _MOST, -1
     for start, found in _checked(_FRAMES, items, path, _MMPOSE):
-        frames, rows = list[int](), list[list[float]]()
+        rows = list[list[float]]()
         for index, frame in enumerate(found, start):
             first, last = min(first, frame.frame_id), max(last, frame.frame_id)
             for person in frame.instances:
@@ -185,10 +182,8 @@ def _video(path: Path, items: Iterable[Any]) -> CameraPeople:
                 frames.append(frame.frame_id)
                 pairs = zip(person.keypoints, person.keypoint_scores, strict=True)
                 rows.append([number for (x, y), score in pairs for number in (x, y, score)])
-        if len(rows) > 0:
-            people.add(frames, rows)
-    every = np.concatenate([np.zeros(0, dtype=np.intp), *people.frames])
-    return people.camera(every, (first, last) if last >= 0 else (0, -1))
+        people.add(rows)
+    return people.camera(frames, (first, last) if last >= 0 else (0, -1))
 
 
 def _checked(
