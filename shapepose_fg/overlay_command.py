@@ -1,10 +1,10 @@
 """The command `overlay`: a result drawn over the videos or pictures that it was made from."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel
     from shapepose_fg.camera import Rig
     from shapepose_fg.overlay.frames import Overlay
-    from shapepose_fg.reconstruction import Reconstruction
 
 # Everything else is imported inside the command: `--help` must not wait for it.
 
@@ -77,25 +76,26 @@ def overlay(
     from shapepose_fg.reconstruction import Reconstruction
 
     folder = results_folder(results)
-    people = Reconstruction.load(folder)
-    rig = read_rig(folder / CAMERAS)
-    drawn = _drawn_cameras(cameras, videos, rig)
-    pictures = pictures_of(people, rig, drawn, videos, detections, image_placement or [])
-    content = OverlayContent(skeletons=skeletons, bodies=bodies, detections=points)
-    if points and people.observations is None:
-        note(f"{folder}: there is no observations.npz, so no detections are drawn")
-    over = Overlay(people, rig, pictures, content, _body(people) if bodies else None)
-    length = max(len(used.places) for used, _ in pictures)
     if stills is not None and frames is not None:
         raise InputError("--stills and --frames: both say which frames; give one of them")
-    if stills is not None:
-        chosen, fps = _stills(stills, length), None
-    else:
-        chosen, fps = _recorded(people, length) if frames is None else frame_range(frames, length), _fps(people)
-    if len(chosen) == 0:
-        raise InputError(f"{folder}: none of its frames has a picture; give the videos that it was made from")
-    for path in _write(over, chosen, output or folder / "overlay", each, width, fps):
-        print(f"written  {path}")
+    with Reconstruction.open(folder) as people:
+        rig = read_rig(folder / CAMERAS)
+        drawn = _drawn_cameras(cameras, videos, rig)
+        pictures = pictures_of(people.run, rig, drawn, videos, detections, image_placement or [])
+        content = OverlayContent(skeletons=skeletons, bodies=bodies, detections=points)
+        if points and not people.observed:
+            note(f"{folder}: there is no observations.npz, so no detections are drawn")
+        over = Overlay(people, rig, pictures, content, _body(people.run) if bodies else None)
+        length = max(len(used.places) for used, _ in pictures)
+        if stills is not None:
+            chosen, fps = _stills(stills, length), None
+        else:
+            chosen = _recorded(people.run, length) if frames is None else frame_range(frames, length)
+            fps = _fps(people.run)
+        if len(chosen) == 0:
+            raise InputError(f"{folder}: none of its frames has a picture; give the videos that it was made from")
+        for path in _write(over, chosen, output or folder / "overlay", each, width, fps):
+            print(f"written  {path}")
 
 
 def _drawn_cameras(text: str | None, videos: Sequence[str] | None, rig: "Rig") -> list[str]:
@@ -112,25 +112,25 @@ def _drawn_cameras(text: str | None, videos: Sequence[str] | None, rig: "Rig") -
     return names
 
 
-def _body(people: "Reconstruction") -> "BodyModel":
+def _body(run: Mapping[str, Any]) -> "BodyModel":
     """The model that the bodies of a result are of."""
     from shapepose_fg.body.model.body_model import BodyModel
 
-    file = people.run.get("body")
+    file = run.get("body")
     return BodyModel.default() if file is None else BodyModel.load(Path(str(file)))
 
 
-def _recorded(people: "Reconstruction", length: int) -> range:
+def _recorded(run: Mapping[str, Any], length: int) -> range:
     """The frames that a result tells of, people in them or not."""
-    told = people.run.get("frames")
+    told = run.get("frames")
     if isinstance(told, list) and len(told) == 2 and all(isinstance(each, int) for each in told):
         return range(max(0, told[0]), min(told[1], length))
     return range(length)
 
 
-def _fps(people: "Reconstruction") -> float:
+def _fps(run: Mapping[str, Any]) -> float:
     """Frames a second of the video that is made."""
-    told = people.run.get("time")
+    told = run.get("time")
     rate = told.get("fps") if isinstance(told, dict) else None
     return float(rate) if isinstance(rate, int | float) and 0.1 <= rate <= 1000 else ASSUMED_FPS
 

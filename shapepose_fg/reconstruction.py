@@ -249,6 +249,7 @@ class OpenedReconstruction:
         """InputError where there is no result, or its files are of two runs."""
         file = path / PEOPLE if path.is_dir() else path
         self._observed: SavedTable | None = None
+        self._block = range(0), Reconstruction.empty()
         self._people = SavedTable(
             file,
             rows=Reconstruction.ROWS,
@@ -275,6 +276,18 @@ class OpenedReconstruction:
 
     def __len__(self) -> int:
         return len(self.frame)
+
+    @property
+    def observed(self) -> bool:
+        """Whether it is known what the rows were solved from."""
+        return self._observed is not None
+
+    def at(self, frame: int) -> Reconstruction:
+        """The people of one frame. The next ones come into memory with it, for whoever goes on to them."""
+        if frame not in self._block[0]:
+            block = range(frame, frame + _BLOCK)
+            self._block = block, self.frames(block.start, block.stop)
+        return self._block[1].at(frame)
 
     def frames(self, start: int, stop: int) -> Reconstruction:
         """Everybody in the frames from `start` to before `stop`."""
@@ -339,6 +352,8 @@ class OpenedReconstruction:
         return run
 
 
+_BLOCK = 128
+"""Frames that are read together by `OpenedReconstruction.at`; as many as detections are kept in."""
 _CURE = "give the people.npz of a reconstruction"
 _TYPES: dict[str, type] = {
     "frame": np.int64,

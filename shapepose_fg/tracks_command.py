@@ -175,7 +175,8 @@ def _correct(context: typer.Context, action: str, person: int, **more: int | Non
 
     folder = _folder(context.obj)
     if action == "split" and more["other"] is None:
-        more["other"] = free_number(Reconstruction.load(folder))
+        with Reconstruction.open(folder) as opened:
+            more["other"] = free_number(opened.person)
     edit = Edit(Action(action), person, **more)
     solve = _solver(folder)
     edited = correct(folder, edit, solve)

@@ -108,4 +108,4 @@ def _pictures(
         raise InputError("--videos: there is no cameras.json beside the result, so no picture has a place")
     named = {each.partition("=")[0].strip() for each in videos if "=" in each}
     drawn = [name for name in take.rig.names if name in named] or list(take.rig.names)
-    return pictures_of(take.people, take.rig, drawn, videos, None, image_placement)
+    return pictures_of(take.people.run, take.rig, drawn, videos, None, image_placement)

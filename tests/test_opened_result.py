@@ -88,6 +88,9 @@ def test_frames_and_people_are_those_of_the_whole(folder, result):
         for numbers in ([2], [0, 2], [9]):
             same(opened.people(numbers), result.rows(np.isin(result.person, numbers)))
         assert opened.people([1], observations=False).observations is None
+        # On, back, over the border of what is read at a time, and where nobody is.
+        for frame in (0, 1, 127, 128, 300, 5, 399, 1000):
+            same(opened.at(frame), result.at(frame))
         some, every = opened.thinned(most_rows=300)
         assert every == 4
         same(some, result.rows(result.frame % 4 == 0))

@@ -41,6 +41,7 @@ def export_result(
             frames=frames,
             persons=persons,
             identities=any(each.identities for each in formats),
+            observations=any(each.observations for each in formats),
         )
         job = Job(take, folder, body_file(take, body), markers, fill_gaps_s)
     done = {}

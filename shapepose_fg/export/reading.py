@@ -24,16 +24,18 @@ def read_take(
     frames: range | None = None,
     persons: tuple[int, ...] | None = None,
     identities: bool = True,
+    observations: bool = True,
 ) -> Take:
     """What of the result at `path` is exported; InputError, one sentence, where it cannot be.
 
-    `up` is asked for where there is no cameras.json beside people.npz. `frames` and `persons` choose rows.
+    `up` is asked for where there is no cameras.json beside people.npz. `frames` and `persons` choose rows;
+    `observations` says whether what they were solved from is read, too.
     """
     cameras = results_folder(path) / CAMERAS
     with Reconstruction.open(path) as opened:
         rig = read_rig(cameras) if cameras.is_file() else None
         axis = _up(up, rig, cameras)
-        people = opened.rows(chosen_rows(opened, path, frames, persons))
+        people = opened.rows(chosen_rows(opened, path, frames, persons), observations=observations)
     if frames is not None:
         people = people.with_run(frames=_covered(people, frames))
     try:

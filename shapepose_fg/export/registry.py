@@ -27,6 +27,8 @@ class Format:
     folder) -> Written` of an `OpenedReconstruction` and the rows of it (R,), None for all."""
     identities: bool = True
     """Whether it follows people over frames, and so needs a result over time."""
+    observations: bool = False
+    """Whether it shows what people were solved from."""
     rows: bool = False
     """Whether it holds the result's rows as they are, and is written without having them all in memory."""
 
@@ -55,7 +57,13 @@ FORMATS = {
         Format("glb", "moving bodies with their skin, for Blender and the web", "glb:write_glb"),
         Format("csv", "joints as a table", "table:write_csv", identities=False),
         Format("parquet", "all columns, for archives", "parquet:write_parquet", identities=False, rows=True),
-        Format("rrd", "everything on a timeline, for the rerun viewer", "rrd:write_rrd", identities=False),
+        Format(
+            "rrd",
+            "everything on a timeline, for the rerun viewer",
+            "rrd:write_rrd",
+            identities=False,
+            observations=True,
+        ),
     )
 }
 """By name. A format of your own is an entry here and a module beside this one."""

@@ -22,7 +22,7 @@ from shapepose_fg.overlay.drawing import (
     draw_skeletons,
 )
 from shapepose_fg.overlay.picture_view import PictureView
-from shapepose_fg.reconstruction import Known, Reconstruction, Status
+from shapepose_fg.reconstruction import Known, OpenedReconstruction, Reconstruction, Status
 from shapepose_fg.viewer.palette import colour_of
 
 if TYPE_CHECKING:
@@ -48,8 +48,8 @@ class OverlayContent:
 class Overlay:
     """A result over the pictures of some cameras."""
 
-    people: Reconstruction
-    """The result."""
+    people: OpenedReconstruction
+    """The result, as it was saved."""
     rig: Rig
     """Its cameras."""
     cameras: Sequence[tuple[CameraFootage, Footage]]

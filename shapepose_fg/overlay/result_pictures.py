@@ -1,7 +1,8 @@
 """Where the pictures of a result are, and which of them belongs to which of its frames."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -11,12 +12,11 @@ from shapepose_fg.io.footage.footage import Footage, open_footage
 from shapepose_fg.io.footage.given import placements_of
 from shapepose_fg.io.footage.places import find_footage
 from shapepose_fg.io.footage.used import FOOTAGE, CameraFootage, read_used_footage
-from shapepose_fg.reconstruction import Reconstruction
 from shapepose_fg.terminal import note, progress
 
 
 def pictures_of(
-    people: Reconstruction,
+    run: Mapping[str, Any],
     rig: Rig,
     drawn: Sequence[str],
     videos: Sequence[str] | None,
@@ -25,10 +25,11 @@ def pictures_of(
 ) -> list[tuple[CameraFootage, Footage]]:
     """The pictures of the cameras `drawn`, and which belongs to which frame.
 
-    They are those of `videos`, as the command line gives them, or else those that `detect` says it read: in its
-    folder `detections`, or beside the detections that the result was made from. InputError where they are missing.
+    `run` is what the result's run.json says. They are those of `videos`, as the command line gives them, or else
+    those that `detect` says it read: in its folder `detections`, or beside the detections that the result was made
+    from. InputError where they are missing.
     """
-    used = {each.name: each for each in _used_footage(people, detections)}
+    used = {each.name: each for each in _used_footage(run, detections)}
     if videos is not None:
         places = find_footage(videos, drawn)
         paths = dict(zip(drawn, places.paths, strict=True))
@@ -71,14 +72,14 @@ def pictures_of(
     return pairs
 
 
-def _used_footage(people: Reconstruction, detections: Path | None) -> list[CameraFootage]:
+def _used_footage(run: Mapping[str, Any], detections: Path | None) -> list[CameraFootage]:
     """What `detect` wrote of the pictures, beside the detections that the result was made from."""
     if detections is not None:
         file = detections / FOOTAGE if detections.is_dir() else detections
         if not file.is_file():
             raise InputError(f"{file}: there is no such file; give the folder that `shapepose-fg detect` wrote")
         return read_used_footage(file)
-    inputs = people.run.get("inputs")
+    inputs = run.get("inputs")
     for text in inputs if isinstance(inputs, dict) else ():
         file = Path(str(text)).parent / FOOTAGE
         if Path(str(text)).suffix == ".txt" and file.is_file():

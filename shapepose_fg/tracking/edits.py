@@ -83,9 +83,9 @@ class Edited:
         return {person: range(int(rows.min()), int(rows.max()) + 1) for person, rows in frames.items()}
 
 
-def free_number(people: Reconstruction) -> int:
-    """The number that a new identity gets."""
-    return int(people.person.max(initial=-1)) + 1
+def free_number(person: NDArray[np.integer]) -> int:
+    """The number that a new identity gets, where these are the rows' (N,)."""
+    return int(person.max(initial=-1)) + 1
 
 
 def apply(people: Reconstruction, edit: Edit) -> Edited:
@@ -229,7 +229,7 @@ def _refuse_taken(people: Reconstruction, edit: Edit) -> None:
         raise ValueError(f"{edit.other} cannot be a person's number; give one from 0")
     if (people.person == edit.other).any():
         raise ValueError(
-            f"{edit.other} is somebody already; give another number such as {free_number(people)}, or merge"
+            f"{edit.other} is somebody already; give another number such as {free_number(people.person)}, or merge"
             f" {edit.person} and {edit.other}"
         )
 

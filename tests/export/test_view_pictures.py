@@ -78,7 +78,7 @@ def test_pictures_are_logged_in_their_frames(filmed, result, tmp_path):
     rerun = pytest.importorskip("rerun")
     take = read_take(filmed, frames=range(FIRST, FIRST + 3))
     assert take.rig is not None
-    pictures = pictures_of(take.people, take.rig, ["cam0"], [f"cam0={filmed / 'cam0'}"], None, [])
+    pictures = pictures_of(take.people.run, take.rig, ["cam0"], [f"cam0={filmed / 'cam0'}"], None, [])
     stream, told = new_stream(), []
     stream.save(tmp_path / "pictures.rrd")
     log_pictures(stream, take, pictures, lambda done, total: told.append((done, total)))

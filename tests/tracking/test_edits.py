@@ -87,7 +87,7 @@ def test_split(people):
     edited = apply(people, Edit(Action.SPLIT, 1, 8, 12))
     assert frames_of(edited.people, 1) == list(range(12)) and frames_of(edited.people, 8) == list(range(12, 20))
     assert edited.spans == {1: range(12), 8: range(12, 20)}
-    assert free_number(people) == 8 and free_number(Reconstruction.empty()) == 0
+    assert free_number(people.person) == 8 and free_number(Reconstruction.empty().person) == 0
 
 
 def test_rename_changes_a_number_and_nothing_to_solve(people):
@@ -229,7 +229,7 @@ def test_any_corrections_keep_every_row_once_and_undo_one_by_one(people, seed):
         action = Action(rng.choice(list(Action)))
         person, other = (int(rng.choice(known)) for _ in range(2))
         if action in (Action.SPLIT, Action.RENAME):
-            other = free_number(states[-1])
+            other = free_number(states[-1].person)
         edit = Edit(
             action,
             person,
