@@ -49,10 +49,6 @@ from shapepose_fg.tracking.stitching import Ends, Trace, stitch
 from shapepose_fg.windows import Engine, Solved, Span
 from shapepose_fg.workers import Pool, Workers
 
-FRAMES_WORTH_A_WORKER = 200
-"""A recording must have this many for each worker: starting one takes some seconds of a core, and a window is a
-hundred frames."""
-
 Progress = Callable[[int, int], None]
 """Called with the number of frames that are done and the number of all."""
 

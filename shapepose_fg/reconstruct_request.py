@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 OUTPUTS = (PEOPLE, RUN, OBSERVATIONS, "cameras.json", "report.html")
 """The files that are left in the folder of results."""
+_FRAMES_WORTH_A_WORKER = 100
+"""A recording must have this many for each worker: a window is a hundred, and it is what is handed out."""
 
 # Everything else is imported inside the functions: `--help` must not wait for torch.
 
@@ -163,6 +165,7 @@ def carry_out(
     from shapepose_fg.io.corrections import refuse_corrected
     from shapepose_fg.io.detections import read_detections
     from shapepose_fg.provenance import ReadInputs, checksums
+    from shapepose_fg.workers import get_ready, suitable_workers
 
     config, body, shapes = request.config, request.body, request.shapes
     known = prepare(request, output)
@@ -179,6 +182,9 @@ def carry_out(
             span = project.span(len(recording))
         times = times_of(known.fps, timestamps, rig, len(recording))
         cuts = possible_cuts(request.cuts, len(recording))
+        count = suitable_workers(len(span), _FRAMES_WORTH_A_WORKER) if workers is None else workers
+        if count > 1 and cluster is None:
+            get_ready("shapepose_fg.pipeline")
         from shapepose_fg.reconstruct_ending import Ending
         from shapepose_fg.reconstruct_run import Job, run_job
 
@@ -197,5 +203,5 @@ def carry_out(
         ending = Ending(calibration, project, videos, report=request.report, check=request.check)
         watched = watched or (lambda: progress("reconstructing"))
         return run_job(
-            job, output, ending, workers=workers, cluster=cluster, resume=resume, restart=restart, watched=watched
+            job, output, ending, workers=count, cluster=cluster, resume=resume, restart=restart, watched=watched
         )

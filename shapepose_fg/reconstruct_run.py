@@ -18,7 +18,7 @@ from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.solved_setup import CAMERAS
 from shapepose_fg.kept_arrays import KeptArrays
-from shapepose_fg.pipeline import FRAMES_WORTH_A_WORKER, PipelineConfig, Progress, reconstruct_parts
+from shapepose_fg.pipeline import PipelineConfig, Progress, reconstruct_parts
 from shapepose_fg.provenance import program_digest, versions
 from shapepose_fg.reconstruct_ending import Ending
 from shapepose_fg.reconstruct_inputs import known_shapes
@@ -29,7 +29,6 @@ from shapepose_fg.runs.manifest import PARTS, end_run, frames_done, open_run
 from shapepose_fg.runs.room import check_room, expected_bytes
 from shapepose_fg.stopping import Stopped
 from shapepose_fg.terminal import note, show
-from shapepose_fg.workers import suitable_workers
 
 
 @dataclass(frozen=True)
@@ -95,7 +94,7 @@ def run_job(
     output: Path,
     ending: Ending,
     *,
-    workers: int | None,
+    workers: int,
     cluster: str | None,
     resume: bool,
     restart: bool,
@@ -128,7 +127,7 @@ def _run(
     output: Path,
     ending: Ending,
     kept: KeptArrays,
-    workers: int | None,
+    workers: int,
     cluster: str | None,
     watched: Callable[[], AbstractContextManager[Progress]],
 ) -> Ended:
@@ -138,7 +137,6 @@ def _run(
     if file is not None:
         known = people_at_start(kept, file, lambda: known_shapes(file, job.body))
     start = time.perf_counter()
-    count = suitable_workers(len(job.frames), FRAMES_WORTH_A_WORKER) if workers is None else workers
     with watched() as progress:
         result = reconstruct_parts(
             kept,
@@ -151,7 +149,7 @@ def _run(
             cuts=job.cuts,
             shapes=known,
             progress=progress,
-            workers=count,
+            workers=workers,
             cluster=cluster,
             chunk_frames=job.chunk_frames,
             sharing=job.sharing,

@@ -10,8 +10,11 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from multiprocessing import get_context, resource_tracker
-from typing import Any, Generic, Protocol, TypeVar
+from multiprocessing import forkserver, get_context, resource_tracker
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+
+if TYPE_CHECKING:
+    from multiprocessing.context import ForkServerContext, SpawnContext
 
 Shared = TypeVar("Shared")
 Given = TypeVar("Given", covariant=True)
@@ -57,10 +60,10 @@ class Workers(Generic[Shared]):
                     f"this cannot be sent to worker processes ({error}): define functions and classes of your own"
                     " at the top of a module, or use workers=1"
                 ) from error
-            spawn = get_context("spawn")
-            held, self._lifeline = spawn.Pipe(duplex=False)
+            context = processes(type(self._shared).__module__)
+            held, self._lifeline = context.Pipe(duplex=False)
             given: tuple[Any, ...] = (content, held)  # one end of a pipe, of one class or another by the system
-            self._pool = ProcessPoolExecutor(self.count, spawn, initializer=_begin, initargs=given)
+            self._pool = ProcessPoolExecutor(self.count, context, initializer=_begin, initargs=given)
             with what_workers_inherit():
                 for _ in range(self.count):  # the pool starts a process for each of its first jobs
                     self._pool.submit(_nothing)
@@ -97,6 +100,27 @@ class Workers(Generic[Shared]):
                 "a worker process ended before its work: there may be too little memory for so many; in a script,"
                 " call what takes `workers` below `if __name__ == '__main__':`"
             ) from error
+
+
+def processes(module: str) -> "SpawnContext | ForkServerContext":
+    """How further processes of this program start.
+
+    On Linux each is forked off a process that has imported `module` and done nothing else, so that loading takes
+    its seconds and its memory once; what was asked for first counts, as long as this process lives. Elsewhere,
+    where forks of loaded libraries are not safe, each imports what it needs.
+    """
+    if sys.platform != "linux":
+        return get_context("spawn")
+    context = get_context("forkserver")
+    context.set_forkserver_preload([module])
+    return context
+
+
+def get_ready(module: str) -> None:
+    """Have `module` imported where `processes` start, while this one does something else."""
+    if processes(module).get_start_method() == "forkserver":
+        with what_workers_inherit():
+            forkserver.ensure_running()
 
 
 def suitable_workers(items: int, worth: int) -> int:

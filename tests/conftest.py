@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections
 from shapepose_fg.skeleton import BODY_25, Skeleton
+from shapepose_fg.workers import get_ready
 
 # Some tests import others from this folder, where `factors` is the folder of the library's tests: the project goes
 # first, for processes that are begun by a test, too.
@@ -26,6 +27,12 @@ STANDING = np.array(
         [0.19, -0.12, 0.02], [0.12, 0.08, 0.03], [-0.14, -0.15, 0.02], [-0.19, -0.12, 0.02], [-0.12, 0.08, 0.03],
     ]
 )  # fmt: skip
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _torch_is_loaded_once_for_all_processes() -> None:
+    """Worker processes of any test are forked off one that has torch; the first test's would leave it out."""
+    get_ready("shapepose_fg.pipeline")
 
 
 @pytest.fixture(scope="session")

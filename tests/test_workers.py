@@ -2,6 +2,9 @@
 
 import os
 import signal
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
@@ -31,6 +34,35 @@ def test_what_cannot_be_sent_is_said_before_anything_starts():
         assert list(here.map(lambda _, item: item, [1])) == [1]
 
 
+def what_is_loaded(module: str, _: int) -> tuple[bool, int]:
+    return module in sys.modules, os.getppid()
+
+
+_READY = """
+import os
+from shapepose_fg.workers import Workers, get_ready
+from test_workers import what_is_loaded
+if __name__ == "__main__":
+    get_ready("wave")
+    for _ in range(2):
+        with Workers(2, "wave") as workers:
+            print(*next(workers.map(what_is_loaded, [1])), os.getpid())
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere each process imports what it needs")
+def test_processes_start_from_one_that_has_loaded_what_they_need(tmp_path):
+    """In an interpreter of its own: pytest has loaded everything."""
+    (tmp_path / "script.py").write_text(_READY)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([*sys.path, str(Path(__file__).parent)])}
+    words = [sys.executable, "script.py"]
+    said = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+    first, second = (line.split() for line in said.stdout.splitlines())
+    assert first == second, "both pools' processes have the same parent"
+    loaded, parent, script = first
+    assert loaded == "True" and parent != script
+
+
 @pytest.mark.parametrize("count", [0, -1])
 def test_no_workers_are_refused(count):
     with pytest.raises(ValueError, match="workers must be 1"):
@@ -42,7 +74,7 @@ def test_workers_pay_for_much_work_only(monkeypatch: pytest.MonkeyPatch):
     assert [suitable_workers(items, 100) for items in (0, 1, 60, 300, 3000)] == [1, 1, 1, 3, 8]
 
 
-def testwhat_workers_inherit_is_put_back(monkeypatch: pytest.MonkeyPatch):
+def test_what_workers_inherit_is_put_back(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
     with what_workers_inherit():

@@ -13,7 +13,6 @@ import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -24,8 +23,10 @@ from shapepose_fg.reconstruct_outcome import Ended
 from shapepose_fg.reconstruct_request import Request, carry_out
 from shapepose_fg.stopping import Stopped, stoppable
 from shapepose_fg.terminal import use_any_streams
-from shapepose_fg.workers import end_with, what_workers_inherit
+from shapepose_fg.workers import end_with, processes, what_workers_inherit
 
+_CARRIED_OUT_BY = "shapepose_fg.reconstruct_run"
+"""The module that has loaded what a leader needs."""
 _PATIENCE_S = 20.0
 """So long a leader may take to let go of its work."""
 
@@ -63,14 +64,14 @@ class Leader:
 
     def __init__(self, assignment: Assignment) -> None:
         """Start it."""
-        spawn = get_context("spawn")
+        context = processes(_CARRIED_OUT_BY)
         self.assignment = assignment
         self.began = time.monotonic()
         """When it was started, by the clock of `time.monotonic`."""
-        self.told, tell = spawn.Pipe(duplex=False)
+        self.told, tell = context.Pipe(duplex=False)
         """What it tells: (frames done, all frames), in the end `Ended` or `Failed`."""
-        held, self._lifeline = spawn.Pipe(duplex=False)
-        self._process = spawn.Process(target=_lead, args=(assignment, tell, held), name=assignment.name)
+        held, self._lifeline = context.Pipe(duplex=False)
+        self._process = context.Process(target=_lead, args=(assignment, tell, held), name=assignment.name)
         with what_workers_inherit():
             self._process.start()
         tell.close()
