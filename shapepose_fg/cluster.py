@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from shapepose_fg.errors import InputError
 from shapepose_fg.provenance import program_digest, versions
-from shapepose_fg.workers import what_workers_inherit
+from shapepose_fg.workers import get_ready, processes, what_workers_inherit
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -19,6 +19,8 @@ Shared = TypeVar("Shared")
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+_LOADED = ("shapepose_fg.pipeline", "distributed")
+"""Modules that have loaded what a process needs."""
 RETRIES = 2
 """So often an item whose process was lost, or that failed, is tried again."""
 _LEAST = 2
@@ -112,23 +114,26 @@ def local_cluster(count: int, *, dashboard: bool = False) -> Iterator[Scheduler]
     InputError where Dask is not installed. With `dashboard`, and bokeh installed, the scheduler has one.
     """
     _, LocalCluster = _dask()
+    import dask.config
+
     shown = dashboard and has_dashboard()
-    # One thread a process: GTSAM holds Python's lock, and Dask leaves linear algebra one by itself. Ctrl-C is for
-    # this process alone.
-    with what_workers_inherit(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # another port is taken where the dashboard's usual one is
-        cluster = LocalCluster(
-            n_workers=count,
-            threads_per_worker=1,
-            processes=True,
-            host="127.0.0.1",
-            dashboard_address="127.0.0.1:8787" if shown else None,
-            silence_logs=50,
-        )
-    try:
+    get_ready(*_LOADED)
+    method = processes(*_LOADED).get_start_method()
+    with dask.config.set({"distributed.worker.multiprocessing-method": method}), ExitStack() as opened:
+        # One thread a process: GTSAM holds Python's lock, and Dask leaves linear algebra one by itself. Ctrl-C is
+        # for this process alone.
+        with what_workers_inherit(), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # another port is taken where the dashboard's usual one is
+            cluster = LocalCluster(
+                n_workers=count,
+                threads_per_worker=1,
+                processes=True,
+                host="127.0.0.1",
+                dashboard_address="127.0.0.1:8787" if shown else None,
+                silence_logs=50,
+            )
+        opened.callback(cluster.close)
         yield Scheduler(cluster.scheduler_address, count, cluster.dashboard_link if shown else None)
-    finally:
-        cluster.close()
 
 
 def has_dashboard() -> bool:

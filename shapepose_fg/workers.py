@@ -102,23 +102,23 @@ class Workers(Generic[Shared]):
             ) from error
 
 
-def processes(module: str) -> "SpawnContext | ForkServerContext":
+def processes(*modules: str) -> "SpawnContext | ForkServerContext":
     """How further processes of this program start.
 
-    On Linux each is forked off a process that has imported `module` and done nothing else, so that loading takes
+    On Linux each is forked off a process that has imported `modules` and done nothing else, so that loading takes
     its seconds and its memory once; what was asked for first counts, as long as this process lives. Elsewhere,
     where forks of loaded libraries are not safe, each imports what it needs.
     """
     if sys.platform != "linux":
         return get_context("spawn")
     context = get_context("forkserver")
-    context.set_forkserver_preload([module])
+    context.set_forkserver_preload(list(modules))
     return context
 
 
-def get_ready(module: str) -> None:
-    """Have `module` imported where `processes` start, while this one does something else."""
-    if processes(module).get_start_method() == "forkserver":
+def get_ready(*modules: str) -> None:
+    """Have `modules` imported where `processes` start, while this one does something else."""
+    if processes(*modules).get_start_method() == "forkserver":
         with what_workers_inherit():
             forkserver.ensure_running()
 
