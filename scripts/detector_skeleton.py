@@ -23,10 +23,9 @@ from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import DetectionSequence
 from shapepose_fg.estimation.detector_offsets import confident_targets, spread_frames
+from shapepose_fg.evaluation.footage import shelf_footage
 from shapepose_fg.evaluation.matching import match_people
 from shapepose_fg.evaluation.metrics import joint_metrics
-from shapepose_fg.io.calibration import read_rig
-from shapepose_fg.io.detections import read_detections
 from shapepose_fg.observations import Observations
 from shapepose_fg.pipeline import PipelineConfig, find_people, reconstruct
 from shapepose_fg.simulation import DetectorConfig, built_in_scene, simulate
@@ -74,8 +73,8 @@ def _scene(
 
 def shelf(folder: Path) -> list[str]:
     """The distance between a joint's views and the body that is fitted to all other joints."""
-    rig = read_rig(folder / "calibration.json")
-    detections = read_detections(folder, rig)
+    recording = shelf_footage(folder)
+    rig, detections = recording.rig, recording.detections
     middle = len(detections) // 2
     halves = [_targets(detections, rig, first) for first in (0, middle)]
     rows = [

@@ -18,14 +18,13 @@ from marked_tables import IMAGES, ROOT
 
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.evaluation.experiments.scale import Scale, Stretch, shorter
+from shapepose_fg.evaluation.footage import shelf_footage
 from shapepose_fg.evaluation.pictures.choice import before_and_after, found, mean_error
 from shapepose_fg.evaluation.pictures.pages import draw_before_after, draw_failures, draw_lost_limbs
 from shapepose_fg.evaluation.shelf import ACTORS, match_actors
 from shapepose_fg.evaluation.shelf_events import lost_limbs
 from shapepose_fg.evaluation.shelf_ground_truth import read_shelf_ground_truth
-from shapepose_fg.io.calibration import read_rig
-from shapepose_fg.io.detections import read_detections
-from shapepose_fg.pipeline import PipelineConfig, reconstruct
+from shapepose_fg.pipeline import PipelineConfig
 from shapepose_fg.viewer import demo_picture
 
 FRAMES = 150
@@ -86,9 +85,9 @@ def failures(file: Path, stretches: list[Stretch]) -> None:
 
 def bodies_shelf(file: Path, folder: Path) -> None:
     """Shelf's middle frame of those with most people."""
-    rig = read_rig(folder / "calibration.json")
-    detections = read_detections(folder, rig)
-    people = reconstruct(detections, rig)
+    recording = shelf_footage(folder)
+    rig, detections = recording.rig, recording.detections
+    people = recording.reconstruct()
     count = np.bincount(people.frame, minlength=len(detections))
     full = np.flatnonzero(count == count.max())
     frame = int(full[len(full) // 2])
@@ -100,9 +99,9 @@ def bodies_shelf(file: Path, folder: Path) -> None:
 
 def lost(file: Path, folder: Path) -> None:
     """The limb of each actor on Shelf that is lost for longest."""
-    rig = read_rig(folder / "calibration.json")
-    detections = read_detections(folder, rig)
-    people = reconstruct(detections, rig)
+    recording = shelf_footage(folder)
+    rig, detections = recording.rig, recording.detections
+    people = recording.reconstruct()
     truth = read_shelf_ground_truth(folder / "gt_dev.txt")
     matched = match_actors(people, truth)
     longest = {}

@@ -29,10 +29,9 @@ from marked_tables import ROOT
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import DetectionSequence, Recording
 from shapepose_fg.evaluation.experiments.interactions import contacts
-from shapepose_fg.evaluation.experiments.others import FILTERED, RAW, SHELF_FPS, folder_name
+from shapepose_fg.evaluation.experiments.others import FILTERED, RAW, folder_name
 from shapepose_fg.evaluation.experiments.scale import Scale
-from shapepose_fg.io.calibration import read_rig
-from shapepose_fg.io.detections import read_detections
+from shapepose_fg.evaluation.footage import SHELF_FPS, shelf_footage
 from shapepose_fg.io.write_detections import write_openpose
 from shapepose_fg.skeleton import BODY_25
 
@@ -83,8 +82,8 @@ def main() -> None:
     scale = Scale(data=arguments.data, split=arguments.split)
     wanted = arguments.only or ["shelf", "salsa", "crossing", "crowd"]
     if "shelf" in wanted and scale.shelf is not None:
-        rig, output = read_rig(scale.shelf / "calibration.json"), arguments.output / "shelf"
-        run(python, read_detections(scale.shelf, rig), rig, SHELF_FPS, output, arguments.frames, SHELF)
+        shelf, output = shelf_footage(scale.shelf), arguments.output / "shelf"
+        run(python, shelf.detections, shelf.rig, SHELF_FPS, output, arguments.frames, SHELF)
     for stretch in contacts(scale) if scale.has_scenes else ():
         if stretch.name in wanted:
             output = arguments.output / folder_name(stretch)

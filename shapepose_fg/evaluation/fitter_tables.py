@@ -25,11 +25,10 @@ from shapepose_fg.evaluation.fitting_methods import (
     fits_per_second,
 )
 from shapepose_fg.evaluation.fitting_optimum import check_optimum
+from shapepose_fg.evaluation.footage import shelf_footage
 from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.metrics import joint_metrics
 from shapepose_fg.evaluation.shelf import evaluate_shelf, read_shelf_ground_truth
-from shapepose_fg.io.calibration import read_rig
-from shapepose_fg.io.detections import read_detections
 from shapepose_fg.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.reconstruction import Reconstruction
 from shapepose_fg.simulation import simulate
@@ -217,10 +216,9 @@ def alternation_table(motions: Path, shelf: Path | None) -> list[str]:
     fitters |= {method.name: method.make(None) for method in learned()[1:]}
     rows = []
     if shelf is not None:
-        truth, rig = read_shelf_ground_truth(shelf / "gt_dev.txt"), read_rig(shelf / "calibration.json")
-        detections = read_detections(shelf, rig)
+        truth, recording = read_shelf_ground_truth(shelf / "gt_dev.txt"), shelf_footage(shelf)
         for name, fitter in fitters.items():
-            people, ms = _reconstructed(detections, rig, config, fitter)
+            people, ms = _reconstructed(recording.detections, recording.rig, config, fitter)
             pcp = evaluate_shelf(people, truth).pcp_average
             rows.append(f"| Shelf | {name} | {pcp:.2f} | | | {ms:.1f} |")
     mocap = Mocap.load(motions)

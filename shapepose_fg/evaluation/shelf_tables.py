@@ -14,12 +14,11 @@ from shapepose_fg.estimation.body_step import disagreement, joint_targets
 from shapepose_fg.estimation.linearisation import linearise, observation_sigmas, triangulate
 from shapepose_fg.evaluation.alternation import before_refinement
 from shapepose_fg.evaluation.bodies import body_joints
+from shapepose_fg.evaluation.footage import shelf_footage
 from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.shelf import LIMB_NAMES, ShelfScore, evaluate_shelf, read_shelf_ground_truth
-from shapepose_fg.io.calibration import read_rig
-from shapepose_fg.io.detections import read_detections
 from shapepose_fg.observations import Observations
-from shapepose_fg.pipeline import PipelineConfig, find_people, reconstruct
+from shapepose_fg.pipeline import PipelineConfig, find_people
 from shapepose_fg.skeleton import BODY_25
 
 CONFIG = replace(PipelineConfig(), temporal=False)
@@ -36,13 +35,12 @@ OTHERS = (
 def shelf_steps(folder: Path) -> dict[str, ShelfScore]:
     """Scores on the Shelf recording: after stage I, of the bodies' joints, of the result without time and with."""
     truth = read_shelf_ground_truth(folder / "gt_dev.txt")
-    rig = read_rig(folder / "calibration.json")
-    detections = read_detections(folder, rig)
-    people = reconstruct(detections, rig, CONFIG)
-    before = before_refinement(detections, rig, CONFIG)
+    recording = shelf_footage(folder)
+    people = recording.reconstruct(CONFIG)
+    before = before_refinement(recording.detections, recording.rig, CONFIG)
     bodies = replace(people, joints=body_joints(people))
     steps = {"stage I alone": before, "bodies' joints": bodies, "**shapepose-fg, without time**": people}
-    steps["**shapepose-fg, with time**"] = reconstruct(detections, rig, replace(CONFIG, temporal=True))
+    steps["**shapepose-fg, with time**"] = recording.reconstruct(replace(CONFIG, temporal=True))
     return {name: evaluate_shelf(each, truth) for name, each in steps.items()}
 
 
@@ -138,8 +136,8 @@ def sigma_table(folder: Path) -> list[str]:
 @cache
 def shelf_observations(folder: Path) -> tuple[Rig, Observations, NDArray[np.float64], NDArray[np.float64]]:
     """Everybody on Shelf after stage I: rig, observations, their sigmas (P, J, V) and X_0 (P, J, 3)."""
-    rig = read_rig(folder / "calibration.json")
-    detections = read_detections(folder, rig)
+    recording = shelf_footage(folder)
+    rig, detections = recording.rig, recording.detections
     found = [find_people(detections[t], rig, detections.skeleton, CONFIG) for t in range(len(detections))]
     observations = Observations.concatenate(found)
     views = Views.of(rig)

@@ -13,6 +13,7 @@ from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import DetectionSequence
 from shapepose_fg.evaluation.bodies import body_joints
+from shapepose_fg.evaluation.footage import SINGLE_FPS
 from shapepose_fg.evaluation.trajectories import FOREARMS, WRISTS, limb_lengths
 from shapepose_fg.proposal.candidates import CandidateConfig, triangulate_pairs
 from shapepose_fg.reconstruction import Reconstruction
@@ -20,8 +21,6 @@ from shapepose_fg.skeleton import BODY_25
 
 Array = NDArray[np.float64]
 
-FPS = 60.0
-"""Frames a second of the videos."""
 MIDDLE_M = 1.5
 """Whoever is within this of the middle of the cameras, on the floor, is the man; metres."""
 BYSTANDER_M = np.array([-4.4, 0.4])
@@ -83,7 +82,7 @@ def measure_single_person(
     recording: DetectionSequence,
     rig: Rig,
     *,
-    fps: float = FPS,
+    fps: float = SINGLE_FPS,
     model: BodyModel | None = None,
 ) -> SinglePerson:
     """Measure a reconstruction of the recording; the man is whoever is in the middle of the cameras."""

@@ -7,20 +7,15 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from shapepose_fg.camera import Rig
 from shapepose_fg.evaluation.alone_beside_time import beside
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
-from shapepose_fg.evaluation.experiments.others import SHELF_FPS
 from shapepose_fg.evaluation.experiments.scale import Scale
+from shapepose_fg.evaluation.footage import Footage, shelf_footage, single_footage
 from shapepose_fg.evaluation.held_out_view import held_out
 from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.shelf import evaluate_shelf, match_actors, read_shelf_ground_truth
 from shapepose_fg.evaluation.shelf_events import identity_switches, lost_limbs, pcp_interval
-from shapepose_fg.evaluation.single_person import FPS, measure_single_person
-from shapepose_fg.frame_times import FrameTimes
-from shapepose_fg.io.calibration import read_rig
-from shapepose_fg.io.detection_table import DetectionTable
-from shapepose_fg.io.detections import read_detections
+from shapepose_fg.evaluation.single_person import measure_single_person
 from shapepose_fg.pipeline import PipelineConfig, reconstruct
 
 QUICK = range(20)
@@ -79,9 +74,9 @@ _MODES = {"with time": True, "without time": False}
 
 
 def _shelf(scale: Scale, temporal: bool) -> Figures:
-    rig, recording = _shelf_recording(scale)
+    shelf = shelf_footage(_there(scale.shelf))
     config = replace(PipelineConfig(), temporal=temporal)
-    people = reconstruct(recording, rig, config, frames=_frames(scale, len(recording)))
+    people = shelf.reconstruct(config, _frames(scale, shelf))
     truth = read_shelf_ground_truth(_there(scale.shelf) / "gt_dev.txt")
     matched = match_actors(people, truth)
     return {
@@ -107,11 +102,10 @@ def _events_table(found: Mapping[str, Figures]) -> list[str]:
 
 
 def _views(scale: Scale) -> Figures:
-    rig, recording = _shelf_recording(scale)
-    frames = _frames(scale, len(recording))
-    config = PipelineConfig()
-    solve: Callable = partial(reconstruct, config=config, frames=frames)
-    cameras = held_out(recording, rig, solve(recording, rig), solve, config.observations)
+    shelf, config = shelf_footage(_there(scale.shelf)), PipelineConfig()
+    solve: Callable = partial(reconstruct, config=config, frames=_frames(scale, shelf), times=shelf.times)
+    people = solve(shelf.detections, shelf.rig)
+    cameras = held_out(shelf.detections, shelf.rig, people, solve, config.observations)
     return {
         camera.name: {"inside": 100 * camera.inside, "of": len(camera.squared), "unmatched": camera.unmatched}
         for camera in cameras
@@ -130,11 +124,9 @@ def _view_table(found: Mapping[str, Figures]) -> list[str]:
 
 
 def _single(scale: Scale, temporal: bool) -> Figures:
-    rig, recording = _single_recording(scale)
-    times = FrameTimes.from_fps(FPS, len(recording))
-    config = replace(PipelineConfig(), temporal=temporal)
-    people = reconstruct(recording, rig, config, frames=_frames(scale, len(recording)), times=times)
-    return measure_single_person(people, recording, rig).as_dict()
+    single = single_footage(_there(scale.pose2sim_single))
+    people = single.reconstruct(replace(PipelineConfig(), temporal=temporal), _frames(scale, single))
+    return measure_single_person(people, single.detections, single.rig).as_dict()
 
 
 def _single_table(found: Mapping[str, Figures]) -> list[str]:
@@ -142,21 +134,20 @@ def _single_table(found: Mapping[str, Figures]) -> list[str]:
     return [f"| pose2sim_single | {' | '.join(found)} |", rule(1 + len(found)), *rows]
 
 
-_FOOTAGE: dict[str, Callable[[Scale], tuple[tuple[Rig, DetectionTable], float]]] = {
-    "Shelf": lambda scale: (_shelf_recording(scale), SHELF_FPS),
-    "pose2sim_single": lambda scale: (_single_recording(scale), FPS),
+_FOOTAGE: dict[str, Callable[[Scale], Footage]] = {
+    "Shelf": lambda scale: shelf_footage(_there(scale.shelf)),
+    "pose2sim_single": lambda scale: single_footage(_there(scale.pose2sim_single)),
 }
 _REACHES_M = (PipelineConfig().refine.draft_reach_m, 0.0)
 """`refine.draft_reach_m`: ours, and drafts without it."""
 
 
 def _beside(scale: Scale, name: str) -> Figures:
-    (rig, recording), fps = _FOOTAGE[name](scale)
-    times = FrameTimes.from_fps(fps, len(recording))
-    solve = partial(reconstruct, recording, rig, frames=_frames(scale, len(recording)), times=times)
+    footage = _FOOTAGE[name](scale)
+    solve = partial(footage.reconstruct, frames=_frames(scale, footage))
     default, figures = PipelineConfig(), {}
     timed = solve(config=default)
-    wrists = [recording.skeleton.joints.index(joint) for joint in ("RWrist", "LWrist")]
+    wrists = [footage.detections.skeleton.joints.index(joint) for joint in ("RWrist", "LWrist")]
     for reach_m in _REACHES_M:
         refine = replace(default.refine, draft_reach_m=reach_m)
         found = beside(solve(config=replace(default, temporal=False, refine=refine)), timed)
@@ -182,19 +173,8 @@ def _beside_table(found: Mapping[str, Figures]) -> list[str]:
     return rows
 
 
-def _shelf_recording(scale: Scale) -> tuple[Rig, DetectionTable]:
-    folder = _there(scale.shelf)
-    rig = read_rig(folder / "calibration.json")
-    return rig, read_detections(folder, rig)
-
-
-def _single_recording(scale: Scale) -> tuple[Rig, DetectionTable]:
-    folder = _there(scale.pose2sim_single)
-    rig = read_rig(folder / "rig.json")
-    return rig, read_detections(folder / "openpose", rig)
-
-
-def _frames(scale: Scale, count: int) -> range:
+def _frames(scale: Scale, footage: Footage) -> range:
+    count = len(footage.detections)
     return range(min(len(QUICK), count)) if scale.quick else range(count)
 
 

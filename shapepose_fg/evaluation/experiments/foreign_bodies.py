@@ -10,7 +10,7 @@ from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.simulation import DetectorConfig, simulate
 from shapepose_fg.simulation.foreign import DETECTOR_S_OWN, PEOPLE, people_of, recast
 
-FRAMES = 150
+FRAMES = 100
 """Of each stretch."""
 
 

@@ -25,8 +25,6 @@ OTHERS = {
     "Pose2Sim, over time": FILTERED,
 }
 """Other systems, and what their results are called: 4D Association's text, or a folder of TRC files."""
-SHELF_FPS = 25.0
-"""Frames a second of the Shelf recording."""
 THRESHOLDS_M = (0.2, 0.1, 0.05)
 """A joint is correct if it is at most so far from the true one."""
 COMMON = tuple(BODY_25.index(name) for name in SKEL_19)

@@ -16,7 +16,7 @@ from shapepose_fg.evaluation.markdown import rule
 
 VIEWS = (2, 3, 4, 5, 6)
 """The views that may see a person's hips."""
-FRAMES, FRAMES_OF_VIEWS = 300, 100
+FRAMES, FRAMES_OF_VIEWS = 300, 50
 """Of each stretch; and for each count of views."""
 PAPER = {
     "VoxelPose (Tu et al. 2020)": (68.8, 77.3, 72.8),

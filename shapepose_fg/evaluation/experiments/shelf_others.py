@@ -8,18 +8,16 @@ from pathlib import Path
 import numpy as np
 
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
-from shapepose_fg.evaluation.experiments.others import OTHERS, SHELF_FPS, read_others
+from shapepose_fg.evaluation.experiments.others import OTHERS, read_others
 from shapepose_fg.evaluation.experiments.scale import Scale
+from shapepose_fg.evaluation.footage import SHELF_FPS, shelf_footage
 from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.matching import People
 from shapepose_fg.evaluation.opponent.opponent import find_everybody
 from shapepose_fg.evaluation.opponent.over_time import over_time
 from shapepose_fg.evaluation.shelf import ACTORS, LIMB_NAMES, evaluate_shelf, read_shelf_ground_truth
 from shapepose_fg.evaluation.smpl_only import SamePeople
-from shapepose_fg.frame_times import FrameTimes
-from shapepose_fg.io.calibration import read_rig
-from shapepose_fg.io.detections import read_detections
-from shapepose_fg.pipeline import PipelineConfig, reconstruct
+from shapepose_fg.pipeline import PipelineConfig
 
 METHODS = (
     "ours, over time",
@@ -53,23 +51,20 @@ def shelf_others(scale: Scale, others: Path | None = None) -> Experiment | None:
 
 
 def _with_time(folder: Path) -> Figures:
-    rig = read_rig(folder / "calibration.json")
-    detections = read_detections(folder, rig)
-    times = FrameTimes.from_fps(SHELF_FPS, len(detections))
-    return {"ours, over time": _score(reconstruct(detections, rig, PipelineConfig(), times=times), folder)}
+    return {"ours, over time": _score(shelf_footage(folder).reconstruct(), folder)}
 
 
 def _without_time(folder: Path) -> Figures:
     """Ours, and SMPL-only on the same people and detections."""
-    rig, config = read_rig(folder / "calibration.json"), replace(PipelineConfig(), temporal=False)
-    people = reconstruct(read_detections(folder, rig), rig, config)
-    bodies, _ = SamePeople.of(people, rig, config).smpl_only(rig)
+    recording, config = shelf_footage(folder), replace(PipelineConfig(), temporal=False)
+    people = recording.reconstruct(config)
+    bodies, _ = SamePeople.of(people, recording.rig, config).smpl_only(recording.rig)
     return {"ours, frame by frame": _score(people, folder), "SMPL-only": _score(bodies, folder)}
 
 
 def _opponent(folder: Path) -> Figures:
-    rig = read_rig(folder / "calibration.json")
-    people = find_everybody(read_detections(folder, rig), rig)
+    recording = shelf_footage(folder)
+    people = find_everybody(recording.detections, recording.rig)
     return {
         "opponent, frame by frame": _score(people, folder),
         "opponent, over time": _score(over_time(people, SHELF_FPS), folder),
