@@ -24,6 +24,9 @@ from shapepose_fg.evaluation.experiments.registry import experiments
 from shapepose_fg.evaluation.experiments.runner import Kept, measured
 from shapepose_fg.evaluation.experiments.scale import Scale
 
+_BESIDE_OTHERS = ("shelf others", "interactions")
+"""Tables that have rows of other systems."""
+
 
 def main() -> None:
     """Measure what was asked for, and print or write the tables."""
@@ -58,6 +61,9 @@ def main() -> None:
             print(f"{experiment.name:<24}{len(part.cases):>3} cases{kept.words(part)}")
             continue
         if arguments.kept and not kept.whole(part):
+            continue
+        if arguments.update and arguments.others is None and experiment.name in _BESIDE_OTHERS:
+            print(f"{experiment.name}: left as it is; give --others, or rows of other systems would go\n")
             continue
         figures, seconds = measured(part, kept)
         total += seconds

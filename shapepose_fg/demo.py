@@ -36,7 +36,7 @@ _STAGES = {
 }
 """The stages that are worth a line, and what each does."""
 SEEN_BADLY = 0.25
-"""Mean confidence over all views under which the paper gives a joint to the body (its figure 5)."""
+"""Mean confidence over all views under which the paper gives a joint to the body (its rho_3D)."""
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ def _alternation(demo: Demo) -> Table:
     """What the factor graphs and the body make of what the views alone say."""
     rho = SEEN_BADLY
     table = Table(
-        title="What stage II brings: mean distance to the truth",
+        title="What comes after stage I: mean distance to the truth",
         title_justify="left",
         title_style="bold",
         box=None,

@@ -13,6 +13,8 @@ from shapepose_fg.detections import Detections, Recording
 from shapepose_fg.evaluation.experiments.made_with import changes, made_with
 from shapepose_fg.evaluation.metrics import joint_metrics
 from shapepose_fg.io.calibration import write_rig
+from shapepose_fg.io.config import toml_text
+from shapepose_fg.pipeline import PipelineConfig
 from shapepose_fg.reconstruction import Reconstruction
 from shapepose_fg.simulation import Scene, built_in_scene, simulate
 from shapepose_fg.skeleton import BODY_25
@@ -56,8 +58,9 @@ def matrix_text(frame: Detections, first: np.ndarray, second: np.ndarray) -> str
 
 @pytest.fixture
 def recording(tmp_path, monkeypatch) -> Scene:
-    """A reader's empty folder, with calibration.json and detections/ of six frames of the scene."""
+    """A reader's folder with calibration.json, detections/ of six frames of the scene, and settings.toml."""
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "settings.toml").write_text(toml_text(PipelineConfig()))
     scene = built_in_scene(frames=6)
     seen = simulate(scene)
     write_rig(scene.rig, tmp_path / "calibration.json")
@@ -81,6 +84,7 @@ def test_readme_in_python(recording, tmp_path):
     assert sorted(apart.argmin(axis=1).tolist()) == [0, 1, 2, 3]
     assert apart.min(axis=1).max() < 0.05
     assert wrists_apart(names["people"]) < wrists_apart(saved) - 0.1
+    assert np.unique(names["part"].frame).tolist() == [0, 1, 2, 3] and names["part"].run["cuts"] == [2]
 
 
 def wrists_apart(people: Reconstruction) -> float:
@@ -154,6 +158,7 @@ NOT_MEASURED_AGAIN = frozenset(
         "fitter alternation",
         "foreign",
         "graph solver",
+        "held back",
         "hip_views",
         "iterations",
         "prior confidence",

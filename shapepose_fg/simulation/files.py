@@ -13,6 +13,7 @@ from shapepose_fg.provenance import versions
 from shapepose_fg.simulation import Scene, built_in_scene
 from shapepose_fg.simulation.mocap import Mocap
 from shapepose_fg.simulation.motion import Motion
+from shapepose_fg.simulation.room import SequenceConfig
 from shapepose_fg.simulation.sequences import SEQUENCES, Sequence, Split, sequence
 from shapepose_fg.simulation.truth import truth_of
 
@@ -37,11 +38,13 @@ def named_scene(
     frames: int = 0,
     seed: int = 0,
     mocap: Path | None = None,
+    config: SequenceConfig | None = None,
 ) -> Scene:
     """The scene called `name`; InputError, one sentence, where an option is wrong or the motions are not there.
 
     `people` and `seed` are the built-in scene's, which has 60 frames, or `frames` if that is more. A sequence
-    is what it is; where only its first `frames` are wanted (0: all) the later segments are not made.
+    is what it is, or what `config` says; where only its first `frames` are wanted (0: all) the later segments are
+    not made.
     """
     if name not in NAMES:
         raise InputError(f"{name}: there is no such scene; give one of {' '.join(NAMES)}")
@@ -59,7 +62,8 @@ def named_scene(
             f"--people {people}: {name} has {SEQUENCES[name].people} people; leave it out, or take demo"
         )
     until = frames if frames > 0 else None
-    return sequence(name, split, Mocap.load(_motions(mocap)), cameras=cameras, until=until)  # type: ignore[arg-type]
+    motions = Mocap.load(_motions(mocap))
+    return sequence(name, split, motions, cameras=cameras, until=until, config=config)  # type: ignore[arg-type]
 
 
 def cut(scene: Scene, span: range) -> Scene:

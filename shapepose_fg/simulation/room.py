@@ -63,6 +63,8 @@ class SequenceConfig:
     """Pixels."""
     seed: int = 0
     """Fixes everything that is drawn."""
+    without: frozenset[str] = frozenset()
+    """Subjects of recordings who are not among those who stand and walk; the dancers never are."""
 
     def __post_init__(self) -> None:
         if not (0 <= self.pairs <= 2 and self.standing >= 0 and self.walking >= 0):

@@ -208,9 +208,9 @@ def _segment(
     room = Room(body, config, frames, fps, rng)
     for number, (lead, follow) in enumerate(dancing):
         room.add_pair(betas[2 * number : 2 * number + 2], (lead.between(0, frames), follow.between(0, frames)))
-    for index in _drawn(standing_clips(mocap, without=DANCERS), config.standing, rng):
+    for index in _drawn(standing_clips(mocap, without=DANCERS | config.without), config.standing, rng):
         room.add_standing(betas[len(room.names)], mocap.clip(index))
-    for index in _drawn(walking_clips(mocap, without=DANCERS), config.walking, rng):
+    for index in _drawn(walking_clips(mocap, without=DANCERS | config.without), config.walking, rng):
         room.add_walking(betas[len(room.names)], mocap.clip(index))
     return room
 

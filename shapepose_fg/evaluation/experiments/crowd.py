@@ -43,5 +43,5 @@ def _table(found: Mapping[str, Figures]) -> list[str]:
         for name in ("f1", "idf1", "mpjpe_mm", "seen_inside_50", "seen_inside_95"):
             cells.append("-" if f[name] is None else f"{f[name]:.1f}")
         rows.append(f"| {count} | {' | '.join(cells)} |")
-    head = "| cameras | people found, % | rows of nobody, % | twice | F1, % | IDF1, % | MPJPE, mm | 50 % | 95 % |"
+    head = "| cameras | people found, % | invented, % | twice | F1, % | IDF1, % | MPJPE, mm | 50 % | 95 % |"
     return [head, rule(9), *rows]

@@ -25,9 +25,11 @@ _OWN_M = 0.25
 """A detection farther from where a hip truly is, as a length at its depth, is not of that hip."""
 
 
-def hips_by_stage_one(detections: DetectionSequence, rig: Rig) -> list[Array]:
-    """(P_t, 3) for each frame: the hips of the paper's first stage, alone."""
-    config = PipelineConfig()
+def hips_by_stage_one(
+    detections: DetectionSequence, rig: Rig, config: PipelineConfig | None = None
+) -> list[Array]:
+    """(P_t, 3) for each frame: the hips of the first stage, alone."""
+    config = PipelineConfig() if config is None else config
     return [
         find_people(detections[t], rig, detections.skeleton, config).initial[:, HIP]
         for t in range(len(detections))
@@ -47,6 +49,13 @@ METHODS = {
     "final, over time": lambda detections, scene: hips_of_people(detections, scene, temporal=True),
 }
 """What proposes people, by what tables call it."""
+BY_THE_PAPER = "stage I alone, the paper's settings"
+"""The same by the paper's preset."""
+
+
+def proposed_by_the_paper(detections: DetectionSequence, scene: Scene) -> list[Array]:
+    """(P_t, 3) for each frame: the hips of the first stage as the paper has it."""
+    return hips_by_stage_one(detections, scene.rig, PipelineConfig.paper())
 
 
 def score_hips(found: list[Array], truth: Array) -> Figures:
@@ -82,8 +91,8 @@ class SeenHips:
 def with_hips_in_views(detections: DetectionSequence, scene: Scene, most: int, seed: int = 0) -> SeenHips:
     """The same recording with everybody's hips (middle, left and right) seen by at most `most` views.
 
-    A person's views are asked in an order that lasts for the whole recording, as what stands before a hip does:
-    the first `most` that see one of the hips keep theirs.
+    A person's views are asked in an order that lasts for the whole recording: in each frame the first `most` that
+    see one of the hips keep theirs.
     """
     order = np.random.default_rng([seed, 8]).permuted(
         np.tile(np.arange(len(scene.rig)), (scene.people, 1)), axis=1

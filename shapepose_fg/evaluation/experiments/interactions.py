@@ -1,4 +1,7 @@
-"""People in close contact: what each method makes of the same detections, scored alike (the paper's table 2)."""
+"""People in close contact: what each method makes of the same detections, scored alike.
+
+The paper's table of the Association Dataset.
+"""
 
 import time
 from collections.abc import Callable, Mapping
@@ -142,19 +145,20 @@ def _table(found: Mapping[str, Figures]) -> list[str]:
         f"| mean over stretches, % | {columns} | MPJPE, mm | least F1 | F1, 25 joints | missed | nobody | ms |"
         " the paper: P | R | F1 |"
     )
-    rows = []
-    for name, paper in ROWS.items():
-        parts = [each[name] for each in found.values() if name in each]
+    measured = {name: [each[name] for each in found.values() if name in each] for name in ROWS}
+    stretches, rows = max(map(len, measured.values())), []
+    for name, parts in measured.items():
         if len(parts) == 0:
             continue
-        mean = mean_of(parts)
+        mean, paper = mean_of(parts), ROWS[name]
+        few = f" ({len(parts)} stretches)" if len(parts) < stretches else ""
         shares = [mean["common"]["at"][f"{t:g}"][f] for t in THRESHOLDS_M for f in ("precision", "recall", "f1")]
         cells = [*(_cell(share, 1) for share in shares), _cell(mean["common"]["mpjpe_mm"], 1)]
         cells += [_cell(min(each["common"]["at"]["0.2"]["f1"] for each in parts), 1)]
         cells += [_cell(mean["all"]["at"]["0.2"]["f1"], 1), _cell(mean["common"]["missed"], 0)]
         cells += [_cell(mean["common"]["nobody"], 0), _cell(mean["cpu_ms"], 0)]
         cells += ["-"] * 3 if paper is None else [f"{value:.1f}" for value in paper]
-        rows.append(f"| {name} | {' | '.join(cells)} |")
+        rows.append(f"| {name}{few} | {' | '.join(cells)} |")
     return [head, rule(19), *rows]
 
 

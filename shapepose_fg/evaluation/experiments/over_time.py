@@ -8,15 +8,14 @@ from functools import partial
 import numpy as np
 
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
+from shapepose_fg.evaluation.experiments.others import COMMON
 from shapepose_fg.evaluation.experiments.scale import Scale, Stretch
 from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.tracking import score_tracks, stature_by_person
 from shapepose_fg.pipeline import PipelineConfig
 from shapepose_fg.simulation.truth import truth_of
 
-WITHOUT_FEET = tuple(range(19))
-"""The joints that the C++ system of Zhang et al. 2020 has too."""
-
+_UNSEEN = "joints_long_unseen"
 COLUMNS = {
     "F1": ("f1", 1),
     "F1 19": ("f1_some_joints", 1),
@@ -36,7 +35,7 @@ COLUMNS = {
     "halves": ("halves_apart_cm", 1),
     "50 %": ("seen_inside_50", 1),
     "95 %": ("seen_inside_95", 1),
-    "u": ("joints_long_unseen", 0),
+    "u": (_UNSEEN, 0),
     "u 50 %": ("unseen_inside_50", 1),
     "u 95 %": ("unseen_inside_95", 1),
     "v": ("velocity_error", 2),
@@ -68,7 +67,7 @@ def measure(stretch: Stretch, config: PipelineConfig, *, halves: bool = False, s
         scene.fps,
         identities=config.temporal,
         frames=range(0, len(scene), stride),
-        some_joints=WITHOUT_FEET,
+        some_joints=COMMON,
         model=scene.body,
     )
     apart = {"halves_apart_cm": halves_apart_cm(stretch, config)} if halves else {}
@@ -76,7 +75,10 @@ def measure(stretch: Stretch, config: PipelineConfig, *, halves: bool = False, s
 
 
 def halves_apart_cm(stretch: Stretch, config: PipelineConfig) -> float | None:
-    """The largest difference of a person's stature between two halves reconstructed apart, centimetres."""
+    """The largest difference of a person's stature between two halves reconstructed apart, centimetres.
+
+    Of the people who are found in both. Where the detector puts its joints is learnt from all frames.
+    """
     scene, middle = stretch.scene, len(stretch.span) // 2
     halves = [stretch.reconstruct(config, part) for part in (range(middle), range(middle, len(scene)))]
     first, second = (stature_by_person(half, truth_of(scene), scene.body) for half in halves)
@@ -85,10 +87,14 @@ def halves_apart_cm(stretch: Stretch, config: PipelineConfig) -> float | None:
 
 
 def with_mean(scores: Mapping[str, Figures]) -> dict[str, Figures]:
-    """The scores, and of every figure that some of them has the mean."""
+    """The scores, and the mean of every figure over those that have it, for joints unseen a pooled one."""
     names = dict.fromkeys(name for figures in scores.values() for name in figures)
-    found = {name: [s[name] for s in scores.values() if s.get(name) is not None] for name in names}
-    mean = {name: float(np.mean(values)) for name, values in found.items() if values}
+    mean = {}
+    for name in names:
+        those = [figures for figures in scores.values() if figures.get(name) is not None]
+        if len(those) > 0:
+            weights = [each[_UNSEEN] for each in those] if name.startswith("unseen_inside") else None
+            mean[name] = float(np.average([each[name] for each in those], weights=weights))
     return dict(scores) | ({"mean": mean} if len(scores) > 1 else {})
 
 

@@ -1,4 +1,4 @@
-"""Joint errors before and after the body's prior against the joint's confidence: the paper's figure 5."""
+"""Joint errors before and after the body's prior against the joint's confidence, a figure of the paper."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -28,7 +28,7 @@ FRAMES = 60
 BINS = (0.0, 0.1, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 1.0)
 """Borders of w_i, the mean confidence of a joint over all views."""
 PAPER_CROSSES = 0.25
-"""From where on the body makes joints no better in the paper's figure 5: its rho_3D."""
+"""From where on the body makes joints no better in the paper's figure: its rho_3D."""
 CURVES = {"paper": ("X_0", "body fitted to it"), "ours": ("views alone", "views and body")}
 """Of each setting what is before the prior, and after it."""
 SETTINGS = {"paper": "the paper's setting", "ours": "ours"}
@@ -95,7 +95,7 @@ def crosses(before: NDArray[np.float64], after: NDArray[np.float64]) -> float | 
 
 
 def draw_prior_confidence(figures: Mapping[str, Figures], file: Path) -> None:
-    """The picture that goes with the table, in the manner of the paper's figure 5."""
+    """The picture that goes with the table, in the manner of the paper's."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import NullFormatter, ScalarFormatter
 

@@ -5,9 +5,11 @@ from pathlib import Path
 
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
 from shapepose_fg.evaluation.experiments.hips import (
+    BY_THE_PAPER,
     HIP,
     METHODS,
     precision_recall_f1,
+    proposed_by_the_paper,
     score_hips,
     with_hips_in_views,
 )
@@ -20,7 +22,7 @@ FRAMES, FRAMES_OF_VIEWS = 300, 50
 """Of each stretch; and for each count of views."""
 PAPER = {
     "VoxelPose (Tu et al. 2020)": (68.8, 77.3, 72.8),
-    "Zhang et al. 2020, without time": (99.6, 51.2, 67.6),
+    "Zhang et al. 2020": (99.6, 51.2, 67.6),
     "the paper": (98.8, 94.2, 96.4),
 }
 """Precision, recall, F1 in % of the paper's table, on the Association Dataset."""
@@ -29,20 +31,22 @@ PAPER_VIEWS, PAPER_PRECISION = 4.8, 97.8
 
 
 def proposals(scale: Scale) -> Experiment | None:
-    """Precision, recall and F1 of human proposals: stage I alone, without time, over time."""
+    """Precision, recall and F1 of proposals: stage I alone, the paper's and ours; without time, over time."""
     if not scale.has_scenes:
         return None
     stretches = [shorter(stretch, FRAMES) for stretch in scale.one_each]
-    cases = {(method, stretch): f"{method}, {stretch.label}" for method in METHODS for stretch in stretches}
+    methods = (BY_THE_PAPER, *METHODS)
+    cases = {(method, stretch): f"{method}, {stretch.label}" for method in methods for stretch in stretches}
 
     def case(method: str, stretch: Stretch, name: str) -> Case:
         return Case(name, lambda: _measure(method, stretch))
 
     def table(figures: Mapping[str, Figures]) -> list[str]:
         rows = ["| human proposals | precision, % | recall, % | F1, % |", "|---|---|---|---|"]
-        for method in METHODS:
+        for method in methods:
             found = precision_recall_f1(figures[name] for (other, _), name in cases.items() if other == method)
-            rows.append(f"| **{method}** | {' | '.join(f'{share:.1f}' for share in found)} |")
+            name = method if method == BY_THE_PAPER else f"**ours, {method}**"
+            rows.append(f"| {name} | {' | '.join(f'{share:.1f}' for share in found)} |")
         return rows + [
             f"| {name}: Association Dataset | {' | '.join(map(str, those))} |" for name, those in PAPER.items()
         ]
@@ -118,8 +122,8 @@ def draw_hip_views(figures: Mapping[str, Figures], file: Path) -> None:
 
 def _measure(method: str, stretch: Stretch) -> Figures:
     """One method on a stretch as it is."""
-    scene = stretch.scene
-    return score_hips(METHODS[method](stretch.detections, scene), scene.keypoints[:, :, HIP])
+    scene, propose = stretch.scene, METHODS.get(method, proposed_by_the_paper)
+    return score_hips(propose(stretch.detections, scene), scene.keypoints[:, :, HIP])
 
 
 def _measure_views(views: int, stretch: Stretch) -> Figures:

@@ -16,6 +16,7 @@ from shapepose_fg.evaluation.experiments.ablation import ablation
 from shapepose_fg.evaluation.experiments.experiment import Experiment, whole
 from shapepose_fg.evaluation.experiments.foreign_bodies import foreign
 from shapepose_fg.evaluation.experiments.graph_solver import graph_solver
+from shapepose_fg.evaluation.experiments.held_back import held_back
 from shapepose_fg.evaluation.experiments.interactions import interactions
 from shapepose_fg.evaluation.experiments.iterations import iterations
 from shapepose_fg.evaluation.experiments.prior_confidence import prior_confidence
@@ -36,6 +37,7 @@ def experiments(scale: Scale, images: Path | None = None, others: Path | None = 
     if scale.has_scenes:
         yield over_time.experiment(scale, temporal=True)
         yield over_time.experiment(scale, temporal=False)
+    yield from _there(held_back(scale))
     yield crowd.experiment(scale)
     yield box.experiment(scale)
     for make in (footage.shelf_events, footage.held_out_views, footage.single_person, footage.alone_beside_time):
@@ -89,7 +91,7 @@ def _simulation(scale: Scale, images: Path | None) -> Iterator[Experiment]:
     """The simulator itself."""
     shelf, mocap = scale.shelf, scale.mocap
     if shelf is not None:
-        yield whole("detector", lambda: detector_agreement.table(shelf, images), "detector")
+        yield whole("detector", lambda: detector_agreement.table(shelf, images))
     if mocap is not None:
         yield whole("difficulty", lambda: sequence_difficulty.table(mocap, ("tune", "report"), 20))
     yield whole("visibility", visibility_agreement.table, "detector")

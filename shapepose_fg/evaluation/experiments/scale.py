@@ -11,6 +11,7 @@ from shapepose_fg.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.reconstruction import Reconstruction
 from shapepose_fg.simulation import Scene, built_in_scene, simulate
 from shapepose_fg.simulation.files import cut, named_scene
+from shapepose_fg.simulation.room import SequenceConfig
 from shapepose_fg.simulation.sequences import Split
 
 STRETCHES: dict[Split, dict[str, tuple[range, ...]]] = {
@@ -47,6 +48,8 @@ class Stretch:
     """Of the detector's errors; of the built-in scene, too."""
     people: int = 4
     """Of the built-in scene; a sequence has its own."""
+    made: SequenceConfig | None = None
+    """What a sequence is made of, in place of the named one's."""
     mocap: Path | None = field(default=None, compare=False)
     """The recorded motions; None: where SHAPEPOSE_DATA says."""
 
@@ -143,7 +146,12 @@ def _scene(stretch: Stretch) -> Scene:
         whole = built_in_scene(stretch.seed, people=stretch.people, cameras=stretch.cameras, frames=frames)
         return cut(whole, stretch.span)
     whole = named_scene(
-        stretch.name, split=stretch.split, cameras=stretch.cameras, frames=stretch.span.stop, mocap=stretch.mocap
+        stretch.name,
+        split=stretch.split,
+        cameras=stretch.cameras,
+        frames=stretch.span.stop,
+        mocap=stretch.mocap,
+        config=stretch.made,
     )
     return cut(whole, stretch.span)
 
