@@ -10,7 +10,7 @@ from shapepose_fg.training.split import split_of
 
 
 def test_nothing_was_learnt_from_anybody_in_them(shared_data):
-    """By the clips that each sequence says it is made of: subjects 60 and 61 dance, all others are test subjects."""
+    """By the clips that each sequence says it is made of: 60 and 61 dance, all others are test subjects."""
     mocap = shared_data / "cmu_mocap" / "cmu_smpl24.npz"
     for stretch in stretches_of(mocap):
         scene = stretch.scene
