@@ -151,17 +151,13 @@ def test_files_that_are_named_exist(page):
 
 NOT_MEASURED_AGAIN = frozenset(
     {
-        "ablation",
         "alternation",
         "detector",
         "difficulty",
         "fitter alternation",
         "foreign",
-        "graph solver",
         "held back",
         "hip_views",
-        "iterations",
-        "prior confidence",
         "proposals",
         "sweeps",
     }
