@@ -71,7 +71,7 @@ def draw_iterations(figures: Mapping[str, Figures], file: Path) -> None:
         axes.set_xlabel("alternations")
         axes.grid(alpha=0.3)
     figure.axes[0].plot(list(PAPER), list(PAPER.values()), "k*", label="the paper, its data")
-    figure.axes[0].legend(fontsize=7)
+    figure.axes[0].legend(fontsize=7, loc=(0.28, 0.22))
     figure.savefig(file, dpi=130)
 
 

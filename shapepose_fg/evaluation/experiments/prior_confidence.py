@@ -32,7 +32,7 @@ PAPER_CROSSES = 0.25
 CURVES = {"paper": ("X_0", "body fitted to it"), "ours": ("views alone", "views and body")}
 """Of each setting what is before the prior, and after it."""
 SETTINGS = {"paper": "the paper's setting", "ours": "ours"}
-WORLDS = {"own": "people and detector as the body model has them", "foreign": "other bones, other joints"}
+WORLDS = {"own": "as the body model has them", "foreign": "other bones, other joints"}
 """Who is there, and what the detector means: in the second bones are up to 5 % off the model's, left and right
 apart, and hips, shoulders, neck and others lie 18 to 46 mm from the model's."""
 
