@@ -50,6 +50,13 @@ class BesideFitter:
         )
 
 
+class NobodyFitter:
+    """Fits no body to anybody."""
+
+    def fit(self, targets, initial=None, groups=None) -> BodyFit:
+        return BodyFit.failed(np.full(len(targets), FitStatus.TOO_FEW_JOINTS), targets.xyz.shape[1])
+
+
 @pytest.fixture(scope="module")
 def walk(five_cameras, two_people):
     """Two people who walk 1 m/s, 30 frames, noise of 3 px: observations and truth (60, 25, 3)."""
@@ -338,12 +345,64 @@ def test_chains_have_the_covariances_of_gtsam(walk, five_cameras, two_people, mo
         np.testing.assert_allclose(velocities, of_velocities, rtol=1e-6, atol=1e-9)
 
 
-def test_what_nothing_determines_raises():
-    """A chain whose last state hangs on nothing."""
-    diagonal = np.tile(np.eye(3), (1, 3, 1, 1))
-    diagonal[0, 2] = 0.0
-    with pytest.raises(np.linalg.LinAlgError):
-        Chains(diagonal, np.zeros((1, 2, 3, 3))).covariances()
+@pytest.mark.parametrize("frames", [1, 2, 6])
+def test_joints_of_which_nobody_says_anything_cost_nobody_a_status(walk, five_cameras, two_people, frames):
+    """Three joints in five views, X_0 of all 25: too few to place a body, but these three have covariances."""
+    observations, truth = walk
+    rows = np.flatnonzero((observations.track == 0) & (observations.frame < frames))
+    seen = replace(observations.rows(rows), initial=truth[rows])
+    for joint in set(range(25)) - {1, 8, 9}:
+        seen = hidden(seen, slice(None), joint)
+    found = solve(seen, five_cameras, BesideFitter(two_people[0]))
+    assert (found.status == Status.TOO_FEW_VIEWS).all() and not found.problems
+    determined = np.isfinite(found.covariance).all(axis=(2, 3))
+    np.testing.assert_array_equal(determined, np.isin(np.arange(25), [1, 8, 9]) & np.ones((frames, 1), dtype=bool))
+    np.testing.assert_array_equal(np.isfinite(found.joints).all(axis=2), determined)
+
+
+def test_a_joint_with_a_factor_of_one_s_own_stays_without_views_and_body(walk, five_cameras, two_people):
+    """What the user says of a joint that nobody else mentions is in the problem."""
+    observations, truth = walk
+    rows = np.flatnonzero((observations.track == 0) & (observations.frame < 6))
+    seen = replace(observations.rows(rows), initial=truth[rows])
+    for joint in set(range(25)) - {1, 8, 9}:
+        seen = hidden(seen, slice(None), joint)
+
+    def here(window, keys):
+        noise = gtsam.noiseModel.Isotropic.Sigma(3, 0.01)
+        for key, place in zip(keys[:, WRIST].tolist(), truth[rows, WRIST], strict=True):
+            yield gtsam.PriorFactorPoint3(key, place, noise)
+
+    found = solve(seen, five_cameras, BesideFitter(two_people[0]), here)
+    np.testing.assert_allclose(found.joints[:, WRIST], truth[rows, WRIST], atol=0.01)
+    assert np.isfinite(found.covariance[:, [1, 8, 9, WRIST]]).all()
+
+
+def test_what_nothing_determines_is_nan_and_other_chains_are_not():
+    """The middle one of three chains has a last state that hangs on nothing."""
+    diagonal = np.tile(np.eye(3), (3, 3, 1, 1))
+    diagonal[1, 2] = 0.0
+    found = Chains(diagonal, np.zeros((3, 2, 3, 3))).covariances()
+    assert np.isnan(found[1]).all()
+    np.testing.assert_array_equal(found[[0, 2]], np.tile(np.eye(3), (2, 3, 1, 1)))
+
+
+def test_somebody_undetermined_takes_nobody_else_to_the_slow_path(walk, five_cameras, two_people, monkeypatch):
+    """The user says how fast the first person's wrist is, nobody where: it is not known, and all else is."""
+    observations, truth = walk
+    first = observations.track == 0
+    seen = replace(hidden(observations, first, WRIST), initial=truth)
+
+    def still(window, keys):
+        for key in window.velocity_keys[:, WRIST].tolist() if window.track == 0 else ():
+            yield gtsam.PriorFactorPoint3(key, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 0.1))
+
+    monkeypatch.setattr(WindowGraph, "marginals", lambda self, keys: pytest.fail("the slow path is taken"))
+    found = solve(seen, five_cameras, NobodyFitter(), still)
+    unknown = ~np.isfinite(found.covariance).all(axis=(2, 3))
+    assert unknown[first, WRIST].all() and unknown.sum() == FRAMES
+    assert (found.status[~first] == Status.BODY_UNDETERMINED).all()
+    assert {(each.track, each.joint) for each in found.problems} == {(0, WRIST)}
 
 
 def test_a_chain_is_the_inverse_of_its_matrix():
