@@ -13,8 +13,11 @@ said it once. The error of a message "the joint is at m_t, covariance C_t" is sp
 every frame and one that lasts, an Ornstein-Uhlenbeck chain b_t in units of standard deviations. With R_t the
 symmetric square root of the message's information, R_t C_t R_t = I, and w the white share:
 
-    r = R_t (x_t - m_t) - sqrt(1 - w) b_t  ~  N(0, w I)
-    r = b' - a b                           ~  N(0, (1 - a²) I),    a = exp(-dt / correlation_s),    b_0 ~ N(0, I)
+    r = R_t (x_t - m_t) - sqrt(1 - w) P_t b_t  ~  N(0, w I)
+    r = b' - a b                               ~  N(0, (1 - a²) I),   a = exp(-dt / correlation_s),   b_0 ~ N(0, I)
+
+P_t = R_t R_t^+ projects on what the message knows, the identity but for a ray: along the ray it says nothing of
+the joint, and so nothing of the offset either.
 """
 
 from collections.abc import Iterable
@@ -92,10 +95,10 @@ def lasting_prior_factors(
     if not 0 < white_share < 1:
         raise ValueError(f"white_share must be between 0 and 1, got {white_share}")
     scaled = whiten / np.sqrt(white_share)
-    of_offset = -np.sqrt((1.0 - white_share) / white_share) * np.eye(3)
+    of_offsets = -np.sqrt((1.0 - white_share) / white_share) * _projectors(whiten)
     right = np.einsum("dij,dj->di", scaled, points)
     linear = map(
-        gtsam.JacobianFactor, positions.tolist(), scaled, offsets.tolist(), repeat(of_offset), right,
+        gtsam.JacobianFactor, positions.tolist(), scaled, offsets.tolist(), of_offsets, right,
         repeat(noiseModel.Unit.Create(3)),
     )  # fmt: skip
     return _contained(linear, np.concatenate([positions, offsets]))
@@ -106,6 +109,17 @@ def motion_covariance(dt_s: ArrayLike, psd: ArrayLike) -> NDArray[np.float64]:
     dt, q = np.asarray(dt_s, dtype=np.float64), np.asarray(psd, dtype=np.float64)
     blocks = np.stack([np.stack([dt**3 / 3, dt**2 / 2], -1), np.stack([dt**2 / 2, dt], -1)], -2)
     return np.einsum("...ab,ij->...aibj", q[..., None, None] * blocks, np.eye(3)).reshape(*blocks.shape[:-2], 6, 6)
+
+
+def _projectors(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """R R^+ of each R (D, 3, 3): the projectors on their ranges, the identity exactly where R has full rank.
+
+    Singular values below 1e-5 of the largest are rounding: the root of information that is zero up to 1e-10.
+    """
+    left, values, _ = np.linalg.svd(matrices)
+    ranged = left * (values > 1e-5 * values[:, :1])[:, None]
+    full = (values[:, 2] > 1e-5 * values[:, 0])[:, None, None]
+    return np.where(full, np.eye(3), ranged @ ranged.swapaxes(1, 2))
 
 
 def _contained(linear: Iterable[gtsam.JacobianFactor], keys: NDArray[np.int64]) -> list[gtsam.NonlinearFactor]:
