@@ -1,6 +1,8 @@
 """Stage II over several frames: motion, joints lost from sight, factors of one's own, what went wrong."""
 
+import json
 from dataclasses import replace
+from importlib.resources import files
 
 import gtsam
 import numpy as np
@@ -294,6 +296,22 @@ def test_the_motion_model_is_read_by_name_and_checked(tmp_path):
         MotionConfig(psd_scale=0.0)
     with pytest.raises(ValueError, match="window_alternations must be at least 1"):
         RefineConfig(window_alternations=0)
+
+
+@pytest.mark.parametrize("source", ["views", "body"])
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("white_share", 1.5), ("white_share", 1.0), ("white_share", 0.0), ("white_share", -1.0),
+     ("white_share", np.nan), ("correlation_s", -2.0), ("correlation_s", 0.0), ("correlation_s", np.inf),
+     ("kept", 7.0), ("kept", -0.1), ("kept", np.nan)],
+)  # fmt: skip
+def test_impossible_errors_in_a_motion_model_are_refused(tmp_path, source, key, value):
+    shipped = files("shapepose_fg.estimation") / "data" / "motion.json"
+    data = json.loads(shipped.read_text(encoding="utf-8"))
+    data[source][key] = value
+    (tmp_path / "motion.json").write_text(json.dumps(data), encoding="utf-8")
+    with pytest.raises(InputError, match=r"motion\.json: .*(white_share must be between|not a motion model|JSON)"):
+        MotionModel.load(("RWrist",), MotionConfig(model=str(tmp_path / "motion.json")))
 
 
 def nothing(window, keys):
