@@ -44,8 +44,8 @@ def motion_factors(
             "keys, velocity_keys and times_s must be (T,), got"
             f" {positions.shape}, {velocities.shape}, {times.shape}"
         )
-    if not np.all(np.diff(times) > 0):
-        raise ValueError("times_s must rise from state to state")
+    if not _rise(times):
+        raise ValueError("times_s must be finite and rise from state to state")
     densities = np.broadcast_to(np.asarray(psd, dtype=np.float64), max(len(times) - 1, 0))
     if not np.all((densities > 0) & np.isfinite(densities)):
         raise ValueError("psd must be positive and finite, m²/s³")
@@ -59,8 +59,10 @@ def offset_factors(
 ) -> list[gtsam.NonlinearFactor]:
     """The chain of offsets b_t: a unit prior on the first, then T - 1 links that forget within `correlation_s`."""
     times, keys = np.asarray(times_s, dtype=np.float64), np.asarray(offset_keys)
-    if keys.shape != times.shape or times.ndim != 1 or not np.all(np.diff(times) > 0):
-        raise ValueError(f"offset_keys and times_s must be (T,), times rising; got {keys.shape}, {times.shape}")
+    if keys.shape != times.shape or times.ndim != 1 or not _rise(times):
+        raise ValueError(
+            f"offset_keys and times_s must be (T,), times finite and rising; got {keys.shape}, {times.shape}"
+        )
     if not (np.isfinite(correlation_s) and correlation_s > 0):
         raise ValueError(f"correlation_s must be positive, got {correlation_s}")
     kept = np.exp(-np.diff(times) / correlation_s)
@@ -77,7 +79,9 @@ def offset_factors(
 def lasting_prior_factors(
     keys: ArrayLike, offset_keys: ArrayLike, means: ArrayLike, roots: ArrayLike, white_share: float
 ) -> list[gtsam.NonlinearFactor]:
-    """Messages about D joints whose errors last: position `keys` (D,) against `means` (D, 3) and their offsets.
+    """D messages about joints whose errors last: position `keys` (D,) against `means` (D, 3) and their offsets.
+
+    Several may be about one joint, each with an offset of its own or with one for all.
 
     `roots` (D, 3, 3), 1/m, are the symmetric square roots of the messages' information, of the whole error; they
     may be singular (a ray). `white_share` of the error's variance, between 0 and 1, is new each time.
@@ -111,6 +115,11 @@ def motion_covariance(dt_s: ArrayLike, psd: ArrayLike) -> NDArray[np.float64]:
     return np.einsum("...ab,ij->...aibj", q[..., None, None] * blocks, np.eye(3)).reshape(*blocks.shape[:-2], 6, 6)
 
 
+def _rise(times_s: NDArray[np.float64]) -> bool:
+    """Whether times (T,) are finite and each is after the one before."""
+    return bool(np.isfinite(times_s).all() and (np.diff(times_s) > 0).all())
+
+
 def _projectors(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
     """R R^+ of each R (D, 3, 3): the projectors on their ranges, the identity exactly where R has full rank.
 
@@ -128,6 +137,6 @@ def _contained(linear: Iterable[gtsam.JacobianFactor], keys: NDArray[np.int64]) 
     They must be told that they are linearised at zero: without that their error is always 0.
     """
     zeros, origin = gtsam.Values(), np.zeros(3)
-    for key in keys.tolist():
+    for key in np.unique(keys).tolist():
         zeros.insert(key, origin)
     return list(map(gtsam.LinearContainerFactor, linear, repeat(zeros)))

@@ -205,6 +205,22 @@ def test_a_message_told_often_is_no_surer_than_told_once():
     assert sigma == pytest.approx(0.1 * np.sqrt(0.8 + 0.2 / 100), rel=0.02)
 
 
+def test_two_messages_about_one_joint_both_count():
+    """At 0 and at 1 m, the second twice as sure: at 0.8 m, known as five messages are."""
+    means, roots = [[0, 0, 0], [1, 1, 1]], np.stack([np.eye(3), 2 * np.eye(3)]) / 0.1
+    factors = lasting_prior_factors(KEYS[[0, 0]], OFFSETS[[0, 1]], means, roots, 0.4)
+    unit = gtsam.noiseModel.Unit.Create(3)
+    factors += [gtsam.PriorFactorPoint3(key, np.zeros(3), unit) for key in OFFSETS[:2].tolist()]
+    values = gtsam.Values()
+    for key in [KEYS[0], *OFFSETS[:2]]:
+        values.insert(int(key), np.zeros(3))
+    graph, solution = solved(factors, values)
+    np.testing.assert_allclose(solution.atPoint3(int(KEYS[0])), [0.8, 0.8, 0.8], atol=1e-9)
+    np.testing.assert_allclose(
+        gtsam.Marginals(graph, solution).marginalCovariance(int(KEYS[0])), 0.1**2 / 5 * np.eye(3), atol=1e-12
+    )
+
+
 def test_a_ray_leaves_its_direction_open():
     """A singular message: nothing along z, so that the joint stays where the prior has it."""
     roots = np.diag([100.0, 100.0, 0.0])[None]
@@ -264,11 +280,14 @@ def test_a_message_of_full_rank_is_split_as_it_is_written():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: motion_factors(KEYS, SPEEDS, TIMES[::-1], 1.0), "must rise"),
+        (lambda: motion_factors(KEYS, SPEEDS, TIMES[::-1], 1.0), "must be finite and rise"),
+        (lambda: motion_factors(KEYS[:2], SPEEDS[:2], [0.0, np.inf], 1.0), "must be finite and rise"),
+        (lambda: motion_factors(KEYS[:1], SPEEDS[:1], [np.nan], 1.0), "must be finite and rise"),
         (lambda: motion_factors(KEYS, SPEEDS, TIMES, 0.0), "psd must be positive"),
         (lambda: motion_factors(KEYS[:2], SPEEDS, TIMES, 1.0), r"must be \(T,\)"),
         (lambda: offset_factors(OFFSETS, TIMES, 0.0), "correlation_s must be positive"),
-        (lambda: offset_factors(OFFSETS, TIMES[::-1], 1.0), "times rising"),
+        (lambda: offset_factors(OFFSETS, TIMES[::-1], 1.0), "times finite and rising"),
+        (lambda: offset_factors(OFFSETS[:2], [0.0, np.inf], 1.0), "times finite and rising"),
         (
             lambda: lasting_prior_factors(KEYS[:1], OFFSETS[:1], [[0, 0, np.nan]], np.eye(3)[None], 0.5),
             "not finite",
