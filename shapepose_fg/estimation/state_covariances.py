@@ -12,7 +12,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from shapepose_fg.estimation.window_graph import UNDETERMINED_M, WindowGraph
+from shapepose_fg.estimation.window_graph import WindowGraph, is_determined
 
 
 @dataclass(frozen=True)
@@ -123,6 +123,6 @@ def _of_present(
     position, velocity = (np.full((*placed.shape, 3, 3), np.nan) for _ in range(2))
     for result, first in ((position, 0), (velocity, 3)):
         part = covariance[..., first : first + 3, first : first + 3]
-        determined = placed & (np.trace(part, axis1=2, axis2=3) < UNDETERMINED_M**2)
+        determined = placed & is_determined(part)
         result[determined] = part[determined]
     return position, velocity

@@ -35,7 +35,8 @@ from shapepose_fg.estimation.motion_model import Lasting, MotionModel
 _OF_VIEWS, _OF_BODY = 0, 1
 """Sources of messages about joints, for the keys of their offsets."""
 UNDETERMINED_M = 10.0
-"""A variable that the problem leaves less certain than this, metres or m/s, is not determined."""
+"""A variable that the problem leaves less certain than this in some direction, metres or m/s, is not
+determined."""
 
 
 @dataclass(frozen=True)
@@ -278,6 +279,7 @@ class WindowGraph:
                 result[n] = found.marginalCovariance(key)
         except RuntimeError:
             result = self._damped_marginals(inside, keys.size)
+        result[~is_determined(result)] = np.nan
         return result.reshape(*keys.shape, 3, 3)
 
     @cached_property
@@ -306,8 +308,6 @@ class WindowGraph:
                 result[n] = found.marginalCovariance(key)
         except RuntimeError:
             return np.full((count, 3, 3), np.nan)
-        lost = ~(np.trace(result, axis1=1, axis2=2) < UNDETERMINED_M**2)
-        result[lost] = np.nan
         return result
 
     def _optimise(self) -> None:
@@ -421,6 +421,13 @@ def near_in_time(marked: NDArray[np.bool_], times_s: NDArray[np.float64], within
 def spanned(marked: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """(T, J) which frames lie between the first and the last that are `marked` (T, J), these two included."""
     return np.maximum.accumulate(marked, axis=0) & np.maximum.accumulate(marked[::-1], axis=0)[::-1]
+
+
+def is_determined(covariance: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(...,) whether variables of this `covariance` (..., 3, 3), m² or m²/s², are known to `UNDETERMINED_M`."""
+    known = np.asarray(np.isfinite(covariance).all(axis=(-2, -1)))
+    largest = np.linalg.eigvalsh(np.where(known[..., None, None], covariance, 0.0))[..., -1]
+    return np.asarray(known & (largest < UNDETERMINED_M**2))
 
 
 def symmetric_roots(information: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -387,6 +387,23 @@ def test_of_a_joint_that_one_view_saw_there_is_no_covariance_and_the_others_have
     np.testing.assert_allclose(np.delete(covariance, 4, axis=0), np.delete(whole, 4, axis=0), rtol=1e-6)
 
 
+def test_what_is_known_to_more_than_ten_metres_is_not_determined(five_cameras, person):
+    """In some direction: 11 m along x are too much, 9 m along every axis are not, and no path to it matters."""
+    truth, xy, sigmas = person
+    for whole_system_is_singular in (False, True):
+        graph = graph_of(five_cameras, xy, np.where(np.arange(25)[:, None] == 6, sigmas, 0.0))
+        inlier = np.ones(sigmas.shape, dtype=bool)
+        inlier[6, 1:] = not whole_system_is_singular
+        graph.set_gates(inlier)
+        covariance = np.tile(1e-4 * np.eye(3), (25, 1, 1))
+        covariance[4], covariance[5] = np.diag([11.0**2, 1e-4, 1e-4]), 9.0**2 * np.eye(3)
+        graph.set_priors(np.isin(np.arange(25), [3, 4, 5]), truth, covariance)
+        start = np.where(np.isin(np.arange(25), [3, 4, 5, 6])[:, None], truth, np.nan)
+        graph.solve(start)
+        determined = np.isfinite(graph.covariance()).all(axis=(1, 2))
+        assert np.flatnonzero(determined).tolist() == [3, 5] + [6] * (not whole_system_is_singular)
+
+
 def test_in_a_frame_alone_a_joint_lost_from_sight_is_pulled_as_any_other(five_cameras, person):
     """Offsets are for windows of several frames: here the body's pull counts, whatever is said to be lost."""
     truth, xy, sigmas = person
