@@ -49,7 +49,9 @@ class CameraKey(NamedTuple):
 
 
 def joint_key(person: int, joint: int, frame: int = 0) -> int:
-    """Key of the position (`Point3`, metres, world) of a joint; ValueError beyond the limits above."""
+    """Key of the position (`Point3`, metres, world) of a joint; ValueError beyond the limits above, and for
+    what is not a whole number.
+    """
     return int(_pack(_JOINT, person, joint, frame))
 
 
@@ -112,9 +114,9 @@ def format_key(key: int) -> str:
 
 
 def _offset(source: int) -> int:
-    if not 0 <= source < _SOURCES:
-        raise ValueError(f"source in a key must be 0 to {_SOURCES - 1}, got {source}")
-    return _OFFSET + source
+    if source not in range(_SOURCES):
+        raise ValueError(f"source in a key must be a whole number, 0 to {_SOURCES - 1}, got {source}")
+    return _OFFSET + int(source)
 
 
 def _pack(kind: int, first: int, joint: ArrayLike, frame: ArrayLike) -> NDArray[np.int64]:
@@ -126,6 +128,8 @@ def _pack(kind: int, first: int, joint: ArrayLike, frame: ArrayLike) -> NDArray[
     ):
         if value.size and not (value.min() >= 0 and value.max() <= limit):
             raise ValueError(f"{name} in a key must be 0 to {limit}, got {value.min()} to {value.max()}")
+        if np.any(value % 1 != 0):
+            raise ValueError(f"{name} in a key must be a whole number, got {value[value % 1 != 0].flat[0]}")
     base = kind * _PER_KIND + int(first) * _PER_PERSON
     return base + joints.astype(np.int64) * _PER_JOINT + frames.astype(np.int64)
 

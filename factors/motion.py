@@ -13,8 +13,11 @@ said it once. The error of a message "the joint is at m_t, covariance C_t" is sp
 every frame and one that lasts, an Ornstein-Uhlenbeck chain b_t in units of standard deviations. With R_t the
 symmetric square root of the message's information, R_t C_t R_t = I, and w the white share:
 
-    r = R_t (x_t - m_t) - sqrt(1 - w) b_t  ~  N(0, w I)
-    r = b' - a b                           ~  N(0, (1 - a²) I),    a = exp(-dt / correlation_s),    b_0 ~ N(0, I)
+    r = R_t (x_t - m_t) - sqrt(1 - w) P_t b_t  ~  N(0, w I)
+    r = b' - a b                               ~  N(0, (1 - a²) I),   a = exp(-dt / correlation_s),   b_0 ~ N(0, I)
+
+P_t = R_t R_t^+ projects on what the message knows, the identity but for a ray: along the ray it says nothing of
+the joint, and so nothing of the offset either.
 """
 
 from collections.abc import Iterable
@@ -41,8 +44,8 @@ def motion_factors(
             "keys, velocity_keys and times_s must be (T,), got"
             f" {positions.shape}, {velocities.shape}, {times.shape}"
         )
-    if not np.all(np.diff(times) > 0):
-        raise ValueError("times_s must rise from state to state")
+    if not _rise(times):
+        raise ValueError("times_s must be finite and rise from state to state")
     densities = np.broadcast_to(np.asarray(psd, dtype=np.float64), max(len(times) - 1, 0))
     if not np.all((densities > 0) & np.isfinite(densities)):
         raise ValueError("psd must be positive and finite, m²/s³")
@@ -56,8 +59,10 @@ def offset_factors(
 ) -> list[gtsam.NonlinearFactor]:
     """The chain of offsets b_t: a unit prior on the first, then T - 1 links that forget within `correlation_s`."""
     times, keys = np.asarray(times_s, dtype=np.float64), np.asarray(offset_keys)
-    if keys.shape != times.shape or times.ndim != 1 or not np.all(np.diff(times) > 0):
-        raise ValueError(f"offset_keys and times_s must be (T,), times rising; got {keys.shape}, {times.shape}")
+    if keys.shape != times.shape or times.ndim != 1 or not _rise(times):
+        raise ValueError(
+            f"offset_keys and times_s must be (T,), times finite and rising; got {keys.shape}, {times.shape}"
+        )
     if not (np.isfinite(correlation_s) and correlation_s > 0):
         raise ValueError(f"correlation_s must be positive, got {correlation_s}")
     kept = np.exp(-np.diff(times) / correlation_s)
@@ -74,7 +79,9 @@ def offset_factors(
 def lasting_prior_factors(
     keys: ArrayLike, offset_keys: ArrayLike, means: ArrayLike, roots: ArrayLike, white_share: float
 ) -> list[gtsam.NonlinearFactor]:
-    """Messages about D joints whose errors last: position `keys` (D,) against `means` (D, 3) and their offsets.
+    """D messages about joints whose errors last: position `keys` (D,) against `means` (D, 3) and their offsets.
+
+    Several may be about one joint, each with an offset of its own or with one for all.
 
     `roots` (D, 3, 3), 1/m, are the symmetric square roots of the messages' information, of the whole error; they
     may be singular (a ray). `white_share` of the error's variance, between 0 and 1, is new each time.
@@ -92,10 +99,10 @@ def lasting_prior_factors(
     if not 0 < white_share < 1:
         raise ValueError(f"white_share must be between 0 and 1, got {white_share}")
     scaled = whiten / np.sqrt(white_share)
-    of_offset = -np.sqrt((1.0 - white_share) / white_share) * np.eye(3)
+    of_offsets = -np.sqrt((1.0 - white_share) / white_share) * _projectors(whiten)
     right = np.einsum("dij,dj->di", scaled, points)
     linear = map(
-        gtsam.JacobianFactor, positions.tolist(), scaled, offsets.tolist(), repeat(of_offset), right,
+        gtsam.JacobianFactor, positions.tolist(), scaled, offsets.tolist(), of_offsets, right,
         repeat(noiseModel.Unit.Create(3)),
     )  # fmt: skip
     return _contained(linear, np.concatenate([positions, offsets]))
@@ -108,12 +115,28 @@ def motion_covariance(dt_s: ArrayLike, psd: ArrayLike) -> NDArray[np.float64]:
     return np.einsum("...ab,ij->...aibj", q[..., None, None] * blocks, np.eye(3)).reshape(*blocks.shape[:-2], 6, 6)
 
 
+def _rise(times_s: NDArray[np.float64]) -> bool:
+    """Whether times (T,) are finite and each is after the one before."""
+    return bool(np.isfinite(times_s).all() and (np.diff(times_s) > 0).all())
+
+
+def _projectors(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """R R^+ of each R (D, 3, 3): the projectors on their ranges, the identity exactly where R has full rank.
+
+    Singular values below 1e-5 of the largest are rounding: the root of information that is zero up to 1e-10.
+    """
+    left, values, _ = np.linalg.svd(matrices)
+    ranged = left * (values > 1e-5 * values[:, :1])[:, None]
+    full = (values[:, 2] > 1e-5 * values[:, 0])[:, None, None]
+    return np.where(full, np.eye(3), ranged @ ranged.swapaxes(1, 2))
+
+
 def _contained(linear: Iterable[gtsam.JacobianFactor], keys: NDArray[np.int64]) -> list[gtsam.NonlinearFactor]:
     """Linear factors on `Point3` variables `keys` (D,) as factors of a nonlinear graph.
 
     They must be told that they are linearised at zero: without that their error is always 0.
     """
     zeros, origin = gtsam.Values(), np.zeros(3)
-    for key in keys.tolist():
+    for key in np.unique(keys).tolist():
         zeros.insert(key, origin)
     return list(map(gtsam.LinearContainerFactor, linear, repeat(zeros)))

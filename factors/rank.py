@@ -24,12 +24,15 @@ def joint_information(
     Observation d is of `joint[d]` (D,) in `view[d]` (D,) to within `sigmas_px[d]` (D,); `points_world` (J, 3)
     is where the joints are thought to be; `K` (V, 3, 3) and `cTw` (V, 3, 4) are the cameras;
     `prior_information` is (J, 3, 3), zero where a joint has no prior. Observations from behind a camera
-    count nothing.
+    count nothing. ValueError where a sigma is not positive and finite.
     """
     points = np.asarray(points_world, dtype=np.float64)
     joints, views = np.asarray(joint, dtype=np.intp), np.asarray(view, dtype=np.intp)
     _, _, jacobian = project_with_jacobian(points[joints], np.asarray(K)[views], np.asarray(cTw)[views])
-    jacobian = np.nan_to_num(jacobian) / np.asarray(sigmas_px, dtype=np.float64)[:, None, None]
+    sigmas = np.asarray(sigmas_px, dtype=np.float64)
+    if not np.all((sigmas > 0) & np.isfinite(sigmas)):
+        raise ValueError("sigmas_px must be positive and finite: drop observations of no weight")
+    jacobian = np.nan_to_num(jacobian) / sigmas[:, None, None]
     information = np.zeros((len(points), 3, 3))
     np.add.at(information, joints, jacobian.transpose(0, 2, 1) @ jacobian)
     return information if prior_information is None else information + np.asarray(prior_information)

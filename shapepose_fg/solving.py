@@ -1,7 +1,7 @@
 """Rows of a result solved anew from their own observations: after who is who was corrected by hand."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from shapepose_fg.pipeline import PipelineConfig
 from shapepose_fg.reconstruction import Reconstruction
 from shapepose_fg.run_summary import covered_frames
 from shapepose_fg.solved_rows import result_rows
+from shapepose_fg.windows import near_border, window_stop
 
 
 def solve_rows(
@@ -40,42 +41,55 @@ def solve_rows(
     estimator = Estimator(rig, fitter, joint_names, settings)
     parts = []
     with torch_threads(config.threads):
-        for own in _windows(rows, config):
-            near = _near(rows, own, config)
-            part = rows.rows(near)
+        for window in _windows(rows, config):
+            part = rows.rows(window.rows(rows, config.windows.overlap_s))
             table = part.observations
             assert table is not None
             # From the views: the joints as they are may be somebody else's.
             observations = table.observations(np.full_like(part.joints, np.nan), part.time_s)
             estimates = estimator.estimate(observations, extra_factors)
             solved = result_rows(observations, estimates, table.candidate, rig, joint_names, part.person)
-            parts.append(solved.rows(np.isin(part.frame, np.array(own))))
+            parts.append(solved.rows(_inside(part.frame, window.own)))
         solved = replace(Reconstruction.concatenate(parts), run=rows.run) if parts else rows
         return with_bodies_over_time(solved, fitter) if isinstance(fitter, SequenceFitting) else solved
 
 
-def _windows(rows: Reconstruction, config: PipelineConfig) -> list[range]:
-    """The frames of each window that has any of `rows`, as the recording was cut into them."""
+@dataclass(frozen=True)
+class _Window:
+    """A window of the recording, whoever is in it."""
+
+    own: range
+    """The frames whose rows it returns."""
+    stretch: range
+    """The frames from one cut to the next that it lies in."""
+
+    def rows(self, rows: Reconstruction, overlap_s: float) -> NDArray[np.intp]:
+        """Rows in its own frames, and in those within `overlap_s` of its borders, none beyond a cut."""
+        frame, time_s = rows.frame, rows.time_s
+        known, first = np.unique(frame, return_index=True)
+        # Where nobody of `rows` is in the frame at a border, its time is between those of the frames around it.
+        begin_s, end_s = np.interp([self.own.start, self.own.stop], known, time_s[first])
+        own = _inside(frame, self.own)
+        before = near_border(time_s, begin_s, overlap_s) & (frame < self.own.start)
+        after = near_border(time_s, end_s, overlap_s) & (frame >= self.own.stop)
+        return np.flatnonzero((own | before | after) & _inside(frame, self.stretch))
+
+
+def _windows(rows: Reconstruction, config: PipelineConfig) -> list[_Window]:
+    """The windows that have any of `rows`, as the recording was cut into them."""
     first, last = (int(rows.frame.min()), int(rows.frame.max()) + 1) if len(rows) > 0 else (0, 0)
     cuts: Sequence[int] = rows.run.get("cuts", ())
     covered = covered_frames(rows.run) or [range(first, last)]
     windows = []
     for stretch in (part for span in covered for part in stretches(span, cuts)):
-        size = config.batch_frames
-        windows += [
-            range(start, min(start + size, stretch.stop)) for start in range(stretch.start, stretch.stop, size)
-        ]
-    frames = np.unique(rows.frame)
-    return [window for window in windows if ((frames >= window.start) & (frames < window.stop)).any()]
+        start = stretch.start
+        while start < stretch.stop:
+            stop = window_stop(start, stretch.stop, config.batch_frames)
+            windows.append(_Window(range(start, stop), stretch))
+            start = stop
+    return [window for window in windows if _inside(rows.frame, window.own).any()]
 
 
-def _near(rows: Reconstruction, own: range, config: PipelineConfig) -> NDArray[np.intp]:
-    """Rows in the frames `own` and in those around them that the window overlaps, none beyond a cut."""
-    cuts = np.array(rows.run.get("cuts", ()), dtype=np.int64)
-    begin = cuts[cuts <= own.start].max(initial=0)
-    end = cuts[cuts >= own.stop].min(initial=np.iinfo(np.int64).max)
-    inside = (rows.frame >= own.start) & (rows.frame < own.stop)
-    times = rows.time_s[inside]
-    overlap_s = config.windows.overlap_s
-    around = (rows.time_s >= times.min() - overlap_s) & (rows.time_s <= times.max() + overlap_s)
-    return np.flatnonzero((inside | around) & (rows.frame >= begin) & (rows.frame < end))
+def _inside(frame: NDArray[np.integer], span: range) -> NDArray[np.bool_]:
+    """(N,) which frames are in `span`."""
+    return (frame >= span.start) & (frame < span.stop)

@@ -12,6 +12,7 @@ from typing import Annotated
 
 import numpy as np
 from annotated_types import Interval
+from numpy.typing import NDArray
 
 from shapepose_fg.bounds import RepeatsOrNone, Settings
 from shapepose_fg.estimation.estimator import Estimates, Estimator, ExtraFactors
@@ -35,6 +36,20 @@ class WindowConfig(Settings):
     again_alone: RepeatsOrNone = 5
     """The same for frames that stand alone. From time to time more is asked of who stays (`Survival`): whoever
     goes leaves detections to others, so the least goes first."""
+
+
+def window_stop(start: int, end: int, frames: int) -> int:
+    """Where the window that begins at `start` stops, of `frames` frames, in a stretch that ends before `end`.
+
+    The last takes up to half a window more: one of a few frames would know its people less well than the others.
+    """
+    stop = start + frames
+    return stop if stop + frames // 2 < end else end
+
+
+def near_border(times_s: NDArray[np.float64], border_s: float, overlap_s: float) -> NDArray[np.bool_]:
+    """(T,) which frames, at `times_s` (T,), are so near to the border between two windows that both have them."""
+    return np.abs(times_s - border_s) <= overlap_s
 
 
 @dataclass(frozen=True)
@@ -176,9 +191,8 @@ class Engine:
 
     def _next(self, decided: Sequence[Decided], before: int, last: bool) -> tuple[int, int] | None:
         """Where the next window's own frames stop, and where it ends; None where there is too little."""
-        stop = before + self.frames
-        # A window of a few frames at the end would know its people less well than the others do.
-        if stop + self.frames // 2 < len(decided):
+        stop = window_stop(before, len(decided), self.frames)
+        if stop < len(decided):
             end = self._overlap(decided, stop, 1)
             if end < len(decided) or last:
                 return stop, end
@@ -188,5 +202,5 @@ class Engine:
         """The frame `overlap_s` before or after the border at `at`."""
         times = np.array([frame.time_s.mean() for frame, _ in decided])
         border = times[min(at, len(times) - 1)]
-        near = np.abs(times - border) <= self.solver.windows.overlap_s
+        near = near_border(times, border, self.solver.windows.overlap_s)
         return int(np.flatnonzero(near)[0]) if direction < 0 else int(np.flatnonzero(near)[-1]) + 1

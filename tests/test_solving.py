@@ -1,5 +1,6 @@
 """People solved anew from the observations of a result: nothing changes where nobody did, and swaps are mended."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.cli import main
 from shapepose_fg.errors import InputError
+from shapepose_fg.estimation.estimator import Estimator
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.solved_setup import CAMERAS, read_setup
 from shapepose_fg.observation_table import Gate
@@ -20,6 +22,7 @@ from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.scene import Scene
 from shapepose_fg.solving import solve_rows
 from shapepose_fg.tracking.edits import Action, Edit, apply, solve_anew
+from shapepose_fg.windows import WindowConfig
 
 FRAMES = 12
 CONFIG = PipelineConfig(batch_frames=8)
@@ -32,14 +35,14 @@ def scene() -> Scene:
 
 @pytest.fixture(scope="module")
 def people(scene) -> Reconstruction:
-    """Two windows of eight and four frames."""
+    """One window of twelve frames: it takes up to half of its eight more."""
     return reconstruct(simulate(scene), scene.rig, CONFIG)
 
 
-def solve(rows: Reconstruction, scene: Scene) -> Reconstruction:
+def solve(rows: Reconstruction, scene: Scene, config: PipelineConfig = CONFIG) -> Reconstruction:
     offsets = KeypointOffsets.from_dict(rows.run["keypoint_offsets"])
-    fitter = make_fitter(CONFIG.body, BodyModel.default()).with_keypoint_offsets(offsets)
-    return solve_rows(rows, scene.rig, CONFIG, fitter)
+    fitter = make_fitter(config.body, BodyModel.default()).with_keypoint_offsets(offsets)
+    return solve_rows(rows, scene.rig, config, fitter)
 
 
 def moved_mm(one: Reconstruction, other: Reconstruction) -> np.ndarray:
@@ -60,6 +63,36 @@ def test_solved_anew_nobody_moves(scene, people):
 
 def replace_changed(people: Reconstruction, changed: frozenset[int]):
     return replace(apply(people, Edit(Action.RENAME, int(people.person[0]), 99)), people=people, changed=changed)
+
+
+LONG = PipelineConfig(batch_frames=6, windows=WindowConfig(overlap_s=0.1))
+
+
+def solved_frames(work: Callable[[], Reconstruction]) -> tuple[list[list[int]], Reconstruction]:
+    """The frames of each window that is solved meanwhile, and what comes of it."""
+    frames, estimate = [], Estimator.estimate
+
+    def noted(self, observations, *others):
+        frames.append(sorted(set(observations.frame.tolist())))
+        return estimate(self, observations, *others)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Estimator, "estimate", noted)
+        return frames, work()
+
+
+def test_rows_are_solved_anew_in_the_windows_of_the_recording():
+    """22 frames cut before the tenth, windows of six that overlap by three; the last of each part is longer."""
+    scene = built_in_scene(people=2, cameras=4, frames=22)
+    windows, people = solved_frames(lambda: reconstruct(simulate(scene), scene.rig, LONG, cuts=[9]))
+    spans = [(0, 9), (9, 19), (12, 22)]  # 9 to 15 and 15 to 22, and three frames of the other
+    assert windows == [list(range(start, stop)) for start, stop in spans]
+    assert solved_frames(lambda: solve(people, scene, LONG))[0] == windows
+    # Nobody in the frames about the border: it lies where it did.
+    gone = [13, 14, 15, 16]
+    fewer = people.rows(~np.isin(people.frame, gone))
+    expected = [[frame for frame in window if frame not in gone] for window in windows]
+    assert solved_frames(lambda: solve(fewer, scene, LONG))[0] == expected
 
 
 def test_a_swap_is_mended_and_only_who_was_in_it_is_solved(scene, people):

@@ -194,6 +194,9 @@ def _solve(
         if window.graph.temporal:
             initial = np.where(np.isfinite(evidence.points[part]), evidence.points[part], initial)
             initial = interpolated(initial, window.graph.times_s)
+            # X_0 alone is no evidence: a joint that nobody says anything of has nothing that determines it.
+            mentioned = (inlier.any(axis=-1) | body.known[part]).any(axis=0) | window.graph.touched
+            initial[:, ~mentioned] = np.nan
             lost = badly[part]
         else:
             inlier = inlier & known[part][..., None]

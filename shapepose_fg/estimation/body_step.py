@@ -39,7 +39,11 @@ class BodyStep:
         return JointTargets(np.nan_to_num(evidence.points), information)
 
     def fit(self, targets: JointTargets, last: BodyFit, rows: NDArray[np.intp] | None = None) -> BodyFit:
-        """Bodies of some `rows` (K,) or of all, from the `last` ones (R) on."""
+        """Bodies of some `rows` (K,) or of all, from the `last` ones (R) on.
+
+        A group's shape is then that of those of its rows that are in `rows`: a row fitted again has another shape
+        than the rest of its group. Over time results are measured so; a frame alone is a group of its own.
+        """
         groups = self.groups
         if rows is not None:
             targets = targets.rows(rows)

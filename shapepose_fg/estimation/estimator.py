@@ -121,8 +121,7 @@ class Estimator:
         X = observations.initial
         if config.refine.complete_start:
             X = triangulate(observations, views, config.observations)
-        if len(np.unique(observations.track)) < len(observations):
-            X = self._completed(X, observations, views)
+        X = self._completed(X, observations, views)
         sigmas = observation_sigmas(observations, X, views, config.observations, self.joints)
         windows = self._windows(observations, sigmas, views, extra_factors)
         solution = alternate(observations, views, sigmas, X, windows, self.fitter, config)
@@ -162,12 +161,13 @@ class Estimator:
         return drafted(evidence, body, config.refine.contradiction)
 
     def _completed(self, X: NDArray[np.float64], observations: Observations, views: Views) -> NDArray[np.float64]:
-        """X_0 (N, J, 3) with joints that are not placed where a draft has them.
+        """X_0 (N, J, 3) with joints that are not placed where a draft has them, in windows of several frames.
 
         A view that sees one counts from the first round on, then, and windows need no second.
         """
+        _, whose, rows_of = np.unique(observations.track, return_inverse=True, return_counts=True)
         unknown = np.asarray(np.isnan(X).any(axis=2))
-        rows = np.flatnonzero(unknown.any(axis=1))
+        rows = np.flatnonzero(unknown.any(axis=1) & (rows_of[whose] > 1))
         if len(rows) == 0:
             return X
         places, _ = self.draft(observations.rows(rows), views.rows(rows))

@@ -40,8 +40,9 @@ class RefineConfig(Settings):
     once, to what lies within `rho_2d_m` of where the views alone put each joint. On `tune`, frames alone, 0 / 5
     cm: F1 91.9 / 93.8 %, MPJPE 44 / 35 mm; over time 18.8 / 18.1 mm."""
     complete_start: bool = True
-    """Whether joints that two views saw and stage I did not place are triangulated for X_0. In the paper they are
-    missing until the body puts them somewhere."""
+    """Whether in frames that stand alone joints that two views saw and stage I did not place are triangulated for
+    X_0. In the paper they are missing until the body puts them somewhere. Windows of several frames start from a
+    draft, which triangulates in any case."""
     body_from_views: bool = True
     """Whether the body is fitted to what the views alone say of each joint, weighed by it. In Algorithm 1 it is
     fitted to X_n, all joints alike, of which part was made by the body."""

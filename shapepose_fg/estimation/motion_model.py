@@ -44,6 +44,11 @@ class Lasting:
     kept: float = 0.0
     """How much of the first share motion leaves in, because it lasts for a few frames after all, 0 to 1."""
 
+    @property
+    def possible(self) -> bool:
+        """Whether these numbers are within their bounds, and finite."""
+        return 0 < self.white_share < 1 and 0 < self.correlation_s < np.inf and 0 <= self.kept <= 1
+
 
 @dataclass(frozen=True)
 class MotionModel:
@@ -102,6 +107,11 @@ class MotionModel:
         table = np.array(list(known.values())).reshape(-1, 3)
         if len(table) == 0 or not (np.isfinite(table).all() and (table[:, 0] > 0).all() and (table >= 0).all()):
             raise InputError(f"{path}: densities must be positive; give what scripts/measure_motion.py writes")
+        if not (views.possible and body.possible):
+            raise InputError(
+                f"{path}: of views and body, white_share must be between 0 and 1, correlation_s positive and kept"
+                " 0 to 1; give what scripts/measure_motion.py writes"
+            )
         chosen = config.psd_scale * np.array([known.get(name, tuple(table.mean(axis=0))) for name in joints])
         still, speed, lost = np.ascontiguousarray(chosen.T)
         return cls(still, speed, lost, views, body, config.around_s)

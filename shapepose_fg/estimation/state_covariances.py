@@ -12,7 +12,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from shapepose_fg.estimation.window_graph import UNDETERMINED_M, WindowGraph
+from shapepose_fg.estimation.window_graph import WindowGraph, is_determined
 
 
 @dataclass(frozen=True)
@@ -27,10 +27,20 @@ class Chains:
     """(C, T - 1, n, n) of each state, rows, with the one before it, columns."""
 
     def covariances(self) -> NDArray[np.float64]:
-        """(C, T, n, n) marginal covariance of each state; LinAlgError where a chain is not determined.
+        """(C, T, n, n) marginal covariance of each state; NaN in all states of a chain that is not determined."""
+        try:
+            return self._blocks_of_inverse()
+        except np.linalg.LinAlgError:
+            if len(self.diagonal) == 1:
+                return np.full_like(self.diagonal, np.nan)
+        # NumPy does not say which one failed.
+        single = (Chains(self.diagonal[n : n + 1], self.below[n : n + 1]) for n in range(len(self.diagonal)))
+        return np.concatenate([chain.covariances() for chain in single])
 
-        Block Cholesky down the chains, and the blocks on the diagonal of the inverse on the way back, for all
-        chains together.
+    def _blocks_of_inverse(self) -> NDArray[np.float64]:
+        """(C, T, n, n) blocks on the diagonal of the inverse; LinAlgError where a chain is not determined.
+
+        Block Cholesky down the chains, and these blocks on the way back, for all chains together.
         """
         steps = self.diagonal.shape[1]
         inverse, gain = np.empty_like(self.diagonal), np.empty_like(self.below)
@@ -64,10 +74,7 @@ def state_covariances(
             np.concatenate([chains.diagonal for _, chains in members]),
             np.concatenate([chains.below for _, chains in members]),
         )
-        try:
-            found = np.split(together.covariances(), len(members))
-        except np.linalg.LinAlgError:
-            continue
+        found = np.split(together.covariances(), len(members))
         for (n, _), covariance in zip(members, found, strict=True):
             result[n] = _of_present(graphs[n], covariance.swapaxes(0, 1))
     return [
@@ -116,6 +123,6 @@ def _of_present(
     position, velocity = (np.full((*placed.shape, 3, 3), np.nan) for _ in range(2))
     for result, first in ((position, 0), (velocity, 3)):
         part = covariance[..., first : first + 3, first : first + 3]
-        determined = placed & (np.trace(part, axis1=2, axis2=3) < UNDETERMINED_M**2)
+        determined = placed & is_determined(part)
         result[determined] = part[determined]
     return position, velocity

@@ -35,7 +35,8 @@ from shapepose_fg.estimation.motion_model import Lasting, MotionModel
 _OF_VIEWS, _OF_BODY = 0, 1
 """Sources of messages about joints, for the keys of their offsets."""
 UNDETERMINED_M = 10.0
-"""A variable that the problem leaves less certain than this, metres or m/s, is not determined."""
+"""A variable that the problem leaves less certain than this in some direction, metres or m/s, is not
+determined."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,8 @@ class WindowGraph:
     frames of one guess are one guess. In a window of several frames therefore
 
     - projections and body priors count with the share of their variance that is new in every frame, so that motion
-      smooths that only; the rest is `outcome.lasting_covariance`, to be added to what `marginals` gives;
+      smooths that only; `marginals` has nothing of the rest: what is reported in its place, with all of the error,
+      is `outcome.reported_covariance`;
     - where a joint is lost from sight (`lost` of `solve`) the body's prior gets an offset that decays slowly
       (`factors.motion`): the joint stays where the body puts it plus the difference that there was when it was
       seen;
@@ -144,21 +146,25 @@ class WindowGraph:
         self._motion = motion
         self._frame, self._joint, self._view = np.nonzero(sigmas_px > 0)
         share = motion.views.white_share if T > 1 else 1.0
-        # A lasting error is no outlier: the kernel is as wide as before the sigma was split.
-        width = None if kernel is None else DEFAULT_WIDTH_SIGMA[kernel] / np.sqrt(share)
+        scale = np.sqrt(share / config.weight_2d)
+        # A lasting error is no outlier, and a weight multiplies the kernel's cost, too: in pixels the kernel is as
+        # wide as before either changed the sigma.
+        width = None if kernel is None else DEFAULT_WIDTH_SIGMA[kernel] / scale
         V = sigmas_px.shape[2]
         self._projections = projection_factors(
             [camera for row in cameras for camera in row],
             self._frame * V + self._view,
             self.keys[self._frame, self._joint],
             xy[self._frame, self._joint, self._view],
-            sigmas_px[self._frame, self._joint, self._view] * np.sqrt(share / config.weight_2d),
+            sigmas_px[self._frame, self._joint, self._view] * scale,
             robust_kernel(kernel, width),
         )
         self._offset_keys = np.stack(
             [offset_keys(track, joints, self.frames[:, None], source) for source in (_OF_VIEWS, _OF_BODY)]
         )
         self._added: list[tuple[gtsam.NonlinearFactor, frozenset[int]]] = []
+        self._touched = np.zeros(J, dtype=bool)
+        self._tied: list[frozenset[int]] = []
         self._present = np.zeros((T, J), dtype=bool)
 
     def __len__(self) -> int:
@@ -195,27 +201,25 @@ class WindowGraph:
                 "a factor of your own must be on the window's own keys only (WindowGraph.keys and velocity_keys)"
             )
         self._added.append((factor, frozenset(keys)))
+        joined = frozenset(split_key(key).joint for key in keys)
+        self._touched[list(joined)] = True
+        apart = [each for each in self._tied if not each & joined]
+        self._tied = [*apart, joined.union(*(each for each in self._tied if each & joined))]
 
-    @cached_property
+    @property
     def coupled(self) -> list[frozenset[int]]:
         """Joints that factors of your own tie to each other: sets of two or more, without overlap."""
-        sets: list[frozenset[int]] = []
-        for _, keys in self._added:
-            joined = frozenset(split_key(key).joint for key in keys)
-            apart = [each for each in sets if not each & joined]
-            sets = [*apart, joined.union(*(each for each in sets if each & joined))]
-        return [each for each in sets if len(each) > 1]
+        return [each for each in self._tied if len(each) > 1]
 
-    @cached_property
+    @property
     def with_offsets(self) -> NDArray[np.bool_]:
         """(J,) joints with a factor of your own, in a window of several frames: solved with offsets throughout."""
-        return self.touched if self.temporal else np.zeros_like(self.touched)
+        return self._touched if self.temporal else np.zeros_like(self._touched)
 
-    @cached_property
+    @property
     def touched(self) -> NDArray[np.bool_]:
         """(J,) joints on which there is a factor of your own."""
-        joints = {split_key(key).joint for _, keys in self._added for key in keys}
-        return np.isin(np.arange(self.keys.shape[1]), list(joints))
+        return self._touched
 
     def solve(
         self,
@@ -232,6 +236,7 @@ class WindowGraph:
         a window of several frames that goes for all frames of the joint. `lost` (T, J): where joints are hardly
         seen.
         """
+        self.failure = ""
         self._present = np.asarray(np.isfinite(initial).all(axis=2))
         if self.temporal:
             self._present &= np.asarray(self._present.all(axis=0))
@@ -274,6 +279,7 @@ class WindowGraph:
                 result[n] = found.marginalCovariance(key)
         except RuntimeError:
             result = self._damped_marginals(inside, keys.size)
+        result[~is_determined(result)] = np.nan
         return result.reshape(*keys.shape, 3, 3)
 
     @cached_property
@@ -302,13 +308,10 @@ class WindowGraph:
                 result[n] = found.marginalCovariance(key)
         except RuntimeError:
             return np.full((count, 3, 3), np.nan)
-        lost = ~(np.trace(result, axis1=1, axis2=2) < UNDETERMINED_M**2)
-        result[lost] = np.nan
         return result
 
     def _optimise(self) -> None:
         """Levenberg-Marquardt from `values`; where it fails they stay as they are, and `failure` says why."""
-        self.failure = ""
         try:
             optimizer = gtsam.LevenbergMarquardtOptimizer(self.graph, self.values, self._parameters)
             self.values = optimizer.optimize()
@@ -418,6 +421,13 @@ def near_in_time(marked: NDArray[np.bool_], times_s: NDArray[np.float64], within
 def spanned(marked: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """(T, J) which frames lie between the first and the last that are `marked` (T, J), these two included."""
     return np.maximum.accumulate(marked, axis=0) & np.maximum.accumulate(marked[::-1], axis=0)[::-1]
+
+
+def is_determined(covariance: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(...,) whether variables of this `covariance` (..., 3, 3), m² or m²/s², are known to `UNDETERMINED_M`."""
+    known = np.asarray(np.isfinite(covariance).all(axis=(-2, -1)))
+    largest = np.linalg.eigvalsh(np.where(known[..., None, None], covariance, 0.0))[..., -1]
+    return np.asarray(known & (largest < UNDETERMINED_M**2))
 
 
 def symmetric_roots(information: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -239,6 +239,14 @@ def test_what_cannot_be_fitted_has_a_status(fitter, targets):
     assert single.fit.ok.all()
 
 
+def test_rows_that_never_settle_have_no_body_and_say_so(targets):
+    """After one step from a cold start nobody's energy has stopped falling: no row has anything to start from."""
+    fitter = LevenbergMarquardtFitter(config=PlainFitterConfig(max_iterations=1))
+    found = fitter.fit_sequence(targets, GROUP, TIME_S)
+    assert (found.fit.status == FitStatus.NOT_CONVERGED).all()
+    assert np.isnan(found.fit.joints).all() and not found.fit.betas.any()
+
+
 def test_misuse_is_told(fitter, targets):
     with pytest.raises(ValueError, match="time_s must be 180 finite numbers"):
         fitter.fit_sequence(targets, GROUP, TIME_S[:5])

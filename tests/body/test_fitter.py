@@ -219,9 +219,16 @@ def test_warm_start_is_quicker_and_ends_at_the_same_place(joints, monkeypatch):
 
 def test_rows_without_an_earlier_body_start_afresh(fitter, joints):
     targets = make_targets(joints[:6], 0.01)
-    status = np.full(6, FitStatus.TOO_FEW_JOINTS, dtype="U20")
+    status = np.full(6, FitStatus.TOO_FEW_JOINTS)
     fit = fitter.fit(targets, initial=BodyFit.failed(status, 25))
     assert distance_mm(fit.joints, fitter.fit(targets).joints).max() < 0.1
+
+
+def test_a_failed_row_takes_any_other_status():
+    """`invalid_targets` is longer than the text that the rows were made with."""
+    before, after = (BodyFit.failed(np.full(2, each), 25) for each in ("too_few_joints", "invalid_targets"))
+    changed = before.with_rows(np.array([1]), after.rows(np.array([1])))
+    assert changed.status.tolist() == [FitStatus.TOO_FEW_JOINTS, FitStatus.INVALID_TARGETS]
 
 
 def test_misuse_is_told(fitter, joints):

@@ -47,6 +47,16 @@ def test_keypoints_are_the_regressor_on_the_mesh(tiny_model, random_parameters):
     np.testing.assert_allclose(tiny_model.keypoints(parameters).numpy(), expected.numpy(), atol=1e-12)
 
 
+def test_some_vertices_are_those_of_the_mesh_whatever_the_type_of_their_numbers(tiny_model, random_parameters):
+    """[1, 0] of 32 bits has the bytes of [1] of 64."""
+    parameters = random_parameters()
+    whole = tiny_model.vertices(parameters).numpy()
+    for only in (np.array([1, 0], dtype=np.int32), np.array([1]), np.array([4, 2, 0])[::-1]):
+        np.testing.assert_allclose(tiny_model.vertices(parameters, only).numpy(), whole[:, only], atol=1e-12)
+    with pytest.raises(ValueError, match=r"only must be \(M,\)"):
+        tiny_model.vertices(parameters, np.array([[1, 0]]))
+
+
 def test_rows_that_do_not_sum_to_one(tmp_path, make_smpl_arrays, random_parameters):
     arrays = make_smpl_arrays()
     arrays["keypoint_regressor"] *= np.linspace(0.985, 1.015, 25)[:, None]  # as printed with few digits

@@ -227,6 +227,45 @@ def test_weights_divide_the_covariances(five_cameras, person):
     np.testing.assert_allclose(9.0 * body.covariance(), covariance, rtol=1e-8)
 
 
+@pytest.mark.parametrize("kernel", ["huber", "cauchy", "geman_mcclure", "tukey"])
+@pytest.mark.parametrize("frames", [1, 2])
+def test_the_weight_of_the_views_multiplies_their_cost_kernel_and_all(five_cameras, person, kernel, frames):
+    """One view is 60 px off, where every kernel bends: four times the weight is four times the cost."""
+    truth, xy, sigmas = person
+    xy = xy.copy()
+    xy[:, 2, 0] += 60.0
+    cameras = [[make_camera(camera.K, camera.wTc) for camera in five_cameras.cameras]] * frames
+    costs = []
+    for weight in (1.0, 4.0):
+        times = {"frames": np.arange(frames), "times_s": 0.1 * np.arange(frames)}
+        observed = np.tile(xy, (frames, 1, 1, 1)), np.tile(sigmas, (frames, 1, 1))
+        config = WindowGraphConfig(weight_2d=weight, max_iterations=1)
+        window = WindowGraph(cameras, *observed, config, kernel, MOTION, track=0, **times)
+        none = Message(np.zeros((frames, 25, 3)), np.zeros((frames, 25, 3, 3)))
+        window.solve(observed[1] > 0, none, none, np.tile(truth, (frames, 1, 1)))
+        values = gtsam.Values()
+        for key in window.values.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
+            values.insert(key, truth[split_key(key).joint] if key in window.keys else np.zeros(3))
+        costs.append(window.graph.error(values))  # where nobody moves, so that motion costs nothing
+    assert costs[1] == pytest.approx(4.0 * costs[0], rel=1e-9)
+
+
+def test_a_factor_added_late_counts(five_cameras, person):
+    """What was asked of the graph before does not matter."""
+    _, xy, sigmas = person
+    cameras = [[make_camera(camera.K, camera.wTc) for camera in five_cameras.cameras]] * 2
+    both = np.stack([xy, xy]), np.stack([sigmas, sigmas])
+    window = WindowGraph(cameras, *both, EXACT, None, MOTION, track=0, frames=[0, 1], times_s=[0.0, 0.1])
+    assert not window.touched.any() and not window.with_offsets.any() and window.coupled == []
+    noise = gtsam.noiseModel.Isotropic.Sigma(1, 0.01)
+    for frame in range(2):
+        for one, other in ((3, 4), (6, 7), (4, 2)):
+            window.add(gtsam.RangeFactor3(*window.keys[frame, [one, other]].tolist(), 0.3, noise))
+    assert np.flatnonzero(window.touched).tolist() == [2, 3, 4, 6, 7]
+    np.testing.assert_array_equal(window.with_offsets, window.touched)
+    assert sorted(window.coupled, key=sorted) == [{2, 3, 4}, {6, 7}]
+
+
 def test_a_joint_that_is_not_known_is_left_out(five_cameras, person):
     truth, xy, sigmas = person
     sigmas, start = sigmas.copy(), truth.copy()
@@ -321,6 +360,16 @@ def test_a_solver_that_fails_says_so_and_leaves_the_joints(five_cameras, person,
         np.testing.assert_array_equal(found, truth)
 
 
+def test_an_empty_problem_after_a_failure_is_no_failure(five_cameras, person):
+    truth, xy, sigmas = person
+    graph = graph_of(five_cameras, xy, sigmas)
+    graph.add(gtsam.PriorFactorPoint3(int(graph.keys[4]), np.full(3, np.nan), gtsam.noiseModel.Unit.Create(3)))
+    graph.solve(truth)
+    assert graph.window.failure
+    assert np.isnan(graph.solve(np.full((25, 3), np.nan))).all()
+    assert graph.window.failure == ""
+
+
 def test_of_a_joint_that_one_view_saw_there_is_no_covariance_and_the_others_have_theirs(five_cameras, person):
     """Its depth is open, so that the whole system is singular; what hangs together with it is nothing."""
     truth, xy, sigmas = person
@@ -336,6 +385,23 @@ def test_of_a_joint_that_one_view_saw_there_is_no_covariance_and_the_others_have
     assert np.isnan(covariance[4]).all() and np.isfinite(whole).all()
     # With a prior of 100 m on each joint: a relative difference of (1 cm / 100 m)^2.
     np.testing.assert_allclose(np.delete(covariance, 4, axis=0), np.delete(whole, 4, axis=0), rtol=1e-6)
+
+
+def test_what_is_known_to_more_than_ten_metres_is_not_determined(five_cameras, person):
+    """In some direction: 11 m along x are too much, 9 m along every axis are not, and no path to it matters."""
+    truth, xy, sigmas = person
+    for whole_system_is_singular in (False, True):
+        graph = graph_of(five_cameras, xy, np.where(np.arange(25)[:, None] == 6, sigmas, 0.0))
+        inlier = np.ones(sigmas.shape, dtype=bool)
+        inlier[6, 1:] = not whole_system_is_singular
+        graph.set_gates(inlier)
+        covariance = np.tile(1e-4 * np.eye(3), (25, 1, 1))
+        covariance[4], covariance[5] = np.diag([11.0**2, 1e-4, 1e-4]), 9.0**2 * np.eye(3)
+        graph.set_priors(np.isin(np.arange(25), [3, 4, 5]), truth, covariance)
+        start = np.where(np.isin(np.arange(25), [3, 4, 5, 6])[:, None], truth, np.nan)
+        graph.solve(start)
+        determined = np.isfinite(graph.covariance()).all(axis=(1, 2))
+        assert np.flatnonzero(determined).tolist() == [3, 5] + [6] * (not whole_system_is_singular)
 
 
 def test_in_a_frame_alone_a_joint_lost_from_sight_is_pulled_as_any_other(five_cameras, person):

@@ -96,6 +96,24 @@ def test_a_number_beyond_its_bits_is_refused(make):
         make()
 
 
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: joint_key(1.9, 2.7, 3.2),
+        lambda: velocity_key(1, 2, 3.5),
+        lambda: joint_keys(1, [2, 2.5], 3),
+        lambda: joint_keys(1.5, [2, 3], 3),
+        lambda: offset_key(1, 2, 3, 1.5),
+        lambda: camera_key(0.5),
+    ],
+)
+def test_a_number_that_is_not_whole_is_refused(make):
+    """It would be the key of somebody else."""
+    with pytest.raises(ValueError, match="must be a whole number"):
+        make()
+    assert joint_key(1.0, np.float64(2), np.int32(3)) == joint_key(1, 2, 3)
+
+
 def test_keys_are_printed_readably_also_by_gtsam(capfd):
     assert format_key(joint_key(1, 4, 30)) == "position(person 1, joint 4, frame 30)"
     assert format_key(velocity_key(1, 4, 30)) == "velocity(person 1, joint 4, frame 30)"

@@ -205,6 +205,22 @@ def test_a_message_told_often_is_no_surer_than_told_once():
     assert sigma == pytest.approx(0.1 * np.sqrt(0.8 + 0.2 / 100), rel=0.02)
 
 
+def test_two_messages_about_one_joint_both_count():
+    """At 0 and at 1 m, the second twice as sure: at 0.8 m, known as five messages are."""
+    means, roots = [[0, 0, 0], [1, 1, 1]], np.stack([np.eye(3), 2 * np.eye(3)]) / 0.1
+    factors = lasting_prior_factors(KEYS[[0, 0]], OFFSETS[[0, 1]], means, roots, 0.4)
+    unit = gtsam.noiseModel.Unit.Create(3)
+    factors += [gtsam.PriorFactorPoint3(key, np.zeros(3), unit) for key in OFFSETS[:2].tolist()]
+    values = gtsam.Values()
+    for key in [KEYS[0], *OFFSETS[:2]]:
+        values.insert(int(key), np.zeros(3))
+    graph, solution = solved(factors, values)
+    np.testing.assert_allclose(solution.atPoint3(int(KEYS[0])), [0.8, 0.8, 0.8], atol=1e-9)
+    np.testing.assert_allclose(
+        gtsam.Marginals(graph, solution).marginalCovariance(int(KEYS[0])), 0.1**2 / 5 * np.eye(3), atol=1e-12
+    )
+
+
 def test_a_ray_leaves_its_direction_open():
     """A singular message: nothing along z, so that the joint stays where the prior has it."""
     roots = np.diag([100.0, 100.0, 0.0])[None]
@@ -219,14 +235,59 @@ def test_a_ray_leaves_its_direction_open():
     np.testing.assert_allclose(solution.atPoint3(int(KEYS[0])), [1.0, 2.0, 0.0], atol=1e-5)
 
 
+def covariance_beside_rays(rays: int, direction) -> np.ndarray:
+    """(3, 3) covariance of a joint that one full message of 20 mm is of, `rays` frames with rays along `direction`
+    after it; each ray's own joint is anywhere within 10 m.
+    """
+    frames = np.arange(rays + 1)
+    keys, offsets = joint_keys(0, 0, frames), offset_keys(0, 0, frames)
+    along = np.asarray(direction) / np.linalg.norm(direction)
+    roots = np.tile((np.eye(3) - np.outer(along, along)) / 0.02, (rays + 1, 1, 1))
+    roots[0] = np.eye(3) / 0.02
+    factors = lasting_prior_factors(keys, offsets, np.zeros((rays + 1, 3)), roots, 0.3)
+    factors += offset_factors(offsets, 0.04 * frames, 1.0)
+    anywhere = gtsam.noiseModel.Isotropic.Sigma(3, 10.0)
+    factors += [gtsam.PriorFactorPoint3(key, np.zeros(3), anywhere) for key in keys[1:].tolist()]
+    values = gtsam.Values()
+    for key in [*keys.tolist(), *offsets.tolist()]:
+        values.insert(key, np.zeros(3))
+    graph, solution = solved(factors, values)
+    return gtsam.Marginals(graph, solution).marginalCovariance(int(keys[0]))
+
+
+@pytest.mark.parametrize("direction", [(0, 0, 1), (1, 2, 3)])
+@pytest.mark.parametrize("rays", [1, 5, 20])
+def test_a_ray_tells_nothing_of_the_offset_along_itself(rays, direction):
+    """One message of 20 mm stays one of 20 mm, however many rays follow; an offset said to be 0 made it 13 mm."""
+    # Across the ray the joints of the other frames are known to 10 m: two millionths of the variance.
+    np.testing.assert_allclose(covariance_beside_rays(rays, direction), 0.02**2 * np.eye(3), rtol=1e-4, atol=1e-8)
+
+
+def test_a_message_of_full_rank_is_split_as_it_is_written():
+    """The factor's error at any point is half the square of (R (x - m) - sqrt(1 - w) b) / sqrt(w)."""
+    rng = np.random.default_rng(5)
+    root = rng.normal(size=(3, 3))
+    root = root @ root.T + 1e-3 * np.eye(3)
+    x, m, b = rng.normal(size=(3, 3))
+    values = gtsam.Values()
+    values.insert(int(KEYS[0]), x)
+    values.insert(int(OFFSETS[0]), b)
+    (factor,) = lasting_prior_factors(KEYS[:1], OFFSETS[:1], m[None], root[None], 0.2)
+    residual = (root @ (x - m) - np.sqrt(0.8) * b) / np.sqrt(0.2)
+    assert factor.error(values) == pytest.approx(0.5 * residual @ residual, rel=1e-12)
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: motion_factors(KEYS, SPEEDS, TIMES[::-1], 1.0), "must rise"),
+        (lambda: motion_factors(KEYS, SPEEDS, TIMES[::-1], 1.0), "must be finite and rise"),
+        (lambda: motion_factors(KEYS[:2], SPEEDS[:2], [0.0, np.inf], 1.0), "must be finite and rise"),
+        (lambda: motion_factors(KEYS[:1], SPEEDS[:1], [np.nan], 1.0), "must be finite and rise"),
         (lambda: motion_factors(KEYS, SPEEDS, TIMES, 0.0), "psd must be positive"),
         (lambda: motion_factors(KEYS[:2], SPEEDS, TIMES, 1.0), r"must be \(T,\)"),
         (lambda: offset_factors(OFFSETS, TIMES, 0.0), "correlation_s must be positive"),
-        (lambda: offset_factors(OFFSETS, TIMES[::-1], 1.0), "times rising"),
+        (lambda: offset_factors(OFFSETS, TIMES[::-1], 1.0), "times finite and rising"),
+        (lambda: offset_factors(OFFSETS[:2], [0.0, np.inf], 1.0), "times finite and rising"),
         (
             lambda: lasting_prior_factors(KEYS[:1], OFFSETS[:1], [[0, 0, np.nan]], np.eye(3)[None], 0.5),
             "not finite",

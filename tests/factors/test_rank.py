@@ -51,6 +51,12 @@ def test_a_joint_on_the_line_through_both_cameras_is_not_determined(scene):
     np.testing.assert_array_equal(determined(information), [False, True])
 
 
+@pytest.mark.parametrize("sigma", [0.0, -1.0, np.nan, np.inf])
+def test_a_sigma_that_is_none_is_refused(scene, sigma):
+    with pytest.raises(ValueError, match="sigmas_px must be positive and finite"):
+        joint_information(scene.points, [0, 0], [0, 1], [2.0, sigma], scene.K, scene.cTw)
+
+
 def test_behind_a_camera_counts_nothing(scene):
     behind = scene.wTc[0, :3, 3] - 2.0 * scene.wTc[0, :3, 2]
     xy, depth, jacobian = project_with_jacobian(behind, scene.K[0], scene.cTw[0])

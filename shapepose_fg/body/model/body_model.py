@@ -151,9 +151,9 @@ class BodyModel:
     def vertices(self, parameters: BodyParameters, only: NDArray[np.intp] | None = None) -> Tensor:
         """(B, Nv, 3) the skinned mesh, metres; or (B, M, 3), the vertices `only` (M,) of it.
 
-        The only thing here whose cost grows with the mesh.
+        The only thing here whose cost grows with the mesh. ValueError where `only` has other than one axis.
         """
-        mesh = self._mesh if only is None else self._part_of_mesh(only)
+        mesh = self._mesh if only is None else self._part_of_mesh(np.ascontiguousarray(only, dtype=np.intp))
         _, rotations = self._rotations(parameters)
         shaped = mesh.template + (parameters.betas @ mesh.shapes).unflatten(-1, (-1, 3))
         if mesh.pose_blend is not None:
@@ -232,6 +232,8 @@ class BodyModel:
 
     def _part_of_mesh(self, only: NDArray[np.intp]) -> "_Mesh":
         """What some of the vertices need; the last part is kept, for it is asked for frame after frame."""
+        if only.ndim != 1:
+            raise ValueError(f"only must be (M,) numbers of vertices, got {only.shape}")
         key = only.tobytes()
         if self._last_part is None or self._last_part[0] != key:
             self._last_part = (key, self._mesh.part(only))
