@@ -56,7 +56,9 @@ def cut_in_chunks(
 
 def _until(stop: int, stretch: range, first: int, time_s: NDArray[np.float64], config: PipelineConfig) -> int:
     """How far people must be followed for the window that ends at `stop`: half a window and the overlap beyond it,
-    and as far as following looks ahead.
+    as far as following looks ahead, and a batch to spare.
+
+    The spare one is there because `Engine` compares means over the cameras' times, which round differently.
     """
     beyond = stop + config.batch_frames // 2 + 1
     while beyond < stretch.stop and time_s[beyond] - time_s[stop] <= config.windows.overlap_s:
@@ -66,6 +68,7 @@ def _until(stop: int, stretch: range, first: int, time_s: NDArray[np.float64], c
     newest = beyond
     while newest < stretch.stop and time_s[newest] - time_s[beyond] < config.following.look_ahead_s:
         newest += 1
+    newest = max(newest, beyond + config.following.least_frames) + max(config.batch_frames, 2)
     batches = -(-(newest + 1 - first) // config.batch_frames)
     return min(first + batches * config.batch_frames, stretch.stop)
 
