@@ -16,8 +16,8 @@ from shapepose_fg.runs import chunks
 from shapepose_fg.runs.borders import Border, same_people
 from shapepose_fg.runs.chunks import Chunk, cut_in_chunks, windows_of
 from shapepose_fg.simulation import built_in_scene, simulate
-from shapepose_fg.stopping import Stopped
 from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.stopping import Stopped
 from shapepose_fg.tracking.following import FollowingConfig, Input
 from shapepose_fg.tracking.tracker import TrackedFrame, TrackerState
 from shapepose_fg.windows import Engine, WindowConfig

@@ -18,8 +18,8 @@ class FollowingConfig(Settings):
     """What becomes of tracks."""
 
     look_ahead_s: Seconds = 1.0
-    """A frame is decided when this much more has been seen: whether a new track was a phantom, whether a person
-    out of sight comes back, and since when a new person had been there."""
+    """A frame is decided when this much more has been seen, and `least_frames` with it: whether a new track was a
+    phantom, whether a person out of sight comes back, and since when a new person had been there."""
     least_frames: Count = 5
     """Frames with evidence that a track needs; fewer only where the recording ends."""
 
@@ -91,7 +91,9 @@ def _decide(state: FollowState, config: FollowingConfig, *, ended: bool) -> tupl
     pending, rows = list(state.pending), list[Decided]()
     while pending:
         (given, tracked), newest = pending[0], pending[-1][0]
-        if not ended and (newest.time_s - given.time_s).mean() < config.look_ahead_s:
+        recent = (newest.time_s - given.time_s).mean() < config.look_ahead_s
+        # At three frames a second the look ahead is over before a track can have had its frames with evidence.
+        if not ended and (recent or len(pending) < config.least_frames):
             break
         to_come = set[int]()
         for _, later in pending[1:]:

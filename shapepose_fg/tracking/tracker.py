@@ -328,7 +328,9 @@ class Tracker:
         distance = np.linalg.norm(centre - expected, axis=-1)  # (W, K)
         waited_s = np.abs(state.time_s - state.evident_s[waiting])
         gate_m = _APART_M + _WALK_MPS * waited_s
-        first, second = linear_sum_assignment(np.minimum(distance, gate_m.max()))
+        # Any pair within its gate counts more than all that can be gained by the distances of others.
+        far_m = 1.0 + len(waiting) * gate_m.max()
+        first, second = linear_sum_assignment(np.where(distance < gate_m[:, None], distance, far_m))
         near = distance[first, second] < gate_m[first]
         return waiting[first[near]], people[second[near]]
 
@@ -337,9 +339,10 @@ class Tracker:
         fresh = self._states_at(places)
         mean, covariance = state.joints.mean.copy(), state.joints.covariance.copy()
         mean[track], covariance[track] = fresh.mean, fresh.covariance
-        evident_s = state.evident_s.copy()
+        evident_s, misses = state.evident_s.copy(), state.misses.copy()
         evident_s[track] = state.time_s
-        return replace(state, joints=JointStates(mean, covariance), evident_s=evident_s)
+        misses[track] -= 1  # this frame has evidence after all
+        return replace(state, joints=JointStates(mean, covariance), evident_s=evident_s, misses=misses)
 
     def _states_at(self, places: Array) -> JointStates:
         """People at `places` (P, J, 3), whose NaN joints are lost."""
