@@ -20,7 +20,7 @@ from shapepose_fg.kept_arrays import InFolder
 from shapepose_fg.output_folder import only_run_in
 from shapepose_fg.pipeline import PipelineConfig, reconstruct, reconstruct_parts
 from shapepose_fg.reconstruction import Reconstruction
-from shapepose_fg.runs.manifest import open_run
+from shapepose_fg.runs.manifest import end_run, open_run
 from shapepose_fg.runs.room import check_room, expected_bytes
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.files import write_simulated
@@ -252,6 +252,25 @@ class _Done:
         from shapepose_fg.runs.notes import Notes
 
         return Notes(frames=8)
+
+
+@pytest.mark.parametrize("removed", ["manifest.json", "followed-000000.safetensors"])
+@pytest.mark.parametrize("by", ["restart", "end"])
+def test_a_kill_while_a_run_is_removed_leaves_nothing_to_be_refused(tmp_path, begun, monkeypatch, by, removed):
+    """Whichever file goes first, the next start finds no half of a run."""
+
+    def killed(folder: Path, ignore_errors: bool = False) -> None:
+        if folder.exists():
+            (folder / removed).unlink()
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("shapepose_fg.runs.manifest.shutil.rmtree", killed)
+        with pytest.raises(KeyboardInterrupt):
+            open_run(tmp_path, begun, restart=True) if by == "restart" else end_run(tmp_path)
+    kept = open_run(tmp_path, begun, resume=True)
+    assert kept.names("") == [], "it begins anew"
+    assert [file.name for file in tmp_path.iterdir()] == ["parts"]
 
 
 def test_a_folder_of_somebody_else_is_left_alone(tmp_path):
