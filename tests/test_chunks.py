@@ -15,6 +15,7 @@ from shapepose_fg.pipeline import PipelineConfig, reconstruct, reconstruct_parts
 from shapepose_fg.runs import chunks
 from shapepose_fg.runs.borders import Border, same_people
 from shapepose_fg.runs.chunks import Chunk, cut_in_chunks, windows_of
+from shapepose_fg.runs.notes import Notebook
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.skeleton import BODY_25
 from shapepose_fg.stopping import Stopped
@@ -115,13 +116,16 @@ def test_every_frame_is_in_one_chunk_whose_borders_are_those_of_windows():
 
 @dataclass(frozen=True)
 class NobodyIsThere:
-    """A tracker that finds nobody, and so is quick."""
+    """A tracker that finds nobody, and so is quick; of three phantoms in each frame two are found twice."""
 
     views: int
+    book: Notebook
     skeleton = BODY_25
 
     def step(self, state: TrackerState, *_: object, **__: object) -> tuple[TrackerState, TrackedFrame]:
         """Nobody."""
+        self.book.drop("phantom", 2)
+        self.book.drop("phantom", 3)
         none = np.zeros(0, dtype=bool)
         return state, TrackedFrame(state.ids, state.joints, np.zeros((0, 25, self.views), dtype=int), none, none)
 
@@ -138,10 +142,12 @@ def test_every_chunk_gives_its_own_frames_and_whole_windows(fps, views, batch):
     def read(frame: int) -> Input:
         return Input(frame, of_views[frame], Detections.empty(), None)  # type: ignore[arg-type]
 
+    book = Notebook()
+
     def spans(chunk: Chunk) -> list[tuple[list[int], int, int]]:
         solver = SimpleNamespace(windows=config.windows)
-        engine = Engine(NobodyIsThere(views), config.following, solver, frames=batch)  # type: ignore[arg-type]
-        found = windows_of(engine, chunk, read)
+        engine = Engine(NobodyIsThere(views, book), config.following, solver, frames=batch)  # type: ignore[arg-type]
+        found = windows_of(engine, chunk, read, book)
         return [([given.frame for given, _ in span.decided], span.start, span.stop) for span in found]
 
     whole = [
@@ -149,7 +155,8 @@ def test_every_chunk_gives_its_own_frames_and_whole_windows(fps, views, batch):
         for stretch in (range(170), range(170, 200))
         for frames, start, stop in spans(Chunk(stretch, stretch.start, stretch.stop, ended=True))
     ]
-    pieces = []
+    noted, pieces = book.torn_off(), []
+    assert noted.dropped == {"phantom": 600} and noted.dropped_frames == {"phantom": list(range(200))}
     for chunk in cut_in_chunks(range(200), (170,), times.frame_s, config, 2 * batch):
         found = spans(chunk)
         own = [frame for frames, start, stop in found for frame in frames[start:stop]]
@@ -157,6 +164,7 @@ def test_every_chunk_gives_its_own_frames_and_whole_windows(fps, views, batch):
         pieces += found
     # The frames that a chunk's first window overlaps are those of the windows without chunks, too.
     assert pieces == whole
+    assert book.torn_off() == noted, "of a chunk's own frames, not of those that it is followed before and behind"
 
 
 def test_a_chunk_without_its_frames_is_an_error_and_no_gap(scene, recording):
