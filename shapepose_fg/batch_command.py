@@ -88,7 +88,7 @@ def _run(
 
     begin = time.monotonic()
     standings = Standings(output / BATCH, str(table))
-    standings.of, changed = _standings(entries, output, resume=resume, restart=restart)
+    standings.of = _standings(entries, output, resume=resume, restart=restart)
     todo = [entry for entry in entries if standings.of[entry.name].status == "waiting"]
     sizes = look_at_all(table, todo, output, begun=resume or restart)
     if len(todo) > 0:
@@ -100,8 +100,7 @@ def _run(
             count = min(at_once or _at_once(scheduler.processes, cores()), len(todo))
             _say(scheduler, len(entries), len(todo), count, here=address is None)
             standings.write()
-            anew = frozenset(standings.of) if restart else changed
-            campaign = Campaign(entries, sizes, output, scheduler.address, count, anew)
+            campaign = Campaign(entries, sizes, output, scheduler.address, count)
             try:
                 with bars(standings) as watcher:
                     campaign.run(standings, watcher)
@@ -117,10 +116,8 @@ def _run(
         raise typer.Exit(1)
 
 
-def _standings(
-    entries: "list[Entry]", output: Path, *, resume: bool, restart: bool
-) -> "tuple[dict[str, Standing], frozenset[str]]":
-    """How far every recording is, and who is not to go on, because something else is wanted of it now."""
+def _standings(entries: "list[Entry]", output: Path, *, resume: bool, restart: bool) -> "dict[str, Standing]":
+    """How far every recording is, and who begins anew: by `restart`, or with something else wanted."""
     from shapepose_fg.batch.standing import BATCH, Standing, read_standings
     from shapepose_fg.batch.table import asked
     from shapepose_fg.result_files import PEOPLE, RUN
@@ -132,16 +129,16 @@ def _standings(
         note(f"{output}: no batch was begun here; this one is")
     before = read_standings(file) if resume and file.exists() else {}
     found: dict[str, Standing] = {}
-    changed = set[str]()
     for entry in entries:
-        fresh = Standing(asked(entry.request))
-        old = before.get(entry.name, fresh)
+        wanted = asked(entry.request)
+        old = before.get(entry.name, Standing(wanted, anew=restart))
         there = all((output / entry.name / name).is_file() for name in (PEOPLE, RUN))
-        if old.asked != fresh.asked:
-            changed.add(entry.name)
+        changed = old.asked != wanted
+        if changed:
             note(f"{entry.name}: something else is wanted of it than before; it begins anew")
-        found[entry.name] = old if old.asked == fresh.asked and old.status == "done" and there else fresh
-    return found, frozenset(changed)
+        is_done = not changed and old.status == "done" and there
+        found[entry.name] = old if is_done else Standing(wanted, anew=changed or old.anew)
+    return found
 
 
 def _at_once(processes: int, cores: int) -> int:

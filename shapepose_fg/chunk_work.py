@@ -35,10 +35,16 @@ class SolvedChunk:
 
 
 def solve_chunk(setup: Setup, job: ChunkJob) -> SolvedChunk:
-    """Follow people through a chunk and solve its windows."""
+    """Follow people through a chunk and solve its windows.
+
+    RuntimeError where these are not the frames of the chunk, each once.
+    """
     book = Notebook()
     engine = setup.engine(book)
     with book.stage("follow"):
-        spans = list(windows_of(engine, job.chunk, lambda frame: job.given[frame - job.chunk.first]))
+        spans = list(windows_of(engine, job.chunk, lambda frame: job.given[frame - job.chunk.first], book))
+    frames = [given.frame for span in spans for given, _ in span.decided[span.start : span.stop]]
+    if frames != list(job.chunk.own):
+        raise RuntimeError(f"windows of {len(frames)} frames were found for a chunk of {job.chunk.own}")
     solved = tuple(setup.solver.solve(span) for span in spans)
     return SolvedChunk(solved, book.torn_off(), Border.of(spans[0]), Border.of(spans[-1]))

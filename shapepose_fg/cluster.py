@@ -1,10 +1,12 @@
 """The same work for many items on the processes of a Dask cluster: this machine's, or that of many machines."""
 
+import socket
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import cache
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
@@ -75,13 +77,16 @@ class Cluster(Generic[Shared]):
         from distributed import KilledWorker
 
         client: Any = self._client
+        program = tuple(_program().items())
         waiting = deque["Future[Any]"]()
         if client is None:
             raise RuntimeError("a cluster is a context: use it in `with`")
         try:
             for item in items:
                 with _large():
-                    waiting.append(client.submit(_work, work, self._at, item, pure=False, retries=RETRIES))
+                    waiting.append(
+                        client.submit(_work, program, work, self._at, item, pure=False, retries=RETRIES)
+                    )
                 if len(waiting) >= max(_LEAST, self._ahead * len(client.nthreads())):
                     yield waiting.popleft().result()
             while len(waiting) > 0:
@@ -177,18 +182,27 @@ def _refuse_other_programs(client: Any, address: str) -> None:
                 f"--cluster {address}: its process {process} cannot run this program ({reason}); install"
                 ' "shapepose-fg[cluster]" there'
             )
-        other = next((name for name in own if theirs.get(name) != own[name]), None)
+        other = _other_version(own, theirs)
         if other is not None:
-            which = f" ({theirs.get(other)} there, {own[other]} here)" if other != "shapepose-fg itself" else ""
-            raise InputError(
-                f"--cluster {address}: its process {process} has another version of {other}{which}; install the"
-                " same there, or results would depend on who did what"
-            )
+            raise InputError(f"--cluster {address}: its process {process} has {other}")
 
 
+def _other_version(own: dict[str, str], theirs: dict[str, str]) -> str | None:
+    """What the program of another process has another version of, with the cure; None where both are the same."""
+    other = next((name for name in own if theirs.get(name) != own[name]), None)
+    if other is None:
+        return None
+    which = f" ({theirs.get(other)} there, {own[other]} here)" if other != _ITSELF else ""
+    return f"another version of {other}{which}; install the same there, or results would depend on who did what"
+
+
+_ITSELF = "shapepose-fg itself"
+
+
+@cache
 def _program() -> dict[str, str]:
-    """What decides about the numbers of a process."""
-    return {**versions(), "shapepose-fg itself": program_digest()}
+    """What decides about the numbers of this process."""
+    return {**versions(), _ITSELF: program_digest()}
 
 
 def _dask() -> tuple[Any, Any]:
@@ -213,10 +227,16 @@ def _same(shared: Shared) -> Shared:
     return shared
 
 
-def _work(work: Callable[[Any, Any], Any], shared: Any, item: Any) -> Any:
-    """One item, in a process of the cluster."""
+def _work(program: tuple[tuple[str, str], ...], work: Callable[[Any, Any], Any], shared: Any, item: Any) -> Any:
+    """One item, in a process of the cluster; InputError where it has another `program` than who asks.
+
+    Processes may come at any time, after the others were looked at.
+    """
     import torch
 
+    other = _other_version(dict(program), _program())
+    if other is not None:
+        raise InputError(f"--cluster: one of its processes, {socket.gethostname()}, has {other}")
     if torch.get_num_threads() != 1:
         torch.set_num_threads(1)
     return work(shared, item)

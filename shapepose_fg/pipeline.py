@@ -201,7 +201,8 @@ def estimate_offsets(
     fitter = make_fitter(config.body) if fitter is None else fitter
     config = replace(config, offsets=replace(config.offsets, source="recording"))
     with torch_threads(config.threads):
-        offsets = _offsets(detections, rig, config, fitter, Notebook())
+        thinned = ThinnedFrames(detections, len(rig), config.candidates)
+        offsets = _offsets(thinned, rig, config, fitter, Notebook())
     if offsets is None:
         raise ValueError(
             f"offsets are known for {BODY_25.name} only, these are joints of {detections.skeleton.name}"
@@ -300,9 +301,28 @@ def _solved(
 
     for solved in pool.map(_solve, spans()):
         window = waiting.popleft()
-        notes = Notes(solved.frames, dict(solved.seconds), problems=list(solved.estimates.problems))
+        notes = _notes(solved, config)
         notes.add(window.notes)
         yield _Done(solved, notes, window.checkpoint)
+
+
+def _notes(solved: Solved, config: PipelineConfig) -> Notes:
+    """What is to be said about a window; people are tracks, or without time numbers within the frame."""
+    rows, problems = solved.observations, list(solved.estimates.problems)
+    if not config.temporal:
+        problems = [
+            replace(each, track=int(((rows.frame == each.frame) & (rows.track < each.track)).sum()))
+            for each in problems
+        ]
+    notes = Notes(solved.frames, dict(solved.seconds), problems=problems)
+    if len(solved.nobody) > 0:
+        notes.dropped[_NOBODY] = len(solved.nobody)
+        notes.dropped_frames[_NOBODY] = sorted(set(solved.nobody))
+    return notes
+
+
+_NOBODY = "next to no detections of their own, or in somebody else's place"
+"""Why people are dropped when detections are given out again."""
 
 
 def _solve(setup: Setup, span: Span) -> Solved:
@@ -339,9 +359,9 @@ def _solved_in_chunks(
         names = identities.names(found.begins, alone=chunk.first == chunk.own.start)
         identities.remember(found.ends, names)
         for n, solved in enumerate(found.solved, start=1):
-            seconds, problems = dict(solved.seconds), list(solved.estimates.problems)
-            renamed = [replace(each, track=identities.name(each.track, names)) for each in problems]
-            of_window = Notes(solved.frames, seconds, problems=renamed)
+            of_window = _notes(solved, setup.config)
+            renamed = [replace(each, track=identities.name(each.track, names)) for each in of_window.problems]
+            of_window = replace(of_window, problems=renamed)
             track = np.array([identities.name(each, names) for each in solved.observations.track.tolist()])
             last = n == len(found.solved)
             if last:
@@ -454,7 +474,7 @@ def _summary(notes: Notes, config: PipelineConfig, frames: range, result: Assemb
     skeleton = result.joint_names
     problems = [
         {
-            "person": result.names.get(each.track, each.track),  # without time, of its batch
+            "person": result.names.get(each.track, each.track),
             "frame": each.frame,
             "joint": skeleton[each.joint],
             "reason": each.reason,

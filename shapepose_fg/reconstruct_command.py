@@ -81,6 +81,10 @@ def reconstruct(
 ) -> None:
     """Reconstruct the people of a recording: 3D joints with covariances, and bodies."""
     check_workers(workers)
+    if workers is not None and cluster not in (None, "local"):
+        raise InputError(
+            f"--workers and --cluster {cluster}: these are processes of this machine, or of the cluster; give one"
+        )
     if resume and restart:
         raise InputError("--resume and --restart: a run goes on or begins anew; give one of them")
     request = Request(

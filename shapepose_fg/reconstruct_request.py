@@ -105,6 +105,13 @@ class Prepared:
         up, unit = cast("Axis | None", asked.up), cast("Unit | None", asked.unit)
         return read_rig(self.calibration, up=up, unit=unit, image_size=size)
 
+    @property
+    def changes_settings(self) -> bool:
+        """Whether anything is asked for that `settings` might refuse; looking at it loads torch, some seconds."""
+        asked = self.request
+        given = (asked.config, asked.temporal, asked.shapes, asked.chunk_frames, self.project)
+        return any(each is not None for each in given)
+
     def settings(self) -> "PipelineConfig":
         """The settings; InputError where they do not go with the rest."""
         from shapepose_fg.io.config import read_config
@@ -173,6 +180,8 @@ def carry_out(
     reading = ReadInputs((calibration, known.detections, config, body, timestamps))
     rig = known.rig()
     refuse_corrected(output)
+    if known.changes_settings:
+        known.settings()  # what is wrong with them is said before the whole recording is read
     with only_run_in(output, OUTPUTS), recording_folder(output) as kept:
         recording = read_detections(known.detections, rig, request.skeleton, kept)
         for each in recording.notes:

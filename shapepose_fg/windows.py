@@ -1,11 +1,12 @@
 """Frames in, solved rows out: people are followed, and solved in windows of frames that overlap.
 
-One function, `advance`, from (frames, state) to (rows, state): memory does not grow with the recording. Its first
-half follows people and is quick; its second half solves windows that know nothing of each other, here or in other
-processes.
+`Engine.follow` goes from (frames, state) to (windows, state): it is quick, and memory does not grow with the
+recording. `WindowSolver.solve` goes from a window to rows: windows know nothing of each other, and are solved here
+or in other processes.
 """
 
 import time
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated
@@ -78,6 +79,8 @@ class Solved:
     """How many frames they are of."""
     seconds: dict[str, float]
     """What it took, by stage."""
+    nobody: tuple[int, ...] = ()
+    """The frame of each row that was nobody when detections were given out again: a phantom, or a double."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +102,7 @@ class WindowSolver:
         """One window."""
         given = [frame for frame, _ in span.decided]
         rows = Observations.concatenate([part for _, part in span.decided])
+        before = rows.frame
         again = self.windows.again_alone if span.alone else self.windows.again_over_time
         began = time.perf_counter()
         for n in range(again if len(rows) > 0 else 0):
@@ -111,6 +115,7 @@ class WindowSolver:
         associated = time.perf_counter()
         estimates = self.estimator.estimate(rows, self.extra_factors)
         own = {frame.frame for frame in given[span.start : span.stop]}
+        left = Counter(before.tolist()) - Counter(rows.frame.tolist())
         index = np.flatnonzero(np.isin(rows.frame, list(own)))
         problems = tuple(problem for problem in estimates.problems if problem.frame in own)
         return Solved(
@@ -118,6 +123,7 @@ class WindowSolver:
             replace(estimates.rows(index), problems=problems),
             frames=span.stop - span.start,
             seconds={"associate again": associated - began, "solve": time.perf_counter() - associated},
+            nobody=tuple(sorted(frame for frame in left.elements() if frame in own)),
         )
 
 
@@ -150,17 +156,13 @@ class Engine:
         """Before the first frame, or after a cut; identities count from `next_id`."""
         return StreamState(FollowState(TrackerState.start(self.tracker.skeleton, next_id)))
 
-    def advance(
-        self, state: StreamState, frames: Iterable[Input], *, last: bool = False
-    ) -> tuple[list[Solved], StreamState]:
-        """Take in `frames`; returns the rows that are done. With `last` the recording ends, or is cut, there."""
-        spans, state = self.follow(state, frames, last=last)
-        return [self.solver.solve(span) for span in spans], state
-
     def follow(
         self, state: StreamState, frames: Iterable[Input], *, last: bool = False
     ) -> tuple[list[Span], StreamState]:
-        """The first half of `advance`: the windows that can be solved now, each by itself, in any process."""
+        """Take in `frames`: the windows that can be solved now, each by itself, in any process.
+
+        With `last` the recording ends, or is cut, behind them.
+        """
         following, decided = state.follow, list(state.decided)
         for frame in frames:
             following, more = follow(self.tracker, following, frame, self.following)

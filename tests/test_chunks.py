@@ -1,20 +1,27 @@
 """Chunks of a recording, reconstructed side by side: the same people, the same joints, the same names."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from shapepose_fg.chunk_work import ChunkJob, solve_chunk
+from shapepose_fg.detections import Detections
+from shapepose_fg.engine import Setup
 from shapepose_fg.frame_times import FrameTimes
 from shapepose_fg.kept_arrays import InFolder
 from shapepose_fg.pipeline import PipelineConfig, reconstruct, reconstruct_parts
 from shapepose_fg.runs import chunks
 from shapepose_fg.runs.borders import Border, same_people
-from shapepose_fg.runs.chunks import cut_in_chunks
+from shapepose_fg.runs.chunks import Chunk, cut_in_chunks, windows_of
+from shapepose_fg.runs.notes import Notebook
 from shapepose_fg.simulation import built_in_scene, simulate
+from shapepose_fg.skeleton import BODY_25
 from shapepose_fg.stopping import Stopped
-from shapepose_fg.tracking.following import FollowingConfig
-from shapepose_fg.windows import WindowConfig
+from shapepose_fg.tracking.following import FollowingConfig, Input
+from shapepose_fg.tracking.tracker import TrackedFrame, TrackerState
+from shapepose_fg.windows import Engine, WindowConfig
 
 CONFIG = PipelineConfig(
     batch_frames=12, following=FollowingConfig(look_ahead_s=0.3), windows=WindowConfig(overlap_s=0.16)
@@ -105,6 +112,67 @@ def test_every_frame_is_in_one_chunk_whose_borders_are_those_of_windows():
         assert chunk.first >= start and chunk.until <= (333 if chunk.own.stop <= 333 else 1000)
         assert chunk.until >= chunk.own.stop
         assert chunk.ended == (chunk.until in (333, 1000))
+
+
+@dataclass(frozen=True)
+class NobodyIsThere:
+    """A tracker that finds nobody, and so is quick; of three phantoms in each frame two are found twice."""
+
+    views: int
+    book: Notebook
+    skeleton = BODY_25
+
+    def step(self, state: TrackerState, *_: object, **__: object) -> tuple[TrackerState, TrackedFrame]:
+        """Nobody."""
+        self.book.drop("phantom", 2)
+        self.book.drop("phantom", 3)
+        none = np.zeros(0, dtype=bool)
+        return state, TrackedFrame(state.ids, state.joints, np.zeros((0, 25, self.views), dtype=int), none, none)
+
+
+@pytest.mark.parametrize("fps", [3.0, 25.0, 50.0, 60.0])
+@pytest.mark.parametrize("views", [1, 3, 6])
+@pytest.mark.parametrize("batch", [1, 12])
+def test_every_chunk_gives_its_own_frames_and_whole_windows(fps, views, batch):
+    """Times of views are rounded when their mean is taken: 0.4 s or 1 s are a frame more or less then."""
+    config = PipelineConfig(batch_frames=batch)
+    times = FrameTimes.from_fps(fps, 200)
+    of_views = times.of_views(views)
+
+    def read(frame: int) -> Input:
+        return Input(frame, of_views[frame], Detections.empty(), None)  # type: ignore[arg-type]
+
+    book = Notebook()
+
+    def spans(chunk: Chunk) -> list[tuple[list[int], int, int]]:
+        solver = SimpleNamespace(windows=config.windows)
+        engine = Engine(NobodyIsThere(views, book), config.following, solver, frames=batch)  # type: ignore[arg-type]
+        found = windows_of(engine, chunk, read, book)
+        return [([given.frame for given, _ in span.decided], span.start, span.stop) for span in found]
+
+    whole = [
+        (frames, start, stop)
+        for stretch in (range(170), range(170, 200))
+        for frames, start, stop in spans(Chunk(stretch, stretch.start, stretch.stop, ended=True))
+    ]
+    noted, pieces = book.torn_off(), []
+    assert noted.dropped == {"phantom": 600} and noted.dropped_frames == {"phantom": list(range(200))}
+    for chunk in cut_in_chunks(range(200), (170,), times.frame_s, config, 2 * batch):
+        found = spans(chunk)
+        own = [frame for frames, start, stop in found for frame in frames[start:stop]]
+        assert own == list(chunk.own), chunk
+        pieces += found
+    # The frames that a chunk's first window overlaps are those of the windows without chunks, too.
+    assert pieces == whole
+    assert book.torn_off() == noted, "of a chunk's own frames, not of those that it is followed before and behind"
+
+
+def test_a_chunk_without_its_frames_is_an_error_and_no_gap(scene, recording):
+    setup = Setup(scene.rig, recording.skeleton, CONFIG, SimpleNamespace())  # type: ignore[arg-type]
+    given = tuple(Input(n, np.full(4, n / 25), Detections.empty(), scene.rig) for n in range(16))
+    short = Chunk(range(0, 12), 0, 16, ended=False)  # half a window and 0.3 s more are needed
+    with pytest.raises(RuntimeError, match=r"windows of 0 frames were found for a chunk of range\(0, 12\)"):
+        solve_chunk(setup, ChunkJob(short, given))
 
 
 def border(track, candidate, place):

@@ -429,6 +429,25 @@ def test_a_reader_that_stops_reading_is_no_error():
     assert result.returncode == 1
 
 
+def test_settings_are_looked_at_before_the_recording(recording, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("shapepose_fg.io.detections.read_detections", lambda *_: pytest.fail("it is read"))
+    (tmp_path / "typo.toml").write_text("batch_frame = 3\n")
+    for words, said in (
+        (("--config", str(tmp_path / "typo.toml")), "typo.toml: batch_frame"),
+        (("--shapes", str(tmp_path / "s.npz"), "--no-temporal"), "--shapes: a person's shape is known over time"),
+        (("--chunk-frames", "20"), "--chunk-frames 20: must be 96"),
+    ):
+        assert run(*recording, *words) == 2
+        assert said in capsys.readouterr().err
+
+
+def test_processes_are_this_machine_s_or_the_cluster_s(recording, pipeline, capsys):
+    assert run(*recording, "--workers", "2", "--cluster", "tcp://host:8786") == 2
+    assert "--workers and --cluster tcp://host:8786: these are processes of this" in capsys.readouterr().err
+    assert run(*recording, "--workers", "2", "--cluster", "local") == 0
+    assert (pipeline["workers"], pipeline["cluster"]) == (2, "local")
+
+
 def test_chunks_and_a_cluster_reach_the_pipeline(recording, pipeline, capsys):
     assert run(*recording, "--chunk-frames", "200", "--cluster", "tcp://host:8786") == 0
     assert (pipeline["chunk_frames"], pipeline["cluster"]) == (200, "tcp://host:8786")

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from shapepose_fg.cluster import Cluster, has_dashboard, local_cluster
+from shapepose_fg.cluster import Cluster, _program, _work, has_dashboard, local_cluster
 from shapepose_fg.errors import InputError
 
 
@@ -51,6 +51,15 @@ def test_a_killed_process_costs_only_its_own_work(tmp_path):
     with Cluster(None, 2, str(tmp_path / "killed")) as cluster:
         assert list(cluster.map(once_killed, range(6))) == [0, 10, 20, 30, 40, 50]
     assert (tmp_path / "killed").exists()
+
+
+def test_a_process_that_comes_later_with_another_program_does_no_work():
+    """Whoever asks says what it has; a process compares, whenever it came."""
+    own = _program()
+    assert _work(tuple(own.items()), power, 2, 5) == 32
+    other = tuple((own | {"numpy": "1.0"}).items())
+    with pytest.raises(InputError, match=r"another version of numpy \(\S+ there, 1\.0 here\); install the same"):
+        _work(other, power, 2, 5)
 
 
 class FakeClient:

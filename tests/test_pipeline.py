@@ -200,6 +200,23 @@ def test_a_factor_that_throws_a_wrist_away_is_a_status_that_names_it(scene, reco
     }
 
 
+def test_without_time_problems_and_phantoms_are_those_of_the_frames(scene, recording):
+    """Who is named is in people.npz; who goes when detections are given out again is counted."""
+
+    def throw(window, keys):
+        far = np.array([1000.0, 0.0, 0.0])
+        yield gtsam.PriorFactorPoint3(int(keys[0, WRISTS[0]]), far, isotropic(3, 1e-3))
+
+    config = PipelineConfig(temporal=False, offsets=OffsetConfig(source="none"))
+    result = reconstruct(recording, scene.rig, config, frames=range(3), extra_factors=throw)
+    named = {(each["person"], each["frame"]) for each in result.run["people"]["problems"]}
+    assert named == set(zip(result.person.tolist(), result.frame.tolist(), strict=True))
+    assert {person for person, _ in named} == {0, 1, 2, 3}
+    # In frame 1 a fifth is proposed, most of whose detections are the others'.
+    gone = "next to no detections of their own, or in somebody else's place"
+    assert result.run["people"]["dropped"][gone] == 1 and result.run["dropped_frames"][gone] == [[1, 2]]
+
+
 def test_settings_reach_their_steps(scene, recording):
     strict = PipelineConfig(proposals=ProposalConfig(min_confidence=1.0))
     assert len(find_people(recording[0], scene.rig, BODY_25, strict)) == 0

@@ -1,5 +1,6 @@
 """Runs that are stopped go on, and end as if they had not been; nothing that was done is lost in silence."""
 
+import hashlib
 import json
 import os
 import signal
@@ -7,11 +8,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import pytest
 
+from shapepose_fg.body.shapes import SubjectShapes
 from shapepose_fg.cli import main
 from shapepose_fg.errors import InputError
 from shapepose_fg.estimation.detector_offsets import OffsetConfig
@@ -20,7 +24,8 @@ from shapepose_fg.kept_arrays import InFolder
 from shapepose_fg.output_folder import only_run_in
 from shapepose_fg.pipeline import PipelineConfig, reconstruct, reconstruct_parts
 from shapepose_fg.reconstruction import Reconstruction
-from shapepose_fg.runs.manifest import open_run
+from shapepose_fg.runs.known_people import checksum_at_start, people_at_start, write_people
+from shapepose_fg.runs.manifest import end_run, open_run
 from shapepose_fg.runs.room import check_room, expected_bytes
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.files import write_simulated
@@ -252,6 +257,58 @@ class _Done:
         from shapepose_fg.runs.notes import Notes
 
         return Notes(frames=8)
+
+
+def test_a_run_goes_on_with_the_people_that_it_began_with(tmp_path):
+    """The file of shapes may not change under a stopped run, but by its own hand."""
+    kept, file = InFolder(tmp_path / "parts"), tmp_path / "shapes.npz"
+    body = "b" * 64
+    first = SubjectShapes(np.array(["0"]), np.ones((1, 10)), np.eye(10)[None], body)
+    more = SubjectShapes(np.array(["0", "1"]), np.full((2, 10), 2.0), np.stack([np.eye(10)] * 2), body)
+
+    def must_not_load() -> SubjectShapes:
+        raise AssertionError("it was read when the run began")
+
+    def stored(people: SubjectShapes) -> bytes:
+        content = BytesIO()
+        people.write(content)
+        return content.getvalue()
+
+    file.write_bytes(stored(first))
+    assert people_at_start(kept, file, lambda: first) is first
+    again = people_at_start(kept, file, must_not_load)
+    assert again.names.tolist() == ["0"] and again.body == body
+    np.testing.assert_array_equal(again.betas, first.betas)
+    assert checksum_at_start(kept) == hashlib.sha256(stored(first)).hexdigest()
+    file.write_bytes(stored(more))
+    with pytest.raises(InputError, match=r"shapes\.npz: this has changed since the run was stopped; begin anew"):
+        people_at_start(kept, file, must_not_load)
+    # Stopped right behind its own writing: that is no change by somebody else, and who was known stays known.
+    write_people(kept, file, more)
+    assert file.read_bytes() == stored(more)
+    assert people_at_start(kept, file, must_not_load).names.tolist() == ["0"]
+    file.unlink()
+    with pytest.raises(InputError, match="this has changed"):
+        people_at_start(kept, file, must_not_load)
+
+
+@pytest.mark.parametrize("removed", ["manifest.json", "followed-000000.safetensors"])
+@pytest.mark.parametrize("by", ["restart", "end"])
+def test_a_kill_while_a_run_is_removed_leaves_nothing_to_be_refused(tmp_path, begun, monkeypatch, by, removed):
+    """Whichever file goes first, the next start finds no half of a run."""
+
+    def killed(folder: Path, ignore_errors: bool = False) -> None:
+        if folder.exists():
+            (folder / removed).unlink()
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("shapepose_fg.runs.manifest.shutil.rmtree", killed)
+        with pytest.raises(KeyboardInterrupt):
+            open_run(tmp_path, begun, restart=True) if by == "restart" else end_run(tmp_path)
+    kept = open_run(tmp_path, begun, resume=True)
+    assert kept.names("") == [], "it begins anew"
+    assert [file.name for file in tmp_path.iterdir()] == ["parts"]
 
 
 def test_a_folder_of_somebody_else_is_left_alone(tmp_path):

@@ -1,7 +1,7 @@
 """Recordings, some at a time: who is next, who failed and is tried again, who is given up."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.connection import wait
 from pathlib import Path
 from time import monotonic
@@ -47,8 +47,6 @@ class Campaign:
     """Address of the scheduler."""
     at_once: int
     """So many recordings are led at a time."""
-    restart: frozenset[str]
-    """Those of whom nothing is to be kept."""
 
     def run(self, standings: Standings, watcher: Watcher) -> None:
         """Do what is not done; `standings` has how each ended.
@@ -95,8 +93,7 @@ class Campaign:
 
     def _assignment(self, entry: Entry, standings: Standings) -> Assignment:
         """What its leader is to do."""
-        folder = self.output / entry.name
-        restart = entry.name in self.restart and standings.of[entry.name].attempts == 0
+        folder, restart = self.output / entry.name, standings.of[entry.name].anew
         resume = not restart and (folder / PARTS).exists()
         return Assignment(entry.name, entry.request, folder, self.cluster, self.at_once, resume, restart)
 
@@ -104,6 +101,8 @@ class Campaign:
         """Take in what a leader tells; whether it has ended."""
         name, told = leader.assignment.name, leader.next()
         if isinstance(told, tuple):
+            if standings.of[name].anew:  # what is kept now is this run's own
+                standings.set(name, replace(standings.of[name], anew=False))
             watcher.frames(name, *told)
             return False
         leader.end()

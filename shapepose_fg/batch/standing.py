@@ -27,6 +27,8 @@ class Standing:
     """`failed`: it failed twice, or one that it had to wait for did."""
     attempts: int = 0
     """How often it was begun."""
+    anew: bool = False
+    """Whether what an earlier run of it left is to be removed first; so until the first frames are done."""
     reasons: tuple[str, ...] = ()
     """Why it failed, each time."""
     seconds: float = 0.0
@@ -39,8 +41,8 @@ class Standing:
 
     def done(self, found: Ended, seconds: float) -> "Standing":
         """After it was done, in so many seconds."""
-        seconds += self.seconds
-        return replace(self, status="done", attempts=self.attempts + 1, seconds=seconds, **asdict(found))
+        attempts, seconds = self.attempts + 1, self.seconds + seconds
+        return replace(self, status="done", attempts=attempts, anew=False, seconds=seconds, **asdict(found))
 
     def failed(self, reason: str, seconds: float, most: int) -> "Standing":
         """After another attempt failed; the last of `most`?"""

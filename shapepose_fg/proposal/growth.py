@@ -125,7 +125,7 @@ def _bridge(
     candidate that is linked to nobody belongs to the nearest person who lacks it.
     """
     empty = (chosen < 0)[:, candidates.joint]
-    free = np.ones(len(candidates), dtype=bool)
+    free = candidates.joint >= 0
     free[chosen[chosen >= 0]] = False
     loose = free & candidates.strong & ~(support > 0).any(axis=0)
     score = np.where(empty & free & (support > 0), support + evidence, 0.0)

@@ -167,6 +167,7 @@ class _Search:
         height = offset @ self.up
         horizontal = np.linalg.norm(offset - height[..., None] * self.up, axis=-1)
         in_box = (horizontal < config.box_horizontal_m) & (np.abs(height) < config.box_vertical_m)
+        in_box &= candidates.joint >= 0  # not those that `among` hid
         best = np.zeros((len(roots), len(self.skeleton)))
         root, candidate = np.nonzero(in_box)
         np.maximum.at(best, (root, candidates.joint[candidate]), candidates.score[candidate])

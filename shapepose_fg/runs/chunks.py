@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from shapepose_fg.frame_times import stretches
 from shapepose_fg.pipeline_config import PipelineConfig
 from shapepose_fg.runs.borders import Border, same_people
+from shapepose_fg.runs.notes import Notebook
 from shapepose_fg.tracking.following import Input
 from shapepose_fg.windows import Engine, Span
 
@@ -56,7 +57,9 @@ def cut_in_chunks(
 
 def _until(stop: int, stretch: range, first: int, time_s: NDArray[np.float64], config: PipelineConfig) -> int:
     """How far people must be followed for the window that ends at `stop`: half a window and the overlap beyond it,
-    and as far as following looks ahead.
+    as far as following looks ahead, and two frames to spare, in whole batches.
+
+    `Engine` compares means over the cameras' times, which round differently: a frame more or less, twice.
     """
     beyond = stop + config.batch_frames // 2 + 1
     while beyond < stretch.stop and time_s[beyond] - time_s[stop] <= config.windows.overlap_s:
@@ -66,17 +69,19 @@ def _until(stop: int, stretch: range, first: int, time_s: NDArray[np.float64], c
     newest = beyond
     while newest < stretch.stop and time_s[newest] - time_s[beyond] < config.following.look_ahead_s:
         newest += 1
+    newest = max(newest, beyond + config.following.least_frames) + 2
     batches = -(-(newest + 1 - first) // config.batch_frames)
     return min(first + batches * config.batch_frames, stretch.stop)
 
 
-def windows_of(engine: Engine, chunk: Chunk, read: Callable[[int], Input]) -> Iterator[Span]:
-    """The windows of a chunk, whose people are followed from `chunk.first` on."""
+def windows_of(engine: Engine, chunk: Chunk, read: Callable[[int], Input], book: Notebook) -> Iterator[Span]:
+    """The windows of a chunk, whose people are followed from `chunk.first` on; notes are of its own frames."""
     state, done = engine.start(), chunk.first
     for start in range(chunk.first, chunk.until, engine.frames):
         batch = range(start, min(start + engine.frames, chunk.until))
         last = chunk.ended and batch.stop == chunk.until
-        spans, state = engine.follow(state, [read(frame) for frame in batch], last=last)
+        given = book.watched([read(frame) for frame in batch], chunk.own)
+        spans, state = engine.follow(state, given, last=last)
         for span in spans:
             if done in chunk.own:
                 yield span

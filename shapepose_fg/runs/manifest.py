@@ -13,6 +13,8 @@ from shapepose_fg.runs.parts import Parts
 
 PARTS = "parts"
 """The folder of an unfinished run, beside its results."""
+_GONE = ".parts-gone"
+"""What that folder is called while it is removed."""
 _MANIFEST = "manifest.json"
 _FORMAT = "shapepose-fg unfinished run 1"
 
@@ -26,6 +28,7 @@ def open_run(output: Path, begun: dict[str, Any], *, resume: bool = False, resta
     """
     folder = output / PARTS
     manifest = folder / _MANIFEST
+    shutil.rmtree(output / _GONE, ignore_errors=True)  # what a kill left of a run that was being removed
     begun = json.loads(json.dumps({"format": _FORMAT, **begun}))
     if folder.exists() and not manifest.is_file() and not _only_ours(folder):
         raise InputError(f"{folder}: not of a run of this program; move it away, or give another --output")
@@ -41,7 +44,7 @@ def open_run(output: Path, begun: dict[str, Any], *, resume: bool = False, resta
                 f"{folder}: a run was stopped here after {done} frames; go on with --resume, or begin anew with"
                 " --restart"
             )
-    shutil.rmtree(folder, ignore_errors=True)
+    _remove(output)
     write_atomically(manifest, lambda stream: stream.write(json.dumps(begun, indent=1).encode()))
     return kept
 
@@ -53,10 +56,16 @@ def frames_done(output: Path) -> int:
 
 def end_run(output: Path) -> None:
     """Remove what a run kept: its results are written."""
-    # The manifest last: a kill on the way leaves a run that is known for what it is.
-    for file in (output / PARTS).glob("*.safetensors"):
-        file.unlink()
-    shutil.rmtree(output / PARTS)
+    _remove(output)
+
+
+def _remove(output: Path) -> None:
+    """Remove what a run kept, under another name: after a kill on the way it is no half of a run."""
+    gone = output / _GONE
+    shutil.rmtree(gone, ignore_errors=True)
+    if (output / PARTS).exists():
+        (output / PARTS).rename(gone)
+        shutil.rmtree(gone)
 
 
 def _only_ours(folder: Path) -> bool:

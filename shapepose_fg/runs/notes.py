@@ -20,7 +20,7 @@ class Notes:
     seconds: dict[str, float] = field(default_factory=dict)
     """Time per stage, over all processes."""
     dropped: dict[str, int] = field(default_factory=dict)
-    """How many people were none, or too little is seen of, for each reason."""
+    """How many people were none, or too little is seen of, for each reason; in every frame anew."""
     dropped_frames: dict[str, list[int]] = field(default_factory=dict)
     """The frames in which that was."""
     thinned_frames: dict[str, list[int]] = field(default_factory=dict)
@@ -61,6 +61,7 @@ class Notebook:
         self._dropped_frames: defaultdict[str, list[int]] = defaultdict(list)
         self._thinned_frames: defaultdict[str, list[int]] = defaultdict(list)
         self._frame: int | None = None
+        self._of_frame: Counter[str] = Counter()
 
     def thin(self, what: str, is_thinned: bool, frame: int | None = None) -> None:
         """Note down that some of a frame's detections, points or candidates were too many and left out."""
@@ -69,16 +70,24 @@ class Notebook:
             self._thinned_frames[what].append(frame)
 
     def drop(self, reason: str, count: int) -> None:
-        """Note down people of the present frame who were none, or too little is seen of."""
-        self._dropped[reason] += count
-        frames = self._dropped_frames
-        if count > 0 and self._frame is not None and self._frame not in frames[reason][-1:]:
-            frames[reason].append(self._frame)
+        """Note down people of the present frame who were none, or too little is seen of.
 
-    def watched(self, given: Sequence[Input]) -> Iterator[Input]:
-        """The same frames; while one is worked on, it is the present frame."""
+        A frame is searched twice, the second time for people of whom less is seen: then only those count that the
+        first time had not.
+        """
+        more = count - self._of_frame[reason]
+        if self._frame is None or more <= 0:
+            return
+        self._of_frame[reason] = count
+        self._dropped[reason] += more
+        if self._frame not in self._dropped_frames[reason][-1:]:
+            self._dropped_frames[reason].append(self._frame)
+
+    def watched(self, given: Sequence[Input], own: range | None = None) -> Iterator[Input]:
+        """The same frames; while one is worked on, it is the present frame. Only of `own` ones notes are taken."""
         for each in given:
-            self._frame = each.frame
+            self._frame = each.frame if own is None or each.frame in own else None
+            self._of_frame.clear()
             yield each
 
     @contextmanager
@@ -95,7 +104,7 @@ class Notebook:
         notes = Notes(
             seconds=dict(self._seconds),
             dropped=dict(self._dropped),
-            dropped_frames={reason: frames for reason, frames in self._dropped_frames.items() if frames},
+            dropped_frames=dict(self._dropped_frames),
             thinned_frames={what: frames for what, frames in self._thinned_frames.items() if frames},
         )
         self._seconds.clear()

@@ -98,8 +98,9 @@ def replay(people: Reconstruction, edits: Sequence[Edit]) -> Edited:
     edited = Edited(people)
     for edit in edits:
         earlier, edited = edited.changed, apply(edited.people, edit)
-        if edit.action is Action.RENAME and edit.person in earlier and edit.other is not None:
-            earlier = earlier - {edit.person} | {edit.other}
+        if edit.action in (Action.RENAME, Action.SWAP) and not edited.changed:  # people only change names
+            names = {edit.person: _other(edit), _other(edit): edit.person}
+            earlier = frozenset(names.get(each, each) for each in earlier)
         left = frozenset(edited.people.person.tolist())
         edited = replace(edited, changed=(earlier | edited.changed) & left)
     return edited

@@ -11,9 +11,6 @@ from shapepose_fg.skeleton import Skeleton
 from shapepose_fg.tracking.following import Input
 from shapepose_fg.tracking.view_assignment import AssignmentConfig, assign
 
-_UNKNOWN_SIGMA_M = 0.3
-"""Sigma of a joint that is not placed at all."""
-
 
 @dataclass(frozen=True)
 class Survival:
@@ -144,9 +141,7 @@ def _candidates(
     config: AssignmentConfig,
 ) -> NDArray[np.intp]:
     """(P, J, V) the detections of one frame's people."""
-    lost = ~np.isfinite(sigma_m)
-    sigma = np.where(lost, _UNKNOWN_SIGMA_M, sigma_m)
-    return assign(joints, sigma, lost, frame.detections, frame.rig, skeleton, config)
+    return assign(joints, sigma_m, ~np.isfinite(sigma_m), frame.detections, frame.rig, skeleton, config)
 
 
 def _gone(

@@ -11,6 +11,7 @@ from shapepose_fg.batch.campaign import Campaign
 from shapepose_fg.batch.leader import Assignment, Failed, Leader
 from shapepose_fg.batch.standing import Standing, Standings, read_standings
 from shapepose_fg.batch.table import Entry
+from shapepose_fg.batch_command import _standings
 from shapepose_fg.errors import InputError
 from shapepose_fg.reconstruct_outcome import Ended
 from shapepose_fg.reconstruct_request import Request
@@ -25,6 +26,8 @@ class Stage:
     def __init__(self) -> None:
         self.begun: list[Assignment] = []
         self.ends: dict[str, list[Ended | Failed]] = {}
+        self.frameless: list[str] = []
+        """Whose first attempt ends before any frame is done."""
         self.heard: list[tuple] = []
         self.together = 0
         self.alive = 0
@@ -49,7 +52,11 @@ class FakeLeader:
     def __init__(self, stage: Stage, assignment: Assignment) -> None:
         self.stage, self.assignment, self.began = stage, assignment, 0.0
         self.told, tell = Pipe(duplex=False)
-        tell.send((5, 10))
+        if assignment.name in stage.frameless:
+            stage.frameless.remove(assignment.name)
+        else:
+            (assignment.folder / "parts").mkdir(parents=True, exist_ok=True)
+            tell.send((5, 10))
         tell.send(stage.ends.get(assignment.name, [DONE]).pop(0))
         self.tell = tell
         self.asked = False
@@ -76,10 +83,11 @@ def stage(monkeypatch) -> Stage:
     return found
 
 
-def run(stage: Stage, folder: Path, entries: list[Entry], at_once: int = 1, restart=frozenset()) -> Standings:
-    standings = Standings(folder / "batch.json", "t", {entry.name: Standing({}) for entry in entries})
+def run(stage: Stage, folder: Path, entries: list[Entry], at_once: int = 1, anew=()) -> Standings:
+    of = {entry.name: Standing({}, anew=entry.name in anew) for entry in entries}
+    standings = Standings(folder / "batch.json", "t", of)
     sizes = {entry.name: len(entry.name) for entry in entries}
-    Campaign(entries, sizes, folder, "tcp://x", at_once, restart).run(standings, stage)
+    Campaign(entries, sizes, folder, "tcp://x", at_once).run(standings, stage)
     return standings
 
 
@@ -90,7 +98,7 @@ def entries(*names: str) -> list[Entry]:
 def test_the_largest_are_begun_first_and_who_failed_comes_again_at_the_end(stage, tmp_path):
     stage.ends = {"bbb": [Failed("disk full"), DONE], "cc": [Failed("no"), Failed("no again")], "a": [DONE]}
     (tmp_path / "bbb" / "parts").mkdir(parents=True)
-    standings = run(stage, tmp_path, entries("a", "bbb", "cc"), restart=frozenset(["bbb", "cc"]))
+    standings = run(stage, tmp_path, entries("a", "bbb", "cc"), anew=("bbb", "cc"))
     assert [each.name for each in stage.begun] == ["bbb", "cc", "a", "bbb", "cc"]
     # What was there goes once; what the first attempt left is kept.
     assert [(each.restart, each.resume) for each in stage.begun if each.name == "bbb"] == [
@@ -109,6 +117,48 @@ def test_the_largest_are_begun_first_and_who_failed_comes_again_at_the_end(stage
     assert read_standings(tmp_path / "batch.json") == standings.of
     content = json.loads((tmp_path / "batch.json").read_text())
     assert (content["done"], content["failed"], content["waiting"]) == (2, 1, 0)
+
+
+def test_who_is_to_begin_anew_does_so_until_frames_are_done(stage, tmp_path, monkeypatch):
+    """A first attempt that ends before its run is begun leaves what was there before: nothing to go on with."""
+    stage.ends, stage.frameless = {"a": [Failed("no memory"), DONE]}, ["a"]
+    (tmp_path / "a" / "parts").mkdir(parents=True)
+    standings = run(stage, tmp_path, entries("a"), anew=("a",))
+    assert [(each.restart, each.resume) for each in stage.begun] == [(True, False), (True, False)]
+    assert standings.of["a"].status == "done" and not standings.of["a"].anew
+
+    def stop(*_: object) -> None:
+        raise Stopped(15)
+
+    for heard, anew in (("began", True), ("frames", False)):
+        monkeypatch.setattr(stage, heard, stop)
+        standings = Standings(tmp_path / "batch.json", "t", {"a": Standing({}, anew=True)})
+        standings.write()
+        with pytest.raises(Stopped):
+            stage.ends = {"a": [Failed("stopped")]}
+            Campaign(entries("a"), {"a": 1}, tmp_path, "tcp://x", 1).run(standings, stage)
+        assert read_standings(tmp_path / "batch.json")["a"].anew == anew
+        monkeypatch.undo()
+        monkeypatch.setattr(module, "Leader", stage.leader)
+
+
+def test_a_batch_that_goes_on_knows_who_was_to_begin_anew(tmp_path):
+    """--restart, or another wish, that was stopped before anything was begun, and gone on with by --resume."""
+    both = [Entry("a", Request(fps=25.0)), Entry("b", Request(fps=50.0))]
+
+    def anew(entries: list[Entry], **how: bool) -> list[str]:
+        options = {"resume": False, "restart": False} | how
+        found = _standings(entries, tmp_path, **options)
+        Standings(tmp_path / "batch.json", "t", found).write()
+        return [name for name, each in found.items() if each.anew]
+
+    assert anew(both) == []
+    assert anew(both, resume=True) == []
+    other = [both[0], Entry("b", Request(fps=60.0))]
+    assert anew(other, resume=True) == ["b"]
+    assert anew(other, resume=True) == ["b"], "it has not begun yet"
+    assert anew(other, restart=True) == ["a", "b"]
+    assert anew(other, resume=True) == ["a", "b"]
 
 
 def test_no_more_are_led_at_a_time_than_asked(stage, tmp_path):

@@ -17,6 +17,8 @@ from shapepose_fg.estimation.detector_offsets import OffsetConfig, confident_tar
 from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.observations import Observations
 from shapepose_fg.pipeline import PipelineConfig, estimate_offsets, reconstruct
+from shapepose_fg.proposal.candidates import CandidateConfig
+from shapepose_fg.proposal.thinning import ThinnedFrames
 from shapepose_fg.simulation import DetectorConfig, built_in_scene, simulate
 from shapepose_fg.simulation.scene import Scene
 from shapepose_fg.skeleton import BODY_25
@@ -105,6 +107,23 @@ def test_no_offsets_are_found_where_there_are_none(scene):
     assert np.linalg.norm(offsets.xyz_m, axis=1).mean() < 0.006
     harmed = left_out_error_mm(scene.body.with_keypoint_offsets(offsets), scene)
     assert harmed < left_out_error_mm(scene.body, scene) + 1.0
+
+
+def test_offsets_are_learnt_from_frames_that_are_thinned_as_in_a_run(scene):
+    """Every detection is there four times, 2 px aside; eight of a joint stay in a view, of four people."""
+    config = PipelineConfig(candidates=CandidateConfig(most_pairs=1000))
+    rng, frames = np.random.default_rng(0), []
+    for seen in simulate(scene, seed=0, frames=range(3)):
+        xy = np.tile(seen.xy, (4, 1)) + rng.normal(0, 2, (4 * len(seen), 2))
+        confidence = np.tile(seen.confidence, 4) * np.repeat([1.0, 0.99, 0.98, 0.97], len(seen))
+        view, joint = np.tile(seen.view, 4), np.tile(seen.joint, 4)
+        frames.append(replace(seen, view=view, joint=joint, xy=xy, confidence=confidence))
+    recording = Recording(BODY_25, frames)
+    thinned = ThinnedFrames(recording, len(scene.rig), config.candidates)
+    assert all(thinned.is_thinned(frame) for frame in range(3))
+    found = estimate_offsets(recording, scene.rig, config)
+    expected = estimate_offsets(Recording(BODY_25, [thinned[frame] for frame in range(3)]), scene.rig, config)
+    np.testing.assert_array_equal(found.xyz_m, expected.xyz_m)
 
 
 def test_left_and_right_are_mirrored_unless_the_data_insist():

@@ -14,7 +14,7 @@ from shapepose_fg.proposal.association import mean_affinity
 from shapepose_fg.proposal.candidates import CandidateConfig, Candidates, PairPoints, triangulate_pairs, vote
 from shapepose_fg.proposal.growth import GrowthConfig, Links, grow, link
 from shapepose_fg.proposal.proposals import ProposalConfig, _apart, _Search
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.skeleton import BODY_25, Skeleton
 
 CONFIG = CandidateConfig()
 GATE_M, ANGLE_DEG, RHO_M = 0.07, 3.0, 0.12
@@ -453,18 +453,42 @@ def test_the_least_share_of_grown_joints_counts_every_candidate(crowded):
     assert len(search(weak, limbs, crowded).linked(np.array([5]))[0]) == 0
 
 
-def test_among_the_free_only_these_count(candidates, links, crowded):
-    """In boxes, as roots and in links: what is not free is no joint at all."""
+def backwards(skeleton: Skeleton) -> Skeleton:
+    """The same with its joints in the other order: the nose, a core joint, is the last of BODY_25's."""
+    last = len(skeleton) - 1
+    return replace(
+        skeleton,
+        joints=skeleton.joints[::-1],
+        limbs=tuple((last - a, last - b) for a, b in skeleton.limbs),
+        parents=tuple(last - up if up >= 0 else -1 for up in skeleton.parents[::-1]),
+        mirror=tuple(last - other for other in skeleton.mirror[::-1]),
+        core=tuple(sorted(last - joint for joint in skeleton.core)),
+    )
+
+
+@pytest.mark.parametrize("skeleton", [BODY_25, backwards(BODY_25)])
+def test_among_the_free_only_these_count(candidates, links, crowded, skeleton):
+    """Boxes, roots, links and who is grown are as if there were no other candidates at all."""
+    joint = candidates.joint if skeleton == BODY_25 else 24 - candidates.joint
+    candidates = replace(candidates, joint=joint)
     free = np.random.default_rng(1).random(len(candidates)) < 0.5
-    whole = search(candidates, links, crowded)
+    whole = replace(search(candidates, links, crowded), skeleton=skeleton)
     whole.dropped["low confidence"] = 1
     here = whole.among(free)
-    hidden = np.where(free, candidates.joint, -1)
-    np.testing.assert_array_equal(here.candidates.joint, hidden)
-    both = np.array([free[a] and free[b] for a, b in links.ends.tolist()])
-    np.testing.assert_array_equal(here.links.ends, links.ends[both])
-    np.testing.assert_array_equal(here.links.score, links.score[both])
-    roots = np.flatnonzero(hidden == BODY_25.root)
-    expected = boxes(roots, replace(candidates, joint=hidden), SimpleNamespace(**PROPOSALS))
-    np.testing.assert_allclose(np.column_stack(here.boxes(roots)), expected)
-    assert here.dropped == Counter(), "what it drops is counted by itself"
+    left, place = np.flatnonzero(free), np.cumsum(free) - 1
+    rows = candidates.support[free[candidates.support[:, 0]]]
+    columns = {name: getattr(candidates, name)[left] for name in ("xyz", "joint", "score", "votes", "strong")}
+    only = Candidates(**columns, support=np.stack([place[rows[:, 0]], rows[:, 1]], axis=1))
+    both = free[links.ends].all(axis=1)
+    alone = replace(whole, candidates=only, links=Links(place[links.ends[both]], links.score[both]))
+    roots = np.flatnonzero(only.joint == skeleton.root)
+    assert len(roots) >= 3
+    np.testing.assert_array_equal(here.boxes(left[roots]), alone.boxes(roots))
+    grown_here, grown_alone = (
+        grow(anchors, each.candidates, each.links, skeleton, GrowthConfig())
+        for each, anchors in ((here, left[roots]), (alone, roots))
+    )
+    np.testing.assert_array_equal(grown_here, np.where(grown_alone >= 0, left[grown_alone], -1))
+    none = np.zeros(0, dtype=int)
+    np.testing.assert_array_equal(here.people(none), left[alone.people(none)])
+    assert whole.among(free).dropped == Counter(), "what it drops is counted by itself"

@@ -218,6 +218,20 @@ def test_undo_solves_only_what_the_last_correction_touched(people):
     np.testing.assert_array_equal(solve_anew(before, solve).joints, expected.joints)
 
 
+def test_undo_keeps_what_was_solved_of_somebody_who_changed_names_since(people):
+    """Who was merged is called 1 by then; undoing what is done to somebody else leaves them solved."""
+    edits = [Edit(Action.MERGE, 5, 7), Edit(Action.SWAP, 1, 5, 0), Edit(Action.DROP, 2)]
+    assert replay(people, edits[:2]).spans == {1: range(3, 20)}
+    states = [people]
+    for edit in edits:
+        states.append(solve_anew(apply(states[-1], edit), solve))
+    before = undo(people, states[3], edits)
+    assert before.changed == frozenset()
+    np.testing.assert_array_equal(before.people.person, states[2].person)
+    np.testing.assert_array_equal(before.people.joints, states[2].joints)
+    assert (before.people.joints[before.people.person == 1, :, 2] == 1.0).all(), "solved, once"
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_any_corrections_keep_every_row_once_and_undo_one_by_one(people, seed):
     """Random corrections: nobody is twice in a frame, no row is there twice, undoing leads back step by step."""

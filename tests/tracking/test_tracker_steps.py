@@ -141,6 +141,28 @@ def test_two_who_come_back_are_told_apart_together(tracker, two_people):
     assert dict(zip(track.tolist(), person.tolist(), strict=True)) == {0: 1, 1: 0}
 
 
+def test_who_comes_back_within_reach_is_not_lost_to_a_track_out_of_reach(tracker, two_people):
+    """The tracks' gates are 0.25 and 0.70 m: the person is 0.30 and 0.60 m away, and is the second."""
+    places = two_people[:1]
+    tracks = [two_people[0] + [0.3, 0.0, 0.0], two_people[0] + [0.0, 0.6, 0.0]]
+    state = states(tracks, evident_s=np.array([10.0, 9.55]))
+    track, person = tracker._returned(places, np.array([True]), state, np.zeros(2, dtype=bool))
+    assert (track.tolist(), person.tolist()) == ([1], [0])
+    beside = two_people[0] + [0.25, 0.0, 0.0]  # 5 cm from the first track, 0.65 m from the second
+    both = np.stack([places[0], beside])
+    track, person = tracker._returned(both, np.ones(2, dtype=bool), state, np.zeros(2, dtype=bool))
+    assert dict(zip(track.tolist(), person.tolist(), strict=True)) == {0: 1, 1: 0}
+
+
+def test_who_is_found_again_on_trial_goes_on(tracker, five_cameras, two_people, seen_exactly):
+    """Two misses before, and in this frame stage I finds the person: it is no third one."""
+    away = two_people[:1] + np.array([0.4, 0.0, 0.0])  # farther than any detection is taken from
+    state = states(away, born_s=np.array([9.8]), evident_s=np.array([9.8]), misses=np.array([2]))
+    after, frame = tracker.step(state, seen_exactly(five_cameras, two_people[:1]), five_cameras, 10.0)
+    assert frame.ids.tolist() == [0] and frame.evident.tolist() == [True]
+    assert after.ids.tolist() == [0] and after.misses.tolist() == [2] and after.evident_s.tolist() == [10.0]
+
+
 def test_new_joints_are_known_to_4_cm_and_unplaced_ones_are_lost(tracker, two_people):
     places = two_people[:1].copy()
     places[0, WRIST] = np.nan
