@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.camera import Axis, Rig
+from shapepose_fg.errors import InputError
 from shapepose_fg.reconstruction import Known, Reconstruction
 from shapepose_fg.run_summary import covered_frames
 
@@ -87,14 +88,14 @@ class Take:
         """The same people at exactly `fps` frames a second, for formats that know no other; and what was lost.
 
         A frame goes to the nearest step, numbered on from the first; steps that no frame is near to are holes.
-        The number says how many frames were left out because another is nearer to their step. ValueError where
+        The number says how many frames were left out because another is nearer to their step. InputError where
         that would be more than a million frames.
         """
         step = (self.times_s - self.times_s[0]) * self.fps
         if step[-1] >= _LONGEST:
-            raise ValueError(
-                f"the times run over {self.times_s[-1] - self.times_s[0]:.0f} s, {step[-1]:.0f} frames at "
-                f"{self.fps:g} a second; give --fps, or part of it with --frames"
+            raise InputError(
+                f"people.npz: the times run over {self.times_s[-1] - self.times_s[0]:.0f} s, {step[-1]:.0f} frames"
+                f" at {self.fps:g} a second; give --fps, or part of it with --frames"
             )
         place = np.rint(step).astype(np.intp)
         nearest = np.lexsort((np.abs(step - place), place))

@@ -43,15 +43,15 @@ class _File(BaseModel):
 def read_corrections(folder: str | Path) -> tuple[Edit, ...]:
     """What was corrected in the result in `folder`, first to last; none where there is no corrections.json.
 
-    InputError, one sentence, where that file is damaged, people.npz is not what the corrections led to, or there is
-    `uncorrected` without it: a correction was stopped half way, or `uncorrected` is of an earlier result.
+    InputError, one sentence, where that file is damaged, people.npz is not what the corrections led to, or there
+    is `uncorrected` without it: a correction was stopped half way, or `uncorrected` is of an earlier result.
     """
     file = Path(folder) / CORRECTIONS
     if not file.is_file():
         if (Path(folder) / UNCORRECTED).exists():
             raise InputError(
-                f"{file}: it is missing beside {UNCORRECTED}, so a correction was stopped half way; copy the files of"
-                f" {UNCORRECTED} back and delete that folder, or only delete it where people.npz is of a later run"
+                f"{file}: it is missing beside {UNCORRECTED}, so a correction was stopped half way; copy the files"
+                f" of {UNCORRECTED} back and delete that folder, or only delete it if people.npz is of a later run"
             )
         return ()
     try:
@@ -137,8 +137,8 @@ def _check_kept(folder: Path) -> None:
     file = folder / UNCORRECTED / "people.npz"
     if not file.is_file():
         raise InputError(
-            f"{file}: the result as it was before the corrections is not there; put it back, or delete {CORRECTIONS}"
-            " to keep the result as it is now"
+            f"{file}: the result as it was before the corrections is not there; put it back, or delete"
+            f" {CORRECTIONS} to keep the result as it is now"
         )
 
 

@@ -124,8 +124,8 @@ def _check_points(number: int, line: str, path: Path) -> None:
         triples = False
     if not triples:
         raise InputError(
-            f"{path}: line {number}: must hold the points of the image before it, three numbers each; leave an empty"
-            " line there where it has none"
+            f"{path}: line {number}: must hold the points of the image before it, three numbers each; leave an"
+            " empty line there where it has none"
         )
 
 
