@@ -541,6 +541,26 @@ def test_unknown_files_are_named_by_what_they_are(tmp_path):
 # Real files.
 
 
+@pytest.mark.parametrize(("resolution", "scale"), [("1080p", 1), ("720p", 2 / 3), ("540p", 1 / 2)])
+def test_qualisys_pictures_of_a_lower_resolution_are_resized(tmp_path, resolution, scale):
+    file = qualisys(tmp_path)
+    file.write_text(
+        file.read_text().replace('model="Miqus Video"', f'model="Miqus Video" video_resolution="{resolution}"')
+    )
+    rig = read_rig(file)
+    np.testing.assert_allclose(rig.cTw, TRUTH.cTw, atol=1e-9)
+    for one, truth in zip(rig.cameras, TRUTH.cameras, strict=True):
+        np.testing.assert_allclose(one.K[:2], scale * truth.K[:2])
+        np.testing.assert_array_equal(one.distortion, truth.distortion)
+        assert one.image_size == (round(1280 * scale), round(720 * scale))
+
+
+def test_qualisys_resolutions_that_are_not_known(tmp_path):
+    file = qualisys(tmp_path)
+    file.write_text(file.read_text().replace('model="Miqus Video"', 'model="Miqus Video" video_resolution="4K"'))
+    refuses(file, "camera 0 \"alpha\": video_resolution must be one of 1080p 720p 540p 480p, got '4K'")
+
+
 def test_pose2sim_s_recording_in_three_formats(shared_data):
     """The Qualisys file, and what Pose2Sim made of it; Pose2Sim divides the distortion by 64."""
     single, formats = shared_data / "pose2sim_single", shared_data / "formats"
