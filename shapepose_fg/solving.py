@@ -62,11 +62,10 @@ def _windows(rows: Reconstruction, config: PipelineConfig) -> list[range]:
     windows = []
     for stretch in (part for span in covered for part in stretches(span, cuts)):
         size = config.batch_frames
-        windows += [
-            range(start, min(start + size, stretch.stop)) for start in range(stretch.start, stretch.stop, size)
-        ]
-    frames = np.unique(rows.frame)
-    return [window for window in windows if ((frames >= window.start) & (frames < window.stop)).any()]
+        inside = rows.frame[(rows.frame >= stretch.start) & (rows.frame < stretch.stop)]
+        starts = stretch.start + size * np.unique((inside - stretch.start) // size)
+        windows += [range(start, min(start + size, stretch.stop)) for start in starts.tolist()]
+    return windows
 
 
 def _near(rows: Reconstruction, own: range, config: PipelineConfig) -> NDArray[np.intp]:

@@ -206,13 +206,15 @@ def _solver(folder: Path) -> "Solve | None":
     None where the result does not hold what that takes, or without time: then every row is solved by itself,
     whoever it is.
     """
-    from shapepose_fg.files import read_json
     from shapepose_fg.io.solved_setup import CAMERAS
+    from shapepose_fg.reconstruction import Reconstruction
 
     needed = [folder / name for name in ("run.json", "observations.npz", CAMERAS)]
     if not all(file.is_file() for file in needed):
         return None
-    if not read_json(needed[0]).get("configuration", {}).get("temporal", False):
+    with Reconstruction.open(folder) as opened:
+        temporal = opened.run.get("configuration", {}).get("temporal", False)
+    if not temporal:
         return None
 
     def solve(rows: "Reconstruction") -> "Reconstruction":

@@ -313,7 +313,16 @@ def test_scores_of_nothing_are_nothing(tmp_path, score):
 
 @pytest.mark.parametrize(
     ("column", "value", "sentence"),
-    [("joints", np.inf, "joints must be finite"), ("frame", -1, "frame must not be negative")],
+    [
+        ("joints", np.inf, "joints must be at most 1e+06 or unknown (NaN), got inf"),
+        ("joints", -1e200, "joints must be at most 1e+06 or unknown (NaN), got 1e+200"),
+        ("betas", 1e200, "betas must be at most 1000"),
+        ("body_pose", 1e300, "body_pose must be at most 1000"),
+        ("transl", 2e6, "transl must be at most 1e+06"),
+        ("frame", -1, "frame must not be negative"),
+        ("frame", 2**62, "frame must be at most 9.0072e+15"),
+        ("person", 2**53, "person must be at most 9.0072e+15"),
+    ],
 )
 def test_results_that_no_reconstruction_gives(tmp_path, column, value, sentence):
     read = READERS["result"](tmp_path, 0)
@@ -323,6 +332,21 @@ def test_results_that_no_reconstruction_gives(tmp_path, column, value, sentence)
     np.savez(tmp_path / "people.npz", **columns)
     assert sentence in refused(read)
     assert sentence in refused(Reconstruction.load, tmp_path)
+
+
+@pytest.mark.parametrize("column", ["frame", "person"])
+def test_numbers_by_which_rows_are_chosen_are_numbers(tmp_path, column):
+    READERS["result"](tmp_path, 0)
+    with np.load(tmp_path / "people.npz") as archive:
+        columns = dict(archive)
+    for value, sentence in (
+        (np.array(["a", "b", "c"]), f"{column} must hold int64 values, got <U1"),
+        (np.zeros((3, 2), dtype=int), f"{column} must be (3,), got (3, 2)"),
+        (np.array([0, 0, 2**60]), f"{column} must be at most"),
+        (np.array(7), "must have an entry for each row"),
+    ):
+        np.savez(tmp_path / "people.npz", **(columns | {column: value}))
+        assert sentence in refused(Reconstruction.open, tmp_path)
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's device that is always full")

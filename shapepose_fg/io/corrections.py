@@ -13,7 +13,7 @@ from shapepose_fg.errors import InputError
 from shapepose_fg.files import read_json, write_atomically
 from shapepose_fg.io.validation import first_problem, key_text
 from shapepose_fg.provenance import checksums
-from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.reconstruction import MOST_NUMBER, Reconstruction
 from shapepose_fg.tracking.edits import Edit, Edited, Solve, apply, solve_anew, undo
 
 CORRECTIONS, UNCORRECTED = "corrections.json", "uncorrected"
@@ -22,7 +22,7 @@ _FORMAT = "shapepose-fg corrections 1"
 _FILES = ("people.npz", "run.json", "observations.npz")
 _CURE = f"copy the files of {UNCORRECTED} back and delete {UNCORRECTED} and {CORRECTIONS} to begin anew"
 
-Number = Annotated[int, Field(ge=0, lt=2**62)]
+Number = Annotated[int, Field(ge=0, le=MOST_NUMBER)]
 
 
 class _Edit(BaseModel):

@@ -192,3 +192,23 @@ def test_errors_are_one_sentence(folder, capsys, arguments, sentence):
 def test_a_folder_without_a_result(tmp_path, capsys):
     assert run(tmp_path) == 2
     assert "people.npz: there is no such file" in capsys.readouterr().err
+
+
+def test_a_number_that_no_result_has(folder, capsys):
+    assert run(folder, "rename", 0, 2**53) == 2
+    assert "9007199254740992 cannot be a person's number; give one from 0 to" in capsys.readouterr().err
+    assert run(folder, "rename", 0, 2**53 - 1) == 0
+    assert Reconstruction.load(folder).person.max() == 2**53 - 1
+
+
+@pytest.mark.parametrize("text", ["[]", '{"configuration": null}', '{"configuration": []}'])
+def test_an_odd_run_json_is_one_sentence(folder, capsys, text):
+    for name in ("observations.npz", "cameras.json"):
+        (folder / name).write_bytes(b"")
+    (folder / "run.json").write_text(text)
+    before = contents(folder)
+    for words in (["merge", 0, 1], ["drop", 0]):
+        assert run(folder, *words) == 2
+        printed = capsys.readouterr().err
+        assert "run.json: " in printed and "restore it or delete it" in printed
+    assert contents(folder) == before
