@@ -7,6 +7,7 @@ import pickle
 import struct
 import subprocess
 import sys
+import time
 import zipfile
 from itertools import pairwise
 from pathlib import Path
@@ -26,9 +27,11 @@ from shapepose_fg.files import read_json, read_text, read_toml
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.config import read_config
 from shapepose_fg.io.detections import read_detections
+from shapepose_fg.io.timestamps import read_timestamps
 from shapepose_fg.npz_reader import read_npz
 from shapepose_fg.pipeline import PipelineConfig
 from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.simulation.scene import ring_of_cameras
 
 
 def refused(read, *arguments) -> str:
@@ -107,6 +110,18 @@ def test_text_that_is_deep_long_or_repeats_itself(tmp_path, name, text):
         refused(lambda: read_config(tmp_path / name, PipelineConfig))
     if name.endswith(".json"):
         refused(read_json, tmp_path / name)
+
+
+def test_a_name_twice_among_many_is_found_at_once(tmp_path):
+    names = [f"camera{number}" for number in range(200_000)]
+    members = "".join(f'"{name}": 1, ' for name in names)
+    (tmp_path / "a.json").write_text(f'{{{members}"last": 1, "last": 2}}')
+    (tmp_path / "times.csv").write_text(" ".join([*names, "last", "last"]))
+    start = time.process_time()
+    assert 'key "last" occurs twice' in refused(read_json, tmp_path / "a.json")
+    rig = ring_of_cameras(2, np.random.default_rng(0))
+    assert "column last occurs twice" in refused(read_timestamps, tmp_path / "times.csv", rig, 3)
+    assert time.process_time() - start < 5
 
 
 def test_a_number_too_long_is_named(tmp_path):

@@ -371,6 +371,17 @@ BAD_SKELETONS = [
     ('neck = "Neck"', 'nick = "Neck"', "body.nick is no keypoint of ours; it has head"),
     ('r_wri = "RWrist"', 'r_wri = "LWrist"', "joint LWrist occurs twice"),
     ("limbs = [", "limbs = ", "is not TOML"),
+    (
+        'neck = ["r_sho", "l_sho"]',
+        'neck = ["neck", "l_sho"]',
+        "the middle Neck is made of Neck, which must be a key",
+    ),
+    (
+        'neck = ["r_sho", "l_sho"]',
+        'neck = ["MidHip", "l_sho"]',
+        "the middle Neck is made of MidHip, which must be",
+    ),
+    ("[middles]", "core = []\n[middles]", "core must have a joint at least, by which a person is recognised"),
 ]
 
 
