@@ -9,6 +9,7 @@ import numpy as np
 from rich.console import Group, RenderableType
 from rich.padding import Padding
 from rich.table import Table
+from rich.text import Text
 
 from shapepose_fg.detections import Recording
 from shapepose_fg.errors import InputError
@@ -152,7 +153,7 @@ def _alternation(demo: Demo) -> Table:
     notes = (f"mean confidence {rho:g} or more", "less: body and motion help", "the body fills them in")
     for (name, mask), note in zip(demo.errors.groups(rho).items(), notes, strict=True):
         cells = (_mm(demo.errors.before_mm[mask]), _mm(demo.errors.after_mm[mask]))
-        table.add_row(name, str(int(mask.sum())), *cells, f"[dim]{note}")
+        table.add_row(name, str(int(mask.sum())), *cells, Text(note, style="dim"))
     return table
 
 

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from shapepose_fg.errors import InputError
-from shapepose_fg.options import FramesOption, ResultUpOption
-from shapepose_fg.result_options import checked_fps, frame_range, results_folder
+from shapepose_fg.options import FramesOption, ResultUpOption, check_fps, result_frames
+from shapepose_fg.result_options import results_folder
 from shapepose_fg.terminal import note
 
 if TYPE_CHECKING:
@@ -51,6 +51,7 @@ def export(
 
     if markers not in set(MarkerSet):
         raise InputError(f"--markers {markers}: must be one of {' '.join(MarkerSet)}")
+    check_fps(fps)
     if not 0 <= fill_gaps <= 3600:
         raise InputError(f"--fill-gaps {fill_gaps:g}: must be seconds, 0 or more")
     wanted = list(FORMATS.values()) if "all" in formats else chosen(formats)
@@ -59,9 +60,9 @@ def export(
         wanted,
         results_folder(results) / "export" if output is None else output,
         up=cast("Axis | None", up),
-        fps=checked_fps(fps),
+        fps=fps,
         seen_only=seen_only,
-        frames=frame_range(frames),
+        frames=result_frames(frames),
         persons=tuple(person) if person else None,
         markers=MarkerSet(markers),
         fill_gaps_s=fill_gaps,

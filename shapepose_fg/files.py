@@ -8,6 +8,7 @@ import re
 import stat
 import tempfile
 import tomllib
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -261,8 +262,7 @@ def unique_keys(pairs: list[tuple[str, Any]], path: Path) -> dict[str, Any]:
     """An object's members, if no key occurs twice: JSON itself would keep the last one in silence."""
     members = dict(pairs)
     if len(members) < len(pairs):
-        keys = [key for key, _ in pairs]
-        twice = next(key for key in keys if keys.count(key) > 1)
+        twice = next(key for key, count in Counter(key for key, _ in pairs).items() if count > 1)
         raise InputError(f'{path}: key "{twice}" occurs twice in one object; give each its own name')
     return members
 

@@ -76,6 +76,7 @@ class ObservationTable:
         for name, (shape, dtype) in columns.items():
             object.__setattr__(self, name, checked(name, getattr(self, name), shape, dtype))
         check_codes("gate", self.gate, Gate)
+        self._check_values()
         seen = self.gate != Gate.NOT_SEEN
         # A score may be too small for a float32, and which detection it was need not be said.
         wrong = {
@@ -90,6 +91,16 @@ class ObservationTable:
                     f"{name} and gate must agree on what was seen, at row {row}, {self.joint_names[joint]},"
                     f" view {self.view_names[view]} they do not"
                 )
+
+    def _check_values(self) -> None:
+        """ValueError for scores that are none, errors without end, and two cameras or joints of one name."""
+        if not ((self.confidence >= 0) & (self.confidence <= 1)).all():
+            raise ValueError("confidence must be 0 to 1")
+        if np.isinf(self.residual_px).any():
+            raise ValueError("residual_px must be finite, or NaN where there is none")
+        for name in ("joint_names", "view_names"):
+            if len(set(getattr(self, name).tolist())) < len(getattr(self, name)):
+                raise ValueError(f"{name} must differ from each other")
 
     def __len__(self) -> int:
         return len(self.frame)

@@ -37,6 +37,17 @@ def check_fps(fps: float | None) -> None:
         raise InputError(f"--fps {fps:g}: must be a number of frames a second, such as 25")
 
 
+def result_frames(text: str | None) -> range | None:
+    """Frames that `A:B` selects of a saved result, whose last is not known yet; None where all are."""
+    if text is None:
+        return None
+    match = _ends(text)
+    start, stop = int(match[1] or 0), int(match[2] or 10**18)
+    if not start < stop:
+        raise InputError(f"--frames {text}: must be A:B with A below B, such as 0:100")
+    return range(start, stop)
+
+
 def refuse_no_range(text: str | None) -> None:
     """Refuse what is not of the form `A:B`, whatever the recording."""
     if text is not None:

@@ -80,12 +80,17 @@ def _joints(count: dict[str, int], people: "Reconstruction") -> str:
 
 def show_check(checked: "ResultCheck") -> None:
     """How far each camera is from the result, and on stderr what looks wrong."""
+    from rich.text import Text
+
     from shapepose_fg.setup_check.camera_use import use_table
 
     if len(checked.cameras) > 0:
         print()
         show(use_table(checked.cameras))
-        show("[dim]error: median / 90 % of all detections given to people, before gates; used: after;[/]")
-        show("[dim]left out: median, from where the other cameras alone put the joint[/]")
+        meaning = (
+            "error: median / 90 % of all detections given to people, before gates; used: after;\n"
+            "left out: median, from where the other cameras alone put the joint"
+        )
+        show(Text(meaning, style="dim"))
     for each in checked.warnings:
         warn(each)

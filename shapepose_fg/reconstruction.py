@@ -118,13 +118,10 @@ class Reconstruction:
         self._check_observations()
 
     def _check_values(self) -> None:
-        """ValueError for what no reconstruction gives: numbers that are infinite, frames before the first."""
+        """ValueError for what no reconstruction gives: frames before the first, people farther than the moon."""
         for name in self.ROWS:
-            column = getattr(self, name)
-            if column.dtype.kind == "f" and np.isinf(column).any():
-                raise ValueError(f"{name} must be finite, or NaN where unknown")
-            if column.dtype.kind == "i" and (column < 0).any():
-                raise ValueError(f"{name} must not be negative, got {column.min()}")
+            if name in _LARGEST:
+                check_range(name, getattr(self, name))
 
     def _check_observations(self) -> None:
         """ValueError where `observations` are of other rows."""
@@ -199,10 +196,6 @@ class Reconstruction:
         table = None if self.observations is None else replace(self.observations, person=person)
         return replace(self, person=person, observations=table)
 
-    def count_known(self) -> dict[str, int]:
-        """How many joints are known in each way, in words: what run.json says of them."""
-        return count_rows([(self.status, self.known)])["joints"]
-
     def counts(self) -> dict[str, Any]:
         """What run.json says of the rows: how many, with which status, and how their joints are known."""
         return count_rows([(self.status, self.known)])
@@ -259,14 +252,12 @@ class OpenedReconstruction:
             cure=_CURE,
         )
         try:
-            self.frame: NDArray[np.integer] = self._people.column("frame")
+            self.frame = self._numbers("frame")
             """(N,) frame of each row."""
-            self.person: NDArray[np.integer] = self._people.column("person")
+            self.person = self._numbers("person")
             """(N,) identity of each row's person."""
             self.run = self._read_run(file.with_name(RUN))
             """What run.json says."""
-            if self.frame.ndim != 1 or self.person.shape != self.frame.shape:
-                raise InputError(f"{file}: frame and person must be one number a row; {_CURE}")
             table = file.with_name(OBSERVATIONS)
             if table.is_file():
                 self._observed = ObservationTable.open(table, self._people.run_id)
@@ -338,6 +329,17 @@ class OpenedReconstruction:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    def _numbers(self, name: str) -> NDArray[np.integer]:
+        """A column of frames or identities, of which rows are chosen before the others are read."""
+        try:
+            column = checked(name, self._people.column(name), (self._people.count,), np.int64)
+            check_range(name, column)
+        except InputError:
+            raise
+        except ValueError as error:
+            raise InputError(f"{self._people.file}: {error}; {_CURE}") from None
+        return column
+
     def _read_run(self, file: Path) -> dict[str, Any]:
         """What run.json says, if it is of the same run; empty where there is none."""
         run = read_json(file) if file.is_file() else {}
@@ -365,8 +367,36 @@ _TYPES: dict[str, type] = {
 """The type of a column; every other column is float64."""
 _ADDED = frozenset({"time_s", "velocity", "velocity_covariance", "known"})
 """Columns that files of version 0.1 lack."""
+MOST_NUMBER = 2**53 - 1
+"""The highest number of a frame or a person: the last whole number that all real ones below it are."""
+_LARGEST: dict[str, float] = {
+    "frame": MOST_NUMBER,
+    "person": MOST_NUMBER,
+    "time_s": 1e12,
+    "joints": 1e6,
+    "covariance": 1e12,
+    "velocity": 1e9,
+    "velocity_covariance": 1e18,
+    "confidence": 1.001,
+    "betas": 1e3,
+    "global_orient": 1e3,
+    "body_pose": 1e3,
+    "transl": 1e6,
+}
+"""The largest magnitude that is read: far beyond what people do, and such that products of it are numbers."""
 _STORED: dict[str, Any] = {"status": np.dtype(f"U{max(map(len, Status))}")}
 """Types in people.npz that do not depend on the rows."""
+
+
+def check_range(name: str, column: NDArray[Any]) -> None:
+    """ValueError where a number in the column `name` is larger than any result has, or a whole one negative."""
+    if column.size == 0:
+        return
+    if column.dtype.kind == "i" and column.min() < 0:
+        raise ValueError(f"{name} must not be negative, got {column.min()}")
+    largest = max(np.fmax.reduce(column, axis=None), -np.fmin.reduce(column, axis=None))
+    if largest > _LARGEST[name]:
+        raise ValueError(f"{name} must be at most {_LARGEST[name]:g} or unknown (NaN), got {largest:g}")
 
 
 def shared_columns(joint_names: NDArray[np.str_]) -> dict[str, Column]:

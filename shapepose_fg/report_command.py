@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from shapepose_fg.options import ResultUpOption
-from shapepose_fg.result_options import checked_fps
+from shapepose_fg.options import ResultUpOption, check_fps
 
 if TYPE_CHECKING:
     from shapepose_fg.camera import Axis
@@ -25,4 +24,5 @@ def report(
     """Write report.html anew: one page, to be opened in a browser, with the people in 3D and how good they are."""
     from shapepose_fg.report.writing import report_of
 
-    print(report_of(results, up=cast("Axis | None", up), fps=checked_fps(fps), body=body))
+    check_fps(fps)
+    print(report_of(results, up=cast("Axis | None", up), fps=fps, body=body))

@@ -70,7 +70,20 @@ def check_run(run: Mapping[str, Any]) -> None:
         raise ValueError(f'"cuts" must be a list of frame numbers, got {_short(cuts)}')
     if not isinstance(run.get("body"), str | None):
         raise ValueError(f'"body" must be the name of a file or null, got {_short(run["body"])}')
-    covered_frames(run)
+    spans = covered_frames(run) or []
+    if any(span.start < 0 or span.stop < span.start for span in spans) or _count(spans) > _MOST_FRAMES:
+        raise ValueError(
+            f'"frames" must be [start, stop] of at most {_MOST_FRAMES} frames, got {_short(run["frames"])}'
+        )
+
+
+_MOST_FRAMES = 10_000_000
+"""Frames of a recording: over four days at 25 a second."""
+
+
+def _count(spans: Sequence[range]) -> int:
+    """Frames in all of `spans`; the length of a range may be too large for `len`."""
+    return sum(span.stop - span.start for span in spans)
 
 
 def _short(value: object) -> str:

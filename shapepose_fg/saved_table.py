@@ -48,6 +48,8 @@ class SavedTable:
                     raise InputError(f"{file}: {name} are not those of this version; {cure}")
             self.run_id = self._npz.array(RUN_ID) if RUN_ID in there else None
             self._rows = [name for name in rows if name in there]
+            self.count = self._counted()
+            """How many rows there are."""
             self.shared = {name: self._npz.array(name) for name in shared if name in there}
         except InputError:
             self._npz.close()
@@ -62,10 +64,22 @@ class SavedTable:
 
         InputError where they would not fit in memory.
         """
-        self._check_memory(self._npz.shape(self._rows[0])[0] if index is None else len(index))
+        self._check_memory(self.count if index is None else len(index))
         if index is None:
             return {name: self._npz.array(name) for name in self._rows} | self.shared
         return {name: self._npz.rows(name, index) for name in self._rows} | self.shared
+
+    def _counted(self) -> int:
+        """Rows of all columns; InputError where one has others."""
+        first = self._rows[0]
+        count = (self._npz.shape(first) or (0,))[0]
+        for name in self._rows:
+            if self._npz.shape(name)[:1] != (count,):
+                raise InputError(
+                    f"{self.file}: {name} must have an entry for each row, as many as {first}, got the shape"
+                    f" {self._npz.shape(name)}; {self._cure}"
+                )
+        return count
 
     def _check_memory(self, count: int) -> None:
         """InputError where so many rows, and as much again to work with them, are more than there is room for."""

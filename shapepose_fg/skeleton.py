@@ -1,5 +1,6 @@
 """What a detector's joints are called, how limbs join them, and which are left and right of each other."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -59,12 +60,24 @@ class Skeleton:
         joints = (*(joint for joint in keypoints if joint), *middles)
         place = {joint: index for index, joint in enumerate(joints)}
         if len(place) < len(joints):
-            twice = next(joint for joint in joints if joints.count(joint) > 1)
+            twice = next(joint for joint, count in Counter(joints).items() if count > 1)
             raise ValueError(f"{name}: joint {twice} occurs twice; give each its own name")
         pairs = [*limbs, *mirror, *middles.values()]
         for joint in (anchor, *core, *(end for pair in pairs for end in pair)):
             if joint not in place:
                 raise ValueError(f"{name} has no joint {joint!r}; it has {' '.join(joints)}")
+        made = set(keypoints)
+        for joint, ends in middles.items():
+            late = next((end for end in ends if end not in made), None)
+            if late is not None:
+                raise ValueError(
+                    f"{name}: the middle {joint} is made of {late}, which must be a keypoint or a middle before it"
+                )
+            made.add(joint)
+        if len(core) == 0:
+            raise ValueError(
+                f"{name}: core must have a joint at least, by which a person is recognised; name some"
+            )
         other = {place[a]: place[b] for a, b in (*mirror, *((b, a) for a, b in mirror))}
         edges = tuple((place[a], place[b]) for a, b in limbs)
         grown = (

@@ -30,10 +30,10 @@ def use_any_streams() -> None:
 
 
 def show(content: "RenderableType") -> None:
-    """Print on stdout; with colours on a terminal only."""
+    """Print on stdout; with colours on a terminal only. Text is no markup: names and paths are in it."""
     from rich.console import Console
 
-    Console().print(content)
+    Console(markup=False, emoji=False).print(content)
 
 
 def note(message: str) -> None:
@@ -63,7 +63,7 @@ def progress(what: str, unit: str = "frames") -> Iterator[Callable[[int, int], N
 
     console = Console(stderr=True)
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TextColumn(unit),

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from shapepose_fg.errors import InputError
+from shapepose_fg.result_options import results_folder
 from shapepose_fg.terminal import show
 
 if TYPE_CHECKING:
@@ -103,16 +104,11 @@ def undo_correction(context: typer.Context) -> None:
     """Take the last correction back."""
     from shapepose_fg.io.corrections import take_back
 
-    folder = _folder(context.obj)
+    folder = results_folder(context.obj)
     edit, _ = take_back(folder, _solver(folder))
     print(f"taken back: {edit}")
     show(_tracks_table(context.obj))
     _renew_report(folder)
-
-
-def _folder(results: Path) -> Path:
-    """The folder of a result, which may be given as its people.npz too."""
-    return results.parent if results.name == "people.npz" else results
 
 
 def _tracks_table(results: Path) -> "RenderableType":
@@ -146,7 +142,7 @@ def _tracks_table(results: Path) -> "RenderableType":
     lines = [f"{len(listed)} people, {rows} rows{rate_words(run)}"]
     if not run.get("configuration", {}).get("temporal", True):
         lines.append("every frame stands alone here: a number is nobody's over time")
-    edits = read_corrections(_folder(results))
+    edits = read_corrections(results_folder(results))
     if len(edits) > 0:
         lines.append(f"corrected: {'; '.join(map(str, edits))}")
     return Group(*([table] if listed else []), Padding("\n".join(lines), (1 if listed else 0, 0, 0, 0)))
@@ -173,7 +169,7 @@ def _correct(context: typer.Context, action: str, person: int, **more: int | Non
     from shapepose_fg.reconstruction import Reconstruction
     from shapepose_fg.tracking.edits import Action, Edit, free_number
 
-    folder = _folder(context.obj)
+    folder = results_folder(context.obj)
     if action == "split" and more["other"] is None:
         with Reconstruction.open(folder) as opened:
             more["other"] = free_number(opened.person)
@@ -206,13 +202,15 @@ def _solver(folder: Path) -> "Solve | None":
     None where the result does not hold what that takes, or without time: then every row is solved by itself,
     whoever it is.
     """
-    from shapepose_fg.files import read_json
     from shapepose_fg.io.solved_setup import CAMERAS
+    from shapepose_fg.reconstruction import Reconstruction
 
     needed = [folder / name for name in ("run.json", "observations.npz", CAMERAS)]
     if not all(file.is_file() for file in needed):
         return None
-    if not read_json(needed[0]).get("configuration", {}).get("temporal", False):
+    with Reconstruction.open(folder) as opened:
+        temporal = opened.run.get("configuration", {}).get("temporal", False)
+    if not temporal:
         return None
 
     def solve(rows: "Reconstruction") -> "Reconstruction":

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from shapepose_fg.errors import InputError
-from shapepose_fg.options import FramesOption, ResultUpOption
-from shapepose_fg.result_options import checked_fps, frame_range
+from shapepose_fg.options import FramesOption, ResultUpOption, check_fps, result_frames
 from shapepose_fg.terminal import note, progress
 
 if TYPE_CHECKING:
@@ -71,12 +70,13 @@ def view(
     from shapepose_fg.export.rerun_scene import body_if_there, log_take, new_stream, open_viewer, viewer_file
     from shapepose_fg.export.rerun_statistics import switch_off
 
+    check_fps(fps)
     take = read_take(
         results,
         up=cast("Axis | None", up),
-        fps=checked_fps(fps),
+        fps=fps,
         seen_only=seen_only,
-        frames=frame_range(frames),
+        frames=result_frames(frames),
         persons=tuple(person) if person else None,
         identities=False,
     )

@@ -3,11 +3,12 @@
 import io
 import random
 import re
+import struct
 import zipfile
 
 NUMBERS = [
     *"0 -1 1e400 -1e308 1e-320 nan NaN Infinity null true [] {}".split(),
-    *"99999999999999999999 2147483648 0x10 1_000".split(),
+    *"99999999999999999999 2147483648 10000000000000 4611686018427387904 1e200 0x10 1_000".split(),
     "9" * 5000,
     "0." + "0" * 400 + "1",
     "[" * 2000 + "]" * 2000,
@@ -111,7 +112,16 @@ def _header(array: bytes, rng: random.Random) -> bytes:
     old, new = rng.choice(changes)
     head = re.sub(old, new, head, count=1)
     if rng.random() < 0.5:
-        kind = rng.choice((b"\xff" * 8, b"\0" * 8, b"\0" * 6 + b"\xf0\x7f", b"\0" * 6 + b"\xf8\x7f"))
+        kind = rng.choice(
+            (
+                b"\xff" * 8,
+                b"\0" * 8,
+                b"\0" * 6 + b"\xf0\x7f",
+                b"\0" * 6 + b"\xf8\x7f",
+                struct.pack("<d", 1e200),
+                struct.pack("<q", rng.choice((2**40, 2**52, 2**62))),
+            )
+        )
         at = 8 * rng.randrange(max(1, len(body) // 8))
         body = body[:at] + kind + body[at + 8 :]
     return head[:128] + body

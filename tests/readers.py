@@ -4,6 +4,7 @@ import json
 import pickle
 import shutil
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,16 +21,18 @@ from shapepose_fg.batch.standing import Standing, Standings, read_standings
 from shapepose_fg.batch.table import read_table
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS, read_smpl_file
-from shapepose_fg.body.shapes import SubjectShapes
+from shapepose_fg.body.shapes import SubjectShapes, read_body
 from shapepose_fg.camera import Rig
 from shapepose_fg.detection2d.onnx_file import read_onnx
 from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
 from shapepose_fg.evaluation.other_results.reading import read_people
+from shapepose_fg.export.exporting import export_result
 from shapepose_fg.export.markers import Markers, opensim_names
+from shapepose_fg.export.registry import chosen
 from shapepose_fg.export.trc import trc_text
 from shapepose_fg.io.calibration import read_rig, write_rig
 from shapepose_fg.io.config import read_config, toml_text
-from shapepose_fg.io.corrections import read_corrections
+from shapepose_fg.io.corrections import correct, read_corrections, take_back
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.io.footage.used import read_used_footage
 from shapepose_fg.io.pose2sim_project import read_pose2sim_project
@@ -38,7 +41,10 @@ from shapepose_fg.io.timestamps import read_timestamps
 from shapepose_fg.observation_table import ObservationTable
 from shapepose_fg.pipeline import PipelineConfig
 from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.report.writing import report_of
 from shapepose_fg.skeleton import BODY_25, COCO_17
+from shapepose_fg.tracking.edits import Action, Edit
+from shapepose_fg.tracking.listing import list_saved_tracks
 
 Read = Callable[[], object]
 """Reads the files; raises InputError, or returns."""
@@ -197,6 +203,38 @@ def _result(folder: Path, seed: int) -> Read:
     return lambda: Reconstruction.load(folder)
 
 
+def _result_for(use: Callable[[Path], object]) -> Prepare:
+    """A result, of which `use` is made in a copy: what is written there is no file to be changed."""
+
+    def prepare(folder: Path, seed: int) -> Read:
+        results.people([0, 0, 3], seed).save(folder)
+        _unpack(folder / "people.npz")
+
+        def read() -> None:
+            with tempfile.TemporaryDirectory() as copy:
+                shutil.copytree(folder, copy, dirs_exist_ok=True)
+                use(Path(copy))
+
+        return read
+
+    return prepare
+
+
+def _exported(folder: Path) -> None:
+    for name in ("csv", "bvh", "c3d"):
+        export_result(folder, chosen([name]), folder / "export", up="z")
+
+
+def _listed(folder: Path) -> None:
+    with Reconstruction.open(folder) as opened:
+        list_saved_tracks(opened, read_body())
+
+
+def _merged(folder: Path) -> None:
+    correct(folder, Edit(Action.MERGE, 0, 2))
+    take_back(folder)
+
+
 def _observations(folder: Path, seed: int) -> Read:
     import test_observation_table as tables
 
@@ -310,6 +348,10 @@ READERS: dict[str, Prepare] = {
     "offsets": _offsets,
     "motion": _motion,
     "result": _result,
+    "result for export": _result_for(_exported),
+    "result for its report": _result_for(report_of),
+    "result for its tracks": _result_for(_listed),
+    "result for corrections": _result_for(_merged),
     "observations": _observations,
     "shapes": _shapes,
     "body": _body(False),

@@ -7,6 +7,7 @@ import pickle
 import struct
 import subprocess
 import sys
+import time
 import zipfile
 from itertools import pairwise
 from pathlib import Path
@@ -26,9 +27,11 @@ from shapepose_fg.files import read_json, read_text, read_toml
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.config import read_config
 from shapepose_fg.io.detections import read_detections
+from shapepose_fg.io.timestamps import read_timestamps
 from shapepose_fg.npz_reader import read_npz
 from shapepose_fg.pipeline import PipelineConfig
 from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.simulation.scene import ring_of_cameras
 
 
 def refused(read, *arguments) -> str:
@@ -107,6 +110,18 @@ def test_text_that_is_deep_long_or_repeats_itself(tmp_path, name, text):
         refused(lambda: read_config(tmp_path / name, PipelineConfig))
     if name.endswith(".json"):
         refused(read_json, tmp_path / name)
+
+
+def test_a_name_twice_among_many_is_found_at_once(tmp_path):
+    names = [f"camera{number}" for number in range(200_000)]
+    members = "".join(f'"{name}": 1, ' for name in names)
+    (tmp_path / "a.json").write_text(f'{{{members}"last": 1, "last": 2}}')
+    (tmp_path / "times.csv").write_text(" ".join([*names, "last", "last"]))
+    start = time.process_time()
+    assert 'key "last" occurs twice' in refused(read_json, tmp_path / "a.json")
+    rig = ring_of_cameras(2, np.random.default_rng(0))
+    assert "column last occurs twice" in refused(read_timestamps, tmp_path / "times.csv", rig, 3)
+    assert time.process_time() - start < 5
 
 
 def test_a_number_too_long_is_named(tmp_path):
@@ -313,7 +328,16 @@ def test_scores_of_nothing_are_nothing(tmp_path, score):
 
 @pytest.mark.parametrize(
     ("column", "value", "sentence"),
-    [("joints", np.inf, "joints must be finite"), ("frame", -1, "frame must not be negative")],
+    [
+        ("joints", np.inf, "joints must be at most 1e+06 or unknown (NaN), got inf"),
+        ("joints", -1e200, "joints must be at most 1e+06 or unknown (NaN), got 1e+200"),
+        ("betas", 1e200, "betas must be at most 1000"),
+        ("body_pose", 1e300, "body_pose must be at most 1000"),
+        ("transl", 2e6, "transl must be at most 1e+06"),
+        ("frame", -1, "frame must not be negative"),
+        ("frame", 2**62, "frame must be at most 9.0072e+15"),
+        ("person", 2**53, "person must be at most 9.0072e+15"),
+    ],
 )
 def test_results_that_no_reconstruction_gives(tmp_path, column, value, sentence):
     read = READERS["result"](tmp_path, 0)
@@ -323,6 +347,21 @@ def test_results_that_no_reconstruction_gives(tmp_path, column, value, sentence)
     np.savez(tmp_path / "people.npz", **columns)
     assert sentence in refused(read)
     assert sentence in refused(Reconstruction.load, tmp_path)
+
+
+@pytest.mark.parametrize("column", ["frame", "person"])
+def test_numbers_by_which_rows_are_chosen_are_numbers(tmp_path, column):
+    READERS["result"](tmp_path, 0)
+    with np.load(tmp_path / "people.npz") as archive:
+        columns = dict(archive)
+    for value, sentence in (
+        (np.array(["a", "b", "c"]), f"{column} must hold int64 values, got <U1"),
+        (np.zeros((3, 2), dtype=int), f"{column} must be (3,), got (3, 2)"),
+        (np.array([0, 0, 2**60]), f"{column} must be at most"),
+        (np.array(7), "must have an entry for each row"),
+    ):
+        np.savez(tmp_path / "people.npz", **(columns | {column: value}))
+        assert sentence in refused(Reconstruction.open, tmp_path)
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's device that is always full")

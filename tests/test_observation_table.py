@@ -70,6 +70,10 @@ def test_rows_and_back_together():
         ("candidate", np.zeros((2, 2, 2)), "candidate must hold int32 values, got float64"),
         ("candidate", np.full((2, 2, 2), 2**40), "candidate must hold -2147483648 to 2147483647"),
         ("xy", np.zeros((2, 2, 2)), r"xy must be \(2, 2, 2, 2\), got \(2, 2, 2\)"),
+        ("confidence", np.full((2, 2, 2), np.nan), "confidence must be 0 to 1"),
+        ("confidence", np.full((2, 2, 2), 1.5), "confidence must be 0 to 1"),
+        ("residual_px", np.full((2, 2, 2, 2), np.inf), "residual_px must be finite, or NaN"),
+        ("view_names", np.array(["A", "A"]), "view_names must differ from each other"),
     ],
 )
 def test_wrong_columns(tmp_path, column, value, message):
@@ -91,6 +95,7 @@ def test_wrong_columns(tmp_path, column, value, message):
         ({"gate_names": None}, "column gate_names is missing"),
         ({"xy": None}, "column xy is missing"),
         ({"gate_names": np.array(["used"])}, "gate_names are not those of this version"),
+        ({"frame": np.array(3)}, "must have an entry for each row"),
     ],
 )
 def test_bad_files(tmp_path, changed, sentence):

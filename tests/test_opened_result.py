@@ -125,6 +125,15 @@ def test_what_does_not_fit_in_memory_is_a_sentence(folder, monkeypatch):
         assert len(opened.frames(0, 20)) > 0
 
 
+def test_many_people_in_many_frames_are_a_sentence(folder, monkeypatch):
+    """A place for everybody in every frame: 12,000 people in as many frames took a gigabyte from 83 KB."""
+    monkeypatch.setattr("shapepose_fg.export.take.free_memory", lambda: 1000)
+    with pytest.raises(
+        InputError, match=r"people\.npz: \d+ people over \d+ frames would take .* \(--frames, --person\)"
+    ):
+        read_take(folder, up="z")
+
+
 def test_a_file_that_was_changed_is_one_sentence(folder, tmp_path, result):
     """Damage in a column is found where the rows are read, and a file of other rows when it is opened."""
     result.save(tmp_path)

@@ -131,3 +131,16 @@ def test_without_footage_json_pictures_are_counted_and_it_is_said(solved, tmp_pa
     assert f"frame 0 of the result is taken to be the first picture of {name}" in told
     assert "of the same shape: taken as resized" in told
     assert len(frames_of(tmp_path / "results" / "overlay" / "grid.mp4")) == 2
+
+
+def test_footage_of_another_calibration_is_not_drawn_on(solved, tmp_path, capsys):
+    """detect was run with another rig: its places of pixels are not those of this result."""
+    content = json.loads((solved / "detections" / "footage.json").read_text())
+    content["cameras"][0]["calibrated_size"][0] *= 2
+    (tmp_path / "footage.json").write_text(json.dumps(content))
+    words = ["--output", tmp_path / "out", "--stills", "0", "--width", "640", "--detections", tmp_path]
+    assert run(solved / "results", *words) == 2
+    printed = " ".join(capsys.readouterr().err.split())
+    assert f"camera {content['cameras'][0]['name']} was calibrated for pictures of" in printed
+    assert "give --detections with the folder of this result, or --image-placement" in printed
+    assert run(solved / "results", *words, "--image-placement", "scale") == 0

@@ -288,9 +288,9 @@ def test_files_of_the_first_version_still_load(tmp_path):
 
 
 def test_joints_are_counted_by_how_they_are_known():
-    count = people([0, 0, 3]).count_known()
+    count = people([0, 0, 3]).counts()["joints"]
     assert count == {"seen": 3 * 23 - 1, "body": 3, "motion": 3, "unknown": 1}
-    assert Reconstruction.empty().count_known() == {"seen": 0, "body": 0, "motion": 0, "unknown": 0}
+    assert Reconstruction.empty().counts()["joints"] == {"seen": 0, "body": 0, "motion": 0, "unknown": 0}
 
 
 def part(rows: list[int], **run) -> Reconstruction:
@@ -433,6 +433,16 @@ def test_a_file_that_is_damaged_anywhere_is_one_sentence_or_none(tmp_path, file)
         ({"cuts": [1.5]}, '"cuts" must be a list of frame numbers, got [1.5]'),
         ({"body": 7}, '"body" must be the name of a file or null, got 7'),
         ({"frames": [[0, 1], [2]]}, '"frames" must be [start, stop] or a list of those'),
+        (
+            {"frames": [0, 10_000_000_000_000]},
+            '"frames" must be [start, stop] of at most 10000000 frames, got [0, 1',
+        ),
+        (
+            {"frames": [[0, 6_000_000], [6_000_000, 12_000_000]]},
+            '"frames" must be [start, stop] of at most 10000000',
+        ),
+        ({"frames": [-5, 3]}, '"frames" must be [start, stop] of at most'),
+        ({"frames": [0, 10**18]}, '"frames" must be [start, stop] of at most'),
     ],
 )
 def test_entries_of_run_json_that_are_read_again(tmp_path, run, sentence):

@@ -4,7 +4,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
@@ -23,7 +22,7 @@ class Bars:
 
     def began(self, name: str) -> None:
         """See `Watcher`."""
-        self._tasks[name] = self._bars.add_task(escape(name), total=None)
+        self._tasks[name] = self._bars.add_task(name, total=None)
 
     def frames(self, name: str, done: int, count: int) -> None:
         """See `Watcher`."""
@@ -51,7 +50,7 @@ def bars(standings: Standings) -> Iterator[Bars]:
     """`Bars` on stderr while the block runs."""
     console = Console(stderr=True)
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeRemainingColumn(compact=True),

@@ -1,17 +1,22 @@
 """C3D, the binary file of motion capture laboratories, by ezc3d: millimetres, y up; residual -1 is missing."""
 
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from shapepose_fg.export.job import Job, Written, optional
 from shapepose_fg.export.markers import Markers, markers_of
+from shapepose_fg.export.take import Take
 from shapepose_fg.files import write_atomically
+
+_MOST = 65_535
+"""The number of a frame, and how many there are, have 16 bits in a C3D file."""
 
 
 def write_c3d(job: Job) -> Written:
-    """A file per person, from the first to the last frame with a marker, at one rate."""
+    """A file per person, or several of 65,535 frames, from the first to the last with a marker, at one rate."""
     optional("ezc3d", "export")
     take, lost = job.take.at_one_rate()
     written = Written()
@@ -21,16 +26,43 @@ def write_c3d(job: Job) -> Written:
         if len(markers.frames) == 0:
             written.notes.append(f"c3d: person {who} has no marker in any frame")
             continue
-        part = slice(int(markers.frames[0]), int(markers.frames[-1]) + 1)
-        path = job.folder / f"person_{who}.c3d"
-        content = c3d_bytes(markers, int(take.frames[part.start]), take.fps, part)
+        write_person(
+            markers,
+            take,
+            job.folder,
+            lambda span, who=who: f"person_{who}" + ("" if span is None else f"_frames_{span[0]}-{span[1]}"),
+            written,
+        )
+    return written
+
+
+def write_person(
+    markers: Markers, take: Take, folder: Path, name: Callable[[tuple[int, int] | None], str], written: Written
+) -> None:
+    """One person's file in `folder`, from the first to the last frame with a marker; several of 65,535 frames.
+
+    `take` is at one rate. `name` gives a file's name without ending: of all frames (None), or of the first to the
+    last frame in it. Files and notes are added to `written`.
+    """
+    first, stop = int(markers.frames[0]), int(markers.frames[-1]) + 1
+    for start in range(first, stop, _MOST):
+        part = slice(start, min(start + _MOST, stop))
+        frames = take.frames[part]
+        span = int(frames[0]), int(frames[-1])
+        path = folder / f"{name(None if stop - first <= _MOST else span)}.c3d"
+        fits = span[1] < _MOST
+        if not fits:
+            written.notes.append(
+                f"{path.name} counts its frames from 1, not {span[0] + 1}: numbers in C3D end at {_MOST}"
+            )
+        content = c3d_bytes(markers, span[0] if fits else 0, take.fps, part)
         write_atomically(path, lambda stream, content=content: stream.write(content))
         written.files.append(path)
-    return written
 
 
 def c3d_bytes(markers: Markers, first_frame: int, fps: float, part: slice = slice(None)) -> bytes:
     """A C3D file of the frames `part`; `first_frame`, counted from 0, is in its header, where frames count from 1.
+    `part` has at most 65,535 frames, and the last is number 65,535 at most.
 
     A point's residual is the standard deviation of its place in whole millimetres, which the format keeps in a
     byte: 1 to 255, where 255 is more, too. It is 0 where it is not known (C3D's word for a point that was

@@ -7,7 +7,7 @@ import numpy as np
 
 from shapepose_fg.camera import Axis
 from shapepose_fg.errors import InputError
-from shapepose_fg.export.c3d import c3d_bytes
+from shapepose_fg.export.c3d import write_person
 from shapepose_fg.export.job import Written, optional
 from shapepose_fg.export.markers import MarkerSet, markers_of
 from shapepose_fg.export.take import Take
@@ -20,18 +20,23 @@ from shapepose_fg.reconstruction import Known, Reconstruction
 def write_pose2sim_files(people: Reconstruction, up: Axis, project: Pose2SimProject) -> Written:
     """A TRC and a C3D file per person into pose-3d/; of one person only, where the project is of one.
 
-    That one is who has most joints in the detections of most frames. Without ezc3d there is no C3D, and a note.
+    That one is who has most joints in the detections of most frames. A note says why there is no C3D, or nothing
+    at all: this comes at the end of a run, which must not fail here.
     """
     written = Written()
     if len(people) == 0:
         written.notes.append("nobody was found, so there is no TRC and no C3D")
         return written
-    take = _numbered(Take.of(people, up), project.first_number)
+    try:
+        take = _numbered(Take.of(people, up), project.first_number)
+    except ValueError as error:
+        written.notes.append(f"no TRC and no C3D: {error}")
+        return written
     chosen = range(len(take.persons)) if project.multi_person else [_main_person(take)]
-    c3d = _c3d_or_why_not(written)
+    even = _even_or_why_not(take, written)
     before = {each.name for each in project.pose_3d.glob("*.trc")} if project.pose_3d.is_dir() else set()
     for number, person in enumerate(chosen):
-        _write_person(take, person, number if project.multi_person else None, project, written, c3d)
+        _write_person(take, person, number if project.multi_person else None, project, written, even)
     left = sorted(before - {each.name for each in written.files})
     if len(left) > 0:
         written.notes.append(
@@ -42,9 +47,9 @@ def write_pose2sim_files(people: Reconstruction, up: Axis, project: Pose2SimProj
 
 
 def _write_person(
-    take: Take, person: int, number: int | None, project: Pose2SimProject, written: Written, c3d: bool
+    take: Take, person: int, number: int | None, project: Pose2SimProject, written: Written, even: Take | None
 ) -> None:
-    """The files of one person, the `number`th of several."""
+    """The files of one person, the `number`th of several; no C3D without the take at one rate, `even`."""
     markers = markers_of(take, person, MarkerSet.OPENSIM)
     if len(markers.frames) == 0:
         written.notes.append(f"person {take.persons[person]} has no joint in any frame")
@@ -59,14 +64,14 @@ def _write_person(
     holes = int(last - first + 1 - len(markers.frames))
     if holes > 0:
         written.notes.append(f"{name}.trc leaves out {holes} frames in which nothing is known of the person")
-    if c3d:
-        even, lost = take.at_one_rate()
-        written.note_rate(lost, take.fps)
-        there = markers_of(even, person, MarkerSet.OPENSIM)
-        part = slice(int(there.frames[0]), int(there.frames[-1]) + 1)
-        path = project.pose_3d / f"{name}.c3d"
-        _write(path, c3d_bytes(there, int(even.frames[part.start]), even.fps, part))
-        written.files.append(path)
+    if even is not None:
+        write_person(
+            markers_of(even, person, MarkerSet.OPENSIM),
+            even,
+            project.pose_3d,
+            lambda span: name if span is None else project.name_of(number, *span),
+            written,
+        )
 
 
 def _numbered(take: Take, first: int) -> Take:
@@ -81,13 +86,16 @@ def _main_person(take: Take) -> int:
     return int(np.argmax(count))
 
 
-def _c3d_or_why_not(written: Written) -> bool:
+def _even_or_why_not(take: Take, written: Written) -> Take | None:
+    """The take at one rate, for C3D; None, and a note, where there cannot be one."""
     try:
         optional("ezc3d", "export")
+        even, lost = take.at_one_rate()
     except InputError as error:
         written.notes.append(f"no C3D: {error}")
-        return False
-    return True
+        return None
+    written.note_rate(lost, take.fps)
+    return even
 
 
 def _write(path: Path, content: bytes) -> None:

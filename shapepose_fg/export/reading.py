@@ -59,6 +59,11 @@ def chosen_rows(
         chosen &= np.isin(opened.person, persons)
     if frames is not None:
         chosen &= (opened.frame >= frames.start) & (opened.frame < frames.stop)
+        there = opened.frame if persons is None else opened.frame[np.isin(opened.person, persons)]
+        if len(there) > 0 and not chosen.any():
+            raise InputError(
+                f"--frames: {path} has nobody in these frames; people are in frames {there.min()} to {there.max()}"
+            )
     return np.flatnonzero(chosen)
 
 

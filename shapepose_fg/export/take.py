@@ -5,13 +5,18 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.filesize import decimal
 
 from shapepose_fg.camera import Axis, Rig
+from shapepose_fg.errors import InputError
 from shapepose_fg.reconstruction import Known, Reconstruction
 from shapepose_fg.run_summary import covered_frames
+from shapepose_fg.saved_table import free_memory
 
 _LONGEST = 1_000_000
 """Frames of a file with one rate: nine hours at 30 a second. Beyond, times are in another unit or have a hole."""
+_SHORTEST_S, _LONGEST_S = 1e-6, 1e5
+"""From frame to frame: outside of this times are in another unit."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +67,7 @@ class Take:
         people = _seen(people) if seen_only else people
         frames = _frames(people)
         persons, person = np.unique(people.person, return_inverse=True)
+        _check_memory(len(persons), len(frames))
         rows = np.full((len(persons), len(frames)), -1, dtype=np.intp)
         place = np.searchsorted(frames, people.frame)
         rows[person, place] = np.arange(len(people))
@@ -73,6 +79,8 @@ class Take:
             )
         times = _times(people, frames, fps)
         steps = np.diff(times) / np.diff(frames)
+        if len(steps) > 0 and not _SHORTEST_S <= np.median(steps) <= _LONGEST_S:
+            raise ValueError(f"frames are {np.median(steps):g} s apart by time_s; give --fps")
         rate = round(1 / float(np.median(steps)), 6) if len(steps) > 0 else fps or _fps_of(people)
         return cls(people, persons.astype(np.int64), rows, frames, times, rate, up, rig)
 
@@ -87,24 +95,35 @@ class Take:
         """The same people at exactly `fps` frames a second, for formats that know no other; and what was lost.
 
         A frame goes to the nearest step, numbered on from the first; steps that no frame is near to are holes.
-        The number says how many frames were left out because another is nearer to their step. ValueError where
+        The number says how many frames were left out because another is nearer to their step. InputError where
         that would be more than a million frames.
         """
         step = (self.times_s - self.times_s[0]) * self.fps
         if step[-1] >= _LONGEST:
-            raise ValueError(
-                f"the times run over {self.times_s[-1] - self.times_s[0]:.0f} s, {step[-1]:.0f} frames at "
-                f"{self.fps:g} a second; give --fps, or part of it with --frames"
+            raise InputError(
+                f"people.npz: the times run over {self.times_s[-1] - self.times_s[0]:.0f} s, {step[-1]:.0f} frames"
+                f" at {self.fps:g} a second; give --fps, or part of it with --frames"
             )
         place = np.rint(step).astype(np.intp)
         nearest = np.lexsort((np.abs(step - place), place))
         kept = nearest[np.unique(place[nearest], return_index=True)[1]]
         count = int(place[-1]) + 1
+        _check_memory(len(self.persons), count)
         rows = np.full((len(self.persons), count), -1, dtype=np.intp)
         rows[:, place[kept]] = self.rows[:, kept]
         numbers = np.arange(count)
         times = self.times_s[0] + numbers / self.fps
         return replace(self, rows=rows, frames=self.frames[0] + numbers, times_s=times), len(place) - len(kept)
+
+
+def _check_memory(persons: int, frames: int) -> None:
+    """InputError where a place for every person in every frame, twice, is more than there is room for."""
+    needed, free = 2 * 8 * persons * frames, free_memory()
+    if free is not None and needed > free:
+        raise InputError(
+            f"people.npz: {persons} people over {frames} frames would take {decimal(needed)} of memory, and"
+            f" {decimal(free)} are free; take some frames or people at a time (--frames, --person)"
+        )
 
 
 def _seen(people: Reconstruction) -> Reconstruction:

@@ -13,16 +13,16 @@ from shapepose_fg.errors import InputError
 from shapepose_fg.files import read_json, write_atomically
 from shapepose_fg.io.validation import first_problem, key_text
 from shapepose_fg.provenance import checksums
-from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.reconstruction import MOST_NUMBER, Reconstruction
 from shapepose_fg.tracking.edits import Edit, Edited, Solve, apply, solve_anew, undo
 
 CORRECTIONS, UNCORRECTED = "corrections.json", "uncorrected"
 """The list of what was corrected, and the folder of the result as it was before."""
 _FORMAT = "shapepose-fg corrections 1"
 _FILES = ("people.npz", "run.json", "observations.npz")
-_CURE = f"copy the files of {UNCORRECTED} back and delete {CORRECTIONS} to begin anew"
+_CURE = f"copy the files of {UNCORRECTED} back and delete {UNCORRECTED} and {CORRECTIONS} to begin anew"
 
-Number = Annotated[int, Field(ge=0, lt=2**62)]
+Number = Annotated[int, Field(ge=0, le=MOST_NUMBER)]
 
 
 class _Edit(BaseModel):
@@ -43,10 +43,16 @@ class _File(BaseModel):
 def read_corrections(folder: str | Path) -> tuple[Edit, ...]:
     """What was corrected in the result in `folder`, first to last; none where there is no corrections.json.
 
-    InputError, one sentence, where that file is damaged or people.npz is not what the corrections led to.
+    InputError, one sentence, where that file is damaged, people.npz is not what the corrections led to, or there
+    is `uncorrected` without it: a correction was stopped half way, or `uncorrected` is of an earlier result.
     """
     file = Path(folder) / CORRECTIONS
     if not file.is_file():
+        if (Path(folder) / UNCORRECTED).exists():
+            raise InputError(
+                f"{file}: it is missing beside {UNCORRECTED}, so a correction was stopped half way; copy the files"
+                f" of {UNCORRECTED} back and delete that folder, or only delete it if people.npz is of a later run"
+            )
         return ()
     try:
         content = _File.model_validate(read_json(file))
@@ -71,12 +77,15 @@ def correct(folder: str | Path, edit: Edit, solve: Solve | None = None) -> Edite
     """
     folder = Path(folder)
     edits, people = read_corrections(folder), Reconstruction.load(folder)
+    if len(edits) > 0:
+        _check_kept(folder)
     try:
         edited = apply(people, edit)
     except ValueError as error:
         raise InputError(f"{folder}: {error}") from None
     solved = edited.people if solve is None else solve_anew(edited, solve)
-    _keep(folder)
+    if len(edits) == 0:
+        _keep(folder)
     _write(folder, solved, (*edits, edit))
     return replace(edited, people=solved)
 
@@ -93,6 +102,7 @@ def take_back(folder: str | Path, solve: Solve | None = None) -> tuple[Edit, Rec
         raise InputError(
             f"{folder}: there is no correction to take back; shapepose-fg tracks {folder} lists people"
         )
+    _check_kept(folder)
     if len(edits) == 1:
         _restore(folder)
         return edits[-1], Reconstruction.load(folder)
@@ -104,9 +114,11 @@ def take_back(folder: str | Path, solve: Solve | None = None) -> tuple[Edit, Rec
 
 def refuse_corrected(folder: Path) -> None:
     """InputError where `folder` holds a result that was corrected by hand: a new one would make that worthless."""
-    if (folder / CORRECTIONS).exists():
+    there = [name for name in (CORRECTIONS, UNCORRECTED) if (folder / name).exists()]
+    if len(there) > 0:
         raise InputError(
-            f"{folder}: this result was corrected by hand ({CORRECTIONS}); give another folder, or delete it first"
+            f"{folder}: this result was corrected by hand ({' and '.join(there)}); give another folder, or delete"
+            f" {CORRECTIONS} and {UNCORRECTED} first"
         )
 
 
@@ -120,11 +132,19 @@ def _write(folder: Path, people: Reconstruction, edits: Sequence[Edit]) -> None:
     write_atomically(folder / CORRECTIONS, lambda stream: stream.write(text.encode()))
 
 
+def _check_kept(folder: Path) -> None:
+    """InputError where the result as it was before the corrections is not there any more."""
+    file = folder / UNCORRECTED / "people.npz"
+    if not file.is_file():
+        raise InputError(
+            f"{file}: the result as it was before the corrections is not there; put it back, or delete"
+            f" {CORRECTIONS} to keep the result as it is now"
+        )
+
+
 def _keep(folder: Path) -> None:
     """Copy the result aside, before the first correction: whole or not at all."""
-    if (folder / UNCORRECTED).is_dir():
-        return
-    part = folder / f".{UNCORRECTED}.part"
+    part = folder / _PART
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir()
     for name in _FILES:
@@ -140,10 +160,18 @@ def _restore(folder: Path) -> None:
         if file.is_file():
             content = file.read_bytes()
             write_atomically(folder / name, lambda stream, content=content: stream.write(content))
-        else:
+        else:  # people.npz was there before; a result may lack the others
             (folder / name).unlink(missing_ok=True)
     (folder / CORRECTIONS).unlink()
-    shutil.rmtree(folder / UNCORRECTED)
+    # Stopped while it is deleted, it must not be taken for the result as it was.
+    part = folder / _PART
+    shutil.rmtree(part, ignore_errors=True)
+    (folder / UNCORRECTED).rename(part)
+    shutil.rmtree(part)
+
+
+_PART = f".{UNCORRECTED}.part"
+"""The folder while it is made, or deleted."""
 
 
 def _checksum(folder: Path) -> str:

@@ -1,6 +1,7 @@
 """When frames were taken, from a text file: a line per frame, in seconds; one column, or one for each camera."""
 
 import re
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,7 @@ def read_timestamps(path: str | Path, rig: Rig, frames: int) -> FrameTimes:
     InputError, one sentence that names file, line and cure.
     """
     path = Path(path)
-    names, numbers, lines = _table(path)
+    names, numbers, lines = _table(path, rig)
     columns = _columns(path, names, rig)
     if _FRAME in names:
         picked = _lines_of_frames(path, numbers[:, names.index(_FRAME)], lines, frames)
@@ -46,7 +47,7 @@ def read_timestamps(path: str | Path, rig: Rig, frames: int) -> FrameTimes:
     return FrameTimes(time_s[:, 0] if len(columns) == 1 else time_s, source=str(path))
 
 
-def _table(path: Path) -> tuple[list[str], NDArray[np.float64], NDArray[np.intp]]:
+def _table(path: Path, rig: Rig) -> tuple[list[str], NDArray[np.float64], NDArray[np.intp]]:
     """Names of the columns, the numbers (T, C), and the line of the file that each row is from."""
     names: list[str] = []
     rows, lines = [], []
@@ -55,7 +56,8 @@ def _table(path: Path) -> tuple[list[str], NDArray[np.float64], NDArray[np.intp]
         if len(words) == 0:
             continue
         if len(names) == 0:
-            header = not _is_number(words[0])
+            # Cameras may be called by numbers; without a header there is one column.
+            header = not _is_number(words[0]) or (len(words) > 1 and set(rig.names) <= set(words))
             names = words if header else [_TIME]
             if header:
                 continue
@@ -82,7 +84,7 @@ def _is_number(word: str) -> bool:
 
 def _columns(path: Path, names: list[str], rig: Rig) -> list[int]:
     """The columns that hold times: one for all cameras, or one for each in the rig's order."""
-    twice = next((name for name in names if names.count(name) > 1), None)
+    twice = next((name for name, count in Counter(names).items() if count > 1), None)
     if twice is not None:
         raise InputError(f"{path}: column {twice} occurs twice; give each its own name")
     if _TIME in names:

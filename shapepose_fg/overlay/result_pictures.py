@@ -5,11 +5,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shapepose_fg.camera import Rig
 from shapepose_fg.errors import InputError
 from shapepose_fg.io.footage.footage import Footage, open_footage
 from shapepose_fg.io.footage.given import placements_of
+from shapepose_fg.io.footage.placement import Placement
 from shapepose_fg.io.footage.places import find_footage
 from shapepose_fg.io.footage.used import FOOTAGE, CameraFootage, read_used_footage
 from shapepose_fg.terminal import note, progress
@@ -43,12 +45,14 @@ def pictures_of(
                 " folder that `shapepose-fg detect` wrote"
             )
         paths = {name: used[name].path for name in drawn}
-    opened = {}
+    opened: dict[str, Footage] = {}
     for name, path in paths.items():
         if not path.exists():
             raise InputError(f"{path}: the pictures of camera {name} are not there any more; give --videos")
         with progress(f"looking through {name}") as done:
             opened[name] = open_footage(path, done)
+        for text in opened[name].notes:
+            note(text)
     # What detect was told of the pictures holds as long as they have the same size.
     alike = {
         name: used[name].placement
@@ -56,6 +60,8 @@ def pictures_of(
         if name in used and used[name].placement.picture_size == each.size and not image_placement
     }
     sizes = {name: each.size for name, each in opened.items() if name not in alike}
+    for name, placement in alike.items():
+        _refuse_other_calibration(name, placement, rig)
     placements, notes = placements_of(image_placement, sizes, rig)
     counted = [name for name in drawn if name not in used]
     if len(counted) > 0:
@@ -65,11 +71,38 @@ def pictures_of(
     placements |= alike
     pairs = []
     for name, footage in opened.items():
-        count = len(footage.number)
-        index = used[name].places if name in used else np.arange(count)
-        index = np.where(index < count, index, -1)
+        index = used[name].places if name in used else _counted(footage)
+        index = np.where(index < len(footage.number), index, -1)
         pairs.append((CameraFootage(name, footage.path, placements[name], index), footage))
     return pairs
+
+
+_MOST_FRAMES = 10_000_000
+"""No recording is as long: numbers in the names of pictures that are not those of frames."""
+
+
+def _counted(footage: Footage) -> NDArray[np.intp]:
+    """(T,) the picture of each frame, counted from the first picture's number; -1 where one is missing."""
+    count = int(footage.number[-1] - footage.number[0]) + 1
+    if count > _MOST_FRAMES:
+        raise InputError(
+            f"{footage.path}: pictures are numbered from {footage.number[0]} to {footage.number[-1]}; number them"
+            " by the frames of the recording"
+        )
+    index = np.full(count, -1, dtype=np.intp)
+    index[footage.number - footage.number[0]] = np.arange(len(footage.number))
+    return index
+
+
+def _refuse_other_calibration(name: str, placement: Placement, rig: Rig) -> None:
+    """InputError where what `detect` wrote is of pictures that were calibrated at another size."""
+    size = rig.cameras[rig.names.index(name)].image_size
+    if placement.calibrated_size != size:
+        theirs, ours = (f"{width} x {height}" for width, height in (placement.calibrated_size, size))
+        raise InputError(
+            f"{FOOTAGE}: camera {name} was calibrated for pictures of {theirs}, and the cameras.json of the result"
+            f" is for {ours}; give --detections with the folder of this result, or --image-placement"
+        )
 
 
 def _used_footage(run: Mapping[str, Any], detections: Path | None) -> list[CameraFootage]:

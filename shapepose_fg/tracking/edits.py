@@ -11,7 +11,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.reconstruction import MOST_NUMBER, Reconstruction
 
 Solve = Callable[[Reconstruction], Reconstruction]
 """Rows of some people with their `observations` to rows of the same people, solved anew; other frames may join."""
@@ -226,8 +226,8 @@ def _rows_of(people: Reconstruction, person: int) -> NDArray[np.bool_]:
 
 def _refuse_taken(people: Reconstruction, edit: Edit) -> None:
     """ValueError where the number that is to be given belongs to somebody, or cannot be one."""
-    if _other(edit) < 0:
-        raise ValueError(f"{edit.other} cannot be a person's number; give one from 0")
+    if not 0 <= _other(edit) <= MOST_NUMBER:
+        raise ValueError(f"{edit.other} cannot be a person's number; give one from 0 to {MOST_NUMBER}")
     if (people.person == edit.other).any():
         raise ValueError(
             f"{edit.other} is somebody already; give another number such as {free_number(people.person)}, or merge"

@@ -3,17 +3,22 @@
 import csv
 import io
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from shapepose_fg.errors import InputError
+from shapepose_fg.export.amass import write_amass
+from shapepose_fg.export.bvh import write_bvh
 from shapepose_fg.export.c3d import c3d_bytes, write_c3d
 from shapepose_fg.export.job import Job
 from shapepose_fg.export.markers import Markers, MarkerSet, opensim_names
 from shapepose_fg.export.reading import read_take
 from shapepose_fg.export.table import COLUMNS, csv_text
+from shapepose_fg.export.take import Take
 from shapepose_fg.export.trc import write_trc
+from shapepose_fg.reconstruction import Reconstruction
 from shapepose_fg.skeleton import BODY_25, COCO_17, HALPE_26, SMPL_24
 
 from .conftest import AWAY, FIRST, FPS, FRAMES, GUESSED, LOST
@@ -92,6 +97,62 @@ def test_c3d_keeps_sigmas_that_a_byte_cannot_hold(tmp_path):
     (tmp_path / "one.c3d").write_bytes(c3d_bytes(markers, 0, 30.0))
     residuals = ezc3d.c3d(str(tmp_path / "one.c3d"))["data"]["meta_points"]["residuals"]
     assert residuals.ravel().tolist() == [1, 1, 200, 255, 0, -1]
+
+
+def moving(count: int, first: int, person: int = 3) -> Take:
+    """A person in `count` frames from `first` on, of whom one joint is known: its x is the frame's place, mm."""
+    joints = np.zeros((count, 1, 3))
+    joints[:, 0, 0] = 1e-3 * np.arange(count)
+    nothing = {
+        "betas": (count, 10),
+        "global_orient": (count, 3),
+        "body_pose": (count, 23, 3),
+        "transl": (count, 3),
+    }
+    people = Reconstruction(
+        frame=np.arange(first, first + count),
+        person=np.full(count, person),
+        joint_names=np.array(["Nose"]),
+        joints=joints,
+        covariance=np.full((count, 1, 3, 3), np.nan),
+        confidence=np.ones((count, 1)),
+        **{name: np.full(shape, np.nan) for name, shape in nothing.items()},
+        status=np.full(count, "body undetermined"),
+    )
+    return Take.of(people, "z", fps=100.0)
+
+
+def test_c3d_is_cut_where_its_numbers_end(tmp_path):
+    """The count of frames has 16 bits: of 65,536 frames ezc3d kept 65,535 without a word."""
+    ezc3d = pytest.importorskip("ezc3d")
+    written = write_c3d(Job(moving(65_536, 0), tmp_path))
+    assert [path.name for path in written.files] == [
+        "person_3_frames_0-65534.c3d",
+        "person_3_frames_65535-65535.c3d",
+    ]
+    files = [ezc3d.c3d(str(path)) for path in written.files]
+    assert [file["header"]["points"]["first_frame"] for file in files] == [0, 0]
+    x = np.concatenate([file["data"]["points"][2, 0] for file in files])
+    np.testing.assert_allclose(x, np.arange(65_536), rtol=1e-6)
+    assert len(written.notes) == 1
+    assert "person_3_frames_65535-65535.c3d counts its frames from 1, not 65536" in written.notes[0]
+
+
+@pytest.mark.parametrize(("first", "header"), [(65_533, 65_533), (65_534, 0), (70_000, 0)])
+def test_c3d_s_first_frame_does_not_wrap_around(tmp_path, first, header):
+    ezc3d = pytest.importorskip("ezc3d")
+    written = write_c3d(Job(moving(2, first), tmp_path))
+    file = ezc3d.c3d(str(tmp_path / "person_3.c3d"))
+    assert file["header"]["points"]["first_frame"] == header and file["data"]["points"].shape[2] == 2
+    assert [f"not {first + 1}:" in note for note in written.notes] == ([] if header else [True])
+
+
+@pytest.mark.parametrize("write", [write_c3d, write_amass, write_bvh])
+def test_times_that_no_file_of_one_rate_holds_are_one_sentence(tmp_path, write):
+    take = moving(3, 0)
+    odd = replace(take, times_s=np.array([0, 0.01, 1e9]))
+    with pytest.raises(InputError, match=r"people\.npz: the times run over 1000000000 s"):
+        write(Job(odd, tmp_path))
 
 
 def test_what_no_view_saw_can_be_left_out(saved, tmp_path):

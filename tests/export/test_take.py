@@ -115,6 +115,11 @@ def test_people_and_frames_can_be_chosen(saved):
     assert take.frames.tolist() == list(range(110, 120))
     with pytest.raises(InputError, match=r"--person 5: .* it has 3 7"):
         read_take(saved, persons=(5,))
+    for frames, persons in ((range(1000, 1100), None), (range(AWAY.start, AWAY.stop), (7,))):
+        with pytest.raises(
+            InputError, match=r"--frames: .* nobody in these frames; people are in frames 100 to 123"
+        ):
+            read_take(saved, frames=frames, persons=persons)
 
 
 @pytest.mark.parametrize("up", ["x", "-x", "y", "-y", "z", "-z"])

@@ -8,6 +8,7 @@ import pytest
 
 from shapepose_fg.camera import Camera, Rig
 from shapepose_fg.cli import main
+from shapepose_fg.errors import InputError
 from shapepose_fg.export.reading import read_take
 from shapepose_fg.export.rerun_pictures import log_pictures, undistorting
 from shapepose_fg.export.rerun_scene import new_stream
@@ -74,7 +75,7 @@ def filmed(result, scene, tmp_path):
     return tmp_path
 
 
-def test_pictures_are_logged_in_their_frames(filmed, result, tmp_path):
+def test_pictures_are_logged_in_their_frames(filmed, result, tmp_path, capsys):
     rerun = pytest.importorskip("rerun")
     take = read_take(filmed, frames=range(FIRST, FIRST + 3))
     assert take.rig is not None
@@ -88,9 +89,10 @@ def test_pictures_are_logged_in_their_frames(filmed, result, tmp_path):
     chunks = [chunk for chunk in rerun.chunk.RrdReader(tmp_path / "pictures.rrd").stream()]
     tables = [each.to_record_batch() for each in chunks if each.entity_path == "/world/cameras/cam0/picture"]
     rows = {row["frame"]: row for table in tables for row in table.to_pylist() if row.get("EncodedImage:blob")}
-    # Pictures count from 0: the 101st, of frame 100, is the file of frame 101.
-    assert sorted(rows) == [FIRST]
-    blob = np.array(rows[FIRST]["EncodedImage:blob"][0], dtype=np.uint8)
+    # The file of frame 100 is missing: that of frame 101 stays in frame 101, and it is said.
+    assert sorted(rows) == [FIRST + 1]
+    assert f"{filmed / 'cam0'}: 1 of 102 pictures are missing" in capsys.readouterr().err
+    blob = np.array(rows[FIRST + 1]["EncodedImage:blob"][0], dtype=np.uint8)
     picture = cv2.imdecode(blob, cv2.IMREAD_COLOR)
     assert picture is not None and picture.shape[1::-1] == take.rig.cameras[0].image_size
     truly, _ = take.rig.cameras[0].project(result.joints[result.frame == FIRST + 1][0])
@@ -98,6 +100,16 @@ def test_pictures_are_logged_in_their_frames(filmed, result, tmp_path):
     away = np.linalg.norm(found[:, None] - truly[None], axis=2).min(axis=1)
     # Dots of joints that touch have one middle for two.
     assert np.median(away) < 0.5
+
+
+def test_pictures_whose_numbers_are_no_frames_are_refused(filmed):
+    take = read_take(filmed)
+    assert take.rig is not None
+    (filmed / "cam0" / f"{FIRST + 1:06d}.png").rename(filmed / "cam0" / "20261122061055.png")
+    with pytest.raises(
+        InputError, match="pictures are numbered from 0 to 20261122061055; number them by the frames"
+    ):
+        pictures_of({}, take.rig, ["cam0"], [f"cam0={filmed / 'cam0'}"], None, [])
 
 
 @pytest.mark.parametrize(

@@ -427,6 +427,40 @@ def test_colmap_s_pictures_have_ten_words_and_a_camera_that_is_there(tmp_path, l
         read_rig(tmp_path, unit="m", up="z")
 
 
+def test_colmap_s_pictures_are_followed_by_their_points(tmp_path):
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 100 80 90 90 50 40\n")
+    images = [f"{n} 1 0 0 0 {n} 0 0 1 {name}.jpg" for n, name in enumerate(("a", "b", "c"), 1)]
+    file = tmp_path / "images.txt"
+    for points in ("", "1.5 2.5 -1 3 4 17"):
+        file.write_text("# pictures\n\n" + "".join(f"{image}\n{points}\n" for image in images))
+        assert read_rig(tmp_path, unit="m", up="z").names == ("a", "b", "c")
+    file.write_text("# pictures\n" + "\n".join(images))
+    refuses(tmp_path, "images.txt: line 3: must hold the points of the image before it", unit="m", up="z")
+    file.write_text(f"{images[0]}\n1 2\n{images[1]}\n\n")
+    refuses(tmp_path, "images.txt: line 2: must hold the points of the image before it", unit="m", up="z")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("distortion_coefficients: [-0.2, 0.05, 0.001, -0.002, 0.01]", FIVE),
+        ("unknown: 1", (0.0,) * 5),
+        ("dist: !!opencv-matrix\n  rows: 1\n  cols: 5\n  dt: d\n  data: [1, 2, x]", "dist must be a matrix or a"),
+        ("distortion_coefficients: none", "distortion_coefficients must be a matrix or a list of numbers"),
+        ("D: [[0.1, 0.2], [0.3]]", "D must be a matrix or a list of numbers"),
+    ],
+)
+def test_distortion_of_a_file_per_camera(tmp_path, text, expected):
+    for path in files_of_opencv(tmp_path).iterdir():
+        before, after = path.read_text().split("distortion_coefficients:")
+        path.write_text(before + text + after[after.index("\nrvec") :])
+    if isinstance(expected, str):
+        refuses(tmp_path, f'camera "alpha": {expected}', **BOARD)
+    else:
+        for each in read_rig(tmp_path, **BOARD).cameras:
+            np.testing.assert_allclose(each.distortion, expected)
+
+
 def test_colmap_that_cannot_be_read(tmp_path):
     (tmp_path / "cameras.bin").write_bytes(b"\x01")
     with pytest.raises(InputError, match="run colmap model_converter --output_type TXT"):
@@ -505,6 +539,26 @@ def test_unknown_files_are_named_by_what_they_are(tmp_path):
 
 
 # Real files.
+
+
+@pytest.mark.parametrize(("resolution", "scale"), [("1080p", 1), ("720p", 2 / 3), ("540p", 1 / 2)])
+def test_qualisys_pictures_of_a_lower_resolution_are_resized(tmp_path, resolution, scale):
+    file = qualisys(tmp_path)
+    file.write_text(
+        file.read_text().replace('model="Miqus Video"', f'model="Miqus Video" video_resolution="{resolution}"')
+    )
+    rig = read_rig(file)
+    np.testing.assert_allclose(rig.cTw, TRUTH.cTw, atol=1e-9)
+    for one, truth in zip(rig.cameras, TRUTH.cameras, strict=True):
+        np.testing.assert_allclose(one.K[:2], scale * truth.K[:2])
+        np.testing.assert_array_equal(one.distortion, truth.distortion)
+        assert one.image_size == (round(1280 * scale), round(720 * scale))
+
+
+def test_qualisys_resolutions_that_are_not_known(tmp_path):
+    file = qualisys(tmp_path)
+    file.write_text(file.read_text().replace('model="Miqus Video"', 'model="Miqus Video" video_resolution="4K"'))
+    refuses(file, "camera 0 \"alpha\": video_resolution must be one of 1080p 720p 540p 480p, got '4K'")
 
 
 def test_pose2sim_s_recording_in_three_formats(shared_data):

@@ -1,6 +1,7 @@
 """Corrections beside a result: listed, taken back to the last byte, and refused where they do not fit."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -64,8 +65,47 @@ def test_a_correction_that_cannot_be_made_changes_nothing(folder):
 def test_a_result_that_was_corrected_is_not_written_over(folder):
     refuse_corrected(folder)
     correct(folder, Edit(Action.DROP, 2))
-    with pytest.raises(InputError, match=r"this result was corrected by hand \(corrections.json\); give another"):
+    with pytest.raises(InputError, match=r"was corrected by hand \(corrections.json and uncorrected\)"):
         refuse_corrected(folder)
+    (folder / "corrections.json").unlink()
+    with pytest.raises(InputError, match=r"by hand \(uncorrected\).* delete corrections.json and uncorrected"):
+        refuse_corrected(folder)
+
+
+def test_a_folder_of_before_that_is_gone_loses_no_result(folder):
+    correct(folder, Edit(Action.RENAME, 0, 7))
+    shutil.rmtree(folder / "uncorrected")
+    before = contents(folder)
+    for action in (lambda: correct(folder, Edit(Action.DROP, 1)), lambda: take_back(folder)):
+        with pytest.raises(InputError, match=r"uncorrected/people\.npz: .* or delete corrections\.json"):
+            action()
+    assert contents(folder) == before
+
+
+def test_a_first_correction_that_was_stopped_half_way_is_told(folder, monkeypatch):
+    before = contents(folder)
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("shapepose_fg.io.corrections.write_atomically", stop)
+        with pytest.raises(KeyboardInterrupt):
+            correct(folder, Edit(Action.DROP, 2))
+    assert set(Reconstruction.load(folder).person.tolist()) == {0, 1}
+    sentence = r"corrections\.json: it is missing beside uncorrected"
+    for action in (lambda: read_corrections(folder), lambda: correct(folder, Edit(Action.DROP, 1))):
+        with pytest.raises(InputError, match=sentence):
+            action()
+    assert contents(folder / "uncorrected") == before
+
+
+def test_a_result_without_run_json_comes_back_without_it(folder):
+    (folder / "run.json").unlink()
+    before = contents(folder)
+    correct(folder, Edit(Action.RENAME, 0, 7))
+    take_back(folder)
+    assert contents(folder) == before
 
 
 @pytest.mark.parametrize(
@@ -89,7 +129,7 @@ def test_bad_files(folder, change, sentence):
     with pytest.raises(InputError) as caught:
         read_corrections(folder)
     assert str(caught.value).startswith(f"{file}: ") and sentence in str(caught.value)
-    assert "copy the files of uncorrected back and delete corrections.json" in str(caught.value)
+    assert "copy the files of uncorrected back and delete uncorrected and corrections.json" in str(caught.value)
 
 
 def test_a_result_that_changed_since_is_noticed(folder):
@@ -152,3 +192,23 @@ def test_errors_are_one_sentence(folder, capsys, arguments, sentence):
 def test_a_folder_without_a_result(tmp_path, capsys):
     assert run(tmp_path) == 2
     assert "people.npz: there is no such file" in capsys.readouterr().err
+
+
+def test_a_number_that_no_result_has(folder, capsys):
+    assert run(folder, "rename", 0, 2**53) == 2
+    assert "9007199254740992 cannot be a person's number; give one from 0 to" in capsys.readouterr().err
+    assert run(folder, "rename", 0, 2**53 - 1) == 0
+    assert Reconstruction.load(folder).person.max() == 2**53 - 1
+
+
+@pytest.mark.parametrize("text", ["[]", '{"configuration": null}', '{"configuration": []}'])
+def test_an_odd_run_json_is_one_sentence(folder, capsys, text):
+    for name in ("observations.npz", "cameras.json"):
+        (folder / name).write_bytes(b"")
+    (folder / "run.json").write_text(text)
+    before = contents(folder)
+    for words in (["merge", 0, 1], ["drop", 0]):
+        assert run(folder, *words) == 2
+        printed = capsys.readouterr().err
+        assert "run.json: " in printed and "restore it or delete it" in printed
+    assert contents(folder) == before

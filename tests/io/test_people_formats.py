@@ -273,6 +273,38 @@ def test_frames_that_only_some_cameras_list(tmp_path, rig):
     assert [sorted(set(frame.view.tolist())) for frame in table] == [[0], [1], [0]]
 
 
+def test_pictures_without_people_are_frames_where_the_file_lists_them(tmp_path, rig):
+    """Of 50 pictures, people are in 37 to 39: frame 37 of the result is picture 37."""
+    person = people_of(COCO_17)["left"][0][0]
+    frames = [[person] if number in (37, 38, 39) else [] for number in range(50)]
+    coco_data_set(tmp_path, dict.fromkeys(rig.names, frames))
+    table = read_detections(tmp_path, rig)
+    assert [number for number, frame in enumerate(table) if len(frame) > 0] == [37, 38, 39] and len(table) == 50
+    assert not any("frame 0 is number" in note for note in table.notes)
+
+
+@pytest.mark.parametrize("write", [coco, alphapose])
+def test_lists_that_begin_without_people_say_which_frame_is_the_first(tmp_path, rig, write):
+    person = people_of(COCO_17)["left"][0][0]
+    write(tmp_path, dict.fromkeys(rig.names, [[]] * 37 + [[person]] * 3))
+    table = read_detections(tmp_path, rig)
+    assert len(table) == 3 and "frame 0 is number 37 of the files" in table.notes
+
+
+def test_what_macos_leaves_beside_a_file_is_no_frame(tmp_path, rig):
+    openpose(tmp_path, people_of(COCO_18))
+    (tmp_path / "left" / "._left_000000000000_keypoints.json").write_bytes(b"\0\5\26\7")
+    assert len(read_detections(tmp_path, rig)) == 3
+
+
+def test_a_number_that_no_frame_has(tmp_path, rig):
+    openpose(tmp_path, people_of(COCO_18))
+    for file in (tmp_path / "left").iterdir():
+        file.unlink()
+    (tmp_path / "left" / "100000000000000000000_keypoints.json").write_text('{"people": []}')
+    refuses(tmp_path, rig, "100000000000000000000_keypoints.json: no frame has so high a number")
+
+
 USER = """
 name = "ours"
 keypoints = ["head", "", "r_sho", "l_sho", "r_hip", "l_hip", "r_wri", "l_wri"]
@@ -339,6 +371,17 @@ BAD_SKELETONS = [
     ('neck = "Neck"', 'nick = "Neck"', "body.nick is no keypoint of ours; it has head"),
     ('r_wri = "RWrist"', 'r_wri = "LWrist"', "joint LWrist occurs twice"),
     ("limbs = [", "limbs = ", "is not TOML"),
+    (
+        'neck = ["r_sho", "l_sho"]',
+        'neck = ["neck", "l_sho"]',
+        "the middle Neck is made of Neck, which must be a key",
+    ),
+    (
+        'neck = ["r_sho", "l_sho"]',
+        'neck = ["MidHip", "l_sho"]',
+        "the middle Neck is made of MidHip, which must be",
+    ),
+    ("[middles]", "core = []\n[middles]", "core must have a joint at least, by which a person is recognised"),
 ]
 
 
@@ -412,8 +455,17 @@ BAD_FILES = [
     ('[{"frame_id": -1, "instances": []}]', "[0].frame_id"),
     (
         '[{"image_id": 99999999999999, "keypoints": [1, 2, 3]}]',
-        "[0].image_id '99999999999999' has no frame number",
+        "[0].image_id '99999999999999' is no frame's number",
     ),
+    (
+        '[{"image_id": -5, "keypoints": [1, 2, 3]}]',
+        "[0].image_id '-5' is no frame's number; write the results again",
+    ),
+    (
+        '[{"image_id": "a/7.jpg", "keypoints": [1, 2, 3]}, {"image_id": "b/7.jpg", "keypoints": [1, 2, 3]}]',
+        "the pictures 'a/7.jpg' and 'b/7.jpg' are both frame 7; run AlphaPose again",
+    ),
+    ('{"images": [{"id": [1]}], "annotations": []}', "images[0].id must be a whole number or text"),
     ('{"annotations": 3}', "the file must be a list, got 3"),
 ]
 

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -203,6 +204,26 @@ def test_everybody_has_files_where_the_project_is_of_several(project, two_tracks
     assert any("leaves out 1 frames" in each for each in written.notes)
     assert any("also has Walk_0-9.trc of before" in each for each in written.notes)
     assert (project / "pose-3d" / "Walk_0-9.trc").read_text() == "old"
+
+
+def test_times_that_c3d_cannot_have_are_a_note(project, two_tracks):
+    """The run that is over by then must end well: the TRC is there, and what is missing is said."""
+    late = replace(two_tracks, time_s=np.where(two_tracks.frame == 3, 1e9, two_tracks.time_s))
+    written = write_pose2sim_files(late, "z", read_pose2sim_project(project))
+    assert [each.name for each in written.files] == ["Walk_3-6.trc"]
+    assert len(written.notes) == 1 and written.notes[0].startswith("no C3D: people.npz: the times run over")
+    back = replace(two_tracks, time_s=-two_tracks.time_s)
+    written = write_pose2sim_files(back, "z", read_pose2sim_project(project))
+    assert written.files == [] and written.notes[0].startswith("no TRC and no C3D: time_s does not rise")
+
+
+def test_c3d_of_high_frame_numbers(project, two_tracks):
+    ezc3d = pytest.importorskip("ezc3d")
+    late = replace(two_tracks, frame=two_tracks.frame + 70_000, run={"time": {"fps": 50.0}})
+    written = write_pose2sim_files(late, "z", read_pose2sim_project(project))
+    file = ezc3d.c3d(str(project / "pose-3d" / "Walk_70003-70006.c3d"))
+    assert file["header"]["points"]["first_frame"] == 0
+    assert "counts its frames from 1, not 70004" in written.notes[0]
 
 
 def test_nobody_is_a_note(project):

@@ -1,5 +1,6 @@
 """Times from a text file: what people write, and one sentence for what cannot be used."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +42,14 @@ def test_one_time_for_all_cameras(tmp_path, rig, text):
 def test_a_time_for_each_camera(tmp_path, rig):
     times = read(tmp_path, "frame, cam1, other, cam0\n0, 0.01, 9, 0\n1, 0.05, 9, 0.04\n2, 0.13, 9, 0.12\n", rig)
     np.testing.assert_allclose(times.time_s, [[0, 0.01], [0.04, 0.05], [0.12, 0.13]])
+
+
+def test_cameras_that_are_called_by_numbers(tmp_path):
+    cameras = ring_of_cameras(2, np.random.default_rng(0)).cameras
+    rig = Rig(tuple(replace(each, name=name) for each, name in zip(cameras, ("1", "2"), strict=True)), "z")
+    times = read(tmp_path, "2 1\n0.01 0\n0.05 0.04\n0.13 0.12\n", rig)
+    np.testing.assert_allclose(times.time_s, [[0, 0.01], [0.04, 0.05], [0.12, 0.13]])
+    np.testing.assert_allclose(read(tmp_path, "1\n2\n3\n", rig).time_s, [1, 2, 3])
 
 
 def test_a_recording_without_frames(tmp_path, rig):

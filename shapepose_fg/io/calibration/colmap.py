@@ -94,8 +94,12 @@ def _lenses(path: Path) -> dict[str, _Lens]:
 def _images(path: Path, lenses: dict[str, _Lens]) -> list[WrittenCamera]:
     """images.txt: IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; each followed by a line of points."""
     every = enumerate(read_text(path, most=LARGE).splitlines(), 1)
-    lines = [(number, line) for number, line in every if line[:1] != "#"]
-    rows = [(number, line.split(maxsplit=9)) for number, line in lines[::2] if line.strip()]
+    lines = iter([(number, line) for number, line in every if line[:1] != "#"])
+    rows = []
+    for number, line in lines:
+        if line.strip():
+            rows.append((number, line.split(maxsplit=9)))
+            _check_points(*next(lines, (0, "")), path)
     names = _names([words[9] if len(words) == 10 else "" for _, words in rows])
     cameras = []
     for (number, words), name in zip(rows, names, strict=True):
@@ -109,6 +113,20 @@ def _images(path: Path, lenses: dict[str, _Lens]) -> list[WrittenCamera]:
         lens = lenses[words[8]]
         cameras.append(WrittenCamera(name, lens.K, wTc, lens.image_size, lens.distortion, lens.lens))
     return cameras
+
+
+def _check_points(number: int, line: str, path: Path) -> None:
+    """InputError where the line after an image's is not that of its points, X, Y, POINT3D_ID each, or empty."""
+    words = line.split()
+    try:
+        triples = len([float(word) for word in words]) % 3 == 0
+    except ValueError:
+        triples = False
+    if not triples:
+        raise InputError(
+            f"{path}: line {number}: must hold the points of the image before it, three numbers each; leave an"
+            " empty line there where it has none"
+        )
 
 
 def _names(files: list[str]) -> list[str]:

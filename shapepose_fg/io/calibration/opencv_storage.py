@@ -109,7 +109,6 @@ def _camera(name: str, node: dict[str, Any], place: str) -> WrittenCamera:
     K = _find(node, "K")
     if not isinstance(K, np.ndarray) or K.size != 9:
         raise InputError(f"{place}: camera_matrix must be a 3x3 matrix; write it with OpenCV's FileStorage")
-    distortion = _find(node, "distortion")
     width, height = _find(node, "width"), _find(node, "height")
     fisheye = node.get("distortion_type") == 1 or node.get("fisheye") in (1, "true")
     return WrittenCamera(
@@ -117,9 +116,25 @@ def _camera(name: str, node: dict[str, Any], place: str) -> WrittenCamera:
         K.reshape(3, 3),
         _pose(node, place),
         picture_size(width, height, place),
-        distortion.ravel().tolist() if isinstance(distortion, np.ndarray) else (),
+        _distortion(node, place),
         "fisheye" if fisheye else "perspective",
     )
+
+
+def _distortion(node: dict[str, Any], place: str) -> list[float]:
+    """Coefficients of the lens: a matrix or a list; none where no key of them is there."""
+    key = next((key for key in _KEYS["distortion"] if key in node), None)
+    if key is None:
+        return []
+    try:
+        if not isinstance(node[key], np.ndarray | list):
+            raise ValueError
+        return np.asarray(node[key], dtype=np.float64).ravel().tolist()
+    except (TypeError, ValueError):
+        raise InputError(
+            f"{place}: {key} must be a matrix or a list of numbers; write it with OpenCV's FileStorage, or delete"
+            " it where the lens has no distortion"
+        ) from None
 
 
 def _pose(node: dict[str, Any], place: str) -> np.ndarray:

@@ -10,6 +10,9 @@ from shapepose_fg.io.calibration.written import Format, WrittenCamera, WrittenRi
 
 _SUBPIXEL = 64.0
 """QTM counts focal lengths and centres in 64ths of a pixel."""
+_FULL = "1080p"
+_LINES = {"1080p": 1080, "720p": 720, "540p": 540, "480p": 480}
+"""Lines of a picture of the whole sensor by `video_resolution`."""
 _TO_OPENCV = np.diag([1.0, -1.0, -1.0])
 """QTM's cameras have y up and look along -z."""
 _DISTORTION = (
@@ -46,10 +49,24 @@ def _camera(camera: ET.Element, place: str) -> WrittenCamera:
     R = _TO_OPENCV @ values[:9].reshape(3, 3)
     wTc = pose(R, -R @ values[9:], "transform", place)
     fx, fy, cx, cy = _numbers(camera, "intrinsic", "focalLengthU focalLengthV centerPointU centerPointV", place)
-    K = intrinsics(*(fx / _SUBPIXEL, fy / _SUBPIXEL, cx / _SUBPIXEL - window[0], cy / _SUBPIXEL - window[1]))
+    # The numbers are of the whole sensor; pictures of a lower resolution are resized.
+    scale = _scale(camera, place)
+    centre = (cx / _SUBPIXEL - window[0]) * scale, (cy / _SUBPIXEL - window[1]) * scale
+    K = intrinsics(fx / _SUBPIXEL * scale, fy / _SUBPIXEL * scale, *centre)
     distortion = _numbers(camera, "intrinsic", " ".join(_DISTORTION), place, missing=0.0)
-    width, height = window[2:] - window[:2] + 1
+    width, height = (window[2:] - window[:2] + 1) * scale
     return WrittenCamera(name, K, wTc, (round(width), round(height)), distortion.tolist())
+
+
+def _scale(camera: ET.Element, place: str) -> float:
+    """Pixels of the pictures per pixel of the sensor, as Pose2Sim's read_qca has it."""
+    resolution = camera.get("video_resolution", _FULL)
+    if resolution not in _LINES:
+        raise InputError(
+            f"{place}: video_resolution must be one of {' '.join(_LINES)}, got {resolution[:20]!r}; film and"
+            " calibrate at one of these, or delete it where pictures are as large as fov_video says"
+        )
+    return _LINES[resolution] / _LINES[_FULL]
 
 
 def _numbers(camera: ET.Element, tag: str, names: str, place: str, missing: float | None = None) -> np.ndarray:

@@ -20,11 +20,9 @@ from shapepose_fg.io.detections.association_skeletons import (
     with_middles,
 )
 from shapepose_fg.io.detections.number_stream import NumberStream
+from shapepose_fg.io.detections.scores import OVERSHOOT
 from shapepose_fg.io.detections.view_streams import ViewCandidates, ViewStream
 from shapepose_fg.skeleton import Skeleton
-
-_OVERSHOOT = 1.1
-"""Heat maps that are enlarged overshoot a little: scores up to this are read as 1."""
 
 
 def read_association_text(path: Path, camera: Camera) -> tuple[ViewStream, Skeleton]:
@@ -190,7 +188,7 @@ def _check(
     n: NDArray[np.intp],
 ) -> None:
     """Refuse scores that are no scores and positions that are no parts of the picture."""
-    bad = (scores < 0) | (scores > _OVERSHOOT)
+    bad = (scores < 0) | (scores > OVERSHOOT)
     if bad.any():
         index = int(np.argmax(bad))
         raise numbers.refuse(

@@ -53,7 +53,9 @@ _INSTANCES = TypeAdapter(list[_Instance])
 
 def frame_files(folder: Path) -> list[Path]:
     """Files of a folder that are named after a frame, in order of their names."""
-    return sorted(each for each in folder.iterdir() if _FILE.search(each.name) is not None and each.is_file())
+    # macOS leaves ._000000_keypoints.json beside each file that it copies.
+    found = [each for each in folder.iterdir() if _FILE.search(each.name) and not each.name.startswith(".")]
+    return sorted(each for each in found if each.is_file())
 
 
 def frame_number(file: Path) -> int:
@@ -108,6 +110,8 @@ def _program(folder: Path) -> str:
     return "MMPose's JSON of pictures" if begin == "[" else "Pose2Sim's JSON"
 
 
+_MOST = 10**12
+"""No frame has a higher number."""
 _LONGEST_GAP = 1000
 """Frames that may be missing, and as many as there are: more are numbers of something else."""
 
@@ -121,6 +125,10 @@ def _numbered(folder: Path, program: str) -> dict[int, Path]:
             " or Pose2Sim's pose estimation into it"
         )
     numbered = sorted((int(match[1]), file) for file in files if (match := _FILE.search(file.name)) is not None)
+    if numbered[-1][0] >= _MOST:
+        raise InputError(
+            f"{numbered[-1][1]}: no frame has so high a number; number them by the recording's frames"
+        )
     for (number, file), (following, other) in pairwise(numbered):
         if following == number:
             raise InputError(f"{other}: frame {number} is also in {file.name}; keep one recording in a folder")

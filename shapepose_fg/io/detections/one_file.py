@@ -159,11 +159,17 @@ def _results(path: Path, program: str, items: Iterable[Any], others: Mapping[str
                 )
         images += [person.image_id for person in results]
         people.add([person.keypoints for person in results])
-    names = _picture_names(others)
-    places = (f"{path}: [{index}].image_id" for index in range(len(images)))
-    numbers = [_number(image, names, place, program) for image, place in zip(images, places, strict=True)]
-    listed = (min(numbers), max(numbers)) if numbers else (0, -1)
-    return people.camera(numbers, listed)
+    pictures = _pictures(others, path, program)
+    frames: dict[int | str, int] = {}
+    for index, image in enumerate(images):
+        if image not in frames:
+            frames[image] = _number(image, pictures, f"{path}: [{index}].image_id", program)
+    for index, image in enumerate(pictures):
+        if image not in frames:
+            frames[image] = _number(image, pictures, f"{path}: images[{index}]", program)
+    _refuse_merged(frames, path, program)
+    listed = (min(frames.values()), max(frames.values())) if frames else (0, -1)
+    return people.camera([frames[image] for image in images], listed)
 
 
 def _video(path: Path, items: Iterable[Any]) -> CameraPeople:
@@ -201,21 +207,38 @@ def _checked(
         start += len(some)
 
 
-def _picture_names(value: Mapping[str, Any]) -> dict[int, str]:
-    """Names of the pictures of a COCO data set by their ids."""
-    images = value.get("images")
-    if not isinstance(images, list) or not all(isinstance(each, dict) for each in images):
-        return {}
-    return {each["id"]: str(each["file_name"]) for each in images if "id" in each and "file_name" in each}
+def _pictures(others: Mapping[str, Any], path: Path, program: str) -> dict[int | str, str | None]:
+    """The pictures of a COCO data set by their ids, those without people too: the names of their files."""
+    pictures = {}
+    images = others.get("images")
+    for index, image in enumerate(images if isinstance(images, list) else []):
+        one = image.get("id") if isinstance(image, dict) else None
+        if type(one) not in (int, str):
+            raise InputError(f"{path}: images[{index}].id must be a whole number or text; {_RERUN[program]}")
+        pictures[one] = str(image["file_name"]) if "file_name" in image else None
+    return pictures
 
 
-def _number(image: int | str, names: dict[int, str], place: str, program: str) -> int:
-    """The frame of a picture: its id, or the last number in its name."""
-    if isinstance(image, int):
-        if image not in names and 0 <= image < _MOST:
+def _number(image: int | str, pictures: Mapping[int | str, str | None], place: str, program: str) -> int:
+    """The frame of a picture: the last number in its name, or its id where that is a number and it has no name."""
+    name = pictures.get(image)
+    if name is None and isinstance(image, int):
+        if 0 <= image < _MOST:
             return image
-        image = names.get(image, str(image))
-    match = _FRAME_NUMBER.search(Path(image).stem) if len(image) <= _LONGEST_NAME else None
+        raise InputError(f"{place} '{image}' is no frame's number; {_RERUN[program]}, of numbered pictures")
+    name = str(image) if name is None else name
+    match = _FRAME_NUMBER.search(Path(name).stem) if len(name) <= _LONGEST_NAME else None
     if match is None or len(match[1]) > len(str(_MOST)):
-        raise InputError(f"{place} {image[:40]!r} has no frame number; {_RERUN[program]}, of numbered pictures")
+        raise InputError(f"{place} {name[:40]!r} has no frame number; {_RERUN[program]}, of numbered pictures")
     return int(match[1])
+
+
+def _refuse_merged(frames: Mapping[int | str, int], path: Path, program: str) -> None:
+    """InputError where two pictures would be one frame, by their numbers."""
+    first: dict[int, int | str] = {}
+    for image, frame in frames.items():
+        if first.setdefault(frame, image) != image:
+            raise InputError(
+                f"{path}: the pictures {str(first[frame])[:40]!r} and {str(image)[:40]!r} are both frame {frame};"
+                f" {_RERUN[program]}, of one camera with a number for each picture"
+            )

@@ -49,7 +49,9 @@ def read_detections(
     ]
     table = assemble(views, rig, found.skeleton, kept)
     notes = () if rule.note is None else (rule.note,)
-    return replace(table, notes=(*places.notes, *notes, *found.gaps(), *found.middles(), *table.notes))
+    return replace(
+        table, notes=(*places.notes, *notes, *found.beginning(), *found.gaps(), *found.middles(), *table.notes)
+    )
 
 
 def _read_texts(texts: Sequence[Path], rig: Rig, wanted: Skeleton | None, kept: KeptArrays) -> DetectionTable:
@@ -130,6 +132,13 @@ class _Found:
                     f"{each.camera.source}: recognised as {each.camera.program}, but all keypoints lie between -1"
                     f" and 1, and pixels were expected; {each.camera.rerun}"
                 )
+
+    def beginning(self) -> list[str]:
+        """Which number frame 0 has, where the files may leave out frames before it."""
+        first, _ = self.span()
+        if first == 0 or all(each.camera.every_frame for each in self.people):
+            return []
+        return [f"frame 0 is number {first} of the files"]
 
     def gaps(self) -> list[str]:
         """Which cameras lack frames in between."""

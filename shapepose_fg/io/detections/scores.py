@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-_OVERSHOOT = 1.1
+OVERSHOOT = 1.1
 """Heat maps that are enlarged overshoot a little: scores up to this are cut at 1 without a word."""
 _RARE = 0.01
 """Scores are divided by what this share of them exceeds: the highest alone would be decided by one outlier."""
@@ -66,7 +66,7 @@ def as_probabilities(scores: Scores, keypoints: Iterable[NDArray[np.float64]]) -
     if scores.top == 2 and scores.visibilities:
         note = "scores are COCO's visibilities: 2 was read as 1, and 1, a hidden joint, as 0.5"
         return ScoreRule(visibilities=True, note=note)
-    if scores.top <= _OVERSHOOT:
+    if scores.top <= OVERSHOOT:
         return ScoreRule()
     step = -(-scores.count // _MOST_LOOKED_AT)
     looked_at = np.concatenate([_seen(each)[::step] for each in keypoints])
