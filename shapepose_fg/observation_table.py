@@ -94,8 +94,8 @@ class ObservationTable:
 
     def _check_values(self) -> None:
         """ValueError for scores that are none, errors without end, and two cameras or joints of one name."""
-        if not ((self.confidence >= 0) & (self.confidence <= 1)).all():
-            raise ValueError("confidence must be 0 to 1")
+        if not ((self.confidence >= 0) & np.isfinite(self.confidence)).all():
+            raise ValueError("confidence must be 0 or more")
         if np.isinf(self.residual_px).any():
             raise ValueError("residual_px must be finite, or NaN where there is none")
         for name in ("joint_names", "view_names"):

@@ -377,7 +377,7 @@ _LARGEST: dict[str, float] = {
     "covariance": 1e12,
     "velocity": 1e9,
     "velocity_covariance": 1e18,
-    "confidence": 1.001,
+    "confidence": 1e3,
     "betas": 1e3,
     "global_orient": 1e3,
     "body_pose": 1e3,

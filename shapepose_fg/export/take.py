@@ -15,6 +15,8 @@ from shapepose_fg.saved_table import free_memory
 
 _LONGEST = 1_000_000
 """Frames of a file with one rate: nine hours at 30 a second. Beyond, times are in another unit or have a hole."""
+_BODY_BYTES = 2_000
+"""What one person's body takes in a frame while it is written, about."""
 _SHORTEST_S, _LONGEST_S = 1e-6, 1e5
 """From frame to frame: outside of this times are in another unit."""
 
@@ -117,8 +119,8 @@ class Take:
 
 
 def _check_memory(persons: int, frames: int) -> None:
-    """InputError where a place for every person in every frame, twice, is more than there is room for."""
-    needed, free = 2 * 8 * persons * frames, free_memory()
+    """InputError where places of all people in all frames, and one person's body, need more than there is."""
+    needed, free = frames * (2 * 8 * persons + _BODY_BYTES), free_memory()
     if free is not None and needed > free:
         raise InputError(
             f"people.npz: {persons} people over {frames} frames would take {decimal(needed)} of memory, and"
