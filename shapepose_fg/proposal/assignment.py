@@ -4,6 +4,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 
+def lesser(value: NDArray[np.floating] | NDArray[np.integer]) -> NDArray[np.bool_]:
+    """(P, P) whether one has less of `value` (P,) than another; of equal ones the later has."""
+    return (value[:, None] < value) | ((value[:, None] == value) & np.tri(len(value), k=-1, dtype=bool))
+
+
 def match_best_first(
     left: NDArray[np.intp], right: NDArray[np.intp], score: NDArray[np.float64]
 ) -> NDArray[np.intp]:

@@ -69,8 +69,7 @@ def associate(
     rounds = 1 + _PASSES
     while rounds > 0:
         chosen = _choose(nearness, owns, detections, skeleton)
-        seen_twice = ((chosen >= 0).sum(axis=2) >= 2)[:, skeleton.core].mean(axis=1)
-        keep = seen_twice >= config.min_observed_parts
+        keep = seen_twice(chosen >= 0, skeleton).mean(axis=1) >= config.min_observed_parts
         real[np.flatnonzero(real)[~keep]] = False
         nearness, chosen = nearness.of(keep), chosen[keep]
         owns = owned(chosen, len(detections))
@@ -111,24 +110,38 @@ def _nearness(
     skeleton: Skeleton,
 ) -> _Nearness:
     """Compare all detections with the projections of all joints at `places` (P, J, 3)."""
-    xy, depth = rig.project(places)
-    focal = rig.focal_px[detections.view]
-
-    def distance_px(joint: NDArray[np.intp]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        at = (detections.view, slice(None), joint)
-        offset_px = np.hypot(*np.moveaxis(xy[at] - detections.xy[:, None], -1, 0)).T
-        unknown = np.isnan(offset_px)
-        offset_m = np.where(unknown, np.inf, offset_px * depth[at].T / focal)
-        return np.where(unknown, np.inf, offset_px), offset_m
-
-    own_px, own_m = distance_px(detections.joint)
+    projected = rig.project(places)
+    own_px, own_m = projected_distances(projected, detections.joint, detections, rig)
     placed = np.isfinite(places[:, detections.joint, 0])
     reachable = np.zeros(placed.shape, dtype=bool)
     if not placed.all():
         for neighbour in skeleton.tree_neighbours.T:  # a joint has few
             of_each = neighbour[detections.joint]
-            reachable |= (of_each >= 0) & (distance_px(of_each)[1] < _REACH_M)
+            reachable |= (of_each >= 0) & (projected_distances(projected, of_each, detections, rig)[1] < _REACH_M)
     return _Nearness(len(rig), placed, own_m, own_px, reachable & ~placed)
+
+
+def projected_distances(
+    projected: tuple[NDArray[np.float64], NDArray[np.float64]],
+    joint: NDArray[np.intp],
+    detections: Detections,
+    rig: Rig,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Distance (P, D) of each detection to the projection of a `joint` (D,): pixels, and metres at its depth.
+
+    `projected` is what `rig.project` gives of people's joints; infinite where a joint is not known.
+    """
+    xy, depth = projected
+    at = (detections.view, slice(None), joint)
+    distance_px = np.hypot(*np.moveaxis(xy[at] - detections.xy[:, None], -1, 0)).T
+    unknown = np.isnan(distance_px)
+    distance_m = distance_px * depth[at].T / rig.focal_px[detections.view]
+    return np.where(unknown, np.inf, distance_px), np.where(unknown, np.inf, distance_m)
+
+
+def seen_twice(seen: NDArray[np.bool_], skeleton: Skeleton) -> NDArray[np.bool_]:
+    """(P, K) which of each person's core joints two views see, of `seen` (P, J, V)."""
+    return (seen.sum(axis=2) >= 2)[:, list(skeleton.core)]
 
 
 def _choose(

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.bounds import Count, Metres, MetresOrNone, Settings, Share
 from shapepose_fg.detections import Detections
+from shapepose_fg.proposal.assignment import lesser
 from shapepose_fg.proposal.candidates import Candidates
 from shapepose_fg.proposal.growth import GrowthConfig, Links, grow, link
 from shapepose_fg.skeleton import Skeleton
@@ -198,8 +199,7 @@ class _Search:
         near = np.linalg.norm(hips[:, None] - hips[None], axis=-1) < self.config.split_m
         count = strong.sum(axis=1)
         shared = strong.astype(np.intp) @ strong.T
-        less = (count[:, None] < count) | ((count[:, None] == count) & np.tri(len(count), k=-1, dtype=bool))
-        return (near & less & (shared <= self.config.split_shared)).any(axis=1)
+        return (near & lesser(count) & (shared <= self.config.split_shared)).any(axis=1)
 
     def unclaimed(self, chosen: NDArray[np.intp]) -> NDArray[np.bool_] | None:
         """(C,) the candidates that nobody chose, if there are strong ones of enough joints to be a person.

@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.observations import Observations
+from shapepose_fg.proposal.assignment import lesser
+from shapepose_fg.proposal.association import seen_twice
 from shapepose_fg.skeleton import Skeleton
 from shapepose_fg.tracking.following import Input
 from shapepose_fg.tracking.view_assignment import AssignmentConfig, assign
@@ -79,10 +81,10 @@ def _nobody(given: Sequence[Input], rows: Observations, skeleton: Skeleton, last
         index = np.flatnonzero(rows.frame == frame.frame)
         share[index] = _own_share(frame, rows.candidate[index], rows.initial[index])
         near[np.ix_(place[index], place[index])] += _apart(rows.initial[index], skeleton) < lasting.double_m
-    seen = (rows.seen.sum(axis=-1) >= 2)[:, list(skeleton.core)].sum(axis=1)
+    seen = seen_twice(rows.seen, skeleton).sum(axis=1)
     means = [np.bincount(place, value, len(tracks)) / count for value in (share, seen)]
     few = (means[0] < lasting.min_share) & (means[1] < lasting.min_seen_twice)
-    few |= ((near > count[:, None] / 2) & _lesser(means[0])).any(axis=1)
+    few |= ((near > count[:, None] / 2) & lesser(means[0])).any(axis=1)
     return int(tracks[np.where(few, means[0], np.inf).argmin()]) if few.any() else None
 
 
@@ -93,11 +95,6 @@ def _apart(joints: NDArray[np.float64], skeleton: Skeleton) -> NDArray[np.float6
     known = np.isfinite(distance)
     apart = np.where(known, distance, 0.0).sum(axis=-1) / np.maximum(known.sum(axis=-1), 1)
     return np.where(known.any(axis=-1), apart, np.inf)
-
-
-def _lesser(value: NDArray[np.floating] | NDArray[np.integer]) -> NDArray[np.bool_]:
-    """(P, P) whether one has less of `value` (P,) than another; of equal ones the later has."""
-    return (value[:, None] < value) | ((value[:, None] == value) & np.tri(len(value), k=-1, dtype=bool))
 
 
 def reassociate(
@@ -152,10 +149,9 @@ def _gone(
     survival: Survival,
 ) -> NDArray[np.bool_]:
     """(P,) who has too few detections of their own, or is a double of one who has more."""
-    core = list(skeleton.core)
-    seen = ((candidate >= 0).sum(axis=-1) >= 2)[:, core].sum(axis=1)
+    seen = seen_twice(candidate >= 0, skeleton).sum(axis=1)
     few = (seen < survival.min_seen_twice) | (_own_share(frame, candidate, joints) < survival.min_share)
-    return few | ((_apart(joints, skeleton) < survival.double_m) & _lesser(seen)).any(axis=1)
+    return few | ((_apart(joints, skeleton) < survival.double_m) & lesser(seen)).any(axis=1)
 
 
 def _own_share(frame: Input, candidate: NDArray[np.intp], joints: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -8,6 +8,8 @@ import numpy as np
 from annotated_types import Interval
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from shapepose_fg.bounds import Settings
 from shapepose_fg.skeleton import Skeleton
@@ -101,23 +103,17 @@ class Ends:
 
 
 def stitch(ends: Ends, config: StitchingConfig, cuts_s: Sequence[float] = ()) -> dict[int, int]:
-    """What each track is called after tracks are joined: of two that are one the smaller number stays.
+    """What each track is called after tracks are joined: of two that are one the earlier one's number stays.
 
     Each track has one before it and one after it at the most; which, is decided for all together. Nothing is
-    joined across `cuts_s`.
+    joined across `cuts_s`. Time and memory grow with the pairs of tracks of which one begins within
+    `longest_gap_s` of the other's end.
     """
-    if len(ends.track) < 2 or config.longest_gap_s == 0:
-        return {track: track for track in ends.track.tolist()}
-    gap_s = ends.time_s[None, :, 0] - ends.time_s[:, None, 1]
-    apart = np.linalg.norm(ends.place[None, :, 0] - ends.place[:, None, 1], axis=-1)
-    may = (gap_s > 0) & (gap_s <= config.longest_gap_s)
-    may &= apart <= config.reach_m + config.walk_mps * np.maximum(gap_s, 0.0)
-    may &= _alike(ends.bones)
-    for cut in cuts_s:
-        may &= ~((ends.time_s[:, None, 1] < cut) & (ends.time_s[None, :, 0] >= cut))
-    cost = np.where(may, gap_s, 2 * config.longest_gap_s)
-    before, after = linear_sum_assignment(cost)
-    joined = dict(zip(after[may[before, after]].tolist(), before[may[before, after]].tolist(), strict=True))
+    before, after = _pairs(ends, config, cuts_s)
+    gap_s = ends.time_s[after, 0] - ends.time_s[before, 1]
+    joined = dict[int, int]()
+    for group in _groups(before, after, len(ends.track)):
+        joined |= _matched(before[group], after[group], gap_s[group], config)
     names = {}
     for place in np.argsort(ends.time_s[:, 0], kind="stable").tolist():
         earlier = joined.get(place)
@@ -125,11 +121,58 @@ def stitch(ends: Ends, config: StitchingConfig, cuts_s: Sequence[float] = ()) ->
     return {int(ends.track[place]): int(name) for place, name in names.items()}
 
 
-def _alike(bones: Array) -> NDArray[np.bool_]:
-    """(G, G) which builds may be one person's: enough bones known, and alike."""
-    difference = bones[:, None] - bones[None]
+def _pairs(
+    ends: Ends, config: StitchingConfig, cuts_s: Sequence[float]
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Tracks (K,) of whom others (K,) may be what comes after."""
+    begin_s, end_s = ends.time_s.T
+    order = np.argsort(begin_s, kind="stable")
+    first = np.searchsorted(begin_s[order], end_s, side="right")
+    latest_s = np.nextafter(end_s + config.longest_gap_s, np.inf)  # no rounding leaves one out
+    last = np.searchsorted(begin_s[order], latest_s, side="right")
+    count = np.maximum(last - first, 0)
+    before = np.repeat(np.arange(len(end_s)), count)
+    after = order[np.arange(len(before)) + np.repeat(first - np.cumsum(count) + count, count)]
+    gap_s = begin_s[after] - end_s[before]
+    apart = np.linalg.norm(ends.place[after, 0] - ends.place[before, 1], axis=-1)
+    may = (gap_s <= config.longest_gap_s) & (apart <= config.reach_m + config.walk_mps * gap_s)
+    for cut in cuts_s:
+        may &= ~((end_s[before] < cut) & (begin_s[after] >= cut))
+    before, after = before[may], after[may]
+    alike = _alike(ends.bones[before], ends.bones[after])
+    return before[alike], after[alike]
+
+
+def _alike(bones: Array, others: Array) -> NDArray[np.bool_]:
+    """(K,) which builds (K, B) may be those of others (K, B): enough bones known, and alike."""
+    difference = bones - others
     known = np.isfinite(difference)
     squared = np.where(known, difference, 0.0) ** 2 / (2 * _BONE_SIGMA_M**2)
     count = known.sum(axis=-1)
     mean = squared.sum(axis=-1) / np.maximum(count, 1)
     return (count >= bones.shape[1] / 2) & (mean <= _BUILD)
+
+
+def _groups(before: NDArray[np.intp], after: NDArray[np.intp], count: int) -> list[NDArray[np.intp]]:
+    """Which pairs compete for tracks with each other, of `count` tracks: each group is decided by itself."""
+    if len(before) == 0:
+        return []
+    edges = coo_array((np.ones(len(before)), (before, count + after)), shape=(2 * count, 2 * count))
+    _, group = connected_components(edges, directed=False)
+    of_pair = group[before]
+    order = np.argsort(of_pair, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(of_pair[order])) + 1)
+
+
+def _matched(
+    before: NDArray[np.intp], after: NDArray[np.intp], gap_s: Array, config: StitchingConfig
+) -> dict[int, int]:
+    """For tracks that are joined the one before, of pairs (K,) that may be: most of them, with short gaps."""
+    rows, row = np.unique(before, return_inverse=True)
+    columns, column = np.unique(after, return_inverse=True)
+    count = len(rows)  # so many columns first: each track may have nobody after it
+    cost = np.full((count, count + len(columns)), 2 * config.longest_gap_s)
+    cost[row, count + column] = gap_s
+    first, second = linear_sum_assignment(cost)
+    may = cost[first, second] <= config.longest_gap_s
+    return dict(zip(columns[second[may] - count].tolist(), rows[first[may]].tolist(), strict=True))

@@ -16,6 +16,7 @@ from shapepose_fg.camera import Rig, Views
 from shapepose_fg.detections import Detections
 from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas, triangulate
 from shapepose_fg.observations import Observations
+from shapepose_fg.proposal.association import seen_twice
 from shapepose_fg.skeleton import Skeleton
 from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.plausibility import torn_joints
@@ -268,10 +269,7 @@ class Tracker:
 
     def _evident(self, candidate: NDArray[np.intp]) -> NDArray[np.bool_]:
         """(A,) whether enough core joints are seen by two views."""
-        return self._seen_twice(candidate) >= _MIN_SEEN_TWICE
-
-    def _seen_twice(self, candidate: NDArray[np.intp]) -> NDArray[np.intp]:
-        return ((candidate >= 0).sum(axis=-1) >= 2)[:, list(self.skeleton.core)].sum(axis=1)
+        return seen_twice(candidate >= 0, self.skeleton).sum(axis=1) >= _MIN_SEEN_TWICE
 
     def _doubles(self, joints: JointStates, state: TrackerState) -> NDArray[np.bool_]:
         """(A,) tracks that lie on an older one."""
@@ -299,7 +297,7 @@ class Tracker:
             if len(people) == 0:
                 continue
             theirs = np.where(people.candidate >= 0, rest[people.candidate], -1)
-            new = self._seen_twice(theirs) >= self.config.min_new_joints
+            new = seen_twice(theirs >= 0, self.skeleton).sum(axis=1) >= self.config.min_new_joints
             track, person = self._returned(people.initial, new, state, evident)
             if len(track) > 0:
                 state = self._revived(state, track, people.initial[person])

@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 from shapepose_fg.bounds import Metres, Repeats, Settings, Share
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections
-from shapepose_fg.proposal.association import match_views, mean_affinity, owned, share_overlaps
+from shapepose_fg.proposal.association import (
+    match_views,
+    mean_affinity,
+    owned,
+    projected_distances,
+    share_overlaps,
+)
 from shapepose_fg.skeleton import Skeleton
 
 
@@ -55,7 +61,7 @@ def assign(
     shape = (people, len(skeleton), len(rig))
     if people == 0 or count == 0:
         return np.full(shape, -1, dtype=np.intp)
-    distance_px, distance_m = _distances(places, detections, rig)
+    distance_px, distance_m = projected_distances(rig.project(places), detections.joint, detections, rig)
     sigma, astray = sigma_m[:, detections.joint], lost[:, detections.joint]
     nearness = np.exp(-0.5 * distance_m**2 / (config.near_m**2 + sigma**2))
     gate_m = np.minimum(config.far_m + 2 * sigma, config.farthest_m)
@@ -76,15 +82,3 @@ def assign(
     overlap = (distance_px < config.overlap_px) & (affinity >= config.least_affinity)
     share_overlaps(chosen, overlap, distance_px, detections)
     return chosen
-
-
-def _distances(
-    places: NDArray[np.float64], detections: Detections, rig: Rig
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Distance (A, D) of each detection to its joint's projection: pixels, and metres at the joint's depth."""
-    xy, depth = rig.project(places)
-    at = (detections.view, slice(None), detections.joint)
-    distance_px = np.hypot(*np.moveaxis(xy[at] - detections.xy[:, None], -1, 0)).T
-    unknown = np.isnan(distance_px)
-    distance_m = distance_px * depth[at].T / rig.focal_px[detections.view]
-    return np.where(unknown, np.inf, distance_px), np.where(unknown, np.inf, distance_m)
