@@ -101,6 +101,8 @@ class SequenceFitter:
         evidence = weigh(targets, self.rows.evidence)
         fit = BodyFit.failed(evidence.status, targets.xyz.shape[1])
         start = self._start(evidence, group, time_s, len(numbers))
+        # Whoever is in a segment that is fitted gets a body all the same, and `_fill` says so.
+        fit.status[fit.ok & ~start.found] = FitStatus.NOT_CONVERGED
         known = _unknown(len(numbers)) if shapes is None else shapes
         usable = np.flatnonzero(evidence.status != FitStatus.INVALID_TARGETS)
         config = self.config

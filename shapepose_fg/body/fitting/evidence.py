@@ -7,12 +7,11 @@ import numpy as np
 from annotated_types import Interval
 from numpy.typing import NDArray
 
-from shapepose_fg.body.fitting.fitter import FitStatus, JointTargets
+from shapepose_fg.body.fitting.fitter import STATUS_TYPE, FitStatus, JointTargets
 from shapepose_fg.bounds import Metres, Settings
 
 Array = NDArray[np.float64]
 
-_STATUS_TYPE = f"U{max(len(status) for status in FitStatus)}"
 _ROUNDING = 1e-4
 """Asymmetry or negativity of information, relative, that passes for rounding: inverses of rays lose much."""
 
@@ -66,7 +65,7 @@ def weigh(targets: JointTargets, config: EvidenceConfig) -> Evidence:
     full = values[..., 0] > 1 / config.seen_sigma_m**2
     count = full.sum(axis=1)
     centre = np.where(full[..., None], xyz, 0.0).sum(axis=1) / np.maximum(count, 1)[:, None]
-    status = np.full(len(xyz), FitStatus.OK, dtype=_STATUS_TYPE)
+    status = np.full(len(xyz), FitStatus.OK, dtype=STATUS_TYPE)
     status[~determine_pose(xyz, full, config)] = FitStatus.TOO_FEW_JOINTS
     status[~valid] = FitStatus.INVALID_TARGETS
     half = np.sqrt(values / (1 + values * config.model_sigma_m**2))

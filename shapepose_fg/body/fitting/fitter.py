@@ -20,6 +20,10 @@ class FitStatus(StrEnum):
     """The energy was still falling when the iterations ran out, or it left the finite numbers."""
 
 
+STATUS_TYPE = np.dtype(f"U{max(map(len, FitStatus))}")
+"""Of arrays that hold any `FitStatus`: one made of a shorter text would cut off the others."""
+
+
 @dataclass(frozen=True)
 class JointTargets:
     """Where the joints of B people (rows: people, frames or both) should be, and how surely."""
@@ -106,7 +110,7 @@ class BodyFit:
 
     @classmethod
     def failed(cls, status: NDArray[np.str_], num_joints: int) -> "BodyFit":
-        """Rows without a body: zero parameters, NaN joints, the given `status` (B,)."""
+        """Rows without a body: zero parameters, NaN joints, a copy of the given `status` (B,)."""
         B, J = len(status), num_joints
         return cls(
             betas=np.zeros((B, 10)),
@@ -118,7 +122,7 @@ class BodyFit:
             prior_xyz=np.full((B, J, 3), np.nan),
             prior_covariance=np.full((B, J, 3, 3), np.nan),
             residual_m=np.full(B, np.nan),
-            status=status,
+            status=np.asarray(status).astype(STATUS_TYPE),
         )
 
 
