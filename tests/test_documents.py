@@ -152,8 +152,6 @@ def test_files_that_are_named_exist(page):
 NOT_MEASURED_AGAIN = frozenset(
     {
         "alternation",
-        "detector",
-        "difficulty",
         "fitter alternation",
         "foreign",
         "held back",
