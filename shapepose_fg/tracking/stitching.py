@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 
 _BONE_SIGMA_M = 0.015
 """Error of a bone's mean length in a track: errors of detectors last, so that it does not vanish with time."""
+_PLACE_SIGMA_M = 0.05
+"""Error of the centre of somebody's core joints, metres, at the least."""
 _LEAST_ROWS = 10
 """Rows that a track needs for its build to be known."""
 _BUILD = 2.0
@@ -105,15 +107,14 @@ class Ends:
 def stitch(ends: Ends, config: StitchingConfig, cuts_s: Sequence[float] = ()) -> dict[int, int]:
     """What each track is called after tracks are joined: of two that are one the earlier one's number stays.
 
-    Each track has one before it and one after it at the most; which, is decided for all together. Nothing is
-    joined across `cuts_s`. Time and memory grow with the pairs of tracks of which one begins within
-    `longest_gap_s` of the other's end.
+    Each track has one before it and one after it at the most. Which, is decided for all together: as many as can
+    be are joined, in the likeliest way by place and build. Nothing is joined across `cuts_s`.
+    Time and memory grow with the pairs of tracks of which one begins within `longest_gap_s` of the other's end.
     """
-    before, after = _pairs(ends, config, cuts_s)
-    gap_s = ends.time_s[after, 0] - ends.time_s[before, 1]
+    before, after, cost = _pairs(ends, config, cuts_s)
     joined = dict[int, int]()
     for group in _groups(before, after, len(ends.track)):
-        joined |= _matched(before[group], after[group], gap_s[group], config)
+        joined |= _matched(before[group], after[group], cost[group])
     names = {}
     for place in np.argsort(ends.time_s[:, 0], kind="stable").tolist():
         earlier = joined.get(place)
@@ -123,8 +124,8 @@ def stitch(ends: Ends, config: StitchingConfig, cuts_s: Sequence[float] = ()) ->
 
 def _pairs(
     ends: Ends, config: StitchingConfig, cuts_s: Sequence[float]
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Tracks (K,) of whom others (K,) may be what comes after."""
+) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
+    """Tracks (K,) of whom others (K,) may be what comes after, and what that costs: see `_costs`."""
     begin_s, end_s = ends.time_s.T
     order = np.argsort(begin_s, kind="stable")
     first = np.searchsorted(begin_s[order], end_s, side="right")
@@ -134,23 +135,40 @@ def _pairs(
     before = np.repeat(np.arange(len(end_s)), count)
     after = order[np.arange(len(before)) + np.repeat(first - np.cumsum(count) + count, count)]
     gap_s = begin_s[after] - end_s[before]
-    apart = np.linalg.norm(ends.place[after, 0] - ends.place[before, 1], axis=-1)
-    may = (gap_s <= config.longest_gap_s) & (apart <= config.reach_m + config.walk_mps * gap_s)
+    apart_m = np.linalg.norm(ends.place[after, 0] - ends.place[before, 1], axis=-1)
+    reach_m = config.reach_m + config.walk_mps * gap_s
+    may = (gap_s <= config.longest_gap_s) & (apart_m <= reach_m)
     for cut in cuts_s:
         may &= ~((end_s[before] < cut) & (begin_s[after] >= cut))
-    before, after = before[may], after[may]
-    alike = _alike(ends.bones[before], ends.bones[after])
-    return before[alike], after[alike]
+    before, after, apart_m, reach_m = before[may], after[may], apart_m[may], reach_m[may]
+    unlike = _unlike(ends.bones[before], ends.bones[after])
+    alike = unlike <= _BUILD  # not where it is not known
+    cost = _costs(apart_m, reach_m, ends.bones.shape[1] * unlike)[alike]
+    return before[alike], after[alike], cost
 
 
-def _alike(bones: Array, others: Array) -> NDArray[np.bool_]:
-    """(K,) which builds (K, B) may be those of others (K, B): enough bones known, and alike."""
+def _unlike(bones: Array, others: Array) -> Array:
+    """(K,) mean squared difference of builds (K, B) and others (K, B), in its variances.
+
+    NaN where fewer than half of the bones are known.
+    """
     difference = bones - others
     known = np.isfinite(difference)
     squared = np.where(known, difference, 0.0) ** 2 / (2 * _BONE_SIGMA_M**2)
     count = known.sum(axis=-1)
-    mean = squared.sum(axis=-1) / np.maximum(count, 1)
-    return (count >= bones.shape[1] / 2) & (mean <= _BUILD)
+    enough = (count > 0) & (count >= bones.shape[1] / 2)
+    return np.where(enough, squared.sum(axis=-1) / np.maximum(count, 1), np.nan)
+
+
+def _costs(apart_m: Array, reach_m: Array, unlike: Array) -> Array:
+    """(K,) how unlikely it is that two tracks are one, -2 log of a density but for a constant.
+
+    Places `apart_m` (K,) are Gaussian on the floor, two standard deviations being what is in reach (K,); bones of
+    one person differ by `unlike` (K,) squared standard deviations, all bones together. The time between does not
+    count by itself: where as many come as go it is the same in all, whoever is who.
+    """
+    sigma_m = np.maximum(reach_m / 2, _PLACE_SIGMA_M)
+    return (apart_m / sigma_m) ** 2 + 4 * np.log(sigma_m / _PLACE_SIGMA_M) + unlike
 
 
 def _groups(before: NDArray[np.intp], after: NDArray[np.intp], count: int) -> list[NDArray[np.intp]]:
@@ -164,15 +182,15 @@ def _groups(before: NDArray[np.intp], after: NDArray[np.intp], count: int) -> li
     return np.split(order, np.flatnonzero(np.diff(of_pair[order])) + 1)
 
 
-def _matched(
-    before: NDArray[np.intp], after: NDArray[np.intp], gap_s: Array, config: StitchingConfig
-) -> dict[int, int]:
-    """For tracks that are joined the one before, of pairs (K,) that may be: most of them, with short gaps."""
+def _matched(before: NDArray[np.intp], after: NDArray[np.intp], pair_cost: Array) -> dict[int, int]:
+    """For tracks that are joined the one before, of pairs (K,) that may be: as many as can be, the likeliest."""
     rows, row = np.unique(before, return_inverse=True)
     columns, column = np.unique(after, return_inverse=True)
     count = len(rows)  # so many columns first: each track may have nobody after it
-    cost = np.full((count, count + len(columns)), 2 * config.longest_gap_s)
-    cost[row, count + column] = gap_s
+    # A pair more counts more than all that others can gain by it.
+    alone = 1.0 + count * float(pair_cost.max())
+    cost = np.full((count, count + len(columns)), alone)
+    cost[row, count + column] = pair_cost
     first, second = linear_sum_assignment(cost)
-    may = cost[first, second] <= config.longest_gap_s
+    may = cost[first, second] < alone
     return dict(zip(columns[second[may] - count].tolist(), rows[first[may]].tolist(), strict=True))

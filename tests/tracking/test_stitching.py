@@ -70,6 +70,18 @@ def test_two_who_swap_places_out_of_sight_are_told_apart_by_their_build(rows):
     assert np.unique(named[track == 3]).tolist() == [2] and np.unique(named[track == 4]).tolist() == [1]
 
 
+@pytest.mark.parametrize("first", [(60, 60), (60, 75), (75, 60)])
+def test_of_two_who_leave_and_two_who_come_build_decides_and_then_place(rows, first):
+    """Builds 4 % apart may both be either's, and so may all places, up to a metre away, whoever comes first."""
+    parts = (1, 1.0, 0, 0.0), (2, 1.04, 0, 1.0), (3, 1.04, first[0], 0.3), (4, 1.0, first[1], 0.7)
+    track, time_s, joints = rows(*parts)
+    named = stitch(track, time_s, joints, BODY_25, StitchingConfig())
+    assert np.unique(named[track == 3]).tolist() == [2] and np.unique(named[track == 4]).tolist() == [1]
+    track, time_s, joints = rows(*((name, 1.0, start, x) for name, _, start, x in parts))
+    named = stitch(track, time_s, joints, BODY_25, StitchingConfig())
+    assert np.unique(named[track == 3]).tolist() == [1] and np.unique(named[track == 4]).tolist() == [2]
+
+
 def test_nobody_is_nobody():
     none = np.zeros(0)
     named = stitch(none.astype(int), none, np.zeros((0, 25, 3)), BODY_25, StitchingConfig())
@@ -135,8 +147,8 @@ def many_tracks(count: int, seconds: float, people: int, seed: int = 0) -> Ends:
 
 def joined_all_at_once(ends: Ends, config: StitchingConfig, cuts_s: list[float]) -> dict[int, int]:
     """Every track compared with every other, and one assignment for all."""
-    G = len(ends.track)
-    cost = np.full((G, G), 2 * config.longest_gap_s)
+    G, alone = len(ends.track), 1e6
+    cost = np.full((G, G), alone)
     for a in range(G):
         for b in range(G):
             (_, end), (begin, _) = ends.time_s[a], ends.time_s[b]
@@ -146,22 +158,15 @@ def joined_all_at_once(ends: Ends, config: StitchingConfig, cuts_s: list[float])
             alike = known.sum() >= 7 and squared[known].mean() <= 2.0
             cut = any(end < at <= begin for at in cuts_s)
             if alike and not cut and 0 < gap <= config.longest_gap_s and apart <= 0.5 + 1.5 * gap:
-                cost[a, b] = gap
+                # -2 log of a Gaussian on the floor, two sigmas of which are in reach, and of the 14 bones.
+                sigma = max((0.5 + 1.5 * gap) / 2, 0.05)
+                cost[a, b] = apart**2 / sigma**2 + 2 * np.log(sigma**2 / 0.05**2) + 14 * squared[known].mean()
     pairs = zip(*linear_sum_assignment(cost), strict=True)
-    before = {b: a for a, b in pairs if cost[a, b] <= config.longest_gap_s}
+    before = {b: a for a, b in pairs if cost[a, b] < alone}
     names: dict[int, int] = {}
     for at in np.argsort(ends.time_s[:, 0]).tolist():
         names[at] = int(ends.track[at]) if at not in before else names[before[at]]
     return {int(ends.track[at]): name for at, name in names.items()}
-
-
-def in_gaps_s(ends: Ends, names: dict[int, int]) -> float:
-    """All times together that people are out of sight."""
-    found = 0.0
-    for name in set(names.values()):
-        own = np.sort(ends.time_s[[names[each] == name for each in ends.track.tolist()]], axis=0)
-        found += float((own[1:, 0] - own[:-1, 1]).sum())
-    return found
 
 
 @pytest.mark.parametrize(("seed", "seconds", "cuts_s"), [(0, 30.0, []), (1, 100.0, [20.0, 50.0]), (2, 400.0, [])])
@@ -169,10 +174,8 @@ def test_groups_of_tracks_are_joined_as_all_at_once_would_be(seed, seconds, cuts
     ends = many_tracks(70, seconds, people=4, seed=seed)
     found = stitch_traces(ends, StitchingConfig(), cuts_s)
     expected = joined_all_at_once(ends, StitchingConfig(), cuts_s)
-    assert len(set(found.values())) == len(set(expected.values())) < 65, "some are joined"
-    assert in_gaps_s(ends, found) == pytest.approx(in_gaps_s(ends, expected))
-    # Of two who leave and two who come all gaps together are the same, whoever is who: in a crowd many such meet.
-    assert found == expected or seconds < 50
+    assert len(set(found.values())) < 65, "some are joined"
+    assert found == expected
 
 
 def test_memory_grows_with_tracks_and_not_with_their_square():
