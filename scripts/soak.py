@@ -150,8 +150,9 @@ def _watched(command: Sequence[str], parts: Path) -> list[Sample]:
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=environment)
     samples = []
     while process.poll() is None:
-        kept = max((int(file.stem.split("-")[1]) + 1 for file in parts.glob("part-*.safetensors")), default=0)
-        kept = max(kept, samples[-1].parts if samples else 0)  # at its end they are removed
+        kept = samples[-1].parts if samples else 0  # at its end they are removed
+        while (parts / f"part-{kept:06d}.safetensors").exists():
+            kept += 1
         memory, peak, cpu = (sum(column) for column in zip(*map(_process, _tree(process.pid)), strict=True))
         if kept // _SAID_WINDOWS > (samples[-1].parts if samples else 0) // _SAID_WINDOWS:
             print(f"{kept} windows: {memory / _MEGABYTE:.0f} MB, {cpu:.0f} s", file=sys.stderr)

@@ -41,6 +41,7 @@ class Parts:
         self.kept = kept
         self._counts: list[int] = []
         followed = kept.names(f"{_FOLLOWED}-")
+        self._followed = followed[-1] if followed else None
         done = int(followed[-1].split("-")[1]) + 1 if followed else 0
         for name in followed[:-1]:
             kept.drop(name)
@@ -67,10 +68,10 @@ class Parts:
         self.kept.keep(_name(n), arrays, part.notes.as_dict())
         self._counts.append(len(rows))
         if part.checkpoint is not None and self.kept.lasting:
-            before = self.kept.names(f"{_FOLLOWED}-")
-            self.kept.keep(f"{_FOLLOWED}-{n:06d}", checkpoint_arrays(part.checkpoint))
-            for name in before:
-                self.kept.drop(name)
+            before, self._followed = self._followed, f"{_FOLLOWED}-{n:06d}"
+            self.kept.keep(self._followed, checkpoint_arrays(part.checkpoint))
+            if before is not None:
+                self.kept.drop(before)
 
     def column(self, n: int, name: str) -> NDArray[Any]:
         """A column of a part, by its name in people.npz, or in observations.npz with `OBSERVED` before it."""
@@ -87,10 +88,9 @@ class Parts:
 
     def checkpoint(self, read: Callable[[int], Input]) -> Checkpoint | None:
         """From where following goes on; None at the beginning. `read` gives what the cameras saw of a frame."""
-        followed = self.kept.names(f"{_FOLLOWED}-")
-        if len(followed) == 0:
+        name = self._followed
+        if name is None:
             return None
-        name = followed[-1]
         return checkpoint_of(lambda key: self.kept.array(name, key), self.kept.keys(name), read)
 
 
