@@ -154,9 +154,7 @@ NOT_MEASURED_AGAIN = frozenset(
         "alternation",
         "fitter alternation",
         "foreign",
-        "held back",
         "hip_views",
-        "proposals",
         "sweeps",
     }
 )
