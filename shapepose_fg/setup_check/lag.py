@@ -14,6 +14,8 @@ Array = NDArray[np.float64]
 _MIN_AGREEMENT = 0.12
 _MIN_LAG_GAIN = 0.004
 """An offset in time is named if it takes away enough of what people move in it, and 7 mm on average."""
+_HALF = 0.2
+"""A half of the recording in which people move this share of all that they move has a say."""
 _STRIDE = 4
 """Offsets are tried at every fourth frame first."""
 _MOST_PEOPLE = 100
@@ -30,7 +32,8 @@ class Lag:
     """By how much the joints' errors fall, as a part of the people's size: mean over all joints."""
     agreement: float
     """The same, over how far the joints move within the offset: near 1 if it is the offset, near -1 if there is
-    none, 0 where nobody moves."""
+    none, 0 where nobody moves. Of the half of the frames in which it is less: an offset is in both halves, while
+    in one of them people may come by chance to where they were."""
 
 
 def is_offset(lag: Lag) -> bool:
@@ -47,13 +50,18 @@ def find_lag(others: Others, seen: Sightings, camera: Pinhole, most: int) -> Lag
 
     def tried(lag: int) -> Lag:
         moved = _nearest(others, seen, camera, lag)
-        return _compare(lag, seen, size, still, moved)
+        return _compare(lag, others.frame, seen, size, still, moved)
 
     first = {lag: tried(lag) for lag in range(-(most // _STRIDE) * _STRIDE, most + 1, _STRIDE)}
-    best = max(first.values(), key=lambda lag: lag.gain)
+    best = max(first.values(), key=_worth)
     near = [tried(best.frames + d) for d in range(1 - _STRIDE, _STRIDE) if d != 0 and abs(best.frames + d) <= most]
-    best = max([best, *near], key=lambda lag: lag.gain)
+    best = max([best, *near], key=_worth)
     return best if best.gain > 0 else Lag(0, 0.0, 0.0)
+
+
+def _worth(lag: Lag) -> float:
+    """What an offset takes away, where it is one in both halves of the frames."""
+    return lag.gain if lag.agreement >= 0 else -np.inf
 
 
 @dataclass(frozen=True)
@@ -87,7 +95,9 @@ def _nearest(others: Others, seen: Sightings, camera: Pinhole, lag: int) -> _Nea
     return _Nearest(np.isin(others.frame + lag, seen.frame), found, errors)
 
 
-def _compare(lag: int, seen: Sightings, size: Array, still: _Nearest, moved: _Nearest) -> Lag:
+def _compare(
+    lag: int, frame: NDArray[np.integer], seen: Sightings, size: Array, still: _Nearest, moved: _Nearest
+) -> Lag:
     """How much better people fit at an offset than without: joints of people that both have, or one has."""
     usable = still.there & moved.there & ((still.sighting >= 0) | (moved.sighting >= 0))
     a, b = still.sighting[usable], moved.sighting[usable]
@@ -102,5 +112,9 @@ def _compare(lag: int, seen: Sightings, size: Array, still: _Nearest, moved: _Ne
     both = ~np.isnan(error_a) & ~np.isnan(error_b)
     if both.sum() < 10 * MIN_JOINTS:
         return Lag(lag, 0.0, 0.0)
-    better = (error_a - error_b)[both]
-    return Lag(lag, float(better.mean()), float(better.sum() / max(way[both].sum(), 1e-9)))
+    better, way = np.where(both, error_a - error_b, 0.0), np.where(both, way, 0.0)
+    late = frame[usable] > np.median(frame[usable])
+    halves = [(float(better[half].sum()), float(way[half].sum())) for half in (late, ~late)]
+    whole = max(sum(moves for _, moves in halves), 1e-9)
+    agreement = min(gain / moves for gain, moves in halves if moves >= _HALF * whole) if whole > 1e-9 else 0.0
+    return Lag(lag, float(better[both].mean()), agreement)
