@@ -118,7 +118,7 @@ class Reconstruction:
         self._check_observations()
 
     def _check_values(self) -> None:
-        """ValueError for what no reconstruction gives: frames before the first, people farther than the moon."""
+        """ValueError for what no reconstruction gives: negative frames, joints thousands of kilometres away."""
         for name in self.ROWS:
             if name in _LARGEST:
                 check_range(name, getattr(self, name))

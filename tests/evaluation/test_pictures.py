@@ -4,10 +4,21 @@ import cv2
 import numpy as np
 import pytest
 
+from shapepose_fg.evaluation.experiments.others import PlainPeople
 from shapepose_fg.evaluation.experiments.scale import Stretch
-from shapepose_fg.evaluation.pictures.choice import Rows, farthest, mean_error, missing, most, odd_limbs, oddest
+from shapepose_fg.evaluation.pictures.choice import (
+    Beside,
+    Rows,
+    closest_contact,
+    farthest,
+    mean_error,
+    missing,
+    most,
+    odd_limbs,
+    oddest,
+)
 from shapepose_fg.evaluation.pictures.close_up import clear_views
-from shapepose_fg.evaluation.pictures.pages import draw_before_after, draw_failures
+from shapepose_fg.evaluation.pictures.pages import draw_before_after, draw_failures, draw_methods
 from shapepose_fg.skeleton import BODY_25
 
 STRETCH = Stretch("demo", range(30))
@@ -48,12 +59,47 @@ def test_examples_are_of_other_people_or_moments(rows):
 def test_the_clearest_view_is_one_that_sees_the_person_and_the_next_is_across():
     scene = STRETCH.scene
     bodies = scene.vertices_at(0)
-    first, second = clear_views(scene.rig, bodies, scene.body.faces, 1)
+    first, second = clear_views(scene.rig, bodies, scene.body.faces, [1])
     axes = scene.rig.cTw[:, 2, :3]
     assert abs(axes[first] @ axes[second]) < 0.5
-    alone, _ = clear_views(scene.rig, bodies[1:2], scene.body.faces, 0)
+    alone, _ = clear_views(scene.rig, bodies[1:2], scene.body.faces, [0])
     sizes = [np.linalg.norm(scene.rig.centres[view] - bodies[1].mean(axis=0)) for view in (alone, second)]
     assert sizes[0] < 6.0  # in the room: nobody stands before somebody who is alone
+
+
+def test_the_closest_contact_is_chosen_by_the_truth_alone():
+    frame, (first, second) = closest_contact(STRETCH)
+    joints = STRETCH.scene.keypoints
+    apart = np.median(np.linalg.norm(joints[:, :, None] - joints[:, None], axis=-1), axis=-1)
+    apart[:, np.arange(4), np.arange(4)] = np.inf
+    assert first < second and apart[frame, first, second] == apart.min()
+
+
+def test_methods_beside_each_other_count_what_is_wrong_with_the_pair(tmp_path):
+    pytest.importorskip("matplotlib")
+    frame, pair = closest_contact(STRETCH)
+    true = STRETCH.scene.keypoints[frame]
+    one_lost = true[[person for person in range(4) if person != pair[1]]].copy()
+    own = sorted(set(range(4)) - {pair[1]}).index(pair[0])
+    one_lost[own, WRIST] += (0.0, 0.0, 0.4)
+    here = np.full(4, frame)
+    people = {
+        "the truth": PlainPeople(here, true),
+        "one lost": PlainPeople(here[:3], one_lost),
+        "nobody at all": PlainPeople(here[:0], true[:0]),
+    }
+    beside = Beside(STRETCH, frame, pair, people)
+    np.testing.assert_array_equal(beside.of_the_pair("the truth"), true[list(pair)])
+    found = beside.of_the_pair("one lost")
+    assert np.isnan(found[1]).all() and np.linalg.norm(found[0] - true[pair[0]], axis=-1).max() == pytest.approx(
+        0.4
+    )
+    assert np.isnan(beside.of_the_pair("nobody at all")).all()
+    draw_methods(tmp_path / "methods.png", [beside])
+    picture = cv2.imread(str(tmp_path / "methods.png")).astype(int)
+    columns = [picture[90:370, 8 + 278 * place : 268 + 278 * place] for place in range(3)]
+    orange = [(np.abs(each - (0x1E, 0x87, 0xE8)).max(axis=-1) < 30).sum() for each in columns]
+    assert orange[0] == 0 < orange[1] < orange[2]  # none, one person's and two people's joints are missing
 
 
 def test_pages_are_drawn(rows, tmp_path):

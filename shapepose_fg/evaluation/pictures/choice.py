@@ -3,13 +3,14 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.evaluation.alternation import before_refinement
 from shapepose_fg.evaluation.experiments.scale import Stretch
-from shapepose_fg.evaluation.matching import match_people
+from shapepose_fg.evaluation.matching import People, match_people
 from shapepose_fg.evaluation.trajectories import LIMB_ENDS
 from shapepose_fg.pipeline import PipelineConfig
 from shapepose_fg.reconstruction import Reconstruction
@@ -48,6 +49,44 @@ class Rows:
     def first(self) -> Array:
         """(M, 25, 3) of the first step."""
         return next(iter(self.joints.values()))
+
+
+@dataclass(frozen=True)
+class Beside:
+    """What several methods make of one frame."""
+
+    stretch: Stretch
+    """Of which scene."""
+    frame: int
+    """Of the stretch."""
+    pair: tuple[int, int]
+    """Two people of the scene."""
+    people: dict[str, People]
+    """Everybody whom each method finds, in all frames."""
+
+    def here(self, name: str) -> Array:
+        """(N, 25, 3) joints of a method's people in the frame, metres."""
+        found = self.people[name]
+        return np.asarray(found.joints, dtype=np.float64)[np.asarray(found.frame) == self.frame]
+
+    def of_the_pair(self, name: str) -> Array:
+        """(2, 25, 3) joints of the two, by who is who in that frame; NaN for somebody who is not found."""
+        here = self.here(name)
+        truth = self.stretch.scene.keypoints[[self.frame]]
+        matches = match_people(np.zeros(len(here), dtype=np.intp), here, truth)
+        joints = np.full((len(truth[0]), *truth.shape[2:]), np.nan)
+        joints[matches.person] = here[matches.row]
+        return joints[list(self.pair)]
+
+
+def closest_contact(stretch: Stretch) -> tuple[int, tuple[int, int]]:
+    """The frame in which two people are closest, in the median distance between their own joints, and the two."""
+    joints = stretch.scene.keypoints
+    apart = np.full((len(joints), joints.shape[1], joints.shape[1]), np.inf)
+    for first, second in combinations(range(joints.shape[1]), 2):
+        apart[:, first, second] = np.median(np.linalg.norm(joints[:, first] - joints[:, second], axis=-1), axis=-1)
+    frame, first, second = (int(each) for each in np.unravel_index(apart.argmin(), apart.shape))
+    return frame, (first, second)
 
 
 def before_and_after(stretch: Stretch, config: PipelineConfig) -> Rows:

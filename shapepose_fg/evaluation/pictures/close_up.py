@@ -1,5 +1,6 @@
-"""One person as a camera sees them: true bodies in grey, what was found as a skeleton, and what is wrong."""
+"""People as a camera sees them from near: true bodies in grey, what was found as skeletons, and what is wrong."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,23 +33,23 @@ class Circle:
     """One of the three."""
 
 
-def greyed(bodies: NDArray[np.floating], faces: NDArray[np.integer], person: int) -> Mesh:
-    """All true bodies (P, Nv, 3), the `person`'s darker than the others'."""
+def greyed(bodies: NDArray[np.floating], faces: NDArray[np.integer], people: Sequence[int]) -> Mesh:
+    """All true bodies (P, Nv, 3), those of `people` darker than the others'."""
     colours = np.tile(_OTHERS, (len(bodies), 1))
-    colours[person] = _OWN
+    colours[list(people)] = _OWN
     return Mesh.of(bodies, faces, colours)
 
 
 def clear_views(
-    rig: Rig, bodies: NDArray[np.floating], faces: NDArray[np.integer], person: int
+    rig: Rig, bodies: NDArray[np.floating], faces: NDArray[np.integer], people: Sequence[int]
 ) -> tuple[int, int]:
-    """The view that shows most of a person, and of those from across (60 degrees and more) the next."""
+    """The view that shows most of some people, and of those from across (60 degrees and more) the next."""
     mesh = Mesh.of(bodies, faces, np.zeros((len(bodies), 3)))
     area_m2 = np.zeros(len(rig))
     for view, camera in enumerate(rig.cameras):
         small = zoom(camera, (0, 0, *camera.image_size), _SMALL_PX)
         surface = render_depth(mesh.vertices, mesh.faces, small, cull_back=True)
-        own = (surface.face >= 0) & (surface.face // len(faces) == person)
+        own = (surface.face >= 0) & np.isin(surface.face // len(faces), people)
         area_m2[view] = (surface.depth[own].astype(np.float64) ** 2).sum() / small.K[0, 0] ** 2
     first = int(area_m2.argmax())
     axes = rig.cTw[:, 2, :3]
@@ -63,13 +64,13 @@ def draw_close_up(
     ghosts: Mesh,
     floor: Floor,
     joints: Array,
-    colour: str,
+    colours: Sequence[str],
     *,
     focus: Array,
     circles: tuple[Circle, ...] = (),
     candidates: Array | None = None,
 ) -> None:
-    """Draw a person's `joints` (25, 3) over the true bodies, enlarged on the points `focus` (K, 3).
+    """Draw people's `joints` (N, 25, 3) over the true bodies, enlarged on the points `focus` (K, 3).
 
     `candidates` (D, 2) are what the detector saw in this view, undistorted pixels.
     """
@@ -81,7 +82,8 @@ def draw_close_up(
         scale = window.K[0, 0] / camera.K[0, 0]
         xy = scale * (candidates - camera.K[:2, 2]) + window.K[:2, 2]
         axes.scatter(*xy.T, s=5, color="#2b2d33", linewidths=0, zorder=2)
-    draw_skeletons(axes, window, joints[None], np.array([rgb(colour)]) / 0.55, width=1.8)
+    if len(joints) > 0:
+        draw_skeletons(axes, window, joints, np.array([rgb(each) for each in colours]) / 0.55, width=1.8)
     for circle in circles:
         xy, _ = window.project(circle.at[None])
         axes.scatter(*xy.T, s=110, facecolors="none", edgecolors=circle.colour, linewidths=1.8, zorder=5)

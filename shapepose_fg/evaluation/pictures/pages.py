@@ -13,6 +13,7 @@ from shapepose_fg.detections import DetectionSequence
 from shapepose_fg.evaluation.pictures.choice import (
     ODD_SHARE,
     WRONG_M,
+    Beside,
     Rows,
     farthest,
     mean_error,
@@ -35,9 +36,11 @@ from shapepose_fg.evaluation.shelf_events import LostLimb
 from shapepose_fg.evaluation.shelf_ground_truth import ShelfGroundTruth
 from shapepose_fg.evaluation.trajectories import LIMB_ENDS
 from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.simulation import Scene
 from shapepose_fg.skeleton import BODY_25
 from shapepose_fg.viewer.drawing import INK, QUIET, panel, tag
 from shapepose_fg.viewer.figures import Figures, Mesh, floor_under, framed
+from shapepose_fg.viewer.floor import Floor
 from shapepose_fg.viewer.palette import PALETTE
 
 Array = NDArray[np.float64]
@@ -50,6 +53,8 @@ _RULES = {
     "most abnormal limb": oddest,
 }
 _ANNOTATED = "#d0342c"
+_UNLIKE_RINGS = (PALETTE[2], PALETTE[3], PALETTE[7], PALETTE[6])
+"""Colours of people that are none of those of rings."""
 _DOTS_PER_INCH = 100
 
 
@@ -92,6 +97,43 @@ def draw_failures(file: Path, parts: Sequence[Rows], each: int = 2) -> None:
     page.save(file)
 
 
+def draw_methods(file: Path, parts: Sequence[Beside], around_m: float = 1.0) -> None:
+    """For each stretch its frame of closest contact, as each method has it: a row of the page a stretch.
+
+    Drawn is everybody whom a method finds with a joint within `around_m` of the pair's middle; rings are around
+    what is wrong with the two.
+    """
+    names = list(parts[0].people)
+    page = _Page(columns=len(names), rows=len(parts))
+    page.head(
+        "The closest contact of each sequence, by each method", "the same detections for all; grey: the truth"
+    )
+    page.legend({MISSING: "missing joint", WRONG: "joint more than 0.2 m off"})
+    for line, part in enumerate(parts):
+        scene, pair = part.stretch.scene, list(part.pair)
+        bodies, truth = scene.vertices_at(part.frame), scene.keypoints[part.frame]
+        camera = scene.rig.cameras[clear_views(scene.rig, bodies, scene.body.faces, pair)[0]]
+        ghosts, floor = greyed(bodies, scene.body.faces, pair), _floor(scene, bodies)
+        focus = truth[pair].reshape(-1, 3)
+        for column, name in enumerate(names):
+            here = part.here(name)
+            distance = np.linalg.norm(here - focus.mean(axis=0), axis=-1)
+            near = np.nan_to_num(distance, nan=np.inf).min(axis=1) < around_m
+            found = part.of_the_pair(name)
+            circles = [each for joints, true in zip(found, truth[pair], strict=True)
+                       for each in _circles(joints, true, limbs=False)]  # fmt: skip
+            wrong = sum(each.colour == WRONG for each in circles)
+            page.label(line, column, f"{name}: {len(circles) - wrong} missing, {wrong} wrong of {len(focus)}")
+            axes = page.panel(line, column)
+            colours = [_UNLIKE_RINGS[number % len(_UNLIKE_RINGS)] for number in range(int(near.sum()))]
+            draw_close_up(
+                axes, camera, page.size, ghosts, floor, here[near], colours, focus=focus, circles=tuple(circles)
+            )
+            if column == 0:
+                tag(axes, f"{part.stretch.name}, frame {part.stretch.span[part.frame]}")
+    page.save(file)
+
+
 def draw_lost_limbs(
     file: Path,
     people: Reconstruction,
@@ -120,15 +162,15 @@ def draw_lost_limbs(
         annotated = truth.joints[those][0]
         page.label(0, column, f"actor {event.actor}: {event.limb}")
         page.label(1, column, f"frames {event.first} to {event.last}; this one: {frame}")
-        ghosts = greyed(bodies, body.faces, person)
+        ghosts = greyed(bodies, body.faces, [person])
         floor = floor_under(rig, figures, Mesh.clay(None, body.faces))
-        for line, view in enumerate(clear_views(rig, bodies, body.faces, person)):
+        for line, view in enumerate(clear_views(rig, bodies, body.faces, [person])):
             axes = page.panel(line, column)
             focus = np.concatenate([people.joints[row], annotated])
             focus = focus[np.isfinite(focus).all(axis=1)]
             seen = detections[frame]
             draw_close_up(
-                axes, rig.cameras[view], page.size, ghosts, floor, people.joints[row], PALETTE[0],
+                axes, rig.cameras[view], page.size, ghosts, floor, people.joints[[row]], PALETTE[:1],
                 focus=focus, candidates=seen.xy[seen.view == view],
             )  # fmt: skip
             xy, _ = framed(rig.cameras[view], focus, page.size).project(annotated)
@@ -153,11 +195,8 @@ def _draw_row(
     """A person of a simulated stretch in the first or second of the clear views; returns the camera's name."""
     scene, frame, person = rows.stretch.scene, int(rows.frame[row]), int(rows.person[row])
     bodies, faces = scene.vertices_at(frame), scene.body.faces
-    chosen = clear_views(scene.rig, bodies, faces, person)[view]
+    chosen = clear_views(scene.rig, bodies, faces, [person])[view]
     truth = rows.truth[row]
-    clay = Mesh.clay(bodies, faces)
-    nobody = Figures(np.zeros((0, 25, 3)), np.zeros(0, dtype=bool), np.zeros((0, 3)), (), Mesh.clay(None, faces))
-    floor = floor_under(scene.rig, nobody, clay)
     seen = rows.stretch.detections[frame]
     focus = np.concatenate([truth, *(each[row] for each in rows.joints.values())])
     near = np.linalg.norm(focus - truth.mean(axis=0), axis=-1) < 1.5  # what is lost in the room is not framed
@@ -165,15 +204,22 @@ def _draw_row(
         axes,
         scene.rig.cameras[chosen],
         size,
-        greyed(bodies, faces, person),
-        floor,
-        joints,
-        PALETTE[0],
+        greyed(bodies, faces, [person]),
+        _floor(scene, bodies),
+        joints[None],
+        PALETTE[:1],
         focus=focus[near],
         circles=tuple(_circles(joints, truth, limbs=marked)),
         candidates=seen.xy[seen.view == chosen] if dots else None,
     )
     return scene.rig.cameras[chosen].name
+
+
+def _floor(scene: Scene, bodies: NDArray[np.floating]) -> Floor:
+    """Under the true bodies."""
+    faces = scene.body.faces
+    nobody = Figures(np.zeros((0, 25, 3)), np.zeros(0, dtype=bool), np.zeros((0, 3)), (), Mesh.clay(None, faces))
+    return floor_under(scene.rig, nobody, Mesh.clay(bodies, faces))
 
 
 def _circles(joints: Array, truth: Array, *, limbs: bool) -> list[Circle]:
