@@ -33,6 +33,13 @@ def body_joints(people: Reconstruction, model: BodyModel | None = None) -> NDArr
         return model.keypoints(_parameters(people, model)).double().numpy()
 
 
+def bone_joints(people: Reconstruction, model: BodyModel | None = None) -> NDArray[np.float64]:
+    """(N, 24, 3) SMPL's joints of the fitted bodies, where bones meet, metres; NaN where there is no body."""
+    model = BodyModel.default() if model is None else model
+    with torch.no_grad():
+        return model.joints(_parameters(people, model)).double().numpy()
+
+
 def statures(betas: NDArray[np.float64], model: BodyModel | None = None) -> NDArray[np.float64]:
     """(N,) height in metres of bodies of shape `betas` (N, 10) in the T-pose, sole to crown; NaN where unknown."""
     model = BodyModel.default() if model is None else model

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import DetectionSequence
-from shapepose_fg.evaluation.bodies import body_joints
+from shapepose_fg.evaluation.bodies import body_joints, bone_joints
 from shapepose_fg.evaluation.footage import SINGLE_FPS
 from shapepose_fg.evaluation.trajectories import FOREARMS, WRISTS, limb_lengths
 from shapepose_fg.proposal.candidates import CandidateConfig, triangulate_pairs
 from shapepose_fg.reconstruction import Reconstruction
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.skeleton import BODY_25, SMPL_24
 
 Array = NDArray[np.float64]
 
@@ -49,7 +49,10 @@ class SinglePerson:
     forearm_spread: float
     """Standard deviation over mean of the length of his forearms, the mean of the two."""
     body_forearm_spread: float
-    """The same of his bodies' own joints."""
+    """The same of his bodies, between the points where the detector puts elbow and wrist: on the skin, which moves
+    as the elbow bends."""
+    bone_forearm_spread: float
+    """The same of his bodies' bones."""
     wrist_acceleration: float
     """Mean length of the acceleration of his wrists, m/s²."""
     wrist_below_shoulder_m: Array
@@ -67,6 +70,7 @@ class SinglePerson:
         figures = {
             "forearm_spread": 100 * self.forearm_spread,
             "body_forearm_spread": 100 * self.body_forearm_spread,
+            "bone_forearm_spread": 100 * self.bone_forearm_spread,
             "wrist_acceleration": self.wrist_acceleration,
             "lowest_wrist_m": float(below.max()) if len(below) > 0 else np.nan,
             "residual_px": self.residual_px,
@@ -99,6 +103,7 @@ def measure_single_person(
         torn_limbs=int((lengths > LIMB_LIMIT * _median(lengths)).sum()),
         forearm_spread=_spread(lengths[:, list(FOREARMS)]),
         body_forearm_spread=_spread(body_lengths[:, list(FOREARMS)]),
+        bone_forearm_spread=_spread(_forearm_bones(his, model)),
         wrist_acceleration=_acceleration(his, fps),
         wrist_below_shoulder_m=below[ARM_UP.start : ARM_UP.stop],
         residual_px=residual_to_nearest(his, recording, rig),
@@ -178,6 +183,13 @@ def _acceleration(people: Reconstruction, fps: float) -> float:
 
 def _median(lengths: Array) -> Array:
     return np.nanmedian(lengths, axis=0) if len(lengths) > 0 else np.zeros(lengths.shape[1])
+
+
+def _forearm_bones(people: Reconstruction, model: BodyModel | None) -> Array:
+    """(N, 2) lengths of the bones between elbow and wrist, right and left, metres."""
+    joints = bone_joints(people, model)
+    elbow, wrist = ([SMPL_24.index(f"{side}_{name}") for side in ("right", "left")] for name in ("elbow", "wrist"))
+    return np.linalg.norm(joints[:, wrist] - joints[:, elbow], axis=-1)
 
 
 def _spread(lengths: Array) -> float:

@@ -24,7 +24,10 @@ SINGLE = {
     "frames with the man, of all": lambda f: f"{f['man_found']} of {f['frames']}",
     "limbs over 1.25 times their own median": lambda f: str(f["torn_limbs"]),
     "forearm, standard deviation over mean: joints, %": lambda f: f"{f['forearm_spread']:.2f}",
-    "the same of the bodies, %": lambda f: f"{f['body_forearm_spread']:.2f}",
+    "the same of the bodies' points where the detector puts elbow and wrist, %": lambda f: (
+        f"{f['body_forearm_spread']:.2f}"
+    ),
+    "the same of the bodies' bones, %": lambda f: f"{f['bone_forearm_spread']:.2f}",
     "wrists, mean acceleration, m/s²": lambda f: f"{f['wrist_acceleration']:.1f}",
     "raised wrist under the shoulder, at the most, m": lambda f: f"{f['lowest_wrist_m']:.3f}",
     "arms to the nearest detection, median, px": lambda f: f"{f['residual_px']:.2f}",
