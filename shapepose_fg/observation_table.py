@@ -34,7 +34,7 @@ class Gate(IntEnum):
     CONTRADICTS_BODY = 3
     """Views agree on a place where the rest of the body cannot have the joint: they saw somebody else's."""
     BEHIND_CAMERA = 4
-    """The joint is behind this camera, or nearer than `min_depth_m`."""
+    """The joint is behind this camera, or nearer than 0.2 m."""
     NOT_PLACED = 5
     """The joint itself could not be placed: there is nothing to compare the detection with."""
 

@@ -6,12 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus, JointTargets
 from shapepose_fg.camera import Views
 from shapepose_fg.estimation.body_step import BodyStep, Tie, disagreement
 from shapepose_fg.estimation.draft import WholeFitter
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.linearisation import ViewEvidence, linearise, mean_confidence
+from shapepose_fg.estimation.motion_model import LOST_M
 from shapepose_fg.estimation.window_graph import Message, WindowGraph
 from shapepose_fg.observations import Observations
 
@@ -88,7 +90,7 @@ def alternate(
         evidence = linearise(observed, sigma, start, here, config.observations)
         if n == 0:
             placed = evidence.sigma_m <= config.refine.max_sigma_m
-            solution.enough[rows] = placed.sum(axis=1) >= config.refine.min_joints
+            solution.enough[rows] = placed.sum(axis=1) >= LEAST_JOINTS
         enough = solution.enough[rows]
         step = BodyStep(fitter, _groups(moving), config)
         targets = step.targets(evidence, enough)
@@ -184,7 +186,7 @@ def _solve(
     placed = evidence.sigma_m <= config.refine.max_sigma_m
     known = placed | body.known
     start = np.where(placed[..., None], evidence.points, np.where(body.known[..., None], body.xyz, np.nan))
-    badly = evidence.sigma_m > config.motion.lost_m
+    badly = evidence.sigma_m > LOST_M
     X = np.full(evidence.points.shape, np.nan)
     first = 0
     for window in windows:

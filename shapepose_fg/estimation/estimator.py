@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import make_camera
+from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter
 from shapepose_fg.camera import Rig, Views
 from shapepose_fg.estimation.alternation import Solution, Window, alternate, final_bodies
@@ -142,7 +143,7 @@ class Estimator:
         X = triangulate(observations, views, config.observations)
         sigmas = observation_sigmas(observations, X, views, config.observations, self.joints)
         evidence = linearise(observations, sigmas, X, views, config.observations)
-        enough = (evidence.sigma_m <= config.refine.max_sigma_m).sum(axis=1) >= config.refine.min_joints
+        enough = (evidence.sigma_m <= config.refine.max_sigma_m).sum(axis=1) >= LEAST_JOINTS
         whole = self.fitter.fit_whole if isinstance(self.fitter, WholeFitter) else self.fitter.fit
         fitted = joint_targets(evidence, enough)
         body = whole(fitted)

@@ -6,7 +6,7 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Interval
 
-from shapepose_fg.bounds import Count, Metres, MetresOrNone, Repeats, Settings
+from shapepose_fg.bounds import Metres, MetresOrNone, Repeats, Settings
 from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.estimation.motion_model import MotionConfig
 from shapepose_fg.estimation.window_graph import WindowGraphConfig
@@ -31,8 +31,6 @@ class RefineConfig(Settings):
     its gates are decided anew from the body's place, and the body is fitted again without what was thrown away. 4
     threw away more joints that were right than wrong ones, in simulated crowds whose detections had been given out
     again. 0: nothing is thrown away, as in the paper."""
-    min_joints: Count = 4
-    """Fewer joints than this determined by the views are not a person that can be placed in space."""
     draft_reach_m: MetresOrNone = 0.05
     """Where detections are given out again, a body is fitted to the views' detections around it, fit by fit, under
     a kernel that narrows to this, as in SMPLify: the distance from the projection, as a length at the joint's

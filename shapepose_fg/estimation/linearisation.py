@@ -14,6 +14,8 @@ from shapepose_fg.bounds import Factor, Metres, MetresOrNone, Pixels, Settings, 
 from shapepose_fg.camera import Views
 from shapepose_fg.observations import Observations
 
+MIN_DEPTH_M = 0.2
+"""An observation counts only if the joint is at least this far in front of the camera."""
 _DEPTH_M = 8.0
 """Of joints before the cameras of the `tune` sequences, in the median (7 to 10 m): where lengths become pixels in
 the paper's setting."""
@@ -38,8 +40,6 @@ class ObservationConfig(Settings):
     rho_2d_m: Factor = 0.15
     """rho_2D of Eq. 2, as a length at the joint's depth: an observation farther from the projected joint is
     discarded. Half the distance between a person's own shoulders or hips."""
-    min_depth_m: Metres = 0.2
-    """An observation counts only if the joint is at least this far in front of the camera."""
     fixed_depth_m: MetresOrNone = 0.0
     """Positive: `sigma_m` and `rho_2d_m` are lengths at this depth, wherever the joint is, so that d_2D is in
     pixels, as in the paper. 0: at the joint's own depth."""
@@ -161,9 +161,9 @@ def observation_sigmas(
     takes the mean depth of the person's known ones.
     """
     _, depth, _ = views.project(points)
-    usable = depth >= config.min_depth_m
+    usable = depth >= MIN_DEPTH_M
     mean = np.where(usable, depth, 0.0).sum(axis=1) / np.maximum(usable.sum(axis=1), 1)
-    depth = np.where(usable, depth, np.maximum(mean, config.min_depth_m)[:, None, :])
+    depth = np.where(usable, depth, np.maximum(mean, MIN_DEPTH_M)[:, None, :])
     seen = observations.seen
     sigmas = np.zeros(observations.confidence.shape)
     focal = _per_joint(views.focal_px, sigmas.shape)
@@ -193,7 +193,7 @@ def linearise(
     joint's depth. `inlier` is then every observation before its camera.
     """
     projected, depth, jacobian = views.project(points)
-    usable = observations.seen & in_front(depth, config.min_depth_m)
+    usable = observations.seen & in_front(depth, MIN_DEPTH_M)
     residual = np.where(usable[..., None], projected - observations.xy, np.nan)
     distance = np.linalg.norm(residual, axis=-1)
     px_per_m = _per_joint(views.focal_px, depth.shape) / config.depth(np.where(usable, depth, 1.0))
@@ -255,8 +255,8 @@ def triangulate(
         camera = np.einsum("...ij,...j->...i", here.cTw[..., :3], points[:, None]) + here.cTw[..., 3]
         error_m = np.linalg.norm(camera[..., :2] - normalised * camera[..., 2:], axis=-1)
         weight = seen * observations.confidence[row, joint] / (1.0 + (error_m / (2.0 * config.sigma_m)) ** 2)
-        weight /= np.maximum(camera[..., 2], config.min_depth_m) ** 2
-    agrees = (seen & (error_m < config.rho_2d_m) & (camera[..., 2] > config.min_depth_m)).sum(axis=1) >= 2
+        weight /= np.maximum(camera[..., 2], MIN_DEPTH_M) ** 2
+    agrees = (seen & (error_m < config.rho_2d_m) & (camera[..., 2] > MIN_DEPTH_M)).sum(axis=1) >= 2
     complete = observations.initial.copy()
     complete[row[agrees], joint[agrees]] = points[agrees]
     return complete

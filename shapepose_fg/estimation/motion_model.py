@@ -7,11 +7,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.bounds import Factor, Metres, Seconds, Settings
+from shapepose_fg.bounds import Factor, Seconds, Settings
 from shapepose_fg.errors import InputError
 from shapepose_fg.files import read_json
 
 FORMAT = "shapepose-fg motion model 1"
+LOST_M = 0.1
+"""A joint whose views leave it less certain than this in some direction, metres, is lost from sight."""
 
 
 @dataclass(frozen=True)
@@ -23,11 +25,9 @@ class MotionConfig(Settings):
     psd_scale: Factor = 1.0
     """Multiplies the power spectral densities of the joints' accelerations: more follows faster and smooths
     less."""
-    lost_m: Metres = 0.1
-    """A joint whose views leave it less certain than this in some direction is lost from sight: in these frames,
-    and in those around them, the difference between joint and body is followed (`factors.motion`)."""
     around_s: Seconds = 0.5
-    """How far around them, seconds."""
+    """In frames where a joint is lost from sight (`LOST_M`), and so far around them, seconds, the difference
+    between joint and body is followed (`factors.motion`)."""
     keep_limbs: bool = True
     """Whether joints that no view saw go to where a body can have them, and limbs with an open end get the body's
     length: motion carries each joint by itself."""

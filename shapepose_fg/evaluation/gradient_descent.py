@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter, PlainFitterConfig
+from shapepose_fg.body.fitting.baseline import ANNEAL_STEPS, LevenbergMarquardtFitter, PlainFitterConfig
 from shapepose_fg.body.fitting.energy import Held, WhitenedTargets
 from shapepose_fg.body.fitting.pose_prior import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel
@@ -65,7 +65,7 @@ class GradientDescentFitter(LevenbergMarquardtFitter):
         if held is not None:
             steps[:, :10] /= held.stiffness  # Adam would jump as far however stiff
         first, second = torch.zeros_like(free), torch.zeros_like(free)
-        annealing = torch.where(torch.from_numpy(warm), 0, config.anneal_steps)[:, None]
+        annealing = torch.where(torch.from_numpy(warm), 0, ANNEAL_STEPS)[:, None]
         for n in range(config.max_iterations):
             done = n / config.max_iterations
             widening = annealing * max(0.0, 1 - 5 * done)

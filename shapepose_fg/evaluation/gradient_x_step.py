@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import make_camera
+from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus
 from shapepose_fg.camera import Rig, Views
 from shapepose_fg.estimation.body_step import BodyStep
@@ -142,7 +143,7 @@ def alternate_with(
     X, step = observations.initial, BodyStep(fitter, None, config)
     last = BodyFit.failed(np.full(len(X), FitStatus.TOO_FEW_JOINTS), X.shape[1])
     body_s, step_s, energy = 0.0, 0.0, None
-    enough = np.isfinite(X).all(axis=-1).sum(axis=1) >= config.refine.min_joints
+    enough = np.isfinite(X).all(axis=-1).sum(axis=1) >= LEAST_JOINTS
     for _ in range(rounds):
         began = time.process_time()
         evidence = linearise(observations, sigmas, X, views, config.observations)

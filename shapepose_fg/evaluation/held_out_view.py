@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from factors import project_with_jacobian, sigma_px
 from shapepose_fg.camera import Camera, Rig
 from shapepose_fg.detections import Detections, DetectionSequence
-from shapepose_fg.estimation.linearisation import ObservationConfig
+from shapepose_fg.estimation.linearisation import MIN_DEPTH_M, ObservationConfig
 from shapepose_fg.evaluation.matching import match_people
 from shapepose_fg.reconstruction import Reconstruction
 from shapepose_fg.skeleton import Skeleton
@@ -135,7 +135,7 @@ def squared_distances(
     """
     count = len(points)
     projected, depth, J = project_with_jacobian(points, camera.K, camera.cTw)
-    ahead = depth >= config.min_depth_m
+    ahead = depth >= MIN_DEPTH_M
     sigma = np.full(count, np.nan)
     sigma[ahead] = sigma_px(
         config.weight(confidence[ahead]) / scatter[ahead] ** 2,

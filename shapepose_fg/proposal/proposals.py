@@ -18,6 +18,8 @@ from shapepose_fg.proposal.candidates import Candidates
 from shapepose_fg.proposal.growth import GrowthConfig, Links, grow, link
 from shapepose_fg.skeleton import Skeleton
 
+_HIP_WIDTH_M = 0.4
+"""Two hips of one person are not farther apart: their middle is a root where no two views saw one."""
 _OWN_DETECTIONS = 2
 """What a candidate needs of its own to be looked at after the first people were found: others made these."""
 
@@ -40,8 +42,6 @@ class ProposalConfig(Settings):
     separation_m: Metres = 0.2
     """Non-maximum suppression: of two anchors closer than this the better one stays. A pelvis is about 20 cm
     deep and 30 cm wide: the middles of two are not closer even when people hug."""
-    hip_width_m: Metres = 0.4
-    """Two hips of one person are not farther apart: their middle is a root where no two views saw one."""
     split_m: MetresOrNone = 0.4
     """Two anchors nearer than this, with hardly a joint that both have, are one person's trunk and legs. 0: none
     are, as in the paper."""
@@ -235,7 +235,7 @@ class _Search:
         first, second = (np.flatnonzero(free & (candidates.joint == hip)) for hip in (right, left))
         first, second = (index.ravel() for index in np.meshgrid(first, second, indexing="ij"))
         width = np.linalg.norm(candidates.xyz[first] - candidates.xyz[second], axis=1)
-        fits = (width < self.config.hip_width_m) & (candidates.strong[first] | candidates.strong[second])
+        fits = (width < _HIP_WIDTH_M) & (candidates.strong[first] | candidates.strong[second])
         first, second = first[fits], second[fits]
         best = np.argsort(-(candidates.score[first] + candidates.score[second]), kind="stable")
         best = np.sort(best[: 4 * self.config.most_people])

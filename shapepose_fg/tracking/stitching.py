@@ -27,6 +27,9 @@ _BUILD = 2.0
 """Mean squared difference of bone lengths, in their standard deviations, up to which two builds are one. For
 one person it is 1 in the mean; lengths of adults differ by 2 to 3 cm, which gives 3 to 5."""
 
+_WALK_MPS = 1.5
+"""How much farther somebody may be for each second: people walk at 1.4 m/s."""
+
 
 @dataclass(frozen=True)
 class StitchingConfig(Settings):
@@ -35,9 +38,7 @@ class StitchingConfig(Settings):
     longest_gap_s: Annotated[float, Interval(ge=0, le=86400)] = 10.0
     """Nobody is recognised after a longer time. 0: tracks are never joined."""
     reach_m: Annotated[float, Interval(ge=0, le=10)] = 0.5
-    """How far from where a track ended the next may begin, at once."""
-    walk_mps: Annotated[float, Interval(ge=0, le=100)] = 1.5
-    """And how much farther per second: people walk at 1.4 m/s."""
+    """How far from where a track ended the next may begin, at once; 1.5 m farther for each second that passed."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +137,7 @@ def _pairs(
     after = order[np.arange(len(before)) + np.repeat(first - np.cumsum(count) + count, count)]
     gap_s = begin_s[after] - end_s[before]
     apart_m = np.linalg.norm(ends.place[after, 0] - ends.place[before, 1], axis=-1)
-    reach_m = config.reach_m + config.walk_mps * gap_s
+    reach_m = config.reach_m + _WALK_MPS * gap_s
     may = (gap_s <= config.longest_gap_s) & (apart_m <= reach_m)
     for cut in cuts_s:
         may &= ~((end_s[before] < cut) & (begin_s[after] >= cut))

@@ -22,13 +22,15 @@ from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.rotation import log_so3
 from shapepose_fg.body.model.target_skeletons import slots
-from shapepose_fg.bounds import Factor, Repeats, RepeatsOrNone, Settings
+from shapepose_fg.bounds import Factor, Settings
 
 Array = NDArray[np.float64]
 
 _SPREAD = {"RWrist": 2.0, "LWrist": 2.0}
 """Multiplies the variance of joints without their own target. Elbows bend farther from their mean than a Gaussian
 says: without it, 85 % of the wrists of the validation subjects (training.split) lay in their 90 % ellipsoids."""
+ANNEAL_STEPS = 2
+"""From a cold start the kernel begins 2^ANNEAL_STEPS times as wide, and is halved every iteration."""
 _DAMPING_START, _DAMPING_MIN, _DAMPING_MAX = 1e-3, 1e-7, 1e7
 
 
@@ -42,16 +44,12 @@ class PlainFitterConfig(Settings):
     """How bodies are fitted over time."""
     kernel_scale: Factor = 6.0
     """Mahalanobis distance at which the Geman-McClure kernel has cut a joint's weight to a quarter."""
-    anneal_steps: RepeatsOrNone = 2
-    """From a cold start the kernel begins 2^anneal_steps times as wide, and is halved every iteration."""
     max_iterations: Annotated[int, Interval(ge=1, le=1000)] = 40
     """Levenberg-Marquardt steps, refused ones included."""
     tolerance: Factor = 1e-2
     """A row is done when a step lowers its energy (in squared standard deviations) by less."""
     unfinished: Factor = 9.0
     """Rows whose energy a Newton step would still lower by more (3 sigma of the posterior) are NOT_CONVERGED."""
-    left_out_sets: Repeats = 6
-    """Passes without some of the targets, each joint in one: more cost more, and leave fewer out at a time."""
 
 
 class LevenbergMarquardtFitter:
@@ -76,7 +74,7 @@ class LevenbergMarquardtFitter:
         self._slots = slots(model.keypoint_names)
         self._energy = BodyEnergy(model.to(torch.float32), prior)
         self._mean_angles = prior.mean[self._energy.angles]
-        sets = left_out_sets(self._energy, prior, self.config.left_out_sets)
+        sets = left_out_sets(self._energy, prior)
         spread = np.array([_SPREAD.get(name, 1.0) for name in model.keypoint_names])
         self._rows = RowFitter(self._energy, self, sets, self.config.evidence, self.config.unfinished, spread)
 
@@ -153,7 +151,7 @@ class LevenbergMarquardtFitter:
         """Minimise from `free` (B, P); rows leave the batch as they finish. Returns (B, P)."""
         config, energy = self.config, self._energy
         result, rows = free.clone(), torch.arange(len(free))
-        widening = torch.where(torch.from_numpy(warm), 0, config.anneal_steps)[:, None]
+        widening = torch.where(torch.from_numpy(warm), 0, ANNEAL_STEPS)[:, None]
         damping = torch.full((len(free),), _DAMPING_START)
         here = energy.linearise(free, targets, config.kernel_scale * 2.0**widening, held)
         for _ in range(config.max_iterations):

@@ -1,10 +1,8 @@
 """Which joint targets can be believed, and how much: what every fitter does before it fits."""
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
-from annotated_types import Interval
 from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitter import STATUS_TYPE, FitStatus, JointTargets
@@ -14,6 +12,10 @@ Array = NDArray[np.float64]
 
 _ROUNDING = 1e-4
 """Asymmetry or negativity of information, relative, that passes for rounding: inverses of rays lose much."""
+LEAST_JOINTS = 4
+"""Joints with full information that a fit needs: three place a body in space, one more says whether they agree."""
+_SEEN_SIGMA_M = 0.3
+"""A joint's information is full when its target's sigma is under this along every axis, metres."""
 
 
 @dataclass(frozen=True)
@@ -22,12 +24,9 @@ class EvidenceConfig(Settings):
 
     model_sigma_m: Metres = 0.02
     """How far the detector's joints lie from the body's, metres: added to every target's covariance."""
-    min_joints: Annotated[int, Interval(ge=3, le=1000)] = 4
-    """Joints with full information that a fit needs."""
-    seen_sigma_m: Metres = 0.3
-    """A joint counts as fully seen when its target's sigma is under this along every axis, metres."""
     min_spread_m: Metres = 0.03
-    """Those joints must lie this far off a common line (root mean square), metres, or the body could spin."""
+    """Joints with full information must lie this far off a common line (root mean square), metres: the body could
+    spin about it."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,7 @@ def weigh(targets: JointTargets, config: EvidenceConfig) -> Evidence:
     asymmetry = np.abs(information - information.swapaxes(-1, -2)).max(axis=(-1, -2))
     valid &= ((values[..., 0] > -tolerance) & (asymmetry <= tolerance)).all(axis=1)
     values = np.maximum(values, 0.0)
-    full = values[..., 0] > 1 / config.seen_sigma_m**2
+    full = values[..., 0] > 1 / _SEEN_SIGMA_M**2
     count = full.sum(axis=1)
     centre = np.where(full[..., None], xyz, 0.0).sum(axis=1) / np.maximum(count, 1)[:, None]
     status = np.full(len(xyz), FitStatus.OK, dtype=STATUS_TYPE)
@@ -83,7 +82,7 @@ def determine_pose(xyz: Array, used: NDArray[np.bool_], config: EvidenceConfig) 
     scatter = points.swapaxes(-1, -2) @ points / np.maximum(count, 1)[..., None, None]
     # How far they lie off their best line, squared, is what the largest eigenvalue leaves of the trace.
     off = np.maximum(np.linalg.eigvalsh(scatter)[..., :2].sum(axis=-1), 0.0)
-    return (count >= config.min_joints) & (off >= config.min_spread_m**2)
+    return (count >= LEAST_JOINTS) & (off >= config.min_spread_m**2)
 
 
 def _refuse_nonsense(targets: JointTargets) -> tuple[Array, Array, NDArray[np.bool_]]:

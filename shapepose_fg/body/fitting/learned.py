@@ -2,11 +2,9 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import torch
-from annotated_types import Interval
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -14,7 +12,7 @@ from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter, PlainFi
 from shapepose_fg.body.fitting.body_sequence import SequenceConfig, SequenceFit, SequenceFitter, Shapes
 from shapepose_fg.body.fitting.descent import BodyState, DescentTargets, LearnedDescent
 from shapepose_fg.body.fitting.energy import BodyEnergy, Evaluated, Held, WhitenedTargets, robust_weight
-from shapepose_fg.body.fitting.evidence import EvidenceConfig
+from shapepose_fg.body.fitting.evidence import LEAST_JOINTS, EvidenceConfig
 from shapepose_fg.body.fitting.fit_rows import RowFitter
 from shapepose_fg.body.fitting.fitter import BodyFit, JointTargets
 from shapepose_fg.body.fitting.left_out import left_out_sets
@@ -26,9 +24,14 @@ from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.rotation import log_so3
 from shapepose_fg.body.model.skinned_points import SkinnedPoints
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, slots
-from shapepose_fg.bounds import Factor, Repeats, RepeatsOrNone, Settings
+from shapepose_fg.bounds import Factor, RepeatsOrNone, Settings
 
 Array = NDArray[np.float64]
+
+_STALE = 0.3
+"""Change of a joint's robust weight, in a step, from which on a row is linearised anew after it."""
+_WELL_SEEN_M = 0.05
+"""Sigma of a joint, metres, from which on the network is not shown it."""
 
 
 @dataclass(frozen=True)
@@ -44,12 +47,6 @@ class LearnedFitterConfig(Settings):
     polish_steps: RepeatsOrNone = 1
     """Gauss-Newton steps after the network's, held by the pose prior around where the network arrived. On
     validation subjects the first takes clean joints from 5.2 to 2.6 mm; a second changes nothing."""
-    stale: Annotated[float, Interval(ge=0, le=1000000.0)] = 0.3
-    """Change of a joint's robust weight, in a step, from which on a row is linearised anew after it."""
-    left_out_sets: Repeats = 6
-    """Passes without some of the targets, each joint in one: more cost more, and leave fewer out at a time."""
-    well_seen_m: Annotated[float, Interval(ge=0, le=10)] = 0.05
-    """Sigma of a joint, metres, from which on the network is not shown it."""
     unfinished: Factor = 30.0
     """Rows whose energy another step would still lower by more are left to the plain optimiser: some in a hundred
     whose joints contradict each other, such as those of two people."""
@@ -83,7 +80,7 @@ class LearnedFitter:
         plain = PlainFitterConfig(evidence=self.config.evidence, kernel_scale=self.config.kernel_scale)
         self._plain = LevenbergMarquardtFitter(model, prior, plain)
         self._slots = slots(model.keypoint_names)
-        sets = left_out_sets(self._energy, prior, self.config.left_out_sets)
+        sets = left_out_sets(self._energy, prior)
         spread = self.weights.spread[list(self._slots)].double().numpy()
         self._rows = RowFitter(
             self._energy, self, sets, self.config.evidence, self.config.unfinished, spread, fallback=self._plain
@@ -168,7 +165,7 @@ class LearnedFitter:
             better = slope.energy(scale) < body.here.energy(scale)  # a step into NaN is not
             body = body.moved(better, there, slope)
             change = (robust_weight(body.here.squared, scale) - before).abs().amax(1)
-            stale = torch.nonzero(change > self.config.stale)[:, 0]
+            stale = torch.nonzero(change > _STALE)[:, 0]
             if len(stale) > 0:
                 body.put(stale, self._energy.evaluate(body.free[stale], targets[stale], scale, held[stale]))
         return body
@@ -179,8 +176,8 @@ class LearnedFitter:
         rotation, origin = frame.place(targets.xyz, variance, self._slots)
         inside = (targets.xyz - origin[:, None]) @ rotation
         # What is hardly seen is left to the polish: the pull of a guess that had seen it would count it twice.
-        well_seen = variance < self.config.well_seen_m**2
-        well_seen |= (well_seen.sum(1) < self.config.evidence.min_joints)[:, None]
+        well_seen = variance < _WELL_SEEN_M**2
+        well_seen |= (well_seen.sum(1) < LEAST_JOINTS)[:, None]
         root = targets.root @ rotation[:, None] * well_seen[..., None, None]
         state = BodyState(
             torch.zeros(count, 10), frame.local.expand(count, 24, 3, 3), frame.transl.expand(count, 3)

@@ -13,6 +13,8 @@ from shapepose_fg.body.fitting.pose_prior import PosePrior
 
 Array = NDArray[np.float64]
 
+SETS = 6
+"""So many sets: more cost more passes, and leave fewer joints out at a time."""
 _POSES = 8
 """Poses of the prior at which the coupling of joints is linearised."""
 _ROOT_INFORMATION = 1e-2
@@ -107,7 +109,7 @@ def plan_passes(
     return Passes(row, without, group[row] * (S + 1) + of_set + 1, votes, source)
 
 
-def left_out_sets(energy: BodyEnergy, prior: PosePrior, count: int) -> NDArray[np.intp]:
+def left_out_sets(energy: BodyEnergy, prior: PosePrior, count: int = SETS) -> NDArray[np.intp]:
     """Which of `count` sets each joint (J,) is left out with: joints that tell little of each other.
 
     The cost of a pair is how much less certain each of the two is when the other is missing too (`_coupling`); the

@@ -13,11 +13,9 @@ alike, turning a limb) is not mistaken for an offset; the prior Q keeps that at 
 """
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 import torch
-from annotated_types import Interval
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -35,6 +33,11 @@ Array = NDArray[np.floating]
 
 _CHUNK = 128
 """Rows that are linearised at a time."""
+_POSE_WIDENING = 3.0
+"""The pose prior is this many times as wide while offsets are learnt: a prior is never quite right about how poses
+vary, and what it has wrong would look like an offset, the same in hundreds of rows."""
+_ROWS_PER_DRAW = 4.0
+"""How many rows say as much as one that is independent: a detector's error lasts, and people come back."""
 
 
 @dataclass(frozen=True)
@@ -45,12 +48,6 @@ class OffsetPrior(Settings):
     """How far joints lie from the body's, metres per axis: offsets are shrunk towards zero by this."""
     asymmetry_sigma_m: Metres = 0.003
     """How far left and right may differ from being mirror images, metres per axis."""
-    pose_widening: Annotated[float, Interval(ge=1, le=1000000.0)] = 3.0
-    """The pose prior is this many times as wide while offsets are learnt: a prior is never quite right about how
-    poses vary, and what it has wrong would look like an offset, the same in hundreds of rows."""
-    rows_per_draw: Annotated[float, Interval(ge=1, le=1000000.0)] = 4.0
-    """How many rows say as much as one that is independent: a detector's error lasts over frames, and people come
-    back."""
     rounds: Repeats = 1
     """How often bodies are fitted and offsets are solved. As bodies are eliminated and not held, the first
     solution is nearly the last: more rounds change what the body predicts by 0.2 mm."""
@@ -70,7 +67,7 @@ def learn_offsets(
     """
     pose_prior = PosePrior.default() if pose_prior is None else pose_prior
     prior = OffsetPrior() if prior is None else prior
-    wide = pose_prior.widened(prior.pose_widening)
+    wide = pose_prior.widened(_POSE_WIDENING)
     config = PlainFitterConfig() if config is None else config
     precision = np.linalg.inv(_prior_covariance(prior))
     model, fit = model.with_keypoint_offsets(_made(np.zeros(75), precision, np.zeros(25))), None
@@ -116,7 +113,7 @@ def _summed(energy: BodyEnergy, fit: BodyFit, evidence: Evidence, kernel_scale: 
 def _solve(sums: _Sums, offsets: KeypointOffsets, precision: Array, prior: OffsetPrior) -> KeypointOffsets:
     """One Newton step in offsets and mean; the mean starts from zero, which is where the bodies were fitted."""
     current = offsets.xyz_m.ravel()
-    hessian, gradient = sums.hessian / prior.rows_per_draw, sums.gradient / prior.rows_per_draw
+    hessian, gradient = sums.hessian / _ROWS_PER_DRAW, sums.gradient / _ROWS_PER_DRAW
     hessian[:75, :75] += precision
     gradient[:75] += precision @ current
     # The root's place and turn have no prior, and no say in the sums either: any small number holds them at zero.
