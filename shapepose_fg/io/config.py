@@ -34,6 +34,8 @@ def read_config(path: str | Path, kind: type[T]) -> T:
 
 
 _CURE = "`shapepose-fg config` shows the defaults"
+ANOTHER_VERSION = "another version of this program wrote it; reconstruct the recording again"
+"""The cure for settings that nobody wrote by hand."""
 
 
 def config_from(
@@ -60,7 +62,8 @@ def _build(kind: type[T], table: dict[str, Any], path: Path, prefix: str = "", c
     for key, value in table.items():
         if key not in known:
             near = get_close_matches(key, known, n=1, cutoff=0)[0]
-            raise InputError(f"{path}: {prefix}{key} is not a known key; did you mean {prefix}{near}?")
+            meant = cure if cure == ANOTHER_VERSION else f"did you mean {prefix}{near}?"
+            raise InputError(f"{path}: {prefix}{key} is not a known key; {meant}")
         values[key] = _value(hints[key], value, path, f"{prefix}{key}", cure)
     try:
         return kind(**values)

@@ -8,7 +8,7 @@ from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.camera import Rig
 from shapepose_fg.errors import InputError
 from shapepose_fg.io.calibration import read_rig
-from shapepose_fg.io.config import config_from
+from shapepose_fg.io.config import ANOTHER_VERSION, config_from
 from shapepose_fg.reconstruction import Reconstruction
 
 CAMERAS = "cameras.json"
@@ -46,7 +46,7 @@ def read_setup(folder: Path, people: Reconstruction, kind: type[Settings]) -> So
     configuration: Any = people.run.get("configuration")
     if not isinstance(configuration, dict):
         raise InputError(f"{run_file}: configuration is missing; reconstruct the recording again")
-    settings = config_from(configuration, kind, run_file)
+    settings = config_from(configuration, kind, run_file, cure=ANOTHER_VERSION)
     learnt = people.run.get("keypoint_offsets") is not None
     body = people.run.get("body")
     return SolvedSetup(

@@ -69,5 +69,6 @@ def tag(axes: Any, text: str) -> None:
         color=INK,
         fontsize=9.5,
         fontweight="bold",
+        zorder=6,
         bbox={"boxstyle": "round,pad=0.35", "facecolor": "white", "edgecolor": "none", "alpha": 0.85},
     )

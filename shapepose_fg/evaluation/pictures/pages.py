@@ -106,7 +106,8 @@ def draw_methods(file: Path, parts: Sequence[Beside], around_m: float = 1.0) -> 
     names = list(parts[0].people)
     page = _Page(columns=len(names), rows=len(parts))
     page.head(
-        "The closest contact of each sequence, by each method", "the same detections for all; grey: the truth"
+        "The closest contact of each sequence, by each method",
+        "the same detections for all; of the 50 joints of the two; grey: the truth",
     )
     page.legend({MISSING: "missing joint", WRONG: "joint more than 0.2 m off"})
     for line, part in enumerate(parts):
@@ -123,7 +124,7 @@ def draw_methods(file: Path, parts: Sequence[Beside], around_m: float = 1.0) -> 
             circles = [each for joints, true in zip(found, truth[pair], strict=True)
                        for each in _circles(joints, true, limbs=False)]  # fmt: skip
             wrong = sum(each.colour == WRONG for each in circles)
-            page.label(line, column, f"{name}: {len(circles) - wrong} missing, {wrong} wrong of {len(focus)}")
+            page.label(line, column, f"{name}: {len(circles) - wrong} missing, {wrong} wrong")
             axes = page.panel(line, column)
             colours = [_UNLIKE_RINGS[number % len(_UNLIKE_RINGS)] for number in range(int(near.sum()))]
             draw_close_up(
