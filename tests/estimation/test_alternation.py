@@ -305,6 +305,20 @@ def test_factors_of_one_s_own_stay_through_all_rounds(five_cameras, two_people):
     np.testing.assert_allclose(found, length, atol=3e-4)
 
 
+def test_bodies_follow_what_factors_of_one_s_own_did_to_joints(five_cameras, two_people):
+    """Both people's, with what is known of each joint in the end."""
+
+    def forearm(window: WindowGraph, keys):
+        ends = keys[0, [ELBOW, WRIST]].tolist()
+        return [gtsam.RangeFactor3(*ends, 0.3, gtsam.noiseModel.Isotropic.Sigma(1, 1e-4))]
+
+    fitter = FakeFitter(two_people)
+    result = run(observed(five_cameras, two_people), five_cameras, fitter, extra_factors=forearm)
+    last = fitter.targets[-1]
+    np.testing.assert_allclose(last.xyz, result.joints, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.inv(last.information), result.covariance, rtol=1e-6, atol=1e-12)
+
+
 def test_a_factor_on_a_joint_that_is_not_known_harms_nobody(five_cameras, two_people):
     def forearm(window: WindowGraph, keys):
         ends = keys[0, [ELBOW, WRIST]].tolist()

@@ -16,7 +16,7 @@ from shapepose_fg.estimation.estimator import Estimates, Estimator, window_rows
 from shapepose_fg.estimation.estimator_config import EstimatorConfig, RefineConfig
 from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
 from shapepose_fg.estimation.state_covariances import Chains, state_covariances
-from shapepose_fg.estimation.window_graph import WindowGraph, near_in_time
+from shapepose_fg.estimation.window_graph import WindowGraph, near_in_time, symmetric_roots
 from shapepose_fg.observations import Observations
 from shapepose_fg.reconstruction import Known, Status
 from shapepose_fg.skeleton import BODY_25
@@ -383,6 +383,34 @@ def test_impossible_errors_in_a_motion_model_are_refused(tmp_path, source, key, 
     (tmp_path / "motion.json").write_text(json.dumps(data), encoding="utf-8")
     with pytest.raises(InputError, match=r"motion\.json: .*(white_share must be between|not a motion model|JSON)"):
         MotionModel.load(("RWrist",), MotionConfig(model=str(tmp_path / "motion.json")))
+
+
+@pytest.mark.parametrize(
+    ("densities", "possible"),
+    [([0.5, 0.0, 0.0], True), ([0.0, 1.0, 1.0], False), ([0.5, -0.5, 1.0], False), ([0.5, 1.0, -0.5], False),
+     ([0.5, np.inf, 1.0], False)],
+)  # fmt: skip
+def test_densities_that_are_none_are_refused(tmp_path, densities, possible):
+    data = json.loads((files("shapepose_fg.estimation") / "data" / "motion.json").read_text(encoding="utf-8"))
+    data["joints"]["RWrist"] = densities
+    (tmp_path / "motion.json").write_text(json.dumps(data), encoding="utf-8")
+    config = MotionConfig(model=str(tmp_path / "motion.json"))
+    if possible:
+        assert MotionModel.load(("RWrist",), config).psd_still[0] == 0.5
+    else:
+        with pytest.raises(InputError, match=r"motion\.json: (densities must be positive|.*JSON)"):
+            MotionModel.load(("RWrist",), config)
+
+
+def test_symmetric_roots_multiply_to_what_they_are_of():
+    """A ray says nothing along itself: that direction stays nothing."""
+    rng = np.random.default_rng(0)
+    half = rng.normal(size=(20, 3, 3)) * rng.uniform(0, 30, (20, 3))[:, None]
+    half[:5, :, 2] = 0.0  # rank 2
+    information = half @ half.swapaxes(1, 2)
+    roots = symmetric_roots(information)
+    np.testing.assert_allclose(roots, roots.swapaxes(1, 2), atol=1e-9)
+    np.testing.assert_allclose(roots @ roots, information, atol=1e-9 * np.abs(information).max())
 
 
 def nothing(window, keys):

@@ -137,6 +137,8 @@ def test_what_is_missing_is_named_with_the_cure(project):
     [
         ({"rate": "'fast'"}, "frame_rate must be frames a second or 'auto', got 'fast'"),
         ({"rate": "true"}, "frame_rate must be"),
+        ({"rate": "100000.5"}, "frame_rate must be"),
+        ({"rate": "0.009"}, "frame_rate must be"),
         ({"frames": "[9, 3]"}, "frame_range must be 'auto', 'all', or two frame numbers"),
         ({"multi": "'yes'"}, "multi_person must be true or false"),
         ({"multi": "="}, "this is not TOML"),

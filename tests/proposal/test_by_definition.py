@@ -244,6 +244,21 @@ def test_only_what_hangs_on_the_person_is_grown():
     assert np.flatnonzero(chosen[0] >= 0).tolist() == [hip]
 
 
+@pytest.mark.parametrize(("height_m", "taken"), [(0.6, True), (0.2, False)])
+def test_a_bridge_begins_at_the_nearest_joint_that_is_known_the_first_candidate_too(height_m, taken):
+    """From the neck, the first of all candidates, an elbow is two bones of 0.55 m away; from the hip it would be
+    three.
+    """
+    neck, hip, elbow = (BODY_25.index(name) for name in ("Neck", "MidHip", "RElbow"))
+    places = np.array([[0.0, 0.0, 1.5], [0.0, 0.0, 1.0], [0.0, 0.0, height_m]])
+    none = np.zeros((0, 2), dtype=np.intp)
+    three = Candidates(
+        places, np.array([neck, hip, elbow]), np.ones(3), np.full(3, 9), np.ones(3, dtype=bool), none
+    )
+    chosen = grow(np.array([1]), three, Links(np.array([[1, 0]]), np.array([3.0])), BODY_25, GrowthConfig())
+    assert chosen[0, [neck, hip]].tolist() == [0, 1] and (chosen[0, elbow] == 2) == taken
+
+
 def test_the_settings_of_growth_make_a_difference_here(candidates, links):
     """Or the test above would say little: views, sweeps and bridges each change somebody's joints."""
     hips = np.flatnonzero((candidates.joint == BODY_25.root) & candidates.strong)

@@ -9,7 +9,14 @@ import pytest
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections, Recording
 from shapepose_fg.pipeline import PipelineConfig, find_people, reconstruct
-from shapepose_fg.proposal.candidates import CandidateConfig, PairPoints, _greedy_seeds, triangulate_pairs, vote
+from shapepose_fg.proposal.candidates import (
+    CandidateConfig,
+    Candidates,
+    PairPoints,
+    _greedy_seeds,
+    triangulate_pairs,
+    vote,
+)
 from shapepose_fg.proposal.thinning import ThinnedFrames, kept_detections, thinned_candidates, thinned_points
 from shapepose_fg.simulation.scene import ring_of_cameras
 from shapepose_fg.skeleton import BODY_25
@@ -58,6 +65,25 @@ def test_the_most_confident_detections_stay(rig):
     named = frames.in_recording(0, np.array([0, 5, -1]))
     np.testing.assert_array_equal(detections.xy[named[:2]], frames[0].xy[[0, 5]])
     assert named[2] == -1 and frames.is_thinned(0)
+
+
+def test_of_candidates_with_too_many_links_half_stay(rig):
+    """250 candidates for each joint, all made of the same two detections: 3 million links, where 2 are allowed."""
+    view, joint = (index.ravel() for index in np.indices((2, 25)))
+    first, second = np.array(BODY_25.limbs).T
+    pairs = np.concatenate([np.column_stack([25 * v + first, 25 * v + second]) for v in range(2)])
+    detections = Detections(view, joint, np.zeros((50, 2)), np.full(50, 0.8), pairs, np.full(len(pairs), 0.9))
+    of_joint = np.arange(25).repeat(250)
+    support = np.concatenate([np.column_stack([np.arange(len(of_joint)), 25 * v + of_joint]) for v in range(2)])
+    rng = np.random.default_rng(0)
+    every = Candidates(
+        rng.normal(size=(len(of_joint), 3)), of_joint, rng.uniform(size=len(of_joint)),
+        np.full(len(of_joint), 3), np.ones(len(of_joint), dtype=bool), support,
+    )  # fmt: skip
+    kept = thinned_candidates(every, detections, CandidateConfig(most_candidates=250))
+    assert np.bincount(kept.joint).tolist() == [125] * 25
+    few = thinned_candidates(every, detections, CandidateConfig(most_candidates=200))
+    assert np.bincount(few.joint).tolist() == [100] * 25
 
 
 def test_strong_candidates_and_those_with_most_votes_stay(rig):

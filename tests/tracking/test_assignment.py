@@ -97,6 +97,21 @@ def test_detections_are_given_out_again_and_doubles_go(five_cameras, two_people,
     assert share == 1.0 and total == 250
 
 
+def test_the_first_detection_of_a_frame_counts_as_any_other(five_cameras, two_people, seen_exactly):
+    """Somebody of whom two views see six core joints and nothing else, the first detection among them."""
+    every = seen_exactly(five_cameras, two_people[:1])
+    chosen = np.isin(every.joint, list(BODY_25.core)[:6]) & (every.view < 2)
+    detections = every.only(chosen)
+    assert len(detections) == 12
+    given = [Input(0, np.zeros(5), detections, five_cameras)]
+    rows = Observations.of(np.full((1, 25, 5), -1), detections, two_people[:1])
+    covariance = np.broadcast_to(0.02**2 * np.eye(3), (1, 25, 3, 3))
+    for least, people in ((6, 1), (7, 0)):
+        survival = Survival(min_seen_twice=least, min_share=0.0)
+        asked = given, rows, two_people[:1], covariance, BODY_25, AssignmentConfig(), survival
+        assert len(reassociate(*asked)) == people
+
+
 def test_a_track_that_has_next_to_nothing_of_its_own_for_a_window_is_nobody(
     five_cameras, two_people, seen_exactly
 ):
