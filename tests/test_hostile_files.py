@@ -315,7 +315,7 @@ def test_openpose_with_a_key_twice(tmp_path):
     assert 'key "people" occurs twice' in refused(read)
 
 
-@pytest.mark.parametrize("score", ["0", "1e-200"])
+@pytest.mark.parametrize("score", ["0", "1e-200", "9e-7"])
 def test_scores_of_nothing_are_nothing(tmp_path, score):
     import test_people_formats as people
 

@@ -203,3 +203,12 @@ def test_stage_one_s_settings_of_the_paper():
     assert c.gate_m >= 10 and c.min_angle_deg < 0.01 and c.min_view_fraction < 0.01
     assert (p.min_parts, p.separation_m, p.min_own_views, p.min_grown_parts) == (0.9, 0.6, 0, 0.0)
     assert (p.split_m, p.weak_anchors, p.growth.bridge_m) == (0.0, False, 0.0)
+
+
+def test_stage_two_s_settings_of_the_paper():
+    """Section 3.2: N = 10, rho_3D 0.25; X_0 as stage I has it, the body fitted to X, nothing left out of it."""
+    r, w, o = PAPER.refine, PAPER.window_graph, PAPER.observations
+    assert (r.alternations, w.rho_3d, o.confidence_power, o.kernel) == (10, 0.25, 1.0, "none")
+    assert (r.complete_start, r.body_from_views, r.leave_one_out) == (False, False, False)
+    assert (r.settled_m, r.disagreement, r.draft_reach_m) == (0.0, 0.0, 0.0)
+    assert not PAPER.temporal and PAPER.offsets.source == "none"

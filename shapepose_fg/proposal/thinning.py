@@ -61,7 +61,7 @@ def kept_detections(detections: Detections, views: int, config: CandidateConfig)
     """
     joints = int(detections.joint.max(initial=0)) + 1
     group = detections.view * joints + detections.joint
-    most = max(_LEAST_IN_A_VIEW, int(np.sqrt(2 * config.most_pairs / max(views * (views - 1), 1))))
+    most = max(_LEAST_IN_A_VIEW, int(np.sqrt(2 * config.most_pairs / (views * (views - 1)))))
     if np.bincount(group, minlength=1).max() <= most:
         return None
     return _best(group, most, (-detections.confidence,))

@@ -108,8 +108,11 @@ def test_keypoints_of_smpls_own_mesh(save, make_smpl_arrays):
     keypoints = dict(zip(BODY_25.joints, model.keypoints(BodyParameters.zeros(1))[0].numpy(), strict=True))
     joints = dict(zip(SMPL_24, model.joints(BodyParameters.zeros(1))[0].numpy(), strict=True))
     tolerance = {"atol": 1e-6}  # float32
-    np.testing.assert_allclose(keypoints["Nose"], arrays["v_template"][332], **tolerance)
-    np.testing.assert_allclose(keypoints["LHeel"], arrays["v_template"][3387], **tolerance)
+    # Vertices as the community's SMPL tools have them (smplx, `vertex_ids`).
+    vertices = {"Nose": 332, "REye": 6260, "LEye": 2800, "REar": 4071, "LEar": 583, "LBigToe": 3216}
+    vertices |= {"LSmallToe": 3226, "LHeel": 3387, "RBigToe": 6617, "RSmallToe": 6624, "RHeel": 6787}
+    for name, vertex in vertices.items():
+        np.testing.assert_allclose(keypoints[name], arrays["v_template"][vertex], **tolerance)
     np.testing.assert_allclose(keypoints["RKnee"], joints["right_knee"], **tolerance)
     hips = (joints["left_hip"] + joints["right_hip"]) / 2
     np.testing.assert_allclose(keypoints["MidHip"], hips, **tolerance)

@@ -200,8 +200,8 @@ def test_unseen_joints_go_towards_the_body_the_more_the_less_they_are_known():
 
 
 def test_smoothing_in_time_is_a_gaussian_mean():
-    values, times = np.array([[0.0], [1.0], [4.0]]), np.array([0.0, 0.1, 0.3])
-    weight = np.exp([0.0, -0.5, -4.5])  # 0, 1 and 3 widths off
+    values, times = np.array([[0.0], [1.0], [4.0]]), np.array([0.0, 0.07, 0.24])
+    weight = np.exp([0.0, -0.5 * 0.7**2, -0.5 * 2.4**2])  # 0, 0.7 and 2.4 widths off
     smooth = smoothed_in_time(values, times, 0.1)
     assert smooth[0, 0] == pytest.approx((weight[1] + 4 * weight[2]) / weight.sum())
 

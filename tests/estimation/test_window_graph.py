@@ -250,6 +250,20 @@ def test_the_weight_of_the_views_multiplies_their_cost_kernel_and_all(five_camer
     assert costs[1] == pytest.approx(4.0 * costs[0], rel=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("frames", "times_s"),
+    [([1, 0], [0.0, 0.1]), ([3, 3], [0.0, 0.1]), ([0], [0.0, 0.1]), ([0, 1], [0.0]), ([0, 1, 2], [0.0, 0.1, 0.2])],
+)
+def test_frames_that_do_not_rise_or_fit_are_refused(five_cameras, person, frames, times_s):
+    _, xy, sigmas = person
+    cameras = [[make_camera(camera.K, camera.wTc) for camera in five_cameras.cameras]] * 2
+    both = np.stack([xy, xy]), np.stack([sigmas, sigmas])
+    with pytest.raises(ValueError, match=r"frames and times_s must be \(2,\), frames rising"):
+        WindowGraph(
+            cameras, *both, EXACT, None, MOTION, track=0, frames=np.array(frames), times_s=np.array(times_s)
+        )
+
+
 def test_a_factor_added_late_counts(five_cameras, person):
     """What was asked of the graph before does not matter."""
     _, xy, sigmas = person

@@ -170,6 +170,27 @@ def test_a_wrist_out_of_sight_goes_where_the_body_can_have_it(walk, five_cameras
     np.testing.assert_array_equal(kept.covariance, carried.covariance)
 
 
+def test_a_joint_with_a_factor_of_one_s_own_stays_where_that_leaves_it(walk, five_cameras, two_people):
+    """The same wrist, out of sight, with a factor that says next to nothing: `keep_limbs` leaves it alone."""
+    observations, truth = walk
+    rows = np.flatnonzero((observations.track == 0) & (observations.frame >= 5))
+    seen = observations
+    for view in range(5):
+        seen = one_view_less(seen, rows, WRIST, view)
+
+    def hint(window, keys):
+        loose = gtsam.noiseModel.Isotropic.Sigma(3, 5.0)
+        return [gtsam.PriorFactorPoint3(int(key), truth[0, WRIST], loose) for key in keys[:, WRIST]]
+
+    fitter = PlacingFitter(two_people[0], np.array([0.0, 0.12, 0.0]))
+    kept, carried, plain = (
+        solve(seen, five_cameras, fitter, factors, keep_limbs=keep)
+        for factors, keep in ((hint, True), (hint, False), (None, True))
+    )
+    np.testing.assert_array_equal(kept.joints[:, WRIST], carried.joints[:, WRIST])
+    assert np.linalg.norm((plain.joints - kept.joints)[rows[-10:], WRIST], axis=-1).mean() > 0.03
+
+
 def test_motion_takes_noise_away_and_knows_the_velocity(walk, five_cameras, two_people):
     observations, truth = walk
     alone = solve(observations, five_cameras, BesideFitter(two_people[0]), temporal=False)
@@ -400,6 +421,13 @@ def test_densities_that_are_none_are_refused(tmp_path, densities, possible):
     else:
         with pytest.raises(InputError, match=r"motion\.json: (densities must be positive|.*JSON)"):
             MotionModel.load(("RWrist",), config)
+
+
+def test_another_format_is_refused_whatever_it_holds(tmp_path):
+    data = json.loads((files("shapepose_fg.estimation") / "data" / "motion.json").read_text(encoding="utf-8"))
+    (tmp_path / "motion.json").write_text(json.dumps(data | {"format": "shapepose-fg motion model 2"}))
+    with pytest.raises(InputError, match=r"motion\.json: is not a motion model"):
+        MotionModel.load(("RWrist",), MotionConfig(model=str(tmp_path / "motion.json")))
 
 
 def test_symmetric_roots_multiply_to_what_they_are_of():

@@ -112,6 +112,26 @@ def test_the_first_detection_of_a_frame_counts_as_any_other(five_cameras, two_pe
         assert len(reassociate(*asked)) == people
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("side", [-1, 1])
+def test_nothing_is_expected_where_a_person_is_outside_of_the_picture(
+    five_cameras, two_people, seen_exactly, axis, side
+):
+    """Three of five pictures end left, right, above or below of everybody; the other two see all joints."""
+    cameras = []
+    for number, camera in enumerate(five_cameras.cameras):
+        K = camera.K.copy()
+        K[axis, 2] += 0 if number < 2 else side * 10_000
+        cameras.append(replace(camera, K=K))
+    rig = replace(five_cameras, cameras=tuple(cameras))
+    every = seen_exactly(rig, two_people[:1])
+    detections = every.only(every.view < 2)
+    rows = Observations.of(np.full((1, 25, 5), -1), detections, two_people[:1])
+    covariance = np.broadcast_to(0.02**2 * np.eye(3), (1, 25, 3, 3))
+    asked = [Input(0, np.zeros(5), detections, rig)], rows, two_people[:1], covariance, BODY_25, AssignmentConfig()
+    assert len(reassociate(*asked, Survival(min_share=0.9))) == 1
+
+
 def test_a_track_that_has_next_to_nothing_of_its_own_for_a_window_is_nobody(
     five_cameras, two_people, seen_exactly
 ):

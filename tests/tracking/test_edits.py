@@ -166,6 +166,8 @@ def test_several_corrections_name_who_is_to_be_solved_in_the_end(people):
     assert names(edited.people) == {1, 3}
     assert edited.spans == {1: range(20), 3: range(3, 20)}
     assert replay(people, []).changed == frozenset()
+    twice = replay(people, [Edit(Action.MERGE, 5, 7), Edit(Action.SPLIT, 5, 8, 5)])
+    assert twice.changed == {5, 8}  # who changes again is still to be solved
 
 
 def test_only_who_changed_is_solved_anew(people):

@@ -1,5 +1,7 @@
 """Who is in a result: figures worked out by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -55,6 +57,14 @@ def test_figures_by_hand():
 def test_without_a_body_or_anybody():
     assert all(np.isnan(track.stature_m) for track in list_tracks(walkers()))
     assert list_tracks(Reconstruction.empty(), read_body()) == []
+
+
+def test_rows_without_any_joint_are_no_step():
+    people = walkers()
+    lost = people.joints.copy()
+    lost[(people.person == 9) & (people.frame % 7 == 3)] = np.nan
+    walked = list_tracks(replace(people, joints=lost))[1].walked_m
+    assert walked == pytest.approx(list_tracks(people)[1].walked_m, abs=0.1)
 
 
 def test_without_times_30_frames_a_second_are_assumed():
