@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from shapepose_fg.proposal.association import mean_affinity
+from shapepose_fg.proposal.association import mean_affinity, share_overlaps
 from shapepose_fg.proposal.candidates import CandidateConfig, Candidates, PairPoints, triangulate_pairs, vote
 from shapepose_fg.proposal.growth import GrowthConfig, Links, grow, link
 from shapepose_fg.proposal.proposals import ProposalConfig, _apart, _Search
@@ -265,6 +265,19 @@ def test_the_settings_of_growth_make_a_difference_here(candidates, links):
     plain = grow(hips, candidates, links, BODY_25, GrowthConfig())
     for other in (GrowthConfig(sweeps=0), GrowthConfig(view_weight=0.0), GrowthConfig(bridge_m=0.0)):
         assert (grow(hips, candidates, links, BODY_25, other) != plain).any(), other
+
+
+def test_an_overlap_serves_only_joints_that_have_nothing_of_their_own():
+    """Two noses in one view: who has the first of all detections keeps it, who has none gets the nearer one."""
+    nose, none = BODY_25.index("Nose"), np.zeros((0, 2), dtype=np.intp)
+    two = Detections(np.zeros(2, int), np.full(2, nose), np.zeros((2, 2)), np.ones(2), none, np.zeros(0))
+    chosen = np.full((2, 25, 1), -1, dtype=np.intp)
+    chosen[0, nose, 0] = 0
+    share_overlaps(chosen, np.ones((2, 2), dtype=bool), np.array([[3.0, 1.0], [2.0, 4.0]]), two)
+    assert chosen[:, nose, 0].tolist() == [0, 0]
+    chosen[1] = -1
+    share_overlaps(chosen, np.ones((2, 2), dtype=bool), np.array([[3.0, 1.0], [4.0, 2.0]]), two)
+    assert chosen[:, nose, 0].tolist() == [0, 1] and (np.delete(chosen, nose, axis=1) == -1).all()
 
 
 def test_mean_affinity_is_over_the_neighbours_that_the_person_owns_in_that_view(crowded):
