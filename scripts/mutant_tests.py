@@ -23,7 +23,8 @@ ROOT = Path(__file__).parents[1]
 _LIBRARIES = (
     "numpy scipy.optimize scipy.spatial torch gtsam cv2 pydantic yaml safetensors hypothesis pytest typer rich"
 )
-_MOST_S, _MOST_TESTS = 8.0, 100
+_TESTS_A_SECOND = 12.5
+"""So many tests are run at the most for each second that they may take: starting each takes its time."""
 
 
 class Tree:
@@ -204,8 +205,8 @@ class Reached:
         """Those that reach any line of a file."""
         return self._functions.get(path, set())
 
-    def in_order(self, tests: set[str], path: str) -> tuple[list[str], float]:
-        """Tests of the changed file's own folder, then the quickest others, up to some seconds; their time.
+    def in_order(self, tests: set[str], path: str, most_s: float) -> tuple[list[str], float]:
+        """Tests of the changed file's own folder, then the quickest others, up to `most_s` seconds; their time.
 
         Of a folder's tests those of one file stay together: they share fixtures.
         """
@@ -217,7 +218,7 @@ class Reached:
         chosen, total = [], 0.0
         for test in sorted(tests, key=rank):
             total += self.seconds.get(test, 0.0)
-            if len(chosen) > 0 and (total > _MOST_S or len(chosen) >= _MOST_TESTS):
+            if len(chosen) > 0 and (total > most_s or len(chosen) >= _TESTS_A_SECOND * most_s):
                 break
             chosen.append(test)
         files = list(dict.fromkeys(test.split("::")[0] for test in chosen))

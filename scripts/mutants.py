@@ -4,11 +4,11 @@ Changes are Cosmic Ray's (pip install -e ".[mutants]"): another operator or comp
 a condition the other way round, a loop that is not gone through, an exception that is not caught. A place of the
 code is drawn, each as likely, then one of its changes. Left out by rule: words for people, types, decorators,
 `strict=`, `==` for `is`, and changes that no float or mask could take. For every change the tests that reach its
-line are run, those of its own package and the quickest first, until one fails or 8 s are full. Noticed is what
-fails, or does not end.
+line are run, those of its own package and the quickest first, until one fails or `--seconds` are full. Noticed is
+what fails, or does not end.
 
 Results are kept in .mutants, and a run that is stopped goes on there. `--again` tries the survivors anew, with the
-tests of today. scripts/equivalent_mutants.txt lists survivors that no test can notice, with the reason.
+tests of today, and with more `--seconds` if need be. scripts/equivalent_mutants.txt lists survivors that no test can notice, with the reason.
 """
 
 import argparse
@@ -66,6 +66,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the sample")
     parser.add_argument("--minutes", type=float, default=1e9, help="stop after so long")
     parser.add_argument("--again", action="store_true", help="try the survivors anew")
+    parser.add_argument("--seconds", type=float, default=8.0, help="of tests for each change")
     parser.add_argument("--survivors", action="store_true", help="only print them, and the counts")
     parser.add_argument("--state", type=Path, default=ROOT / ".mutants", help="where results are kept")
     given = parser.parse_args()
@@ -77,7 +78,8 @@ def main() -> None:
         # A change of each package in turn: what is stopped has tried some of all.
         turns = [mutant for turn in zip(*_filled(list(drawn.values())), strict=True) for mutant in turn if mutant]
         by_path = {source.path: source for each in sources.values() for source in each}
-        campaign.run(turns, by_path, again=given.again, until=time.monotonic() + 60 * given.minutes)
+        until = time.monotonic() + 60 * given.minutes
+        campaign.run(turns, by_path, again=given.again, most_s=given.seconds, until=until)
     campaign.show(drawn)
 
 
@@ -115,8 +117,10 @@ class Campaign:
                 entry = json.loads(line)
                 self.results[entry["id"]] = entry["outcome"]
 
-    def run(self, mutants: list[Mutant], sources: dict[str, Source], *, again: bool, until: float) -> None:
-        """Try those that have no result yet; with `again` those that survived, too."""
+    def run(
+        self, mutants: list[Mutant], sources: dict[str, Source], *, again: bool, most_s: float, until: float
+    ) -> None:
+        """Try those that have no result yet, with `most_s` seconds of tests; with `again` survivors, too."""
         left = [each for each in mutants if self._open(each, again)]
         if len(left) == 0:
             return
@@ -130,7 +134,7 @@ class Campaign:
                 print(f"{len(left) - n} are left for another run")
                 return
             began = time.monotonic()
-            outcome, count = self._tried(mutant, sources[mutant.path], tree, reached, everything)
+            outcome, count = self._tried(mutant, sources[mutant.path], tree, reached, everything, most_s)
             self.results[mutant.identity] = outcome
             seconds = time.monotonic() - began
             with (self.folder / "results.jsonl").open("a") as stream:
@@ -146,7 +150,13 @@ class Campaign:
         return outcome is None or (again and outcome in ("survived", "not reached"))
 
     def _tried(
-        self, mutant: Mutant, source: Source, tree: Tree, reached: Reached, everything: dict[str, str]
+        self,
+        mutant: Mutant,
+        source: Source,
+        tree: Tree,
+        reached: Reached,
+        everything: dict[str, str],
+        most_s: float,
     ) -> tuple[str, int]:
         """What came of a change, and of how many tests."""
         lines, names, inside = source.statement(mutant.line)
@@ -155,11 +165,11 @@ class Campaign:
             tests = set().union(*(reached.users(name, everything) for name in names)) or reached.of_file(
                 mutant.path
             )
-        chosen, seconds = reached.in_order(tests, mutant.path)
+        chosen, seconds = reached.in_order(tests, mutant.path, most_s)
         changed = mutant.applied(source.code)
         if len(chosen) == 0 or changed is None:
             return "not reached", 0
-        code = tree.test_changed(mutant.path, changed, chosen, 8.0 + 1.5 * seconds, self.folder / "said")
+        code = tree.test_changed(mutant.path, changed, chosen, most_s + 1.5 * seconds, self.folder / "said")
         return ("too long" if code is None else "survived" if code == 0 else "noticed"), len(chosen)
 
     def show(self, drawn: dict[str, list[Mutant]]) -> None:
