@@ -8,7 +8,8 @@ line are run, those of its own package and the quickest first, until one fails o
 what fails, or does not end.
 
 Results are kept in .mutants, and a run that is stopped goes on there. `--again` tries the survivors anew, with the
-tests of today, and with more `--seconds` if need be. scripts/equivalent_mutants.txt lists survivors that no test can notice, with the reason.
+tests of today, and with more `--seconds` if need be. scripts/equivalent_mutants.txt lists survivors that no test
+can notice, with the reason.
 """
 
 import argparse
