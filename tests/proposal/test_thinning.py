@@ -67,6 +67,15 @@ def test_the_most_confident_detections_stay(rig):
     assert named[2] == -1 and frames.is_thinned(0)
 
 
+def test_the_most_confident_points_of_each_joint_stay(rig):
+    points = triangulate_pairs(crowd(rig, 20), rig, CandidateConfig())
+    kept = thinned_points(points, CandidateConfig(most_points=100))
+    for joint in (0, 8, 24):
+        before, after = (np.sort(each.score[each.joint == joint])[::-1] for each in (points, kept))
+        assert len(before) > 100
+        np.testing.assert_array_equal(after, before[:100])
+
+
 def test_of_candidates_with_too_many_links_half_stay(rig):
     """250 candidates for each joint, all made of the same two detections: 3 million links, where 2 are allowed."""
     view, joint = (index.ravel() for index in np.indices((2, 25)))
