@@ -57,7 +57,7 @@ def covered_frames(run: Mapping[str, Any]) -> list[range] | None:
 
 
 def check_run(run: Mapping[str, Any]) -> None:
-    """ValueError where an entry that is read again is not what it must be; other entries may be anything."""
+    """ValueError where an entry that is read again is not what it must be; others may be anything finite."""
     for key in ("configuration", "versions", "inputs", "seconds", "people", "time"):
         if not isinstance(run.get(key, {}), dict):
             raise ValueError(f'"{key}" must be an object, got {_short(run[key])}')
@@ -75,6 +75,21 @@ def check_run(run: Mapping[str, Any]) -> None:
         raise ValueError(
             f'"frames" must be [start, stop] of at most {_MOST_FRAMES} frames, got {_short(run["frames"])}'
         )
+    endless = _not_finite(run)
+    if endless is not None:  # such as 1e999, which could not be written again
+        raise ValueError(f'"{".".join(endless[:-1])[:80]}" must be a finite number, got {endless[-1]}')
+
+
+def _not_finite(value: object) -> list[str] | None:
+    """Keys and indices that lead to a number that is not finite, and the number; None where there is none."""
+    if isinstance(value, float):
+        return None if math.isfinite(value) else [str(value)]
+    items = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list) else ()
+    for key, child in items:
+        way = _not_finite(child)
+        if way is not None:
+            return [str(key), *way]
+    return None
 
 
 _MOST_FRAMES = 10_000_000

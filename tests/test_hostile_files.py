@@ -381,3 +381,13 @@ def test_a_path_that_the_terminal_cannot_write(tmp_path):
     command += ["--detections", tmp_path]
     done = subprocess.run(command, capture_output=True, timeout=60, check=False, env=environment)
     assert done.returncode == 2 and b"there is no such file" in done.stderr and b"Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("number", ["1e999", "-1e999", "NaN", "Infinity"])
+def test_numbers_in_run_json_that_could_not_be_written_again(tmp_path, number):
+    """`tracks merge` found out when it had solved everybody anew, in a traceback."""
+    READERS["result"](tmp_path, 0)
+    file = tmp_path / "run.json"
+    content = json.loads(file.read_text())
+    file.write_text(json.dumps(content | {"more": {"said": [1.0, "ENDLESS"]}}).replace('"ENDLESS"', number))
+    assert 'run.json: "more.said.1" must be a finite number, got' in refused(Reconstruction.open, tmp_path)
