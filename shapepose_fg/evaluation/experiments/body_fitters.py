@@ -22,7 +22,7 @@ from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.evaluation.bodies import TWIST_JUMP, statures, twists
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
 from shapepose_fg.evaluation.experiments.scale import Scale
-from shapepose_fg.evaluation.fitting import true_bodies
+from shapepose_fg.evaluation.fitting import SHAPE_LIMIT, true_bodies
 from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.simulation.mocap import Clip, Mocap
 from shapepose_fg.skeleton import BODY_25
@@ -170,7 +170,7 @@ def recorded_bodies(clips: list[Clip], model: BodyModel) -> tuple[BodyParameters
     upright = Rotation.from_rotvec([np.pi / 2, 0.0, 0.0])
     parts = []
     for clip in clips:
-        betas = np.tile(np.clip(rng.normal(size=(1, 10)), -2.5, 2.5), (len(clip), 1))
+        betas = np.tile(np.clip(rng.normal(size=(1, 10)), -SHAPE_LIMIT, SHAPE_LIMIT), (len(clip), 1))
         orient = (upright * Rotation.from_matrix(clip.rotations[:, 0])).as_rotvec()
         poses = Rotation.from_matrix(clip.rotations[:, 1:].reshape(-1, 3, 3)).as_rotvec().reshape(-1, 23, 3)
         rest = replace(BodyParameters.zeros(1, torch.float64), betas=torch.from_numpy(betas[:1]))
