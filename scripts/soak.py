@@ -19,6 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
+from shapepose_fg.camera import Rig
+from shapepose_fg.detections import DetectionSequence
 from shapepose_fg.evaluation.speed import BackAndForth
 from shapepose_fg.io.write_detections import write_association
 from shapepose_fg.runs.manifest import PARTS
@@ -38,9 +40,9 @@ class Sample:
     parts: int
     """Windows that it has kept."""
     memory_bytes: int
-    """Of all its processes, what is in memory and theirs alone."""
-    peak_bytes: int
-    """The largest that was so far, each process by itself."""
+    """Of all its processes together; what several have in common counts once, pages of files do not."""
+    whole_bytes: int
+    """With the pages of files, programs and libraries mostly."""
     cpu_s: float
     """Their processor time so far."""
 
@@ -72,14 +74,36 @@ def main(words: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory(prefix="soak-") as name:
         folder = Path(name) if given.folder is None else given.folder
         scene = built_in_scene(0, people=given.people, cameras=given.cameras, frames=given.loop, fps=_FPS)
-        long = BackAndForth(simulate(scene, seed=0), given.frames)
-        write_association(long, scene.rig, folder / "recording")
+        write_recording(simulate(scene, seed=0), scene.rig, given.frames, folder)
         size = sum(file.stat().st_size for file in (folder / "recording").rglob("*.txt"))
         print(f"{given.frames} frames of {given.people} people and {given.cameras} cameras, {size / 1e6:.0f} MB")
         samples = _watched(_command(folder, given.workers, given.batch_frames), folder / "out" / PARTS)
     rounds = rounds_of(samples, given.batch_frames, 2 * given.loop, given.frames)
     _print(samples, rounds)
     return judged(rounds, given.tolerance)
+
+
+def write_recording(loop: DetectionSequence, rig: Rig, frames: int, folder: Path) -> None:
+    """Write `folder`/recording, so many frames of a loop that is played back and forth, as 4D Association's text.
+
+    Once there and back is written, and what is left of it at the end; the rest is copies of that text.
+    """
+    period = 2 * len(loop)
+    times, rest = divmod(frames, period)
+    lengths = [(name, count) for name, count in (("recording", period), ("rest", rest)) if count > 0]
+    lengths = lengths if times > 0 else [("recording", rest)]
+    for name, count in lengths:
+        write_association(BackAndForth(loop, count), rig, folder / name)
+    if times == 0:
+        return
+    for file in (folder / "recording" / "detection").iterdir():
+        head, body = file.read_bytes().split(b"\n", 1)
+        end = (folder / "rest" / "detection" / file.name).read_bytes().split(b"\n", 1)[1] if rest > 0 else b""
+        with file.open("wb") as stream:
+            stream.write(b"%s %d\n" % (head.split()[0], frames))
+            for _ in range(times):
+                stream.write(body)
+            stream.write(end)
 
 
 def rounds_of(samples: Sequence[Sample], batch_frames: int, length: int, frames: int) -> list[Round]:
@@ -124,7 +148,7 @@ def _print(samples: Sequence[Sample], rounds: Sequence[Round]) -> None:
     for what, some in (("reading", reading), ("ending", ending)):
         peak, spent = max(each.memory_bytes for each in some), some[-1].cpu_s - some[0].cpu_s
         print(f"{what}: up to {peak / _MEGABYTE:.0f} MB, {spent:.0f} s of processor time")
-    print(f"peak of all: {max(each.peak_bytes for each in samples) / _MEGABYTE:.0f} MB")
+    print(f"at most {max(each.whole_bytes for each in samples) / _MEGABYTE:.0f} MB, pages of files included")
 
 
 def _command(folder: Path, workers: int, batch_frames: int) -> list[str]:
@@ -153,10 +177,10 @@ def _watched(command: Sequence[str], parts: Path) -> list[Sample]:
         kept = samples[-1].parts if samples else 0  # at its end they are removed
         while (parts / f"part-{kept:06d}.safetensors").exists():
             kept += 1
-        memory, peak, cpu = (sum(column) for column in zip(*map(_process, _tree(process.pid)), strict=True))
+        memory, whole, cpu = (sum(column) for column in zip(*map(_process, _tree(process.pid)), strict=True))
         if kept // _SAID_WINDOWS > (samples[-1].parts if samples else 0) // _SAID_WINDOWS:
             print(f"{kept} windows: {memory / _MEGABYTE:.0f} MB, {cpu:.0f} s", file=sys.stderr)
-        samples.append(Sample(kept, int(memory), int(peak), cpu))
+        samples.append(Sample(kept, int(memory), int(whole), cpu))
         time.sleep(_EVERY_S)
     if process.returncode != 0:
         raise RuntimeError(f"the run ended with exit code {process.returncode}")
@@ -173,15 +197,16 @@ def _tree(number: int) -> list[int]:
 
 
 def _process(number: int) -> tuple[int, int, float]:
-    """Memory and peak, bytes, and processor time, seconds, of one process; zeros where it is gone."""
+    """Memory without and with pages of files, bytes, and processor time, seconds; zeros where it is gone."""
+    folder = Path(f"/proc/{number}")
     try:
-        status = dict(line.split(":", 1) for line in Path(f"/proc/{number}/status").read_text().splitlines())
-        ticks = Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[11:13]
+        rollup = dict(line.split(":", 1) for line in (folder / "smaps_rollup").read_text().splitlines()[1:])
+        ticks = (folder / "stat").read_text().rpartition(")")[2].split()[11:13]
     except OSError:
         return 0, 0, 0.0
-    # Pages of files (RssFile) are the system's to take back.
-    memory, peak = (1024 * int(status.get(name, "0").split()[0]) for name in ("RssAnon", "VmHWM"))
-    return memory, peak, sum(map(int, ticks)) / os.sysconf("SC_CLK_TCK")
+    # Of a page that processes forked off one have in common each has its share.
+    memory, whole = (1024 * int(rollup.get(name, "0").split()[0]) for name in ("Pss_Anon", "Pss"))
+    return memory, whole, sum(map(int, ticks)) / os.sysconf("SC_CLK_TCK")
 
 
 if __name__ == "__main__":

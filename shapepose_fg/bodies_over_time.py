@@ -1,7 +1,8 @@
 """One body per person over a recording: one shape, and poses that move as people do, fitted to solved joints."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -16,9 +17,11 @@ from shapepose_fg.person_bodies import Person, PersonBodies, SequenceFitting
 from shapepose_fg.reconstruction import Reconstruction, Status
 
 STRETCH_ROWS = 4000
-"""Rows of a person that are fitted together at the most. Of a longer track the shape is what all its stretches
-say together; poses are then fitted with that shape, stretch by stretch, so that memory does not grow with the
-recording."""
+"""Rows of a person that are fitted together at the most. The shape of a longer track is what so many of its rows
+say, in pieces spread evenly over it; poses are then fitted with that shape, stretch by stretch. Neither memory nor
+the time of a row grows with the recording."""
+PIECE_ROWS = 160
+"""Rows of such a piece: some seconds, so that poses are linked in time there, too."""
 _OVERLAP_ROWS = 32
 """Rows that a stretch has of its neighbours, on either side, when poses are fitted."""
 
@@ -75,63 +78,69 @@ class BodiesOverTime:
 
 def fit_everybody(
     counts: Mapping[int, int],
-    person: Callable[[int, slice], Person],
+    person: Callable[[int, Sequence[range]], Person],
     fits: Fits,
     kept: KeptArrays,
     known: SubjectShapes,
     stretch_rows: int = STRETCH_ROWS,
+    piece_rows: int = PIECE_ROWS,
 ) -> BodiesOverTime:
     """Fit one body per person to the joints as they were solved; what is kept already is not fitted again.
 
     `counts` is how many rows everybody has; `person` gives what somebody's bodies are fitted to in some of these,
-    and `fits` fits people, side by side if it likes. `known` are people from other recordings: who is recognised
-    by shape (`recognise`) is fitted again with that as the prior.
+    one range after the other, and `fits` fits people, side by side if it likes. `known` are people from other
+    recordings: who is recognised by shape (`recognise`) is fitted again with that as the prior.
     """
-    stretches = {number: _stretches(count, stretch_rows) for number, count in counts.items()}
+    long = [number for number, count in counts.items() if count > stretch_rows]
 
-    def fitted(name: str, numbers: Iterable[int], job: Callable[[int, range], Person]) -> _Places:
-        """Fit some people stretch by stretch."""
-        places = {
-            number: {f"{name}-{number}-{n:04d}": own for n, own in enumerate(stretches[number])}
-            for number in numbers
-        }
-        wanted = [(number, place, own) for number, each in places.items() for place, own in each.items()]
-        there = set(kept.names(f"{name}-"))
-        missing = [each for each in wanted if each[1] not in there]
-        jobs = (job(number, own) for number, _, own in missing)
-        for (_, place, _), bodies in zip(missing, fits(jobs), strict=True):
+    def fitted(jobs: Mapping[str, Callable[[], Person]]) -> None:
+        """Fit what is not kept yet under these names."""
+        there = set(kept.names(""))
+        missing = [name for name in jobs if name not in there]
+        for name, bodies in zip(missing, fits(jobs[name]() for name in missing), strict=True):
             arrays = {column: getattr(bodies, column) for column in ("ok", *_COLUMNS)}
-            kept.keep(place, arrays | {"mean": bodies.shape.mean, "information": bodies.shape.information})
-        return places
+            kept.keep(name, arrays | {"mean": bodies.shape.mean, "information": bodies.shape.information})
 
-    def alone(number: int, own: range) -> Person:
-        return person(number, slice(own.start, own.stop))
+    def found(kind: str, prior: Mapping[int, Shapes | None]) -> dict[int, Shapes]:
+        """Some people's shapes, and their bodies where the track is short."""
 
-    places = fitted("bodies", counts, alone)
-    shapes = {number: _together(each, kept, None) for number, each in places.items()}
+        def job(number: int) -> Person:
+            count = counts[number]
+            if number not in long:
+                return replace(person(number, [range(count)]), shapes=prior[number])
+            rows = person(number, _spread(count, stretch_rows, piece_rows))
+            return replace(rows, shapes=prior[number], kept=range(0))
+
+        names = {number: f"{kind}-{number}" for number in prior}
+        fitted({name: partial(job, number) for number, name in names.items()})
+        places.update({number: {name: range(counts[number])} for number, name in names.items()})
+        return {
+            number: Shapes(kept.array(name, "mean"), kept.array(name, "information"))
+            for number, name in names.items()
+        }
+
+    places: dict[int, dict[str, range]] = {}
+    shapes = found("bodies", dict.fromkeys(counts))
     whose = recognise(_subjects(shapes, known.body), known)
     prior = {
         number: Shapes(known.betas[[subject]], known.information[[subject]])
         for number, subject in zip(counts, whose.tolist(), strict=True)
         if subject >= 0
     }
-    again = fitted("recognised", prior, lambda number, own: replace(alone(number, own), shapes=prior[number]))
-    places |= again
-    shapes |= {number: _together(each, kept, prior[number]) for number, each in again.items()}
+    shapes |= found("recognised", prior)
 
-    def joined(number: int, own: range) -> Person:
+    def stretch(number: int, own: range) -> Person:
         first = max(own.start - _OVERLAP_ROWS, 0)
-        rows = person(number, slice(first, min(own.stop + _OVERLAP_ROWS, counts[number])))
+        rows = person(number, [range(first, min(own.stop + _OVERLAP_ROWS, counts[number]))])
         inside = range(own.start - first, own.stop - first)
         return replace(rows, shapes=shapes[number], fixed_shapes=True, kept=inside)
 
-    places |= fitted("joined", [number for number, each in stretches.items() if len(each) > 1], joined)
+    for number in long:
+        stretches = _stretches(counts[number], stretch_rows)
+        places[number] = {f"stretch-{number}-{n:04d}": own for n, own in enumerate(stretches)}
+    fitted({name: partial(stretch, number, own) for number in long for name, own in places[number].items()})
     names = _names(np.array(list(counts), dtype=np.intp), known, whose)
     return BodiesOverTime(kept, places, _subjects(shapes, known.body).named(names))
-
-
-_Places = dict[int, dict[str, range]]
-"""See `BodiesOverTime.places`."""
 
 
 def _stretches(count: int, most: int) -> list[range]:
@@ -140,21 +149,11 @@ def _stretches(count: int, most: int) -> list[range]:
     return [range(start, stop) for start, stop in pairwise(edges)]
 
 
-def _together(places: Iterable[str], kept: KeptArrays, prior: Shapes | None) -> Shapes:
-    """What the stretches of one person say of the shape together: `prior` counts once, what each adds to it once.
-
-    The product of Gaussians N(m_s, A_s⁻¹), each of which has the prior N(m, A⁻¹) in it:
-    information A + sum (A_s - A), and that times the mean is A m + sum (A_s m_s - A m).
-    """
-    found = [Shapes(*(kept.array(place, name) for name in ("mean", "information"))) for place in places]
-    if len(found) == 1:
-        return found[0]
-    known = Shapes(np.zeros((1, 10)), np.eye(10)[None]) if prior is None else prior
-    before = known.information @ known.mean[..., None]
-    information = known.information + sum(each.information - known.information for each in found)
-    pull = before + sum(each.information @ each.mean[..., None] - before for each in found)
-    mean = np.asarray(np.linalg.solve(information, pull)[..., 0], dtype=np.float64)
-    return Shapes(mean, information)
+def _spread(count: int, most: int, length: int) -> list[range]:
+    """At most so many of `count` rows, in pieces of equal `length`, spread evenly from the first to the last."""
+    length = min(length, most)
+    starts = np.linspace(0, count - length, most // length).round().astype(int).tolist()
+    return [range(start, start + length) for start in starts]
 
 
 def with_bodies_over_time(
@@ -173,8 +172,8 @@ def with_bodies_over_time(
 
     numbers, counts = np.unique(people.person, return_counts=True)
 
-    def person(number: int, part: slice) -> Person:
-        mine = np.flatnonzero(people.person == number)[part]
+    def person(number: int, parts: Sequence[range]) -> Person:
+        mine = np.flatnonzero(people.person == number)[np.concatenate(parts)]
         return Person.of(number, people.joints[mine], people.covariance[mine], people.time_s[mine])
 
     bodies = fit_everybody(

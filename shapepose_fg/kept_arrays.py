@@ -1,6 +1,7 @@
 """Named sets of arrays that are kept while a run goes on: in memory, or as files that survive the process."""
 
 import json
+import mmap
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +18,8 @@ from shapepose_fg.files import write_atomically
 Arrays = Mapping[str, NDArray[Any]]
 """Arrays of numbers by name."""
 _SUFFIX = ".safetensors"
+_ALIGNED = 64
+"""Bytes; arrays begin at multiples of it."""
 
 
 class KeptArrays(Protocol):
@@ -53,7 +56,7 @@ class KeptArrays(Protocol):
 
 
 class InMemory:
-    """Sets of arrays in memory."""
+    """Sets of arrays in memory. That of a set that is dropped goes back to the system at once."""
 
     lasting = False
 
@@ -66,7 +69,7 @@ class InMemory:
 
     def keep(self, name: str, arrays: Arrays, about: Any = None) -> None:
         """See `KeptArrays`."""
-        self._sets[name] = ({key: np.ascontiguousarray(array) for key, array in arrays.items()}, about)
+        self._sets[name] = (_mapped(arrays), about)
 
     def drop(self, name: str) -> None:
         """See `KeptArrays`."""
@@ -83,6 +86,19 @@ class InMemory:
     def keys(self, name: str) -> list[str]:
         """See `KeptArrays`."""
         return list(self._sets[name][0])
+
+
+def _mapped(arrays: Arrays) -> Arrays:
+    """Copies in a mapping of their own. Freed between others, the allocator's would stay with the process."""
+    starts = np.cumsum([0, *(-(-array.nbytes // _ALIGNED) * _ALIGNED for array in arrays.values())]).tolist()
+    if starts[-1] == 0:
+        return {key: array.copy() for key, array in arrays.items()}
+    memory = mmap.mmap(-1, starts[-1], flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    copies = {}
+    for start, (key, array) in zip(starts, arrays.items(), strict=False):
+        copies[key] = np.ndarray(array.shape, array.dtype, memory, start)
+        copies[key][...] = array
+    return copies
 
 
 class InFolder:

@@ -46,7 +46,8 @@ class Person:
     fixed_shapes: bool = False
     """Whether the shape is known and stays."""
     kept: range | None = None
-    """The rows whose bodies are wanted, None for all; the others overlap with what is before and after."""
+    """The rows whose bodies are wanted, None for all. Others overlap with what is before and after, or tell of the
+    shape only."""
 
     @classmethod
     def of(
@@ -67,7 +68,7 @@ class Person:
         """The bodies, and the shape that they share."""
         group = np.full(len(self.time_s), self.number)
         found = fitter.fit_sequence(self.targets, group, self.time_s, self.shapes, fixed_shapes=self.fixed_shapes)
-        fit = found.fit if self.kept is None else found.fit.rows(np.array(self.kept))
+        fit = found.fit if self.kept is None else found.fit.rows(np.arange(self.kept.start, self.kept.stop))
         return PersonBodies(fit.ok, fit.betas, fit.global_orient, fit.body_pose, fit.transl, found.shapes)
 
 

@@ -99,7 +99,7 @@ def reconstruct(
         workers=workers,
         cluster=cluster,
         chunk_frames=chunk_frames,
-    ).reconstruction()
+    ).reconstruction(consume=True)
 
 
 def reconstruct_parts(

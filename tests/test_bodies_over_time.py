@@ -1,5 +1,6 @@
 """People recognised from one recording to the next, by shape: their names, and what is known of them."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 import torch
 
 from shapepose_fg.bodies_over_time import STRETCH_ROWS, BodiesOverTime, fit_everybody, with_bodies_over_time
+from shapepose_fg.body.fitting.body_sequence import Shapes
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.fitting.learned import LearnedFitter
 from shapepose_fg.body.fitting.weights import fingerprint
@@ -75,32 +77,71 @@ def test_a_long_track_is_fitted_in_stretches_that_fit_together(fitter):
     people = replace(people, time_s=people.frame / 25)
     given = []
 
-    def person(number: int, part: slice) -> Person:
-        given.append(part.stop - part.start)
-        return Person.of(number, people.joints[part], people.covariance[part], people.time_s[part])
+    def person(number: int, parts: Sequence[range]) -> Person:
+        given.append([*parts])
+        mine = np.concatenate(parts)
+        return Person.of(number, people.joints[mine], people.covariance[mine], people.time_s[mine])
 
     def fitted(stretch_rows: int) -> tuple[BodiesOverTime, BodyParameters]:
         nobody = SubjectShapes.empty(fingerprint(fitter.model))
         bodies = fit_everybody(
-            {0: 240}, person, lambda jobs: (job.fitted(fitter) for job in jobs), InMemory(), nobody, stretch_rows
-        )
+            {0: 240}, person, lambda jobs: (job.fitted(fitter) for job in jobs), InMemory(), nobody, stretch_rows,
+            piece_rows=20,
+        )  # fmt: skip
         columns = ("betas", "global_orient", "body_pose", "transl")
         parts = [bodies.filled(name, getattr(people, name), people.person, {}) for name in columns]
         return bodies, BodyParameters(*(torch.from_numpy(part).float() for part in parts))
 
     whole, expected = fitted(STRETCH_ROWS)
-    assert given == [240]
+    assert given == [[range(240)]]
     given.clear()
     cut, found = fitted(80)
     assert [*cut.places[0].values()] == [range(0, 80), range(80, 160), range(160, 240)]
-    assert given == [80, 80, 80, 112, 144, 112]  # 32 rows of the neighbours
+    # The shape is that of pieces from end to end; stretches have 32 rows of their neighbours.
+    assert given[0] == [range(0, 20), range(73, 93), range(147, 167), range(220, 240)]
+    assert given[1:] == [[range(0, 112)], [range(48, 192)], [range(128, 240)]]
     # One shape, and that of the whole track as far as it is known: ten numbers, one each by chance.
     assert np.ptp(found.betas.numpy(), axis=0).max() == 0
     apart = (cut.shapes.betas - whole.shapes.betas)[0]
-    assert apart @ whole.shapes.information[0] @ apart < 10
+    assert apart @ cut.shapes.information[0] @ apart < 10
+    # A third of the rows know less, and say so.
+    gain = np.linalg.slogdet(whole.shapes.information[0])[1] - np.linalg.slogdet(cut.shapes.information[0])[1]
+    assert gain > 1
+    # What 80 rows, three looks, leave open of the shape.
     joints, usual = (fitter.model.keypoints(each).numpy() for each in (found, expected))
-    assert 1e3 * np.linalg.norm(joints - usual, axis=-1).max() < 1  # the shape's share: 0.4 mm
-    # Nothing jumps at a border: steps from frame to frame are those of the whole track.
-    steps, usual_steps = np.diff(joints, axis=0), np.diff(usual, axis=0)
-    apart_mm = 1e3 * np.linalg.norm(steps - usual_steps, axis=-1)
-    assert apart_mm[[79, 159]].max() < 0.1
+    assert 1e3 * np.linalg.norm(joints - usual, axis=-1).max() < 4
+    # With that shape it is the uncut track's bodies, and nothing jumps at a border.
+    known = Shapes(cut.shapes.betas, cut.shapes.information)
+    uncut = replace(person(0, [range(240)]), shapes=known, fixed_shapes=True).fitted(fitter)
+    pose = (uncut.betas, uncut.global_orient, uncut.body_pose, uncut.transl)
+    same = fitter.model.keypoints(BodyParameters(*(torch.from_numpy(part).float() for part in pose))).numpy()
+    assert 1e3 * np.linalg.norm(joints - same, axis=-1).max() < 0.3
+    apart_mm = 1e3 * np.linalg.norm(np.diff(joints, axis=0) - np.diff(same, axis=0), axis=-1)
+    assert apart_mm[[79, 159]].max() < 0.02
+
+
+def test_a_long_track_of_somebody_known(fitter):
+    """Who is recognised is fitted with what was known before, in a track of several stretches as in one of one."""
+    scene = built_in_scene(people=2, frames=96)
+    people = seen(scene, slice(0, 96), 0)
+    first = people.rows(people.frame < 48)
+    known = with_bodies_over_time(first, fitter).shapes.named(["Ann", "Bob"])
+    second = people.rows(people.frame >= 48)
+    numbers, counts = np.unique(second.person, return_counts=True)
+    assert counts.tolist() == [48, 48]
+
+    def person(number: int, parts: Sequence[range]) -> Person:
+        mine = np.flatnonzero(second.person == number)[np.concatenate(parts)]
+        return Person.of(number, second.joints[mine], second.covariance[mine], second.time_s[mine])
+
+    def fitted(known: SubjectShapes) -> SubjectShapes:
+        everybody = dict.fromkeys(numbers.tolist(), 48)
+        jobs = InMemory()
+        return fit_everybody(
+            everybody, person, lambda jobs: (job.fitted(fitter) for job in jobs), jobs, known, 24, piece_rows=8
+        ).shapes
+
+    alone, again = fitted(SubjectShapes.empty(known.body)), fitted(known)
+    assert again.names.tolist() == ["Ann", "Bob"]
+    gain = np.linalg.slogdet(again.information)[1] - np.linalg.slogdet(alone.information)[1]
+    assert gain.min() > 1

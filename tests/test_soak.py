@@ -8,6 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from shapepose_fg.evaluation.speed import BackAndForth
+from shapepose_fg.io.write_detections import write_association
+from shapepose_fg.simulation import built_in_scene, simulate
+
 _FILE = Path(__file__).parents[1] / "scripts" / "soak.py"
 _SPEC = importlib.util.spec_from_file_location("soak", _FILE)
 assert _SPEC is not None and _SPEC.loader is not None
@@ -61,4 +65,19 @@ def test_a_short_run(tmp_path, capsys):
     assert "144 frames of 1 people and 2 cameras" in out
     assert out.count("to frame") >= 4 and " ms a frame, changes by " in out
     assert "reading: up to " in out and "ending: up to " in out
+    assert "MB, pages of files included" in out
     assert (tmp_path / "out" / "people.npz").is_file()
+
+
+@pytest.mark.parametrize("frames", [3, 8, 21, 24])
+def test_the_recording_is_the_loop_back_and_forth(tmp_path, frames):
+    """Copied text is what writing every frame gives, whether the length is a multiple of the loop or not."""
+    scene = built_in_scene(people=1, cameras=2, frames=4)
+    loop = simulate(scene)
+    soak.write_recording(loop, scene.rig, frames, tmp_path / "copied")
+    write_association(BackAndForth(loop, frames), scene.rig, tmp_path / "written")
+    for camera in scene.rig.names:
+        copied, written = (
+            tmp_path / folder / "detection" / f"{camera}.txt" for folder in ("copied/recording", "written")
+        )
+        assert copied.read_bytes() == written.read_bytes()

@@ -1,5 +1,6 @@
 """The result of a run, made of its parts column by column: in memory, or straight into the files."""
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -55,25 +56,20 @@ class Assembly:
         """Everybody's rows."""
         return RowsOfPeople(self.parts, self.persons)
 
-    def person(self, number: int, rows: slice) -> Person:
-        """What somebody's bodies are fitted to, in some of somebody's own rows."""
-        pieces = self.people.pieces(number, ("joints", "covariance", "time_s"), rows)
+    def person(self, number: int, rows: Sequence[range]) -> Person:
+        """What somebody's bodies are fitted to, in some of somebody's own rows, one range after the other."""
+        columns = ("joints", "covariance", "time_s")
+        pieces = [
+            piece for part in rows for piece in self.people.pieces(number, columns, slice(part.start, part.stop))
+        ]
         return Person.of(number, *(np.concatenate(column) for column in zip(*pieces, strict=True)))
 
     def pieces(self, name: str) -> Iterator[NDArray[Any]]:
         """A column of people.npz, or of observations.npz (`OBSERVED`), part by part."""
-        before: dict[int, int] = {}
+        before: Counter[int] = Counter()
         for n, person in enumerate(self.persons):
-            if name.removeprefix(OBSERVED) == "person":
-                yield person
-                continue
-            values = self.parts.column(n, name)
-            if self.bodies is not None:
-                values = self.bodies.filled(name, values, person, before)
-                numbers, counts = np.unique(person, return_counts=True)
-                for number, count in zip(numbers.tolist(), counts.tolist(), strict=True):
-                    before[number] = before.get(number, 0) + count
-            yield values
+            yield self._piece(n, name, before)
+            before.update(person.tolist())
 
     def counts(self) -> dict[str, Any]:
         """What run.json says of the rows (`Reconstruction.counts`)."""
@@ -91,25 +87,36 @@ class Assembly:
         empty = ObservationTable.empty(self.joint_names, self.view_names).columns()
         return self._columns(empty, ObservationTable.ROWS, OBSERVED)
 
-    def reconstruction(self, every: int = 1) -> Reconstruction:
-        """In memory, all of it or every so many frames."""
+    def reconstruction(self, every: int = 1, *, consume: bool = False) -> Reconstruction:
+        """In memory, all of it or every so many frames.
 
-        def array(column: Column) -> NDArray[Any]:
-            if column.shape[:1] != (len(self),) or every == 1:
-                return column.array()
-            frames = self.pieces("frame")
-            return np.concatenate(
-                [piece[frame % every == 0] for piece, frame in zip(column.pieces(), frames, strict=True)]
-            )
-
-        columns = {name: array(column) for name, column in self.columns().items() if name != "known_names"}
-        observed = self.observation_columns()
-        table = None
-        if observed is not None:
-            table = ObservationTable(
-                **{name: array(column) for name, column in observed.items() if name != "gate_names"}
-            )
-        return Reconstruction(**columns, run=self.run, observations=table, shapes=self.shapes)
+        With `consume` the parts are given up as they are read, so that rows are not in memory twice; nothing else
+        can be made of them afterwards.
+        """
+        chosen = [np.flatnonzero(frame % every == 0) for frame in self.pieces("frame")]
+        people, table = self.columns(), self.observation_columns() or {}
+        tables = (("", people, Reconstruction.ROWS), (OBSERVED, table, ObservationTable.ROWS))
+        rows = {
+            prefix + name: np.empty((sum(map(len, chosen)), *columns[name].shape[1:]), columns[name].dtype)
+            for prefix, columns, names in tables
+            for name in names
+            if name in columns
+        }
+        before: Counter[int] = Counter()
+        stop = 0
+        for n, (mine, person) in enumerate(zip(chosen, self.persons, strict=True)):
+            start, stop = stop, stop + len(mine)
+            for name, all_rows in rows.items():
+                all_rows[start:stop] = self._piece(n, name, before)[mine]
+            before.update(person.tolist())
+            if consume:
+                self.parts.drop(n)
+        observed = None
+        if len(table) > 0:
+            names = [name for name in table if name != "gate_names"]
+            observed = ObservationTable(**{name: _array(table[name], rows.get(OBSERVED + name)) for name in names})
+        columns = {name: _array(people[name], rows.get(name)) for name in people if name != "known_names"}
+        return Reconstruction(**columns, run=self.run, observations=observed, shapes=self.shapes)
 
     def save(self, folder: Path) -> None:
         """Write people.npz, observations.npz and run.json as `Reconstruction.save` does, without having it all in
@@ -120,6 +127,13 @@ class Assembly:
     def with_run(self, **entries: Any) -> "Assembly":
         """The same with more to say in run.json."""
         return replace(self, run=self.run | entries)
+
+    def _piece(self, n: int, name: str, before: Mapping[int, int]) -> NDArray[Any]:
+        """A column of a part; `before` is how many rows everybody has in the parts before it."""
+        if name.removeprefix(OBSERVED) == "person":
+            return self.persons[n]
+        values = self.parts.column(n, name)
+        return values if self.bodies is None else self.bodies.filled(name, values, self.persons[n], before)
 
     def _named(self, track: NDArray[np.int64]) -> NDArray[np.int64]:
         """(R,) what each row's track is called."""
@@ -135,3 +149,8 @@ class Assembly:
             name: Column(each.dtype, (len(self), *each.shape[1:]), pieces(name)) if name in rows else each
             for name, each in empty.items()
         }
+
+
+def _array(column: Column, rows: NDArray[Any] | None) -> NDArray[Any]:
+    """The rows of a column, where it has some."""
+    return column.array() if rows is None else rows

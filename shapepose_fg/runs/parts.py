@@ -79,6 +79,10 @@ class Parts:
         values = self.kept.array(_name(n), name)
         return _STATUS[values] if name == "status" else values
 
+    def drop(self, n: int) -> None:
+        """Forget the rows of a part."""
+        self.kept.drop(_name(n))
+
     def notes(self) -> Notes:
         """What is to be said about all of them."""
         notes = Notes()
