@@ -2,9 +2,11 @@
 
 A minute of the built-in scene is simulated and played forwards and backwards, over and over, on a time axis that
 goes on. `shapepose-fg reconstruct` is run on it and looked at from outside: memory of all its processes, and their
-processor time, for each round of the minute. Neither may grow by more than 5 % from the second round to the last;
-the first has the loading in it. Then come bodies over time, check, report and the files, of which the peak is
-printed. Linux only (it reads /proc). Exit code 1 where one of the two grows by more.
+processor time, for each round of the minute. Neither may grow by more than 5 % to the last; the first has the
+loading in it and is left out, as many as there are processes that solve. Then come bodies over time, check, report
+and the files, of which the peak is printed. With `--solve WINDOWS` the run is stopped after so many; what is kept
+of them is copied up to the end, since the recording repeats, and the run goes on from there: the end of a day
+without the day. Linux only (it reads /proc). Exit code 1 where memory or time grows by more.
 """
 
 import argparse
@@ -23,11 +25,14 @@ from shapepose_fg.camera import Rig
 from shapepose_fg.detections import DetectionSequence
 from shapepose_fg.evaluation.speed import BackAndForth
 from shapepose_fg.io.write_detections import write_association
+from shapepose_fg.kept_arrays import InFolder, KeptArrays
 from shapepose_fg.runs.manifest import PARTS
 from shapepose_fg.simulation import built_in_scene, simulate
 
 _FPS = 25.0
 _EVERY_S = 0.2
+_LOOKING = 0.02
+"""Share of the time in which a run is looked at: the system walks through all its pages for that."""
 _SAID_WINDOWS = 20
 """Of a run that takes hours something is said in between."""
 _MEGABYTE = 1e6
@@ -68,19 +73,50 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--cameras", type=int, default=4)
     parser.add_argument("--workers", type=int, default=1, help="processes that solve")
     parser.add_argument("--batch-frames", type=int, default=96, help="frames of a window")
+    parser.add_argument("--solve", type=int, metavar="WINDOWS", help="solve so many only, copy the rest")
     parser.add_argument("--tolerance", type=float, default=0.05, help="change that is let pass, as a share")
     parser.add_argument("--folder", type=Path, help="where the files go, and stay; by default they are removed")
     given = parser.parse_args(words)
+    windows, period = given.frames // given.batch_frames, 2 * given.loop
+    solved = windows if given.solve is None else given.solve
+    if solved < windows and (given.frames % given.batch_frames or solved * given.batch_frames % period):
+        parser.error(
+            f"--frames must be whole windows, and those of --solve {period} frames, there and back, or more"
+        )
     with tempfile.TemporaryDirectory(prefix="soak-") as name:
         folder = Path(name) if given.folder is None else given.folder
         scene = built_in_scene(0, people=given.people, cameras=given.cameras, frames=given.loop, fps=_FPS)
         write_recording(simulate(scene, seed=0), scene.rig, given.frames, folder)
         size = sum(file.stat().st_size for file in (folder / "recording").rglob("*.txt"))
         print(f"{given.frames} frames of {given.people} people and {given.cameras} cameras, {size / 1e6:.0f} MB")
-        samples = _watched(_command(folder, given.workers, given.batch_frames), folder / "out" / PARTS)
-    rounds = rounds_of(samples, given.batch_frames, 2 * given.loop, given.frames)
-    _print(samples, rounds)
-    return judged(rounds, given.tolerance)
+        command, parts = _command(folder, given.workers, given.batch_frames), folder / "out" / PARTS
+        if solved < windows:
+            samples = _watched(command, parts, solved)
+            copy_windows(InFolder(parts), solved, windows, given.batch_frames)
+            ending = _watched([*command, "--resume"], parts)
+        else:
+            samples = _watched(command, parts)
+            ending = [each for each in samples if each.parts == max(each.parts for each in samples)]
+    rounds = rounds_of(samples, given.batch_frames, period, solved * given.batch_frames)
+    _print([each for each in samples if each.parts == 0], rounds, ending)
+    return judged(rounds[given.workers :], given.tolerance)
+
+
+def copy_windows(kept: KeptArrays, solved: int, windows: int, batch_frames: int) -> None:
+    """Of a run that was stopped keep as many windows as were `solved`, and copies of them up to `windows`."""
+    (followed,) = kept.names("followed-")
+    next_id = kept.array(followed, "at")[1]
+    kept.drop(followed)
+    for n in range(solved, windows):
+        source, later = _part(n % solved), (n - n % solved) * batch_frames
+        arrays = {key: kept.array(source, key) for key in kept.keys(source)}
+        arrays["frame"], arrays["time_s"] = arrays["frame"] + later, arrays["time_s"] + later / _FPS
+        kept.keep(_part(n), arrays, kept.about(source))
+    kept.keep(f"followed-{windows - 1:06d}", {"at": np.array([windows * batch_frames, next_id])})
+
+
+def _part(n: int) -> str:
+    return f"part-{n:06d}"
 
 
 def write_recording(loop: DetectionSequence, rig: Rig, frames: int, folder: Path) -> None:
@@ -122,13 +158,13 @@ def rounds_of(samples: Sequence[Sample], batch_frames: int, length: int, frames:
 
 
 def judged(rounds: Sequence[Round], tolerance: float) -> int:
-    """Say how memory and time change from the second round to the last; 1 where it is by more than `tolerance`."""
-    if len(rounds) < 4:
+    """Say how memory and time change from the first round to the last; 1 where it is by more than `tolerance`."""
+    if len(rounds) < 3:
         print("too few rounds to judge: give more --frames, or a shorter --loop")
         return 1
     code = 0
     for name, unit in (("memory_mb", "MB"), ("frame_ms", "ms a frame")):
-        values = np.array([getattr(each, name) for each in rounds[1:]])
+        values = np.array([getattr(each, name) for each in rounds])
         # A line through all: single rounds differ by what else the machine does.
         slope, first = np.polyfit(np.arange(len(values)), values, 1)
         change = slope * (len(values) - 1) / first
@@ -138,17 +174,17 @@ def judged(rounds: Sequence[Round], tolerance: float) -> int:
     return code
 
 
-def _print(samples: Sequence[Sample], rounds: Sequence[Round]) -> None:
-    """A line per round, and the peaks."""
+def _print(reading: Sequence[Sample], rounds: Sequence[Round], ending: Sequence[Sample]) -> None:
+    """A line per round, and the peaks before and after them."""
     for each in rounds:
         print(f"to frame {each.stop:8d}: {each.memory_mb:7.1f} MB, {each.frame_ms:6.1f} ms a frame")
-    windows = max(each.parts for each in samples)
-    reading = [each for each in samples if each.parts == 0]
-    ending = [each for each in samples if each.parts == windows]
     for what, some in (("reading", reading), ("ending", ending)):
-        peak, spent = max(each.memory_bytes for each in some), some[-1].cpu_s - some[0].cpu_s
-        print(f"{what}: up to {peak / _MEGABYTE:.0f} MB, {spent:.0f} s of processor time")
-    print(f"at most {max(each.whole_bytes for each in samples) / _MEGABYTE:.0f} MB, pages of files included")
+        memory, whole = (max(getattr(each, name) for each in some) for name in ("memory_bytes", "whole_bytes"))
+        spent = some[-1].cpu_s - some[0].cpu_s
+        print(
+            f"{what}: up to {memory / _MEGABYTE:.0f} MB, with pages of files {whole / _MEGABYTE:.0f};"
+            f" {spent:.0f} s of processor time"
+        )
 
 
 def _command(folder: Path, workers: int, batch_frames: int) -> list[str]:
@@ -168,21 +204,26 @@ def _command(folder: Path, workers: int, batch_frames: int) -> list[str]:
     return [sys.executable, "-m", "shapepose_fg", "reconstruct", *words]
 
 
-def _watched(command: Sequence[str], parts: Path) -> list[Sample]:
-    """Looks at a run, from its beginning to its end; RuntimeError where it fails."""
+def _watched(command: Sequence[str], parts: Path, stop: int | None = None) -> list[Sample]:
+    """Looks at a run until it ends, or has kept `stop` windows and is stopped; RuntimeError where it fails."""
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=environment)
     samples = []
     while process.poll() is None:
         kept = samples[-1].parts if samples else 0  # at its end they are removed
-        while (parts / f"part-{kept:06d}.safetensors").exists():
+        while (parts / f"{_part(kept)}.safetensors").exists():
             kept += 1
+        start = time.perf_counter()
         memory, whole, cpu = (sum(column) for column in zip(*map(_process, _tree(process.pid)), strict=True))
         if kept // _SAID_WINDOWS > (samples[-1].parts if samples else 0) // _SAID_WINDOWS:
             print(f"{kept} windows: {memory / _MEGABYTE:.0f} MB, {cpu:.0f} s", file=sys.stderr)
         samples.append(Sample(kept, int(memory), int(whole), cpu))
-        time.sleep(_EVERY_S)
-    if process.returncode != 0:
+        if stop is not None and kept >= stop:
+            process.terminate()
+            process.wait()
+            break
+        time.sleep(max(_EVERY_S, (time.perf_counter() - start) / _LOOKING))
+    if process.returncode != 0 and stop is None:
         raise RuntimeError(f"the run ended with exit code {process.returncode}")
     return [each for each in samples if each.memory_bytes > 0]
 
@@ -201,7 +242,7 @@ def _process(number: int) -> tuple[int, int, float]:
     folder = Path(f"/proc/{number}")
     try:
         rollup = dict(line.split(":", 1) for line in (folder / "smaps_rollup").read_text().splitlines()[1:])
-        ticks = (folder / "stat").read_text().rpartition(")")[2].split()[11:13]
+        ticks = (folder / "stat").read_text().rpartition(")")[2].split()[11:15]  # with those that ended
     except OSError:
         return 0, 0, 0.0
     # Of a page that processes forked off one have in common each has its share.
