@@ -15,23 +15,49 @@ def torn_joints(
 ) -> NDArray[np.bool_]:
     """(A, J) joints without which no bone of a person is longer than `longest_m` (J,), from each joint's parent.
 
-    `places` (A, J, 3); only joints that are `trusted` (A, J) are judged. The joint of which the larger share of
-    bones is too long is taken first, of equals the one that fewer `views` (A, J) see, until nothing is too long.
+    `places` (A, J, 3); only joints that are `trusted` (A, J) are judged. A joint whose parent is not is judged by
+    the next such joint above it, with the bones between added up; where there is none, by the first of the person.
+    Two people who were near each other may have exchanged legs below a pelvis that nobody sees: what hangs on so
+    little goes, not what it is judged by. Of two ends of a bone the one goes of which the larger share of bones is
+    too long, of equals the one that fewer `views` (A, J) see; and so on until nothing is too long.
     """
-    child = np.flatnonzero(np.array(skeleton.parents) >= 0)
-    parent = np.array(skeleton.parents)[child]
-    length = np.linalg.norm(places[:, child] - places[:, parent], axis=-1)
-    long = np.nan_to_num(length) > longest_m[child]
     torn = np.zeros(trusted.shape, dtype=bool)
-    ends = np.zeros((len(child), len(skeleton)))
-    ends[np.arange(len(child)), child] = ends[np.arange(len(child)), parent] = 1.0
+    person, joint, parent = np.arange(len(places))[:, None], np.arange(len(skeleton)), np.array(skeleton.parents)
     doubt = 0.1 / (1.0 + views)  # less than any difference of shares of a joint's few bones
     while True:
         judged = trusted & ~torn
-        both = judged[:, child] & judged[:, parent]
-        too_long = (both & long) @ ends
-        share = np.where(too_long > 0, too_long / np.maximum(both @ ends, 1.0) + doubt, 0.0)
+        above, allowed_m = _judged_above(judged, longest_m, skeleton)
+        apart_m = np.linalg.norm(places - places[person, above], axis=-1)
+        compared = judged & (above != joint)
+        long = compared & (np.nan_to_num(apart_m) > allowed_m)
+        count, too_long = compared.astype(float), long.astype(float)
+        for of, bones in ((count, compared), (too_long, long)):
+            rows, children = np.nonzero(bones & (above == parent))
+            np.add.at(of, (rows, parent[children]), 1.0)
+        share = np.where(too_long > 0, too_long / np.maximum(count, 1.0) + doubt, 0.0)
         rows = np.flatnonzero(share.max(axis=1, initial=0.0) > 0)
         if len(rows) == 0:
             return torn
         torn[rows, share[rows].argmax(axis=1)] = True
+
+
+def _judged_above(
+    judged: NDArray[np.bool_], longest_m: NDArray[np.float64], skeleton: Skeleton
+) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """For each joint the nearest `judged` (A, J) one above it, (A, J), and the longest way there, metres.
+
+    Joints with none above them have the first of these, by way of the root; that one has itself.
+    """
+    count, person = len(skeleton), np.arange(len(judged))[:, None]
+    parent = np.array([*skeleton.parents, -1])
+    parent[parent < 0] = count  # a place above the root, where every way ends
+    longest = np.append(np.where(parent[:count] < count, longest_m, 0.0), 0.0)
+    ends = np.append(judged, np.ones((len(judged), 1), dtype=bool), axis=1)
+    above, way_m = (np.tile(of[:count], (len(judged), 1)) for of in (parent, longest))
+    for _ in skeleton.tree_levels:
+        on = ~ends[person, above]
+        way_m = way_m + np.where(on, longest[above], 0.0)
+        above = np.where(on, parent[above], above)
+    top = above == count
+    first = (top & judged).argmax(axis=1)[:, None]
+    return np.where(top, first, above), way_m + np.where(top, way_m[person, first], 0.0)

@@ -80,6 +80,27 @@ def test_a_wrist_a_metre_from_its_elbow_is_torn_and_its_neighbours_are_not(two_p
     assert not torn_joints(places, np.zeros((2, 25), bool), views, longest, BODY_25).any(), "nothing is judged"
 
 
+def test_the_legs_of_somebody_else_are_torn_off(two_people):
+    """They hang on nothing but a pelvis that nobody sees: they are judged by the shoulders."""
+    legs = [BODY_25.index(f"{side}{joint}") for side in "LR" for joint in ("Hip", "Knee", "Ankle", "Heel")]
+    legs += [BODY_25.index(f"{side}{toe}") for side in "LR" for toe in ("BigToe", "SmallToe")]
+    places = two_people.copy()
+    places[0, legs] = places[1, legs] + [0.0, 6.0, 0.0]
+    trusted, longest, views = np.ones((2, 25), bool), np.full(25, 0.7), np.full((2, 25), 4)
+    trusted[:, BODY_25.root] = False
+    torn = torn_joints(places, trusted, views, longest, BODY_25)
+    assert sorted(np.flatnonzero(torn[0])) == sorted(legs) and not torn[1].any()
+    # So they are with a shoulder that is not judged either, or with no shoulder: by the next joint that is.
+    trusted[0, [BODY_25.index(joint) for joint in ("Neck", "LShoulder", "RShoulder")]] = False
+    torn = torn_joints(places, trusted, views, longest, BODY_25)
+    assert set(legs) <= set(np.flatnonzero(torn[0])) and not torn[1].any()
+    # A leg bent aside by as much as the joints between allow is a person's own.
+    places = two_people.copy()
+    trusted[:] = True
+    trusted[:, BODY_25.root] = False
+    assert not torn_joints(places, trusted, views, longest, BODY_25).any()
+
+
 def test_detections_are_given_out_again_and_doubles_go(five_cameras, two_people, seen_exactly):
     detections = seen_exactly(five_cameras, two_people)
     given = [Input(7, np.zeros(5), detections, five_cameras)]
