@@ -12,14 +12,18 @@ def torn_joints(
     views: NDArray[np.intp],
     longest_m: NDArray[np.float64],
     skeleton: Skeleton,
+    reach_m: float,
 ) -> NDArray[np.bool_]:
     """(A, J) joints without which no bone of a person is longer than `longest_m` (J,), from each joint's parent.
 
-    `places` (A, J, 3); only joints that are `trusted` (A, J) are judged. A joint whose parent is not is judged by
-    the next such joint above it, with the bones between added up; where there is none, by the first of the person.
-    Two people who were near each other may have exchanged legs below a pelvis that nobody sees: what hangs on so
-    little goes, not what it is judged by. Of two ends of a bone the one goes of which the larger share of bones is
-    too long, of equals the one that fewer `views` (A, J) see; and so on until nothing is too long.
+    `places` (A, J, 3); only joints that are `trusted` (A, J) are judged. Of two ends of a bone the one goes of
+    which the larger share of bones is too long, of equals the one that fewer `views` (A, J) see; and so on until
+    nothing is too long.
+
+    A joint whose parent is not judged is judged by the next such joint above it, with the bones between added up;
+    where there is none, by the first of the person. Two people who were near each other may have exchanged legs,
+    below a pelvis that nobody sees, and go apart: what hangs on so little goes, not what it is judged by. But only
+    where it is `reach_m` farther than bones are long: nearer, detections are given out again around whole bodies.
     """
     torn = np.zeros(trusted.shape, dtype=bool)
     person, joint, parent = np.arange(len(places))[:, None], np.arange(len(skeleton)), np.array(skeleton.parents)
@@ -27,12 +31,13 @@ def torn_joints(
     while True:
         judged = trusted & ~torn
         above, allowed_m = _judged_above(judged, longest_m, skeleton)
+        bone = above == parent
         apart_m = np.linalg.norm(places - places[person, above], axis=-1)
-        compared = judged & (above != joint)
-        long = compared & (np.nan_to_num(apart_m) > allowed_m)
+        long = judged & (above != joint) & (np.nan_to_num(apart_m) > allowed_m + np.where(bone, 0.0, reach_m))
+        compared = (judged & bone) | long
         count, too_long = compared.astype(float), long.astype(float)
-        for of, bones in ((count, compared), (too_long, long)):
-            rows, children = np.nonzero(bones & (above == parent))
+        for of, those in ((count, compared), (too_long, long)):
+            rows, children = np.nonzero(those & bone)
             np.add.at(of, (rows, parent[children]), 1.0)
         share = np.where(too_long > 0, too_long / np.maximum(count, 1.0) + doubt, 0.0)
         rows = np.flatnonzero(share.max(axis=1, initial=0.0) > 0)

@@ -260,9 +260,10 @@ class Tracker:
             measured, inlier = joints.updated(said.information, toward), said.inlier
             at = measured.position
         trusted = measured.sigma_m < _TRUSTED_M
-        torn = torn_joints(at, trusted, inlier.sum(axis=-1), self.scale.longest_m, self.skeleton)
+        reach_m = self.config.assignment.farthest_m
+        torn = torn_joints(at, trusted, inlier.sum(axis=-1), self.scale.longest_m, self.skeleton, reach_m)
         doubt = np.zeros((6, 6))
-        doubt[:3, :3] = self.config.assignment.farthest_m**2 * np.eye(3)
+        doubt[:3, :3] = reach_m**2 * np.eye(3)
         doubted = JointStates(measured.mean, measured.covariance + doubt)
         measured = measured.replaced(torn, doubted)
         return measured, np.where(inlier & ~torn[..., None], candidate, -1)

@@ -69,15 +69,17 @@ def test_a_wrist_a_metre_from_its_elbow_is_torn_and_its_neighbours_are_not(two_p
     places = two_people.copy()
     places[0, WRIST] += 1.0
     longest, views = np.full(25, 0.7), np.full((2, 25), 4)
-    torn = torn_joints(places, np.ones((2, 25), bool), views, longest, BODY_25)
+    torn = torn_joints(places, np.ones((2, 25), bool), views, longest, BODY_25, 0.5)
     assert torn.sum() == 1 and torn[0, WRIST]
     # A shoulder that is off takes two bones with it: it goes, and nothing else.
     shoulder = BODY_25.index("RShoulder")
     places = two_people.copy()
     places[1, shoulder] += [0.0, 0.0, 1.0]
-    torn = torn_joints(places, np.ones((2, 25), bool), views, longest, BODY_25)
+    torn = torn_joints(places, np.ones((2, 25), bool), views, longest, BODY_25, 0.5)
     assert np.argwhere(torn).tolist() == [[1, shoulder]]
-    assert not torn_joints(places, np.zeros((2, 25), bool), views, longest, BODY_25).any(), "nothing is judged"
+    assert not torn_joints(places, np.zeros((2, 25), bool), views, longest, BODY_25, 0.5).any(), (
+        "nothing is judged"
+    )
 
 
 def test_the_legs_of_somebody_else_are_torn_off(two_people):
@@ -88,17 +90,22 @@ def test_the_legs_of_somebody_else_are_torn_off(two_people):
     places[0, legs] = places[1, legs] + [0.0, 6.0, 0.0]
     trusted, longest, views = np.ones((2, 25), bool), np.full(25, 0.7), np.full((2, 25), 4)
     trusted[:, BODY_25.root] = False
-    torn = torn_joints(places, trusted, views, longest, BODY_25)
+    torn = torn_joints(places, trusted, views, longest, BODY_25, 0.5)
     assert sorted(np.flatnonzero(torn[0])) == sorted(legs) and not torn[1].any()
     # So they are with a shoulder that is not judged either, or with no shoulder: by the next joint that is.
     trusted[0, [BODY_25.index(joint) for joint in ("Neck", "LShoulder", "RShoulder")]] = False
-    torn = torn_joints(places, trusted, views, longest, BODY_25)
+    torn = torn_joints(places, trusted, views, longest, BODY_25, 0.5)
     assert set(legs) <= set(np.flatnonzero(torn[0])) and not torn[1].any()
-    # A leg bent aside by as much as the joints between allow is a person's own.
-    places = two_people.copy()
+    # Legs that are 0.3 m farther off than bones allow may be put right by a whole body: they stay.
     trusted[:] = True
     trusted[:, BODY_25.root] = False
-    assert not torn_joints(places, trusted, views, longest, BODY_25).any()
+    neck, hips = BODY_25.index("Neck"), [BODY_25.index(f"{side}Hip") for side in "LR"]
+    for beyond_m, gone in ((0.3, 0), (0.7, 2)):
+        places = two_people.copy()
+        places[0, legs] -= [0.0, 0.0, 5.0]
+        below = places[0, hips].mean(axis=0)
+        places[0, legs] += places[0, neck] - below - [0.0, 0.0, 1.4 + beyond_m]
+        assert torn_joints(places, trusted, views, longest, BODY_25, 0.5)[0, hips].sum() == gone
 
 
 def test_detections_are_given_out_again_and_doubles_go(five_cameras, two_people, seen_exactly):
