@@ -126,12 +126,11 @@ def write_recording(loop: DetectionSequence, rig: Rig, frames: int, folder: Path
     """
     period = 2 * len(loop)
     times, rest = divmod(frames, period)
-    lengths = [(name, count) for name, count in (("recording", period), ("rest", rest)) if count > 0]
-    lengths = lengths if times > 0 else [("recording", rest)]
-    for name, count in lengths:
-        write_association(BackAndForth(loop, count), rig, folder / name)
-    if times == 0:
+    write_association(BackAndForth(loop, min(frames, period)), rig, folder / "recording")
+    if frames <= period:
         return
+    if rest > 0:
+        write_association(BackAndForth(loop, rest), rig, folder / "rest")
     for file in (folder / "recording" / "detection").iterdir():
         head, body = file.read_bytes().split(b"\n", 1)
         end = (folder / "rest" / "detection" / file.name).read_bytes().split(b"\n", 1)[1] if rest > 0 else b""
