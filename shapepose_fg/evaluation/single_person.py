@@ -55,6 +55,8 @@ class SinglePerson:
     """The same of his bodies' bones."""
     wrist_acceleration: float
     """Mean length of the acceleration of his wrists, m/s²."""
+    largest_wrist_acceleration: float
+    """The greatest, m/s²."""
     wrist_below_shoulder_m: Array
     """(15,) right shoulder's height minus right wrist's in frames 16 to 30, metres; NaN where unknown."""
     residual_px: float
@@ -72,6 +74,7 @@ class SinglePerson:
             "body_forearm_spread": 100 * self.body_forearm_spread,
             "bone_forearm_spread": 100 * self.bone_forearm_spread,
             "wrist_acceleration": self.wrist_acceleration,
+            "largest_wrist_acceleration": self.largest_wrist_acceleration,
             "lowest_wrist_m": float(below.max()) if len(below) > 0 else np.nan,
             "residual_px": self.residual_px,
             "bystander_found": 100 * self.bystander_found / max(self.bystander_seen, 1),
@@ -97,6 +100,7 @@ def measure_single_person(
     below[his.frame] = up[:, _RIGHT[1]] - up[:, _RIGHT[0]]
     there = _one_a_frame(people, np.linalg.norm(_places(people, rig) - BYSTANDER_M, axis=1), AROUND_M)
     seen = bystander_seen(recording, rig)
+    accelerations = _accelerations(his, fps)
     return SinglePerson(
         frames=len(recording),
         man_found=len(his),
@@ -104,7 +108,8 @@ def measure_single_person(
         forearm_spread=_spread(lengths[:, list(FOREARMS)]),
         body_forearm_spread=_spread(body_lengths[:, list(FOREARMS)]),
         bone_forearm_spread=_spread(_forearm_bones(his, model)),
-        wrist_acceleration=_acceleration(his, fps),
+        wrist_acceleration=float(accelerations.mean()) if len(accelerations) > 0 else np.nan,
+        largest_wrist_acceleration=float(accelerations.max()) if len(accelerations) > 0 else np.nan,
         wrist_below_shoulder_m=below[ARM_UP.start : ARM_UP.stop],
         residual_px=residual_to_nearest(his, recording, rig),
         bystander_seen=int(seen.sum()),
@@ -172,13 +177,12 @@ def _one_a_frame(people: Reconstruction, distance: Array, limit: float) -> NDArr
     return rows[distance[rows] < limit]
 
 
-def _acceleration(people: Reconstruction, fps: float) -> float:
-    """Mean length over wrists and consecutive frames, m/s²."""
+def _accelerations(people: Reconstruction, fps: float) -> Array:
+    """Lengths over wrists and consecutive frames, m/s²."""
     wrists = people.joints[:, list(WRISTS)]
     second = np.linalg.norm(wrists[2:] - 2 * wrists[1:-1] + wrists[:-2], axis=-1) * fps**2
     second = second[people.frame[2:] - people.frame[:-2] == 2]
-    known = second[np.isfinite(second)]
-    return float(known.mean()) if len(known) > 0 else float("nan")
+    return second[np.isfinite(second)]
 
 
 def _median(lengths: Array) -> Array:

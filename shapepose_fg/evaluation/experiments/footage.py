@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from shapepose_fg.evaluation.alone_beside_time import beside
+from shapepose_fg.evaluation.annotated_arms import ANNOTATION, ARMS, measure_arms, read_annotated_arms
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
 from shapepose_fg.evaluation.experiments.scale import Scale
 from shapepose_fg.evaluation.footage import Footage, shelf_footage, single_footage
@@ -15,7 +16,7 @@ from shapepose_fg.evaluation.held_out_view import held_out
 from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.shelf import evaluate_shelf, match_actors, read_shelf_ground_truth
 from shapepose_fg.evaluation.shelf_events import identity_switches, lost_limbs, pcp_interval
-from shapepose_fg.evaluation.single_person import measure_single_person
+from shapepose_fg.evaluation.single_person import man_of, measure_single_person
 from shapepose_fg.pipeline import PipelineConfig, reconstruct
 
 QUICK = range(20)
@@ -29,6 +30,7 @@ SINGLE = {
     ),
     "the same of the bodies' bones, %": lambda f: f"{f['bone_forearm_spread']:.2f}",
     "wrists, mean acceleration, m/s²": lambda f: f"{f['wrist_acceleration']:.1f}",
+    "wrists, largest acceleration, m/s²": lambda f: f"{f['largest_wrist_acceleration']:.0f}",
     "raised wrist under the shoulder, at the most, m": lambda f: f"{f['lowest_wrist_m']:.3f}",
     "arms to the nearest detection, median, px": lambda f: f"{f['residual_px']:.2f}",
     "bystander found, of the frames in which two views have five joints, %": lambda f: (
@@ -36,6 +38,14 @@ SINGLE = {
     ),
 }
 """What a row is called, and its words."""
+ANNOTATED = {
+    "annotated elbows and wrists: right elbow, right wrist, left elbow, left wrist, median error, mm": lambda f: (
+        ", ".join("-" if f[f"{joint}_m"] is None else f"{1000 * f[f'{joint}_m']:.0f}" for joint in ARMS)
+    ),
+    "further than 20 cm, %": lambda f: f"{f['arms_wrong']:.1f} of {f['arms']}",
+    "inside the 50 and 95 % ellipsoids, %": lambda f: f"{f['arms_inside_50']:.1f} / {f['arms_inside_95']:.1f}",
+}
+"""Rows about the joints that were annotated by hand."""
 
 
 def shelf_events(scale: Scale) -> Experiment | None:
@@ -128,12 +138,18 @@ def _view_table(found: Mapping[str, Figures]) -> list[str]:
 
 def _single(scale: Scale, temporal: bool) -> Figures:
     single = single_footage(_there(scale.pose2sim_single))
-    people = single.reconstruct(replace(PipelineConfig(), temporal=temporal), _frames(scale, single))
-    return measure_single_person(people, single.detections, single.rig).as_dict()
+    frames = _frames(scale, single)
+    people = single.reconstruct(replace(PipelineConfig(), temporal=temporal), frames)
+    figures = measure_single_person(people, single.detections, single.rig).as_dict()
+    if not ANNOTATION.is_file():  # it is not installed
+        return figures
+    arms = read_annotated_arms(ANNOTATION, single.rig).only(frames)
+    return figures | measure_arms(people.rows(man_of(people, single.rig)), arms).as_dict()
 
 
 def _single_table(found: Mapping[str, Figures]) -> list[str]:
-    rows = [f"| {name} | {' | '.join(words(each) for each in found.values())} |" for name, words in SINGLE.items()]
+    asked = SINGLE | (ANNOTATED if all("arms" in each for each in found.values()) else {})
+    rows = [f"| {name} | {' | '.join(words(each) for each in found.values())} |" for name, words in asked.items()]
     return [f"| pose2sim_single | {' | '.join(found)} |", rule(1 + len(found)), *rows]
 
 
