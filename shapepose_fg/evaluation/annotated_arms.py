@@ -1,4 +1,4 @@
-"""Elbows and wrists of the man in Pose2Sim's demo recording against marks that were made by hand in its pictures."""
+"""Elbows and wrists of the man in Pose2Sim's demo recording against marks made by hand in its pictures."""
 
 import csv
 from dataclasses import dataclass
@@ -84,7 +84,7 @@ class ArmErrors:
 
 
 def read_annotated_arms(file: Path, rig: Rig) -> AnnotatedArms:
-    """Read marks, in raw pixels, and triangulate the clear ones. InputError where the file is no such annotation."""
+    """Read marks, in raw pixels, and triangulate the clear ones. InputError where the file has no such marks."""
     try:
         lines = [line for line in file.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
         rows = [row for row in csv.DictReader(lines) if row["flag"] == "clear"]
