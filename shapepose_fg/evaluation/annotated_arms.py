@@ -99,9 +99,8 @@ def read_annotated_arms(file: Path, rig: Rig) -> AnnotatedArms:
     for index, camera in enumerate(rig.cameras):
         xy[place[view == index], index] = camera.undistort(raw[view == index])
         seen[place[view == index], index] = 1.0
-    xyz, used = (
-        each[:, 0] for each in triangulate_robustly(xy[:, None], seen[:, None], rig, AGREE_M, min_views=2)
-    )
+    points, agree = triangulate_robustly(xy[:, None], seen[:, None], rig, AGREE_M, min_views=2)
+    xyz, used = points[:, 0], agree[:, 0]
     placed = used.any(axis=1)
     return _with_covariance(key[placed], xyz[placed], xy[placed], used[placed], rig)
 
