@@ -6,7 +6,7 @@ from shapepose_fg.engine import Setup
 from shapepose_fg.runs.borders import Border
 from shapepose_fg.runs.chunks import Chunk, windows_of
 from shapepose_fg.runs.notes import Notebook, Notes
-from shapepose_fg.tracking.following import Input
+from shapepose_fg.tracking.hypotheses import Input
 from shapepose_fg.windows import Solved
 
 

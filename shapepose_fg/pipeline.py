@@ -44,7 +44,7 @@ from shapepose_fg.runs.parts import Part, Parts
 from shapepose_fg.runs.rows_of_people import RowsOfPeople
 from shapepose_fg.skeleton import BODY_25, Skeleton
 from shapepose_fg.solved_rows import result_rows
-from shapepose_fg.tracking.following import Input
+from shapepose_fg.tracking.hypotheses import Input
 from shapepose_fg.tracking.stitching import Ends, Trace, stitch
 from shapepose_fg.windows import Engine, Solved, Span
 from shapepose_fg.workers import Pool, Workers
@@ -260,7 +260,7 @@ def _windows(
             with book.stage("follow"):
                 if config.temporal:
                     spans, state = engine.follow(state, book.watched(given), last=last)
-                    next_id = state.follow.tracker.next_id
+                    next_id = state.follow.next_id
                 else:
                     spans = [engine.alone(book.watched(given))]
             carried = state if config.temporal and not last else None

@@ -19,9 +19,10 @@ from shapepose_fg.bounds import RepeatsOrNone, Settings
 from shapepose_fg.estimation.estimator import Estimates, Estimator, ExtraFactors
 from shapepose_fg.observations import Observations
 from shapepose_fg.skeleton import Skeleton
-from shapepose_fg.tracking.following import Decided, FollowingConfig, FollowState, Input, finish, follow
+from shapepose_fg.tracking.following import Decided, FollowingConfig, FollowState, finish, follow
+from shapepose_fg.tracking.hypotheses import Input
 from shapepose_fg.tracking.reassociation import Survival, reassociate, reassociate_over_time
-from shapepose_fg.tracking.tracker import Tracker, TrackerState
+from shapepose_fg.tracking.tracker import Tracker, Tracks
 from shapepose_fg.tracking.view_assignment import AssignmentConfig
 
 
@@ -154,7 +155,7 @@ class Engine:
 
     def start(self, next_id: int = 0) -> StreamState:
         """Before the first frame, or after a cut; identities count from `next_id`."""
-        return StreamState(FollowState(TrackerState.start(self.tracker.skeleton, next_id)))
+        return StreamState(FollowState(Tracks.none(self.tracker.skeleton), next_id))
 
     def follow(
         self, state: StreamState, frames: Iterable[Input], *, last: bool = False
@@ -168,7 +169,7 @@ class Engine:
             following, more = follow(self.tracker, following, frame, self.following)
             decided += more
         if last:
-            following, more = finish(following, self.following)
+            following, more = finish(self.tracker, following)
             decided += more
         before, spans = state.before, list[Span]()
         while (cut := self._next(decided, before, last)) is not None:
@@ -182,8 +183,7 @@ class Engine:
         """Frames that have nothing to do with each other, in one window because bodies are fitted fastest so."""
         decided = list[Decided]()
         for frame in frames:
-            first, _ = follow(self.tracker, self.start().follow, frame, self.following)
-            decided += finish(first, self.following)[1]
+            decided += finish(self.tracker, replace(self.start().follow, pending=(frame,)))[1]
         numbered = np.cumsum([0, *(len(rows) for _, rows in decided)])
         numbered = [
             (frame, replace(rows, track=first + np.arange(len(rows))))

@@ -204,11 +204,16 @@ def match_views(
     score: NDArray[np.float64],
     detections: Detections,
     shape: tuple[int, ...],
+    world: NDArray[np.intp] | None = None,
 ) -> NDArray[np.intp]:
-    """(P, J, V) the detections matched to people, joints and views, best score first, each serving one."""
+    """(P, J, V) the detections matched to people, joints and views, best score first, each serving one.
+
+    People of different worlds (P,) do not compete.
+    """
     person, detection = np.nonzero(likely)
     slot = np.ravel_multi_index((person, detections.joint[detection], detections.view[detection]), shape)
-    picked = match_best_first(slot, detection, score[person, detection])
+    once = detection if world is None else detection + len(detections) * world[person]
+    picked = match_best_first(slot, once, score[person, detection])
     chosen = np.full(shape, -1, dtype=np.intp)
     chosen.reshape(-1)[slot[picked]] = detection[picked]
     return chosen

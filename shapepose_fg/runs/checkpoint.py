@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from shapepose_fg.kept_arrays import split
 from shapepose_fg.observations import Observations
 from shapepose_fg.runs.borders import Border
-from shapepose_fg.tracking.following import FollowState, Input
+from shapepose_fg.tracking.following import FollowState
+from shapepose_fg.tracking.hypotheses import Input
 from shapepose_fg.tracking.motion_filter import JointStates
-from shapepose_fg.tracking.tracker import TrackedFrame, TrackerState
+from shapepose_fg.tracking.tracker import Tracks
 from shapepose_fg.windows import StreamState
 
 
@@ -30,8 +31,7 @@ class Checkpoint:
     """Between chunks: who was where at the end of the last."""
 
 
-_TRACK = ("ids", "born_s", "evident_s", "misses", "weak")
-_TRACKED = ("ids", "candidate", "evident", "weak")
+_TRACKS = ("ids", "world", "evident_s")
 _BORDER = tuple(field.name for field in fields(Border))
 _OBSERVED = tuple(field.name for field in fields(Observations))
 
@@ -44,17 +44,12 @@ def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray[Any]]:
     if checkpoint.state is None:
         return arrays
     follow, decided = checkpoint.state.follow, checkpoint.state.decided
-    tracker, pending = follow.tracker, follow.pending
-    arrays |= {f"tracker.{name}": getattr(tracker, name) for name in _TRACK}
-    arrays |= {"tracker.mean": tracker.joints.mean, "tracker.covariance": tracker.joints.covariance}
-    arrays |= {"tracker.time_s": np.array([tracker.time_s]), "tracker.next_id": np.array([tracker.next_id])}
-    arrays["evident"] = np.array(sorted(follow.evident.items()), dtype=np.int64).reshape(-1, 2)
-    arrays["real"] = np.array(sorted(follow.real), dtype=np.int64)
+    people = follow.people
+    arrays |= {f"people.{name}": getattr(people, name) for name in _TRACKS}
+    arrays |= {"people.mean": people.joints.mean, "people.covariance": people.joints.covariance}
+    arrays |= {"people.time_s": np.array([people.time_s]), "people.next_id": np.array([follow.next_id])}
+    arrays |= {"pending.frames": np.array([given.frame for given in follow.pending], dtype=np.int64)}
     arrays["before"] = np.array([checkpoint.state.before])
-    tracked = [each for _, each in pending]
-    arrays |= _frames("pending", [given for given, _ in pending], [len(each.ids) for each in tracked])
-    arrays |= _joined("pending", _TRACKED, tracked)
-    arrays |= _joined("pending", ("mean", "covariance"), [each.joints for each in tracked])
     arrays |= _frames("decided", [given for given, _ in decided], [len(rows) for _, rows in decided])
     return arrays | _joined("decided", _OBSERVED, [rows for _, rows in decided])
 
@@ -68,21 +63,16 @@ def checkpoint_of(
         known = "border.frame" in keys
         border = Border(**{name: array(f"border.{name}") for name in _BORDER}) if known else None
         return Checkpoint(following, next_id, border=border)
-    joints = JointStates(array("tracker.mean"), array("tracker.covariance"))
-    tracker = TrackerState(
-        time_s=float(array("tracker.time_s")[0]),
+    joints = JointStates(array("people.mean"), array("people.covariance"))
+    people = Tracks(
+        time_s=float(array("people.time_s")[0]),
         joints=joints,
-        next_id=int(array("tracker.next_id")[0]),
-        **{name: array(f"tracker.{name}") for name in _TRACK},
+        **{name: array(f"people.{name}") for name in _TRACKS},
     )
-    evident = {int(track): int(count) for track, count in array("evident").tolist()}
     given = {frame: read(frame) for name in ("pending", "decided") for frame in array(f"{name}.frames").tolist()}
-    pending = []
-    for frame, parts in _parted("pending", (*_TRACKED, "mean", "covariance"), array):
-        states = JointStates(parts.pop("mean"), parts.pop("covariance"))
-        pending.append((given[frame], TrackedFrame(joints=states, **parts)))
+    pending = tuple(given[frame] for frame in array("pending.frames").tolist())
     decided = [(given[frame], Observations(**parts)) for frame, parts in _parted("decided", _OBSERVED, array)]
-    follow = FollowState(tracker, tuple(pending), evident, frozenset(array("real").tolist()))
+    follow = FollowState(people, int(array("people.next_id")[0]), pending)
     return Checkpoint(following, next_id, StreamState(follow, tuple(decided), int(array("before")[0])))
 
 

@@ -10,7 +10,7 @@ from shapepose_fg.frame_times import stretches
 from shapepose_fg.pipeline_config import PipelineConfig
 from shapepose_fg.runs.borders import Border, same_people
 from shapepose_fg.runs.notes import Notebook
-from shapepose_fg.tracking.following import Input
+from shapepose_fg.tracking.hypotheses import Input
 from shapepose_fg.windows import Engine, Span
 
 WARM_S = 6.0
@@ -69,7 +69,7 @@ def _until(stop: int, stretch: range, first: int, time_s: NDArray[np.float64], c
     newest = beyond
     while newest < stretch.stop and time_s[newest] - time_s[beyond] < config.following.look_ahead_s:
         newest += 1
-    newest = max(newest, beyond + config.following.least_frames) + 2
+    newest += 2
     batches = -(-(newest + 1 - first) // config.batch_frames)
     return min(first + batches * config.batch_frames, stretch.stop)
 

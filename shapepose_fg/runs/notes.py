@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from shapepose_fg.estimation.outcome import Problem
-from shapepose_fg.tracking.following import Input
+from shapepose_fg.tracking.hypotheses import Input
 
 
 @dataclass

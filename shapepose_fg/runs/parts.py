@@ -12,7 +12,7 @@ from shapepose_fg.observation_table import ObservationTable
 from shapepose_fg.reconstruction import Reconstruction, Status
 from shapepose_fg.runs.checkpoint import Checkpoint, checkpoint_arrays, checkpoint_of
 from shapepose_fg.runs.notes import Notes
-from shapepose_fg.tracking.following import Input
+from shapepose_fg.tracking.hypotheses import Input
 
 _PART, _FOLLOWED = "part", "followed"
 _STATUS = np.array([*map(str, Status)])

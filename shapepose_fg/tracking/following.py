@@ -1,16 +1,29 @@
-"""From tracked frames to rows: who is real, from when to when; with a short look ahead, in bounded memory."""
+"""From frames to rows: who is there, from when to when; block by block, with a short look ahead, in bounded memory."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 
-from shapepose_fg.bounds import Count, Seconds, Settings
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import Detections
+from shapepose_fg.bounds import Seconds, Settings
 from shapepose_fg.observations import Observations
-from shapepose_fg.tracking.tracker import TrackedFrame, Tracker, TrackerState
+from shapepose_fg.skeleton import Skeleton
+from shapepose_fg.tracking.evidence import Chosen
+from shapepose_fg.tracking.hypotheses import Hypotheses, Input, explained, times_of
+from shapepose_fg.tracking.tracker import Tracker, Tracks
+
+Array = NDArray[np.float64]
+
+_BLOCK_S = 3.0
+"""People are decided for so long at a time: in some of its frames everybody is seen well."""
+_MOST_FRAMES = 256
+"""Frames that a block has at the most, whatever the rate: memory."""
+_SAME_M = 0.35
+"""Mean distance of core joints up to which somebody is whom another explanation has in the same frame."""
+_WALK_MPS = 1.5
+"""How much farther off somebody may be for each second out of sight."""
 
 
 @dataclass(frozen=True)
@@ -18,24 +31,8 @@ class FollowingConfig(Settings):
     """What becomes of tracks."""
 
     look_ahead_s: Seconds = 1.0
-    """A frame is decided when this much more has been seen, and `least_frames` with it: whether a new track was a
-    phantom, whether a person out of sight comes back, and since when a new person had been there."""
-    least_frames: Count = 5
-    """Frames with evidence that a track needs; fewer only where the recording ends."""
-
-
-@dataclass(frozen=True)
-class Input:
-    """What the cameras give of one frame."""
-
-    frame: int
-    """Its number in the recording."""
-    time_s: NDArray[np.float64]
-    """(V,) when each view was exposed, seconds."""
-    detections: Detections
-    """What the detector saw."""
-    rig: Rig
-    """Where the cameras were."""
+    """A frame is decided when this much more has been seen: whether a person out of sight comes back, and since when
+    a new person had been there."""
 
 
 Decided = tuple[Input, Observations]
@@ -44,148 +41,113 @@ Decided = tuple[Input, Observations]
 
 @dataclass(frozen=True)
 class FollowState:
-    """What is carried from frame to frame: the tracks, and the frames that are not decided yet."""
+    """What is carried from frame to frame: who was there last, and the frames that are not decided yet."""
 
-    tracker: TrackerState
-    """The tracks at the last frame."""
-    pending: tuple[tuple[Input, TrackedFrame], ...] = ()
+    people: Tracks
+    """The people of the last frame that is decided; their numbers are identities."""
+    next_id: int = 0
+    """The identity of the next new person."""
+    pending: tuple[Input, ...] = field(default=())
     """Frames that wait for what comes after them, oldest first."""
-    evident: dict[int, int] = field(default_factory=dict)
-    """Frames with evidence so far of each track that may still appear."""
-    real: frozenset[int] = frozenset()
-    """Tracks that are people, of those that may still appear."""
 
 
 def follow(
     tracker: Tracker, state: FollowState, new: Input, config: FollowingConfig
 ) -> tuple[FollowState, list[Decided]]:
     """Take in the next frame; returns the rows of the frames that are decided by it, oldest first."""
-    carried, tracked = tracker.step(state.tracker, new.detections, new.rig, float(new.time_s.mean()))
-    evident = dict(state.evident)
-    for track in tracked.ids[tracked.evident].tolist():
-        evident[track] = evident.get(track, 0) + 1
-    pending = (*state.pending, (new, tracked))
-    proven = [
-        track
-        for track in tracked.ids[~tracked.weak].tolist()
-        if track not in state.real and evident.get(track, 0) >= config.least_frames
-    ]
-    for track in proven:
-        pending = _since_when(tracker, pending, track)
-    state = FollowState(carried, pending, evident, state.real | frozenset(proven))
-    return _decide(state, config, ended=False)
+    pending = (*state.pending, new)
+    times = times_of(pending)
+    own = int(np.searchsorted(times, times[0] + _BLOCK_S - 1e-6))
+    behind = times[-1] - times[min(own, len(times) - 1)]
+    if len(pending) <= _MOST_FRAMES and (own == len(pending) or behind < config.look_ahead_s):
+        return replace(state, pending=pending), []
+    return _decide(tracker, replace(state, pending=pending), min(own, len(pending) - 1))
 
 
-def finish(state: FollowState, config: FollowingConfig) -> tuple[FollowState, list[Decided]]:
-    """The rows of all frames that are still open: the recording ends here, or is cut.
-
-    Tracks that had no time to prove themselves count as people where stage I found them by itself.
-    """
-    last = state.pending[-1][1] if state.pending else None
-    untried = set() if last is None else set(last.ids[~last.weak & last.evident].tolist())
-    return _decide(replace(state, real=state.real | untried), config, ended=True)
+def finish(tracker: Tracker, state: FollowState) -> tuple[FollowState, list[Decided]]:
+    """The rows of all frames that are still open: the recording ends here, or is cut."""
+    return _decide(tracker, state, len(state.pending)) if len(state.pending) > 0 else (state, [])
 
 
-def _decide(state: FollowState, config: FollowingConfig, *, ended: bool) -> tuple[FollowState, list[Decided]]:
-    """Rows of the frames at the head of `pending` that are old enough, or of all."""
-    pending, rows = list(state.pending), list[Decided]()
-    while pending:
-        (given, tracked), newest = pending[0], pending[-1][0]
-        recent = (newest.time_s - given.time_s).mean() < config.look_ahead_s
-        # At three frames a second the look ahead is over before a track can have had its frames with evidence.
-        if not ended and (recent or len(pending) < config.least_frames):
-            break
-        to_come = set[int]()
-        for _, later in pending[1:]:
-            to_come |= set(later.ids[later.evident].tolist())
-        ids = tracked.ids
-        kept = np.array([i in state.real for i in ids.tolist()], dtype=bool)
-        kept &= tracked.evident | np.isin(ids, list(to_come))
-        rows.append((given, _rows(given, tracked, kept)))
-        pending.pop(0)
-    alive = {i for _, tracked in pending for i in tracked.ids.tolist()} | set(state.tracker.ids.tolist())
-    return FollowState(
-        state.tracker,
-        tuple(pending),
-        {track: count for track, count in state.evident.items() if track in alive},
-        state.real & alive,
-    ), rows
+def _decide(tracker: Tracker, state: FollowState, own: int) -> tuple[FollowState, list[Decided]]:
+    """Rows of the first `own` frames that are pending."""
+    frames = state.pending
+    found, chosen = explained(tracker, frames, state.people, own - 1)
+    identity, next_id = _identities(found, chosen, state, times_of(frames), own, tracker.skeleton)
+    decided = [(frame, _rows(frame, t, found, chosen, identity)) for t, frame in enumerate(frames[:own])]
+    last = chosen.during(own - 1) & (identity >= 0)
+    who = chosen.hypothesis[last]
+    time_s, zero = float(frames[own - 1].time_s.mean()), np.zeros(len(who), dtype=np.intp)
+    people = Tracks(time_s, identity[last], zero, found.joints.rows(who), np.full(len(who), time_s))
+    return FollowState(people, next_id, frames[own:]), decided
 
 
-def _rows(given: Input, tracked: TrackedFrame, kept: NDArray[np.bool_]) -> Observations:
-    """The tracks `kept` (A,) of a frame as observations; what is not known well is left open."""
-    known = np.isfinite(tracked.places).all(axis=-1) & (tracked.sigma_m < _PLACED_M)
-    initial = np.where(known[..., None], tracked.places, np.nan)[kept]
-    rows = Observations.of(tracked.candidate[kept], given.detections, initial)
-    count = int(kept.sum())
+def _rows(
+    given: Input, t: int, found: Hypotheses, chosen: Chosen, identity: NDArray[np.intp]
+) -> Observations:
+    """The people of a frame as observations, each identity once; what is not known well is left open."""
+    here = np.flatnonzero(chosen.during(t) & (identity >= 0))
+    _, first = np.unique(identity[here], return_index=True)
+    here = here[np.sort(first)]
+    who = chosen.hypothesis[here]
+    rows = Observations.of(found.candidate[who, t].astype(np.intp), given.detections, found.places[who, t])
     return replace(
         rows,
-        track=tracked.ids[kept],
-        frame=np.full(count, given.frame),
-        time_s=np.repeat(given.time_s[None], count, axis=0),
+        track=identity[here],
+        frame=np.full(len(who), given.frame),
+        time_s=np.repeat(given.time_s[None], len(who), axis=0),
     )
 
 
-_PLACED_M = 0.2
-"""Sigma of a track's joint that counts as placed: larger, and the views or the body place it."""
+def _identities(
+    found: Hypotheses, chosen: Chosen, state: FollowState, times: Array, own: int, skeleton: Skeleton
+) -> tuple[NDArray[np.intp], int]:
+    """(K,) the identity of everybody who was chosen, -1 for whom only later frames have; and the next new one.
+
+    Whoever is there from the first frame on is one of those carried on, where there is one in the same place; who
+    appears later is somebody who vanished before nearby.
+    """
+    identity = np.full(len(chosen), -1, dtype=np.intp)
+    needed = chosen.start < own
+    early = np.flatnonzero(needed & (chosen.start == 0))
+    carried = np.flatnonzero((found.carried >= 0) & found.there[:, 0])
+    apart = core_distance(found.places[chosen.hypothesis[early], 0], found.places[carried, 0], skeleton)
+    for row, column in zip(*linear_sum_assignment(np.minimum(apart, 2 * _SAME_M)), strict=True):
+        if apart[row, column] < _SAME_M:
+            identity[early[row]] = found.carried[carried[column]]
+    next_id = state.next_id
+    for k in np.argsort(chosen.start, kind="stable").tolist():
+        if not needed[k] or identity[k] >= 0:
+            continue
+        identity[k] = _returned(found, chosen, k, identity, times, skeleton)
+        if identity[k] < 0:
+            identity[k], next_id = next_id, next_id + 1
+    return identity, next_id
 
 
-def _since_when(
-    tracker: Tracker, pending: Sequence[tuple[Input, TrackedFrame]], track: int
-) -> tuple[tuple[Input, TrackedFrame], ...]:
-    """`pending` with the track followed back in time from its first frame, by detections that nobody has."""
-    frames = list(pending)
-    first = next(k for k, (_, tracked) in enumerate(frames) if track in tracked.ids)
-    if first == 0:
-        return tuple(frames)
-    given, tracked = frames[-1]
-    state = _alone(tracker, tracked, track, float(given.time_s.mean()))
-    found: list[tuple[int, TrackedFrame]] = []
-    for k in range(len(frames) - 2, -1, -1):
-        given, tracked = frames[k]
-        others = tracked.candidate[tracked.ids != track]
-        free = np.ones(len(given.detections), dtype=bool)
-        free[others[others >= 0]] = False
-        state, alone = tracker.step(
-            state, given.detections.only(free), given.rig, float(given.time_s.mean()), births=False
-        )
-        if len(state.ids) == 0:
-            break
-        if k < first:
-            left = np.flatnonzero(free)
-            candidate = np.where(alone.candidate >= 0, np.append(left, -1)[alone.candidate], -1)
-            found.append((k, replace(alone, candidate=candidate)))
-    while found and not found[-1][1].evident[0]:
-        found.pop()
-    for k, alone in found:
-        given, tracked = frames[k]
-        frames[k] = (given, _joined(tracked, alone))
-    return tuple(frames)
+def _returned(
+    found: Hypotheses, chosen: Chosen, k: int, identity: NDArray[np.intp], times: Array, skeleton: Skeleton
+) -> int:
+    """The identity of the nearest person who vanished before the `k`-th chosen appears; -1 where nobody fits."""
+    start, best, nearest_m = int(chosen.start[k]), -1, np.inf
+    here = found.places[chosen.hypothesis[[k]], start]
+    for j in np.flatnonzero((identity >= 0) & (chosen.stop <= start)).tolist():
+        again = (identity == identity[j]) & (chosen.stop > chosen.stop[j])
+        gap_s = times[start] - times[chosen.stop[j] - 1]
+        there = found.places[chosen.hypothesis[[j]], chosen.stop[j] - 1]
+        apart = float(core_distance(here, there, skeleton)[0, 0])
+        if not again.any() and apart < min(nearest_m, _SAME_M + _WALK_MPS * gap_s):
+            best, nearest_m = int(identity[j]), apart
+    return best
 
 
-def _alone(tracker: Tracker, tracked: TrackedFrame, track: int, time_s: float) -> TrackerState:
-    """A state with one track, as it is in a frame."""
-    row = tracked.ids == track
-    start = TrackerState.start(tracker.skeleton)
-    now = np.array([time_s])
-    return replace(
-        start,
-        time_s=time_s,
-        ids=tracked.ids[row],
-        joints=tracked.joints.rows(row),
-        born_s=now,
-        evident_s=now,
-        misses=np.zeros(1, dtype=np.intp),
-        weak=np.zeros(1, dtype=bool),
-    )
+def core_distance(places: Array, others: Array, skeleton: Skeleton) -> Array:
+    """(P, Q) mean distance of the core joints of people (P, J, 3) and others (Q, J, 3), metres.
 
-
-def _joined(first: TrackedFrame, second: TrackedFrame) -> TrackedFrame:
-    """The tracks of both in one frame."""
-    return TrackedFrame(
-        np.append(first.ids, second.ids),
-        type(first.joints).concatenate(first.joints, second.joints),
-        np.concatenate([first.candidate, second.candidate]),
-        np.append(first.evident, second.evident),
-        np.append(first.weak, second.weak),
-    )
+    Infinite where no joint is known of both.
+    """
+    core = list(skeleton.core)
+    distance = np.linalg.norm(places[:, None, core] - others[None, :, core], axis=-1)
+    known = np.isfinite(distance)
+    mean = np.where(known, distance, 0.0).sum(axis=-1) / np.maximum(known.sum(axis=-1), 1)
+    return np.where(known.any(axis=-1), mean, np.inf)

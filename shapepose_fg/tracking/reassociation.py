@@ -10,7 +10,7 @@ from shapepose_fg.observations import Observations
 from shapepose_fg.proposal.assignment import lesser
 from shapepose_fg.proposal.association import seen_twice
 from shapepose_fg.skeleton import Skeleton
-from shapepose_fg.tracking.following import Input
+from shapepose_fg.tracking.hypotheses import Input
 from shapepose_fg.tracking.view_assignment import AssignmentConfig, assign
 
 

@@ -50,12 +50,14 @@ def assign(
     rig: Rig,
     skeleton: Skeleton,
     config: AssignmentConfig,
+    world: NDArray[np.intp] | None = None,
 ) -> NDArray[np.intp]:
     """The detection (A, J, V) of each person's joint in each view, -1 where there is none.
 
     `places` (A, J, 3) are predictions known to `sigma_m` (A, J). A detection's score is its nearness and its mean
     affinity to what the same person has at the limbs' other ends; the best score is taken first, each detection
-    once. A joint that is `lost` (A, J) is found by affinity alone; its place is that of its neighbour.
+    once. A joint that is `lost` (A, J) is found by affinity alone; its place is that of its neighbour. People of
+    different worlds (A,) do not compete for detections.
     """
     people, count = len(places), len(detections)
     shape = (people, len(skeleton), len(rig))
@@ -77,7 +79,7 @@ def assign(
         score = nearness + spoken
         likely = inside & (score >= 2 * config.least_affinity)
         likely |= reachable & (neighbours > 0) & (affinity >= config.least_affinity)
-        chosen = match_views(likely, score, detections, shape)
+        chosen = match_views(likely, score, detections, shape, world)
         owns = owned(chosen, count)
     overlap = (distance_px < config.overlap_px) & (affinity >= config.least_affinity)
     share_overlaps(chosen, overlap, distance_px, detections)

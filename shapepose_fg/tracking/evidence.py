@@ -1,0 +1,179 @@
+"""Who was there, by evidence: what only a person explains, against what should have been seen of that person."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.camera import Rig
+from shapepose_fg.detections import Detections
+from shapepose_fg.proposal.association import mean_affinity, owned
+from shapepose_fg.skeleton import Skeleton
+
+Array = NDArray[np.float64]
+
+_PRICE = 0.15
+"""What a second of being there costs, in seconds in which every joint is seen by every view. A person is believed in
+where the share of places with detections of their own is over price / (1 + price), a fifth: people in simulated
+crowds have a half of theirs and people behind others a quarter, phantoms less than a fifth."""
+_SURE_AFFINITY = 0.6
+"""Mean affinity to the person's other detections from which on a detection counts wholly."""
+_ALONE = 0.5
+"""What a detection counts whose neighbours on the skeleton nobody saw: affinities say nothing of it."""
+_APPEARS_S = 0.125
+"""What it costs to appear or vanish while others are watched, as long as half a second of not being seen: people are
+where they were, and nobody comes out of nothing."""
+_WORLDS = 4
+"""How many worlds are tried as those that come first, the most promising ones."""
+_LEAST_S = 0.1
+"""Least evidence of a person, seconds; of less than 0.4 seconds of frames a quarter of their time."""
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """K people and from when to when they are there, in the order in which they were chosen, best first."""
+
+    hypothesis: NDArray[np.intp]
+    """(K,) which hypothesis."""
+    start: NDArray[np.intp]
+    """(K,) index of the first frame."""
+    stop: NDArray[np.intp]
+    """(K,) the one after the last."""
+    evidence_s: Array
+    """(K,) evidence, in seconds in which all of a person is seen by all views; what being there costs taken off."""
+
+    def __len__(self) -> int:
+        return len(self.hypothesis)
+
+    def during(self, frame: int) -> NDArray[np.bool_]:
+        """(K,) who is there in a frame."""
+        return (self.start <= frame) & (frame < self.stop)
+
+
+def weighed(
+    candidate: NDArray[np.intp], places: Array, detections: Detections, rig: Rig, skeleton: Skeleton
+) -> tuple[Array, NDArray[np.intp]]:
+    """What each detection of A people counts (A, J, V), and how many places they should be seen at (A,).
+
+    `candidate` (A, J, V) are detections of one frame, -1 for none, `places` (A, J, 3) the joints, metres, NaN where
+    unknown. A detection counts by its affinity to the same person's others. A place is a joint in the picture of a
+    view; joints whose place is unknown are thought to be where the others are in the mean.
+    """
+    known = np.asarray(np.isfinite(places).all(axis=-1))[..., None]
+    centre = np.where(known, places, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+    xy, depth = rig.project(np.where(known, places, centre[:, None]))
+    inside = ((xy >= 0) & (xy < rig.image_sizes[:, None, None])).all(axis=-1) & (depth > 0)
+    weight = np.zeros(candidate.shape)
+    seen = candidate >= 0
+    if seen.any():
+        affinity, neighbours = mean_affinity(owned(candidate, len(detections)), detections, skeleton, len(rig))
+        counts = np.where(neighbours > 0, np.clip(affinity / _SURE_AFFINITY, 0.0, 1.0), _ALONE)
+        weight[seen] = counts[np.nonzero(seen)[0], candidate[seen]]
+    return weight, inside.sum(axis=(0, 2))
+
+
+def choose(
+    candidate: NDArray[np.intp],
+    weight: NDArray[np.floating],
+    expected: NDArray[np.intp],
+    there: NDArray[np.bool_],
+    world: NDArray[np.intp],
+    counts: NDArray[np.intp],
+    lasts_s: Array,
+) -> Chosen:
+    """Choose hypotheses, and from when to when, so that each detection is evidence of one person only.
+
+    `candidate` (H, T, J, V) are the detections of H hypotheses in T frames, of `counts` (T,) in each frame, with
+    the `weight` (H, T, J, V) and the `expected` (H, T) places of `weighed`; `there` (H, T) tells where a hypothesis
+    says something, in frames that each stand for `lasts_s` (T,) seconds. `world` (H,) are people who were followed
+    together. The best stretch of the best hypothesis comes first; its detections are evidence of nobody else then.
+    Where that is worse all in all, the people of one world come first: a hypothesis that goes over from one person to
+    another, always to who is seen better, is better than either of them, and leaves the others with too little.
+    """
+    account = _Account.of(candidate, weight, expected, there, counts, lasts_s)
+    if len(there) == 0:
+        return account.chosen(np.zeros(0, dtype=bool))
+    gains = account.gains(np.append(np.ones(counts.sum(), dtype=np.float32), np.float32(0)), slice(0, len(lasts_s)))
+    bound = np.bincount(world, np.maximum(_best_stretches(gains)[0], 0.0))
+    tried = np.argsort(-bound, kind="stable")[:_WORLDS]
+    found = [account.chosen(first) for first in (np.zeros(len(world), dtype=bool), *(world == w for w in tried))]
+    return max(found, key=lambda each: float(each.evidence_s.sum()))
+
+
+@dataclass(frozen=True)
+class _Account:
+    """Hypotheses as detections with weights: what `choose` is given, made ready."""
+
+    place: NDArray[np.intp]
+    """(H, T, J V) each detection's place among those of all frames; one more stands for none."""
+    weight: NDArray[np.float32]
+    """(H, T, J V) what it counts."""
+    expected: NDArray[np.intp]
+    """(H, T) places in which the person should be seen."""
+    there: NDArray[np.bool_]
+    """(H, T) where there is something to say."""
+    lasts_s: Array
+    """(T,) what each frame stands for, seconds."""
+    detections: int
+    """How many there are."""
+
+    @classmethod
+    def of(
+        cls,
+        candidate: NDArray[np.intp],
+        weight: NDArray[np.floating],
+        expected: NDArray[np.intp],
+        there: NDArray[np.bool_],
+        counts: NDArray[np.intp],
+        lasts_s: Array,
+    ) -> "_Account":
+        """See `choose`."""
+        H, T = there.shape
+        first, count = np.cumsum(counts) - counts, int(counts.sum())
+        place = np.where(candidate >= 0, candidate + first[:, None, None], count).reshape(H, T, -1)
+        weights = np.where(candidate >= 0, weight, 0.0).reshape(H, T, -1).astype(np.float32)
+        return cls(place, weights, np.maximum(expected, 1), there, lasts_s, count)
+
+    def gains(self, free: NDArray[np.float32], span: slice) -> Array:
+        """(H, S) evidence of each hypothesis in the frames of `span`, seconds, of detections that are `free`."""
+        share = np.einsum("htk,htk->ht", self.weight[:, span], free[self.place[:, span]]) / self.expected[:, span]
+        return np.where(self.there[:, span], ((1 + _PRICE) * share - _PRICE) * self.lasts_s[span], -np.inf)
+
+    def chosen(self, first: NDArray[np.bool_]) -> Chosen:
+        """People one after the other, the best of those `first` (H,) before all others."""
+        free = np.append(np.ones(self.detections, dtype=np.float32), np.float32(0))
+        gains, chosen = self.gains(free, slice(0, len(self.lasts_s))), list[tuple[int, int, int, float]]()
+        taken, least = np.zeros(self.there.shape, dtype=bool), min(_LEAST_S, 0.25 * float(self.lasts_s.sum()))
+        while len(gains) > 0:
+            value, start, stop = _best_stretches(gains)
+            if first.any() and value[first].max() < least:
+                first = np.zeros_like(first)
+            best = int(np.where(first | ~first.any(), value, -np.inf).argmax())
+            if value[best] < least:
+                break
+            span = slice(int(start[best]), int(stop[best]))
+            chosen.append((best, span.start, span.stop, float(value[best])))
+            free[self.place[best, span]] = 0.0
+            taken[best, span] = True
+            gains[:, span] = np.where(taken[:, span], -np.inf, self.gains(free, span))
+        columns = list(zip(*chosen, strict=True)) if chosen else [(), (), (), ()]
+        return Chosen(*(np.array(each, dtype=np.intp) for each in columns[:3]), np.array(columns[3], dtype=np.float64))
+
+
+def _best_stretches(gains: Array) -> tuple[Array, NDArray[np.intp], NDArray[np.intp]]:
+    """Of each row of `gains` (H, T) the stretch with the greatest sum: its value (H,), start (H,) and stop (H,).
+
+    Where a stretch begins after the first frame, or stops before the last, it costs `_APPEARS_S` each.
+    """
+    H, T = gains.shape
+    running, since = np.full(H, -np.inf), np.zeros(H, dtype=np.intp)
+    value, start, stop = np.full(H, -np.inf), np.zeros(H, dtype=np.intp), np.zeros(H, dtype=np.intp)
+    for t in range(T):
+        afresh = -_APPEARS_S if t > 0 else 0.0
+        begins = running < afresh
+        since = np.where(begins, t, since)
+        running = np.where(begins, afresh, running) + gains[:, t]
+        ends = running - (_APPEARS_S if t < T - 1 else 0.0)
+        better = ends > value
+        value, start, stop = np.where(better, ends, value), np.where(better, since, start), np.where(better, t + 1, stop)
+    return value, start, stop

@@ -1,0 +1,293 @@
+"""Ways in which people may have gone through some frames: worlds, each followed from one frame to both ends.
+
+A world is a set of people of whom each detection has one. Who is there is seen best in some frame, and hardly in
+others; so people are sought in several frames, followed from there forwards and backwards, and what explains most is
+chosen (`evidence.py`). Whoever was chosen is put together in one world in the frames in which they are seen best, and
+followed from there again: people who know of each other do not take each other's detections.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.camera import Rig
+from shapepose_fg.detections import Detections
+from shapepose_fg.tracking.evidence import Chosen, choose, weighed
+from shapepose_fg.tracking.motion_filter import JointStates
+from shapepose_fg.tracking.tracker import Tracker, Tracks
+
+Array = NDArray[np.float64]
+
+_KEY_S = 0.67
+"""People are sought among all detections so often: in some frame everybody is seen well. Seconds."""
+_BIRTHS_S = 0.1
+"""New people are sought so often among what a world's people leave: who is found later is followed back. Seconds."""
+_RESTART_S = 1.3
+"""Whoever was chosen is followed again from a frame in each so many seconds."""
+_ROUNDS = 2
+"""How often that is done."""
+_PLACED_M = 0.2
+"""Sigma of a track's joint that counts as placed."""
+
+
+@dataclass(frozen=True)
+class Input:
+    """What the cameras give of one frame."""
+
+    frame: int
+    """Its number in the recording."""
+    time_s: NDArray[np.float64]
+    """(V,) when each view was exposed, seconds."""
+    detections: Detections
+    """What the detector saw."""
+    rig: Rig
+    """Where the cameras were."""
+
+
+@dataclass(frozen=True)
+class Hypotheses:
+    """H people as they may have gone through T frames."""
+
+    carried: NDArray[np.intp]
+    """(H,) whom of those who were there before the first frame each one goes on from; -1 for none."""
+    world: NDArray[np.intp]
+    """(H,) numbers of the worlds that they are in."""
+    there: NDArray[np.bool_]
+    """(H, T) frames in which they are followed."""
+    candidate: NDArray[np.intp]
+    """(H, T, J, V) the detections that would be theirs, -1 for none."""
+    places: Array
+    """(H, T, J, 3) where their joints would be, metres; NaN where that is not known well."""
+    weight: NDArray[np.float32]
+    """(H, T, J, V) what each detection counts as evidence (`weighed`)."""
+    expected: NDArray[np.intp]
+    """(H, T) in how many places they should be seen."""
+    joints: JointStates
+    """Where their joints are in the frame from which people are carried on."""
+
+    def __len__(self) -> int:
+        return len(self.carried)
+
+    @classmethod
+    def concatenate(cls, parts: Sequence["Hypotheses"]) -> "Hypotheses":
+        """All of several, whose worlds are other ones."""
+        names = [each.name for each in fields(cls) if each.name not in ("joints", "world")]
+        columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+        first = np.cumsum([0, *(int(part.world.max(initial=-1)) + 1 for part in parts)])
+        columns["world"] = np.concatenate([part.world + n for part, n in zip(parts, first, strict=False)])
+        mean, covariance = (np.concatenate([getattr(p.joints, n) for p in parts]) for n in ("mean", "covariance"))
+        return cls(**columns, joints=JointStates(mean, covariance))
+
+
+@dataclass(frozen=True)
+class Seed:
+    """A world: who is in it to begin with."""
+
+    frame: int
+    """Index of the frame in which they are; -1 for the one before the first."""
+    tracks: Tracks
+    """Where they are."""
+    candidate: NDArray[np.intp]
+    """(A, J, V) their detections there."""
+    forwards: bool = True
+    """Whether they are followed forwards."""
+    backwards: bool = True
+    """And backwards."""
+    births: bool = False
+    """Whether others are sought beside them."""
+
+
+def explained(tracker: Tracker, frames: Sequence[Input], carried: Tracks, keep: int) -> tuple[Hypotheses, Chosen]:
+    """The people who explain T frames best, and from when to when they are there.
+
+    `carried` are the people of the frame before; `keep` is the index of the frame from which they are carried on.
+    """
+    times = times_of(frames)
+    found = follow_worlds(tracker, frames, _seeds(tracker, frames, carried), keep)
+    chosen = _choose(found, frames)
+    for _ in range(_ROUNDS if len(frames) > 1 else 0):
+        if len(chosen) == 0:
+            break
+        again = _restarts(tracker, frames, times, found, chosen)
+        found = Hypotheses.concatenate([found, follow_worlds(tracker, frames, again, keep)])
+        chosen = _choose(found, frames)
+    return found, chosen
+
+
+def times_of(frames: Sequence[Input]) -> Array:
+    """(T,) times of frames, seconds."""
+    return np.array([float(frame.time_s.mean()) for frame in frames])
+
+
+def _choose(found: Hypotheses, frames: Sequence[Input]) -> Chosen:
+    counts = np.array([len(frame.detections) for frame in frames], dtype=np.intp)
+    lasts_s = lasting(times_of(frames))
+    return choose(found.candidate, found.weight, found.expected, found.there, found.world, counts, lasts_s)
+
+
+def lasting(times_s: Array) -> Array:
+    """(T,) the seconds that each frame stands for: up to halfway to its neighbours; a frame alone stands for one."""
+    if len(times_s) < 2:
+        return np.ones(len(times_s))
+    step = np.diff(times_s)
+    return (np.append(step[:1], step) + np.append(step, step[-1:])) / 2
+
+
+def _seeds(tracker: Tracker, frames: Sequence[Input], carried: Tracks) -> list[Seed]:
+    """Worlds to begin with: people carried on, people met on the way back, and those seen in single frames."""
+    times, nobody = times_of(frames), Tracks.none(tracker.skeleton)
+    none = np.zeros((0, len(tracker.skeleton), len(frames[0].rig)), dtype=np.intp)
+    on = Seed(-1, carried, np.broadcast_to(-1, (len(carried), *none.shape[1:])), backwards=False, births=True)
+    if len(frames) == 1:
+        return [on]
+    back = Seed(len(frames) - 1, nobody, none, forwards=False, births=True)
+    parts = np.array_split(np.arange(len(frames)), max(1, round((times[-1] - times[0]) / _KEY_S)))
+    keys = [int(part[len(part) // 2]) for part in parts if len(part) > 0]
+    found = [(key, *tracker.newcomers(nobody, none, frames[key].detections, frames[key].rig)) for key in keys]
+    return [on, back, *(_seed(tracker, frames, key, places, own) for key, places, own in found if len(places) > 0)]
+
+
+def _seed(
+    tracker: Tracker,
+    frames: Sequence[Input],
+    key: int,
+    places: Array,
+    candidate: NDArray[np.intp],
+    *,
+    births: bool = False,
+) -> Seed:
+    """A world of people at `places` (A, J, 3) with their detections in a frame."""
+    zero = np.zeros(len(places), dtype=np.intp)
+    return Seed(key, tracker.at(places, zero, zero, float(frames[key].time_s.mean())), candidate, births=births)
+
+
+def _restarts(
+    tracker: Tracker, frames: Sequence[Input], times: Array, found: Hypotheses, chosen: Chosen
+) -> list[Seed]:
+    """Worlds of all who were chosen, in the frames in which they are seen best, one in each `_RESTART_S`."""
+    K, T = len(chosen), len(frames)
+    placed = np.isfinite(found.places[chosen.hypothesis]).all(axis=-1).any(axis=-1)
+    there = np.array([chosen.during(t) for t in range(T)]).T & placed
+    own = found.weight[chosen.hypothesis].sum(axis=(2, 3)) / np.maximum(found.expected[chosen.hypothesis], 1)
+    worth = np.where(there, own, -0.5).sum(axis=0)
+    parts = np.array_split(np.arange(T), min(T, max(1, round((times[-1] - times[0]) / _RESTART_S))))
+    seeds = []
+    for part in parts:
+        key = int(part[worth[part].argmax()])
+        who = chosen.hypothesis[there[:, key]]
+        if len(who) > 0:
+            seeds.append(
+                _seed(tracker, frames, key, found.places[who, key], found.candidate[who, key], births=True)
+            )
+    return seeds
+
+
+def follow_worlds(tracker: Tracker, frames: Sequence[Input], seeds: Sequence[Seed], keep: int) -> Hypotheses:
+    """Follow all `seeds` forwards and backwards through T frames, side by side."""
+    log = _Log(tracker, frames, keep)
+    numbers = log.numbered(seeds)
+    for forwards in (True, False):
+        part = [(w, s, n) for w, (s, n) in enumerate(zip(seeds, numbers, strict=True))]
+        part = [each for each in part if (each[1].forwards if forwards else each[1].backwards)]
+        _follow(tracker, frames, part, log, forwards=forwards)
+    return log.hypotheses()
+
+
+def _follow(
+    tracker: Tracker,
+    frames: Sequence[Input],
+    seeds: Iterable[tuple[int, Seed, NDArray[np.intp]]],
+    log: "_Log",
+    *,
+    forwards: bool,
+) -> None:
+    """One way through the frames: (world, seed, numbers of its people) begin in the seed's frame."""
+    tracks, births = Tracks.none(tracker.skeleton), dict[int, int]()
+    begins = dict[int, list[tuple[Tracks, NDArray[np.intp]]]]()
+    for world, seed, numbers in seeds:
+        place = np.full(len(numbers), world, dtype=np.intp)
+        own = Tracks(seed.tracks.time_s, numbers, place, seed.tracks.joints, seed.tracks.evident_s)
+        if seed.births:
+            births[world] = seed.frame
+        if seed.frame >= 0:
+            begins.setdefault(seed.frame, []).append((own, seed.candidate))
+        elif len(own) > 0:
+            tracks = own
+    sought_s = -np.inf
+    for t in range(len(frames)) if forwards else range(len(frames) - 1, -1, -1):
+        frame = frames[t]
+        time_s, candidate = float(frame.time_s.mean()), np.zeros((0, *log.shape), dtype=np.intp)
+        if len(tracks) > 0:
+            tracks, candidate = tracker.step(tracks, frame.detections, frame.rig, time_s)
+            alive = tracker.alive(tracks)
+            tracks, candidate = tracks.rows(alive), candidate[alive]
+            log.add(t, tracks, candidate)
+        tracks = replace(tracks, time_s=time_s)
+        for own, theirs in begins.get(t, []):
+            log.add(t, own, theirs)
+            tracks, candidate = tracks.joined(own), np.concatenate([candidate, theirs])
+        if abs(time_s - sought_s) < _BIRTHS_S:
+            continue
+        sought_s = time_s
+        for world in [world for world, since in births.items() if (since <= t if forwards else since >= t)]:
+            here = tracks.world == world
+            places, theirs = tracker.newcomers(tracks.rows(here), candidate[here], frame.detections, frame.rig)
+            if len(places) > 0:
+                new = tracker.at(places, log.more(len(places), world), np.full(len(places), world, dtype=np.intp), time_s)
+                log.add(t, new, theirs)
+                tracks, candidate = tracks.joined(new), np.concatenate([candidate, theirs])
+
+
+class _Log:
+    """What becomes of people on their way."""
+
+    def __init__(self, tracker: Tracker, frames: Sequence[Input], keep: int) -> None:
+        self.tracker, self.frames, self.keep = tracker, frames, keep
+        self.shape = (len(tracker.skeleton), len(frames[0].rig))
+        self.carried, self.world = list[int](), list[int]()
+        self.parts = list[tuple[int, NDArray[np.intp], NDArray[np.intp], Array, Array, NDArray[np.intp]]]()
+        self.kept = list[tuple[NDArray[np.intp], JointStates]]()
+
+    def numbered(self, seeds: Sequence[Seed]) -> list[NDArray[np.intp]]:
+        """Numbers of the people of each seed."""
+        return [
+            self.more(len(seed.tracks), world, seed.tracks.ids if seed.frame < 0 else None)
+            for world, seed in enumerate(seeds)
+        ]
+
+    def more(self, count: int, world: int, carried: NDArray[np.intp] | None = None) -> NDArray[np.intp]:
+        """Numbers of people who are new here, in a world."""
+        first = len(self.carried)
+        self.world += [world] * count
+        self.carried += [-1] * count if carried is None else carried.tolist()
+        return np.arange(first, first + count)
+
+    def add(self, t: int, tracks: Tracks, candidate: NDArray[np.intp]) -> None:
+        """Where tracks are in frame `t`, and their detections (A, J, V)."""
+        if len(tracks) == 0:
+            return
+        frame, joints = self.frames[t], tracks.joints
+        places = np.where((joints.sigma_m < _PLACED_M)[..., None], joints.position, np.nan)
+        weight, expected = weighed(candidate, places, frame.detections, frame.rig, self.tracker.skeleton)
+        self.parts.append((t, tracks.ids, candidate, places, weight, expected))
+        if t == self.keep:
+            self.kept.append((tracks.ids, joints))
+
+    def hypotheses(self) -> Hypotheses:
+        """All of it."""
+        H, T, (J, V) = len(self.carried), len(self.frames), self.shape
+        there = np.zeros((H, T), dtype=bool)
+        candidate, expected = np.full((H, T, J, V), -1, dtype=np.int32), np.zeros((H, T), dtype=np.int32)
+        places, weight = np.full((H, T, J, 3), np.nan), np.zeros((H, T, J, V), dtype=np.float32)
+        for t, ids, own, at, counts, many in self.parts:
+            there[ids, t], candidate[ids, t], places[ids, t] = True, own, at
+            weight[ids, t], expected[ids, t] = counts, many
+        mean, covariance = np.zeros((H, J, 6)), np.zeros((H, J, 6, 6))
+        for ids, joints in self.kept:
+            mean[ids], covariance[ids] = joints.mean, joints.covariance
+        return Hypotheses(
+            np.array(self.carried, dtype=np.intp), np.array(self.world, dtype=np.intp), there, candidate, places, weight, expected,
+            JointStates(mean, covariance),
+        )  # fmt: skip
