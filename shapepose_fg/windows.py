@@ -19,7 +19,7 @@ from shapepose_fg.bounds import RepeatsOrNone, Settings
 from shapepose_fg.estimation.estimator import Estimates, Estimator, ExtraFactors
 from shapepose_fg.observations import Observations
 from shapepose_fg.skeleton import Skeleton
-from shapepose_fg.tracking.following import Decided, FollowingConfig, FollowState, finish, follow
+from shapepose_fg.tracking.following import Decided, FollowingConfig, FollowState, alone, finish, follow
 from shapepose_fg.tracking.hypotheses import Input
 from shapepose_fg.tracking.reassociation import Survival, reassociate, reassociate_over_time
 from shapepose_fg.tracking.tracker import Tracker, Tracks
@@ -181,15 +181,11 @@ class Engine:
 
     def alone(self, frames: Iterable[Input]) -> Span:
         """Frames that have nothing to do with each other, in one window because bodies are fitted fastest so."""
-        decided = list[Decided]()
+        decided, people = list[Decided](), 0
         for frame in frames:
-            decided += finish(self.tracker, replace(self.start().follow, pending=(frame,)))[1]
-        numbered = np.cumsum([0, *(len(rows) for _, rows in decided)])
-        numbered = [
-            (frame, replace(rows, track=first + np.arange(len(rows))))
-            for (frame, rows), first in zip(decided, numbered.tolist(), strict=False)
-        ]
-        return Span(tuple(numbered), 0, len(numbered), alone=True)
+            decided.append((frame, alone(self.tracker, frame, people)))
+            people += len(decided[-1][1])
+        return Span(tuple(decided), 0, len(decided), alone=True)
 
     def _next(self, decided: Sequence[Decided], before: int, last: bool) -> tuple[int, int] | None:
         """Where the next window's own frames stop, and where it ends; None where there is too little."""

@@ -82,6 +82,13 @@ def _decide(tracker: Tracker, state: FollowState, own: int) -> tuple[FollowState
     return FollowState(people, next_id, frames[own:]), decided
 
 
+def alone(tracker: Tracker, given: Input, next_id: int) -> Observations:
+    """The people whom stage I finds in a frame that has nothing to do with others, numbered from `next_id` on."""
+    none = np.zeros((0, len(tracker.skeleton), len(given.rig)), dtype=np.intp)
+    places, candidate = tracker.newcomers(Tracks.none(tracker.skeleton), none, given.detections, given.rig)
+    return _observed(given, candidate, places, next_id + np.arange(len(places)))
+
+
 def _rows(
     given: Input, t: int, found: Hypotheses, chosen: Chosen, identity: NDArray[np.intp]
 ) -> Observations:
@@ -90,12 +97,18 @@ def _rows(
     _, first = np.unique(identity[here], return_index=True)
     here = here[np.sort(first)]
     who = chosen.hypothesis[here]
-    rows = Observations.of(found.candidate[who, t].astype(np.intp), given.detections, found.places[who, t])
+    return _observed(given, found.candidate[who, t].astype(np.intp), found.places[who, t], identity[here])
+
+
+def _observed(
+    given: Input, candidate: NDArray[np.intp], places: Array, track: NDArray[np.intp]
+) -> Observations:
+    """People at `places` (P, J, 3) with their detections (P, J, V) as rows of a frame."""
     return replace(
-        rows,
-        track=identity[here],
-        frame=np.full(len(who), given.frame),
-        time_s=np.repeat(given.time_s[None], len(who), axis=0),
+        Observations.of(candidate, given.detections, places),
+        track=track,
+        frame=np.full(len(track), given.frame),
+        time_s=np.repeat(given.time_s[None], len(track), axis=0),
     )
 
 

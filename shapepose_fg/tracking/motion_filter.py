@@ -32,6 +32,18 @@ class JointStates:
         """(A, J) standard deviation of the position, root mean square over the axes, metres."""
         return np.sqrt(np.trace(self.covariance[..., :3, :3], axis1=-2, axis2=-1) / 3)
 
+    @property
+    def across_m(self) -> Array:
+        """(A, J) standard deviation of the position across the ray of a joint that one view sees, metres.
+
+        The root of what pairs of axes know together over what they know in sum: where all axes are alike it is
+        `sigma_m`, and an axis that is known much worse than the others (v) drops out: (u + w) v / v.
+        """
+        P = self.covariance[..., :3, :3]
+        trace = np.trace(P, axis1=-2, axis2=-1)
+        pairs = (trace**2 - np.einsum("...ij,...ji->...", P, P)) / 2
+        return np.sqrt(pairs / trace)
+
     def __len__(self) -> int:
         return len(self.mean)
 

@@ -28,7 +28,8 @@ FindPeople = Callable[[Detections, Rig, bool], Observations]
 
 
 _LOST_M = 0.2
-"""A joint whose predicted place has a larger sigma is lost: it is sought around its parent on the skeleton."""
+"""A joint whose predicted place has a larger sigma is lost: it is sought around its parent on the skeleton. A joint
+that one view sees is not, however far along the ray it may be."""
 _TRUSTED_M = 0.1
 """A joint with a smaller sigma is judged by the length of its bones, and is not lost in the next frame, however long
 that is in coming: at 10 frames a second the velocity of a new person's joints alone makes it uncertain by 20 cm."""
@@ -40,6 +41,8 @@ _ITERATIONS = 3
 """How often gates and linearisation are made anew in one frame."""
 _MIN_SEEN_TWICE = 4
 """Core joints that two views must see for a frame to count as evidence of the person."""
+_MIN_IN_A_VIEW = 9
+"""Core joints of which one view sees enough for the same: more than half of a body is no chance."""
 _APART_M = 0.25
 """A new person's joints are at least this far from any track's, in the mean: nearer is the same person."""
 _BIRTH_SIGMA_M = 0.04
@@ -134,9 +137,9 @@ class Tracker:
         """The next frame, at `time_s` (earlier than the last where time runs backwards), and the detections of each
         track (A, J, V), -1 for none. No track ends here.
         """
-        before = tracks.joints.sigma_m
+        before = tracks.joints.across_m
         joints = self._predict(tracks.joints, time_s - tracks.time_s) if len(tracks) > 0 else tracks.joints
-        lost = (joints.sigma_m > _LOST_M) & (before > _TRUSTED_M)
+        lost = (joints.across_m > _LOST_M) & (before > _TRUSTED_M)
         joints = self._beside_neighbours(joints, lost)
         candidate = assign(
             joints.position, joints.sigma_m, lost, detections, rig, self.skeleton, self.config.assignment, tracks.world
@@ -186,7 +189,8 @@ class Tracker:
         """Joints `step_s` later; an unseen joint comes to move as the person does."""
         core = list(self.skeleton.core)
         certainty = 1 / joints.sigma_m[:, core, None] ** 2
-        person = (joints.velocity[:, core] * certainty).sum(1) / certainty.sum(1)
+        at_rest = 1 / _TRUSTED_M**2  # what nothing is known of stands still: it must not drift along a ray
+        person = (joints.velocity[:, core] * certainty).sum(1) / (certainty.sum(1) + at_rest)
         decay = np.exp(-abs(step_s) / _FOLLOW_S)
         unseen = (joints.sigma_m > _FOLLOW_SIGMA_M)[..., None]
         following = person[:, None] + decay * (joints.velocity - person[:, None])
@@ -246,8 +250,10 @@ class Tracker:
         return measured, np.where(inlier & ~torn[..., None], candidate, -1)
 
     def _evident(self, candidate: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """(A,) whether enough core joints are seen by two views."""
-        return seen_twice(candidate >= 0, self.skeleton).sum(axis=1) >= _MIN_SEEN_TWICE
+        """(A,) whether enough core joints are seen by two views, or by one."""
+        seen = candidate >= 0
+        in_a_view = seen[:, list(self.skeleton.core)].sum(axis=1).max(axis=1, initial=0)
+        return (seen_twice(seen, self.skeleton).sum(axis=1) >= _MIN_SEEN_TWICE) | (in_a_view >= _MIN_IN_A_VIEW)
 
     def _enough(self, detections: Detections, free: NDArray[np.bool_]) -> bool:
         """Whether the free detections can be a person: enough core joints, each in two views."""
