@@ -1,5 +1,6 @@
 """Who was there, by evidence: what only a person explains, against what should have been seen of that person."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,16 +14,16 @@ from shapepose_fg.skeleton import Skeleton
 Array = NDArray[np.float64]
 
 _PRICE = 0.15
-"""What a second of being there costs, in seconds in which every joint is seen by every view. A person is believed in
-where the share of places with detections of their own is over price / (1 + price), a fifth: people in simulated
-crowds have a half of theirs and people behind others a quarter, phantoms less than a fifth."""
+"""What a second of being there costs, in seconds in which every joint is seen by every view. A person is believed
+in where the share of places with detections of their own is over price / (1 + price), an eighth: people in
+simulated crowds have a half of theirs and people behind others a quarter, phantoms less."""
 _SURE_AFFINITY = 0.6
 """Mean affinity to the person's other detections from which on a detection counts wholly."""
 _ALONE = 0.5
 """What a detection counts whose neighbours on the skeleton nobody saw: affinities say nothing of it."""
 _APPEARS_S = 0.125
-"""What it costs to appear or vanish while others are watched, as long as half a second of not being seen: people are
-where they were, and nobody comes out of nothing."""
+"""What it costs to appear or vanish while others are watched, as much as not being seen for 0.8 seconds: people
+are where they were, and nobody comes out of nothing."""
 _WORLDS = 4
 """How many worlds are tried as those that come first, the most promising ones."""
 _LEAST_S = 0.1
@@ -40,7 +41,14 @@ class Chosen:
     stop: NDArray[np.intp]
     """(K,) the one after the last."""
     evidence_s: Array
-    """(K,) evidence, in seconds in which all of a person is seen by all views; what being there costs taken off."""
+    """(K,) evidence, in seconds in which all of a person is seen by all views; what being there costs taken
+    off."""
+
+    @classmethod
+    def of(cls, rows: Sequence[tuple[int, int, int, float]]) -> "Chosen":
+        """Of (hypothesis, start, stop, evidence), in order."""
+        hypothesis, start, stop = (np.array([row[n] for row in rows], dtype=np.intp) for n in range(3))
+        return cls(hypothesis, start, stop, np.array([row[3] for row in rows], dtype=np.float64))
 
     def __len__(self) -> int:
         return len(self.hypothesis)
@@ -55,9 +63,9 @@ def weighed(
 ) -> tuple[Array, NDArray[np.intp]]:
     """What each detection of A people counts (A, J, V), and how many places they should be seen at (A,).
 
-    `candidate` (A, J, V) are detections of one frame, -1 for none, `places` (A, J, 3) the joints, metres, NaN where
-    unknown. A detection counts by its affinity to the same person's others. A place is a joint in the picture of a
-    view; joints whose place is unknown are thought to be where the others are in the mean.
+    `candidate` (A, J, V) are detections of one frame, -1 for none, `places` (A, J, 3) the joints, metres, NaN
+    where unknown. A detection counts by its affinity to the same person's others. A place is a joint in the
+    picture of a view; joints whose place is unknown are thought to be where the others are in the mean.
     """
     known = np.asarray(np.isfinite(places).all(axis=-1))[..., None]
     centre = np.where(known, places, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
@@ -73,9 +81,9 @@ def weighed(
 
 
 def choose(
-    candidate: NDArray[np.intp],
+    candidate: NDArray[np.integer],
     weight: NDArray[np.floating],
-    expected: NDArray[np.intp],
+    expected: NDArray[np.integer],
     there: NDArray[np.bool_],
     world: NDArray[np.intp],
     counts: NDArray[np.intp],
@@ -84,16 +92,19 @@ def choose(
     """Choose hypotheses, and from when to when, so that each detection is evidence of one person only.
 
     `candidate` (H, T, J, V) are the detections of H hypotheses in T frames, of `counts` (T,) in each frame, with
-    the `weight` (H, T, J, V) and the `expected` (H, T) places of `weighed`; `there` (H, T) tells where a hypothesis
-    says something, in frames that each stand for `lasts_s` (T,) seconds. `world` (H,) are people who were followed
-    together. The best stretch of the best hypothesis comes first; its detections are evidence of nobody else then.
-    Where that is worse all in all, the people of one world come first: a hypothesis that goes over from one person to
-    another, always to who is seen better, is better than either of them, and leaves the others with too little.
+    the `weight` (H, T, J, V) and the `expected` (H, T) places of `weighed`; `there` (H, T) tells where a
+    hypothesis says something, in frames that each stand for `lasts_s` (T,) seconds. `world` (H,) are people who
+    were followed together. The best stretch of the best hypothesis comes first; its detections are evidence of
+    nobody else then. Where that is worse all in all, the people of one world come first: a hypothesis that goes
+    over from one person to another, always to who is seen better, is better than either of them, and leaves the
+    others with too little.
     """
     account = _Account.of(candidate, weight, expected, there, counts, lasts_s)
     if len(there) == 0:
         return account.chosen(np.zeros(0, dtype=bool))
-    gains = account.gains(np.append(np.ones(counts.sum(), dtype=np.float32), np.float32(0)), slice(0, len(lasts_s)))
+    gains = account.gains(
+        np.append(np.ones(counts.sum(), dtype=np.float32), np.float32(0)), slice(0, len(lasts_s))
+    )
     bound = np.bincount(world, np.maximum(_best_stretches(gains)[0], 0.0))
     tried = np.argsort(-bound, kind="stable")[:_WORLDS]
     found = [account.chosen(first) for first in (np.zeros(len(world), dtype=bool), *(world == w for w in tried))]
@@ -108,7 +119,7 @@ class _Account:
     """(H, T, J V) each detection's place among those of all frames; one more stands for none."""
     weight: NDArray[np.float32]
     """(H, T, J V) what it counts."""
-    expected: NDArray[np.intp]
+    expected: NDArray[np.integer]
     """(H, T) places in which the person should be seen."""
     there: NDArray[np.bool_]
     """(H, T) where there is something to say."""
@@ -120,9 +131,9 @@ class _Account:
     @classmethod
     def of(
         cls,
-        candidate: NDArray[np.intp],
+        candidate: NDArray[np.integer],
         weight: NDArray[np.floating],
-        expected: NDArray[np.intp],
+        expected: NDArray[np.integer],
         there: NDArray[np.bool_],
         counts: NDArray[np.intp],
         lasts_s: Array,
@@ -156,8 +167,7 @@ class _Account:
             free[self.place[best, span]] = 0.0
             taken[best, span] = True
             gains[:, span] = np.where(taken[:, span], -np.inf, self.gains(free, span))
-        columns = list(zip(*chosen, strict=True)) if chosen else [(), (), (), ()]
-        return Chosen(*(np.array(each, dtype=np.intp) for each in columns[:3]), np.array(columns[3], dtype=np.float64))
+        return Chosen.of(chosen)
 
 
 def _best_stretches(gains: Array) -> tuple[Array, NDArray[np.intp], NDArray[np.intp]]:
@@ -175,5 +185,9 @@ def _best_stretches(gains: Array) -> tuple[Array, NDArray[np.intp], NDArray[np.i
         running = np.where(begins, afresh, running) + gains[:, t]
         ends = running - (_APPEARS_S if t < T - 1 else 0.0)
         better = ends > value
-        value, start, stop = np.where(better, ends, value), np.where(better, since, start), np.where(better, t + 1, stop)
+        value, start, stop = (
+            np.where(better, ends, value),
+            np.where(better, since, start),
+            np.where(better, t + 1, stop),
+        )
     return value, start, stop

@@ -1,6 +1,7 @@
-"""From frames to rows: who is there, from when to when; block by block, with a short look ahead, in bounded memory."""
+"""From frames to rows: who is there, from when to when; block by block, with a short look ahead, in bounded
+memory.
+"""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -31,8 +32,8 @@ class FollowingConfig(Settings):
     """What becomes of tracks."""
 
     look_ahead_s: Seconds = 1.0
-    """A frame is decided when this much more has been seen: whether a person out of sight comes back, and since when
-    a new person had been there."""
+    """A frame is decided when this much more has been seen: whether a person out of sight comes back, and since
+    when a new person had been there."""
 
 
 Decided = tuple[Input, Observations]
@@ -89,9 +90,7 @@ def alone(tracker: Tracker, given: Input, next_id: int) -> Observations:
     return _observed(given, candidate, places, next_id + np.arange(len(places)))
 
 
-def _rows(
-    given: Input, t: int, found: Hypotheses, chosen: Chosen, identity: NDArray[np.intp]
-) -> Observations:
+def _rows(given: Input, t: int, found: Hypotheses, chosen: Chosen, identity: NDArray[np.intp]) -> Observations:
     """The people of a frame as observations, each identity once; what is not known well is left open."""
     here = np.flatnonzero(chosen.during(t) & (identity >= 0))
     _, first = np.unique(identity[here], return_index=True)
@@ -100,9 +99,7 @@ def _rows(
     return _observed(given, found.candidate[who, t].astype(np.intp), found.places[who, t], identity[here])
 
 
-def _observed(
-    given: Input, candidate: NDArray[np.intp], places: Array, track: NDArray[np.intp]
-) -> Observations:
+def _observed(given: Input, candidate: NDArray[np.intp], places: Array, track: NDArray[np.intp]) -> Observations:
     """People at `places` (P, J, 3) with their detections (P, J, V) as rows of a frame."""
     return replace(
         Observations.of(candidate, given.detections, places),

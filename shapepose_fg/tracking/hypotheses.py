@@ -1,9 +1,9 @@
 """Ways in which people may have gone through some frames: worlds, each followed from one frame to both ends.
 
 A world is a set of people of whom each detection has one. Who is there is seen best in some frame, and hardly in
-others; so people are sought in several frames, followed from there forwards and backwards, and what explains most is
-chosen (`evidence.py`). Whoever was chosen is put together in one world in the frames in which they are seen best, and
-followed from there again: people who know of each other do not take each other's detections.
+others; so people are sought in several frames, followed from there forwards and backwards, and what explains most
+is chosen (`evidence.py`). Whoever was chosen is put together in one world in the frames in which they are seen
+best, and followed from there again: people who know of each other do not take each other's detections.
 """
 
 from collections.abc import Iterable, Sequence
@@ -23,7 +23,8 @@ Array = NDArray[np.float64]
 _KEY_S = 0.67
 """People are sought among all detections so often: in some frame everybody is seen well. Seconds."""
 _BIRTHS_S = 0.1
-"""New people are sought so often among what a world's people leave: who is found later is followed back. Seconds."""
+"""New people are sought so often among what a world's people leave: who is found later is followed back.
+Seconds."""
 _RESTART_S = 1.3
 """Whoever was chosen is followed again from a frame in each so many seconds."""
 _ROUNDS = 2
@@ -56,13 +57,13 @@ class Hypotheses:
     """(H,) numbers of the worlds that they are in."""
     there: NDArray[np.bool_]
     """(H, T) frames in which they are followed."""
-    candidate: NDArray[np.intp]
+    candidate: NDArray[np.int32]
     """(H, T, J, V) the detections that would be theirs, -1 for none."""
     places: Array
     """(H, T, J, 3) where their joints would be, metres; NaN where that is not known well."""
     weight: NDArray[np.float32]
     """(H, T, J, V) what each detection counts as evidence (`weighed`)."""
-    expected: NDArray[np.intp]
+    expected: NDArray[np.int32]
     """(H, T) in how many places they should be seen."""
     joints: JointStates
     """Where their joints are in the frame from which people are carried on."""
@@ -128,7 +129,9 @@ def _choose(found: Hypotheses, frames: Sequence[Input]) -> Chosen:
 
 
 def lasting(times_s: Array) -> Array:
-    """(T,) the seconds that each frame stands for: up to halfway to its neighbours; a frame alone stands for one."""
+    """(T,) the seconds that each frame stands for: up to halfway to its neighbours; a frame alone stands for
+    one.
+    """
     if len(times_s) < 2:
         return np.ones(len(times_s))
     step = np.diff(times_s)
@@ -139,7 +142,7 @@ def _seeds(tracker: Tracker, frames: Sequence[Input], carried: Tracks) -> list[S
     """Worlds to begin with: people carried on, people met on the way back, and those seen in single frames."""
     times, nobody = times_of(frames), Tracks.none(tracker.skeleton)
     none = np.zeros((0, len(tracker.skeleton), len(frames[0].rig)), dtype=np.intp)
-    on = Seed(-1, carried, np.broadcast_to(-1, (len(carried), *none.shape[1:])), backwards=False, births=True)
+    on = Seed(-1, carried, np.full((len(carried), *none.shape[1:]), -1), backwards=False, births=True)
     if len(frames) == 1:
         return [on]
     back = Seed(len(frames) - 1, nobody, none, forwards=False, births=True)
@@ -167,7 +170,7 @@ def _restarts(
     tracker: Tracker, frames: Sequence[Input], times: Array, found: Hypotheses, chosen: Chosen
 ) -> list[Seed]:
     """Worlds of all who were chosen, in the frames in which they are seen best, one in each `_RESTART_S`."""
-    K, T = len(chosen), len(frames)
+    T = len(frames)
     placed = np.isfinite(found.places[chosen.hypothesis]).all(axis=-1).any(axis=-1)
     there = np.array([chosen.during(t) for t in range(T)]).T & placed
     own = found.weight[chosen.hypothesis].sum(axis=(2, 3)) / np.maximum(found.expected[chosen.hypothesis], 1)
@@ -179,7 +182,14 @@ def _restarts(
         who = chosen.hypothesis[there[:, key]]
         if len(who) > 0:
             seeds.append(
-                _seed(tracker, frames, key, found.places[who, key], found.candidate[who, key], births=True)
+                _seed(
+                    tracker,
+                    frames,
+                    key,
+                    found.places[who, key],
+                    found.candidate[who, key].astype(np.intp),
+                    births=True,
+                )
             )
     return seeds
 
@@ -235,7 +245,9 @@ def _follow(
             here = tracks.world == world
             places, theirs = tracker.newcomers(tracks.rows(here), candidate[here], frame.detections, frame.rig)
             if len(places) > 0:
-                new = tracker.at(places, log.more(len(places), world), np.full(len(places), world, dtype=np.intp), time_s)
+                new = tracker.at(
+                    places, log.more(len(places), world), np.full(len(places), world, dtype=np.intp), time_s
+                )
                 log.add(t, new, theirs)
                 tracks, candidate = tracks.joined(new), np.concatenate([candidate, theirs])
 
@@ -287,7 +299,6 @@ class _Log:
         mean, covariance = np.zeros((H, J, 6)), np.zeros((H, J, 6, 6))
         for ids, joints in self.kept:
             mean[ids], covariance[ids] = joints.mean, joints.covariance
-        return Hypotheses(
-            np.array(self.carried, dtype=np.intp), np.array(self.world, dtype=np.intp), there, candidate, places, weight, expected,
-            JointStates(mean, covariance),
-        )  # fmt: skip
+        carried, world = (np.array(each, dtype=np.intp) for each in (self.carried, self.world))
+        joints = JointStates(mean, covariance)
+        return Hypotheses(carried, world, there, candidate, places, weight, expected, joints)

@@ -1,8 +1,8 @@
 """People are followed from frame to frame: predicted, found again in the views, measured.
 
 A track predicts where its joints are; the detections there are its observations, whether or not stage I would have
-found the person in this frame. Several worlds are followed at once (`hypotheses.py`): a world is a set of people, of
-whom each detection has one; worlds know nothing of each other.
+found the person in this frame. Several worlds are followed at once (`hypotheses.py`): a world is a set of people,
+of whom each detection has one; worlds know nothing of each other.
 """
 
 from collections.abc import Callable
@@ -28,11 +28,12 @@ FindPeople = Callable[[Detections, Rig, bool], Observations]
 
 
 _LOST_M = 0.2
-"""A joint whose predicted place has a larger sigma is lost: it is sought around its parent on the skeleton. A joint
-that one view sees is not, however far along the ray it may be."""
+"""A joint whose predicted place has a larger sigma is lost: it is sought around its parent on the skeleton. A
+joint that one view sees is not, however far along the ray it may be."""
 _TRUSTED_M = 0.1
-"""A joint with a smaller sigma is judged by the length of its bones, and is not lost in the next frame, however long
-that is in coming: at 10 frames a second the velocity of a new person's joints alone makes it uncertain by 20 cm."""
+"""A joint with a smaller sigma is judged by the length of its bones, and is not lost in the next frame, however
+long that is in coming: at 10 frames a second the velocity of a new person's joints alone makes it uncertain by 20
+cm."""
 _FOLLOW_S = 0.25
 """Time constant with which the velocity of an unseen joint becomes that of the person."""
 _FOLLOW_SIGMA_M = 0.05
@@ -134,15 +135,22 @@ class Tracker:
     def step(
         self, tracks: Tracks, detections: Detections, rig: Rig, time_s: float
     ) -> tuple[Tracks, NDArray[np.intp]]:
-        """The next frame, at `time_s` (earlier than the last where time runs backwards), and the detections of each
-        track (A, J, V), -1 for none. No track ends here.
+        """The next frame, at `time_s` (earlier than the last where time runs backwards), and the detections of
+        each track (A, J, V), -1 for none. No track ends here.
         """
         before = tracks.joints.across_m
         joints = self._predict(tracks.joints, time_s - tracks.time_s) if len(tracks) > 0 else tracks.joints
         lost = (joints.across_m > _LOST_M) & (before > _TRUSTED_M)
         joints = self._beside_neighbours(joints, lost)
         candidate = assign(
-            joints.position, joints.sigma_m, lost, detections, rig, self.skeleton, self.config.assignment, tracks.world
+            joints.position,
+            joints.sigma_m,
+            lost,
+            detections,
+            rig,
+            self.skeleton,
+            self.config.assignment,
+            tracks.world,
         )
         joints, candidate = self._measure(joints, lost, candidate, detections, rig)
         evident_s = np.where(self._evident(candidate), time_s, tracks.evident_s)
