@@ -32,6 +32,7 @@ from shapepose_fg.estimation.linearisation import (
 )
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.outcome import SEEN_M, Problem, how_known, problems, reported_covariance
+from shapepose_fg.estimation.smoothing import smoothed
 from shapepose_fg.estimation.state_covariances import state_covariances
 from shapepose_fg.estimation.window_graph import WindowGraph, near_in_time
 from shapepose_fg.observations import Observations
@@ -129,14 +130,14 @@ class Estimator:
         return self._estimates(observations, sigmas, views, windows, X, solution)
 
     def draft(
-        self, observations: Observations, views: Views | None = None
+        self, observations: Observations, views: Views | None = None, *, over_time: bool = False
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """About where the joints of N rows are (N, J, 3), metres, and how surely (N, J, 3, 3), without any graph.
 
         Enough to give detections out again: what the views say, and where that is little, or contradicts the body,
         what the body says. Views are asked around where they put the joints, and then around the body, ever nearer
         to it (`refine.draft_reach_m`). A joint's views are in the body, too, so that these covariances are too
-        small.
+        small. `over_time` smooths them along each track (`smoothing.smoothed`).
         """
         config = self.config
         views = Views.of(self.rig) if views is None else views
@@ -159,7 +160,11 @@ class Estimator:
             fitted = fitted.with_rows(rows, targets.rows(rows))
             placed = np.flatnonzero(again.ok)
             body = body.with_rows(rows[placed], again.rows(placed))
-        return drafted(evidence, body, config.refine.contradiction)
+        places, covariance = drafted(evidence, body, config.refine.contradiction)
+        if not over_time:
+            return places, covariance
+        times_s = observations.time_s.mean(axis=1)
+        return smoothed(places, covariance, observations.track, times_s, self._motion)
 
     def _completed(self, X: NDArray[np.float64], observations: Observations, views: Views) -> NDArray[np.float64]:
         """X_0 (N, J, 3) with joints that are not placed where a draft has them, in windows of several frames.
