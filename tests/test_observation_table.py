@@ -73,6 +73,8 @@ def test_rows_and_back_together():
         ("confidence", np.full((2, 2, 2), np.nan), "confidence must be 0 or more"),
         ("confidence", np.full((2, 2, 2), np.inf), "confidence must be 0 or more"),
         ("residual_px", np.full((2, 2, 2, 2), np.inf), "residual_px must be finite, or NaN"),
+        ("probability", np.ones((2, 2, 2)), "probability and gate must agree"),
+        ("probability", np.full((2, 2, 2), 1.5), "probability must be 0 to 1"),
         ("view_names", np.array(["A", "A"]), "view_names must differ from each other"),
     ],
 )

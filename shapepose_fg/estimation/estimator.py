@@ -13,6 +13,7 @@ from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter
 from shapepose_fg.camera import Rig, Views
 from shapepose_fg.estimation.alternation import Solution, Window, alternate, final_bodies
 from shapepose_fg.estimation.body_step import joint_targets
+from shapepose_fg.estimation.doubt import association_spread, lasting_spread
 from shapepose_fg.estimation.draft import (
     NARROWING,
     WholeFitter,
@@ -240,6 +241,10 @@ class Estimator:
             X = self._limbs_kept(X, covariance, windows, solution)
         fit = final_bodies(solution, covariance, windows, self.fitter)
         final = linearise(observations, sigmas, X, views, self.config.observations)
+        spread = association_spread(observations, sigmas, final, solution.body, views, self.config.observations)
+        for window in windows:
+            seen, times_s = solution.inlier[window.rows].any(axis=-1), window.graph.times_s
+            covariance[window.rows] += lasting_spread(spread[window.rows], seen, times_s)
         wrong = problems(observations, windows, solution, first, covariance)
         enough = np.where(solution.enough, Status.BODY_UNDETERMINED, Status.TOO_FEW_VIEWS)
         status = np.where(fit.ok, Status.OK, enough)

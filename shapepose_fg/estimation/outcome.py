@@ -17,6 +17,9 @@ RUNAWAY_M = 1.0
 RUNAWAY_SIGMA = 20.0
 """So has one that ends this many standard deviations, and half a metre, from what views and body say of it."""
 _HALF_M = 0.5
+GROWS_S, GROWS_POWER, GROWS_MOST_S = 0.3, 0.2, 3.0
+"""The variance of a joint that two views saw t seconds ago grows with (1 + t / 0.3 s)^0.2, up to 3 s: chosen for the
+log score in simulated crowds (docs of `doubt.TOGETHER`): joints of one view 7.09 -> 7.12, of none 5.0 -> 5.15."""
 SEEN_M = 0.1
 """A joint is seen in a frame whose views leave it no less certain than this in any direction, metres."""
 
@@ -56,14 +59,35 @@ def reported_covariance(
     f, kept = views.white_share, views.kept
     left = np.zeros(information.shape)
     left[seen] = np.linalg.inv(information[seen])
-    times = window.graph.times_s
-    for joint in np.flatnonzero(seen.any(axis=0) & ~seen.all(axis=0)).tolist():
-        frames = np.flatnonzero(seen[:, joint])
-        nearest = frames[np.abs(times[:, None] - times[frames]).argmin(axis=1)]
-        left[:, joint] = left[nearest, joint]
+    left = carried(left, seen, window.graph.times_s)
     own = (1 - f) / f**2 * marginal @ said @ marginal
     total = np.where(seen[..., None, None], (1 - kept) * marginal, marginal + own) + (1 - f + kept * f) * left
-    return np.where(simple[..., None, None], total, marginal)
+    total = np.where(simple[..., None, None], total, marginal)
+    twice = solution.inlier[window.rows].sum(axis=-1) >= 2
+    return total * since(twice, window.graph.times_s)[..., None, None]
+
+
+def since(twice: NDArray[np.bool_], times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(T, J) what covariances are multiplied with, for the time to the nearest frame in which two views see a joint.
+
+    `twice` (T, J). 1 where they do; what one view or none leaves open drifts for longer than the model has it.
+    """
+    at = np.broadcast_to(times_s[:, None], twice.shape)
+    nearest = carried(at, twice, times_s)
+    waited = np.where(twice.any(axis=0), np.abs(at - nearest), GROWS_MOST_S)
+    return (1 + np.minimum(waited, GROWS_MOST_S) / GROWS_S) ** GROWS_POWER
+
+
+def carried(
+    values: NDArray[np.float64], seen: NDArray[np.bool_], times_s: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Values (T, J, ...) of joints in each frame, where these are not `seen` (T, J) from the nearest one that is."""
+    result = values.copy()
+    for joint in np.flatnonzero(seen.any(axis=0) & ~seen.all(axis=0)).tolist():
+        frames = np.flatnonzero(seen[:, joint])
+        nearest = frames[np.abs(times_s[:, None] - times_s[frames]).argmin(axis=1)]
+        result[:, joint] = values[nearest, joint]
+    return result
 
 
 def how_known(solution: Solution, covariance: NDArray[np.float64]) -> NDArray[np.uint8]:
