@@ -66,8 +66,8 @@ class ObservationTable:
     gate: NDArray[np.uint8]
     """(N, J, V) codes of `Gate`."""
     probability: NDArray[np.float32] = _LATER
-    """(N, J, V) how probable it is that the detection is this person's, and nobody else's; 0 where there is none. 1
-    where it is not said, as in files of before."""
+    """(N, J, V) how probable it is that the detection is this person's, and nobody else's; 0 where there is none.
+    1 where it is not said, as in files of before."""
 
     ROWS: ClassVar = "frame person candidate xy confidence residual_px gate probability".split()
     """The columns that have one entry per row."""

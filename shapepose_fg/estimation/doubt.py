@@ -18,12 +18,12 @@ FREE_M = 0.3
 
 
 TOGETHER = 8.0
-"""How many times the sum of single doubts their joint variance is: those of several views, of neighbouring joints and
-of frames are one. As `LASTS_S` chosen in simulated crowds (seeds 4711, 777, 90211 and crossing 5002, three and four
-cameras, births by truth): 1 / 4 / 8 / 12 times gave joints that one view sees a mean log score of 6.92 / 7.02 / 7.08 /
-7.08, those of two views 8.42 / 8.45 / 8.46 / 8.46, and those of none 4.3 / 4.7 / 4.9 / 5.0."""
+"""How many times the sum of single doubts their joint variance is: those of several views, of neighbouring joints
+and of frames are one. Chosen, as `LASTS_S`, in simulated crowds (seeds 4711, 777, 90211, crossing 5002; three and
+four cameras, births by truth): 1, 4, 8, 12 times gave joints of two views a mean log score of 8.42 / 8.45 / 8.46 /
+8.46, of one 6.92 / 7.02 / 7.08 / 7.08 and of none 4.3 / 4.7 / 4.9 / 5.0."""
 LASTS_S = 0.25
-"""A doubt is as large before and after as in its frame, over this time, seconds, one sigma; 0.5 and 1 s scored less."""
+"""Doubts are the same before and after, over this time, seconds, one sigma; 0.5 and 1 s scored less."""
 
 
 def lasting_spread(spread: Array, seen: NDArray[np.bool_], times_s: Array) -> Array:

@@ -32,7 +32,7 @@ from shapepose_fg.estimation.linearisation import (
     weakest_sigma,
 )
 from shapepose_fg.estimation.motion_model import MotionModel
-from shapepose_fg.estimation.outcome import SEEN_M, Problem, how_known, problems, reported_covariance
+from shapepose_fg.estimation.outcome import SEEN_M, Problem, how_known, problems, reported_covariance, since
 from shapepose_fg.estimation.smoothing import smoothed
 from shapepose_fg.estimation.state_covariances import state_covariances
 from shapepose_fg.estimation.window_graph import WindowGraph, near_in_time
@@ -243,8 +243,10 @@ class Estimator:
         final = linearise(observations, sigmas, X, views, self.config.observations)
         spread = association_spread(observations, sigmas, final, solution.body, views, self.config.observations)
         for window in windows:
-            seen, times_s = solution.inlier[window.rows].any(axis=-1), window.graph.times_s
-            covariance[window.rows] += lasting_spread(spread[window.rows], seen, times_s)
+            count, times_s = solution.inlier[window.rows].sum(axis=-1), window.graph.times_s
+            if window.graph.temporal:
+                covariance[window.rows] *= since(count >= 2, times_s)[..., None, None]
+            covariance[window.rows] += lasting_spread(spread[window.rows], count > 0, times_s)
         wrong = problems(observations, windows, solution, first, covariance)
         enough = np.where(solution.enough, Status.BODY_UNDETERMINED, Status.TOO_FEW_VIEWS)
         status = np.where(fit.ok, Status.OK, enough)

@@ -18,8 +18,8 @@ RUNAWAY_SIGMA = 20.0
 """So has one that ends this many standard deviations, and half a metre, from what views and body say of it."""
 _HALF_M = 0.5
 GROWS_S, GROWS_POWER, GROWS_MOST_S = 0.3, 0.2, 3.0
-"""The variance of a joint that two views saw t seconds ago grows with (1 + t / 0.3 s)^0.2, up to 3 s: chosen for the
-log score in simulated crowds (docs of `doubt.TOGETHER`): joints of one view 7.09 -> 7.12, of none 5.0 -> 5.15."""
+"""The variance of a joint that two views saw t seconds ago grows with (1 + t / 0.3 s)^0.2, up to 3 s. Chosen as
+`doubt.TOGETHER`: log score of joints of one view 7.09 -> 7.12, of none 5.0 -> 5.15."""
 SEEN_M = 0.1
 """A joint is seen in a frame whose views leave it no less certain than this in any direction, metres."""
 
@@ -62,13 +62,11 @@ def reported_covariance(
     left = carried(left, seen, window.graph.times_s)
     own = (1 - f) / f**2 * marginal @ said @ marginal
     total = np.where(seen[..., None, None], (1 - kept) * marginal, marginal + own) + (1 - f + kept * f) * left
-    total = np.where(simple[..., None, None], total, marginal)
-    twice = solution.inlier[window.rows].sum(axis=-1) >= 2
-    return total * since(twice, window.graph.times_s)[..., None, None]
+    return np.where(simple[..., None, None], total, marginal)
 
 
 def since(twice: NDArray[np.bool_], times_s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(T, J) what covariances are multiplied with, for the time to the nearest frame in which two views see a joint.
+    """(T, J) what covariances are multiplied with for the time to the nearest frame in which two views see it.
 
     `twice` (T, J). 1 where they do; what one view or none leaves open drifts for longer than the model has it.
     """
@@ -81,7 +79,7 @@ def since(twice: NDArray[np.bool_], times_s: NDArray[np.float64]) -> NDArray[np.
 def carried(
     values: NDArray[np.float64], seen: NDArray[np.bool_], times_s: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Values (T, J, ...) of joints in each frame, where these are not `seen` (T, J) from the nearest one that is."""
+    """Values (T, J, ...) of joints, where they are not `seen` (T, J) from the nearest frame in which they are."""
     result = values.copy()
     for joint in np.flatnonzero(seen.any(axis=0) & ~seen.all(axis=0)).tolist():
         frames = np.flatnonzero(seen[:, joint])
