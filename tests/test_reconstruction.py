@@ -289,8 +289,14 @@ def test_files_of_the_first_version_still_load(tmp_path):
 
 def test_joints_are_counted_by_how_they_are_known():
     count = people([0, 0, 3]).counts()["joints"]
-    assert count == {"seen": 3 * 23 - 1, "body": 3, "motion": 3, "unknown": 1}
-    assert Reconstruction.empty().counts()["joints"] == {"seen": 0, "body": 0, "motion": 0, "unknown": 0}
+    assert count == {"seen": 3 * 23 - 1, "weak": 0, "body": 3, "motion": 3, "unknown": 1}
+    assert Reconstruction.empty().counts()["joints"] == {
+        "seen": 0,
+        "weak": 0,
+        "body": 0,
+        "motion": 0,
+        "unknown": 0,
+    }
 
 
 def part(rows: list[int], **run) -> Reconstruction:

@@ -260,7 +260,7 @@ class Estimator:
             inlier=solution.inlier,
             contradicts=solution.contradicts,
             residual_px=final.residual_px,
-            known=how_known(solution, covariance),
+            known=how_known(solution, observations, covariance),
             fit=fit,
             status=status,
             problems=wrong,

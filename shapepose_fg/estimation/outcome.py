@@ -20,6 +20,11 @@ _HALF_M = 0.5
 GROWS_S, GROWS_POWER, GROWS_MOST_S = 0.3, 0.2, 3.0
 """The variance of a joint that two views saw t seconds ago grows with (1 + t / 0.3 s)^0.2, up to 3 s. Chosen as
 `doubt.TOGETHER`: log score of joints of one view 7.09 -> 7.12, of none 5.0 -> 5.15."""
+WEAK_SCORE = 0.3
+"""Detections of a lower score are weak: in simulated crowds one in 18 is somebody else's or nobody's, of the others
+one in 60."""
+WEAK_PROBABILITY = 0.5
+"""So are those that are as probably somebody else's."""
 SEEN_M = 0.1
 """A joint is seen in a frame whose views leave it no less certain than this in any direction, metres."""
 
@@ -88,17 +93,22 @@ def carried(
     return result
 
 
-def how_known(solution: Solution, covariance: NDArray[np.float64]) -> NDArray[np.uint8]:
+def how_known(
+    solution: Solution, observations: Observations, covariance: NDArray[np.float64]
+) -> NDArray[np.uint8]:
     """(N, J) a `Known` for each joint, `covariance` (N, J, 3, 3) being its own.
 
-    A joint that no view saw is carried by motion where it is known much better (half the variance) than the body
+    It is seen where two views' detections are used that are not weak. A joint that no view saw is carried by motion where it is known much better (half the variance) than the body
     knows it.
     """
     pulled = solution.body.known
     information = np.where(pulled[..., None, None], solution.body.information, np.eye(3))
     said = np.trace(np.linalg.inv(information), axis1=2, axis2=3)
-    carried = ~pulled | (np.trace(covariance, axis1=2, axis2=3) < 0.5 * said)
-    code = np.where(solution.inlier.any(axis=-1), Known.SEEN, np.where(carried, Known.MOTION, Known.BODY))
+    moved = ~pulled | (np.trace(covariance, axis1=2, axis2=3) < 0.5 * said)
+    code = np.where(moved, Known.MOTION, Known.BODY)
+    strong = (observations.confidence >= WEAK_SCORE) & (observations.probability > WEAK_PROBABILITY)
+    code = np.where(solution.inlier.any(axis=-1), Known.WEAK, code)
+    code = np.where((solution.inlier & strong).sum(axis=-1) >= 2, Known.SEEN, code)
     return np.where(np.isfinite(solution.joints).all(axis=-1), code, Known.UNKNOWN).astype(np.uint8)
 
 
