@@ -92,7 +92,6 @@ class ObservationTable:
             "candidate": (self.candidate >= 0) & ~seen,
             "xy": np.isfinite(self.xy).all(axis=-1) != seen,
             "confidence": (self.confidence != 0) & ~seen,
-            "probability": (self.probability != 0) & ~seen,
         }
         for name, where in wrong.items():
             if where.any():

@@ -48,8 +48,8 @@ class Known(IntEnum):
     MOTION = 3
     """Neither: carried by motion from the frames before and after."""
     WEAK = 4
-    """Less than two such views: a joint that one view saw, or whose detections are hardly sure. Body and motion have
-    as much to say."""
+    """Less than two such views: a joint that one view saw, or whose detections are hardly sure. Body and motion
+    have as much to say."""
 
     @classmethod
     def observed(cls, known: NDArray[np.integer]) -> NDArray[np.bool_]:

@@ -21,8 +21,7 @@ GROWS_S, GROWS_POWER, GROWS_MOST_S = 0.3, 0.2, 3.0
 """The variance of a joint that two views saw t seconds ago grows with (1 + t / 0.3 s)^0.2, up to 3 s. Chosen as
 `doubt.TOGETHER`: log score of joints of one view 7.09 -> 7.12, of none 5.0 -> 5.15."""
 WEAK_SCORE = 0.3
-"""Detections of a lower score are weak: in simulated crowds one in 18 is somebody else's or nobody's, of the others
-one in 60."""
+"""Detections of a lower score are weak: one in 18 of them is not the person's in simulated crowds, of others one in 60."""
 WEAK_PROBABILITY = 0.5
 """So are those that are as probably somebody else's."""
 SEEN_M = 0.1
@@ -98,8 +97,8 @@ def how_known(
 ) -> NDArray[np.uint8]:
     """(N, J) a `Known` for each joint, `covariance` (N, J, 3, 3) being its own.
 
-    It is seen where two views' detections are used that are not weak. A joint that no view saw is carried by motion where it is known much better (half the variance) than the body
-    knows it.
+    It is seen where two views' detections are used that are not weak. A joint that no view saw is carried by
+    motion where it is known much better (half the variance) than the body knows it.
     """
     pulled = solution.body.known
     information = np.where(pulled[..., None, None], solution.body.information, np.eye(3))

@@ -25,8 +25,8 @@ def message(sigma_m, known=None):
 
 
 def test_a_joint_is_seen_or_the_body_s_or_carried_by_motion():
-    """Seen by one view of three; by none, with 70 % and 72 % of the body's sigma; without a body; not placed; by two
-    views, of which one is weak, or as probably of somebody else, or neither."""
+    """Seen by one view of three; by none, with 70 % and 72 % of the body's sigma; without a body; not placed; by
+    two views, of which one is weak, or as probably of somebody else, or neither."""
     sigma = np.array([[0.09, 0.07, 0.072, 0.07, 0.07, 0.02, 0.02, 0.02]])
     covariance = sigma[..., None, None] ** 2 * I3
     inlier = np.zeros((1, 8, 3), dtype=bool)
