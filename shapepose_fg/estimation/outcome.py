@@ -21,7 +21,7 @@ GROWS_S, GROWS_POWER, GROWS_MOST_S = 0.3, 0.2, 3.0
 """The variance of a joint that two views saw t seconds ago grows with (1 + t / 0.3 s)^0.2, up to 3 s. Chosen as
 `doubt.TOGETHER`: log score of joints of one view 7.09 -> 7.12, of none 5.0 -> 5.15."""
 WEAK_SCORE = 0.3
-"""Detections of a lower score are weak: one in 18 of them is not the person's in simulated crowds, of others one in 60."""
+"""Detections of a lower score are weak: in simulated crowds one in 18 is not the person's, of others one in 60."""
 WEAK_PROBABILITY = 0.5
 """So are those that are as probably somebody else's."""
 SEEN_M = 0.1
