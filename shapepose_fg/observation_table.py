@@ -39,6 +39,10 @@ class Gate(IntEnum):
     """The joint itself could not be placed: there is nothing to compare the detection with."""
 
 
+_LATER: Any = None
+"""In place of a column that is not given."""
+
+
 @dataclass(frozen=True)
 class ObservationTable:
     """The detections of N rows (person and frame), J joints and V views; row i is row i of people.npz."""
@@ -61,8 +65,11 @@ class ObservationTable:
     """(N, J, V, 2) projected joint minus detection, pixels; NaN where there is none, or no joint to project."""
     gate: NDArray[np.uint8]
     """(N, J, V) codes of `Gate`."""
+    probability: NDArray[np.float32] = _LATER
+    """(N, J, V) how probable it is that the detection is this person's, and nobody else's; 0 where there is none.
+    1 where it is not said, as in files of before."""
 
-    ROWS: ClassVar = "frame person candidate xy confidence residual_px gate".split()
+    ROWS: ClassVar = "frame person candidate xy confidence residual_px gate probability".split()
     """The columns that have one entry per row."""
 
     def __post_init__(self) -> None:
@@ -72,7 +79,9 @@ class ObservationTable:
         columns |= {"joint_names": ((J,), np.str_), "view_names": ((V,), np.str_)}
         columns |= {"candidate": ((N, J, V), np.int32), "xy": ((N, J, V, 2), np.float32)}
         columns |= {"confidence": ((N, J, V), np.float32), "residual_px": ((N, J, V, 2), np.float32)}
-        columns |= {"gate": ((N, J, V), np.uint8)}
+        columns |= {"gate": ((N, J, V), np.uint8), "probability": ((N, J, V), np.float32)}
+        if self.probability is None:
+            object.__setattr__(self, "probability", np.asarray(self.gate != Gate.NOT_SEEN, dtype=np.float32))
         for name, (shape, dtype) in columns.items():
             object.__setattr__(self, name, checked(name, getattr(self, name), shape, dtype))
         check_codes("gate", self.gate, Gate)
@@ -96,6 +105,8 @@ class ObservationTable:
         """ValueError for scores that are none, errors without end, and two cameras or joints of one name."""
         if not ((self.confidence >= 0) & np.isfinite(self.confidence)).all():
             raise ValueError("confidence must be 0 or more")
+        if not ((self.probability >= 0) & (self.probability <= 1)).all():
+            raise ValueError("probability must be 0 to 1")
         if np.isinf(self.residual_px).any():
             raise ValueError("residual_px must be finite, or NaN where there is none")
         for name in ("joint_names", "view_names"):
@@ -141,6 +152,7 @@ class ObservationTable:
             confidence=np.where(seen, observations.confidence, 0.0).astype(np.float32),
             residual_px=np.where(ahead, projected - observations.xy, np.nan).astype(np.float32),
             gate=gate.astype(np.uint8),
+            probability=np.where(seen, observations.probability, 0.0).astype(np.float32),
         )
 
     @classmethod
@@ -194,6 +206,7 @@ class ObservationTable:
             track=self.person.astype(np.intp),
             frame=self.frame.astype(np.intp),
             time_s=np.repeat(time_s[:, None], len(self.view_names), axis=1),
+            probability=np.where(seen, self.probability, 1.0).astype(np.float64),
         )
 
     @property
@@ -240,6 +253,7 @@ class ObservationTable:
             rows=cls.ROWS,
             shared=("joint_names", "view_names"),
             code_names={"gate_names": code_names(Gate)},
+            added={"probability"},
             cure=_CURE,
         )
         try:

@@ -27,6 +27,8 @@ class Observations:
     """(N, V) when each view was exposed, seconds: equal in a row if cameras are synchronised. 0 by default."""
     candidate: NDArray[np.intp] = field(default=None)  # type: ignore[assignment]
     """(N, J, V) which detection of the row's frame each observation is; -1 for none, or not said."""
+    probability: NDArray[np.float64] = field(default=None)  # type: ignore[assignment]
+    """(N, J, V) how probable it is that the observation is this person's; 1 where it is not said."""
 
     def __post_init__(self) -> None:
         shape = np.shape(self.confidence)
@@ -41,6 +43,7 @@ class Observations:
             "frame": np.zeros(N, dtype=np.intp),
             "time_s": np.zeros((N, V)),
             "candidate": np.full(shape, -1, dtype=np.intp),
+            "probability": np.ones(shape),
         }
         for name, default in defaults.items():
             if getattr(self, name) is None:

@@ -69,7 +69,8 @@ def _joints(count: dict[str, int], people: "Reconstruction") -> str:
     """How the joints are known, as shares, and how sure they are, as words."""
     import numpy as np
 
-    words = {"seen": "seen", "body": "inferred from the body", "motion": "carried by motion", "unknown": "unknown"}
+    words = {"seen": "seen by two views", "weak": "seen by one or weakly", "body": "inferred from the body"}
+    words |= {"motion": "carried by motion", "unknown": "unknown"}
     total = max(sum(count.values()), 1)
     shares = ", ".join(f"{100 * count[how] / total:.1f} % {word}" for how, word in words.items() if count[how] > 0)
     variance = np.trace(people.covariance, axis1=-2, axis2=-1) / 3

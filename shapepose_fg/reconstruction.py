@@ -41,11 +41,20 @@ class Known(IntEnum):
     UNKNOWN = 0
     """The joint is not placed (NaN); or the file is older than this column."""
     SEEN = 1
-    """At least one view's detection of the joint was used in this frame."""
+    """Two views' detections of the joint were used in this frame that are the person's as far as one can tell
+    (`estimation.outcome.how_known`); in files from before `WEAK`, one view's."""
     BODY = 2
     """No detection in this frame: inferred from the body, which other joints place."""
     MOTION = 3
     """Neither: carried by motion from the frames before and after."""
+    WEAK = 4
+    """Less than two such views: a joint that one view saw, or whose detections are hardly sure. Body and motion
+    have as much to say."""
+
+    @classmethod
+    def observed(cls, known: NDArray[np.integer]) -> NDArray[np.bool_]:
+        """Of which joints (...) any view's detection was used."""
+        return np.isin(known, (cls.SEEN, cls.WEAK))
 
 
 _LATER: Any = None
@@ -411,6 +420,6 @@ def count_rows(pieces: Iterable[tuple[NDArray[np.str_], NDArray[np.uint8]]]) -> 
     for their_status, their_known in pieces:
         status.update(their_status.tolist())
         known += np.bincount(their_known.ravel(), minlength=len(Known))
-    order = (Known.SEEN, Known.BODY, Known.MOTION, Known.UNKNOWN)
+    order = (Known.SEEN, Known.WEAK, Known.BODY, Known.MOTION, Known.UNKNOWN)
     joints = {kind.name.lower(): int(known[kind]) for kind in order}
     return {"found": status.total(), "status": dict(status), "joints": joints}

@@ -29,8 +29,8 @@ class SavedTable:
         """InputError, with the `cure`, where it cannot be read or an array is missing.
 
         `rows` are the columns with an entry per row, and `shared` arrays beside them; those of `added` may be
-        missing. `code_names` are arrays that say what the codes of a column mean, which must be these where the
-        column, the name without `_names`, is there.
+        missing. `code_names` are arrays that say what the codes of a column mean, which must be these, or the
+        first of them, where the column, the name without `_names`, is there.
         """
         self.file, self._cure = file, cure
         self._npz = NpzFile(file, (*rows, *shared, *code_names, RUN_ID), f"{cure}, or run one first")
@@ -44,7 +44,9 @@ class SavedTable:
                 if name not in there and name not in added:
                     raise InputError(f"{file}: column {name} is missing; {cure}")
             for name in named:
-                if not np.array_equal(self._npz.array(name), code_names[name]):
+                told = self._npz.array(name)
+                # Older files know fewer codes: what is added to them comes last.
+                if not (len(told) > 0 and np.array_equal(told, code_names[name][: len(told)])):
                     raise InputError(f"{file}: {name} are not those of this version; {cure}")
             self.run_id = self._npz.array(RUN_ID) if RUN_ID in there else None
             self._rows = [name for name in rows if name in there]

@@ -33,7 +33,7 @@ class WindowConfig(Settings):
     overlap_s: Annotated[float, Interval(ge=0, le=60)] = 0.4
     """What a window takes of the frames before and after its own, and does not return: smoothing reaches a few
     frames. Windows of other lengths move joints by under 2 mm in the median (tests/test_windows.py)."""
-    again_over_time: RepeatsOrNone = 2
+    again_over_time: RepeatsOrNone = 3
     """How often detections are given out again around a draft of a window."""
     again_alone: RepeatsOrNone = 5
     """The same for frames that stand alone. From time to time more is asked of who stays (`Survival`): whoever
@@ -107,7 +107,7 @@ class WindowSolver:
         again = self.windows.again_alone if span.alone else self.windows.again_over_time
         began = time.perf_counter()
         for n in range(again if len(rows) > 0 else 0):
-            joints, covariance = self.estimator.draft(rows)
+            joints, covariance = self.estimator.draft(rows, over_time=not span.alone)
             draft = given, rows, joints, covariance, self.skeleton, self.assignment
             if span.alone:
                 rows = reassociate(*draft, Survival().at(n / max(again - 1, 1)))

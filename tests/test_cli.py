@@ -115,7 +115,7 @@ def test_reconstruct_writes_results_and_says_what_it_found(recording, pipeline, 
     ):
         assert part in words
     for part in (
-        "100.0 % seen; median sigma 20 mm",
+        "100.0 % seen by two views; median sigma 20 mm",
         "5.0 ms a frame",
         "vote 5.0",
         "out/people.npz",

@@ -73,6 +73,7 @@ def test_rows_and_back_together():
         ("confidence", np.full((2, 2, 2), np.nan), "confidence must be 0 or more"),
         ("confidence", np.full((2, 2, 2), np.inf), "confidence must be 0 or more"),
         ("residual_px", np.full((2, 2, 2, 2), np.inf), "residual_px must be finite, or NaN"),
+        ("probability", np.full((2, 2, 2), 1.5), "probability must be 0 to 1"),
         ("view_names", np.array(["A", "A"]), "view_names must differ from each other"),
     ],
 )
@@ -167,3 +168,18 @@ def test_the_table_of_solved_rows(five_cameras, two_people, seen_exactly):
 
 def test_every_gate_has_a_name_of_its_own():
     assert len({gate.name for gate in Gate}) == len(Gate) == max(Gate) + 1
+
+
+def test_a_file_of_before_reads_as_certain(tmp_path):
+    file = tmp_path / "observations.npz"
+    given = replace(table(), probability=np.full((2, 2, 2), 0.25))
+    given.save(file)
+    assert (ObservationTable.load(file).probability == 0.25).all()
+    with np.load(file) as archive:
+        np.savez(file, **{name: archive[name] for name in archive if name != "probability"})
+    old = ObservationTable.load(file)
+    np.testing.assert_array_equal(old.probability, old.gate > 0)
+    again = old.observations(np.zeros((2, 2, 3)), np.zeros(2))
+    assert (again.probability == 1).all() and given.observations(
+        np.zeros((2, 2, 3)), np.zeros(2)
+    ).probability.min() == 0.25

@@ -251,6 +251,6 @@ def test_the_observations_are_what_the_joints_were_solved_from(scene, recording,
     np.testing.assert_allclose(table.residual_px[row, joint, view], residual, atol=1e-3)
     assert np.median(np.linalg.norm(table.residual_px[table.used], axis=-1)) < 10
     # Seen means that a detection was used; nobody is known by motion where every frame stands alone.
-    np.testing.assert_array_equal(people.known == Known.SEEN, table.used.any(axis=-1))
-    assert set(np.unique(people.known)) <= {Known.SEEN, Known.BODY}
+    np.testing.assert_array_equal(Known.observed(people.known), table.used.any(axis=-1))
+    assert set(np.unique(people.known)) <= {Known.SEEN, Known.WEAK, Known.BODY}
     assert people.run["people"]["joints"]["seen"] == (people.known == Known.SEEN).sum()

@@ -82,7 +82,7 @@ def test_file_has_the_columns_that_are_promised_and_nothing_pickled(tmp_path):
         "velocity": (3, 25, 3),
         "velocity_covariance": (3, 25, 3, 3),
         "known": (3, 25),
-        "known_names": (4,),
+        "known_names": (5,),
         "confidence": (3, 25),
         "betas": (3, 10),
         "global_orient": (3, 3),
@@ -123,7 +123,7 @@ def test_run_may_hold_arrays_and_paths(tmp_path):
         ("covariance", np.zeros((2, 25, 3)), r"covariance must be \(2, 25, 3, 3\), got"),
         ("frame", np.array([0.5, 1.0]), "frame must hold int64 values, got float64"),
         ("status", np.array(["ok", "fine"]), r"status must be one of \['ok', .*\], got \['fine'\]"),
-        ("known", np.full((2, 25), 4), "known must hold codes below 4, got 4"),
+        ("known", np.full((2, 25), 5), "known must hold codes below 5, got 5"),
         ("known", np.full((2, 25), 300), "known must hold 0 to 255, got 300 to 300"),
         ("known", np.full((2, 25), 1.0), "known must hold uint8 values, got float64"),
         ("time_s", np.zeros(3), r"time_s must be \(2,\), got \(3,\)"),
@@ -289,8 +289,14 @@ def test_files_of_the_first_version_still_load(tmp_path):
 
 def test_joints_are_counted_by_how_they_are_known():
     count = people([0, 0, 3]).counts()["joints"]
-    assert count == {"seen": 3 * 23 - 1, "body": 3, "motion": 3, "unknown": 1}
-    assert Reconstruction.empty().counts()["joints"] == {"seen": 0, "body": 0, "motion": 0, "unknown": 0}
+    assert count == {"seen": 3 * 23 - 1, "weak": 0, "body": 3, "motion": 3, "unknown": 1}
+    assert Reconstruction.empty().counts()["joints"] == {
+        "seen": 0,
+        "weak": 0,
+        "body": 0,
+        "motion": 0,
+        "unknown": 0,
+    }
 
 
 def part(rows: list[int], **run) -> Reconstruction:
@@ -452,3 +458,10 @@ def test_entries_of_run_json_that_are_read_again(tmp_path, run, sentence):
         Reconstruction.load(tmp_path)
     assert str(caught.value).startswith(f"{tmp_path / 'run.json'}: ")
     assert sentence in str(caught.value) and "restore it or delete it" in str(caught.value)
+
+
+def test_files_from_before_weak_joints_had_a_code_still_load(tmp_path):
+    """Their codes keep their meaning, and observations without a probability count as certain."""
+    old = people([0, 3])
+    np.savez(tmp_path / "people.npz", **(columns_of(old) | {"known_names": columns_of(old)["known_names"][:4]}))
+    np.testing.assert_array_equal(Reconstruction.load(tmp_path).known, old.known)

@@ -13,6 +13,7 @@ from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter
 from shapepose_fg.camera import Rig, Views
 from shapepose_fg.estimation.alternation import Solution, Window, alternate, final_bodies
 from shapepose_fg.estimation.body_step import joint_targets
+from shapepose_fg.estimation.doubt import association_spread, lasting_spread
 from shapepose_fg.estimation.draft import (
     NARROWING,
     WholeFitter,
@@ -31,7 +32,8 @@ from shapepose_fg.estimation.linearisation import (
     weakest_sigma,
 )
 from shapepose_fg.estimation.motion_model import MotionModel
-from shapepose_fg.estimation.outcome import SEEN_M, Problem, how_known, problems, reported_covariance
+from shapepose_fg.estimation.outcome import SEEN_M, Problem, how_known, problems, reported_covariance, since
+from shapepose_fg.estimation.smoothing import smoothed
 from shapepose_fg.estimation.state_covariances import state_covariances
 from shapepose_fg.estimation.window_graph import WindowGraph, near_in_time
 from shapepose_fg.observations import Observations
@@ -129,14 +131,14 @@ class Estimator:
         return self._estimates(observations, sigmas, views, windows, X, solution)
 
     def draft(
-        self, observations: Observations, views: Views | None = None
+        self, observations: Observations, views: Views | None = None, *, over_time: bool = False
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """About where the joints of N rows are (N, J, 3), metres, and how surely (N, J, 3, 3), without any graph.
 
         Enough to give detections out again: what the views say, and where that is little, or contradicts the body,
         what the body says. Views are asked around where they put the joints, and then around the body, ever nearer
         to it (`refine.draft_reach_m`). A joint's views are in the body, too, so that these covariances are too
-        small.
+        small. `over_time` smooths them along each track (`smoothing.smoothed`).
         """
         config = self.config
         views = Views.of(self.rig) if views is None else views
@@ -159,7 +161,11 @@ class Estimator:
             fitted = fitted.with_rows(rows, targets.rows(rows))
             placed = np.flatnonzero(again.ok)
             body = body.with_rows(rows[placed], again.rows(placed))
-        return drafted(evidence, body, config.refine.contradiction)
+        places, covariance = drafted(evidence, body, config.refine.contradiction)
+        if not over_time:
+            return places, covariance
+        times_s = observations.time_s.mean(axis=1)
+        return smoothed(places, covariance, observations.track, times_s, self._motion)
 
     def _completed(self, X: NDArray[np.float64], observations: Observations, views: Views) -> NDArray[np.float64]:
         """X_0 (N, J, 3) with joints that are not placed where a draft has them, in windows of several frames.
@@ -235,6 +241,12 @@ class Estimator:
             X = self._limbs_kept(X, covariance, windows, solution)
         fit = final_bodies(solution, covariance, windows, self.fitter)
         final = linearise(observations, sigmas, X, views, self.config.observations)
+        spread = association_spread(observations, sigmas, final, solution.body, views, self.config.observations)
+        for window in windows:
+            count, times_s = solution.inlier[window.rows].sum(axis=-1), window.graph.times_s
+            if window.graph.temporal:
+                covariance[window.rows] *= since(count >= 2, times_s)[..., None, None]
+            covariance[window.rows] += lasting_spread(spread[window.rows], count > 0, times_s)
         wrong = problems(observations, windows, solution, first, covariance)
         enough = np.where(solution.enough, Status.BODY_UNDETERMINED, Status.TOO_FEW_VIEWS)
         status = np.where(fit.ok, Status.OK, enough)
@@ -248,7 +260,7 @@ class Estimator:
             inlier=solution.inlier,
             contradicts=solution.contradicts,
             residual_px=final.residual_px,
-            known=how_known(solution, covariance),
+            known=how_known(solution, observations, covariance),
             fit=fit,
             status=status,
             problems=wrong,

@@ -16,6 +16,8 @@ from shapepose_fg.observations import Observations
 
 MIN_DEPTH_M = 0.2
 """An observation counts only if the joint is at least this far in front of the camera."""
+LEAST_PROBABILITY = 0.01
+"""An observation that is less probably the person's counts as if it were this."""
 _DEPTH_M = 8.0
 """Of joints before the cameras of the `tune` sequences, in the median (7 to 10 m): where lengths become pixels in
 the paper's setting."""
@@ -175,6 +177,8 @@ def observation_sigmas(
         sigma_m=config.sigma_m,
         floor_px=config.floor_px,
     )
+    # What is as probably somebody else's says half as much.
+    sigmas[seen] /= np.sqrt(np.maximum(observations.probability[seen], LEAST_PROBABILITY))
     return sigmas
 
 

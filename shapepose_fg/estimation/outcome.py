@@ -17,6 +17,13 @@ RUNAWAY_M = 1.0
 RUNAWAY_SIGMA = 20.0
 """So has one that ends this many standard deviations, and half a metre, from what views and body say of it."""
 _HALF_M = 0.5
+GROWS_S, GROWS_POWER, GROWS_MOST_S = 0.3, 0.2, 3.0
+"""The variance of a joint that two views saw t seconds ago grows with (1 + t / 0.3 s)^0.2, up to 3 s. Chosen as
+`doubt.TOGETHER`: log score of joints of one view 7.09 -> 7.12, of none 5.0 -> 5.15."""
+WEAK_SCORE = 0.3
+"""Detections of a lower score are weak: in simulated crowds one in 18 is not the person's, of others one in 60."""
+WEAK_PROBABILITY = 0.5
+"""So are those that are as probably somebody else's."""
 SEEN_M = 0.1
 """A joint is seen in a frame whose views leave it no less certain than this in any direction, metres."""
 
@@ -56,27 +63,51 @@ def reported_covariance(
     f, kept = views.white_share, views.kept
     left = np.zeros(information.shape)
     left[seen] = np.linalg.inv(information[seen])
-    times = window.graph.times_s
-    for joint in np.flatnonzero(seen.any(axis=0) & ~seen.all(axis=0)).tolist():
-        frames = np.flatnonzero(seen[:, joint])
-        nearest = frames[np.abs(times[:, None] - times[frames]).argmin(axis=1)]
-        left[:, joint] = left[nearest, joint]
+    left = carried(left, seen, window.graph.times_s)
     own = (1 - f) / f**2 * marginal @ said @ marginal
     total = np.where(seen[..., None, None], (1 - kept) * marginal, marginal + own) + (1 - f + kept * f) * left
     return np.where(simple[..., None, None], total, marginal)
 
 
-def how_known(solution: Solution, covariance: NDArray[np.float64]) -> NDArray[np.uint8]:
+def since(twice: NDArray[np.bool_], times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(T, J) what covariances are multiplied with for the time to the nearest frame in which two views see it.
+
+    `twice` (T, J). 1 where they do; what one view or none leaves open drifts for longer than the model has it.
+    """
+    at = np.broadcast_to(times_s[:, None], twice.shape)
+    nearest = carried(at, twice, times_s)
+    waited = np.where(twice.any(axis=0), np.abs(at - nearest), GROWS_MOST_S)
+    return (1 + np.minimum(waited, GROWS_MOST_S) / GROWS_S) ** GROWS_POWER
+
+
+def carried(
+    values: NDArray[np.float64], seen: NDArray[np.bool_], times_s: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Values (T, J, ...) of joints, where they are not `seen` (T, J) from the nearest frame in which they are."""
+    result = values.copy()
+    for joint in np.flatnonzero(seen.any(axis=0) & ~seen.all(axis=0)).tolist():
+        frames = np.flatnonzero(seen[:, joint])
+        nearest = frames[np.abs(times_s[:, None] - times_s[frames]).argmin(axis=1)]
+        result[:, joint] = values[nearest, joint]
+    return result
+
+
+def how_known(
+    solution: Solution, observations: Observations, covariance: NDArray[np.float64]
+) -> NDArray[np.uint8]:
     """(N, J) a `Known` for each joint, `covariance` (N, J, 3, 3) being its own.
 
-    A joint that no view saw is carried by motion where it is known much better (half the variance) than the body
-    knows it.
+    It is seen where two views' detections are used that are not weak. A joint that no view saw is carried by
+    motion where it is known much better (half the variance) than the body knows it.
     """
     pulled = solution.body.known
     information = np.where(pulled[..., None, None], solution.body.information, np.eye(3))
     said = np.trace(np.linalg.inv(information), axis1=2, axis2=3)
-    carried = ~pulled | (np.trace(covariance, axis1=2, axis2=3) < 0.5 * said)
-    code = np.where(solution.inlier.any(axis=-1), Known.SEEN, np.where(carried, Known.MOTION, Known.BODY))
+    moved = ~pulled | (np.trace(covariance, axis1=2, axis2=3) < 0.5 * said)
+    code = np.where(moved, Known.MOTION, Known.BODY)
+    strong = (observations.confidence >= WEAK_SCORE) & (observations.probability > WEAK_PROBABILITY)
+    code = np.where(solution.inlier.any(axis=-1), Known.WEAK, code)
+    code = np.where((solution.inlier & strong).sum(axis=-1) >= 2, Known.SEEN, code)
     return np.where(np.isfinite(solution.joints).all(axis=-1), code, Known.UNKNOWN).astype(np.uint8)
 
 

@@ -50,7 +50,7 @@ def beside(alone: Reconstruction, timed: Reconstruction) -> Beside:
         same = mean[mine, other] < SAME_M
         mine, other = mine[same], other[same]
         missing += len(rows) - len(mine)
-        known = timed.known[rows[mine]] == Known.SEEN
+        known = Known.observed(timed.known[rows[mine]])
         elsewhere = ~(distance[mine, other] <= APART_M)
         apart += (known & elsewhere).sum(axis=0)
         seen += known.sum(axis=0)

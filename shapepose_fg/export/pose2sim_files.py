@@ -81,7 +81,7 @@ def _numbered(take: Take, first: int) -> Take:
 
 def _main_person(take: Take) -> int:
     """Who was seen most: joints that a view saw, over all frames."""
-    seen = take.people.known == Known.SEEN
+    seen = Known.observed(take.people.known)
     count = [int(seen[rows[rows >= 0]].sum()) for rows in take.rows]
     return int(np.argmax(count))
 

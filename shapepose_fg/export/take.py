@@ -132,7 +132,7 @@ def _seen(people: Reconstruction) -> Reconstruction:
     """The people without what no view saw."""
     if not (people.known != Known.UNKNOWN).any():
         raise ValueError("people.npz does not say how joints are known; leave out --seen-only")
-    seen = people.known == Known.SEEN
+    seen = Known.observed(people.known)
     columns: dict[str, Any] = {"known": np.where(seen, people.known, Known.UNKNOWN).astype(np.uint8)}
     for name in ("joints", "covariance", "velocity", "velocity_covariance"):
         value = getattr(people, name)

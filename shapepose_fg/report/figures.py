@@ -12,7 +12,7 @@ from shapepose_fg.reconstruction import Known, Reconstruction
 
 _BINS = 60
 """Points of a line over time: as many as can be told apart in a cell of a table."""
-KINDS = (Known.SEEN, Known.BODY, Known.MOTION, Known.UNKNOWN)
+KINDS = (Known.SEEN, Known.WEAK, Known.BODY, Known.MOTION, Known.UNKNOWN)
 """The ways in which joints are known, the surest first."""
 REASONS = tuple(gate for gate in Gate if gate not in (Gate.NOT_SEEN, Gate.USED))
 """Why a detection may not be used."""
@@ -99,7 +99,7 @@ def number(value: object) -> float | None:
 
 
 def known_counts(people: Reconstruction, by: NDArray[np.integer] | None = None) -> NDArray[np.int64]:
-    """How many joints are known in each of `KINDS`: (J, 4) by joint, or (G, 4) by groups `by` (N,) of the rows."""
+    """How many joints are known in each of `KINDS`: (J, 5) by joint, or (G, 5) by groups `by` (N,) of the rows."""
     kinds = people.known[..., None] == np.array(KINDS)
     if by is None:
         return kinds.sum(axis=0)

@@ -79,7 +79,7 @@ def key_figures(people: Reconstruction) -> Element:
     ok = float((people.status == "ok").mean()) if len(people) > 0 else None
     rows = f"of {_plural(len(people), 'row', 'rows')}: a person in a frame"
     cards = [
-        ("joints seen", _percent(seen), "by a camera, of those placed"),
+        ("joints seen", _percent(seen), "by two cameras, of those placed"),
         (
             "median error",
             or_dash(px.median_px, "{:.1f} px"),

@@ -13,6 +13,7 @@ from shapepose_fg.export.axes import z_up
 from shapepose_fg.export.bones import bones_of
 from shapepose_fg.export.markers import sigma_m
 from shapepose_fg.export.take import Take
+from shapepose_fg.reconstruction import Known
 from shapepose_fg.report.skins import ROW_BYTES, TURN, Skins, skins_of
 from shapepose_fg.viewer.palette import PALETTE
 
@@ -109,7 +110,11 @@ def _packing(joints: NDArray[np.float64]) -> tuple[_Packing, float]:
 
 
 def _known_and_sigma(known: NDArray[np.uint8], sigma: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """How a joint is known in the two low bits, its sigma's level in the six above; level 0 is not known."""
+    """How a joint is known in the two low bits, its sigma's level in the six above; level 0 is not known.
+
+    A joint that is seen weakly is drawn like one that the body places.
+    """
+    known = np.where(known == Known.WEAK, Known.BODY, known)
     with np.errstate(invalid="ignore", divide="ignore"):
         level = 1 + np.rint(_OCTAVE * np.log2(1e3 * sigma))
     level = np.where(np.isfinite(level), np.clip(level, 1, _LEVELS), 0)

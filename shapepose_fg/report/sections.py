@@ -13,13 +13,15 @@ from shapepose_fg.viewer.palette import PALETTE
 
 KIND_WORDS = {
     Known.SEEN: "seen",
+    Known.WEAK: "seen by one view or weakly",
     Known.BODY: "inferred from the body",
     Known.MOTION: "carried by motion",
     Known.UNKNOWN: "unknown",
 }
 """How a joint is known, in words."""
 _MEANING = {
-    Known.SEEN: "a camera's detection of it was used in this frame",
+    Known.SEEN: "two cameras' detections of it were used in this frame",
+    Known.WEAK: "one camera's was, or detections that are hardly sure",
     Known.BODY: "no detection was used; the fitted body places it",
     Known.MOTION: "no detection was used; the frames before and after place it",
     Known.UNKNOWN: "not placed",
@@ -114,7 +116,7 @@ def joints_section(people: Reconstruction) -> Element:
     """How each joint is known, over all people and frames."""
     title = "How joints are known"
     counts = known_counts(people)
-    if counts.sum() == 0 or counts[:, :3].sum() == 0:
+    if counts.sum() == 0 or counts[:, :-1].sum() == 0:
         return section("joints", title, element("p", "This result does not say how its joints are known."))
     legend = element(
         "ul",
@@ -148,7 +150,7 @@ def swatch(person: int) -> Element:
 
 
 def known_bar(counts: np.ndarray, name: str) -> Element:
-    """(4,) how often something is known in each way, as a bar."""
+    """(5,) how often something is known in each way, as a bar."""
     total = max(int(counts.sum()), 1)
     shares = [(kind.name.lower(), int(count) / total) for kind, count in zip(KINDS, counts, strict=True)]
     said = ", ".join(

@@ -94,7 +94,7 @@ def _summary(
         gaps=int((np.diff(frame) > every).sum()),
         stature_m=stature_m,
         confidence=float(people.confidence[rows].mean()),
-        seen=float((known[told] == Known.SEEN).mean()) if told.any() else float("nan"),
+        seen=float(Known.observed(known[told]).mean()) if told.any() else float("nan"),
         walked_m=_walked_m(people, rows),
     )
 

@@ -11,7 +11,7 @@ from shapepose_fg.proposal.assignment import lesser
 from shapepose_fg.proposal.association import seen_twice
 from shapepose_fg.skeleton import Skeleton
 from shapepose_fg.tracking.hypotheses import Input
-from shapepose_fg.tracking.view_assignment import AssignmentConfig, assign
+from shapepose_fg.tracking.view_assignment import AssignmentConfig, assign_with_probability
 
 
 @dataclass(frozen=True)
@@ -118,27 +118,29 @@ def reassociate(
         index = np.flatnonzero(rows.frame == frame.frame)
         if survival is not None:
             index = index[np.isfinite(sigma_m[index]).any(axis=1)]
-        candidate = _candidates(frame, joints[index], sigma_m[index], skeleton, config)
+        candidate, probability = _given_out(frame, joints[index], sigma_m[index], skeleton, config)
         while survival is not None and len(index) > 0:
             gone = _gone(frame, candidate, joints[index], skeleton, survival)
             if not gone.any():
                 break
             index = index[~gone]
-            candidate = _candidates(frame, joints[index], sigma_m[index], skeleton, config)
+            candidate, probability = _given_out(frame, joints[index], sigma_m[index], skeleton, config)
         part = Observations.of(candidate, frame.detections, joints[index])
-        parts.append(replace(part, track=rows.track[index], frame=rows.frame[index], time_s=rows.time_s[index]))
+        who = {name: getattr(rows, name)[index] for name in ("track", "frame", "time_s")}
+        parts.append(replace(part, probability=probability, **who))
     return Observations.concatenate(parts)
 
 
-def _candidates(
+def _given_out(
     frame: Input,
     joints: NDArray[np.float64],
     sigma_m: NDArray[np.float64],
     skeleton: Skeleton,
     config: AssignmentConfig,
-) -> NDArray[np.intp]:
-    """(P, J, V) the detections of one frame's people."""
-    return assign(joints, sigma_m, ~np.isfinite(sigma_m), frame.detections, frame.rig, skeleton, config)
+) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """(P, J, V) the detections of one frame's people, and how probably they are theirs."""
+    lost = ~np.isfinite(sigma_m)
+    return assign_with_probability(joints, sigma_m, lost, frame.detections, frame.rig, skeleton, config)
 
 
 def _gone(

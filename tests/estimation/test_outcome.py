@@ -25,17 +25,22 @@ def message(sigma_m, known=None):
 
 
 def test_a_joint_is_seen_or_the_body_s_or_carried_by_motion():
-    """Seen by one view of three; by none, with 70 % and 72 % of the body's sigma; without a body; not placed."""
-    sigma = np.array([[0.09, 0.07, 0.072, 0.07, 0.07]])
+    """Seen by one view of three; by none, with 70 % and 72 % of the body's sigma; without a body; not placed; by
+    two views, of which one is weak, or as probably of somebody else, or neither."""
+    sigma = np.array([[0.09, 0.07, 0.072, 0.07, 0.07, 0.02, 0.02, 0.02]])
     covariance = sigma[..., None, None] ** 2 * I3
-    inlier = np.zeros((1, 5, 3), dtype=bool)
-    inlier[0, 0, 1] = inlier[0, 4, :] = True
-    joints = np.zeros((1, 5, 3))
+    inlier = np.zeros((1, 8, 3), dtype=bool)
+    inlier[0, 0, 1] = inlier[0, 4, :] = inlier[0, 5:, :2] = True
+    joints = np.zeros((1, 8, 3))
     joints[0, 4, 2] = np.nan
-    body = message(np.full((1, 5), 0.1), [[True, True, True, False, True]])
+    body = message(np.full((1, 8), 0.1), [[True, True, True, False, True, True, True, True]])
+    confidence, probability = np.full((1, 8, 3), 0.8), np.ones((1, 8, 3))
+    confidence[0, 5, 0], probability[0, 6, 0] = 0.2, 0.4
+    observations = SimpleNamespace(confidence=confidence, probability=probability)
     solution = SimpleNamespace(body=body, inlier=inlier, joints=joints)
-    found = how_known(solution, covariance)
-    assert found.tolist() == [[Known.SEEN, Known.MOTION, Known.BODY, Known.MOTION, Known.UNKNOWN]]
+    found = how_known(solution, observations, covariance)
+    unseen = [Known.MOTION, Known.BODY, Known.MOTION, Known.UNKNOWN]
+    assert found.tolist() == [[Known.WEAK, *unseen, Known.WEAK, Known.WEAK, Known.SEEN]]
     assert found.dtype == np.uint8
 
 

@@ -140,10 +140,10 @@ def test_figures_are_those_of_the_observations(result):
         assert camera.trend_px == pytest.approx([np.sqrt(2)] * FRAMES)
     counts = known_counts(result)
     assert counts.sum() == result.known.size
-    assert counts[BODY_25.index(GUESSED[1])].tolist() == [16, 24, 0, 0]
+    assert counts[BODY_25.index(GUESSED[1])].tolist() == [16, 0, 24, 0, 0]
     # By person: the guessed wrist is person 3's.
     by_person = known_counts(result, (result.person == 7).astype(int))
-    assert by_person[0].tolist() == [24 * 24, 24, 0, 0] and by_person[1].tolist() == [16 * 25 - 1, 0, 0, 1]
+    assert by_person[0].tolist() == [24 * 24, 0, 24, 0, 0] and by_person[1].tolist() == [16 * 25 - 1, 0, 0, 0, 1]
 
 
 def test_the_page_says_who_was_there_and_what_happened(result, scene, tmp_path):

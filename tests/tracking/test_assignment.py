@@ -1,16 +1,19 @@
 """Detections of predicted joints, joints that cannot be a person's own, and detections given out again."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from shapepose_fg.detections import Detections
 from shapepose_fg.observations import Observations
 from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.tracking import view_assignment
 from shapepose_fg.tracking.following import Input
 from shapepose_fg.tracking.plausibility import torn_joints
 from shapepose_fg.tracking.reassociation import Lasting, Survival, reassociate, reassociate_over_time
-from shapepose_fg.tracking.view_assignment import AssignmentConfig, assign
+from shapepose_fg.tracking.view_assignment import AssignmentConfig, assign, assign_with_probability
 
 WRIST, ELBOW = BODY_25.index("RWrist"), BODY_25.index("RElbow")
 
@@ -217,3 +220,57 @@ def test_a_track_that_is_in_somebody_else_s_place_for_most_of_a_window_is_their_
     covariance = np.broadcast_to(0.02**2 * np.eye(3), (len(rows), 25, 3, 3))
     kept = reassociate_over_time(given, rows, rows.initial, covariance, BODY_25, AssignmentConfig())
     assert set(kept.track.tolist()) == left
+
+
+def by_enumeration(weight, slot):
+    """(A, D) marginals over all ways to give D detections to A people, one a slot and one a detection."""
+    people, count = weight.shape
+    total, marginal = 0.0, np.zeros(weight.shape)
+    for owners in itertools.product(range(-1, people), repeat=count):
+        taken = {(owner, slot[d]) for d, owner in enumerate(owners) if owner >= 0}
+        if len(taken) == sum(owner >= 0 for owner in owners):
+            of_this = np.prod([weight[owner, d] for d, owner in enumerate(owners) if owner >= 0])
+            total += of_this
+            for d, owner in enumerate(owners):
+                marginal[owner, d] += of_this * (owner >= 0)
+    return marginal / total
+
+
+def test_probabilities_are_the_marginals_of_all_ways_to_give_detections_out():
+    """Two people, three wrists in one view and two in another; exact where they compete for one only."""
+    nothing = np.zeros((0, 2), dtype=int)
+    detections = Detections(
+        np.array([0, 1, 0, 1, 0]), np.full(5, 4), np.zeros((5, 2)), np.ones(5), nothing, np.zeros(0)
+    )
+    score = np.random.default_rng(0).uniform(0, 1.6, (2, 5))
+    possible = np.ones((2, 5), dtype=bool)
+    possible[0, 2:4] = possible[1, 4] = False
+    weight = np.where(possible, np.exp(view_assignment._ODDS * (score - view_assignment._EVEN)), 0.0)
+    expected = by_enumeration(weight, detections.view)
+    found = view_assignment.probabilities(score, possible, detections, 2)
+    np.testing.assert_allclose(found[:, [1, 3]], expected[:, [1, 3]], atol=1e-9)
+    np.testing.assert_allclose(found, expected, atol=0.15)  # both can have wrist 0 and both wrist 4: a cycle
+    alone = view_assignment.probabilities(score[:1], possible[:1], detections, 2)
+    np.testing.assert_allclose(alone, by_enumeration(weight[:1], detections.view), atol=1e-12)
+    order = np.array([3, 0, 4, 1, 2])
+    shuffled = Detections(
+        detections.view[order], np.full(5, 4), np.zeros((5, 2)), np.ones(5), nothing, np.zeros(0)
+    )
+    again = view_assignment.probabilities(score[::-1][:, order], possible[::-1][:, order], shuffled, 2)
+    np.testing.assert_allclose(again[::-1], found[:, order], atol=1e-12)
+
+
+def test_two_people_side_by_side_are_less_certain_than_one_alone(five_cameras, two_people, seen_exactly):
+    """Joints 4 cm apart, and no affinities: either may have either. A metre apart each is somebody's."""
+    median = []
+    for apart in (0.04, 1.0):
+        people = np.stack([two_people[0], two_people[0] + [0, apart, 0]])
+        seen = seen_exactly(five_cameras, people)
+        detections = replace(seen, pairs=np.zeros((0, 2), dtype=int), affinity=np.zeros(0))
+        sigma, lost = np.full((2, 25), 0.02), np.zeros((2, 25), dtype=bool)
+        chosen, probability = assign_with_probability(
+            people, sigma, lost, detections, five_cameras, BODY_25, AssignmentConfig()
+        )
+        assert (chosen >= 0).all()
+        median.append(np.median(probability))
+    assert median[0] < 0.85 < 0.92 < median[1], median

@@ -27,6 +27,7 @@ def result(tracks: dict[int, range]) -> Reconstruction:
         xy=np.zeros((N, 25, 2, 2)),
         confidence=np.ones((N, 25, 2)),
         residual_px=np.zeros((N, 25, 2, 2)),
+        probability=np.ones((N, 25, 2)),
         gate=np.ones((N, 25, 2), dtype=int),
     )
     return Reconstruction(
