@@ -1,9 +1,10 @@
 """All steps from frames to rows, made of the settings: what every process that takes part needs."""
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.bone_reach import longest_bones
 from shapepose_fg.body.fitting.fitter import BodyFitter
@@ -16,7 +17,9 @@ from shapepose_fg.observations import Observations
 from shapepose_fg.pipeline_config import PipelineConfig
 from shapepose_fg.proposal.association import associate
 from shapepose_fg.proposal.candidates import triangulate_pairs, vote
+from shapepose_fg.proposal.hypotheses import Frame
 from shapepose_fg.proposal.proposals import propose
+from shapepose_fg.proposal.selection import choose
 from shapepose_fg.proposal.thinning import thinned_candidates, thinned_points
 from shapepose_fg.runs.notes import Notebook
 from shapepose_fg.skeleton import Skeleton
@@ -25,6 +28,8 @@ from shapepose_fg.windows import Engine, WindowSolver
 
 FAST_M_S = 3.0
 """The tracker predicts joints as if they moved so fast: a hand that is thrown up or strikes."""
+_ON_TRIAL = 0.3
+"""Share of the probability asked for otherwise that makes a track on trial: time tells."""
 
 
 @dataclass(frozen=True)
@@ -55,13 +60,17 @@ class Setup:
     def engine(self, book: Notebook) -> Engine:
         """Follows people and solves windows; what it has to say goes into `book`."""
         config, skeleton = self.config, self.skeleton
-        weaker = replace(config, candidates=replace(config.candidates, min_votes=1))
+        weaker = replace(
+            config,
+            candidates=replace(config.candidates, min_votes=1),
+            proposals=replace(config.proposals, min_probability=_ON_TRIAL * config.proposals.min_probability),
+        )
 
         def find(detections: Detections, rig: Rig, weak: bool) -> Observations:
             return find_people(detections, rig, skeleton, weaker if weak else config, book)
 
         motion = MotionModel.load(skeleton.joints, config.motion)
-        scale = BodyScale(longest_bones(skeleton), motion.psd(np.full(len(skeleton), FAST_M_S)))
+        scale = BodyScale(_longest_bones(skeleton), motion.psd(np.full(len(skeleton), FAST_M_S)))
         tracker = Tracker(skeleton, scale, find, config.tracking, config.observations, weak_births=config.temporal)
         return Engine(tracker, config.following, self.solver, frames=config.batch_frames)
 
@@ -75,6 +84,11 @@ def find_people(
         every = triangulate_pairs(detections, rig, config.candidates)
         points = thinned_points(every, config.candidates)
         book.thin("points", len(points.xyz) < len(every.xyz))
+    if config.proposals.evidence:
+        with book.stage("propose"):
+            frame = Frame(detections, rig, skeleton, _longest_bones(skeleton))
+            people, _ = choose(points, frame, config.proposals.min_probability)
+        return Observations.of(people.chosen, detections, people.places)
     with book.stage("vote"):
         every = vote(points, detections, len(rig), config.candidates)
         candidates = thinned_candidates(every, detections, config.candidates)
@@ -86,3 +100,9 @@ def find_people(
     for reason, count in (*proposals.dropped.items(), ("hardly any joint seen by two views", phantoms)):
         book.drop(reason, count)
     return observations
+
+
+@cache
+def _longest_bones(skeleton: Skeleton) -> NDArray[np.float64]:
+    """`longest_bones`, once."""
+    return longest_bones(skeleton)
