@@ -1,10 +1,9 @@
 """All steps from frames to rows, made of the settings: what every process that takes part needs."""
 
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.bone_reach import longest_bones
 from shapepose_fg.body.fitting.fitter import BodyFitter
@@ -29,7 +28,7 @@ from shapepose_fg.windows import Engine, WindowSolver
 FAST_M_S = 3.0
 """The tracker predicts joints as if they moved so fast: a hand that is thrown up or strikes."""
 _ON_TRIAL = 0.3
-"""Share of the probability asked for otherwise that makes a track on trial: time tells."""
+"""Share of the probability asked for otherwise that is enough where time, or a body, will tell."""
 
 
 @dataclass(frozen=True)
@@ -60,18 +59,22 @@ class Setup:
     def engine(self, book: Notebook) -> Engine:
         """Follows people and solves windows; what it has to say goes into `book`."""
         config, skeleton = self.config, self.skeleton
+        least = _ON_TRIAL * config.proposals.min_probability
         weaker = replace(
             config,
             candidates=replace(config.candidates, min_votes=1),
-            proposals=replace(config.proposals, min_probability=_ON_TRIAL * config.proposals.min_probability),
+            proposals=replace(config.proposals, min_probability=least),
         )
+        alone = config.proposals.evidence and not config.temporal
 
         def find(detections: Detections, rig: Rig, weak: bool) -> Observations:
-            return find_people(detections, rig, skeleton, weaker if weak else config, book)
+            return find_people(detections, rig, skeleton, weaker if weak or alone else config, book)
 
+        # In frames that stand alone evidence decides, when the detections are given out again.
+        tracking = replace(config.tracking, min_new_joints=3) if alone else config.tracking
         motion = MotionModel.load(skeleton.joints, config.motion)
-        scale = BodyScale(_longest_bones(skeleton), motion.psd(np.full(len(skeleton), FAST_M_S)))
-        tracker = Tracker(skeleton, scale, find, config.tracking, config.observations, weak_births=config.temporal)
+        scale = BodyScale(longest_bones(skeleton), motion.psd(np.full(len(skeleton), FAST_M_S)))
+        tracker = Tracker(skeleton, scale, find, tracking, config.observations, weak_births=config.temporal)
         return Engine(tracker, config.following, self.solver, frames=config.batch_frames)
 
 
@@ -86,7 +89,7 @@ def find_people(
         book.thin("points", len(points.xyz) < len(every.xyz))
     if config.proposals.evidence:
         with book.stage("propose"):
-            frame = Frame(detections, rig, skeleton, _longest_bones(skeleton))
+            frame = Frame(detections, rig, skeleton, longest_bones(skeleton))
             people, _ = choose(points, frame, config.proposals.min_probability)
         return Observations.of(people.chosen, detections, people.places)
     with book.stage("vote"):
@@ -100,9 +103,3 @@ def find_people(
     for reason, count in (*proposals.dropped.items(), ("hardly any joint seen by two views", phantoms)):
         book.drop(reason, count)
     return observations
-
-
-@cache
-def _longest_bones(skeleton: Skeleton) -> NDArray[np.float64]:
-    """`longest_bones`, once."""
-    return longest_bones(skeleton)

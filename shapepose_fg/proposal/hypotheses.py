@@ -60,7 +60,7 @@ class Frame:
 
     @cached_property
     def spans(self) -> tuple[NDArray[np.intp], Array]:
-        """Pairs of joints (E, 2) at most three bones apart in a row, or two beside each other, and how far (E,)."""
+        """Pairs of joints (E, 2), up to three bones apart in a row or side by side, and how far at most (E,)."""
         parent, pairs, most = self.skeleton.parents, list[tuple[int, int]](), list[float]()
         for joint in range(len(parent)):
             above, length = joint, 0.0
@@ -135,7 +135,7 @@ def settled(
 
 
 def _claimed(places: Array, owns: NDArray[np.bool_], frame: Frame, *, exclusive: bool) -> NDArray[np.intp]:
-    """(H, J, V) the detections nearest to the joints, and those of affinity to the owned where no place is known."""
+    """(H, J, V) the detections nearest to the joints; where no place is known, those of affinity to the owned."""
     detections, shape = frame.detections, (*places.shape[:2], len(frame.rig))
     distance_px, distance_m = projected_distances(
         frame.rig.project(places), detections.joint, detections, frame.rig
@@ -176,12 +176,23 @@ def triangulated(chosen: NDArray[np.intp], frame: Frame) -> tuple[Array, Array]:
         normal = np.einsum("hjv,hjvab->hjab", weight, across) + 1e-9 * np.eye(3)
         right = np.einsum("hjv,hjva->hja", weight, toward)
         places = np.linalg.solve(np.where(known[..., None, None], normal, np.eye(3)), right[..., None])[..., 0]
-        from_camera = places[:, :, None] - frame.rig.centres
-        gap_m = np.linalg.norm(np.einsum("hjvab,hjvb->hjva", across, from_camera), axis=-1)
-        gap_m = np.where((rays * from_camera).sum(axis=-1) > 0, gap_m, np.inf)
-        weight = confidence / (1 + (gap_m / _KERNEL_M) ** 2)
-    gap_m = np.where(has & known[..., None], gap_m, np.nan)
-    return np.where(known[..., None], places, np.nan), gap_m
+        places = np.where(known[..., None], places, np.nan)
+        gap_m = gaps(places, chosen, frame)
+        weight = confidence / (1 + (np.nan_to_num(gap_m, posinf=1.0) / _KERNEL_M) ** 2)
+    return places, gap_m
+
+
+def gaps(places: Array, chosen: NDArray[np.intp], frame: Frame) -> Array:
+    """(H, J, V) how far the rays of detections `chosen` (H, J, V) pass `places` (H, J, 3), metres; NaN for none.
+
+    A ray that meets its joint behind the camera is infinitely far.
+    """
+    if len(frame.rays) == 0:
+        return np.full(chosen.shape, np.nan)
+    from_camera = places[:, :, None] - frame.rig.centres
+    depth = (frame.rays[chosen] * from_camera).sum(axis=-1)
+    across_m = np.sqrt(np.maximum((from_camera**2).sum(axis=-1) - depth**2, 0.0))
+    return np.where(chosen >= 0, np.where(depth <= 0, np.inf, across_m), np.nan)
 
 
 def connected(places: Array, frame: Frame) -> NDArray[np.intp]:

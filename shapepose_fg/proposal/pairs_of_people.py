@@ -73,7 +73,7 @@ def _meeting(points: PairPoints, group: NDArray[np.intp], frame: Frame) -> tuple
 
 
 def _different(places: Array, weight: Array) -> NDArray[np.intp]:
-    """Which of the hypotheses at `places` (H, J, 3) stay when those that become the same are one; heaviest first."""
+    """Which of `places` (H, J, 3) stay when those that become the same person are one, heaviest first."""
     order = np.argsort(-weight, kind="stable")
     places = places[order]
     distance = np.linalg.norm(places[:, None] - places[None], axis=-1)
