@@ -15,10 +15,12 @@ _LEAST_SHARE = 0.25
 """Of the joints that both have, those that meet: a 2D person may be put together of two people's halves."""
 _LEAST_AFFINITY = 0.2
 """Affinities below tie nobody together: unrelated pairs are mostly 0, true ones above 0.4 (as `growth.doubt`)."""
-_SAME_M = 0.12
+_SAME_M = 0.2
 """Hypotheses nearer than this in most of the lesser one's joints become the same person."""
 _SAME_SHARE = 0.8
 """These are most."""
+_MOST = 256
+"""Hypotheses that are looked at: eight people before six cameras have 120."""
 _PASSES = 3
 """How often detections are chosen around the joints, and joints triangulated."""
 
@@ -75,12 +77,11 @@ def _meeting(points: PairPoints, group: NDArray[np.intp], frame: Frame) -> tuple
 def _different(places: Array, weight: Array) -> NDArray[np.intp]:
     """Which of `places` (H, J, 3) stay when those that become the same person are one, heaviest first."""
     order = np.argsort(-weight, kind="stable")
-    places = places[order]
-    distance = np.linalg.norm(places[:, None] - places[None], axis=-1)
     count = np.isfinite(places[..., 0]).sum(axis=1)
-    inside = (distance < _SAME_M).sum(axis=-1) >= _SAME_SHARE * count
-    stays = np.ones(len(order), dtype=bool)
-    for better in range(len(order)):
-        if stays[better]:
-            stays[better + 1 :] &= ~inside[better, better + 1 :]
-    return order[stays]
+    stays = list[int]()
+    while len(order) > 0 and len(stays) < _MOST:
+        best, order = order[0], order[1:]
+        stays.append(best)
+        near = np.linalg.norm(places[order] - places[best], axis=-1) < _SAME_M
+        order = order[near.sum(axis=1) < _SAME_SHARE * count[order]]
+    return np.array(stays, dtype=np.intp)
