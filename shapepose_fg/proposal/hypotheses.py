@@ -34,7 +34,7 @@ _KERNEL_M = 0.03
 _ROUNDS = 2
 """How often a joint is triangulated with weights made anew."""
 _STRETCH = (1.0, 0.9, 0.8)
-"""One bone, two and three in a row: how much of their summed longest lengths they span at most."""
+"""One bone, two and three: how much of their summed longest lengths they span at most."""
 
 
 @dataclass(frozen=True)
@@ -60,22 +60,20 @@ class Frame:
 
     @cached_property
     def spans(self) -> tuple[NDArray[np.intp], Array]:
-        """Pairs of joints (E, 2), up to three bones apart in a row or side by side, and how far at most (E,)."""
-        parent, pairs, most = self.skeleton.parents, list[tuple[int, int]](), list[float]()
-        for joint in range(len(parent)):
-            above, length = joint, 0.0
-            for share in _STRETCH:
-                if parent[above] < 0:
-                    break
-                above, length = parent[above], length + float(self.longest_m[above])
-                pairs.append((joint, above))
-                most.append(share * length)
-        beside = [
-            (a, b) for a in range(len(parent)) for b in range(a) if parent[a] == parent[b] and parent[a] >= 0
-        ]
-        pairs += beside
-        most += [_STRETCH[-1] * float(self.longest_m[a] + self.longest_m[b]) for a, b in beside]
-        return np.array(pairs, dtype=np.intp).reshape(-1, 2), np.array(most)
+        """Pairs of joints (E, 2) at most three bones apart, and how far they are at most (E,), metres."""
+        joints = np.arange(len(self.skeleton))
+        bones = np.where(joints[:, None] == joints, 0, len(joints))
+        length = np.where(bones == 0, 0.0, np.inf)
+        children = [joint for joint in joints if self.skeleton.parents[joint] >= 0]
+        parents = [self.skeleton.parents[joint] for joint in children]
+        bones[children, parents] = bones[parents, children] = 1
+        length[children, parents] = length[parents, children] = self.longest_m[children]
+        for over in joints:  # the shortest ways, as Floyd and Warshall find them
+            bones = np.minimum(bones, bones[:, [over]] + bones[over])
+            length = np.minimum(length, length[:, [over]] + length[over])
+        near = np.argwhere((bones > 0) & (bones <= len(_STRETCH)) & (joints[:, None] > joints))
+        first, second = near.T
+        return near, np.array(_STRETCH)[bones[first, second] - 1] * length[first, second]
 
 
 @dataclass(frozen=True)
@@ -102,6 +100,16 @@ class Hypotheses:
             np.concatenate([self.places, other.places]),
             np.concatenate([self.chosen, other.chosen]),
             np.concatenate([self.gap_m, other.gap_m]),
+        )
+
+    def completed(self, person: int, part: "Hypotheses") -> "Hypotheses":
+        """The same with the joints of `part`, which is one, for those that `person` lacks."""
+        lacks = np.zeros(self.places.shape[:2], dtype=bool)
+        lacks[person] = np.isnan(self.places[person, :, 0]) & np.isfinite(part.places[0, :, 0])
+        return Hypotheses(
+            np.where(lacks[..., None], part.places, self.places),
+            np.where(lacks[..., None], part.chosen, self.chosen),
+            np.where(lacks[..., None], part.gap_m, self.gap_m),
         )
 
     @classmethod

@@ -34,30 +34,34 @@ def choose(points: PairPoints, frame: Frame, least: float) -> tuple[Hypotheses, 
     people, sure = Hypotheses.none(frame), np.zeros(0)
     for _ in range(_ROUNDS):
         taken = owned(people.chosen, len(frame.detections)).any(axis=0)
-        new = _greedy(pooled(points, ~taken, frame), people, taken, frame, least)
-        if len(new) == 0:
+        pool = pooled(points, ~taken, frame)
+        more = _greedy(pool, people, taken, frame, least)
+        if more is None:
             break
-        people, sure = _given_out(people.with_more(new), frame, least)
+        people, sure = _given_out(more, frame, least)
     return people, sure
 
 
 def _greedy(
     pool: Hypotheses, people: Hypotheses, taken: NDArray[np.bool_], frame: Frame, least: float
-) -> Hypotheses:
-    """Those of the pool who are there besides `people`, who have the detections `taken` (D,): the surest first."""
-    evidence, taken = Evidence.of(pool, frame), taken.copy()
-    open_ = ~_parts(pool.places, people.places, frame)
-    kept = list[int]()
-    while open_.any():  # once a person
+) -> Hypotheses | None:
+    """`people`, who have the detections `taken` (D,), and who else of the pool is there, the surest first.
+
+    Who can be a missing part of somebody becomes that. None where nobody is there besides.
+    """
+    evidence, taken, before = Evidence.of(pool, frame), taken.copy(), people
+    open_ = np.ones(len(pool), dtype=bool)
+    while open_.any():  # once a person or part
         score = np.where(open_, evidence.score(taken), -np.inf)
-        best = int(score.argmax())
-        if probability(score[best : best + 1])[0] < least:
+        best = score.argmax(keepdims=True)
+        if probability(score[best])[0] < least:
             break
-        kept.append(best)
-        taken[pool.chosen[best][pool.chosen[best] >= 0]] = True
-        open_ &= ~_parts(pool.places, pool.places[[best]], frame)
         open_[best] = False
-    return pool.rows(np.array(kept, dtype=np.intp))
+        new = pool.rows(best)
+        taken[new.chosen[new.chosen >= 0]] = True
+        whole = _whole(new.places[0], people.places, frame)
+        people = people.with_more(new) if whole is None else people.completed(whole, new)
+    return None if people is before else people
 
 
 def _given_out(people: Hypotheses, frame: Frame, least: float) -> tuple[Hypotheses, Array]:
@@ -78,15 +82,15 @@ def existence(people: Hypotheses, frame: Frame, prior: float = _PRIOR) -> Array:
     return probability(Evidence.of(people, frame).score(owners > 1), prior)
 
 
-def _parts(places: Array, people: Array, frame: Frame) -> NDArray[np.bool_]:
-    """(H,) whether `places` (H, J, 3) can be a missing part of one of `people` (P, J, 3): legs of a trunk, say.
+def _whole(places: Array, people: Array, frame: Frame) -> int | None:
+    """Which of `people` (P, J, 3) has `places` (J, 3) as a missing part, legs of a trunk, say; None for nobody.
 
     They have hardly a joint in common, and bones would connect them. Two real people have both.
     """
-    has, of = (np.isfinite(each[..., 0]) for each in (places, people))
-    shared = has.astype(np.intp) @ of.T.astype(np.intp)
+    has, of = np.isfinite(places[:, 0]), np.isfinite(people[..., 0])
     pairs, most = frame.spans
-    near = np.zeros(shared.shape, dtype=bool)
-    for one, other in (pairs.T, pairs.T[::-1]):
-        near |= (np.linalg.norm(places[:, None, one] - people[None, :, other], axis=-1) < most).any(axis=-1)
-    return (near & (shared <= _SHARED * has.sum(axis=1)[:, None])).any(axis=1)
+    one, other = np.concatenate([pairs, pairs[:, ::-1]]).T
+    reach = np.linalg.norm(places[one] - people[:, other], axis=-1) / np.tile(most, 2)
+    nearest = np.nan_to_num(reach, nan=np.inf).min(axis=1, initial=np.inf)
+    nearest[(of & has).sum(axis=1) > _SHARED * has.sum()] = np.inf
+    return int(nearest.argmin()) if (nearest < 1).any() else None
