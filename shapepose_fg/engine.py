@@ -15,8 +15,9 @@ from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.observations import Observations
 from shapepose_fg.pipeline_config import PipelineConfig
 from shapepose_fg.proposal.association import associate
-from shapepose_fg.proposal.candidates import triangulate_pairs, vote
+from shapepose_fg.proposal.candidates import PairPoints, triangulate_pairs, vote
 from shapepose_fg.proposal.hypotheses import Frame
+from shapepose_fg.proposal.people_2d import without_repeats
 from shapepose_fg.proposal.proposals import propose
 from shapepose_fg.proposal.selection import choose
 from shapepose_fg.proposal.thinning import thinned_candidates, thinned_points
@@ -83,15 +84,31 @@ def find_people(
 ) -> Observations:
     """Stage I, one frame: the people's 2D observations and where their joints are to begin with."""
     book = Notebook() if book is None else book
+    if not config.proposals.evidence:
+        return _anchored_at_hips(detections, rig, skeleton, config, book)
+    once, index = without_repeats(detections)
+    points = _points(once, rig, config, book)
+    with book.stage("propose"):
+        frame = Frame(once, rig, skeleton, longest_bones(skeleton))
+        people, _ = choose(points, frame, config.proposals.min_probability)
+    chosen = np.where(people.chosen >= 0, np.append(index, -1)[people.chosen], -1)
+    return Observations.of(chosen, detections, people.places)
+
+
+def _points(detections: Detections, rig: Rig, config: PipelineConfig, book: Notebook) -> PairPoints:
+    """Pairs of detections, triangulated; not too many."""
     with book.stage("triangulate"):
         every = triangulate_pairs(detections, rig, config.candidates)
         points = thinned_points(every, config.candidates)
         book.thin("points", len(points.xyz) < len(every.xyz))
-    if config.proposals.evidence:
-        with book.stage("propose"):
-            frame = Frame(detections, rig, skeleton, longest_bones(skeleton))
-            people, _ = choose(points, frame, config.proposals.min_probability)
-        return Observations.of(people.chosen, detections, people.places)
+    return points
+
+
+def _anchored_at_hips(
+    detections: Detections, rig: Rig, skeleton: Skeleton, config: PipelineConfig, book: Notebook
+) -> Observations:
+    """Stage I as the paper has it: votes, hips that anchor people, and joints linked to them."""
+    points = _points(detections, rig, config, book)
     with book.stage("vote"):
         every = vote(points, detections, len(rig), config.candidates)
         candidates = thinned_candidates(every, detections, config.candidates)

@@ -14,6 +14,7 @@ from shapepose_fg.proposal.association import (
     owned,
     projected_distances,
     share_overlaps,
+    without_ties,
 )
 from shapepose_fg.skeleton import Skeleton
 
@@ -159,7 +160,9 @@ def _claimed(places: Array, owns: NDArray[np.bool_], frame: Frame, *, exclusive:
         share_overlaps(chosen, overlap, distance_px, detections)
         return chosen
     person, detection = np.nonzero(likely)
-    order = np.argsort(score[person, detection], kind="stable")  # the best is written last
+    order = np.argsort(
+        without_ties(score, detections)[person, detection], kind="stable"
+    )  # the best is written last
     person, detection = person[order], detection[order]
     chosen = np.full(shape, -1, dtype=np.intp)
     chosen[person, detections.joint[detection], detections.view[detection]] = detection

@@ -76,7 +76,8 @@ def _meeting(points: PairPoints, group: NDArray[np.intp], frame: Frame) -> tuple
 
 def _different(places: Array, weight: Array) -> NDArray[np.intp]:
     """Which of `places` (H, J, 3) stay when those that become the same person are one, heaviest first."""
-    order = np.argsort(-weight, kind="stable")
+    # Equal weights are told apart by place: the order of cameras and detections must not decide.
+    order = np.lexsort((*np.nansum(places, axis=1).T, -np.round(weight, 9)))
     count = np.isfinite(places[..., 0]).sum(axis=1)
     stays = list[int]()
     while len(order) > 0 and len(stays) < _MOST:
