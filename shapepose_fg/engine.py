@@ -15,8 +15,11 @@ from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.observations import Observations
 from shapepose_fg.pipeline_config import PipelineConfig
 from shapepose_fg.proposal.association import associate
-from shapepose_fg.proposal.candidates import triangulate_pairs, vote
+from shapepose_fg.proposal.candidates import PairPoints, triangulate_pairs, vote
+from shapepose_fg.proposal.hypotheses import Frame
+from shapepose_fg.proposal.people_2d import without_repeats
 from shapepose_fg.proposal.proposals import propose
+from shapepose_fg.proposal.selection import choose
 from shapepose_fg.proposal.thinning import thinned_candidates, thinned_points
 from shapepose_fg.runs.notes import Notebook
 from shapepose_fg.skeleton import Skeleton
@@ -25,6 +28,8 @@ from shapepose_fg.windows import Engine, WindowSolver
 
 FAST_M_S = 3.0
 """The tracker predicts joints as if they moved so fast: a hand that is thrown up or strikes."""
+_ON_TRIAL = 0.3
+"""Share of the probability asked for otherwise that is enough where time, or a body, will tell."""
 
 
 @dataclass(frozen=True)
@@ -55,14 +60,22 @@ class Setup:
     def engine(self, book: Notebook) -> Engine:
         """Follows people and solves windows; what it has to say goes into `book`."""
         config, skeleton = self.config, self.skeleton
-        weaker = replace(config, candidates=replace(config.candidates, min_votes=1))
+        least = _ON_TRIAL * config.proposals.min_probability
+        weaker = replace(
+            config,
+            candidates=replace(config.candidates, min_votes=1),
+            proposals=replace(config.proposals, min_probability=least),
+        )
+        alone = config.proposals.evidence and not config.temporal
 
         def find(detections: Detections, rig: Rig, weak: bool) -> Observations:
-            return find_people(detections, rig, skeleton, weaker if weak else config, book)
+            return find_people(detections, rig, skeleton, weaker if weak or alone else config, book)
 
+        # In frames that stand alone evidence decides, when the detections are given out again.
+        tracking = replace(config.tracking, min_new_joints=3) if alone else config.tracking
         motion = MotionModel.load(skeleton.joints, config.motion)
         scale = BodyScale(longest_bones(skeleton), motion.psd(np.full(len(skeleton), FAST_M_S)))
-        tracker = Tracker(skeleton, scale, find, config.tracking, config.observations, weak_births=config.temporal)
+        tracker = Tracker(skeleton, scale, find, tracking, config.observations, weak_births=config.temporal)
         return Engine(tracker, config.following, self.solver, frames=config.batch_frames)
 
 
@@ -71,10 +84,31 @@ def find_people(
 ) -> Observations:
     """Stage I, one frame: the people's 2D observations and where their joints are to begin with."""
     book = Notebook() if book is None else book
+    if not config.proposals.evidence:
+        return _anchored_at_hips(detections, rig, skeleton, config, book)
+    once, index = without_repeats(detections)
+    points = _points(once, rig, config, book)
+    with book.stage("propose"):
+        frame = Frame(once, rig, skeleton, longest_bones(skeleton))
+        people, _ = choose(points, frame, config.proposals.min_probability)
+    chosen = np.where(people.chosen >= 0, np.append(index, -1)[people.chosen], -1)
+    return Observations.of(chosen, detections, people.places)
+
+
+def _points(detections: Detections, rig: Rig, config: PipelineConfig, book: Notebook) -> PairPoints:
+    """Pairs of detections, triangulated; not too many."""
     with book.stage("triangulate"):
         every = triangulate_pairs(detections, rig, config.candidates)
         points = thinned_points(every, config.candidates)
         book.thin("points", len(points.xyz) < len(every.xyz))
+    return points
+
+
+def _anchored_at_hips(
+    detections: Detections, rig: Rig, skeleton: Skeleton, config: PipelineConfig, book: Notebook
+) -> Observations:
+    """Stage I as the paper has it: votes, hips that anchor people, and joints linked to them."""
+    points = _points(detections, rig, config, book)
     with book.stage("vote"):
         every = vote(points, detections, len(rig), config.candidates)
         candidates = thinned_candidates(every, detections, config.candidates)

@@ -18,6 +18,7 @@ from shapepose_fg.errors import InputError
 from shapepose_fg.files import write_atomically
 from shapepose_fg.io.detections.association_skeletons import TEXT_SKELETONS, TextSkeleton
 from shapepose_fg.io.detections.view_streams import MARGIN
+from shapepose_fg.proposal.people_2d import group_people
 from shapepose_fg.skeleton import BODY_25
 
 SMALLEST_PERSON = 3
@@ -78,26 +79,6 @@ def refuse_leftovers(rig: Rig, folder: str | Path) -> None:
         place = Path(folder) / camera.name
         if next(place.glob("*_keypoints.json"), None) is not None:
             raise InputError(f"{place}: there are frames already, which would mix with the new; delete it first")
-
-
-def group_people(found: Detections) -> list[NDArray[np.intp]]:
-    """Candidates grouped into people, greedily: the rows (N,) of each group, single candidates included.
-
-    As OpenPose does, by the affinities alone: pairs in falling order; a pair joins its two groups unless
-    both have a candidate of one kind of joint, so that nobody gets two left knees.
-    """
-    group = list(range(len(found)))
-    members = [[row] for row in group]
-    kinds = [1 << joint for joint in found.joint.tolist()]
-    for first, second in found.pairs[np.argsort(-found.affinity, kind="stable")].tolist():
-        one, other = group[first], group[second]
-        if one == other or kinds[one] & kinds[other]:
-            continue
-        members[one] += members[other]
-        kinds[one] |= kinds[other]
-        for row in members[other]:
-            group[row] = one
-    return [np.array(members[one], dtype=np.intp) for one in sorted(set(group))]
 
 
 def _check(recording: DetectionSequence) -> None:

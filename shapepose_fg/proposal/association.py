@@ -213,10 +213,21 @@ def match_views(
     person, detection = np.nonzero(likely)
     slot = np.ravel_multi_index((person, detections.joint[detection], detections.view[detection]), shape)
     once = detection if world is None else detection + len(detections) * world[person]
-    picked = match_best_first(slot, once, score[person, detection])
+    picked = match_best_first(slot, once, without_ties(score, detections)[person, detection])
     chosen = np.full(shape, -1, dtype=np.intp)
     chosen.reshape(-1)[slot[picked]] = detection[picked]
     return chosen
+
+
+def without_ties(score: NDArray[np.float64], detections: Detections) -> NDArray[np.float64]:
+    """`score` (P, D) with equal scores of two detections told apart by what these are, not by their order.
+
+    People whom the detector has grouped have affinities of exactly 1.
+    """
+    order = np.lexsort((*detections.xy.T, detections.confidence))
+    rank = np.empty(len(order))
+    rank[order] = np.arange(len(order))
+    return np.round(score, 9) + 1e-10 * rank / max(len(order), 1)
 
 
 def share_overlaps(

@@ -28,6 +28,12 @@ _OWN_DETECTIONS = 2
 class ProposalConfig(Settings):
     """When a hip candidate is a person, and which candidates are that person's joints."""
 
+    evidence: bool = True
+    """Whether people are sought as pairs of 2D people, and judged by evidence (`selection.py`). In the paper, hips
+    of three votes anchor people: all the settings below are for that."""
+    min_probability: Share = 0.5
+    """Least probability of a person."""
+
     box_horizontal_m: Metres = 1.0
     """Half the width of the box around the hip: arms and legs stretched reach 1 m from it."""
     box_vertical_m: Metres = 1.2
@@ -72,6 +78,7 @@ class ProposalConfig(Settings):
         Non-maximum suppression is all that stands against phantoms: 60 cm is the best of 20 to 80 on `tune`.
         """
         return cls(
+            evidence=False,
             separation_m=0.6,
             min_parts=0.9,
             min_own_views=0,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.detections import Detections, DetectionSequence
-from shapepose_fg.io.write_detections import group_people
+from shapepose_fg.proposal.people_2d import group_people
 from shapepose_fg.skeleton import Skeleton
 
 Array = NDArray[np.float64]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from shapepose_fg import read_detections, read_rig, reconstruct, write_rig
-from shapepose_fg.io.write_detections import group_people
+from shapepose_fg.proposal.people_2d import group_people
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.skeleton import BODY_25, COCO_17, HALPE_26, Skeleton
 

@@ -13,7 +13,7 @@ from shapepose_fg.errors import InputError
 from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.io.skeleton_file import read_skeleton
-from shapepose_fg.io.write_detections import group_people
+from shapepose_fg.proposal.people_2d import group_people
 from shapepose_fg.skeleton import BODY_25, COCO_17, COCO_18, COCO_133, HALPE_26, SKELETONS, Skeleton
 
 DATA = Path(__file__).parent / "data"

@@ -12,7 +12,8 @@ from shapepose_fg.detections import Detections, Recording
 from shapepose_fg.errors import InputError
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
-from shapepose_fg.io.write_detections import group_people, write_association, write_openpose
+from shapepose_fg.io.write_detections import write_association, write_openpose
+from shapepose_fg.proposal.people_2d import group_people
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.skeleton import BODY_25, Skeleton
 

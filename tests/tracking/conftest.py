@@ -21,8 +21,8 @@ def tracker() -> Tracker:
     def find(detections, rig, weak):
         from dataclasses import replace
 
-        votes = replace(config.candidates, min_votes=1 if weak else config.candidates.min_votes)
-        return find_people(detections, rig, BODY_25, replace(config, candidates=votes))
+        sure = replace(config.proposals, min_probability=0.15 if weak else config.proposals.min_probability)
+        return find_people(detections, rig, BODY_25, replace(config, proposals=sure))
 
     scale = BodyScale(np.full(25, 0.7), np.full(25, 10.0))
     return Tracker(BODY_25, scale, find, TrackingConfig(), config.observations)

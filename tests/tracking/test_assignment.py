@@ -137,8 +137,8 @@ def test_the_first_detection_of_a_frame_counts_as_any_other(five_cameras, two_pe
     given = [Input(0, np.zeros(5), detections, five_cameras)]
     rows = Observations.of(np.full((1, 25, 5), -1), detections, two_people[:1])
     covariance = np.broadcast_to(0.02**2 * np.eye(3), (1, 25, 3, 3))
-    for least, people in ((6, 1), (7, 0)):
-        survival = Survival(min_seen_twice=least, min_share=0.0)
+    for least, people in ((0.5, 1), (0.95, 0)):
+        survival = Survival(min_probability=least)
         asked = given, rows, two_people[:1], covariance, BODY_25, AssignmentConfig(), survival
         assert len(reassociate(*asked)) == people
 
@@ -160,7 +160,7 @@ def test_nothing_is_expected_where_a_person_is_outside_of_the_picture(
     rows = Observations.of(np.full((1, 25, 5), -1), detections, two_people[:1])
     covariance = np.broadcast_to(0.02**2 * np.eye(3), (1, 25, 3, 3))
     asked = [Input(0, np.zeros(5), detections, rig)], rows, two_people[:1], covariance, BODY_25, AssignmentConfig()
-    assert len(reassociate(*asked, Survival(min_share=0.9))) == 1
+    assert len(reassociate(*asked, Survival(min_probability=0.99))) == 1
 
 
 def test_a_track_that_has_next_to_nothing_of_its_own_for_a_window_is_nobody(

@@ -1,5 +1,7 @@
 """How far a joint can be from its parent on a detector's skeleton, over all adults and poses."""
 
+from functools import cache
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -16,6 +18,7 @@ _UNKNOWN_M = 0.75
 """No bone is longer: the trunk of a tall adult, hip to neck, is about 0.65 m."""
 
 
+@cache
 def longest_bones(skeleton: Skeleton) -> NDArray[np.float64]:
     """(J,) metres from each joint to its parent that hardly anybody exceeds; infinite for the root.
 

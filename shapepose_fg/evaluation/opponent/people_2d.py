@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections
-from shapepose_fg.io.write_detections import group_people
+from shapepose_fg.proposal.people_2d import group_people
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,227 @@
+"""People who may be there: the detections that each would explain, and where the joints then are."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.camera import Rig
+from shapepose_fg.detections import Detections
+from shapepose_fg.proposal.association import (
+    match_views,
+    mean_affinity,
+    owned,
+    projected_distances,
+    share_overlaps,
+    without_ties,
+)
+from shapepose_fg.skeleton import Skeleton
+
+Array = NDArray[np.float64]
+
+_NEAR_M = 0.06
+"""How closeness to a joint falls off: sigma of a Gaussian, as a length at the joint's depth, as in `assign`."""
+_FAR_M = 0.15
+"""No detection whose ray passes a joint at more is the joint's."""
+_LEAST_AFFINITY = 0.3
+"""What counts as affinity where no neighbour is seen; unrelated pairs are mostly 0, true ones above 0.4."""
+_SURE_AFFINITY = 0.5
+"""Mean affinity that takes a detection for a joint whose place nobody knows."""
+_OVERLAP_PX = 6.0
+"""Two people's projected joints closer than this overlap: the one detection there serves both."""
+_KERNEL_M = 0.03
+"""Scale of the Cauchy kernel with which joints are triangulated: what a detector is off, measured."""
+_ROUNDS = 2
+"""How often a joint is triangulated with weights made anew."""
+_STRETCH = (1.0, 0.9, 0.8)
+"""One bone, two and three: how much of their summed longest lengths they span at most."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What is given of one frame."""
+
+    detections: Detections
+    """What the detector saw."""
+    rig: Rig
+    """The cameras."""
+    skeleton: Skeleton
+    """The detector's joints."""
+    longest_m: Array
+    """(J,) the longest distance of a joint to its parent on the skeleton."""
+
+    @cached_property
+    def rays(self) -> Array:
+        """(D, 3) directions of length one, in the world, in which the detections lie."""
+        normalised = self.rig.normalise(self.detections.view, self.detections.xy)
+        camera = np.concatenate([normalised, np.ones((len(normalised), 1))], axis=1)
+        world = np.einsum("dji,dj->di", self.rig.cTw[self.detections.view, :, :3], camera)
+        return world / np.linalg.norm(world, axis=1, keepdims=True)
+
+    @cached_property
+    def spans(self) -> tuple[NDArray[np.intp], Array]:
+        """Pairs of joints (E, 2) at most three bones apart, and how far they are at most (E,), metres."""
+        joints = np.arange(len(self.skeleton))
+        bones = np.where(joints[:, None] == joints, 0, len(joints))
+        length = np.where(bones == 0, 0.0, np.inf)
+        children = [joint for joint in joints if self.skeleton.parents[joint] >= 0]
+        parents = [self.skeleton.parents[joint] for joint in children]
+        bones[children, parents] = bones[parents, children] = 1
+        length[children, parents] = length[parents, children] = self.longest_m[children]
+        for over in joints:  # the shortest ways, as Floyd and Warshall find them
+            bones = np.minimum(bones, bones[:, [over]] + bones[over])
+            length = np.minimum(length, length[:, [over]] + length[over])
+        near = np.argwhere((bones > 0) & (bones <= len(_STRETCH)) & (joints[:, None] > joints))
+        first, second = near.T
+        return near, np.array(_STRETCH)[bones[first, second] - 1] * length[first, second]
+
+
+@dataclass(frozen=True)
+class Hypotheses:
+    """H people who may be there."""
+
+    places: Array
+    """(H, J, 3) where two views or more put the joints, metres; NaN elsewhere."""
+    chosen: NDArray[np.intp]
+    """(H, J, V) the detections that each would explain, -1 for none."""
+    gap_m: Array
+    """(H, J, V) how far from the joint the detection's ray passes; NaN where there is none, or no place."""
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def rows(self, index: NDArray) -> "Hypotheses":
+        """Some of them."""
+        return Hypotheses(self.places[index], self.chosen[index], self.gap_m[index])
+
+    def with_more(self, other: "Hypotheses") -> "Hypotheses":
+        """These and others."""
+        return Hypotheses(
+            np.concatenate([self.places, other.places]),
+            np.concatenate([self.chosen, other.chosen]),
+            np.concatenate([self.gap_m, other.gap_m]),
+        )
+
+    def completed(self, person: int, part: "Hypotheses") -> "Hypotheses":
+        """The same with the joints of `part`, which is one, for those that `person` lacks."""
+        lacks = np.zeros(self.places.shape[:2], dtype=bool)
+        lacks[person] = np.isnan(self.places[person, :, 0]) & np.isfinite(part.places[0, :, 0])
+        return Hypotheses(
+            np.where(lacks[..., None], part.places, self.places),
+            np.where(lacks[..., None], part.chosen, self.chosen),
+            np.where(lacks[..., None], part.gap_m, self.gap_m),
+        )
+
+    @classmethod
+    def none(cls, frame: Frame) -> "Hypotheses":
+        """Nobody."""
+        shape = (0, len(frame.skeleton), len(frame.rig))
+        return cls(np.zeros((*shape[:2], 3)), np.full(shape, -1, dtype=np.intp), np.zeros(shape))
+
+
+def settled(
+    places: Array, owns: NDArray[np.bool_], frame: Frame, passes: int, *, exclusive: bool = False
+) -> Hypotheses:
+    """People at `places` (H, J, 3) who are thought to own `owns` (H, D): detections chosen, joints triangulated.
+
+    Several times in turn. With `exclusive` each detection is one person's; without, each takes what it would
+    explain. Joints that no bones connect to most of the others go: they are somebody else's.
+    """
+    chosen = np.full((*places.shape[:2], len(frame.rig)), -1, dtype=np.intp)
+    for _ in range(passes):
+        chosen = _claimed(places, owns, frame, exclusive=exclusive)
+        places, gap_m = triangulated(chosen, frame)
+        chosen = np.where(np.nan_to_num(gap_m) < _FAR_M, chosen, -1)
+        part = connected(places, frame)
+        size = (part[:, None] == np.arange(part.shape[1])[:, None]).sum(axis=2)
+        astray = (part >= 0) & (part != size.argmax(axis=1)[:, None])
+        places = np.where(astray[..., None], np.nan, places)
+        chosen = np.where(astray[..., None], -1, chosen)
+        owns = owned(chosen, len(frame.detections))
+    places, gap_m = triangulated(chosen, frame)
+    return Hypotheses(places, chosen, gap_m)
+
+
+def _claimed(places: Array, owns: NDArray[np.bool_], frame: Frame, *, exclusive: bool) -> NDArray[np.intp]:
+    """(H, J, V) the detections nearest to the joints; where no place is known, those of affinity to the owned."""
+    detections, shape = frame.detections, (*places.shape[:2], len(frame.rig))
+    distance_px, distance_m = projected_distances(
+        frame.rig.project(places), detections.joint, detections, frame.rig
+    )
+    affinity, neighbours = mean_affinity(owns, detections, frame.skeleton, len(frame.rig))
+    score = np.exp(-0.5 * (distance_m / _NEAR_M) ** 2) + np.where(neighbours > 0, affinity, _LEAST_AFFINITY)
+    placed = np.isfinite(places[:, detections.joint, 0])
+    likely = (distance_m < _FAR_M) & (score >= 2 * _LEAST_AFFINITY)
+    likely |= ~placed & (affinity >= _SURE_AFFINITY)
+    if exclusive:
+        chosen = match_views(likely, score, detections, shape)
+        overlap = (distance_px < _OVERLAP_PX) & (affinity >= _LEAST_AFFINITY)
+        share_overlaps(chosen, overlap, distance_px, detections)
+        return chosen
+    person, detection = np.nonzero(likely)
+    order = np.argsort(
+        without_ties(score, detections)[person, detection], kind="stable"
+    )  # the best is written last
+    person, detection = person[order], detection[order]
+    chosen = np.full(shape, -1, dtype=np.intp)
+    chosen[person, detections.joint[detection], detections.view[detection]] = detection
+    return chosen
+
+
+def triangulated(chosen: NDArray[np.intp], frame: Frame) -> tuple[Array, Array]:
+    """Joints (H, J, 3) nearest to the rays of their detections `chosen` (H, J, V), and the gaps (H, J, V), metres.
+
+    Weighted by confidence, under a Cauchy kernel. NaN for joints that fewer than two views see; a ray that meets
+    its joint behind the camera is infinitely far.
+    """
+    has = chosen >= 0
+    rays = np.where(has[..., None], frame.rays[chosen] if len(frame.rays) > 0 else 0.0, 0.0)
+    across = np.where(has[..., None, None], np.eye(3) - rays[..., :, None] * rays[..., None, :], 0.0)
+    toward = np.einsum("hjvab,vb->hjva", across, frame.rig.centres)
+    confidence = np.where(has, frame.detections.confidence[chosen] if len(frame.rays) > 0 else 0.0, 0.0)
+    known = has.sum(axis=2) >= 2
+    weight, gap_m = confidence, np.full(has.shape, np.nan)
+    places = np.full((*has.shape[:2], 3), np.nan)
+    for _ in range(_ROUNDS):
+        normal = np.einsum("hjv,hjvab->hjab", weight, across) + 1e-9 * np.eye(3)
+        right = np.einsum("hjv,hjva->hja", weight, toward)
+        places = np.linalg.solve(np.where(known[..., None, None], normal, np.eye(3)), right[..., None])[..., 0]
+        places = np.where(known[..., None], places, np.nan)
+        gap_m = gaps(places, chosen, frame)
+        weight = confidence / (1 + (np.nan_to_num(gap_m, posinf=1.0) / _KERNEL_M) ** 2)
+    return places, gap_m
+
+
+def gaps(places: Array, chosen: NDArray[np.intp], frame: Frame) -> Array:
+    """(H, J, V) how far the rays of detections `chosen` (H, J, V) pass `places` (H, J, 3), metres; NaN for none.
+
+    A ray that meets its joint behind the camera is infinitely far.
+    """
+    if len(frame.rays) == 0:
+        return np.full(chosen.shape, np.nan)
+    from_camera = places[:, :, None] - frame.rig.centres
+    depth = (frame.rays[chosen] * from_camera).sum(axis=-1)
+    across_m = np.sqrt(np.maximum((from_camera**2).sum(axis=-1) - depth**2, 0.0))
+    return np.where(chosen >= 0, np.where(depth <= 0, np.inf, across_m), np.nan)
+
+
+def connected(places: Array, frame: Frame) -> NDArray[np.intp]:
+    """(H, J) which joints of `places` (H, J, 3) hang together by bones no longer than people's.
+
+    The number of the part's first joint; -1 where a joint has no place.
+    """
+    pairs, most = frame.spans
+    people, joints = places.shape[:2]
+    near = np.linalg.norm(places[:, pairs[:, 0]] - places[:, pairs[:, 1]], axis=-1) < most
+    person, span = np.nonzero(near)
+    joined = np.zeros((people, joints, joints), dtype=bool)
+    joined[person, pairs[span, 0], pairs[span, 1]] = joined[person, pairs[span, 1], pairs[span, 0]] = True
+    joined |= np.eye(joints, dtype=bool)
+    part = np.where(np.isfinite(places[..., 0]), np.arange(joints), joints)
+    while True:
+        least = np.where(joined, part[:, None], joints).min(axis=-1, initial=joints)
+        least = np.where(part < joints, least, joints)
+        if (least == part).all():
+            return np.where(part < joints, part, -1)
+        part = least

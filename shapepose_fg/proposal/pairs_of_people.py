@@ -1,0 +1,88 @@
+"""Hypotheses from pairs of 2D people: those of two views whose joints' rays pass each other."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.proposal.candidates import PairPoints
+from shapepose_fg.proposal.hypotheses import Array, Frame, Hypotheses, connected, settled
+from shapepose_fg.proposal.people_2d import group_people
+
+_LEAST_JOINTS = 3
+"""Joints of two 2D people that meet, and hang together: two hips may meet by chance."""
+_LEAST_SHARE = 0.25
+"""Of the joints that both have, those that meet: a 2D person may be put together of two people's halves."""
+_LEAST_AFFINITY = 0.2
+"""Affinities below tie nobody together: unrelated pairs are mostly 0, true ones above 0.4 (as `growth.doubt`)."""
+_SAME_M = 0.2
+"""Hypotheses nearer than this in most of the lesser one's joints become the same person."""
+_SAME_SHARE = 0.8
+"""These are most."""
+_MOST = 256
+"""Hypotheses that are looked at: eight people before six cameras have 120."""
+_PASSES = 3
+"""How often detections are chosen around the joints, and joints triangulated."""
+
+
+def pooled(points: PairPoints, free: NDArray[np.bool_], frame: Frame) -> Hypotheses:
+    """People who may be there by the detections that are `free` (D,), each with all that it would explain.
+
+    The pair points of two 2D people's joints, in parts that bones connect, are where a person may be; views that
+    neither of the two is from join in.
+    """
+    group = _groups(free, frame)
+    places, owners = _meeting(points, group, frame)
+    part = connected(places, frame)
+    size = (part[:, None] == np.arange(part.shape[1])[:, None]).sum(axis=2)
+    hypothesis, first = np.nonzero(size >= _LEAST_JOINTS)
+    places = np.where((part[hypothesis] == first[:, None])[..., None], places[hypothesis], np.nan)
+    detections = frame.detections
+    owns = (group == owners[hypothesis, :1]) | (group == owners[hypothesis, 1:])
+    owns &= np.isfinite(places[:, detections.joint, 0])
+    different = _different(places, np.where(owns, detections.confidence, 0.0).sum(axis=1))
+    if len(different) == 0:
+        return Hypotheses.none(frame)
+    return settled(places[different], owns[different], frame, _PASSES)
+
+
+def _groups(free: NDArray[np.bool_], frame: Frame) -> NDArray[np.intp]:
+    """(D,) which 2D person each free detection is of; -1 for those of none, and of persons of few joints."""
+    detections = frame.detections
+    tied = free[detections.pairs].all(axis=1) & (detections.affinity >= _LEAST_AFFINITY)
+    tied = replace(detections, pairs=detections.pairs[tied], affinity=detections.affinity[tied])
+    group = np.full(len(detections), -1, dtype=np.intp)
+    for number, members in enumerate(each for each in group_people(tied) if len(each) >= _LEAST_JOINTS):
+        group[members] = number
+    return group
+
+
+def _meeting(points: PairPoints, group: NDArray[np.intp], frame: Frame) -> tuple[Array, NDArray[np.intp]]:
+    """Places (M, J, 3) at which enough joints of two 2D people meet, and which two (M, 2) these are."""
+    count, joints = group.max(initial=-1) + 1, len(frame.skeleton)
+    ends = np.sort(group[points.pair], axis=1)
+    both = (ends >= 0).all(axis=1)
+    pair, place = np.unique(ends[both, 0] * count + ends[both, 1], return_inverse=True)
+    owners = np.stack(np.divmod(pair, max(count, 1)), axis=1)
+    places = np.full((len(pair), joints, 3), np.nan)
+    places[place, points.joint[both]] = points.xyz[both]
+    has = np.zeros((count, joints), dtype=bool)
+    has[group[group >= 0], frame.detections.joint[group >= 0]] = True
+    shared = (has[owners[:, 0]] & has[owners[:, 1]]).sum(axis=1)
+    met = np.bincount(place, minlength=len(pair))
+    enough = (met >= _LEAST_JOINTS) & (met >= _LEAST_SHARE * shared)
+    return places[enough], owners[enough]
+
+
+def _different(places: Array, weight: Array) -> NDArray[np.intp]:
+    """Which of `places` (H, J, 3) stay when those that become the same person are one, heaviest first."""
+    # Equal weights are told apart by place: the order of cameras and detections must not decide.
+    order = np.lexsort((*np.nansum(places, axis=1).T, -np.round(weight, 9)))
+    count = np.isfinite(places[..., 0]).sum(axis=1)
+    stays = list[int]()
+    while len(order) > 0 and len(stays) < _MOST:
+        best, order = order[0], order[1:]
+        stays.append(best)
+        near = np.linalg.norm(places[order] - places[best], axis=-1) < _SAME_M
+        order = order[near.sum(axis=1) < _SAME_SHARE * count[order]]
+    return np.array(stays, dtype=np.intp)
