@@ -60,16 +60,15 @@ class Setup:
     def engine(self, book: Notebook) -> Engine:
         """Follows people and solves windows; what it has to say goes into `book`."""
         config, skeleton = self.config, self.skeleton
-        least = _ON_TRIAL * config.proposals.min_probability
-        weaker = replace(
-            config,
-            candidates=replace(config.candidates, min_votes=1),
-            proposals=replace(config.proposals, min_probability=least),
-        )
+        # What evidence leaves over may be people whose hips two views saw: whether they are, time tells.
+        candidates = replace(config.candidates, min_votes=1)
+        hips = replace(config, candidates=candidates, proposals=replace(config.proposals, evidence=False))
+        likely = replace(config.proposals, min_probability=_ON_TRIAL * config.proposals.min_probability)
         alone = config.proposals.evidence and not config.temporal
+        sure = replace(config, proposals=likely) if alone else config
 
         def find(detections: Detections, rig: Rig, weak: bool) -> Observations:
-            return find_people(detections, rig, skeleton, weaker if weak or alone else config, book)
+            return find_people(detections, rig, skeleton, hips if weak else sure, book)
 
         # In frames that stand alone evidence decides, when the detections are given out again.
         tracking = replace(config.tracking, min_new_joints=3) if alone else config.tracking
