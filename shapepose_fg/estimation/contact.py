@@ -22,8 +22,10 @@ NEXT = np.array([[0.0, 0.98, 0.02], [0.42, 0.0, 0.58], [0.0, 1.0, 0.0]])
 """What each turns into."""
 CORRELATION_S = np.array([0.06, 0.1, 0.5])
 """How long a speed lasts within each, seconds."""
-LOOK_S = 0.1
-"""Errors of velocities last about so long: frames within this time are one look."""
+LOOK_S = 0.05
+"""Frames within this time are one look at the speed: errors of velocities are alike for longer, but their covariances
+are wider than they are. Of 0.03, 0.05 and 0.1 s this has the least error over all speeds in simulated recordings of 3,
+4 and 6 cameras (crossing 5001, crowd 777, salsa 31)."""
 FREE_M2_S = 0.02
 """A step whose density is more than this is no step of a standing foot: at 30 frames a second it would be held to
 2.6 cm, and motion says more."""
