@@ -4,9 +4,8 @@ Residual, in metres in the world:
 
     r = x' - x  ~  N(0, q dt I)
 
-with q the density of a walk without a direction, m²/s: a standing foot turns and slides by a little, now this way and
-now that. Native and linear. Beside the motion factors of `factors.motion` it says that the joint's speed has no
-lasting part.
+with q the density of a walk without a direction, m²/s: a standing foot turns and slides by a little, now this way
+and now that. Native and linear. Beside `factors.motion` it says that the joint's speed has no lasting part.
 """
 
 from itertools import repeat

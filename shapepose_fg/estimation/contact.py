@@ -9,11 +9,11 @@ from shapepose_fg.estimation.state_covariances import state_covariances
 from shapepose_fg.estimation.window_graph import Message, WindowGraph
 
 FEET = ("Ankle", "Heel", "BigToe", "SmallToe")
-"""Joints that stand while the foot does, on either side. Each is judged by itself: toes stand while the heel rises."""
+"""Joints that may stand, on either side, each by itself: toes stand while the heel rises."""
 SPEEDS_M_S = np.array([0.017, 0.116, 1.62])
-"""Speed per axis, one sigma, of a foot's joint that stands, that turns or slides, and that moves. These, and the next
-three, are a hidden Markov model of CMU motion capture, training subjects, 30 frames a second, fitted by expectation
-maximisation to velocities over two frames of ankles, heels and toes."""
+"""Speed per axis, one sigma, of a foot's joint that stands, that turns or slides, and that moves. These, and the
+next four, are a hidden Markov model of CMU motion capture, training subjects, 30 frames a second, fitted by
+expectation maximisation to velocities over two frames of ankles, heels and toes (`training.foot_speeds`)."""
 LASTS_S = np.array([0.63, 0.35, 0.57])
 """How long each of these lasts, seconds, in the mean."""
 FIRST = np.array([0.29, 0.37, 0.34])
@@ -23,9 +23,9 @@ NEXT = np.array([[0.0, 0.98, 0.02], [0.42, 0.0, 0.58], [0.0, 1.0, 0.0]])
 CORRELATION_S = np.array([0.06, 0.1, 0.5])
 """How long a speed lasts within each, seconds."""
 LOOK_S = 0.05
-"""Frames within this time are one look at the speed: errors of velocities are alike for longer, but their covariances
-are wider than they are. Of 0.03, 0.05 and 0.1 s this has the least error over all speeds in simulated recordings of 3,
-4 and 6 cameras (crossing 5001, crowd 777, salsa 31)."""
+"""Frames within this time are one look at the speed: errors of velocities are alike for longer, but their
+covariances are wider than they are. Of 0.03, 0.05 and 0.1 s this has the least error over all speeds in simulated
+recordings of 4 and 6 cameras (crowd 777, salsa 31)."""
 FREE_M2_S = 0.02
 """A step whose density is more than this is no step of a standing foot: at 30 frames a second it would be held to
 2.6 cm, and motion says more."""
@@ -64,10 +64,10 @@ def standing_density(
 ) -> NDArray[np.float64]:
     """(T - 1, F) density of the walk that joints make in each step, m²/s: small where they stand.
 
-    `velocity` (T, F, 3) m/s and its `covariance` (T, F, 3, 3) are those of a solution that knows nothing of standing.
-    With p_k how probable each way to move is, given the whole window, and 2 s_k² c_k the density of one with speed s_k
-    that lasts for c_k, the mean over k is what a Gaussian can say of the step: where it is doubtful whether a foot
-    stands, it is hardly held. Infinite where a velocity is unknown.
+    `velocity` (T, F, 3) m/s and its `covariance` (T, F, 3, 3) are of a solution that knows nothing of standing. With
+    p_k how probable each way to move is, given the whole window, and 2 s_k² c_k the density of one with speed s_k
+    that lasts for c_k, their mean is what a Gaussian can say of the step: where it is doubtful whether a foot stands,
+    it is hardly held. Infinite where a velocity is unknown.
     """
     known = np.asarray(np.isfinite(velocity).all(axis=2) & np.isfinite(covariance).all(axis=(2, 3)))
     log = log_densities(np.nan_to_num(velocity), np.where(known[..., None, None], covariance, np.eye(3)))

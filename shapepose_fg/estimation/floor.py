@@ -10,18 +10,18 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 LOOK_S = 1.5
-"""Feet that stand for so long are one look at the floor: so long errors of joints last (`SequenceConfig.lasting_s`)."""
+"""A foot that stands for so long is one look at the floor: so long its errors last (`SequenceConfig.lasting_s`)."""
 LEAST_LOOKS = 6
 """Looks that a floor takes: two feet of one person over five seconds, or of three people at a time."""
 AGREE = 0.6
 """The share of all looks that a floor takes. The others may be of feet on chairs and of legs that are crossed."""
 NEAR_M = 0.06
-"""A foot this near to the floor stands on it. In simulated recordings of 3 to 6 cameras 99 % of the soles of bodies
-are within 4 cm."""
+"""A foot this near to the floor stands on it: in simulated recordings of 3 to 6 cameras 99 % of the bodies' lowest
+points are within 4 cm."""
 UNDER_M = 0.1
 """A foot this far below the floor stands on something else; nothing does below a floor."""
 UNDER_SHARE = 0.01
-"""Of so many looks at the most: bodies that are fitted badly. Beyond it there are several floors, and none is said."""
+"""So many looks may be: bodies that are fitted badly. More are another floor, and then none is said."""
 SCALE_M = 0.015
 """Of the kernel: how much soles of bodies differ from the floor that they stand on, metres, one sigma."""
 TILT_RAD = np.deg2rad(0.5)
@@ -68,8 +68,8 @@ class Floor:
 def find_floor(points: Array, look: NDArray[np.intp], up: Array) -> Floor | str:
     """The floor under `points` (N, 3), the lowest of feet that stand; else in words why there is none.
 
-    `look` (N,) numbers what is seen as one. The height at which most looks agree is where a robust plane starts, level
-    but for `TILT_RAD`.
+    `look` (N,) numbers what is seen as one. A robust plane, level but for `TILT_RAD`, starts at the height at which
+    most looks agree.
     """
     numbers, whose, count = np.unique(look, return_inverse=True, return_counts=True)
     if len(numbers) < LEAST_LOOKS:

@@ -15,7 +15,7 @@ from shapepose_fg.runs.parts import Parts
 MOST_ROWS = 4000
 """Rows, spread over the run, that a floor is found from."""
 STANDS_M_S = 0.1
-"""A foot stands in a frame in which one of its joints is slower, and its speed is known to within this per axis."""
+"""A foot stands where one of its joints is slower, and its speed is known to within this per axis."""
 _BODY = ("betas", "global_orient", "body_pose", "transl")
 
 

@@ -9,7 +9,7 @@ from shapepose_fg.skeleton import SMPL_24
 
 _BONES = tuple([SMPL_24.index(f"{side}_{name}") for name in ("ankle", "foot")] for side in ("right", "left"))
 _OF_FEET, _BEYOND = 3, 10
-"""Of the feet's vertices every third is looked at, of the rest of the skin every tenth: they are 1 to 3 cm apart."""
+"""Of the feet's vertices every third is looked at, of the rest of the skin every tenth, 1 to 3 cm apart."""
 _ROWS = 256
 """Bodies whose vertices are made at a time."""
 
