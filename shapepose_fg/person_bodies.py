@@ -99,8 +99,8 @@ class PersonBodies:
 def _lifted(model: BodyModel, fit: BodyFit, floor: Floor) -> NDArray[np.float64]:
     """(N, 3) `transl` of bodies, those that are lower than `SINK_M` below the floor lifted to there.
 
-    By millimetres, mostly: legs that the views put too low. The pose stays. In simulated recordings of 3 to 6 cameras
-    the bodies' joints lose 0 to 0.2 mm by it in the mean.
+    By millimetres, mostly: legs that the views put too low. The pose stays. In simulated recordings of 3 to 6
+    cameras the bodies' joints lose 0 to 0.2 mm by it in the mean.
     """
     bodies = BodyParameters(
         *(torch.from_numpy(getattr(fit, name)) for name in ("betas", "global_orient", "body_pose", "transl"))

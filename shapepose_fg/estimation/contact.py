@@ -53,7 +53,10 @@ def walking(
     alone[:, feet] = initial[:, feet]
     graph.solve(*problem, alone, lost)
     _, covariance = state_covariances([graph])[0]
-    density = standing_density(graph.velocity()[:, feet], covariance[:, feet], graph.times_s)
+    velocity = graph.velocity()
+    if lost is not None:
+        velocity[lost] = np.nan  # A body's guess that stands still is no foot that does.
+    density = standing_density(velocity[:, feet], covariance[:, feet], graph.times_s)
     result = np.full((len(graph) - 1, initial.shape[1]), np.inf)
     result[:, feet] = np.where(density > FREE_M2_S, np.inf, density)
     return result
@@ -64,15 +67,15 @@ def standing_density(
 ) -> NDArray[np.float64]:
     """(T - 1, F) density of the walk that joints make in each step, m²/s: small where they stand.
 
-    `velocity` (T, F, 3) m/s and its `covariance` (T, F, 3, 3) are of a solution that knows nothing of standing. With
-    p_k how probable each way to move is, given the whole window, and 2 s_k² c_k the density of one with speed s_k
-    that lasts for c_k, their mean is what a Gaussian can say of the step: where it is doubtful whether a foot stands,
-    it is hardly held. Infinite where a velocity is unknown.
+    `velocity` (T, F, 3) m/s and its `covariance` (T, F, 3, 3) are of a solution that knows nothing of standing,
+    NaN where nothing was seen. With p_k how probable each way to move is, given the whole window, and 2 s_k² c_k
+    the density of one with speed s_k that lasts for c_k, their mean is what a Gaussian can say of the step: where
+    it is doubtful whether a foot stands, it is hardly held.
     """
     known = np.asarray(np.isfinite(velocity).all(axis=2) & np.isfinite(covariance).all(axis=(2, 3)))
     log = log_densities(np.nan_to_num(velocity), np.where(known[..., None, None], covariance, np.eye(3)))
     probability = smoothed(np.where(known[..., None], log, 0.0), times_s)
-    density = np.where(known, probability @ (2 * SPEEDS_M_S**2 * CORRELATION_S), np.inf)
+    density = probability @ (2 * SPEEDS_M_S**2 * CORRELATION_S)
     return (density[1:] + density[:-1]) / 2
 
 

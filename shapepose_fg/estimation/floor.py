@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 LOOK_S = 1.5
-"""A foot that stands for so long is one look at the floor: so long its errors last (`SequenceConfig.lasting_s`)."""
+"""A foot that stands for so long is one look at the floor: so long errors last (`SequenceConfig.lasting_s`)."""
 LEAST_LOOKS = 6
 """Looks that a floor takes: two feet of one person over five seconds, or of three people at a time."""
 AGREE = 0.6
@@ -68,7 +68,7 @@ class Floor:
 def find_floor(points: Array, look: NDArray[np.intp], up: Array) -> Floor | str:
     """The floor under `points` (N, 3), the lowest of feet that stand; else in words why there is none.
 
-    `look` (N,) numbers what is seen as one. A robust plane, level but for `TILT_RAD`, starts at the height at which
+    `look` (N,) numbers what is seen as one. A robust plane, level but for `TILT_RAD`, starts at the height where
     most looks agree.
     """
     numbers, whose, count = np.unique(look, return_inverse=True, return_counts=True)

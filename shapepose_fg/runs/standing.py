@@ -21,9 +21,7 @@ _BODY = ("betas", "global_orient", "body_pose", "transl")
 
 def floor_of(parts: Parts, joints: Sequence[str], model: BodyModel, up: np.ndarray) -> Floor | str:
     """The floor, or in words why none was found; `up` (3,) points up in the world."""
-    feet = feet_of(joints)
-    toes = [n for n in feet.tolist() if not joints[n].endswith("Ankle")]
-    sides = [[n for n in toes or feet.tolist() if joints[n].startswith(side)] for side in "RL"]
+    sides = [[n for n in feet_of(joints).tolist() if joints[n].startswith(side)] for side in "RL"]
     if not all(sides):
         return "the detector has no feet"
     points, looks = [], []
