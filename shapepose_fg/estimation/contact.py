@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.estimation.state_covariances import state_covariances
-from shapepose_fg.estimation.window_graph import Message, WindowGraph
+from shapepose_fg.estimation.window_graph import Message, WindowGraph, near_in_time
 
 FEET = ("Ankle", "Heel", "BigToe", "SmallToe")
 """Joints that may stand, on either side, each by itself: toes stand while the heel rises."""
@@ -26,6 +26,8 @@ LOOK_S = 0.05
 """Frames within this time are one look at the speed: errors of velocities are alike for longer, but their
 covariances are wider than they are. Of 0.03, 0.05 and 0.1 s this has the least error over all speeds in simulated
 recordings of 4 and 6 cameras (crowd 777, salsa 31)."""
+UNSEEN_S = 0.5
+"""So long after a joint was seen, and before, its speed is taken from the body."""
 FREE_M2_S = 0.02
 """A step whose density is more than this is no step of a standing foot: at 30 frames a second it would be held to
 2.6 cm, and motion says more."""
@@ -55,7 +57,8 @@ def walking(
     _, covariance = state_covariances([graph])[0]
     velocity = graph.velocity()
     if lost is not None:
-        velocity[lost] = np.nan  # A body's guess that stands still is no foot that does.
+        # A body's guess that stands still is no foot that does, but for a while.
+        velocity[~near_in_time(~lost, graph.times_s, UNSEEN_S)] = np.nan
     density = standing_density(velocity[:, feet], covariance[:, feet], graph.times_s)
     result = np.full((len(graph) - 1, initial.shape[1]), np.inf)
     result[:, feet] = np.where(density > FREE_M2_S, np.inf, density)
