@@ -4,12 +4,11 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.body_sequence import SequenceFit, Shapes
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
-from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
+from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.soles import lowest
 from shapepose_fg.estimation.floor import Floor
 
@@ -102,8 +101,6 @@ def _lifted(model: BodyModel, fit: BodyFit, floor: Floor) -> NDArray[np.float64]
     By millimetres, mostly: legs that the views put too low. The pose stays. In simulated recordings of 3 to 6
     cameras the bodies' joints lose 0 to 0.2 mm by it in the mean.
     """
-    bodies = BodyParameters(
-        *(torch.from_numpy(getattr(fit, name)) for name in ("betas", "global_orient", "body_pose", "transl"))
-    )
+    bodies = fit.betas, fit.global_orient, fit.body_pose, fit.transl
     sunk = floor.height_m - SINK_M - lowest(model, bodies, floor.normal)
     return fit.transl + np.maximum(np.nan_to_num(sunk), 0.0)[:, None] * floor.normal

@@ -3,9 +3,8 @@
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 
-from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
+from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.soles import lowest_of_feet
 from shapepose_fg.estimation.contact import feet_of
 from shapepose_fg.estimation.floor import LOOK_S, Floor, find_floor
@@ -38,8 +37,8 @@ def floor_of(parts: Parts, joints: Sequence[str], model: BodyModel, up: np.ndarr
         stands &= (parts.column(n, "status") == Status.OK)[:, None]
         before += len(person)
         rows, side = np.nonzero(stands)
-        bodies = BodyParameters(*(torch.from_numpy(parts.column(n, name)[rows]) for name in _BODY))
-        points.append(lowest_of_feet(model, bodies, up)[np.arange(len(rows)), side])
+        betas, orient, pose, transl = (parts.column(n, name)[rows] for name in _BODY)
+        points.append(lowest_of_feet(model, (betas, orient, pose, transl), up)[np.arange(len(rows)), side])
         looks.append(np.stack([person[rows], side, (time_s[rows] // LOOK_S).astype(np.int64)], axis=1))
     whose = np.unique(np.concatenate(looks), axis=0, return_inverse=True)[1]
     return find_floor(np.concatenate(points), whose.ravel(), up)

@@ -14,6 +14,8 @@ _ROWS = 256
 """Bodies whose vertices are made at a time."""
 
 Array = NDArray[np.float64]
+Bodies = tuple[Array, Array, Array, Array]
+"""`betas` (B, 10), `global_orient` (B, 3), `body_pose` (B, 23, 3) and `transl` (B, 3) as in `BodyParameters`."""
 
 
 def feet_vertices(model: BodyModel) -> list[NDArray[np.intp]]:
@@ -22,7 +24,7 @@ def feet_vertices(model: BodyModel) -> list[NDArray[np.intp]]:
     return [np.flatnonzero(np.isin(bone, bones))[::_OF_FEET] for bones in _BONES]
 
 
-def lowest_of_feet(model: BodyModel, bodies: BodyParameters, up: Array) -> Array:
+def lowest_of_feet(model: BodyModel, bodies: Bodies, up: Array) -> Array:
     """(B, 2, 3) the lowest point of each foot, right and left, metres; NaN where there is no body."""
     feet = feet_vertices(model)
     points = _vertices(model, bodies, np.concatenate(feet))
@@ -31,18 +33,18 @@ def lowest_of_feet(model: BodyModel, bodies: BodyParameters, up: Array) -> Array
     return np.stack([part[rows, (part @ up).argmin(axis=1)] for part in parts], axis=1)
 
 
-def lowest(model: BodyModel, bodies: BodyParameters, normal: Array) -> Array:
+def lowest(model: BodyModel, bodies: Bodies, normal: Array) -> Array:
     """(B,) how low bodies reach along a `normal` (3,), metres, to 1 cm."""
     chosen = np.union1d(np.concatenate(feet_vertices(model)), np.arange(0, model.num_vertices, _BEYOND))
     return np.asarray((_vertices(model, bodies, chosen) @ normal).min(axis=1))
 
 
 @torch.no_grad()
-def _vertices(model: BodyModel, bodies: BodyParameters, only: NDArray[np.intp]) -> Array:
+def _vertices(model: BodyModel, bodies: Bodies, only: NDArray[np.intp]) -> Array:
     """(B, M, 3) some of the vertices."""
-    columns = [getattr(bodies, name) for name in ("betas", "global_orient", "body_pose", "transl")]
+    columns = [torch.from_numpy(column).to(model.dtype) for column in bodies]
     parts = [
-        model.vertices(BodyParameters(*(column[at : at + _ROWS].to(model.dtype) for column in columns)), only)
-        for at in range(0, len(bodies), _ROWS)
+        model.vertices(BodyParameters(*(column[at : at + _ROWS] for column in columns)), only)
+        for at in range(0, len(columns[0]), _ROWS)
     ]
     return torch.cat(parts).double().numpy() if parts else np.zeros((0, len(only), 3))
