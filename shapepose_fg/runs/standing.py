@@ -8,21 +8,23 @@ from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.soles import lowest_of_feet
 from shapepose_fg.estimation.contact import feet_of
 from shapepose_fg.estimation.floor import LOOK_S, Floor, find_floor
-from shapepose_fg.reconstruction import Status
+from shapepose_fg.reconstruction import Known, Status
 from shapepose_fg.runs.parts import Parts
 
 MOST_ROWS = 4000
 """Rows, spread over the run, that a floor is found from."""
 STANDS_M_S = 0.1
-"""A foot stands where one of its joints is slower, and its speed is known to within this per axis."""
+"""A foot stands where its heel or a toe is seen and slower, and the speed is known to within this per axis."""
 _BODY = ("betas", "global_orient", "body_pose", "transl")
 
 
 def floor_of(parts: Parts, joints: Sequence[str], model: BodyModel, up: np.ndarray) -> Floor | str:
     """The floor, or in words why none was found; `up` (3,) points up in the world."""
-    sides = [[n for n in feet_of(joints).tolist() if joints[n].startswith(side)] for side in "RL"]
-    if not all(sides):
-        return "the detector has no feet"
+    # Ankles alone do not say where the sole is: unseen feet hang as the body's prior has them.
+    soles = [n for n in feet_of(joints).tolist() if not joints[n].endswith("Ankle")]
+    sides = [[n for n in soles if joints[n].startswith(side)] for side in "RL"]
+    if len(soles) == 0:
+        return "the detector has no heels and toes"
     points, looks = [], []
     every, before = 1 + (parts.rows - 1) // MOST_ROWS, 0
     for n in range(len(parts)):
@@ -32,6 +34,7 @@ def floor_of(parts: Parts, joints: Sequence[str], model: BodyModel, up: np.ndarr
             still = (np.linalg.norm(speed, axis=2) < STANDS_M_S) & (
                 np.trace(spread, axis1=2, axis2=3) < 3 * STANDS_M_S**2
             )
+        still &= parts.column(n, "known") == Known.SEEN
         stands = np.stack([still[:, side].any(axis=1) for side in sides], axis=1)
         stands &= ((before + np.arange(len(person))) % every == 0)[:, None]
         stands &= (parts.column(n, "status") == Status.OK)[:, None]
