@@ -12,7 +12,7 @@ from shapepose_fg.reconstruction import Known, Status
 from shapepose_fg.runs.parts import Parts
 
 MOST_ROWS = 4000
-"""Rows, spread over the run, that a floor is found from."""
+"""About so many rows, of every so many frames, a floor is found from."""
 STANDS_M_S = 0.1
 """A foot stands where its heel or a toe is seen and slower, and the speed is known to within this per axis."""
 _BODY = ("betas", "global_orient", "body_pose", "transl")
@@ -26,7 +26,7 @@ def floor_of(parts: Parts, joints: Sequence[str], model: BodyModel, up: np.ndarr
     if len(soles) == 0:
         return "the detector has no heels and toes"
     points, looks = [], []
-    every, before = 1 + (parts.rows - 1) // MOST_ROWS, 0
+    every = 1 + (parts.rows - 1) // MOST_ROWS
     for n in range(len(parts)):
         person, time_s = parts.column(n, "person"), parts.column(n, "time_s")
         speed, spread = parts.column(n, "velocity"), parts.column(n, "velocity_covariance")
@@ -36,9 +36,8 @@ def floor_of(parts: Parts, joints: Sequence[str], model: BodyModel, up: np.ndarr
             )
         still &= parts.column(n, "known") == Known.SEEN
         stands = np.stack([still[:, side].any(axis=1) for side in sides], axis=1)
-        stands &= ((before + np.arange(len(person))) % every == 0)[:, None]
+        stands &= (parts.column(n, "frame") % every == 0)[:, None]
         stands &= (parts.column(n, "status") == Status.OK)[:, None]
-        before += len(person)
         rows, side = np.nonzero(stands)
         betas, orient, pose, transl = (parts.column(n, name)[rows] for name in _BODY)
         points.append(lowest_of_feet(model, (betas, orient, pose, transl), up)[np.arange(len(rows)), side])
