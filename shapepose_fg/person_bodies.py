@@ -7,13 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.body_sequence import SequenceFit, Shapes
-from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
+from shapepose_fg.body.fitting.fitter import BodyFitter, JointTargets
 from shapepose_fg.body.model.body_model import BodyModel
-from shapepose_fg.body.model.soles import lowest
+from shapepose_fg.body.model.soles import above_floor
 from shapepose_fg.estimation.floor import Floor
-
-SINK_M = 0.01
-"""Bodies may be this far below the floor: flesh and soles give way."""
 
 
 @runtime_checkable
@@ -76,8 +73,10 @@ class Person:
         group = np.full(len(self.time_s), self.number)
         found = fitter.fit_sequence(self.targets, group, self.time_s, self.shapes, fixed_shapes=self.fixed_shapes)
         fit = found.fit if self.kept is None else found.fit.rows(np.arange(self.kept.start, self.kept.stop))
-        transl = fit.transl if self.floor is None else _lifted(fitter.model, fit, self.floor)
-        return PersonBodies(fit.ok, fit.betas, fit.global_orient, fit.body_pose, transl, found.shapes)
+        bodies = fit.betas, fit.global_orient, fit.body_pose, fit.transl
+        if self.floor is not None:
+            bodies = above_floor(fitter.model, bodies, self.floor.normal, self.floor.height_m)
+        return PersonBodies(fit.ok, *bodies, found.shapes)
 
 
 @dataclass(frozen=True)
@@ -93,14 +92,3 @@ class PersonBodies:
     transl: NDArray[np.float64]
     shape: Shapes
     """(1) what all rows say of the shape."""
-
-
-def _lifted(model: BodyModel, fit: BodyFit, floor: Floor) -> NDArray[np.float64]:
-    """(N, 3) `transl` of bodies, those that are lower than `SINK_M` below the floor lifted to there.
-
-    By millimetres, mostly: legs that the views put too low. The pose stays. In simulated recordings of 3 to 6
-    cameras the bodies' joints lose 0 to 0.2 mm by it in the mean.
-    """
-    bodies = fit.betas, fit.global_orient, fit.body_pose, fit.transl
-    sunk = floor.height_m - SINK_M - lowest(model, bodies, floor.normal)
-    return fit.transl + np.maximum(np.nan_to_num(sunk), 0.0)[:, None] * floor.normal
