@@ -12,7 +12,7 @@ from typing import Annotated
 import gtsam
 import numpy as np
 from annotated_types import Interval
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from factors import (
     DEFAULT_WIDTH_SIGMA,
@@ -117,7 +117,7 @@ class WindowGraph:
         track: int,
         frames: NDArray[np.intp],
         times_s: NDArray[np.float64],
-        feet: Sequence[int] = (),
+        feet: ArrayLike = (),
     ) -> None:
         """Make the factors of all observations.
 
@@ -331,7 +331,7 @@ class WindowGraph:
         if not np.isfinite(optimizer.error()):
             self.failure = "the solver left the finite numbers"
 
-    def _push(self, factors: list[gtsam.NonlinearFactor]) -> None:
+    def _push(self, factors: Sequence[gtsam.NonlinearFactor]) -> None:
         push = self.graph.push_back
         for factor in factors:
             push(factor)

@@ -1,7 +1,5 @@
 """The floor of a run: from the soles of everybody's bodies, where their feet stand."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from shapepose_fg.body.model.body_model import BodyModel
@@ -18,7 +16,7 @@ STANDS_M_S = 0.1
 _BODY = ("betas", "global_orient", "body_pose", "transl")
 
 
-def floor_of(parts: Parts, joints: Sequence[str], model: BodyModel, up: np.ndarray) -> Floor | str:
+def floor_of(parts: Parts, joints: tuple[str, ...], model: BodyModel, up: np.ndarray) -> Floor | str:
     """The floor, or in words why none was found; `up` (3,) points up in the world."""
     # Ankles alone do not say where the sole is: unseen feet hang as the body's prior has them.
     soles = [n for n in feet_of(joints).tolist() if not joints[n].endswith("Ankle")]
