@@ -1,10 +1,12 @@
-"""GTSAM factors for people seen by calibrated cameras: keys, noise, projection, body priors, motion.
+"""GTSAM factors for people seen by calibrated cameras: keys, noise, projection, body priors, motion,
+contact.
 
 Only GTSAM and NumPy. A builder takes keys, arrays and noise and returns native `gtsam.NonlinearFactor`s for
 a graph of your own. Units: metres in the world, pixels in the image; cameras look along +z, x right, y down.
 """
 
 from factors.body_prior import body_prior_factor, body_prior_factors
+from factors.contact import standing_factors
 from factors.keys import (
     CameraKey,
     JointKey,
@@ -86,6 +88,7 @@ __all__ = [
     "sigma_px",
     "split_camera_key",
     "split_key",
+    "standing_factors",
     "to_pixels",
     "velocity_key",
     "velocity_keys",

@@ -14,6 +14,7 @@ from shapepose_fg.body.fitting.fitters import BodyConfig, make_fitter
 from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.estimation.motion_model import FORMAT
 from shapepose_fg.simulation.files import cut, named_scene
+from shapepose_fg.training.foot_speeds import foot_speeds
 from shapepose_fg.training.motion_statistics import (
     LastingErrors,
     densities,
@@ -58,6 +59,9 @@ def main() -> None:
         }
         for lag, value in zip(pairs[0].lags_s, pairs[0].autocorrelation, strict=True):
             print(f"{name}: {lag:.3f} s {value:.2f}")
+    feet = foot_speeds(recorded_joints(arguments.mocap, "train"))  # for estimation/contact.py
+    print(f"feet: {feet.speeds_m_s} m/s, {feet.first}, {feet.lasts_s(30.0)} s, {feet.correlation_s} s")
+    print(feet.turns)
     arguments.output.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
 
 

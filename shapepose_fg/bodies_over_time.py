@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from shapepose_fg.body.fitting.body_sequence import Shapes
 from shapepose_fg.body.fitting.weights import fingerprint
 from shapepose_fg.body.shapes import SubjectShapes, recognise
+from shapepose_fg.estimation.floor import Floor
 from shapepose_fg.kept_arrays import InMemory, KeptArrays
 from shapepose_fg.person_bodies import Person, PersonBodies, SequenceFitting
 from shapepose_fg.reconstruction import Reconstruction, Status
@@ -157,12 +158,15 @@ def _spread(count: int, most: int, length: int) -> list[range]:
 
 
 def with_bodies_over_time(
-    people: Reconstruction, fitter: SequenceFitting, known: SubjectShapes | None = None
+    people: Reconstruction,
+    fitter: SequenceFitting,
+    known: SubjectShapes | None = None,
+    floor: Floor | None = None,
 ) -> Reconstruction:
     """The same rows with one body per person, fitted to the joints as they were solved, and everybody's shape.
 
-    `known`: see `fit_everybody`. Nothing of this returns into the joints or their covariances. Rows without a body
-    keep the body that they had. `shapes` of the result are everybody's.
+    `known`: see `fit_everybody`. Bodies stay above the `floor`. Nothing of this returns into the joints or their
+    covariances. Rows without a body keep the body that they had. `shapes` of the result are everybody's.
     """
     if len(people) == 0:
         return people
@@ -174,7 +178,8 @@ def with_bodies_over_time(
 
     def person(number: int, parts: Sequence[range]) -> Person:
         mine = np.flatnonzero(people.person == number)[np.concatenate(parts)]
-        return Person.of(number, people.joints[mine], people.covariance[mine], people.time_s[mine])
+        one = Person.of(number, people.joints[mine], people.covariance[mine], people.time_s[mine])
+        return replace(one, floor=floor)
 
     bodies = fit_everybody(
         dict(zip(numbers.tolist(), counts.tolist(), strict=True)),

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from shapepose_fg.body.fitting.body_sequence import SequenceFit, Shapes
 from shapepose_fg.body.fitting.fitter import BodyFitter, JointTargets
 from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.body.model.soles import above_floor
+from shapepose_fg.estimation.floor import Floor
 
 
 @runtime_checkable
@@ -48,6 +50,8 @@ class Person:
     kept: range | None = None
     """The rows whose bodies are wanted, None for all. Others overlap with what is before and after, or tell of the
     shape only."""
+    floor: Floor | None = None
+    """What bodies do not sink into, where it was found."""
 
     @classmethod
     def of(
@@ -69,7 +73,10 @@ class Person:
         group = np.full(len(self.time_s), self.number)
         found = fitter.fit_sequence(self.targets, group, self.time_s, self.shapes, fixed_shapes=self.fixed_shapes)
         fit = found.fit if self.kept is None else found.fit.rows(np.arange(self.kept.start, self.kept.stop))
-        return PersonBodies(fit.ok, fit.betas, fit.global_orient, fit.body_pose, fit.transl, found.shapes)
+        bodies = fit.betas, fit.global_orient, fit.body_pose, fit.transl
+        if self.floor is not None:
+            bodies = above_floor(fitter.model, bodies, self.floor.normal, self.floor.height_m)
+        return PersonBodies(fit.ok, *bodies, found.shapes)
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ from shapepose_fg.estimation.detector_offsets import (
     spread_frames,
 )
 from shapepose_fg.estimation.estimator import ExtraFactors
+from shapepose_fg.estimation.floor import Floor
 from shapepose_fg.frame_times import FrameTimes, check_cuts, spans_of, stretches
 from shapepose_fg.kept_arrays import InMemory, KeptArrays
 from shapepose_fg.observation_table import place_in_view
@@ -42,6 +43,7 @@ from shapepose_fg.runs.chunks import Chunk, Identities, cut_in_chunks
 from shapepose_fg.runs.notes import Notebook, Notes
 from shapepose_fg.runs.parts import Part, Parts
 from shapepose_fg.runs.rows_of_people import RowsOfPeople
+from shapepose_fg.runs.standing import floor_of
 from shapepose_fg.skeleton import BODY_25, Skeleton
 from shapepose_fg.solved_rows import result_rows
 from shapepose_fg.tracking.hypotheses import Input
@@ -170,17 +172,26 @@ def reconstruct_parts(
                     # Between two frames, where no rounding matters.
                     cuts_s = (times.frame_s[list(cuts)] + times.frame_s[[cut - 1 for cut in cuts]]) / 2
                     result = replace(result, names=_names(parts, skeleton, config, cuts_s.tolist()))
+            floor: Floor | str = "frames stand alone" if not config.temporal else "not sought"
             if config.temporal and isinstance(fitter, SequenceFitting) and len(result) > 0:
                 with book.stage("bodies over time"):
+                    if config.motion.floor:
+                        floor = floor_of(parts, skeleton.joints, fitter.model, rig.up_vector)
                     known = SubjectShapes.empty(fingerprint(fitter.model)) if shapes is None else shapes
+                    ground = floor if isinstance(floor, Floor) else None
                     bodies = fit_everybody(
-                        result.people.counts, result.person, lambda jobs: pool.map(_bodies, jobs), kept, known
+                        result.people.counts,
+                        lambda number, rows: replace(result.person(number, rows), floor=ground),
+                        lambda jobs: pool.map(_bodies, jobs),
+                        kept,
+                        known,
                     )
                     result = replace(result, bodies=bodies)
         notes = beginning
         for each in (parts.notes(), book.torn_off()):
             notes.add(each)
     more = {"time": times.as_dict(), "cuts": list(cuts)}
+    more |= {"floor": floor.as_dict() if isinstance(floor, Floor) else {"found": False, "why": floor}}
     more |= {"keypoint_offsets": None if offsets is None else offsets.as_dict()}
     return result.with_run(**_summary(notes, config, frames, result), **more)
 

@@ -12,6 +12,7 @@ from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.camera import Rig
 from shapepose_fg.estimation.estimator import Estimator, ExtraFactors
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
+from shapepose_fg.estimation.floor import Floor
 from shapepose_fg.frame_times import stretches
 from shapepose_fg.person_bodies import SequenceFitting
 from shapepose_fg.pipeline import PipelineConfig
@@ -51,7 +52,9 @@ def solve_rows(
             solved = result_rows(observations, estimates, table.candidate, rig, joint_names, part.person)
             parts.append(solved.rows(_inside(part.frame, window.own)))
         solved = replace(Reconstruction.concatenate(parts), run=rows.run) if parts else rows
-        return with_bodies_over_time(solved, fitter) if isinstance(fitter, SequenceFitting) else solved
+        if not isinstance(fitter, SequenceFitting):
+            return solved
+        return with_bodies_over_time(solved, fitter, floor=Floor.from_dict(rows.run.get("floor")))
 
 
 @dataclass(frozen=True)

@@ -114,10 +114,12 @@ def test_extending(tmp_path, monkeypatch):
     assert names["width"].shape == (24,)
     assert abs(np.median(names["width"]) - 0.40) < 0.03
     assert wrists_apart(names["people"]) > 0.6
-    # Over time: heels of standing feet hardly move, and those of feet that step are where they were.
-    before, after = (np.quantile(names["steps"](names[each]), [0.1, 0.9]) for each in ("people", "standing"))
-    assert after[0] < 0.5 * before[0] and after[1] > 0.9 * before[1]
-    assert joint_metrics(names["standing"], truth).mpjpe_mm < 1.1 * joint_metrics(names["people"], truth).mpjpe_mm
+    # Over time: standing feet hardly move, and those that step are where they were.
+    before = np.quantile(names["steps"](names["loose"]), [0.2, 0.9])
+    for each in ("standing", "people"):
+        after = np.quantile(names["steps"](names[each]), [0.2, 0.9])
+        assert after[0] < 0.5 * before[0] and after[1] > 0.9 * before[1]
+        assert joint_metrics(names[each], truth).mpjpe_mm < 1.05 * joint_metrics(names["loose"], truth).mpjpe_mm
     # The detector: perfect but for feet, which it does not have; the rest within its sigma of 2 cm.
     assert joint_metrics(names["from_perfect"], truth).everyone_once
     from_coco = joint_metrics([names["from_perfect"].at(t).joints[:, :19] for t in range(6)], truth[:, :, :19])

@@ -10,6 +10,7 @@ from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus, JointTargets
 from shapepose_fg.camera import Views
 from shapepose_fg.estimation.body_step import BodyStep, Tie, disagreement
+from shapepose_fg.estimation.contact import walking
 from shapepose_fg.estimation.draft import WholeFitter
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.linearisation import ViewEvidence, linearise, mean_confidence
@@ -203,7 +204,8 @@ def _solve(
         else:
             inlier = inlier & known[part][..., None]
         views = Message(evidence.target[part], evidence.information[part])
-        X[part] = window.graph.solve(inlier, views, body.rows(np.arange(part.start, part.stop)), initial, lost)
+        problem = inlier, views, body.rows(np.arange(part.start, part.stop))
+        X[part] = window.graph.solve(*problem, initial, lost, walking(window.graph, problem, initial, lost))
     return X
 
 

@@ -13,6 +13,7 @@ from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter
 from shapepose_fg.camera import Rig, Views
 from shapepose_fg.estimation.alternation import Solution, Window, alternate, final_bodies
 from shapepose_fg.estimation.body_step import joint_targets
+from shapepose_fg.estimation.contact import feet_of
 from shapepose_fg.estimation.doubt import association_spread, lasting_spread
 from shapepose_fg.estimation.draft import (
     NARROWING,
@@ -210,6 +211,7 @@ class Estimator:
                 track=int(observations.track[rows[0]]),
                 frames=observations.frame[rows],
                 times_s=time_s[rows].mean(axis=1),
+                feet=feet_of(self.joints) if self.config.motion.contact else (),
             )
             for factor in extra_factors(graph, graph.keys) if extra_factors is not None else ():
                 graph.add(factor)

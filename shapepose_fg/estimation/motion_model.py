@@ -28,6 +28,10 @@ class MotionConfig(Settings):
     around_s: Seconds = 0.5
     """In frames where a joint is lost from sight (`LOST_M`), and so far around them, seconds, the difference
     between joint and body is followed (`factors.motion`)."""
+    contact: bool = True
+    """Whether feet that stand stay where they are from frame to frame (`estimation.contact`)."""
+    floor: bool = True
+    """Whether a floor is sought under the feet that stand; where one is found, bodies over time stay above it."""
     keep_limbs: bool = True
     """Whether joints that no view saw go to where a body can have them, and limbs with an open end get the body's
     length: motion carries each joint by itself."""

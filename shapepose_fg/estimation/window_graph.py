@@ -12,7 +12,7 @@ from typing import Annotated
 import gtsam
 import numpy as np
 from annotated_types import Interval
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from factors import (
     DEFAULT_WIDTH_SIGMA,
@@ -27,6 +27,7 @@ from factors import (
     projection_factors,
     robust_kernel,
     split_key,
+    standing_factors,
     velocity_keys,
 )
 from shapepose_fg.bounds import Factor, MetresOrNone, Settings, Share
@@ -116,11 +117,13 @@ class WindowGraph:
         track: int,
         frames: NDArray[np.intp],
         times_s: NDArray[np.float64],
+        feet: ArrayLike = (),
     ) -> None:
         """Make the factors of all observations.
 
         `cameras` are V of each of the T frames, `xy` (T, J, V, 2) undistorted pixels, `sigmas_px` (T, J, V), 0
-        where the view did not see the joint; `frames` (T,) and `times_s` (T,) seconds, both rising.
+        where the view did not see the joint; `frames` (T,) and `times_s` (T,) seconds, both rising. `feet` are the
+        joints that may stand.
         """
         T, J = sigmas_px.shape[:2]
         if np.shape(frames) != (T,) or np.shape(times_s) != (T,) or np.any(np.diff(frames) <= 0):
@@ -132,6 +135,8 @@ class WindowGraph:
         """(T,) frame of each row."""
         self.times_s = np.asarray(times_s, dtype=np.float64)
         """(T,) time of each frame, seconds."""
+        self.feet = np.asarray(feet, dtype=np.intp)
+        """(F,) the joints that may stand."""
         joints = np.arange(J)
         self.keys = joint_keys(track, joints, self.frames[:, None])
         """(T, J) key of each joint's position, `Point3`, metres."""
@@ -228,13 +233,14 @@ class WindowGraph:
         body: Message,
         initial: NDArray[np.float64],
         lost: NDArray[np.bool_] | None = None,
+        standing: NDArray[np.float64] | None = None,
     ) -> NDArray[np.float64]:
         """Minimise over the joints, from `initial` (T, J, 3) metres; returns (T, J, 3).
 
         `inlier` (T, J, V) are the observations that count (delta_ij of Eq. 2), `views` what they say together at
         `initial`, `body` the priors (Eq. 3). A joint with NaN in `initial` is not in the problem and stays NaN; in
         a window of several frames that goes for all frames of the joint. `lost` (T, J): where joints are hardly
-        seen.
+        seen. `standing` (T - 1, J): how little they walk in each step, m²/s, infinite where they do not stand.
         """
         self.failure = ""
         self._present = np.asarray(np.isfinite(initial).all(axis=2))
@@ -252,6 +258,10 @@ class WindowGraph:
         self._push(self._lasting(body, 1.0 / self.config.weight_shape, self._motion.body, _OF_BODY, of_body))
         if self.temporal:
             self._push(self._motions(initial, lost))
+        if standing is not None:
+            step, joint = np.nonzero(np.isfinite(standing) & self._present[1:])
+            before, after = self.keys[step, joint], self.keys[step + 1, joint]
+            self._push(standing_factors(before, after, np.diff(self.times_s)[step], standing[step, joint]))
         exists = self.values.exists
         self._push([factor for factor, keys in self._added if all(map(exists, keys))])
         if self.values.empty():
@@ -321,7 +331,7 @@ class WindowGraph:
         if not np.isfinite(optimizer.error()):
             self.failure = "the solver left the finite numbers"
 
-    def _push(self, factors: list[gtsam.NonlinearFactor]) -> None:
+    def _push(self, factors: Sequence[gtsam.NonlinearFactor]) -> None:
         push = self.graph.push_back
         for factor in factors:
             push(factor)
