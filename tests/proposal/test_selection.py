@@ -48,15 +48,12 @@ def test_two_of_three_cameras_are_enough(five_cameras, two_people, seen_exactly,
         )
         for who, views in ((0, (0, 1)), (1, (1, 2)))
     ]
-    first = len(parts[0])
-    both = Detections(
-        *(
-            np.concatenate([getattr(part, name) for part in parts])
-            for name in ("view", "joint", "xy", "confidence")
-        ),
-        np.concatenate([parts[0].pairs, parts[1].pairs + first]),
-        np.concatenate([part.affinity for part in parts]),
+    view, joint, confidence = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("view", "joint", "confidence")
     )
+    xy, affinity = (np.concatenate([getattr(part, name) for part in parts]) for name in ("xy", "affinity"))
+    pairs = np.concatenate([parts[0].pairs, parts[1].pairs + len(parts[0])])
+    both = Detections(view, joint, xy, confidence, pairs, affinity)
     people, sure = chosen(both, rig)
     assert len(people) == 2 and (sure > 0.9).all()
     order = np.argsort(people.places[:, 1, 0])
