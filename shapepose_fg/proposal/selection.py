@@ -33,7 +33,7 @@ def choose(points: PairPoints, frame: Frame, least: float) -> tuple[Hypotheses, 
     """The people of a frame who are there with a probability of at least `least`, and these probabilities (P,)."""
     people, sure = Hypotheses.none(frame), np.zeros(0)
     for _ in range(_ROUNDS):
-        taken = owned(people.chosen, len(frame.detections)).any(axis=0)
+        taken = np.asarray(owned(people.chosen, len(frame.detections)).any(axis=0))
         pool = pooled(points, ~taken, frame)
         more = _greedy(pool, people, taken, frame, least)
         if more is None:
@@ -53,7 +53,7 @@ def _greedy(
     open_ = np.ones(len(pool), dtype=bool)
     while open_.any():  # once a person or part
         score = np.where(open_, evidence.score(taken), -np.inf)
-        best = score.argmax(keepdims=True)
+        best = np.array([score.argmax()])
         if probability(score[best])[0] < least:
             break
         open_[best] = False
