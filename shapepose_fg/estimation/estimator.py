@@ -33,7 +33,17 @@ from shapepose_fg.estimation.linearisation import (
     weakest_sigma,
 )
 from shapepose_fg.estimation.motion_model import MotionModel
-from shapepose_fg.estimation.outcome import SEEN_M, Problem, how_known, problems, reported_covariance, since
+from shapepose_fg.estimation.outcome import (
+    SEEN_M,
+    Problem,
+    how_known,
+    problems,
+    reported_covariance,
+    since,
+    strong,
+    waited_s,
+)
+from shapepose_fg.estimation.plain_view import SPEED_M_S, elsewhere_variance, limbs_that_hide
 from shapepose_fg.estimation.smoothing import smoothed
 from shapepose_fg.estimation.state_covariances import state_covariances
 from shapepose_fg.estimation.window_graph import WindowGraph, near_in_time
@@ -106,6 +116,7 @@ class Estimator:
         self.config = EstimatorConfig() if config is None else config
         self.joints = joints
         self._limbs = limbs_of(joints)
+        self._hiding = limbs_that_hide(joints)
         self._motion = MotionModel.load(joints, self.config.motion)
 
     def estimate(
@@ -244,11 +255,16 @@ class Estimator:
         fit = final_bodies(solution, covariance, windows, self.fitter)
         final = linearise(observations, sigmas, X, views, self.config.observations)
         spread = association_spread(observations, sigmas, final, solution.body, views, self.config.observations)
+        reported, sizes = strong(solution, observations), self.rig.image_sizes
+        elsewhere = elsewhere_variance(X, observations.frame, reported, views, sizes, self._hiding)
         for window in windows:
             count, times_s = solution.inlier[window.rows].sum(axis=-1), window.graph.times_s
             if window.graph.temporal:
                 covariance[window.rows] *= since(count >= 2, times_s)[..., None, None]
             covariance[window.rows] += lasting_spread(spread[window.rows], count > 0, times_s)
+            waited = waited_s(reported[window.rows].any(axis=-1), times_s)
+            moved = np.minimum(elsewhere[window.rows], (SPEED_M_S * waited) ** 2)
+            covariance[window.rows] += moved[..., None, None] * np.eye(3)
         wrong = problems(observations, windows, solution, first, covariance)
         enough = np.where(solution.enough, Status.BODY_UNDETERMINED, Status.TOO_FEW_VIEWS)
         status = np.where(fit.ok, Status.OK, enough)

@@ -74,10 +74,13 @@ def since(twice: NDArray[np.bool_], times_s: NDArray[np.float64]) -> NDArray[np.
 
     `twice` (T, J). 1 where they do; what one view or none leaves open drifts for longer than the model has it.
     """
-    at = np.broadcast_to(times_s[:, None], twice.shape)
-    nearest = carried(at, twice, times_s)
-    waited = np.where(twice.any(axis=0), np.abs(at - nearest), GROWS_MOST_S)
-    return (1 + np.minimum(waited, GROWS_MOST_S) / GROWS_S) ** GROWS_POWER
+    return (1 + np.minimum(waited_s(twice, times_s), GROWS_MOST_S) / GROWS_S) ** GROWS_POWER
+
+
+def waited_s(seen: NDArray[np.bool_], times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(T, J) seconds to the nearest frame in which a joint is `seen` (T, J); infinite where there is none."""
+    at = np.broadcast_to(times_s[:, None], seen.shape)
+    return np.where(seen.any(axis=0), np.abs(at - carried(at, seen, times_s)), np.inf)
 
 
 def carried(
@@ -90,6 +93,12 @@ def carried(
         nearest = frames[np.abs(times_s[:, None] - times_s[frames]).argmin(axis=1)]
         result[:, joint] = values[nearest, joint]
     return result
+
+
+def strong(solution: Solution, observations: Observations) -> NDArray[np.bool_]:
+    """(N, J, V) the observations that are used and not weak."""
+    sure = (observations.confidence >= WEAK_SCORE) & (observations.probability > WEAK_PROBABILITY)
+    return solution.inlier & sure
 
 
 def how_known(
@@ -105,9 +114,8 @@ def how_known(
     said = np.trace(np.linalg.inv(information), axis1=2, axis2=3)
     moved = ~pulled | (np.trace(covariance, axis1=2, axis2=3) < 0.5 * said)
     code = np.where(moved, Known.MOTION, Known.BODY)
-    strong = (observations.confidence >= WEAK_SCORE) & (observations.probability > WEAK_PROBABILITY)
     code = np.where(solution.inlier.any(axis=-1), Known.WEAK, code)
-    code = np.where((solution.inlier & strong).sum(axis=-1) >= 2, Known.SEEN, code)
+    code = np.where(strong(solution, observations).sum(axis=-1) >= 2, Known.SEEN, code)
     return np.where(np.isfinite(solution.joints).all(axis=-1), code, Known.UNKNOWN).astype(np.uint8)
 
 

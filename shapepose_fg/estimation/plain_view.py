@@ -1,0 +1,92 @@
+"""Joints that a detector ought to report and does not: evidence that they are not where the body has them."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.camera import Views
+
+Array = NDArray[np.float64]
+
+LEAST_VIEWS = 3
+"""So many views must look at the joint in plain view and report nothing: fewer often miss it by chance."""
+MISSED = 0.2
+"""Share of joints in plain view that a view does not report, or weakly, in simulated crowds. One, two, three, four
+views all miss 0.18, 0.046, 0.010 and 0.003 of them, as if by themselves."""
+UNUSUAL = 3e-4
+"""Share of joints in a pose that the detector does not know: reasoned, since the simulation has none. Three views
+that miss a joint widen it by 5 cm, four by 10."""
+ELSEWHERE_M = 0.25
+"""Where the joint then is, sigma per axis, metres: somewhere within reach of its neighbour."""
+SPEED_M_S = 2.0
+"""But no farther than it has moved since a view reported it, at this speed: `MotionModel.speed_m_s`."""
+_BEHIND_M = 0.05
+"""Limbs hide what is this much behind them."""
+_LIMBS = {
+    ("Neck", "MidHip"): 0.17, ("Neck", "Nose"): 0.11, **{
+        (f"{side}{first}", f"{side}{second}"): radius for side in "RL" for first, second, radius in (
+            ("Shoulder", "Hip", 0.1), ("Shoulder", "Elbow", 0.06), ("Elbow", "Wrist", 0.05), ("Hip", "Knee", 0.09),
+            ("Knee", "Ankle", 0.07),
+        )
+    },
+}  # fmt: skip
+"""What hides others' joints: from joint to joint, half its width in metres."""
+
+
+def limbs_that_hide(joints: Sequence[str]) -> tuple[NDArray[np.intp], Array]:
+    """(L, 2) the ends of the limbs of a detector's joints, and (L,) half their widths, metres."""
+    place = {name: number for number, name in enumerate(joints)}
+    there = {(place[a], place[b]): r for (a, b), r in _LIMBS.items() if a in place and b in place}
+    return np.array(list(there), dtype=np.intp).reshape(-1, 2), np.array(list(there.values()))
+
+
+def elsewhere_variance(
+    joints: Array,
+    frame: NDArray[np.integer],
+    strong: NDArray[np.bool_],
+    views: Views,
+    image_sizes: NDArray[np.integer],
+    limbs: tuple[NDArray[np.intp], Array],
+) -> Array:
+    """(N, J) variance that is added on every axis to joints that views ought to see and do not, m².
+
+    Of `joints` (N, J, 3) in the `frame` (N,) those that no view reports surely, `strong` (N, J, V): if m views
+    look at the joint in plain view, not behind anybody's limbs, either all have missed it, `MISSED` to the power
+    of m, or it is elsewhere.
+    """
+    xy, depth, _ = views.project(joints)
+    inside = (depth > 0) & ((xy >= 0) & (xy < image_sizes)).all(axis=-1) & ~strong
+    row, joint = np.nonzero(~strong.any(axis=-1) & (inside.sum(axis=-1) >= LEAST_VIEWS))
+    missed = np.zeros(joints.shape[:2])
+    for number in np.unique(frame[row]).tolist():
+        here, of_frame = frame[row] == number, np.flatnonzero(frame == number)
+        hidden = _hidden(xy, depth, row[here], joint[here], of_frame, views, limbs)
+        missed[row[here], joint[here]] = (inside[row[here], joint[here]] & ~hidden).sum(axis=-1)
+    unusual = UNUSUAL / (UNUSUAL + MISSED**missed)
+    return np.where(missed >= LEAST_VIEWS, unusual * ELSEWHERE_M**2, 0.0)
+
+
+def _hidden(
+    xy: Array,
+    depth: Array,
+    row: NDArray[np.intp],
+    joint: NDArray[np.intp],
+    people: NDArray[np.intp],
+    views: Views,
+    limbs: tuple[NDArray[np.intp], Array],
+) -> NDArray[np.bool_]:
+    """(K, V) whether the joints (`row`, `joint`) lie behind a limb of the `people` (P,), theirs included."""
+    ends, radius = limbs
+    focal = views.rows(row).focal_px
+    focal = np.broadcast_to(focal if focal.ndim == 2 else focal[None], (len(row), depth.shape[2]))
+    first, along = xy[people][:, ends[:, 0]], xy[people][:, ends[:, 1]] - xy[people][:, ends[:, 0]]  # (P, L, V, 2)
+    away = xy[row, joint][:, None, None] - first  # (K, P, L, V, 2)
+    at = (away * along).sum(axis=-1) / np.maximum((along**2).sum(axis=-1), 1e-9)
+    at = np.clip(at, 0.0, 1.0)
+    beside = np.linalg.norm(away - at[..., None] * along, axis=-1)
+    ahead = (1 - at) * depth[people][:, ends[:, 0]] + at * depth[people][:, ends[:, 1]]
+    within = beside * ahead < radius[:, None] * focal[:, None, None]
+    hides = within & (ahead > 0) & (ahead < depth[row, joint][:, None, None] - _BEHIND_M)
+    own = (people == row[:, None])[..., None] & (ends == joint[:, None, None]).any(axis=-1)[:, None]  # (K, P, L)
+    return (hides & ~own[..., None]).any(axis=(1, 2))
