@@ -19,7 +19,8 @@ from shapepose_fg.runs.notes import Notebook
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.skeleton import BODY_25
 from shapepose_fg.stopping import Stopped
-from shapepose_fg.tracking.following import FollowingConfig, Input
+from shapepose_fg.tracking.following import FollowingConfig
+from shapepose_fg.tracking.hypotheses import Input
 from shapepose_fg.tracking.tracker import TrackedFrame, TrackerState
 from shapepose_fg.windows import Engine, WindowConfig
 

@@ -139,10 +139,10 @@ class _Account:
         lasts_s: Array,
     ) -> "_Account":
         """See `choose`."""
-        H, T = there.shape
+        shape = (*there.shape, candidate[0, 0].size if there.size > 0 else 0)
         first, count = np.cumsum(counts) - counts, int(counts.sum())
-        place = np.where(candidate >= 0, candidate + first[:, None, None], count).reshape(H, T, -1)
-        weights = np.where(candidate >= 0, weight, 0.0).reshape(H, T, -1).astype(np.float32)
+        place = np.where(candidate >= 0, candidate + first[:, None, None], count).reshape(shape)
+        weights = np.where(candidate >= 0, weight, 0.0).reshape(shape).astype(np.float32)
         return cls(place, weights, np.maximum(expected, 1), there, lasts_s, count)
 
     def gains(self, free: NDArray[np.float32], span: slice) -> Array:

@@ -26,6 +26,11 @@ _SAME_M = 0.35
 _WALK_MPS = 1.5
 """How much farther off somebody may be for each second out of sight."""
 
+_PACE_S = 0.2
+"""How fast somebody went is taken of so many seconds before they vanished."""
+_COASTS_S = 0.5
+"""For so long somebody out of sight is thought to go on like that: as long as tracks are followed unseen."""
+
 
 @dataclass(frozen=True)
 class FollowingConfig(Settings):
@@ -144,11 +149,28 @@ def _returned(
     for j in np.flatnonzero((identity >= 0) & (chosen.stop <= start)).tolist():
         again = (identity == identity[j]) & (chosen.stop > chosen.stop[j])
         gap_s = times[start] - times[chosen.stop[j] - 1]
-        there = found.places[chosen.hypothesis[[j]], chosen.stop[j] - 1]
+        there = _left_at(
+            found.places[chosen.hypothesis[j], chosen.start[j] : chosen.stop[j]], times[chosen.start[j] :], gap_s
+        )
         apart = float(core_distance(here, there, skeleton)[0, 0])
         if not again.any() and apart < min(nearest_m, _SAME_M + _WALK_MPS * gap_s):
             best, nearest_m = int(identity[j]), apart
     return best
+
+
+def _left_at(places: Array, times: Array, later_s: float) -> Array:
+    """(1, J, 3) where a person who was at `places` (T, J, 3) at `times` (>= T,) is `later_s` after the last of them.
+
+    Joints go on as the body went in the last `_PACE_S` that it was placed, for `_COASTS_S` at the most.
+    """
+    last = len(places) - 1
+    first = int(np.searchsorted(times[:last], times[last] - _PACE_S))
+    moved = places[last] - places[first]
+    known = np.isfinite(moved).all(axis=-1)
+    if not known.any():
+        return places[[last]]
+    pace = np.median(moved[known], axis=0) / (times[last] - times[first]) if first < last else np.zeros(3)
+    return (places[last] + min(later_s, _COASTS_S) * pace)[None]
 
 
 def core_distance(places: Array, others: Array, skeleton: Skeleton) -> Array:

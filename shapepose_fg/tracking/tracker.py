@@ -141,6 +141,7 @@ class Tracker:
         before = tracks.joints.across_m
         joints = self._predict(tracks.joints, time_s - tracks.time_s) if len(tracks) > 0 else tracks.joints
         lost = (joints.across_m > _LOST_M) & (before > _TRUSTED_M)
+        lost &= ~lost[:, list(self.skeleton.core)].all(axis=1, keepdims=True)  # beside whom would they be sought?
         joints = self._beside_neighbours(joints, lost)
         candidate = assign(
             joints.position,

@@ -7,8 +7,9 @@ from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections
 from shapepose_fg.pipeline import PipelineConfig, find_people
 from shapepose_fg.skeleton import BODY_25
-from shapepose_fg.tracking.following import FollowingConfig, FollowState, Input, finish, follow
-from shapepose_fg.tracking.tracker import BodyScale, Tracker, TrackerState, TrackingConfig
+from shapepose_fg.tracking.following import FollowingConfig, FollowState, finish, follow
+from shapepose_fg.tracking.hypotheses import Input
+from shapepose_fg.tracking.tracker import BodyScale, Tracker, TrackingConfig, Tracks
 
 FPS = 30.0
 
@@ -36,13 +37,13 @@ def followed(tracker):
         from shapepose_fg.observations import Observations
 
         times = np.arange(len(frames)) / FPS if times is None else times
-        state, decided = FollowState(TrackerState.start(BODY_25)), []
+        state, decided = FollowState(Tracks.none(BODY_25)), []
         for number, (detections, time) in enumerate(zip(frames, times, strict=True)):
             state, more = follow(
                 tracker, state, Input(number, np.full(len(rig), time), detections, rig), following
             )
             decided += more
-        _, more = finish(state, following)
+        _, more = finish(tracker, state)
         decided += more
         assert [frame.frame for frame, _ in decided] == list(range(len(frames)))
         return Observations.concatenate([rows for _, rows in decided])

@@ -128,11 +128,12 @@ def test_nobody_is_no_row(followed, five_cameras):
 
 def test_moving_cameras_are_followed_too(tracker, five_cameras, seen_exactly, walking):
     """The rig slides 2 cm a frame: each frame has its own."""
-    from shapepose_fg.tracking.following import FollowState, Input, finish, follow
-    from shapepose_fg.tracking.tracker import TrackerState
+    from shapepose_fg.tracking.following import FollowState, finish, follow
+    from shapepose_fg.tracking.hypotheses import Input
+    from shapepose_fg.tracking.tracker import Tracks
 
     _, truth = walking
-    state, rows = FollowState(TrackerState.start(tracker.skeleton)), []
+    state, rows = FollowState(Tracks.none(tracker.skeleton)), []
     for t in range(20):
         cameras = []
         for camera in five_cameras.cameras:
@@ -143,18 +144,19 @@ def test_moving_cameras_are_followed_too(tracker, five_cameras, seen_exactly, wa
         given = Input(t, np.full(5, t / 30.0), seen_exactly(rig, truth[t]), rig)
         state, more = follow(tracker, state, given, FollowingConfig())
         rows += more
-    rows += finish(state, FollowingConfig())[1]
+    rows += finish(tracker, state)[1]
     for frame, part in rows:
         distance = np.linalg.norm(part.initial[:, None] - truth[frame.frame], axis=-1).mean(axis=-1)
         assert len(part) == 2 and (distance.min(axis=1) < 0.03).all()
 
 
 def test_the_memory_of_a_long_recording_is_that_of_the_look_ahead(tracker, five_cameras, walking):
-    from shapepose_fg.tracking.following import FollowState, Input, follow
-    from shapepose_fg.tracking.tracker import TrackerState
+    from shapepose_fg.tracking.following import FollowState, follow
+    from shapepose_fg.tracking.hypotheses import Input
+    from shapepose_fg.tracking.tracker import Tracks
 
     frames, _ = walking
-    state, longest = FollowState(TrackerState.start(tracker.skeleton)), 0
+    state, longest = FollowState(Tracks.none(tracker.skeleton)), 0
     for t in range(90):
         given = Input(t, np.full(5, t / 30.0), frames[min(t, len(frames) - 1)], five_cameras)
         state, _ = follow(tracker, state, given, FollowingConfig())

@@ -1,0 +1,155 @@
+"""Who is there, by evidence: small accounts that can be worked out by hand.
+
+A hypothesis is a list of frames, each with the detections that are its (of at most four places), or None where it
+is not followed.
+"""
+
+import numpy as np
+import pytest
+
+from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.tracking.evidence import Chosen, choose, weighed
+from shapepose_fg.tracking.hypotheses import lasting
+
+PLACES = 4
+STEP_S = 0.1
+
+
+def evidence_of(*rows: tuple[list[list[int]], int], times: int | None = None, step_s: float = STEP_S) -> Chosen:
+    """Choose among (detections in each frame, world); detections are numbers in the frame, at most 8."""
+    T = times or len(rows[0][0])
+    candidate = np.full((len(rows), T, PLACES, 1), -1)
+    there = np.zeros((len(rows), T), dtype=bool)
+    for h, (frames, _) in enumerate(rows):
+        for t, own in enumerate(frames):
+            there[h, t] = own is not None
+            if own:
+                candidate[h, t, : len(own), 0] = own
+    expected = np.full((len(rows), T), PLACES)
+    world = np.array([world for _, world in rows])
+    counts, lasts_s = np.full(T, 8), np.full(T, step_s)
+    return choose(candidate, np.ones(candidate.shape), expected, there, world, counts, lasts_s)
+
+
+def stretches(chosen: Chosen) -> list[tuple[int, int, int]]:
+    columns = (chosen.hypothesis.tolist(), chosen.start.tolist(), chosen.stop.tolist())
+    return sorted(zip(*columns, strict=True))
+
+
+ANNA, BERT, NONE = [0, 1, 2, 3], [4, 5, 6, 7], []
+
+
+def test_evidence_is_in_seconds_in_which_all_is_seen():
+    """All of one, half of the other: 1.15 of the share, less 0.15, of each of 2 s."""
+    chosen = evidence_of(([ANNA] * 20, 0), ([BERT[:2]] * 20, 0))
+    assert stretches(chosen) == [(0, 0, 20), (1, 0, 20)]
+    np.testing.assert_allclose(chosen.evidence_s, [2.0, 2 * (1.15 / 2 - 0.15)], rtol=1e-6)
+
+
+def test_a_detection_is_evidence_of_one_person_only():
+    """The second has three of the first's four detections and one of its own: a quarter of its places, for which
+    1.15 / 4 - 0.15 = 0.14 s a second; the third has nothing of its own."""
+    chosen = evidence_of(([ANNA] * 20, 0), ([[0, 1, 2, 4]] * 20, 1), ([[0, 1, 2]] * 20, 2))
+    assert stretches(chosen) == [(0, 0, 20), (1, 0, 20)]
+    np.testing.assert_allclose(chosen.evidence_s, [2.0, 2 * (1.15 / 4 - 0.15)], rtol=1e-6)
+    assert stretches(evidence_of(([ANNA] * 20, 0), ([ANNA] * 20, 1))) == [(0, 0, 20)]
+
+
+def test_a_phantom_of_two_people_s_parts_is_not_chosen():
+    parts = [[0, 1, 4, 5]] * 20
+    assert stretches(evidence_of((parts, 0), ([ANNA] * 20, 1), ([BERT] * 20, 1))) == [(1, 0, 20), (2, 0, 20)]
+
+
+def test_whoever_goes_over_from_one_person_to_another_does_not_win_against_both():
+    """Each is seen well in one half only, three places against two; the one that goes over has the best of both,
+    1.425 s against 1.137. What is left is two halves with two detections each."""
+    anna, bert = [ANNA[:3]] * 10 + [ANNA[:2]] * 10, [BERT[:2]] * 10 + [BERT[:3]] * 10
+    over = [ANNA[:3]] * 10 + [BERT[:3]] * 10
+    chosen = evidence_of((over, 0), (anna, 1), (bert, 1))
+    assert stretches(chosen) == [(1, 0, 20), (2, 0, 20)]
+    np.testing.assert_allclose(chosen.evidence_s, 2 * (1.15 * 5 / 8 - 0.15), rtol=1e-6)
+
+
+@pytest.mark.parametrize("gap", [1, 8, 15])
+def test_a_stretch_ends_where_evidence_ends_and_not_at_a_gap(gap):
+    """A gap costs 0.15 of its time; to vanish and appear again costs 0.25 s: the same after 1.67 s."""
+    frames = [ANNA] * 10 + [NONE] * gap + [ANNA] * 10 + [NONE] * 15
+    assert stretches(evidence_of((frames, 0))) == [(0, 0, 20 + gap)]
+
+
+def test_what_comes_after_a_long_gap_must_be_worth_it():
+    """Two frames are 0.2 s, 1.8 s without evidence cost 0.27."""
+    frames = [ANNA] * 10 + [NONE] * 18 + [ANNA] * 2
+    assert stretches(evidence_of((frames, 0))) == [(0, 0, 10)]
+
+
+def test_nobody_is_there_in_frames_in_which_nobody_is_followed():
+    frames = [None] * 3 + [ANNA] * 10 + [None] * 2 + [ANNA] * 10
+    chosen = evidence_of((frames, 0))
+    assert stretches(chosen) == [(0, 3, 13), (0, 15, 25)]
+    assert [chosen.during(t).sum() for t in (2, 3, 12, 13, 14, 15, 24)] == [0, 1, 1, 0, 0, 1, 1]
+
+
+@pytest.mark.parametrize("step_s", [1 / 60, 1 / 10])
+@pytest.mark.parametrize(("seconds", "there"), [(0.2, False), (0.3, True)])
+def test_how_long_somebody_must_be_seen_is_a_matter_of_seconds(step_s, seconds, there):
+    """Two ends cost 0.25 s, less than 0.1 s of evidence is nobody: 0.35 s of all places; at the recording's start
+    one end costs nothing: 0.225 s."""
+    n, T = round(seconds / step_s), round(2 / step_s)
+    frames = [ANNA] * n + [None] * (T - n)
+    assert (len(evidence_of((frames, 0), step_s=step_s)) == 1) == there
+
+
+def test_a_frame_alone_stands_for_a_second_and_others_up_to_halfway_to_their_neighbours():
+    np.testing.assert_allclose(lasting(np.array([3.0])), [1.0])
+    np.testing.assert_allclose(lasting(np.array([0.0, 0.1, 0.4, 0.5])), [0.1, 0.2, 0.2, 0.1])
+    assert len(evidence_of(([ANNA[:2]], 0), step_s=1.0)) == 1
+
+
+def test_the_order_of_hypotheses_changes_nothing():
+    rng = np.random.default_rng(0)
+    rows = [
+        ([rng.permutation(8)[: rng.integers(1, 5)].tolist() for _ in range(12)], int(rng.integers(3)))
+        for _ in range(7)
+    ]
+    order = rng.permutation(7)
+    chosen, other = evidence_of(*rows), evidence_of(*(rows[n] for n in order))
+    again = [(int(order[h]), start, stop) for h, start, stop in stretches(other)]
+    assert sorted(again) == stretches(chosen) and len(chosen) > 0
+
+
+def test_nobody_among_nobody():
+    assert len(evidence_of(times=5)) == 0
+
+
+def test_detections_count_by_the_affinity_to_the_same_person_s(five_cameras, two_people, seen_exactly):
+    """Exact detections have affinities of 0.9 to the same person's, and 0 to the other's: one wrist that is the
+    other's counts nothing, one elbow without neighbours a half."""
+    detections = seen_exactly(five_cameras, two_people)
+    xy, _ = five_cameras.project(two_people)
+    own = np.full((2, 25, 5), -1)
+    for n in range(len(detections)):
+        view, joint = detections.view[n], detections.joint[n]
+        person = np.linalg.norm(xy[view, :, joint] - detections.xy[n], axis=-1).argmin()
+        own[person, joint, view] = n
+    wrist, elbow = BODY_25.index("RWrist"), BODY_25.index("RElbow")
+    candidate = own.copy()
+    candidate[0, wrist, 1] = own[1, wrist, 1]
+    candidate[1, :, 2] = -1
+    candidate[1, elbow, 2] = own[1, elbow, 2]
+    weight, expected = weighed(candidate, two_people, detections, five_cameras, BODY_25)
+    assert weight[0, wrist, 1] == 0.0 and weight[1, elbow, 2] == 0.5
+    assert weight[1, :, 2].sum() == 0.5, "what nobody has counts nothing"
+    assert (weight[0, :, [0, 2, 3, 4]] == 1.0).all() and (weight[1, :, [0, 1, 3, 4]] == 1.0).all()
+    assert expected.tolist() == [125, 125]
+
+
+def test_joints_outside_the_picture_are_not_expected(five_cameras, two_people, seen_exactly):
+    """Nobody is expected behind a camera; a joint whose place is unknown is expected where the others are."""
+    far = two_people[:1] + np.array([0.0, 0.0, 100.0])
+    detections = seen_exactly(five_cameras, two_people)
+    none = np.full((1, 25, 5), -1)
+    assert weighed(none, far, detections, five_cameras, BODY_25)[1].tolist() == [0]
+    half = two_people[:1].copy()
+    half[0, 10:] = np.nan
+    assert weighed(none, half, detections, five_cameras, BODY_25)[1].tolist() == [125]
