@@ -21,7 +21,7 @@ from shapepose_fg.observations import Observations
 from shapepose_fg.skeleton import Skeleton
 from shapepose_fg.tracking.following import Decided, FollowingConfig, FollowState, alone, finish, follow
 from shapepose_fg.tracking.hypotheses import Input
-from shapepose_fg.tracking.reassociation import Survival, reassociate, reassociate_over_time
+from shapepose_fg.tracking.reassociation import Survival, reassociate
 from shapepose_fg.tracking.tracker import Tracker, Tracks
 from shapepose_fg.tracking.view_assignment import AssignmentConfig
 
@@ -108,11 +108,8 @@ class WindowSolver:
         began = time.perf_counter()
         for n in range(again if len(rows) > 0 else 0):
             joints, covariance = self.estimator.draft(rows, over_time=not span.alone)
-            draft = given, rows, joints, covariance, self.skeleton, self.assignment
-            if span.alone:
-                rows = reassociate(*draft, Survival().at(n / max(again - 1, 1)))
-            else:
-                rows = reassociate_over_time(*draft)
+            survival = Survival().at(n / max(again - 1, 1)) if span.alone else None
+            rows = reassociate(given, rows, joints, covariance, self.skeleton, self.assignment, survival)
         associated = time.perf_counter()
         estimates = self.estimator.estimate(rows, self.extra_factors)
         own = {frame.frame for frame in given[span.start : span.stop]}

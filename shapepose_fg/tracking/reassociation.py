@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from shapepose_fg.body.fitting.bone_reach import longest_bones
 from shapepose_fg.observations import Observations
 from shapepose_fg.proposal.assignment import lesser
-from shapepose_fg.proposal.association import seen_twice
 from shapepose_fg.proposal.hypotheses import Frame, Hypotheses, gaps
 from shapepose_fg.proposal.selection import PRIOR_WITH_BODY, existence
 from shapepose_fg.skeleton import Skeleton
@@ -30,61 +29,6 @@ class Survival:
     def at(self, strictness: float) -> "Survival":
         """The same with a part of the probability asked for, from none at 0 to all of it at 1."""
         return replace(self, min_probability=strictness * self.min_probability)
-
-
-@dataclass(frozen=True)
-class Lasting:
-    """Which tracks of a window are nobody: those with too little, all its frames taken together.
-
-    Of the tracks that are people on `tune` (crowds of seven and eight, and phantoms among them) none has less than
-    0.48 of the places in the mean, and 11.5 joints; of 9 that are nobody 7 have less of both.
-    """
-
-    min_share: float = 1 / 3
-    """Of the places where the joints should be, those with a detection of the track's own."""
-    min_seen_twice: float = 9.0
-    """Whoever has this many core joints that two views see stays all the same: an upper body, which only two of
-    many views may see."""
-    double_m: float = Survival.double_m
-    """Of two tracks that are nearer in more than half of the lesser one's frames, it is nobody: they share one
-    person's detections, and each may have enough of them."""
-
-
-def reassociate_over_time(
-    given: Sequence[Input],
-    rows: Observations,
-    joints: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-    skeleton: Skeleton,
-    config: AssignmentConfig,
-    lasting: Lasting = Lasting(),
-) -> Observations:
-    """`reassociate` for people over time, without the tracks that are nobody (`Lasting`).
-
-    Of several the one with the least goes first: what it leaves belongs to the others.
-    """
-    index = np.arange(len(rows))
-    while True:
-        part = reassociate(given, rows.rows(index), joints[index], covariance[index], skeleton, config)
-        nobody = _nobody(given, part, skeleton, lasting)
-        if nobody is None:
-            return part
-        index = index[rows.track[index] != nobody]
-
-
-def _nobody(given: Sequence[Input], rows: Observations, skeleton: Skeleton, lasting: Lasting) -> int | None:
-    """The track with the least detections of its own among those that are nobody, or somebody else's double."""
-    tracks, place, count = np.unique(rows.track, return_inverse=True, return_counts=True)
-    share, near = np.zeros(len(rows)), np.zeros((len(tracks), len(tracks)))
-    for frame in given:
-        index = np.flatnonzero(rows.frame == frame.frame)
-        share[index] = _own_share(frame, rows.candidate[index], rows.initial[index])
-        near[np.ix_(place[index], place[index])] += _apart(rows.initial[index], skeleton) < lasting.double_m
-    seen = seen_twice(rows.seen, skeleton).sum(axis=1)
-    means = [np.bincount(place, value, len(tracks)) / count for value in (share, seen)]
-    few = (means[0] < lasting.min_share) & (means[1] < lasting.min_seen_twice)
-    few |= ((near > count[:, None] / 2) & lesser(means[0])).any(axis=1)
-    return int(tracks[np.where(few, means[0], np.inf).argmin()]) if few.any() else None
 
 
 def _apart(joints: NDArray[np.float64], skeleton: Skeleton) -> NDArray[np.float64]:
@@ -155,15 +99,3 @@ def _gone(
     doubles = ((_apart(joints, skeleton) < survival.double_m) & lesser(sure)).any(axis=1)
     # What one leaves may be what another lacks.
     return doubles | ((sure < survival.min_probability) & (sure == sure.min()))
-
-
-def _own_share(frame: Input, candidate: NDArray[np.intp], joints: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(P,) of the places in the pictures where each person's joints should be, how many have a detection of their
-    own.
-    """
-    xy, depth = frame.rig.project(joints)
-    size = frame.rig.image_sizes[:, None, None]
-    expected = np.moveaxis((depth > 0) & ((xy >= 0) & (xy < size)).all(axis=-1), 0, 2)
-    owners = np.bincount(candidate[candidate >= 0], minlength=len(frame.detections))
-    own = (candidate >= 0) & (owners[np.maximum(candidate, 0)] == 1) if len(owners) else candidate >= 0
-    return (own & expected).sum(axis=(1, 2)) / np.maximum(expected.sum(axis=(1, 2)), 1)
