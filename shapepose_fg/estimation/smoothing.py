@@ -34,7 +34,7 @@ def smoothed(
     place, variance = np.full((*shape, 3), np.nan), np.full(shape, np.nan)
     place[at, who] = joints
     variance[at, who] = 4 * np.trace(covariance, axis1=-2, axis2=-1) / 3 + LEAST_SIGMA_M**2
-    known = np.isfinite(variance) & np.isfinite(place).all(axis=-1)
+    known = np.asarray(np.isfinite(variance) & np.isfinite(place).all(axis=-1))
     place, variance = np.where(known[..., None], place, 0.0), np.where(known, variance, _UNKNOWN)
     psd, weight = motion.psd(np.full(shape[2], SPEED_M_S)), np.ones(shape)
     mean, of_mean = place, variance

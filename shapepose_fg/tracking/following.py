@@ -159,7 +159,7 @@ def _returned(
 
 
 def _left_at(places: Array, times: Array, later_s: float) -> Array:
-    """(1, J, 3) where a person who was at `places` (T, J, 3) at `times` (>= T,) is `later_s` after the last of them.
+    """(1, J, 3) where a person who was at `places` (T, J, 3) at `times` (>= T,) is `later_s` after the last.
 
     Joints go on as the body went in the last `_PACE_S` that it was placed, for `_COASTS_S` at the most.
     """

@@ -12,7 +12,7 @@ from shapepose_fg.skeleton import BODY_25
 from shapepose_fg.tracking import view_assignment
 from shapepose_fg.tracking.following import Input
 from shapepose_fg.tracking.plausibility import torn_joints
-from shapepose_fg.tracking.reassociation import Lasting, Survival, reassociate, reassociate_over_time
+from shapepose_fg.tracking.reassociation import Survival, reassociate
 from shapepose_fg.tracking.view_assignment import AssignmentConfig, assign, assign_with_probability
 
 WRIST, ELBOW = BODY_25.index("RWrist"), BODY_25.index("RElbow")
@@ -161,65 +161,6 @@ def test_nothing_is_expected_where_a_person_is_outside_of_the_picture(
     covariance = np.broadcast_to(0.02**2 * np.eye(3), (1, 25, 3, 3))
     asked = [Input(0, np.zeros(5), detections, rig)], rows, two_people[:1], covariance, BODY_25, AssignmentConfig()
     assert len(reassociate(*asked, Survival(min_probability=0.99))) == 1
-
-
-def test_a_track_that_has_next_to_nothing_of_its_own_for_a_window_is_nobody(
-    five_cameras, two_people, seen_exactly
-):
-    frames = range(4)
-    given, parts, places = [], [], []
-    beside = two_people[1] + [0.0, 0.0, 3.0]  # out of everybody's reach, in sight of the cameras
-    for frame in frames:
-        detections = seen_exactly(five_cameras, two_people)
-        given.append(Input(frame, np.full(5, frame / 30), detections, five_cameras))
-        joints = np.stack([*two_people, beside])
-        rows = Observations.of(np.full((3, 25, 5), -1), detections, joints)
-        parts.append(replace(rows, track=np.array([4, 5, 6]), frame=np.full(3, frame)))
-        places.append(joints)
-    rows, joints = Observations.concatenate(parts), np.concatenate(places)
-    covariance = np.broadcast_to(0.02**2 * np.eye(3), (len(rows), 25, 3, 3))
-    asked = given, rows, joints, covariance, BODY_25, AssignmentConfig()
-    assert sorted(set(reassociate(*asked).track.tolist())) == [4, 5, 6]
-    kept = reassociate_over_time(*asked)
-    assert kept.track.tolist() == [4, 5] * 4 and kept.frame.tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
-    # Where every place counts as one too few, still nobody goes whom two views see with an upper body.
-    strict = reassociate_over_time(*asked, Lasting(min_share=1.1))
-    assert strict.track.tolist() == [4, 5] * 4
-
-
-def test_of_two_tracks_on_one_person_the_lesser_goes_and_the_other_has_all(five_cameras, two_people, seen_exactly):
-    detections = seen_exactly(five_cameras, two_people[:1])
-    given = [Input(0, np.zeros(5), detections, five_cameras)]
-    joints = np.stack([two_people[0], two_people[0]])
-    joints[0, 13:] += 0.06  # the one is nearer to trunk and arms, the other to legs and face
-    joints[1, :13] += 0.06
-    rows = Observations.of(np.full((2, 25, 5), -1), detections, joints)
-    rows = replace(rows, track=np.array([1, 2]), frame=np.zeros(2, dtype=int))
-    covariance = np.broadcast_to(0.02**2 * np.eye(3), (2, 25, 3, 3))
-    asked = given, rows, joints, covariance, BODY_25, AssignmentConfig()
-    both = (reassociate(*asked).candidate >= 0).sum(axis=(1, 2))
-    assert both[0] > both[1] > 50, "each has what is nearer to it"
-    kept = reassociate_over_time(*asked, Lasting(min_share=0.9, min_seen_twice=26.0))
-    assert kept.track.tolist() == [1]
-    assert (kept.candidate >= 0).mean() > 0.9, "but for joints that are too far off"
-
-
-@pytest.mark.parametrize(("near", "left"), [(4, {4, 5}), (3, {4, 5}), (2, {4, 5, 6})])
-def test_a_track_that_is_in_somebody_else_s_place_for_most_of_a_window_is_their_double(
-    five_cameras, two_people, seen_exactly, near, left
-):
-    """8 cm beside the second person in `near` of four frames, and 60 cm in the others; all are seen."""
-    given, parts = [], []
-    for frame in range(4):
-        third = two_people[1] + [0.08 if frame < near else 0.6, 0.0, 0.0]
-        detections = seen_exactly(five_cameras, np.stack([*two_people, third]))
-        given.append(Input(frame, np.full(5, frame / 30), detections, five_cameras))
-        rows = Observations.of(np.full((3, 25, 5), -1), detections, np.stack([*two_people, third]))
-        parts.append(replace(rows, track=np.array([4, 5, 6]), frame=np.full(3, frame)))
-    rows = Observations.concatenate(parts)
-    covariance = np.broadcast_to(0.02**2 * np.eye(3), (len(rows), 25, 3, 3))
-    kept = reassociate_over_time(given, rows, rows.initial, covariance, BODY_25, AssignmentConfig())
-    assert set(kept.track.tolist()) == left
 
 
 def by_enumeration(weight, slot):

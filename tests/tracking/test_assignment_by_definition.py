@@ -10,7 +10,7 @@ import pytest
 from shapepose_fg.observations import Observations
 from shapepose_fg.skeleton import BODY_25
 from shapepose_fg.tracking.following import Input
-from shapepose_fg.tracking.reassociation import Lasting, Survival, _gone, _nobody, _own_share, reassociate
+from shapepose_fg.tracking.reassociation import Survival, _gone, reassociate
 from shapepose_fg.tracking.view_assignment import AssignmentConfig, assign
 
 CORE = list(BODY_25.core)
@@ -173,25 +173,6 @@ def test_who_has_too_little_or_is_a_double_goes(three):
     part = places.copy()
     part[2, CORE[:10]] = np.nan  # the distance is of the joints that both have
     assert _gone(frame, candidate, part, BODY_25, any_share).tolist() == [False, False, True]
-
-
-def test_the_track_with_the_least_of_its_own_is_nobody(three):
-    """Over two frames: the mean share, and the mean of core joints that two views see, must both be too small."""
-    frame, candidate, places = three
-    half = candidate.copy()
-    half[1, CORE[7:], 1:] = -1  # 7 of 15 core joints are seen twice
-    half[1, [joint for joint in range(25) if joint not in CORE]] = -1
-    rows = [Observations.of(each, frame.detections, places) for each in (half, candidate)]
-    rows = [replace(each, track=np.array([4, 5, 6]), frame=np.full(3, n)) for n, each in enumerate(rows)]
-    both = Observations.concatenate(rows)
-    given = [frame, replace(frame, frame=1)]
-    assert _nobody(given, both, BODY_25, Lasting()) == 6
-    share = np.stack([_own_share(frame, each, places) for each in (half, candidate)]).mean(axis=0)
-    assert share[2] == 0 < share[1] < share[0]
-    alone = both.rows(np.flatnonzero(both.track != 6))
-    assert _nobody(given, alone, BODY_25, Lasting(min_share=share[1] + 0.01, min_seen_twice=11.1)) == 5
-    assert _nobody(given, alone, BODY_25, Lasting(min_share=share[1] - 0.01, min_seen_twice=11.1)) is None
-    assert _nobody(given, alone, BODY_25, Lasting(min_share=share[1] + 0.01, min_seen_twice=11.0)) is None
 
 
 def test_rows_without_a_joint_are_carried_by_motion_unless_they_must_survive(three, two_people):
