@@ -1,6 +1,5 @@
 """Detections of predicted joints on a crowded frame, against what they are defined to be, one thing at a time."""
 
-from collections import Counter
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -107,35 +106,6 @@ def test_detections_are_taken_best_first_by_nearness_and_affinity(settings, pred
     assert (found >= 0).mean() > 0.5 and (found[predicted[2]] >= 0).any(), "lost joints are found, too"
     wider = assign(*predicted, crowded, five_cameras, BODY_25, AssignmentConfig(overlap_px=1.0))
     assert (wider != found).any() or "overlap_px" not in settings, "overlaps happen here"
-
-
-def test_the_own_share_is_of_places_in_front_of_a_camera_and_in_its_picture(
-    predicted, crowded, five_cameras, two_people
-):
-    """A detection that two people have is nobody's own."""
-    places, _, _ = predicted
-    places = np.concatenate(
-        [places, two_people[:1] + np.array([0.0, 0.0, 1.5]), two_people[:1] + np.array([40.0, 0, 0])]
-    )
-    candidate = np.full((6, 25, 5), -1)
-    candidate[:4] = assign(*predicted, crowded, five_cameras, BODY_25, AssignmentConfig())
-    candidate[4] = np.where(np.arange(5) < 2, candidate[0], -1)
-    frame = Input(0, np.zeros(5), crowded, five_cameras)
-    share = _own_share(frame, candidate, places)
-    count = Counter(candidate[candidate >= 0].tolist())
-    xy, depth = five_cameras.project(places)
-    for person in range(6):
-        own = expected = 0
-        for view, joint in np.ndindex(5, 25):
-            width, height = five_cameras.image_sizes[view]
-            x, y = xy[view, person, joint]
-            if depth[view, person, joint] > 0 and 0 <= x < width and 0 <= y < height:
-                expected += 1
-                own += count[int(candidate[person, joint, view])] == 1 and candidate[person, joint, view] >= 0
-        assert share[person] == pytest.approx(own / max(expected, 1)), person
-    assert 0 < share[4] < share[1] or share[4] == 0
-    nobody = Input(0, np.zeros(5), crowded.only(np.zeros(len(crowded), dtype=bool)), five_cameras)
-    assert (_own_share(nobody, np.full((6, 25, 5), -1), places) == 0).all()
 
 
 @pytest.fixture
