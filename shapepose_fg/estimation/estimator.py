@@ -260,7 +260,7 @@ class Estimator:
             if window.graph.temporal:
                 covariance[window.rows] *= since(count >= 2, times_s)[..., None, None]
             covariance[window.rows] += lasting_spread(spread[window.rows], count > 0, times_s)
-            waited = waited_s(reported[window.rows].any(axis=-1), times_s)
+            waited = waited_s(np.asarray(reported[window.rows].any(axis=-1)), times_s)
             moved = np.minimum(elsewhere[window.rows], (SPEED_M_S * waited) ** 2)
             covariance[window.rows] += moved[..., None, None] * np.eye(3)
         wrong = problems(observations, windows, solution, first, covariance)

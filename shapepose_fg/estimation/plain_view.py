@@ -46,7 +46,7 @@ def elsewhere_variance(
     frame: NDArray[np.integer],
     strong: NDArray[np.bool_],
     views: Views,
-    image_sizes: NDArray[np.integer],
+    image_sizes: Array,
     limbs: tuple[NDArray[np.intp], Array],
 ) -> Array:
     """(N, J) variance that is added on every axis to joints that views ought to see and do not, m².

@@ -41,7 +41,7 @@ def smoothed(
     for _ in range(_ROUNDS):
         mean, of_mean = _smooth(place, np.where(known, variance / weight, _UNKNOWN), np.diff(times), psd)
         weight = 1 / (1 + ((place - mean) ** 2).sum(axis=-1) / (of_mean + variance) / KERNEL)
-    ever = known.any(axis=0)[who]
+    ever = np.asarray(known.any(axis=0))[who]
     isotropic = of_mean[at, who][..., None, None] * np.eye(3)
     return np.where(ever[..., None], mean[at, who], np.nan), np.where(ever[..., None, None], isotropic, np.nan)
 
