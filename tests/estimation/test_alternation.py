@@ -184,6 +184,7 @@ def test_the_confidence_of_a_view_that_saw_nothing_is_zero(five_cameras, two_peo
     assert np.argwhere(moved).tolist() == [[0, WRIST], [1, WRIST]]
 
 
+@pytest.mark.usefixtures("out_of_sight")
 def test_a_joint_never_seen_comes_from_the_body(five_cameras, two_people):
     seen = observed(five_cameras, two_people)
     unknown = np.zeros((2, 25), dtype=bool)

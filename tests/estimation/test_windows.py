@@ -224,6 +224,7 @@ def test_rows_of_a_track_are_one_group_of_the_fitter(walk, five_cameras, two_peo
     assert all(len(np.unique(groups)) == 2 for groups in fitter.groups)
 
 
+@pytest.mark.usefixtures("out_of_sight")
 def test_a_joint_lost_from_sight_keeps_its_place_beside_the_body(walk, five_cameras, two_people):
     """The body is 12 cm beside the joints. A wrist hidden for ten frames stays where it is, not where the body
     is."""
@@ -242,6 +243,7 @@ def test_a_joint_lost_from_sight_keeps_its_place_beside_the_body(walk, five_came
     assert sigma[4] > 1.5 * sigma[0] and sigma[5] > 1.5 * sigma[-1], "surest where it was seen a moment ago"
 
 
+@pytest.mark.usefixtures("out_of_sight")
 def test_a_joint_lost_for_long_goes_to_the_body(walk, five_cameras, two_people):
     """Hidden from frame 5 on: after a second, what was known of it has faded, and the covariance is the body's
     15 cm, and a little more."""
