@@ -17,7 +17,7 @@ from shapepose_fg.tracking.tracker import Tracker, Tracks
 
 Array = NDArray[np.float64]
 
-_BLOCK_S = 3.0
+BLOCK_S = 3.0
 """People are decided for so long at a time: in some of its frames everybody is seen well."""
 _MOST_FRAMES = 256
 """Frames that a block has at the most, whatever the rate: memory."""
@@ -63,7 +63,7 @@ def follow(
     """Take in the next frame; returns the rows of the frames that are decided by it, oldest first."""
     pending = (*state.pending, new)
     times = times_of(pending)
-    own = int(np.searchsorted(times, times[0] + _BLOCK_S - 1e-6))
+    own = int(np.searchsorted(times, times[0] + BLOCK_S - 1e-6))
     behind = times[-1] - times[min(own, len(times) - 1)]
     if len(pending) <= _MOST_FRAMES and (own == len(pending) or behind < config.look_ahead_s):
         return replace(state, pending=pending), []
@@ -159,7 +159,7 @@ def _returned(
 
 
 def _left_at(places: Array, times: Array, later_s: float) -> Array:
-    """(1, J, 3) where a person who was at `places` (T, J, 3) at `times` (>= T,) is `later_s` after the last of them.
+    """(1, J, 3) where a person who was at `places` (T, J, 3) at `times` (T,), or more, is `later_s` after.
 
     Joints go on as the body went in the last `_PACE_S` that it was placed, for `_COASTS_S` at the most.
     """
