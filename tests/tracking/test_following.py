@@ -1,14 +1,16 @@
 """Identities: who is who over time, from when to when."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
 from shapepose_fg.detections import Detections
+from shapepose_fg.runs.checkpoint import Checkpoint, checkpoint_arrays, checkpoint_of
 from shapepose_fg.tracking.following import BLOCK_S, FollowingConfig, FollowState, finish, follow
 from shapepose_fg.tracking.hypotheses import Input
 from shapepose_fg.tracking.tracker import Tracks
+from shapepose_fg.windows import StreamState
 
 
 def who(rows, truth):
@@ -214,6 +216,30 @@ def test_the_memory_of_a_long_recording_is_that_of_a_block_and_the_look_ahead(tr
         state, _ = follow(tracker, state, given, FollowingConfig())
         longest = max(longest, len(state.pending))
     assert longest <= 5 * (BLOCK_S + 1.0) + 1 and state.people.ids.tolist() == [0, 1] and state.next_id == 2
+
+
+@pytest.mark.parametrize("stopped", [12, 44])
+def test_whoever_goes_on_from_a_checkpoint_finds_the_same_bytes(tracker, five_cameras, walking, stopped):
+    """10 frames a second: within the first block, and after it while the second is open."""
+    frames = [walking[0][t // 2] for t in range(60)]
+    given = [Input(t, np.full(5, t / 10.0), frame, five_cameras) for t, frame in enumerate(frames)]
+
+    def through(stop: int | None) -> tuple[FollowState, list]:
+        state, decided = FollowState(Tracks.none(tracker.skeleton)), []
+        for each in given:
+            if each.frame == stop:
+                assert len(state.pending) > 0 and len(state.people) == (2 if stop > 40 else 0)
+                arrays = checkpoint_arrays(Checkpoint(stop, state=StreamState(state)))
+                state = checkpoint_of(arrays.__getitem__, list(arrays), given.__getitem__).state.follow
+            state, more = follow(tracker, state, each, FollowingConfig())
+            decided += more
+        return state, decided + finish(tracker, state)[1]
+
+    (_, whole), (_, resumed) = through(None), through(stopped)
+    assert len(whole) == len(resumed) == 60
+    for (_, rows), (_, again) in zip(whole, resumed, strict=True):
+        for name in (each.name for each in fields(rows)):
+            np.testing.assert_array_equal(getattr(again, name), getattr(rows, name), err_msg=name)
 
 
 def test_settings_that_make_no_sense_are_refused():
