@@ -94,6 +94,14 @@ def test_who_is_seen_for_less_than_a_third_of_a_second_is_nobody(
     assert len(np.unique(rows.track)) == people and len(rows) == 45 + (count if people == 2 else 0)
 
 
+def test_rows_begin_and_end_with_detections(followed, five_cameras, walking, nobody):
+    """Half a second without anybody at either end of a recording: as long as a track lives without evidence."""
+    frames, truth = walking
+    seen = [frame if 14 <= t < 31 else nobody for t, frame in enumerate(frames)]
+    rows = followed(five_cameras, seen)
+    assert rows.frame.tolist() == np.arange(14, 31).repeat(2).tolist() and len(identities(rows, truth)) == 2
+
+
 def test_who_enters_late_leaves_early_and_comes_back_is_the_same_person(
     followed, five_cameras, seen_exactly, walking
 ):
