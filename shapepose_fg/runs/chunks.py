@@ -10,6 +10,7 @@ from shapepose_fg.frame_times import stretches
 from shapepose_fg.pipeline_config import PipelineConfig
 from shapepose_fg.runs.borders import Border, same_people
 from shapepose_fg.runs.notes import Notebook
+from shapepose_fg.tracking.following import BLOCK_S
 from shapepose_fg.tracking.hypotheses import Input
 from shapepose_fg.windows import Engine, Span
 
@@ -57,7 +58,7 @@ def cut_in_chunks(
 
 def _until(stop: int, stretch: range, first: int, time_s: NDArray[np.float64], config: PipelineConfig) -> int:
     """How far people must be followed for the window that ends at `stop`: half a window and the overlap beyond it,
-    as far as following looks ahead, and two frames to spare, in whole batches.
+    the block in which that is decided, as far as following looks ahead, and two frames to spare, in whole batches.
 
     `Engine` compares means over the cameras' times, which round differently: a frame more or less, twice.
     """
@@ -67,7 +68,8 @@ def _until(stop: int, stretch: range, first: int, time_s: NDArray[np.float64], c
     if beyond >= stretch.stop:
         return stretch.stop
     newest = beyond
-    while newest < stretch.stop and time_s[newest] - time_s[beyond] < config.following.look_ahead_s:
+    ahead_s = BLOCK_S + config.following.look_ahead_s
+    while newest < stretch.stop and time_s[newest] - time_s[beyond] < ahead_s:
         newest += 1
     newest += 2
     batches = -(-(newest + 1 - first) // config.batch_frames)

@@ -17,7 +17,7 @@ from shapepose_fg.tracking.tracker import Tracker, Tracks
 
 Array = NDArray[np.float64]
 
-_BLOCK_S = 3.0
+BLOCK_S = 3.0
 """People are decided for so long at a time: in some of its frames everybody is seen well."""
 _MOST_FRAMES = 256
 """Frames that a block has at the most, whatever the rate: memory."""
@@ -63,7 +63,7 @@ def follow(
     """Take in the next frame; returns the rows of the frames that are decided by it, oldest first."""
     pending = (*state.pending, new)
     times = times_of(pending)
-    own = int(np.searchsorted(times, times[0] + _BLOCK_S - 1e-6))
+    own = int(np.searchsorted(times, times[0] + BLOCK_S - 1e-6))
     behind = times[-1] - times[min(own, len(times) - 1)]
     if len(pending) <= _MOST_FRAMES and (own == len(pending) or behind < config.look_ahead_s):
         return replace(state, pending=pending), []
@@ -79,6 +79,7 @@ def _decide(tracker: Tracker, state: FollowState, own: int) -> tuple[FollowState
     """Rows of the first `own` frames that are pending."""
     frames = state.pending
     found, chosen = explained(tracker, frames, state.people, own - 1)
+    chosen = _with_detections(found, chosen, first=len(state.people) == 0, last=own == len(frames))
     identity, next_id = _identities(found, chosen, state, times_of(frames), own, tracker.skeleton)
     decided = [(frame, _rows(frame, t, found, chosen, identity)) for t, frame in enumerate(frames[:own])]
     last = chosen.during(own - 1) & (identity >= 0)
@@ -86,6 +87,18 @@ def _decide(tracker: Tracker, state: FollowState, own: int) -> tuple[FollowState
     time_s, zero = float(frames[own - 1].time_s.mean()), np.zeros(len(who), dtype=np.intp)
     people = Tracks(time_s, identity[last], zero, found.joints.rows(who), np.full(len(who), time_s))
     return FollowState(people, next_id, frames[own:]), decided
+
+
+def _with_detections(found: Hypotheses, chosen: Chosen, *, first: bool, last: bool) -> Chosen:
+    """The same people from their first detection on, where nobody was there before the `first` frame, and up to
+    their last one, where nothing follows the `last`: to be there unseen costs less at the ends than to appear.
+    """
+    frame = np.arange(found.there.shape[1])
+    seen = (found.candidate[chosen.hypothesis] >= 0).any(axis=(2, 3))
+    seen &= (chosen.start[:, None] <= frame) & (frame < chosen.stop[:, None])
+    start = np.where(first, seen.argmax(axis=1), chosen.start)
+    stop = np.where(last, len(frame) - seen[:, ::-1].argmax(axis=1), chosen.stop)
+    return replace(chosen, start=start, stop=stop)
 
 
 def alone(tracker: Tracker, given: Input, next_id: int) -> Observations:
@@ -159,7 +172,7 @@ def _returned(
 
 
 def _left_at(places: Array, times: Array, later_s: float) -> Array:
-    """(1, J, 3) where a person who was at `places` (T, J, 3) at `times` (>= T,) is `later_s` after the last.
+    """(1, J, 3) where a person who was at `places` (T, J, 3) at `times` (T,), or more, is `later_s` after.
 
     Joints go on as the body went in the last `_PACE_S` that it was placed, for `_COASTS_S` at the most.
     """

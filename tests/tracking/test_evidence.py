@@ -78,8 +78,8 @@ def test_a_stretch_ends_where_evidence_ends_and_not_at_a_gap(gap):
 
 
 def test_what_comes_after_a_long_gap_must_be_worth_it():
-    """Two frames are 0.2 s, 1.8 s without evidence cost 0.27."""
-    frames = [ANNA] * 10 + [NONE] * 18 + [ANNA] * 2
+    """Two frames are 0.2 s, 1.8 s without evidence cost 0.27; either end costs the same."""
+    frames = [ANNA] * 10 + [NONE] * 18 + [ANNA] * 2 + [None] * 5
     assert stretches(evidence_of((frames, 0))) == [(0, 0, 10)]
 
 

@@ -1,12 +1,16 @@
 """Identities: who is who over time, from when to when."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
 from shapepose_fg.detections import Detections
-from shapepose_fg.tracking.following import FollowingConfig
+from shapepose_fg.runs.checkpoint import Checkpoint, checkpoint_arrays, checkpoint_of
+from shapepose_fg.tracking.following import BLOCK_S, FollowingConfig, FollowState, finish, follow
+from shapepose_fg.tracking.hypotheses import Input
+from shapepose_fg.tracking.tracker import Tracks
+from shapepose_fg.windows import StreamState
 
 
 def who(rows, truth):
@@ -34,18 +38,18 @@ def test_two_who_pass_each_other_keep_their_names(followed, five_cameras, walkin
     np.testing.assert_array_equal(rows.xy[row][seen], frames[rows.frame[row]].xy[rows.candidate[row][seen]])
 
 
-def test_frames_without_detections_are_bridged_for_half_a_second(followed, five_cameras, walking, nobody):
+@pytest.mark.parametrize(("missing", "bridged"), [(12, True), (18, False)])
+def test_who_is_out_of_sight_has_rows_for_half_a_second_and_the_name_for_longer(
+    followed, five_cameras, walking, nobody, missing, bridged
+):
+    """They pass each other meanwhile: nearer to where one vanished it is the other who appears, 1.2 m/s on."""
     frames, truth = walking
-    for missing, gap in ((12, range(20, 32)), (18, range(20, 38))):
-        rows = followed(five_cameras, [nobody if t in gap else frame for t, frame in enumerate(frames)])
-        tracks = identities(rows.rows(np.flatnonzero(np.isfinite(rows.initial).all(axis=(1, 2)))), truth)
-        if missing < 15:
-            assert all(len(own) == 1 for own in tracks.values())
-            assert len(rows) == 2 * len(frames), "rows in the gap, too"
-        else:
-            # 0.6 s is more than the patience of 0.5 s: two new identities, nothing in between.
-            assert all(len(own) == 2 for own in tracks.values())
-            assert not np.isin(rows.frame, np.arange(21, 37)).any()
+    gap = range(20, 20 + missing)
+    rows = followed(five_cameras, [nobody if t in gap else frame for t, frame in enumerate(frames)])
+    tracks = identities(rows.rows(np.flatnonzero(np.isfinite(rows.initial).all(axis=(1, 2)))), truth)
+    assert all(len(own) == 1 for own in tracks.values()) and tracks[0] != tracks[1]
+    # 0.6 s is more than the patience of 0.5 s.
+    assert len(rows) == 2 * (len(frames) if bridged else len(frames) - missing)
 
 
 def test_uneven_times_and_missing_frames_do_not_matter(followed, five_cameras, walking):
@@ -65,28 +69,94 @@ def test_few_frames_a_second_cost_nobody_the_first_ones(followed, five_cameras, 
     assert all(len(own) == 1 for own in identities(rows, np.stack([two_people] * 12)).values())
 
 
-def test_people_in_view_for_five_frames_at_either_end(followed, five_cameras, seen_exactly, walking):
-    frames, truth = walking
-    last = len(frames) - 5
+def present(five_cameras, seen_exactly, truth, when):
+    """Both people in the frames that `when` has, else the first alone."""
+    return [seen_exactly(five_cameras, people if t in when else people[:1]) for t, people in enumerate(truth)]
 
-    def present(t):
-        who = [0] if 5 <= t < last else [0, 1]
-        return seen_exactly(five_cameras, truth[t, who])
 
-    rows = followed(five_cameras, [present(t) for t in range(len(frames))])
+def test_people_in_view_for_a_quarter_of_a_second_at_either_end(followed, five_cameras, seen_exactly, walking):
+    """Evidence of 0.27 s less 0.125 s for one end: more than 0.1 s."""
+    _, truth = walking
+    here = [*range(8), *range(len(truth) - 8, len(truth))]
+    rows = followed(five_cameras, present(five_cameras, seen_exactly, truth, here))
     person, _ = who(rows, truth)
-    assert np.bincount(person).tolist() == [len(frames), 10]
-    assert sorted(np.unique(rows.frame[person == 1]).tolist()) == [*range(5), *range(last, len(frames))]
+    assert np.bincount(person).tolist() == [len(truth), 16]
+    assert sorted(rows.frame[person == 1].tolist()) == here
 
 
-@pytest.mark.parametrize(("count", "people"), [(3, 1), (4, 1), (5, 2)])
-def test_fewer_than_five_frames_in_the_middle_are_a_phantom(
+@pytest.mark.parametrize(("count", "people"), [(4, 1), (9, 1), (12, 2)])
+def test_who_is_seen_for_less_than_a_third_of_a_second_is_nobody(
     followed, five_cameras, seen_exactly, walking, count, people
 ):
-    _, truth = walking
-    seen = [seen_exactly(five_cameras, truth[t, [0, 1] if 8 <= t < 8 + count else [0]]) for t in range(30)]
+    """Two ends cost 0.25 s, and 0.1 s of evidence must be left: 0.35 s of all that can be seen."""
+    truth = walking[1]
+    rows = followed(five_cameras, present(five_cameras, seen_exactly, truth, range(17, 17 + count)))
+    assert len(np.unique(rows.track)) == people and len(rows) == 45 + (count if people == 2 else 0)
+
+
+def test_rows_begin_and_end_with_detections(followed, five_cameras, walking, nobody):
+    """Half a second without anybody at either end of a recording: as long as a track lives without evidence."""
+    frames, truth = walking
+    seen = [frame if 14 <= t < 31 else nobody for t, frame in enumerate(frames)]
     rows = followed(five_cameras, seen)
-    assert len(np.unique(rows.track)) == people and len(rows) == 30 + (count if people == 2 else 0)
+    assert rows.frame.tolist() == np.arange(14, 31).repeat(2).tolist() and len(identities(rows, truth)) == 2
+
+
+def test_who_enters_late_leaves_early_and_comes_back_is_the_same_person(
+    followed, five_cameras, seen_exactly, walking
+):
+    """4 s: the second person comes after 0.8 s, is away for 0.7 s, and leaves 0.7 s before the end."""
+    truth = walking[1][::2].repeat(3, axis=0)[:60]
+    here = [*range(12, 28), *range(38, 49)]
+    rows = followed(five_cameras, present(five_cameras, seen_exactly, truth, here), np.arange(60) / 15)
+    person, _ = who(rows, truth)
+    assert sorted(rows.frame[person == 1].tolist()) == here and (person == 0).sum() == 60
+    assert all(len(own) == 1 for own in identities(rows, truth).values())
+
+
+@pytest.mark.parametrize("fps", [5, 30, 60])
+def test_identities_last_over_the_border_of_a_block(followed, five_cameras, seen_exactly, two_people, fps):
+    """4.2 s before three cameras: a block ends after 3 s, and no frame of anybody is missing or twice."""
+    times = np.arange(round(4.2 * fps)) / fps
+    truth = two_people + np.stack([0 * times, 0.3 * np.sin(2 * times), 0 * times], axis=1)[:, None, None]
+    rig = replace(five_cameras, cameras=five_cameras.cameras[:3])
+    rows = followed(rig, [seen_exactly(rig, people) for people in truth], times)
+    assert len(rows) == 2 * len(times)
+    tracks = identities(rows, truth)
+    assert all(len(own) == 1 for own in tracks.values()) and tracks[0] != tracks[1]
+
+
+@pytest.mark.parametrize("fps", [10, 30])
+def test_what_one_of_two_cameras_sees_goes_on(followed, five_cameras, seen_exactly, walking, fps):
+    """For a second the other camera sees nothing: along the ray joints are uncertain by more than 20 cm then."""
+    two = replace(five_cameras, cameras=five_cameras.cameras[:2])
+    truth = walking[1][np.arange(round(2.4 * fps)) * 18 // fps, :1]
+    blind = np.arange(round(0.8 * fps), round(1.8 * fps))
+    seen = [seen_exactly(two, people) for people in truth]
+    seen = [frame.only(frame.view < 1) if t in blind else frame for t, frame in enumerate(seen)]
+    rows = followed(two, seen, np.arange(len(seen)) / fps)
+    assert rows.frame.tolist() == list(range(len(seen))) and len(np.unique(rows.track)) == 1
+    assert (rows.candidate[blind][..., 0] >= 0).mean() > 0.9 and (rows.candidate[blind][..., 1] < 0).all()
+    if fps == 30:
+        pytest.xfail("joints that are over 0.5 m off along the ray do not get the second view's detections again")
+    both = np.setdiff1d(rows.frame, blind)
+    assert np.linalg.norm(rows.initial - truth[:, 0], axis=-1)[both].max() < 0.1
+
+
+def test_the_order_of_detections_does_not_matter(followed, five_cameras, walking):
+    rng, frames, shuffled = np.random.default_rng(0), [], []
+    for exact in walking[0][10:30]:
+        n = len(exact)
+        frame = replace(exact, xy=exact.xy + rng.normal(0, 2, (n, 2)), confidence=rng.uniform(0.5, 1, n))
+        order = rng.permutation(n)
+        columns = {name: getattr(frame, name)[order] for name in ("view", "joint", "xy", "confidence")}
+        frames.append(frame)
+        shuffled.append(replace(frame, **columns, pairs=np.argsort(order)[frame.pairs]))
+    both = [followed(five_cameras, each) for each in (frames, shuffled)]
+    one, other = (rows.rows(np.lexsort((rows.initial[:, 0, 1], rows.frame))) for rows in both)
+    assert len(set(zip(one.track.tolist(), other.track.tolist(), strict=True))) == 2
+    np.testing.assert_allclose(other.initial, one.initial, atol=1e-9)
+    np.testing.assert_array_equal(other.xy, one.xy)
 
 
 def test_who_is_found_late_was_there_before(followed, five_cameras, seen_exactly, walking):
@@ -128,10 +198,6 @@ def test_nobody_is_no_row(followed, five_cameras):
 
 def test_moving_cameras_are_followed_too(tracker, five_cameras, seen_exactly, walking):
     """The rig slides 2 cm a frame: each frame has its own."""
-    from shapepose_fg.tracking.following import FollowState, finish, follow
-    from shapepose_fg.tracking.hypotheses import Input
-    from shapepose_fg.tracking.tracker import Tracks
-
     _, truth = walking
     state, rows = FollowState(Tracks.none(tracker.skeleton)), []
     for t in range(20):
@@ -150,18 +216,38 @@ def test_moving_cameras_are_followed_too(tracker, five_cameras, seen_exactly, wa
         assert len(part) == 2 and (distance.min(axis=1) < 0.03).all()
 
 
-def test_the_memory_of_a_long_recording_is_that_of_the_look_ahead(tracker, five_cameras, walking):
-    from shapepose_fg.tracking.following import FollowState, follow
-    from shapepose_fg.tracking.hypotheses import Input
-    from shapepose_fg.tracking.tracker import Tracks
-
+def test_the_memory_of_a_long_recording_is_that_of_a_block_and_the_look_ahead(tracker, five_cameras, walking):
     frames, _ = walking
     state, longest = FollowState(Tracks.none(tracker.skeleton)), 0
-    for t in range(90):
-        given = Input(t, np.full(5, t / 30.0), frames[min(t, len(frames) - 1)], five_cameras)
+    for t in range(65):
+        given = Input(t, np.full(5, t / 5.0), frames[min(t, len(frames) - 1)], five_cameras)
         state, _ = follow(tracker, state, given, FollowingConfig())
         longest = max(longest, len(state.pending))
-    assert longest <= 31 and len(state.evident) == len(state.real) == 2
+    assert longest <= 5 * (BLOCK_S + 1.0) + 1 and state.people.ids.tolist() == [0, 1] and state.next_id == 2
+
+
+@pytest.mark.parametrize("stopped", [12, 44])
+def test_whoever_goes_on_from_a_checkpoint_finds_the_same_bytes(tracker, five_cameras, walking, stopped):
+    """10 frames a second: within the first block, and after it while the second is open."""
+    frames = [walking[0][t // 2] for t in range(60)]
+    given = [Input(t, np.full(5, t / 10.0), frame, five_cameras) for t, frame in enumerate(frames)]
+
+    def through(stop: int | None) -> tuple[FollowState, list]:
+        state, decided = FollowState(Tracks.none(tracker.skeleton)), []
+        for each in given:
+            if each.frame == stop:
+                assert len(state.pending) > 0 and len(state.people) == (2 if stop > 40 else 0)
+                arrays = checkpoint_arrays(Checkpoint(stop, state=StreamState(state)))
+                state = checkpoint_of(arrays.__getitem__, list(arrays), given.__getitem__).state.follow
+            state, more = follow(tracker, state, each, FollowingConfig())
+            decided += more
+        return state, decided + finish(tracker, state)[1]
+
+    (_, whole), (_, resumed) = through(None), through(stopped)
+    assert len(whole) == len(resumed) == 60
+    for (_, rows), (_, again) in zip(whole, resumed, strict=True):
+        for name in (each.name for each in fields(rows)):
+            np.testing.assert_array_equal(getattr(again, name), getattr(rows, name), err_msg=name)
 
 
 def test_settings_that_make_no_sense_are_refused():

@@ -8,38 +8,30 @@ import pytest
 from shapepose_fg.detections import Detections
 from shapepose_fg.skeleton import BODY_25
 from shapepose_fg.tracking.motion_filter import JointStates
-from shapepose_fg.tracking.tracker import TrackerState
+from shapepose_fg.tracking.tracker import Tracks, _apart
 
 CORE = list(BODY_25.core)
 HIP, SHOULDER, ELBOW, WRIST = (BODY_25.index(name) for name in ("MidHip", "RShoulder", "RElbow", "RWrist"))
 
 
-def states(places, sigma_m=0.02, **known) -> TrackerState:
-    """Tracks 0, 1, ... at `places` (A, 25, 3) at 10 s, 5 s old, with evidence, unless `known` says so."""
+def tracks_at(places, sigma_m=0.02, **known) -> Tracks:
+    """Tracks 0, 1, ... of one world at `places` (A, 25, 3) at 10 s, with evidence, unless `known` says so."""
     count = len(places)
     joints = JointStates.at(np.asarray(places, dtype=float), np.full((count, 25), sigma_m), 0.1)
-    start = TrackerState.start(BODY_25, next_id=count)
-    columns = {
-        "time_s": 10.0,
-        "ids": np.arange(count),
-        "joints": joints,
-        "born_s": np.full(count, 5.0),
-        "evident_s": np.full(count, 10.0),
-        "misses": np.zeros(count, dtype=int),
-        "weak": np.zeros(count, dtype=bool),
-    }
-    return replace(start, **columns | known)
+    start = Tracks(10.0, np.arange(count), np.zeros(count, dtype=int), joints, np.full(count, 10.0))
+    return replace(start, **known)
 
 
 def test_an_unseen_joint_comes_to_move_as_the_person_does(tracker, two_people):
     """After a quarter of a second 1/e is left of how its velocity differs from the person's: the mean of the core
-    joints, weighted by how surely their places are known."""
+    joints, weighted by how surely their places are known; and at rest, as surely as 10 cm."""
     rng = np.random.default_rng(0)
     sigma = np.where(np.arange(25) == WRIST, 0.06, rng.uniform(0.01, 0.05, (1, 25)))
     velocity = rng.normal(0, 1, (1, 25, 3))
     before = JointStates.at(two_people[:1], sigma, 0.1).with_velocity(velocity)
     after = tracker._predict(before, 0.25)
-    person = np.average(velocity[0, CORE], axis=0, weights=sigma[0, CORE] ** -2.0)
+    certainty = sigma[0, CORE] ** -2.0
+    person = certainty @ velocity[0, CORE] / (certainty.sum() + 0.1**-2)
     expected = velocity.copy()
     expected[0, WRIST] = person + (velocity[0, WRIST] - person) / np.e
     np.testing.assert_allclose(after.velocity, expected)
@@ -72,7 +64,7 @@ def test_four_core_joints_that_two_views_see_are_evidence(tracker):
     candidate = np.full((3, 25, 5), -1)
     for person, joints in enumerate((CORE[:4], CORE[:3], CORE[:3])):
         candidate[person, joints, :2] = 1
-    candidate[2, CORE[3:], 0] = 1  # one view only
+    candidate[2, CORE[3:8], 0] = 1  # one view only, and that sees eight
     candidate[2, [j for j in range(25) if j not in CORE], :3] = 1  # no core joints
     assert tracker._evident(candidate).tolist() == [True, False, False]
 
@@ -95,132 +87,88 @@ def test_six_core_joints_that_two_views_see_may_be_somebody(tracker):
     assert not tracker._enough(lists(others * 2, [0] * 6 + [3] * 6), every)
 
 
-@pytest.mark.parametrize(("beside_m", "double"), [(0.14, True), (0.16, False)])
-def test_of_two_tracks_in_one_place_the_older_has_the_evidence(tracker, two_people, beside_m, double):
-    state = states([two_people[0], two_people[0] + [beside_m, 0, 0], two_people[1]])
-    assert tracker._doubles(state.joints, state).tolist() == [False, double, False]
-    weak = replace(state, weak=np.array([True, False, False]))
-    assert not tracker._doubles(state.joints, weak).any(), "who is on trial takes nobody's evidence"
-    both = replace(state, weak=np.array([True, True, False]))
-    assert tracker._doubles(state.joints, both).tolist() == [False, double, False]
+def test_nine_core_joints_that_one_view_sees_are_evidence_too(tracker):
+    candidate = np.full((2, 25, 5), -1)
+    candidate[0, CORE[:9], 3] = candidate[1, CORE[:8], 3] = 1
+    candidate[1, [j for j in range(25) if j not in CORE], 3] = 1
+    assert tracker._evident(candidate).tolist() == [True, False]
 
 
 @pytest.mark.parametrize(("beside_m", "apart"), [(0.24, False), (0.26, True)])
-def test_a_new_person_stands_apart_from_all_tracks(tracker, two_people, beside_m, apart):
+def test_a_new_person_stands_apart_from_all_tracks(two_people, beside_m, apart):
     new = two_people[:1] + np.array([0.0, beside_m, 0.0])
     new[0, WRIST:] = np.nan  # joints that are not placed count nothing
-    assert tracker._apart(new, states(two_people)).tolist() == [apart]
-    assert tracker._apart(new, states(two_people[1:])).tolist() == [True]
-    assert tracker._apart(new, states(two_people[:0])).tolist() == [True]
-
-
-@pytest.mark.parametrize(
-    ("waited_s", "away_m", "back"), [(0.4, 0.64, True), (0.4, 0.66, False), (0.0, 0.26, False)]
-)
-def test_who_comes_back_is_as_far_off_as_a_person_walks(tracker, two_people, waited_s, away_m, back):
-    """25 cm and 1 m/s; the second track has evidence, the third is on trial: both wait for nobody."""
-    third = two_people[0] + [0.05, 0.0, 0.0]
-    state = states(
-        [*two_people, third], evident_s=np.full(3, 10.0 - waited_s), weak=np.array([False, False, True])
-    )
-    evident = np.array([False, True, False])
-    places = two_people[:1] + np.array([0.0, away_m, 0.0])
-    places[0, CORE[:3]] = np.nan  # the centre is of what is placed, of both
-    track, person = tracker._returned(places, np.array([True]), state, evident)
-    assert (track.tolist(), person.tolist()) == (([0], [0]) if back else ([], []))
-    none = tracker._returned(places, np.array([False]), state, evident)
-    assert len(none[0]) == len(none[1]) == 0
-
-
-def test_two_who_come_back_are_told_apart_together(tracker, two_people):
-    """The first is nearer to both tracks; taken greedily it would leave the other to nobody."""
-    state = states(two_people, evident_s=np.full(2, 9.6))
-    x = two_people[1, CORE].mean(axis=0) - two_people[0, CORE].mean(axis=0)
-    places = np.stack([two_people[0] + 0.6 * x, two_people[0] - 0.3 * x])
-    track, person = tracker._returned(places, np.ones(2, dtype=bool), state, np.zeros(2, dtype=bool))
-    assert dict(zip(track.tolist(), person.tolist(), strict=True)) == {0: 1, 1: 0}
-
-
-def test_who_comes_back_within_reach_is_not_lost_to_a_track_out_of_reach(tracker, two_people):
-    """The tracks' gates are 0.25 and 0.70 m: the person is 0.30 and 0.60 m away, and is the second."""
-    places = two_people[:1]
-    tracks = [two_people[0] + [0.3, 0.0, 0.0], two_people[0] + [0.0, 0.6, 0.0]]
-    state = states(tracks, evident_s=np.array([10.0, 9.55]))
-    track, person = tracker._returned(places, np.array([True]), state, np.zeros(2, dtype=bool))
-    assert (track.tolist(), person.tolist()) == ([1], [0])
-    beside = two_people[0] + [0.25, 0.0, 0.0]  # 5 cm from the first track, 0.65 m from the second
-    both = np.stack([places[0], beside])
-    track, person = tracker._returned(both, np.ones(2, dtype=bool), state, np.zeros(2, dtype=bool))
-    assert dict(zip(track.tolist(), person.tolist(), strict=True)) == {0: 1, 1: 0}
-
-
-def test_who_is_found_again_on_trial_goes_on(tracker, five_cameras, two_people, seen_exactly):
-    """Two misses before, and in this frame stage I finds the person: it is no third one."""
-    away = two_people[:1] + np.array([0.4, 0.0, 0.0])  # farther than any detection is taken from
-    state = states(away, born_s=np.array([9.8]), evident_s=np.array([9.8]), misses=np.array([2]))
-    after, frame = tracker.step(state, seen_exactly(five_cameras, two_people[:1]), five_cameras, 10.0)
-    assert frame.ids.tolist() == [0] and frame.evident.tolist() == [True]
-    assert after.ids.tolist() == [0] and after.misses.tolist() == [2] and after.evident_s.tolist() == [10.0]
+    assert _apart(new, two_people).tolist() == [apart]
+    assert _apart(new, two_people[1:]).tolist() == [True]
+    assert _apart(new, two_people[:0]).tolist() == [True]
 
 
 def test_new_joints_are_known_to_4_cm_and_unplaced_ones_are_lost(tracker, two_people):
     places = two_people[:1].copy()
     places[0, WRIST] = np.nan
-    new = tracker._with_new(states(two_people[1:]), places, True)
-    np.testing.assert_allclose(new.joints.sigma_m[1], np.where(np.arange(25) == WRIST, 0.4, 0.04))
-    np.testing.assert_allclose(new.joints.position[1, WRIST], np.nanmean(places[0], axis=0))
-    np.testing.assert_allclose(np.diagonal(new.joints.covariance[1], axis1=1, axis2=2)[:, 3:], 2.0**2)
-    assert (new.joints.velocity[1] == 0).all()
-    assert new.ids.tolist() == [0, 1] and new.next_id == 2
-    assert new.born_s.tolist() == [5.0, 10.0] and new.evident_s.tolist() == [10.0, 10.0]
-    assert new.misses.tolist() == [0, 0] and new.weak.tolist() == [False, True]
+    new = tracker.at(places, np.array([7]), np.array([3]), 10.0)
+    np.testing.assert_allclose(new.joints.sigma_m[0], np.where(np.arange(25) == WRIST, 0.4, 0.04))
+    np.testing.assert_allclose(new.joints.position[0, WRIST], np.nanmean(places[0], axis=0))
+    np.testing.assert_allclose(np.diagonal(new.joints.covariance[0], axis1=1, axis2=2)[:, 3:], 2.0**2)
+    assert (new.joints.velocity[0] == 0).all()
+    assert (new.ids.tolist(), new.world.tolist(), new.evident_s.tolist()) == ([7], [3], [10.0])
 
 
-@pytest.mark.parametrize(
-    ("age_s", "waited_s", "misses", "weak", "stays"),
-    [
-        (5.0, 0.49, 9, False, True),
-        (5.0, 0.51, 9, False, False),
-        (0.24, 0.1, 2, False, True),
-        (0.24, 0.1, 3, False, False),
-        (0.26, 0.1, 3, False, True),
-        (0.49, 0.1, 2, True, True),
-        (0.49, 0.1, 3, True, False),
-        (0.51, 0.1, 3, True, True),
-    ],
-)
-def test_tracks_end_without_evidence_for_long_and_new_ones_sooner(
-    tracker, two_people, age_s, waited_s, misses, weak, stays
-):
-    """Half a second of patience; a quarter of a second on trial, with weak hips half a second: three misses."""
-    state = states(
-        two_people,
-        born_s=np.array([10.0 - age_s, 0.0]),
-        evident_s=np.array([10.0 - waited_s, 10.0]),
-        misses=np.array([misses, 0]),
-        weak=np.array([weak, False]),
-    )
-    left = tracker._without_the_ended(state)
-    assert left.ids.tolist() == ([0, 1] if stays else [1])
-    if stays:
-        assert left.weak.tolist() == [weak and age_s < 0.5, False], "after the trial a person is one"
+@pytest.mark.parametrize("fps", [10, 30, 60])
+def test_a_newborn_keeps_its_joints_at_any_rate(tracker, five_cameras, two_people, seen_exactly, fps):
+    """2 m/s of unknown speed are 20 cm after 0.1 s, from where on joints count as lost and affinity alone finds
+    them. Here there are no affinities: what was placed to 4 cm is sought where it is expected."""
+    detections = seen_exactly(five_cameras, two_people)
+    detections = replace(detections, pairs=np.zeros((0, 2), dtype=np.intp), affinity=np.zeros(0))
+    zero = np.zeros(2, dtype=int)
+    new = tracker.at(two_people, np.arange(2), zero, 0.0)
+    after, candidate = tracker.step(new, detections, five_cameras, 1 / fps)
+    assert (candidate >= 0).mean() > 0.95 and (after.joints.sigma_m < 0.03).all()
+    np.testing.assert_allclose(after.joints.position, two_people, atol=0.01)
 
 
-def test_tracks_on_trial_get_what_the_others_leave(tracker, five_cameras, two_people, seen_exactly):
-    """Both stand where one person is seen: the one on trial is nearer to all, and gets nothing."""
+@pytest.mark.parametrize("direction", [1, -1])
+def test_tracks_live_for_half_a_second_without_evidence(tracker, two_people, direction):
+    waited = np.array([0.49, 0.51])
+    state = tracks_at(two_people, evident_s=10.0 - direction * waited)
+    assert tracker.alive(state).tolist() == [True, False]
+
+
+def test_evidence_is_dated_and_a_frame_without_it_is_not(tracker, five_cameras, two_people, seen_exactly):
+    state = tracks_at(two_people)
+    after, candidate = tracker.step(state, seen_exactly(five_cameras, two_people[1:]), five_cameras, 9.9)
+    assert after.time_s == 9.9 and after.evident_s.tolist() == [10.0, 9.9] and after.ids.tolist() == [0, 1]
+    assert (candidate[0] < 0).all() and (candidate[1] >= 0).all()
+
+
+def test_worlds_do_not_compete_for_detections(tracker, five_cameras, two_people, seen_exactly):
+    """Two stand 8 cm apart where one person is seen: in one world one of them has the detections, in two both."""
     detections = seen_exactly(five_cameras, two_people[:1])
-    places = np.stack([two_people[0], two_people[0] + [0.03, 0.0, 0.0]])
-    joints = JointStates.at(places, np.full((2, 25), 0.02), 0.1)
-    lost = np.zeros((2, 25), dtype=bool)
-    taken = tracker._assign(joints, lost, np.array([True, False]), detections, five_cameras)
-    # Where the two's joints are within 6 px of each other a detection may serve both, but not over the trial.
-    assert (taken[1] >= 0).all() and (taken[0] < 0).all()
-    both = tracker._assign(joints, lost, np.array([False, False]), detections, five_cameras)
-    assert (both[0] >= 0).sum() > (both[1] >= 0).sum()
+    places = np.stack([two_people[0], two_people[0] + [0.08, 0.0, 0.0]])
+    _, apart = tracker.step(tracks_at(places, world=np.array([0, 1])), detections, five_cameras, 10.03)
+    assert (apart >= 0).all() and (apart[0] == apart[1]).all()
+    _, together = tracker.step(tracks_at(places), detections, five_cameras, 10.03)
+    assert (together[0] >= 0).mean() > 0.9 and (together[1] >= 0).mean() < 0.5
+    alone = [tracker.step(tracks_at(places[[n]]), detections, five_cameras, 10.03) for n in (0, 1)]
+    for n, (_, candidate) in enumerate(alone):
+        np.testing.assert_array_equal(candidate[0], apart[n])
+
+
+def test_who_is_lost_entirely_is_sought_where_expected(tracker, five_cameras, two_people, seen_exactly):
+    """After 0.4 s all joints are uncertain by 0.4 m, and none has a neighbour with detections."""
+    detections = seen_exactly(five_cameras, two_people)
+    moved = two_people - [0.1, 0.0, 0.0]
+    _, candidate = tracker.step(tracks_at(moved, sigma_m=0.4), detections, five_cameras, 10.03)
+    assert (candidate >= 0).mean() > 0.95
+    xy, _ = five_cameras.project(two_people)
+    for person in (0, 1):
+        joint, view = np.nonzero(candidate[person] >= 0)
+        off = detections.xy[candidate[person, joint, view]] - xy[view, person, joint]
+        assert (np.linalg.norm(off, axis=1) < 1e-6).mean() > 0.95
 
 
 def test_hips_that_two_views_saw_are_asked_for_last(tracker, five_cameras, two_people, seen_exactly):
-    """Stage I is asked for weak hips among what is left; who comes of them is on trial."""
+    """Stage I is asked for weak hips among what is left, and not at all where that is too little."""
     detections = seen_exactly(five_cameras, two_people[:1])
     asked = []
 
@@ -229,12 +177,23 @@ def test_hips_that_two_views_saw_are_asked_for_last(tracker, five_cameras, two_p
         everybody = tracker.find(left, rig, False)
         return everybody if weak else everybody.rows(np.zeros(0, dtype=int))
 
-    state = TrackerState.start(BODY_25)
-    state, frame = replace(tracker, find=find).step(state, detections, five_cameras, 0.0)
-    assert asked == [(125, False), (125, True)]
-    assert state.weak.tolist() == [True] and frame.evident.tolist() == [True]
+    none, searching = np.zeros((0, 25, 5), dtype=int), replace(tracker, find=find)
+    places, candidate = searching.newcomers(Tracks.none(BODY_25), none, detections, five_cameras)
+    assert asked == [(125, False), (125, True)] and len(places) == 1
+    assert sorted(candidate.ravel().tolist()) == list(range(125))
     asked.clear()
-    state, _ = replace(tracker, find=find, weak_births=False).step(
-        TrackerState.start(BODY_25), detections, five_cameras, 0.0
+    places, _ = replace(searching, weak_births=False).newcomers(
+        Tracks.none(BODY_25), none, detections, five_cameras
     )
-    assert asked == [(125, False)] and len(state.ids) == 0
+    assert asked == [(125, False)] and len(places) == 0
+    asked.clear()
+    places, _ = searching.newcomers(tracks_at(two_people[:1]), candidate, detections, five_cameras)
+    assert asked == [] and len(places) == 0
+
+
+def test_newcomers_are_sought_among_what_nobody_has(tracker, five_cameras, two_people, seen_exactly):
+    detections = seen_exactly(five_cameras, two_people)
+    there, candidate = tracker.step(tracks_at(two_people[:1]), detections, five_cameras, 10.0)
+    places, own = tracker.newcomers(there, candidate, detections, five_cameras)
+    assert len(places) == 1 and not np.isin(own[own >= 0], candidate).any()
+    np.testing.assert_allclose(places[0], two_people[1], atol=0.01)
