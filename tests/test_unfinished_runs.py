@@ -30,6 +30,7 @@ from shapepose_fg.runs.room import check_room, expected_bytes
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.files import write_simulated
 from shapepose_fg.stopping import Stopped
+from shapepose_fg.tracking import following
 from shapepose_fg.tracking.following import FollowingConfig
 from shapepose_fg.windows import WindowConfig
 
@@ -39,8 +40,15 @@ CONFIG = PipelineConfig(
     windows=WindowConfig(overlap_s=0.1),
     offsets=OffsetConfig(frames=4),
 )
-"""So that following stands between two windows in the middle of a stretch, too."""
 CUTS = (24,)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_blocks():
+    """So that following stands between two windows in the middle of a stretch, too."""
+    before, following.BLOCK_S = following.BLOCK_S, 0.2
+    yield
+    following.BLOCK_S = before
 
 
 @pytest.fixture(scope="module")
