@@ -151,8 +151,16 @@ def command(scene, recording, tmp_path_factory) -> list[str]:
     return ["reconstruct", *words, "--no-report", "--no-check"]
 
 
+SHORT_BLOCKS = """
+from shapepose_fg.tracking import following
+following.BLOCK_S = 0.2
+from shapepose_fg.__main__ import main
+main()
+"""
+
+
 def start(command: list[str], *more: str) -> subprocess.Popen:
-    words = [sys.executable, "-m", "shapepose_fg", *command, *more]
+    words = [sys.executable, "-c", SHORT_BLOCKS, *command, *more]
     return subprocess.Popen(
         words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=hears_ctrl_c
     )
