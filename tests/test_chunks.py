@@ -151,7 +151,7 @@ def test_every_chunk_gives_its_own_frames_and_whole_windows(fps, views, batch):
         for frames, start, stop in spans(Chunk(stretch, stretch.start, stretch.stop, ended=True))
     ]
     pieces = []
-    for chunk in cut_in_chunks(range(200), (170,), times.frame_s, config, 2 * batch):
+    for chunk in cut_in_chunks(range(200), (170,), times.frame_s, config, max(24, 2 * batch)):
         found = spans(chunk)
         own = [frame for frames, start, stop in found for frame in frames[start:stop]]
         assert own == list(chunk.own), chunk

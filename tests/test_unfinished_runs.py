@@ -30,6 +30,7 @@ from shapepose_fg.runs.room import check_room, expected_bytes
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.files import write_simulated
 from shapepose_fg.stopping import Stopped
+from shapepose_fg.tracking import following
 from shapepose_fg.tracking.following import FollowingConfig
 from shapepose_fg.windows import WindowConfig
 
@@ -39,8 +40,15 @@ CONFIG = PipelineConfig(
     windows=WindowConfig(overlap_s=0.1),
     offsets=OffsetConfig(frames=4),
 )
-"""So that following stands between two windows in the middle of a stretch, too."""
 CUTS = (24,)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_blocks():
+    """So that following stands between two windows in the middle of a stretch, too."""
+    before, following.BLOCK_S = following.BLOCK_S, 0.2
+    yield
+    following.BLOCK_S = before
 
 
 @pytest.fixture(scope="module")
@@ -143,8 +151,16 @@ def command(scene, recording, tmp_path_factory) -> list[str]:
     return ["reconstruct", *words, "--no-report", "--no-check"]
 
 
+SHORT_BLOCKS = """
+from shapepose_fg.tracking import following
+following.BLOCK_S = 0.2
+from shapepose_fg.__main__ import main
+main()
+"""
+
+
 def start(command: list[str], *more: str) -> subprocess.Popen:
-    words = [sys.executable, "-m", "shapepose_fg", *command, *more]
+    words = [sys.executable, "-c", SHORT_BLOCKS, *command, *more]
     return subprocess.Popen(
         words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=hears_ctrl_c
     )
