@@ -42,7 +42,7 @@ def solve_chunk(setup: Setup, job: ChunkJob) -> SolvedChunk:
     book = Notebook()
     engine = setup.engine(book)
     with book.stage("follow"):
-        spans = list(windows_of(engine, job.chunk, lambda frame: job.given[frame - job.chunk.first], book))
+        spans = list(windows_of(engine, job.chunk, lambda frame: job.given[frame - job.chunk.first]))
     frames = [given.frame for span in spans for given, _ in span.decided[span.start : span.stop]]
     if frames != list(job.chunk.own):
         raise RuntimeError(f"windows of {len(frames)} frames were found for a chunk of {job.chunk.own}")

@@ -270,7 +270,7 @@ def _windows(
             given, last = [read(frame) for frame in batch], batch.stop == stretch.stop
             with book.stage("follow"):
                 if config.temporal:
-                    spans, state = engine.follow(state, book.watched(given), last=last)
+                    spans, state = engine.follow(state, given, last=last)
                     next_id = state.follow.next_id
                 else:
                     spans = [engine.alone(book.watched(given))]
@@ -435,7 +435,9 @@ def _offsets(
         return KeypointOffsets.load(source)
     with book.stage("offsets"):
         spread = spread_frames(len(detections), config.offsets.frames)
-        people = [find_people(detections[t], rig, detections.skeleton, config) for t in spread]
+        # Joints that three views see well are wanted: people whose hips three views see are enough, and found faster.
+        hips = replace(config, proposals=replace(config.proposals, evidence=False))
+        people = [find_people(detections[t], rig, detections.skeleton, hips) for t in spread]
         if len(people) == 0:
             return KeypointOffsets.identity()
         targets = confident_targets(Observations.concatenate(people), rig, config.observations, config.offsets)

@@ -142,7 +142,7 @@ def test_every_chunk_gives_its_own_frames_and_whole_windows(fps, views, batch):
     def spans(chunk: Chunk) -> list[tuple[list[int], int, int]]:
         solver = SimpleNamespace(windows=config.windows)
         engine = Engine(NobodyIsThere(), config.following, solver, frames=batch)  # type: ignore[arg-type]
-        found = windows_of(engine, chunk, read, book)
+        found = windows_of(engine, chunk, read)
         return [([given.frame for given, _ in span.decided], span.start, span.stop) for span in found]
 
     whole = [

@@ -153,8 +153,8 @@ def test_files_that_are_named_exist(page):
 
 
 def test_tables_that_are_older_than_the_defaults_are_named():
-    """Each table's mark names a file in docs/made_with: settings and data then. Where these are not those of now, the
-    table is in the list of older ones in evaluation.md, and no other table is.
+    """Each table's mark names a file in docs/made_with: settings and data then. Where these are not those of now,
+    the table is in the list of older ones in evaluation.md, and no other table is.
     """
     every = [made_with(basis) for basis in ("pipeline", "bodies", "detector")]
     found = {}

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from shapepose_fg.frame_times import stretches
 from shapepose_fg.pipeline_config import PipelineConfig
 from shapepose_fg.runs.borders import Border, same_people
-from shapepose_fg.runs.notes import Notebook
 from shapepose_fg.tracking.following import BLOCK_S
 from shapepose_fg.tracking.hypotheses import Input
 from shapepose_fg.windows import Engine, Span
@@ -76,13 +75,13 @@ def _until(stop: int, stretch: range, first: int, time_s: NDArray[np.float64], c
     return min(first + batches * config.batch_frames, stretch.stop)
 
 
-def windows_of(engine: Engine, chunk: Chunk, read: Callable[[int], Input], book: Notebook) -> Iterator[Span]:
-    """The windows of a chunk, whose people are followed from `chunk.first` on; notes are of its own frames."""
+def windows_of(engine: Engine, chunk: Chunk, read: Callable[[int], Input]) -> Iterator[Span]:
+    """The windows of a chunk, whose people are followed from `chunk.first` on."""
     state, done = engine.start(), chunk.first
     for start in range(chunk.first, chunk.until, engine.frames):
         batch = range(start, min(start + engine.frames, chunk.until))
         last = chunk.ended and batch.stop == chunk.until
-        given = book.watched([read(frame) for frame in batch], chunk.own)
+        given = [read(frame) for frame in batch]
         spans, state = engine.follow(state, given, last=last)
         for span in spans:
             if done in chunk.own:

@@ -83,10 +83,10 @@ class Notebook:
         if self._frame not in self._dropped_frames[reason][-1:]:
             self._dropped_frames[reason].append(self._frame)
 
-    def watched(self, given: Sequence[Input], own: range | None = None) -> Iterator[Input]:
-        """The same frames; while one is worked on, it is the present frame. Only of `own` ones notes are taken."""
+    def watched(self, given: Sequence[Input]) -> Iterator[Input]:
+        """The same frames; while one is worked on, it is the present frame."""
         for each in given:
-            self._frame = each.frame if own is None or each.frame in own else None
+            self._frame = each.frame
             self._of_frame.clear()
             yield each
 

@@ -62,11 +62,12 @@ def follow(
 ) -> tuple[FollowState, list[Decided]]:
     """Take in the next frame; returns the rows of the frames that are decided by it, oldest first."""
     pending = (*state.pending, new)
-    times = times_of(pending)
-    own = int(np.searchsorted(times, times[0] + BLOCK_S - 1e-6))
-    behind = times[-1] - times[min(own, len(times) - 1)]
-    if len(pending) <= _MOST_FRAMES and (own == len(pending) or behind < config.look_ahead_s):
+    full, lasts_s = len(pending) > _MOST_FRAMES, float(new.time_s.mean() - pending[0].time_s.mean())
+    if not full and lasts_s < BLOCK_S + config.look_ahead_s:
         return replace(state, pending=pending), []
+    times = times_of(pending)
+    ends_s = times[-1] - config.look_ahead_s if full else times[0] + BLOCK_S - 1e-6
+    own = max(int(np.searchsorted(times, ends_s)), len(pending) // 2 if full else 1)
     return _decide(tracker, replace(state, pending=pending), min(own, len(pending) - 1))
 
 
