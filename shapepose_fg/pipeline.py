@@ -435,7 +435,7 @@ def _offsets(
         return KeypointOffsets.load(source)
     with book.stage("offsets"):
         spread = spread_frames(len(detections), config.offsets.frames)
-        # Joints that three views see well are wanted: people whose hips three views see are enough, and found faster.
+        # Joints that three views see well are wanted: people whose hips they see are enough, and found faster.
         hips = replace(config, proposals=replace(config.proposals, evidence=False))
         people = [find_people(detections[t], rig, detections.skeleton, hips) for t in spread]
         if len(people) == 0:

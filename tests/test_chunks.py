@@ -15,7 +15,6 @@ from shapepose_fg.pipeline import PipelineConfig, reconstruct, reconstruct_parts
 from shapepose_fg.runs import chunks
 from shapepose_fg.runs.borders import Border, same_people
 from shapepose_fg.runs.chunks import Chunk, cut_in_chunks, windows_of
-from shapepose_fg.runs.notes import Notebook
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.skeleton import BODY_25
 from shapepose_fg.stopping import Stopped
@@ -136,8 +135,6 @@ def test_every_chunk_gives_its_own_frames_and_whole_windows(fps, views, batch):
 
     def read(frame: int) -> Input:
         return Input(frame, of_views[frame], Detections.empty(), range(views))  # type: ignore[arg-type]
-
-    book = Notebook()
 
     def spans(chunk: Chunk) -> list[tuple[list[int], int, int]]:
         solver = SimpleNamespace(windows=config.windows)
