@@ -369,7 +369,7 @@ def test_room_is_asked_for_before_the_work(scene, recording, whole, tmp_path, mo
     assert 0.5 < needed / (2 * 11_000 * rows) < 1.5
     monkeypatch.setattr("shutil.disk_usage", lambda _: _Usage(needed - 1))
     with pytest.raises(
-        InputError, match=r"about 8\d\d\.\d kB are needed here, and 8\d\d\.\d kB are free; make room"
+        InputError, match=r"about 9\d\d\.\d kB are needed here, and 9\d\d\.\d kB are free; make room"
     ):
         check_room(tmp_path, needed)
     monkeypatch.setattr("shutil.disk_usage", lambda _: _Usage(needed))

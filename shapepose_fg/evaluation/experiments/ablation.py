@@ -25,6 +25,7 @@ SWITCHES: dict[str, tuple[str, ...]] = {
     "rho 12 cm, hips 20 cm apart": ("candidates.vote_radius_m", "proposals.separation_m"),
     "centres weighted by confidence": ("candidates.weighted_centre",),
     "what two views see is kept": ("candidates.weak", "candidates.min_view_fraction", "proposals.weak_anchors"),
+    "people from pairs of 2D people, by evidence": ("proposals.evidence",),
     "60 % of the parts": ("proposals.min_parts",),
     "phantoms end early": (
         "proposals.min_grown_parts",
