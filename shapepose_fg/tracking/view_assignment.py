@@ -93,7 +93,8 @@ def assign_with_probability(
         return chosen, np.zeros(chosen.shape)
     probable = probabilities(score, possible, detections, len(rig))
     serves = np.bincount(chosen[chosen >= 0], minlength=len(detections)) > 1
-    probable = np.where(serves, probable.sum(axis=0), probable)
+    # Marginals of competitors that form a cycle are not exact: their sum may be over 1 by a little.
+    probable = np.where(serves, np.minimum(probable.sum(axis=0), 1.0), probable)
     whose = np.arange(len(chosen))[:, None, None]
     return chosen, np.where(chosen >= 0, probable[whose, chosen], 0.0)
 
