@@ -215,18 +215,3 @@ def test_two_people_side_by_side_are_less_certain_than_one_alone(five_cameras, t
         assert (chosen >= 0).all()
         median.append(np.median(probability))
     assert median[0] < 0.85 < 0.92 < median[1], median
-
-
-def test_a_detection_that_serves_several_is_theirs_with_a_probability_of_one_at_most(
-    five_cameras, two_people, seen_exactly
-):
-    """Six people nearly in one place, before the detections of three of them: marginals there form cycles."""
-    rng = np.random.default_rng(0)
-    places = two_people[:1] + rng.normal(0, 0.01, (6, 1, 3)) + rng.normal(0, 0.003, (6, 25, 3))
-    detections = seen_exactly(five_cameras, places[:3])
-    sigma, lost = np.full((6, 25), 0.02), np.zeros((6, 25), dtype=bool)
-    asked = places, sigma, lost, detections, five_cameras, BODY_25, AssignmentConfig()
-    chosen, probability = view_assignment.assign_with_probability(*asked)
-    owners = np.bincount(chosen[chosen >= 0], minlength=len(detections))
-    assert (owners > 1).sum() > 50, "they serve several"
-    assert ((probability >= 0) & (probability <= 1)).all() and (probability[chosen < 0] == 0).all()

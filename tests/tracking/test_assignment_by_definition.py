@@ -8,6 +8,7 @@ import pytest
 
 from shapepose_fg.observations import Observations
 from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.tracking import view_assignment
 from shapepose_fg.tracking.following import Input
 from shapepose_fg.tracking.reassociation import Survival, _gone, reassociate
 from shapepose_fg.tracking.view_assignment import AssignmentConfig, assign
@@ -106,6 +107,19 @@ def test_detections_are_taken_best_first_by_nearness_and_affinity(settings, pred
     assert (found >= 0).mean() > 0.5 and (found[predicted[2]] >= 0).any(), "lost joints are found, too"
     wider = assign(*predicted, crowded, five_cameras, BODY_25, AssignmentConfig(overlap_px=1.0))
     assert (wider != found).any() or "overlap_px" not in settings, "overlaps happen here"
+
+
+def test_a_detection_that_serves_two_is_theirs_with_a_probability_of_one_at_most(
+    predicted, crowded, five_cameras, monkeypatch
+):
+    """Marginals of competitors that form a cycle are not exact: those of one detection may add up to more."""
+    monkeypatch.setattr(view_assignment, "probabilities", lambda score, *_: np.full(score.shape, 0.6))
+    asked = *predicted, crowded, five_cameras, BODY_25, AssignmentConfig()
+    chosen, probability = view_assignment.assign_with_probability(*asked)
+    owners = np.bincount(chosen[chosen >= 0], minlength=len(crowded))
+    assert (owners > 1).any(), "overlaps happen here"
+    expected = np.where(owners[chosen] > 1, 1.0, 0.6)
+    np.testing.assert_array_equal(probability, np.where(chosen >= 0, expected, 0.0))
 
 
 @pytest.fixture
