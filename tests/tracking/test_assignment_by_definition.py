@@ -114,7 +114,7 @@ def test_a_detection_that_serves_two_is_theirs_with_a_probability_of_one_at_most
 ):
     """Marginals of competitors that form a cycle are not exact: those of one detection may add up to more."""
     monkeypatch.setattr(view_assignment, "probabilities", lambda score, *_: np.full(score.shape, 0.6))
-    asked = *predicted, crowded, five_cameras, BODY_25, AssignmentConfig()
+    asked = *predicted, crowded, five_cameras, BODY_25, AssignmentConfig(passes=1, overlap_px=60.0, farthest_m=0.2)
     chosen, probability = view_assignment.assign_with_probability(*asked)
     owners = np.bincount(chosen[chosen >= 0], minlength=len(crowded))
     assert (owners > 1).any(), "overlaps happen here"
