@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 _KEY_S = 0.67
 """People are sought among all detections so often: in some frame everybody is seen well. Seconds."""
-_BIRTHS_S = 0.3
+_BIRTHS_S = 0.1
 """New people are sought so often among what a world's people leave: who is found later is followed back.
 Seconds."""
 _RESTART_S = 1.3
