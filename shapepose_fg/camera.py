@@ -264,6 +264,12 @@ class Rig:
         xy, depth = to_pixels(points_camera, self.K[:, None])
         return xy.reshape(len(self), *shape, 2), depth.reshape(len(self), *shape)
 
+    def rays(self, view: NDArray[np.intp], xy: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(D, 3) directions of length one, in the world, of undistorted pixels `xy` (D, 2) in views `view`."""
+        camera = np.concatenate([self.normalise(view, xy), np.ones((len(xy), 1))], axis=1)
+        world = np.einsum("dji,dj->di", self.cTw[view, :, :3], camera)
+        return world / np.linalg.norm(world, axis=1, keepdims=True)
+
     def normalise(self, view: NDArray[np.intp], xy: NDArray[np.float64]) -> NDArray[np.float64]:
         """Normalised image coordinates (D, 2) of undistorted pixels `xy` (D, 2) seen in `view` (D,)."""
         K_inverse = np.linalg.inv(self.K)[view]

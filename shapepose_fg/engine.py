@@ -29,7 +29,7 @@ from shapepose_fg.windows import Engine, WindowSolver
 FAST_M_S = 3.0
 """The tracker predicts joints as if they moved so fast: a hand that is thrown up or strikes."""
 _ON_TRIAL = 0.5
-"""Share of the probability asked for otherwise that is enough where time, or a body, will tell."""
+"""Share of the probability asked for otherwise that is enough in frames that stand alone: a body will tell."""
 
 
 @dataclass(frozen=True)

@@ -54,10 +54,7 @@ class Frame:
     @cached_property
     def rays(self) -> Array:
         """(D, 3) directions of length one, in the world, in which the detections lie."""
-        normalised = self.rig.normalise(self.detections.view, self.detections.xy)
-        camera = np.concatenate([normalised, np.ones((len(normalised), 1))], axis=1)
-        world = np.einsum("dji,dj->di", self.rig.cTw[self.detections.view, :, :3], camera)
-        return world / np.linalg.norm(world, axis=1, keepdims=True)
+        return self.rig.rays(self.detections.view, self.detections.xy)
 
     @cached_property
     def spans(self) -> tuple[NDArray[np.intp], Array]:

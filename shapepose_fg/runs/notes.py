@@ -61,7 +61,6 @@ class Notebook:
         self._dropped_frames: defaultdict[str, list[int]] = defaultdict(list)
         self._thinned_frames: defaultdict[str, list[int]] = defaultdict(list)
         self._frame: int | None = None
-        self._of_frame: Counter[str] = Counter()
 
     def thin(self, what: str, is_thinned: bool, frame: int | None = None) -> None:
         """Note down that some of a frame's detections, points or candidates were too many and left out."""
@@ -72,14 +71,11 @@ class Notebook:
     def drop(self, reason: str, count: int) -> None:
         """Note down people of the present frame who were none, or too little is seen of.
 
-        A frame is searched twice, the second time for people of whom less is seen: then only those count that the
-        first time had not.
+        Over time there is no present frame: blocks of frames are looked at, each many times.
         """
-        more = count - self._of_frame[reason]
-        if self._frame is None or more <= 0:
+        if self._frame is None or count <= 0:
             return
-        self._of_frame[reason] = count
-        self._dropped[reason] += more
+        self._dropped[reason] += count
         if self._frame not in self._dropped_frames[reason][-1:]:
             self._dropped_frames[reason].append(self._frame)
 
@@ -87,7 +83,6 @@ class Notebook:
         """The same frames; while one is worked on, it is the present frame."""
         for each in given:
             self._frame = each.frame
-            self._of_frame.clear()
             yield each
 
     @contextmanager

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,10 +103,7 @@ def choose(
     account = _Account.of(candidate, weight, expected, there, counts, lasts_s)
     if len(there) == 0:
         return account.chosen(np.zeros(0, dtype=bool))
-    gains = account.gains(
-        np.append(np.ones(counts.sum(), dtype=np.float32), np.float32(0)), slice(0, len(lasts_s))
-    )
-    bound = np.bincount(world, np.maximum(_best_stretches(gains)[0], 0.0))
+    bound = np.bincount(world, np.maximum(_best_stretches(account.alone)[0], 0.0))
     tried = np.argsort(-bound, kind="stable")[:_WORLDS]
     found = [account.chosen(first) for first in (np.zeros(len(world), dtype=bool), *(world == w for w in tried))]
     return max(found, key=lambda each: float(each.evidence_s.sum()))
@@ -145,6 +143,16 @@ class _Account:
         weights = np.where(candidate >= 0, weight, 0.0).reshape(shape).astype(np.float32)
         return cls(place, weights, np.maximum(expected, 1), there, lasts_s, count)
 
+    @property
+    def free(self) -> NDArray[np.float32]:
+        """(D + 1,) 1 for every detection, as long as nobody has any; 0 for none."""
+        return np.append(np.ones(self.detections, dtype=np.float32), np.float32(0))
+
+    @cached_property
+    def alone(self) -> Array:
+        """(H, T) evidence of each hypothesis, seconds, as if there were no other."""
+        return self.gains(self.free, slice(0, len(self.lasts_s)))
+
     def gains(self, free: NDArray[np.float32], span: slice) -> Array:
         """(H, S) evidence of each hypothesis in the frames of `span`, seconds, of detections that are `free`."""
         share = np.einsum("htk,htk->ht", self.weight[:, span], free[self.place[:, span]]) / self.expected[:, span]
@@ -152,8 +160,7 @@ class _Account:
 
     def chosen(self, first: NDArray[np.bool_]) -> Chosen:
         """People one after the other, the best of those `first` (H,) before all others."""
-        free = np.append(np.ones(self.detections, dtype=np.float32), np.float32(0))
-        gains, chosen = self.gains(free, slice(0, len(self.lasts_s))), list[tuple[int, int, int, float]]()
+        free, gains, chosen = self.free, self.alone.copy(), list[tuple[int, int, int, float]]()
         taken, least = np.zeros(self.there.shape, dtype=bool), min(_LEAST_S, 0.25 * float(self.lasts_s.sum()))
         while len(gains) > 0:
             value, start, stop = _best_stretches(gains)

@@ -12,6 +12,7 @@ from shapepose_fg.proposal.assignment import lesser
 from shapepose_fg.proposal.hypotheses import Frame, Hypotheses, gaps
 from shapepose_fg.proposal.selection import PRIOR_WITH_BODY, existence
 from shapepose_fg.skeleton import Skeleton
+from shapepose_fg.tracking.following import core_distance
 from shapepose_fg.tracking.hypotheses import Input
 from shapepose_fg.tracking.view_assignment import AssignmentConfig, assign_with_probability
 
@@ -29,15 +30,6 @@ class Survival:
     def at(self, strictness: float) -> "Survival":
         """The same with a part of the probability asked for, from none at 0 to all of it at 1."""
         return replace(self, min_probability=strictness * self.min_probability)
-
-
-def _apart(joints: NDArray[np.float64], skeleton: Skeleton) -> NDArray[np.float64]:
-    """(P, P) mean distance of people's core joints (P, J, 3), metres; infinite where none are known of both."""
-    core = list(skeleton.core)
-    distance = np.linalg.norm(joints[:, None, core] - joints[None, :, core], axis=-1)
-    known = np.isfinite(distance)
-    apart = np.where(known, distance, 0.0).sum(axis=-1) / np.maximum(known.sum(axis=-1), 1)
-    return np.where(known.any(axis=-1), apart, np.inf)
 
 
 def reassociate(
@@ -96,6 +88,6 @@ def _gone(
     """(P,) who is not probable enough, the least probable of them, or is a double of one who is more probable."""
     there = Frame(frame.detections, frame.rig, skeleton, longest_bones(skeleton))
     sure = existence(Hypotheses(joints, candidate, gaps(joints, candidate, there)), there, PRIOR_WITH_BODY)
-    doubles = ((_apart(joints, skeleton) < survival.double_m) & lesser(sure)).any(axis=1)
+    doubles = ((core_distance(joints, joints, skeleton) < survival.double_m) & lesser(sure)).any(axis=1)
     # What one leaves may be what another lacks.
     return doubles | ((sure < survival.min_probability) & (sure == sure.min()))

@@ -59,7 +59,8 @@ class TrackingConfig(Settings):
     assignment: AssignmentConfig = field(default_factory=AssignmentConfig)
     """Which detections are a track's."""
     min_new_joints: Count = 6
-    """Core joints that two views must see, by detections that no track has, for a new person."""
+    """Core joints that two views must see, by detections that no track has, for a new person. In frames that stand
+    alone three are enough: evidence decides there."""
     patience_s: Seconds = 0.5
     """A track without evidence for longer has ended."""
 

@@ -34,11 +34,7 @@ class People2D:
 
     def rays(self, rig: Rig) -> NDArray[np.float64]:
         """(S, J, 3) directions in the world from the cameras to the joints, of length one; 0 for none."""
-        normalised = rig.normalise(self.found.view, self.found.xy)
-        directions = np.concatenate([normalised, np.ones((len(normalised), 1))], axis=1)
-        directions = np.einsum("dij,di->dj", rig.cTw[self.found.view, :, :3], directions)
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        return np.where((self.held >= 0)[..., None], directions[self.held], 0.0)
+        return np.where((self.held >= 0)[..., None], rig.rays(self.found.view, self.found.xy)[self.held], 0.0)
 
 
 def people_in_views(found: Detections, joints: int, min_joints: int) -> People2D:
