@@ -6,10 +6,11 @@ is chosen (`evidence.py`). Whoever was chosen is put together in one world in th
 best, and followed from there again: people who know of each other do not take each other's detections.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from shapepose_fg.camera import Rig
@@ -31,6 +32,13 @@ _ROUNDS = 2
 """How often that is done."""
 _PLACED_M = 0.2
 """Sigma of a track's joint that counts as placed."""
+_PLAIN_SHARE, _PLAIN_S = 0.3, 0.3
+"""People who are seen in so large a share of their places, at any time for so many seconds, are followed once:
+in simulated crowds others are found for people who had less."""
+_SAME_M = 0.02
+"""Worlds with the same detections whose people are nowhere farther apart are one from there on."""
+_GAIN = 0.01
+"""A round that explains less than this share more is the last one."""
 
 
 @dataclass(frozen=True)
@@ -105,16 +113,31 @@ def explained(tracker: Tracker, frames: Sequence[Input], carried: Tracks, keep: 
 
     `carried` are the people of the frame before; `keep` is the index of the frame from which they are carried on.
     """
-    times = times_of(frames)
-    found = follow_worlds(tracker, frames, _seeds(tracker, frames, carried), keep)
-    chosen = _choose(found, frames)
-    for _ in range(_ROUNDS if len(frames) > 1 else 0):
-        if len(chosen) == 0:
+    times, none = times_of(frames), np.zeros((0, len(tracker.skeleton), len(frames[0].rig)), dtype=np.intp)
+    on = Seed(-1, carried, np.full((len(carried), *none.shape[1:]), -1), backwards=False, births=True)
+    found = follow_worlds(tracker, frames, [on], keep)
+    if len(frames) == 1 or _plain(found, times):
+        return found, _choose(found, frames)
+    found = Hypotheses.concatenate([found, follow_worlds(tracker, frames, _seeds(tracker, frames), keep)])
+    chosen, before = _choose(found, frames), 0.0
+    for _ in range(_ROUNDS):
+        if chosen.evidence_s.sum() <= (1 + _GAIN) * before:
             break
+        before = float(chosen.evidence_s.sum())
         again = _restarts(tracker, frames, times, found, chosen)
         found = Hypotheses.concatenate([found, follow_worlds(tracker, frames, again, keep)])
         chosen = _choose(found, frames)
     return found, chosen
+
+
+def _plain(found: Hypotheses, times: Array) -> bool:
+    """Whether everybody is there in all frames, and always seen well."""
+    if not found.there.all():
+        return False
+    share = found.weight.sum(axis=(2, 3)) / np.maximum(found.expected, 1)
+    frames = min(len(times), max(1, round(_PLAIN_S / float(np.median(np.diff(times))))))
+    lately = sliding_window_view(share, frames, axis=1).mean(axis=-1)
+    return bool((lately >= _PLAIN_SHARE).all())
 
 
 def times_of(frames: Sequence[Input]) -> Array:
@@ -138,18 +161,15 @@ def lasting(times_s: Array) -> Array:
     return (np.append(step[:1], step) + np.append(step, step[-1:])) / 2
 
 
-def _seeds(tracker: Tracker, frames: Sequence[Input], carried: Tracks) -> list[Seed]:
-    """Worlds to begin with: people carried on, people met on the way back, and those seen in single frames."""
+def _seeds(tracker: Tracker, frames: Sequence[Input]) -> list[Seed]:
+    """Worlds beside the one that goes on: people met on the way back, and those seen in single frames."""
     times, nobody = times_of(frames), Tracks.none(tracker.skeleton)
     none = np.zeros((0, len(tracker.skeleton), len(frames[0].rig)), dtype=np.intp)
-    on = Seed(-1, carried, np.full((len(carried), *none.shape[1:]), -1), backwards=False, births=True)
-    if len(frames) == 1:
-        return [on]
     back = Seed(len(frames) - 1, nobody, none, forwards=False, births=True)
     parts = np.array_split(np.arange(len(frames)), max(1, round((times[-1] - times[0]) / _KEY_S)))
     keys = [int(part[len(part) // 2]) for part in parts if len(part) > 0]
     found = [(key, *tracker.newcomers(nobody, none, frames[key].detections, frames[key].rig)) for key in keys]
-    return [on, back, *(_seed(tracker, frames, key, places, own) for key, places, own in found if len(places) > 0)]
+    return [back, *(_seed(tracker, frames, key, places, own) for key, places, own in found if len(places) > 0)]
 
 
 def _seed(
@@ -233,6 +253,12 @@ def _follow(
         if abs(time_s - sought_s) < _BIRTHS_S:
             continue
         sought_s = time_s
+        gone, same = _twins(tracks, candidate, births)
+        if len(gone) > 0:
+            log.goes_on_as(t, tracks.ids[gone], tracks.ids[same], forwards=forwards)
+            births = {world: since for world, since in births.items() if world not in tracks.world[gone]}
+            rest = np.setdiff1d(np.arange(len(tracks)), gone)
+            tracks, candidate = tracks.rows(rest), candidate[rest]
         for world in [world for world, since in births.items() if (since <= t if forwards else since >= t)]:
             here = tracks.world == world
             places, theirs = tracker.newcomers(tracks.rows(here), candidate[here], frame.detections, frame.rig)
@@ -244,6 +270,26 @@ def _follow(
                 tracks, candidate = tracks.joined(new), np.concatenate([candidate, theirs])
 
 
+def _twins(
+    tracks: Tracks, candidate: NDArray[np.intp], births: Container[int]
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows of `tracks` (A) whose whole world is as another one is, and the rows of the same people there.
+
+    Their detections (A, J, V) are the same, and what is placed is in the same places. Worlds with `births` stay.
+    """
+    gone, same = np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
+    known, kept = tracks.joints.sigma_m < _PLACED_M, dict[tuple[bytes, ...], NDArray[np.intp]]()
+    for world in sorted(np.unique(tracks.world).tolist(), key=lambda world: world not in births):
+        who = np.flatnonzero(tracks.world == world)
+        names = [candidate[row].tobytes() for row in who.tolist()]
+        who = who[sorted(range(len(names)), key=names.__getitem__)]
+        other = kept.setdefault(tuple(sorted(names)), who)
+        apart = np.linalg.norm(tracks.joints.position[who] - tracks.joints.position[other], axis=-1)
+        if other is not who and (apart[known[who] & known[other]] < _SAME_M).all():
+            gone, same = np.append(gone, who), np.append(same, other)
+    return gone, same
+
+
 class _Log:
     """What becomes of people on their way."""
 
@@ -253,6 +299,7 @@ class _Log:
         self.carried, self.world = list[int](), list[int]()
         self.parts = list[tuple[int, NDArray[np.intp], NDArray[np.intp], Array, Array, NDArray[np.intp]]]()
         self.kept = list[tuple[NDArray[np.intp], JointStates]]()
+        self.twins = list[tuple[slice, NDArray[np.intp], NDArray[np.intp]]]()
 
     def numbered(self, seeds: Sequence[Seed]) -> list[NDArray[np.intp]]:
         """Numbers of the people of each seed."""
@@ -279,6 +326,10 @@ class _Log:
         if t == self.keep:
             self.kept.append((tracks.ids, joints))
 
+    def goes_on_as(self, t: int, who: NDArray[np.intp], others: NDArray[np.intp], *, forwards: bool) -> None:
+        """After frame `t`, people are where others are."""
+        self.twins.append((slice(t + 1, None) if forwards else slice(0, t), who, others))
+
     def hypotheses(self) -> Hypotheses:
         """All of it."""
         H, T, (J, V) = len(self.carried), len(self.frames), self.shape
@@ -291,6 +342,11 @@ class _Log:
         mean, covariance = np.zeros((H, J, 6)), np.zeros((H, J, 6, 6))
         for ids, joints in self.kept:
             mean[ids], covariance[ids] = joints.mean, joints.covariance
+        for span, ids, others in reversed(self.twins):
+            for each in (there, candidate, expected, places, weight):
+                each[ids, span] = each[others, span]
+            if self.keep in range(T)[span]:
+                mean[ids], covariance[ids] = mean[others], covariance[others]
         carried, world = (np.array(each, dtype=np.intp) for each in (self.carried, self.world))
         joints = JointStates(mean, covariance)
         return Hypotheses(carried, world, there, candidate, places, weight, expected, joints)
