@@ -68,8 +68,8 @@ def farthest_m(one: Reconstruction, other: Reconstruction, joints: NDArray[np.fl
 
 @cache
 def crowd() -> tuple[Rig, tuple[Detections, ...]]:
-    """Four people who hide each other before three cameras, and a detector that rounds: what is whose is decided by
-    little, and scores are often equal."""
+    """Four people who hide each other before three cameras, and a detector that rounds: what is whose is decided
+    by little, and scores are often equal."""
     scene = built_in_scene(people=4, cameras=3, frames=FRAMES)
     return scene.rig, tuple(
         replace(each, confidence=np.round(each.confidence, 1), affinity=np.round(each.affinity))

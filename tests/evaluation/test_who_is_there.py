@@ -1,4 +1,4 @@
-"""The table of who is there: recordings that differ by their seeds are one row, and all of a number of cameras one."""
+"""The table of who is there: a row for recordings that differ by seeds, and one for each number of cameras."""
 
 import numpy as np
 
