@@ -32,7 +32,8 @@ _LEAST_S = 0.1
 _SCALE, _PRIOR = 10.6, -0.4
 """Evidence to log-odds, and those of a person without any: logistic fit to 429 people, of whom 19 were nobody or
 somebody once more, in simulated crowds, crossings and pairs before two and three cameras. How long somebody is
-there, and before how many cameras, says nothing more."""
+there says nothing more. Of 291 others, before two to six, said to be 0.65 / 0.87 / 0.96 / 0.99, 8 of 9, 33 of 41,
+77 of 80 and 161 of 161 were there."""
 
 
 @dataclass(frozen=True)

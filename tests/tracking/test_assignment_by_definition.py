@@ -10,7 +10,7 @@ from shapepose_fg.observations import Observations
 from shapepose_fg.skeleton import BODY_25
 from shapepose_fg.tracking import view_assignment
 from shapepose_fg.tracking.following import Input
-from shapepose_fg.tracking.reassociation import Survival, _gone, reassociate
+from shapepose_fg.tracking.reassociation import Survival, _existence, _gone, reassociate
 from shapepose_fg.tracking.view_assignment import AssignmentConfig, assign
 
 CORE = list(BODY_25.core)
@@ -135,11 +135,15 @@ def three(five_cameras, two_people, seen_exactly):
 
 def test_who_has_too_little_or_is_a_double_goes(three):
     frame, candidate, places = three
+
+    def gone(candidate, places, survival):
+        return _gone(_existence(frame, candidate, places, BODY_25), places, BODY_25, survival)
+
     any_share = Survival(min_probability=0.0)
-    assert _gone(frame, candidate, places, BODY_25, any_share).tolist() == [False, False, True], "a double"
+    assert gone(candidate, places, any_share).tolist() == [False, False, True], "a double"
     closer = replace(any_share, double_m=0.14)
-    assert not _gone(frame, candidate, places, BODY_25, closer).any()
-    assert _gone(frame, candidate, places, BODY_25, replace(closer, min_probability=0.5)).tolist() == [
+    assert not gone(candidate, places, closer).any()
+    assert gone(candidate, places, replace(closer, min_probability=0.5)).tolist() == [
         False,
         False,
         True,
@@ -147,16 +151,16 @@ def test_who_has_too_little_or_is_a_double_goes(three):
     # Joints that one view sees are next to nothing.
     few = candidate.copy()
     few[1, :, 1:] = -1
-    assert _gone(frame, few[:2], places[:2], BODY_25, Survival()).tolist() == [False, True]
+    assert gone(few[:2], places[:2], Survival()).tolist() == [False, True]
     # Of two that have equally much the later one goes; who is not placed is nobody's double.
     equal = np.stack([candidate[0], candidate[1], candidate[0]])
-    assert _gone(frame, equal, places, BODY_25, any_share).tolist() == [False, False, True]
+    assert gone(equal, places, any_share).tolist() == [False, False, True]
     lost = places.copy()
     lost[2] = np.nan
-    assert not _gone(frame, candidate, lost, BODY_25, any_share).any()
+    assert not gone(candidate, lost, any_share).any()
     part = places.copy()
     part[2, CORE[:10]] = np.nan  # the distance is of the joints that both have
-    assert _gone(frame, candidate, part, BODY_25, any_share).tolist() == [False, False, True]
+    assert gone(candidate, part, any_share).tolist() == [False, False, True]
 
 
 def test_rows_without_a_joint_are_carried_by_motion_unless_they_must_survive(three, two_people):
