@@ -80,7 +80,7 @@ def test_the_run_says_how_it_came_about(recording, people):
     assert set(run["seconds"]) >= {"triangulate", "propose", "follow", "solve"}
     assert run["versions"]["gtsam"].startswith("4.")
     assert [each["person"] for each in run["probability"]] == np.unique(people.person).tolist()
-    assert all(0.3 < each["evidence"] <= 1 and 0.9 < each["probability"] < 1 for each in run["probability"])
+    assert all(0.3 < each["evidence"] <= 1 and 0.9 < each["probability"] <= 1 for each in run["probability"])
 
 
 def test_without_time_frames_stand_alone_and_batches_do_not_matter(scene, recording):
