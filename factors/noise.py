@@ -77,7 +77,7 @@ def sigma_px(
     focal_px: ArrayLike,
     *,
     sigma_m: float = 0.02,
-    floor_px: float = 1.0,
+    floor_px: ArrayLike = 1.0,
 ) -> NDArray[np.float64]:
     """Standard deviation, in pixels, of detections with `confidence` of joints at `depth_m`.
 
@@ -85,7 +85,7 @@ def sigma_px(
 
     A detector places a joint on a body to within `sigma_m` metres, so its pixels scale with the size of the
     person in the image; `floor_px` is what the detector's grid costs at any size. The confidence multiplies
-    the squared error, as w_ij does in Eq. 1 of the paper. The three arrays broadcast against each other.
+    the squared error, as w_ij does in Eq. 1 of the paper. The arrays broadcast against each other.
     ValueError where a confidence, depth or focal length is not positive: gate such observations out first.
     """
     w, depth, focal = (np.asarray(value, dtype=np.float64) for value in (confidence, depth_m, focal_px))

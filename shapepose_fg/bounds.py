@@ -13,8 +13,6 @@ Seconds = Annotated[float, Interval(gt=0, le=60)]
 """A time in which people move."""
 Speed = Annotated[float, Interval(gt=0, le=100)]
 """Metres a second."""
-Pixels = Annotated[float, Interval(ge=0, le=1000)]
-"""A distance in a picture."""
 Share = Annotated[float, Interval(ge=0, le=1)]
 """A part of a whole, or a score."""
 Factor = Annotated[float, Interval(gt=0, le=1e6)]

@@ -47,4 +47,6 @@ def solve_chunk(setup: Setup, job: ChunkJob) -> SolvedChunk:
     if frames != list(job.chunk.own):
         raise RuntimeError(f"windows of {len(frames)} frames were found for a chunk of {job.chunk.own}")
     solved = tuple(setup.solver.solve(span) for span in spans)
-    return SolvedChunk(solved, book.torn_off(), Border.of(spans[0]), Border.of(spans[-1]))
+    notes = book.torn_off()
+    notes.dropped = {why: [each for each in of if each in job.chunk.own] for why, of in notes.dropped.items()}
+    return SolvedChunk(solved, notes, Border.of(spans[0]), Border.of(spans[-1]))

@@ -40,14 +40,20 @@ class Detections:
 
     def only(self, keep: NDArray[np.bool_]) -> "Detections":
         """The candidates of the mask `keep` (D,), and the affinities between them."""
-        place = np.cumsum(keep) - 1
-        both = keep[self.pairs].all(axis=1)
+        return self.rows(np.flatnonzero(keep))
+
+    def rows(self, index: NDArray[np.intp]) -> "Detections":
+        """The candidates `index` (K,), each once, in that order, and the affinities between them."""
+        place = np.full(len(self), -1, dtype=np.intp)
+        place[index] = np.arange(len(index))
+        pairs = place[self.pairs]
+        both = (pairs >= 0).all(axis=1)
         return Detections(
-            self.view[keep],
-            self.joint[keep],
-            self.xy[keep],
-            self.confidence[keep],
-            place[self.pairs[both]],
+            self.view[index],
+            self.joint[index],
+            self.xy[index],
+            self.confidence[index],
+            pairs[both],
             self.affinity[both],
         )
 

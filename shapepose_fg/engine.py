@@ -74,7 +74,9 @@ class Setup:
         tracking = replace(config.tracking, min_new_joints=3) if alone else config.tracking
         motion = MotionModel.load(skeleton.joints, config.motion)
         scale = BodyScale(longest_bones(skeleton), motion.psd(np.full(len(skeleton), FAST_M_S)))
-        tracker = Tracker(skeleton, scale, find, tracking, config.observations, weak_births=config.temporal)
+        tracker = Tracker(
+            skeleton, scale, find, tracking, config.observations, weak_births=config.temporal, drop=book.drop_in
+        )
         return Engine(tracker, config.following, self.solver, frames=config.batch_frames)
 
 

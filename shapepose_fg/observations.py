@@ -29,6 +29,9 @@ class Observations:
     """(N, J, V) which detection of the row's frame each observation is; -1 for none, or not said."""
     probability: NDArray[np.float64] = field(default=None)  # type: ignore[assignment]
     """(N, J, V) how probable it is that the observation is this person's; 1 where it is not said."""
+    evidence: NDArray[np.float64] = field(default=None)  # type: ignore[assignment]
+    """(N,) what speaks for the person being there at all: over time `tracking/evidence.py`, `own_evidence`, in
+    frames that stand alone a probability; NaN where it is not said."""
 
     def __post_init__(self) -> None:
         shape = np.shape(self.confidence)
@@ -44,6 +47,7 @@ class Observations:
             "time_s": np.zeros((N, V)),
             "candidate": np.full(shape, -1, dtype=np.intp),
             "probability": np.ones(shape),
+            "evidence": np.full(N, np.nan),
         }
         for name, default in defaults.items():
             if getattr(self, name) is None:

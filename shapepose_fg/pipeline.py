@@ -1,6 +1,6 @@
 """The whole way: triangulate, vote, propose, associate; follow, solve in windows, put bodies on; rows out."""
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
@@ -46,6 +46,7 @@ from shapepose_fg.runs.rows_of_people import RowsOfPeople
 from shapepose_fg.runs.standing import floor_of
 from shapepose_fg.skeleton import BODY_25, Skeleton
 from shapepose_fg.solved_rows import result_rows
+from shapepose_fg.tracking.evidence import probability
 from shapepose_fg.tracking.hypotheses import Input
 from shapepose_fg.tracking.stitching import Ends, Trace, stitch
 from shapepose_fg.windows import Engine, Solved, Span
@@ -327,8 +328,14 @@ def _notes(solved: Solved, config: PipelineConfig) -> Notes:
         ]
     notes = Notes(solved.frames, dict(solved.seconds), problems=problems)
     if len(solved.nobody) > 0:
-        notes.dropped[_NOBODY] = len(solved.nobody)
-        notes.dropped_frames[_NOBODY] = sorted(set(solved.nobody))
+        notes.dropped[_NOBODY] = list(solved.nobody)
+    said = np.isfinite(rows.evidence)
+    if config.temporal:
+        for track in np.unique(rows.track[said]).tolist():
+            own = rows.evidence[said & (rows.track == track)]
+            notes.evidence[track] = [float(own.sum()), len(own)]
+    else:
+        notes.probable = dict(Counter(f"{tenth / 10:.1f}" for tenth in np.floor(10 * rows.evidence[said])))
     return notes
 
 
@@ -372,7 +379,8 @@ def _solved_in_chunks(
         for n, solved in enumerate(found.solved, start=1):
             of_window = _notes(solved, setup.config)
             renamed = [replace(each, track=identities.name(each.track, names)) for each in of_window.problems]
-            of_window = replace(of_window, problems=renamed)
+            evidence = {identities.name(track, names): each for track, each in of_window.evidence.items()}
+            of_window = replace(of_window, problems=renamed, evidence=evidence)
             track = np.array([identities.name(each, names) for each in solved.observations.track.tolist()])
             last = n == len(found.solved)
             if last:
@@ -494,13 +502,29 @@ def _summary(notes: Notes, config: PipelineConfig, frames: range, result: Assemb
         }
         for each in notes.problems
     ]
-    dropped = {reason: count for reason, count in notes.dropped.items() if count > 0}
+    dropped = {reason: frames for reason, frames in notes.dropped.items() if len(frames) > 0}
+    named = Notes()
+    for track, each in notes.evidence.items():
+        named.add(Notes(evidence={result.names.get(track, track): each}))
+    probable = [
+        {
+            "person": name,
+            "evidence": round(total / rows, 3),
+            "probability": round(probability(total / rows), 3),
+        }
+        for name, (total, rows) in sorted(named.evidence.items())
+    ]
     return {
         "configuration": asdict(config),
         "versions": versions(),
         "frames": [frames.start, frames.stop],
         "seconds": notes.seconds,
-        "people": {**result.counts(), "dropped": dropped, "problems": problems},
-        "dropped_frames": _spans_by_name(notes.dropped_frames),
+        "people": {
+            **result.counts(),
+            "dropped": {reason: len(frames) for reason, frames in dropped.items()},
+            "problems": problems,
+        },
+        "probability": probable if config.temporal else dict(sorted(notes.probable.items())),
+        "dropped_frames": _spans_by_name(dropped),
         "thinned_frames": _spans_by_name(notes.thinned_frames),
     }

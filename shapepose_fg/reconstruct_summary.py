@@ -1,7 +1,7 @@
 """What `shapepose-fg reconstruct` says at its end: who was found, how well it went, and what looks wrong."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from shapepose_fg.terminal import show, warn
 
@@ -38,6 +38,8 @@ def summary_table(
     table.add_row("rows", f"{len(result)} in all")
     for status, count in sorted(counts["status"].items()):
         table.add_row("", f"{count} {status}", style="green" if status == "ok" else "yellow")
+    if len(doubtful := _doubtful(run)) > 0:
+        table.add_row("", doubtful, style="yellow")
     for reason, count in run.get("people", {}).get("dropped", {}).items():
         where = _frames_words(run.get("dropped_frames", {}).get(reason, []))
         table.add_row("", f"{count} dropped: {reason}{where}", style="dim")
@@ -56,6 +58,20 @@ def summary_table(
         table.add_row("", str(output / "observations.npz"))
     table.add_row("", str(output / CAMERAS))
     return table
+
+
+_SURE = 0.9
+"""Whoever is less probable is named."""
+
+
+def _doubtful(run: dict[str, Any]) -> str:
+    """Who is less probable than `_SURE`; without identities how many rows; empty where nobody is."""
+    said = run.get("probability", [])
+    if isinstance(said, dict):
+        count = sum(rows for tenth, rows in said.items() if float(tenth) < _SURE)
+        return f"{count} are less probable than {_SURE}" if count > 0 else ""
+    few = [f"{each['person']} ({each['probability']:.2f})" for each in said if each["probability"] < _SURE]
+    return f"less probable than {_SURE}: person {', '.join(few[:8])}{' ...' * (len(few) > 8)}" if few else ""
 
 
 def _frames_words(spans: list[list[int]]) -> str:

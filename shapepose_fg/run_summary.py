@@ -175,11 +175,13 @@ def _frames(values: Sequence[Any]) -> Run:
 
 
 def _sum(values: Sequence[Any]) -> Any:
-    """Numbers added up, objects key by key; what one part lacks counts nothing."""
+    """Numbers added up, lists put together, objects key by key; what one part lacks counts nothing."""
     values = [value for value in values if value is not None]
     if all(isinstance(value, dict) for value in values):
         keys = dict.fromkeys(key for value in values for key in value)
         return {key: _sum([value.get(key) for value in values]) for key in keys}
+    if all(isinstance(value, list) for value in values):
+        return [each for value in values for each in value]
     return sum(values)
 
 

@@ -65,6 +65,10 @@ def test_chunks_change_neither_people_nor_names(whole, in_chunks):
     # and that is where joints start that no two views see.
     apart = np.abs(in_chunks.joints - whole.joints)
     assert apart.max() < 2e-3 and apart.mean() < 1e-5
+    one, other = ({e["person"]: e["evidence"] for e in each.run["probability"]} for each in (whole, in_chunks))
+    assert one.keys() == {name for name, _ in pairs}
+    for name, in_chunk in pairs:
+        assert one[name] == pytest.approx(other[in_chunk], abs=2e-3)
 
 
 def test_processes_change_no_byte_of_it(scene, recording, in_chunks):

@@ -79,6 +79,8 @@ def test_the_run_says_how_it_came_about(recording, people):
     assert run["configuration"]["window_graph"]["rho_3d"] == PipelineConfig().window_graph.rho_3d
     assert set(run["seconds"]) >= {"triangulate", "propose", "follow", "solve"}
     assert run["versions"]["gtsam"].startswith("4.")
+    assert [each["person"] for each in run["probability"]] == np.unique(people.person).tolist()
+    assert all(0.3 < each["evidence"] <= 1 and 0.9 < each["probability"] <= 1 for each in run["probability"])
 
 
 def test_without_time_frames_stand_alone_and_batches_do_not_matter(scene, recording):
@@ -87,6 +89,7 @@ def test_without_time_frames_stand_alone_and_batches_do_not_matter(scene, record
     rows = whole.rows((whole.frame >= 5) & (whole.frame < 9))
     assert_same(part, rows)
     assert part.run["frames"] == [5, 9]
+    assert sum(part.run["probability"].values()) == len(part) and set(part.run["probability"]) <= {"0.8", "0.9"}
     assert_same(reconstruct(recording, scene.rig, replace(ALONE, batch_frames=3), frames=range(5, 9)), rows)
 
 

@@ -305,11 +305,18 @@ def part(rows: list[int], **run) -> Reconstruction:
 
 def test_the_run_of_parts_put_together():
     settings = {"candidates": {"gate_m": 0.1}}
-    counted = {"found": 1, "status": {"ok": 1}, "dropped": {"phantom": 2}}
+    problem = {"person": 3, "frame": 100, "joint": "RWrist", "reason": "not determined"}
+    counted = {"found": 1, "status": {"ok": 1}, "dropped": {"phantom": 2}, "problems": [problem]}
     early = part(
         [100], frames=[100, 200], configuration=settings, seconds={"vote": 1.0, "load": 3.0}, people=counted
     )
-    late = part([200, 201], frames=[200, 300], configuration=settings, seconds={"vote": 0.5}, people={"found": 2})
+    late = part(
+        [200, 201],
+        frames=[200, 300],
+        configuration=settings,
+        seconds={"vote": 0.5},
+        people={"found": 2, "problems": []},
+    )
     far = part([500], frames=[500, 510], configuration=settings, versions={"numpy": "9"}, inputs={"a": "x"})
     both = Reconstruction.concatenate([late, early])
     assert both.frame.tolist() == [200, 201, 100]
@@ -317,7 +324,7 @@ def test_the_run_of_parts_put_together():
         "frames": [100, 300],
         "configuration": settings,
         "seconds": {"vote": 1.5, "load": 3.0},
-        "people": {"found": 3, "status": {"ok": 1}, "dropped": {"phantom": 2}},
+        "people": {"found": 3, "status": {"ok": 1}, "dropped": {"phantom": 2}, "problems": [problem]},
     }
     three = Reconstruction.concatenate([early, late, far]).run
     assert three["frames"] == [[100, 300], [500, 510]]

@@ -10,7 +10,7 @@ from annotated_types import Interval
 from numpy.typing import NDArray
 
 from factors import KernelName, in_front, inlier_gate, kernel_weight, sigma_px
-from shapepose_fg.bounds import Factor, Metres, MetresOrNone, Pixels, Settings, Share
+from shapepose_fg.bounds import Factor, Metres, MetresOrNone, Settings, Share
 from shapepose_fg.camera import Views
 from shapepose_fg.observations import Observations
 
@@ -37,8 +37,9 @@ class ObservationConfig(Settings):
     """w_0 in it: what the least confident observation weighs."""
     by_joint: bool = True
     """Whether sigma differs from joint to joint (`JOINT_SCATTER`): a detector knows an eye better than a hip."""
-    floor_px: Pixels = 1.0
-    """What the detector's grid costs at any size."""
+    floor_rad: Share = 0.0005
+    """What the detector's grid costs at any size: an angle, one pixel where the focal length is 2,000. A detector
+    scales a picture to its own size, so that it is no number of the picture's pixels."""
     rho_2d_m: Factor = 0.15
     """rho_2D of Eq. 2, as a length at the joint's depth: an observation farther from the projected joint is
     discarded. Half the distance between a person's own shoulders or hips."""
@@ -59,7 +60,7 @@ class ObservationConfig(Settings):
             confidence_power=1.0,
             least_weight=0.0,
             by_joint=False,
-            floor_px=0.0,
+            floor_rad=0.0,
             fixed_depth_m=_DEPTH_M,
             kernel="none",
         )
@@ -175,7 +176,7 @@ def observation_sigmas(
         config.depth(depth[seen]),
         focal[seen],
         sigma_m=config.sigma_m,
-        floor_px=config.floor_px,
+        floor_px=config.floor_rad * focal[seen],
     )
     # What is as probably somebody else's says half as much.
     sigmas[seen] /= np.sqrt(np.maximum(observations.probability[seen], LEAST_PROBABILITY))

@@ -142,7 +142,7 @@ def squared_distances(
         depth[ahead],
         np.full(ahead.sum(), _focal(camera)),
         sigma_m=config.sigma_m,
-        floor_px=config.floor_px,
+        floor_px=config.floor_rad * _focal(camera),
     )
     S = J @ covariance @ J.transpose(0, 2, 1) + sigma[:, None, None] ** 2 * np.eye(2)
     apart = np.where(ahead[:, None], projected - xy, np.nan)

@@ -27,6 +27,8 @@ class IdentityMetrics:
     """Identities."""
     tracks_of_nobody: int
     """Identities at most half of whose rows are matched with anybody."""
+    longest_of_nobody: int
+    """The most rows of one identity that are matched with nobody."""
 
     @property
     def idf1(self) -> float:
@@ -85,6 +87,7 @@ def identity_metrics(
         ),
         tracks=len(names),
         tracks_of_nobody=int((2 * matched <= length).sum()),
+        longest_of_nobody=int((length - matched).max(initial=0)),
     )
 
 

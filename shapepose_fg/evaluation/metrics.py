@@ -16,6 +16,8 @@ CORRECT_M = 0.2
 
 COVERAGE_LEVELS = (0.5, 0.9, 0.95)
 """The levels at which `covariance_calibration` asks how many truths lie inside the ellipsoid."""
+_LEAST_LOG_SCORE = -50.0
+"""What a joint counts at least in the mean log score: ten sigma off; one exchanged limb must not decide alone."""
 
 
 @dataclass(frozen=True)
@@ -157,6 +159,9 @@ class CovarianceCalibration:
     if the covariances are true."""
     coverage: dict[float, float]
     """Share of the truths inside the ellipsoid that should hold 50, 90 and 95 % of them."""
+    log_score: float
+    """Mean of the logarithm of the Gaussian's density, 1/m³, at the truth, each at least -50: no sigma that is
+    merely larger raises it. NaN without joints."""
 
     @property
     def mean_nees(self) -> float:
@@ -202,7 +207,9 @@ def covariance_calibration(
         raise ValueError("a covariance is not positive definite") from None
     nees = np.sum(np.linalg.solve(root, error[..., None])[..., 0] ** 2, axis=1)
     inside = {level: _share((nees <= _chi_squared_3(level)).sum(), len(nees)) for level in COVERAGE_LEVELS}
-    return CovarianceCalibration(nees, inside)
+    density = -0.5 * (nees + 3 * np.log(2 * np.pi)) - np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+    score = float(np.maximum(density, _LEAST_LOG_SCORE).mean()) if len(nees) > 0 else float("nan")
+    return CovarianceCalibration(nees, inside, score)
 
 
 def _rows(

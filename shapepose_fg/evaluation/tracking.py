@@ -75,6 +75,10 @@ class TrackingScore:
     """Covariances of the velocities."""
     seen: CovarianceCalibration
     """Covariances of the joints of matched rows that two views or more see in that frame."""
+    one_view: CovarianceCalibration
+    """Covariances of those that one view sees."""
+    no_view: CovarianceCalibration
+    """Covariances of those that none sees."""
     long_unseen: CovarianceCalibration
     """Covariances of those that no view has seen in this frame and the nine before."""
 
@@ -98,16 +102,24 @@ class TrackingScore:
             figures |= {f"{prefix}{name}": value for name, value in vars(motion).items()}
         for name, calibration in self._calibrations.items():
             figures |= {f"{name}_inside_{100 * level:.0f}": 100 * s for level, s in calibration.coverage.items()}
+            figures[f"{name}_log_score"] = calibration.log_score
         return {name: float(v) if np.isfinite(v) else None for name, v in figures.items()} | self._counts()
 
     @property
     def _calibrations(self) -> dict[str, CovarianceCalibration]:
-        return {"seen": self.seen, "unseen": self.long_unseen, "velocity": self.velocity}
+        return {
+            "seen": self.seen,
+            "one_view": self.one_view,
+            "no_view": self.no_view,
+            "unseen": self.long_unseen,
+            "velocity": self.velocity,
+        }
 
     def _counts(self) -> dict[str, int]:
         counts = {"rows_of_nobody": self.rows_of_nobody, "people_missed": self.joints.people_missed}
-        counts |= {"twist_jumps": self.twist_jumps, "joints_long_unseen": len(self.long_unseen.nees)}
-        names = ("tracks", "tracks_of_nobody", "switches", "fragmentations")
+        counts |= {"twist_jumps": self.twist_jumps}
+        counts |= {f"joints_{name}": len(each.nees) for name, each in self._calibrations.items()}
+        names = ("tracks", "tracks_of_nobody", "longest_of_nobody", "switches", "fragmentations")
         return counts if self.identities is None else counts | {n: getattr(self.identities, n) for n in names}
 
 
@@ -136,7 +148,7 @@ def score_tracks(
     )
     found, index = people.rows(matches.row), frame_index(people.frame, numbers)
     views = views_used(found)
-    seen, unseen = views >= 2, frames_unseen(views > 0, found.frame, chains.identity) >= LONG_UNSEEN
+    unseen = frames_unseen(views > 0, found.frame, chains.identity) >= LONG_UNSEEN
     error = found.joints - true[matches.frame, matches.person]
     moving = found.velocity - velocities(true, numbers, fps)[matches.frame, matches.person]
     chosen = None if some_joints is None else list(some_joints)
@@ -150,8 +162,15 @@ def score_tracks(
         twist_jumps=_twist_jumps(found, truth, numbers, chains, model),
         velocity_error=_mean(np.linalg.norm(moving, axis=-1)),
         velocity=covariance_calibration(moving, found.velocity_covariance),
-        seen=covariance_calibration(error[seen], found.covariance[seen]),
-        long_unseen=covariance_calibration(error[unseen], found.covariance[unseen]),
+        **{
+            name: covariance_calibration(error[those], found.covariance[those])
+            for name, those in (
+                ("seen", views >= 2),
+                ("one_view", views == 1),
+                ("no_view", views == 0),
+                ("long_unseen", unseen),
+            )
+        },
     )
 
 

@@ -27,8 +27,9 @@ _REACH_M = 0.6
 from a joint to the next is longer, the trunk aside."""
 _LEAST_AFFINITY = 0.3
 """A joint whose place is not known is only taken by an affinity of at least this to an observed neighbour."""
-_OVERLAP_PX = 6.0
-"""Two people's projected joints closer than this overlap: the one detection there serves both."""
+_OVERLAP_M = 0.03
+"""Two people's projected joints closer than this overlap, as a length at their depth: the one detection there
+serves both. A detector is 2 to 3 cm off."""
 _PASSES = 2
 """How often the choice is made again with the neighbours that the last one chose."""
 
@@ -87,8 +88,6 @@ class _Nearness:
     """(P, D) whether it is known where the person's joint of the detection's kind is."""
     distance_m: NDArray[np.float64]
     """(P, D) distance from the projection of that joint, as a length at its depth; infinite if not placed."""
-    distance_px: NDArray[np.float64]
-    """(P, D) the same in pixels."""
     reachable: NDArray[np.bool_]
     """(P, D) not placed, but within a limb's length of a neighbour on the skeleton that is."""
 
@@ -98,7 +97,6 @@ class _Nearness:
             self.views,
             self.placed[people],
             self.distance_m[people],
-            self.distance_px[people],
             self.reachable[people],
         )
 
@@ -111,14 +109,14 @@ def _nearness(
 ) -> _Nearness:
     """Compare all detections with the projections of all joints at `places` (P, J, 3)."""
     projected = rig.project(places)
-    own_px, own_m = projected_distances(projected, detections.joint, detections, rig)
+    own_m = projected_distances(projected, detections.joint, detections, rig)
     placed = np.isfinite(places[:, detections.joint, 0])
     reachable = np.zeros(placed.shape, dtype=bool)
     if not placed.all():
         for neighbour in skeleton.tree_neighbours.T:  # a joint has few
             of_each = neighbour[detections.joint]
-            reachable |= (of_each >= 0) & (projected_distances(projected, of_each, detections, rig)[1] < _REACH_M)
-    return _Nearness(len(rig), placed, own_m, own_px, reachable & ~placed)
+            reachable |= (of_each >= 0) & (projected_distances(projected, of_each, detections, rig) < _REACH_M)
+    return _Nearness(len(rig), placed, own_m, reachable & ~placed)
 
 
 def projected_distances(
@@ -126,17 +124,16 @@ def projected_distances(
     joint: NDArray[np.intp],
     detections: Detections,
     rig: Rig,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Distance (P, D) of each detection to the projection of a `joint` (D,): pixels, and metres at its depth.
+) -> NDArray[np.float64]:
+    """Distance (P, D) of each detection to the projection of a `joint` (D,), metres at its depth.
 
     `projected` is what `rig.project` gives of people's joints; infinite where a joint is not known.
     """
     xy, depth = projected
     at = (detections.view, slice(None), joint)
     distance_px = np.hypot(*np.moveaxis(xy[at] - detections.xy[:, None], -1, 0)).T
-    unknown = np.isnan(distance_px)
     distance_m = distance_px * depth[at].T / rig.focal_px[detections.view]
-    return np.where(unknown, np.inf, distance_px), np.where(unknown, np.inf, distance_m)
+    return np.where(np.isnan(distance_px), np.inf, distance_m)
 
 
 def seen_twice(seen: NDArray[np.bool_], skeleton: Skeleton) -> NDArray[np.bool_]:
@@ -158,8 +155,8 @@ def _choose(
     likely = (nearness.distance_m < _FAR_M) & (score >= 2 * _LEAST_AFFINITY)
     likely |= nearness.reachable & (affinity >= _LEAST_AFFINITY)
     chosen = match_views(likely, score, detections, (len(owns), len(skeleton), nearness.views))
-    overlap = (nearness.distance_px < _OVERLAP_PX) & (affinity >= _LEAST_AFFINITY)
-    share_overlaps(chosen, overlap, nearness.distance_px, detections)
+    overlap = (nearness.distance_m < _OVERLAP_M) & (affinity >= _LEAST_AFFINITY)
+    share_overlaps(chosen, overlap, nearness.distance_m, detections)
     return chosen
 
 
@@ -233,12 +230,12 @@ def without_ties(score: NDArray[np.float64], detections: Detections) -> NDArray[
 def share_overlaps(
     chosen: NDArray[np.intp],
     overlap: NDArray[np.bool_],
-    distance_px: NDArray[np.float64],
+    distance_m: NDArray[np.float64],
     detections: Detections,
 ) -> None:
     """Let the detection that lies on a joint serve that joint too where the joint has none of its own."""
     person, detection = np.nonzero(overlap)
     joint, view = detections.joint[detection], detections.view[detection]
-    order = np.argsort(-distance_px[person, detection], kind="stable")  # the nearest is written last
+    order = np.argsort(-distance_m[person, detection], kind="stable")  # the nearest is written last
     empty = order[chosen[person, joint, view][order] < 0]
     chosen[person[empty], joint[empty], view[empty]] = detection[empty]

@@ -28,8 +28,9 @@ _LEAST_AFFINITY = 0.3
 """What counts as affinity where no neighbour is seen; unrelated pairs are mostly 0, true ones above 0.4."""
 _SURE_AFFINITY = 0.5
 """Mean affinity that takes a detection for a joint whose place nobody knows."""
-_OVERLAP_PX = 6.0
-"""Two people's projected joints closer than this overlap: the one detection there serves both."""
+_OVERLAP_M = 0.03
+"""Two people's projected joints closer than this overlap, as a length at their depth: the one detection there
+serves both. A detector is 2 to 3 cm off."""
 _KERNEL_M = 0.03
 """Scale of the Cauchy kernel with which joints are triangulated: what a detector is off, measured."""
 _ROUNDS = 2
@@ -143,9 +144,7 @@ def settled(
 def _claimed(places: Array, owns: NDArray[np.bool_], frame: Frame, *, exclusive: bool) -> NDArray[np.intp]:
     """(H, J, V) the detections nearest to the joints; where no place is known, those of affinity to the owned."""
     detections, shape = frame.detections, (*places.shape[:2], len(frame.rig))
-    distance_px, distance_m = projected_distances(
-        frame.rig.project(places), detections.joint, detections, frame.rig
-    )
+    distance_m = projected_distances(frame.rig.project(places), detections.joint, detections, frame.rig)
     affinity, neighbours = mean_affinity(owns, detections, frame.skeleton, len(frame.rig))
     score = np.exp(-0.5 * (distance_m / _NEAR_M) ** 2) + np.where(neighbours > 0, affinity, _LEAST_AFFINITY)
     placed = np.isfinite(places[:, detections.joint, 0])
@@ -153,8 +152,8 @@ def _claimed(places: Array, owns: NDArray[np.bool_], frame: Frame, *, exclusive:
     likely |= ~placed & (affinity >= _SURE_AFFINITY)
     if exclusive:
         chosen = match_views(likely, score, detections, shape)
-        overlap = (distance_px < _OVERLAP_PX) & (affinity >= _LEAST_AFFINITY)
-        share_overlaps(chosen, overlap, distance_px, detections)
+        overlap = (distance_m < _OVERLAP_M) & (affinity >= _LEAST_AFFINITY)
+        share_overlaps(chosen, overlap, distance_m, detections)
         return chosen
     person, detection = np.nonzero(likely)
     order = np.argsort(

@@ -21,7 +21,11 @@ _LEAST_IN_A_VIEW = 8
 
 @dataclass(frozen=True)
 class ThinnedFrames:
-    """A recording whose frames have no more detections than are allowed."""
+    """A recording whose frames have no more detections than are allowed, in an order of their own.
+
+    They are sorted by where they are, so that nothing depends on the order in which cameras, people and detections
+    are given: of equal ones the first is taken in many places.
+    """
 
     frames: DetectionSequence
     """The recording as it is."""
@@ -40,17 +44,23 @@ class ThinnedFrames:
 
     def __getitem__(self, frame: int, /) -> Detections:
         every = self.frames[frame]
-        kept = kept_detections(every, self.views, self.config)
-        return every if kept is None else every.only(kept)
+        found = every.rows(self._rows(every))
+        order = np.lexsort(found.pairs.T)
+        return replace(found, pairs=found.pairs[order], affinity=found.affinity[order])
 
     def in_recording(self, frame: int, candidate: NDArray[np.intp]) -> NDArray[np.intp]:
         """Detections of a thinned frame, of any shape, -1 for none: which of the recording's own they are."""
-        kept = kept_detections(self.frames[frame], self.views, self.config)
-        return candidate if kept is None else np.append(np.flatnonzero(kept), -1)[candidate]
+        return np.append(self._rows(self.frames[frame]), -1)[candidate]
 
     def is_thinned(self, frame: int) -> bool:
         """Whether detections of a frame were left out."""
         return kept_detections(self.frames[frame], self.views, self.config) is not None
+
+    def _rows(self, every: Detections) -> NDArray[np.intp]:
+        """Which detections stay, in order."""
+        order = np.lexsort((every.confidence, every.joint, *every.xy.T))
+        kept = kept_detections(every.rows(order), self.views, self.config)
+        return order if kept is None else order[kept]
 
 
 def kept_detections(detections: Detections, views: int, config: CandidateConfig) -> NDArray[np.bool_] | None:

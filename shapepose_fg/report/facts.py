@@ -29,6 +29,14 @@ def dropped(run: Run) -> list[tuple[str, int, str]]:
     ]
 
 
+def probabilities(run: Run) -> dict[int, float]:
+    """How probable it is that each person was there, by number; nobody where every frame stands alone."""
+    listed = run.get("probability")
+    entries = [_object(each) for each in (listed if isinstance(listed, list) else [])]
+    found = {number(each.get("person")): number(each.get("probability")) for each in entries}
+    return {int(who): value for who, value in found.items() if who is not None and value is not None}
+
+
 def problems(run: Run) -> list[str]:
     """Whom the solver could not solve: person, frame, joint and reason."""
     listed = _object(run.get("people")).get("problems")

@@ -6,6 +6,7 @@ import numpy as np
 
 from shapepose_fg.observation_table import Gate
 from shapepose_fg.reconstruction import Known, Reconstruction
+from shapepose_fg.report import facts
 from shapepose_fg.report.elements import Child, Element, element, share_bar, table, trend
 from shapepose_fg.report.figures import KINDS, CameraFigures, known_counts
 from shapepose_fg.tracking.listing import TrackSummary
@@ -49,8 +50,10 @@ def people_section(people: Reconstruction, tracks: Sequence[TrackSummary], over_
         "height",
         "walked",
         "confidence",
+        "probability",
         "how joints are known",
     ]
+    sure = facts.probabilities(people.run)
     rows: list[list[Child]] = [
         [
             swatch(each.person),
@@ -60,6 +63,7 @@ def people_section(people: Reconstruction, tracks: Sequence[TrackSummary], over_
             or_dash(each.stature_m, "{:.2f} m"),
             f"{each.walked_m:.1f} m",
             f"{each.confidence:.2f}",
+            or_dash(sure.get(each.person), "{:.2f}"),
             known_bar(count, f"person {each.person}"),
         ]
         for each, count in zip(tracks, counts, strict=True)
@@ -72,8 +76,14 @@ def people_section(people: Reconstruction, tracks: Sequence[TrackSummary], over_
     return section(
         "people",
         "People",
-        element("p", words, " Gaps are stretches between first and last frame without a row.", class_="lead"),
-        table(head, rows, numbers={1, 2, 3, 4, 5, 6}, label="People"),
+        element(
+            "p",
+            words,
+            " Gaps are stretches between first and last frame without a row. Probability: of so many people in",
+            " simulated recordings with as much evidence of their own this share was there.",
+            class_="lead",
+        ),
+        table(head, rows, numbers={1, 2, 3, 4, 5, 6, 7}, label="People"),
     )
 
 

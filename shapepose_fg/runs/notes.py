@@ -1,7 +1,9 @@
-"""What a run notes down for run.json, window by window: times, who was dropped, what could not be solved."""
+"""What a run notes down for run.json, window by window: times, how probable people are, who was dropped, what
+could not be solved.
+"""
 
 import time
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
@@ -19,10 +21,12 @@ class Notes:
     """How many frames it is of."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Time per stage, over all processes."""
-    dropped: dict[str, int] = field(default_factory=dict)
-    """How many people were none, or too little is seen of, for each reason; in every frame anew."""
-    dropped_frames: dict[str, list[int]] = field(default_factory=dict)
-    """The frames in which that was."""
+    evidence: dict[int, list[float]] = field(default_factory=dict)
+    """Of each track the sum of its rows' evidence (`Observations.evidence`), and how many rows that is."""
+    probable: dict[str, int] = field(default_factory=dict)
+    """Without time how many rows are so probable, by tenths rounded down."""
+    dropped: dict[str, list[int]] = field(default_factory=dict)
+    """The frames in which people were none, or too little is seen of, for each reason; a person, a frame."""
     thinned_frames: dict[str, list[int]] = field(default_factory=dict)
     """The frames of which something was left out, because it was too much."""
     problems: list[Problem] = field(default_factory=list)
@@ -33,10 +37,13 @@ class Notes:
         self.frames += other.frames
         for name, spent in other.seconds.items():
             self.seconds[name] = self.seconds.get(name, 0.0) + spent
-        for reason, count in other.dropped.items():
-            self.dropped[reason] = self.dropped.get(reason, 0) + count
-        for reason, frames in other.dropped_frames.items():
-            self.dropped_frames.setdefault(reason, []).extend(frames)
+        for track, (evidence, rows) in other.evidence.items():
+            before = self.evidence.get(track, [0.0, 0])
+            self.evidence[track] = [before[0] + evidence, before[1] + rows]
+        for tenth, count in other.probable.items():
+            self.probable[tenth] = self.probable.get(tenth, 0) + count
+        for reason, frames in other.dropped.items():
+            self.dropped.setdefault(reason, []).extend(frames)
         for what, frames in other.thinned_frames.items():
             self.thinned_frames.setdefault(what, []).extend(frames)
         self.problems += other.problems
@@ -48,7 +55,10 @@ class Notes:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Notes":
         """What `as_dict` gave."""
-        return cls(**{**values, "problems": [Problem(**each) for each in values["problems"]]})
+        evidence = {int(track): each for track, each in values["evidence"].items()}
+        return cls(
+            **{**values, "evidence": evidence, "problems": [Problem(**each) for each in values["problems"]]}
+        )
 
 
 class Notebook:
@@ -57,8 +67,7 @@ class Notebook:
     def __init__(self) -> None:
         self._seconds: defaultdict[str, float] = defaultdict(float)
         self._inner = 0.0
-        self._dropped: Counter[str] = Counter()
-        self._dropped_frames: defaultdict[str, list[int]] = defaultdict(list)
+        self._dropped: defaultdict[str, list[int]] = defaultdict(list)
         self._thinned_frames: defaultdict[str, list[int]] = defaultdict(list)
         self._frame: int | None = None
 
@@ -73,11 +82,12 @@ class Notebook:
 
         Over time there is no present frame: blocks of frames are looked at, each many times.
         """
-        if self._frame is None or count <= 0:
-            return
-        self._dropped[reason] += count
-        if self._frame not in self._dropped_frames[reason][-1:]:
-            self._dropped_frames[reason].append(self._frame)
+        if self._frame is not None:
+            self.drop_in(reason, [self._frame] * count)
+
+    def drop_in(self, reason: str, frames: Sequence[int]) -> None:
+        """Note down somebody who was not kept, in all of these frames."""
+        self._dropped[reason] += frames
 
     def watched(self, given: Sequence[Input]) -> Iterator[Input]:
         """The same frames; while one is worked on, it is the present frame."""
@@ -99,11 +109,9 @@ class Notebook:
         notes = Notes(
             seconds=dict(self._seconds),
             dropped=dict(self._dropped),
-            dropped_frames=dict(self._dropped_frames),
             thinned_frames={what: frames for what, frames in self._thinned_frames.items() if frames},
         )
         self._seconds.clear()
         self._dropped.clear()
-        self._dropped_frames.clear()
         self._thinned_frames.clear()
         return notes

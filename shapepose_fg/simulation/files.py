@@ -39,12 +39,13 @@ def named_scene(
     seed: int = 0,
     mocap: Path | None = None,
     config: SequenceConfig | None = None,
+    fps: float | None = None,
 ) -> Scene:
     """The scene called `name`; InputError, one sentence, where an option is wrong or the motions are not there.
 
     `people` and `seed` are the built-in scene's, which has 60 frames, or `frames` if that is more. A sequence
     is what it is, or what `config` says; where only its first `frames` are wanted (0: all) the later segments are
-    not made.
+    not made. `fps` are frames a second, by default 25 of the built-in scene and 30 of a sequence.
     """
     if name not in NAMES:
         raise InputError(f"{name}: there is no such scene; give one of {' '.join(NAMES)}")
@@ -54,7 +55,8 @@ def named_scene(
         people = 4 if people is None else people
         if not 0 <= people <= 12:
             raise InputError(f"--people {people}: must be 0 to 12")
-        return built_in_scene(seed, people=people, cameras=cameras, frames=max(60, frames))
+        rate = {} if fps is None else {"fps": fps}
+        return built_in_scene(seed, people=people, cameras=cameras, frames=max(60, frames), **rate)
     if split not in get_args(Split):
         raise InputError(f"--split {split}: must be {' or '.join(get_args(Split))}")
     if people is not None:
@@ -63,7 +65,8 @@ def named_scene(
         )
     until = frames if frames > 0 else None
     motions = Mocap.load(_motions(mocap))
-    return sequence(name, split, motions, cameras=cameras, until=until, config=config)  # type: ignore[arg-type]
+    rate = {} if fps is None else {"fps": fps}
+    return sequence(name, split, motions, cameras=cameras, until=until, config=config, **rate)  # type: ignore[arg-type]
 
 
 def cut(scene: Scene, span: range) -> Scene:

@@ -29,6 +29,11 @@ _WORLDS = 4
 """How many worlds are tried as those that come first, the most promising ones."""
 _LEAST_S = 0.1
 """Least evidence of a person, seconds; of less than 0.4 seconds of frames a quarter of their time."""
+_SCALE, _PRIOR = 10.6, -0.4
+"""Evidence to log-odds, and those of a person without any: logistic fit to 429 people, of whom 19 were nobody or
+somebody once more, in simulated crowds, crossings and pairs before two and three cameras. How long somebody is
+there says nothing more. Of 291 others, before two to six, said to be 0.65 / 0.87 / 0.96 / 0.99, 8 of 9, 33 of 41,
+77 of 80 and 161 of 161 were there."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +86,28 @@ def weighed(
     return weight, inside.sum(axis=(0, 2))
 
 
+def own_evidence(
+    candidate: NDArray[np.integer], weight: NDArray[np.floating], expected: NDArray[np.integer]
+) -> Array:
+    """(A,) evidence of A people in a frame, for each second that it stands for: 1 where all of a person is seen.
+
+    Of their detections `candidate` (A, J, V), with `weight` (A, J, V) and `expected` (A,) of `weighed`; a
+    detection that several have is nobody's own.
+    """
+    owners = np.bincount(candidate[candidate >= 0], minlength=1)
+    own = (candidate >= 0) & (owners[np.maximum(candidate, 0)] == 1)
+    share = np.where(own, weight, 0.0).sum(axis=(1, 2)) / np.maximum(expected, 1)
+    return (1 + _PRICE) * share - _PRICE
+
+
+def probability(evidence: float) -> float:
+    """How probable somebody of so much evidence is (mean of `own_evidence` over the frames) to be there.
+
+    That is, to be nearest to one and the same real person in more than half of the frames.
+    """
+    return float(1 / (1 + np.exp(-(_SCALE * evidence + _PRIOR))))
+
+
 def choose(
     candidate: NDArray[np.integer],
     weight: NDArray[np.floating],
@@ -107,6 +134,38 @@ def choose(
     tried = np.argsort(-bound, kind="stable")[:_WORLDS]
     found = [account.chosen(first) for first in (np.zeros(len(world), dtype=bool), *(world == w for w in tried))]
     return max(found, key=lambda each: float(each.evidence_s.sum()))
+
+
+def left_over(
+    candidate: NDArray[np.integer],
+    weight: NDArray[np.floating],
+    expected: NDArray[np.integer],
+    there: NDArray[np.bool_],
+    counts: NDArray[np.intp],
+    lasts_s: Array,
+    chosen: Chosen,
+) -> Chosen:
+    """Who would be there besides those whom `choose` has `chosen` of them, if appearing cost nothing."""
+    account = _Account.of(candidate, weight, expected, there, counts, lasts_s)
+    free, found = account.free, list[tuple[int, int, int, float]]()
+    for h, start, stop in zip(chosen.hypothesis, chosen.start, chosen.stop, strict=True):
+        free[account.place[h, start:stop]] = 0.0
+    gains = account.gains(free, slice(0, len(lasts_s)))
+    while len(gains) > 0:
+        value, start, stop = _best_stretches(gains, 0.0)
+        best = int(value.argmax())
+        if value[best] < _least_s(lasts_s):
+            break
+        span = slice(int(start[best]), int(stop[best]))
+        found.append((best, span.start, span.stop, float(value[best])))
+        free[account.place[best, span]] = 0.0
+        gains[:, span] = account.gains(free, span)
+    return Chosen.of(found)
+
+
+def _least_s(lasts_s: Array) -> float:
+    """The least evidence of a person in frames that last so long (T,)."""
+    return min(_LEAST_S, 0.25 * float(lasts_s.sum()))
 
 
 @dataclass(frozen=True)
@@ -161,7 +220,7 @@ class _Account:
     def chosen(self, first: NDArray[np.bool_]) -> Chosen:
         """People one after the other, the best of those `first` (H,) before all others."""
         free, gains, chosen = self.free, self.alone.copy(), list[tuple[int, int, int, float]]()
-        taken, least = np.zeros(self.there.shape, dtype=bool), min(_LEAST_S, 0.25 * float(self.lasts_s.sum()))
+        taken, least = np.zeros(self.there.shape, dtype=bool), _least_s(self.lasts_s)
         while len(gains) > 0:
             value, start, stop = _best_stretches(gains)
             if first.any() and value[first].max() < least:
@@ -177,20 +236,22 @@ class _Account:
         return Chosen.of(chosen)
 
 
-def _best_stretches(gains: Array) -> tuple[Array, NDArray[np.intp], NDArray[np.intp]]:
+def _best_stretches(
+    gains: Array, appears_s: float = _APPEARS_S
+) -> tuple[Array, NDArray[np.intp], NDArray[np.intp]]:
     """Of each row of `gains` (H, T) the stretch with the greatest sum: its value (H,), start (H,) and stop (H,).
 
-    Where a stretch begins after the first frame, or stops before the last, it costs `_APPEARS_S` each.
+    Where a stretch begins after the first frame, or stops before the last, it costs `appears_s` each.
     """
     H, T = gains.shape
     running, since = np.full(H, -np.inf), np.zeros(H, dtype=np.intp)
     value, start, stop = np.full(H, -np.inf), np.zeros(H, dtype=np.intp), np.zeros(H, dtype=np.intp)
     for t in range(T):
-        afresh = -_APPEARS_S if t > 0 else 0.0
+        afresh = -appears_s if t > 0 else 0.0
         begins = running < afresh
         since = np.where(begins, t, since)
         running = np.where(begins, afresh, running) + gains[:, t]
-        ends = running - (_APPEARS_S if t < T - 1 else 0.0)
+        ends = running - (appears_s if t < T - 1 else 0.0)
         better = ends > value
         value, start, stop = (
             np.where(better, ends, value),

@@ -11,8 +11,8 @@ from scipy.optimize import linear_sum_assignment
 from shapepose_fg.bounds import Seconds, Settings
 from shapepose_fg.observations import Observations
 from shapepose_fg.skeleton import Skeleton
-from shapepose_fg.tracking.evidence import Chosen
-from shapepose_fg.tracking.hypotheses import Hypotheses, Input, explained, times_of
+from shapepose_fg.tracking.evidence import Chosen, own_evidence
+from shapepose_fg.tracking.hypotheses import Hypotheses, Input, explained, times_of, unlikely
 from shapepose_fg.tracking.tracker import Tracker, Tracks
 
 Array = NDArray[np.float64]
@@ -40,6 +40,9 @@ class FollowingConfig(Settings):
     """A frame is decided when this much more has been seen: whether a person out of sight comes back, and since
     when a new person had been there."""
 
+
+_UNLIKELY = "too little that nobody else explains, or there too briefly"
+"""Why people are not kept over time."""
 
 Decided = tuple[Input, Observations]
 """A frame and the rows of its people."""
@@ -80,6 +83,9 @@ def _decide(tracker: Tracker, state: FollowState, own: int) -> tuple[FollowState
     """Rows of the first `own` frames that are pending."""
     frames = state.pending
     found, chosen = explained(tracker, frames, state.people, own - 1)
+    rest = unlikely(found, chosen, frames)
+    for start, stop in zip(rest.start.tolist(), rest.stop.tolist(), strict=True):
+        tracker.drop(_UNLIKELY, [frame.frame for frame in frames[start : min(stop, own)]])
     chosen = _with_detections(found, chosen, first=len(state.people) == 0, last=own == len(frames))
     identity, next_id = _identities(found, chosen, state, times_of(frames), own, tracker.skeleton)
     decided = [(frame, _rows(frame, t, found, chosen, identity)) for t, frame in enumerate(frames[:own])]
@@ -115,7 +121,9 @@ def _rows(given: Input, t: int, found: Hypotheses, chosen: Chosen, identity: NDA
     _, first = np.unique(identity[here], return_index=True)
     here = here[np.sort(first)]
     who = chosen.hypothesis[here]
-    return _observed(given, found.candidate[who, t].astype(np.intp), found.places[who, t], identity[here])
+    own = found.candidate[who, t].astype(np.intp)
+    evidence = own_evidence(own, found.weight[who, t], found.expected[who, t])
+    return replace(_observed(given, own, found.places[who, t], identity[here]), evidence=evidence)
 
 
 def _observed(given: Input, candidate: NDArray[np.intp], places: Array, track: NDArray[np.intp]) -> Observations:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.camera import Rig
 from shapepose_fg.detections import Detections
-from shapepose_fg.tracking.evidence import Chosen, choose, weighed
+from shapepose_fg.tracking.evidence import Chosen, choose, left_over, weighed
 from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.tracker import Tracker, Tracks
 
@@ -145,10 +145,20 @@ def times_of(frames: Sequence[Input]) -> Array:
     return np.array([float(frame.time_s.mean()) for frame in frames])
 
 
+def unlikely(found: Hypotheses, chosen: Chosen, frames: Sequence[Input]) -> Chosen:
+    """Who was not chosen for too little evidence, or for being there too briefly."""
+    counts, lasts_s = _weighing(frames)
+    return left_over(found.candidate, found.weight, found.expected, found.there, counts, lasts_s, chosen)
+
+
 def _choose(found: Hypotheses, frames: Sequence[Input]) -> Chosen:
-    counts = np.array([len(frame.detections) for frame in frames], dtype=np.intp)
-    lasts_s = lasting(times_of(frames))
+    counts, lasts_s = _weighing(frames)
     return choose(found.candidate, found.weight, found.expected, found.there, found.world, counts, lasts_s)
+
+
+def _weighing(frames: Sequence[Input]) -> tuple[NDArray[np.intp], Array]:
+    """How many detections each frame has (T,), and the seconds that it stands for (T,)."""
+    return np.array([len(frame.detections) for frame in frames], dtype=np.intp), lasting(times_of(frames))
 
 
 def lasting(times_s: Array) -> Array:

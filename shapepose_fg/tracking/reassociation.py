@@ -54,15 +54,17 @@ def reassociate(
         if survival is not None:
             index = index[np.isfinite(sigma_m[index]).any(axis=1)]
         candidate, probability = _given_out(frame, joints[index], sigma_m[index], skeleton, config)
+        evidence = rows.evidence[index]
         while survival is not None and len(index) > 0:
-            gone = _gone(frame, candidate, joints[index], skeleton, survival)
+            evidence = _existence(frame, candidate, joints[index], skeleton)
+            gone = _gone(evidence, joints[index], skeleton, survival)
             if not gone.any():
                 break
-            index = index[~gone]
+            index, evidence = index[~gone], evidence[~gone]
             candidate, probability = _given_out(frame, joints[index], sigma_m[index], skeleton, config)
         part = Observations.of(candidate, frame.detections, joints[index])
         who = {name: getattr(rows, name)[index] for name in ("track", "frame", "time_s")}
-        parts.append(replace(part, probability=probability, **who))
+        parts.append(replace(part, probability=probability, evidence=evidence, **who))
     return Observations.concatenate(parts)
 
 
@@ -78,16 +80,18 @@ def _given_out(
     return assign_with_probability(joints, sigma_m, lost, frame.detections, frame.rig, skeleton, config)
 
 
+def _existence(
+    frame: Input, candidate: NDArray[np.intp], joints: NDArray[np.float64], skeleton: Skeleton
+) -> NDArray[np.float64]:
+    """(P,) how probable each person of a frame is."""
+    there = Frame(frame.detections, frame.rig, skeleton, longest_bones(skeleton))
+    return existence(Hypotheses(joints, candidate, gaps(joints, candidate, there)), there, PRIOR_WITH_BODY)
+
+
 def _gone(
-    frame: Input,
-    candidate: NDArray[np.intp],
-    joints: NDArray[np.float64],
-    skeleton: Skeleton,
-    survival: Survival,
+    sure: NDArray[np.float64], joints: NDArray[np.float64], skeleton: Skeleton, survival: Survival
 ) -> NDArray[np.bool_]:
     """(P,) who is not probable enough, the least probable of them, or is a double of one who is more probable."""
-    there = Frame(frame.detections, frame.rig, skeleton, longest_bones(skeleton))
-    sure = existence(Hypotheses(joints, candidate, gaps(joints, candidate, there)), there, PRIOR_WITH_BODY)
     doubles = ((core_distance(joints, joints, skeleton) < survival.double_m) & lesser(sure)).any(axis=1)
     # What one leaves may be what another lacks.
     return doubles | ((sure < survival.min_probability) & (sure == sure.min()))

@@ -25,6 +25,8 @@ from shapepose_fg.tracking.view_assignment import AssignmentConfig, assign
 Array = NDArray[np.float64]
 FindPeople = Callable[[Detections, Rig, bool], Observations]
 """Stage I of one frame: detections and rig to people; with True, hips that two views saw are enough."""
+NoteDropped = Callable[[str, list[int]], None]
+"""Notes down a reason, and the frames in which somebody was not kept for it."""
 
 
 _LOST_M = 0.2
@@ -132,6 +134,8 @@ class Tracker:
     """How far detections are trusted."""
     weak_births: bool = True
     """Whether people are sought whose hips two views saw."""
+    drop: NoteDropped = lambda reason, frames: None
+    """Is told why somebody was not kept, and in which frames."""
 
     def step(
         self, tracks: Tracks, detections: Detections, rig: Rig, time_s: float

@@ -1,10 +1,8 @@
 """Which detections are whose when it is known where people's joints should be: one-to-one in every view."""
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
-from annotated_types import Interval
 from numpy.typing import NDArray
 
 from shapepose_fg.bounds import Metres, Repeats, Settings, Share
@@ -36,8 +34,9 @@ class AssignmentConfig(Settings):
     of the least score of all others. Unrelated pairs are mostly 0, true ones above 0.4."""
     reach_m: Metres = 0.8
     """A lost joint is sought this far around its neighbour on the skeleton."""
-    overlap_px: Annotated[float, Interval(gt=0, le=1000)] = 6.0
-    """Two people's predicted joints closer than this overlap: the one detection there serves both."""
+    overlap_m: Metres = 0.03
+    """Two people's predicted joints closer than this overlap, as a length at their depth: the one detection there
+    serves both. A detector is 2 to 3 cm off."""
     passes: Repeats = 2
     """How often the choice is made again with the affinities to what the last one chose."""
 
@@ -141,7 +140,7 @@ def _assigned(
     if people == 0 or count == 0:
         empty = np.zeros((people, count))
         return np.full(shape, -1, dtype=np.intp), empty, empty > 0
-    distance_px, distance_m = projected_distances(rig.project(places), detections.joint, detections, rig)
+    distance_m = projected_distances(rig.project(places), detections.joint, detections, rig)
     sigma, astray = sigma_m[:, detections.joint], lost[:, detections.joint]
     nearness = np.exp(-0.5 * distance_m**2 / (config.near_m**2 + sigma**2))
     gate_m = np.minimum(config.far_m + 2 * sigma, config.farthest_m)
@@ -160,6 +159,6 @@ def _assigned(
         possible = inside | likely
         chosen = match_views(likely, score, detections, shape, world)
         owns = owned(chosen, count)
-    overlap = (distance_px < config.overlap_px) & (affinity >= config.least_affinity)
-    share_overlaps(chosen, overlap, distance_px, detections)
+    overlap = (distance_m < config.overlap_m) & (affinity >= config.least_affinity)
+    share_overlaps(chosen, overlap, distance_m, detections)
     return chosen, score, possible

@@ -52,7 +52,7 @@ def seen_at(rig: Rig, xy: NDArray[np.float64], point: NDArray[np.float64]) -> Ob
 
 
 def test_sigma_is_the_detector_s_error_at_the_joint_s_depth(two_views):
-    config = ObservationConfig(sigma_m=0.02, floor_px=3.0)
+    config = ObservationConfig(sigma_m=0.02, floor_rad=0.003)
     points = np.array([[[0.0, 0, 2], [0, 0, 1], [0, 0, np.nan]]])
     seen = Observations(np.zeros((1, 3, 2, 2)), np.array([[[1.0, 0.0], [1.0, 0.25], [1.0, 0.0]]]), points)
     sigma = observation_sigmas(seen, points, Views.of(two_views), config, ("Snout", "RAnkle", "Tail"))[0]
@@ -261,8 +261,8 @@ def test_refuses_shapes_and_settings_that_make_no_sense():
         Observations(np.zeros((1, 2, 3, 2)), np.zeros((1, 2, 4)), np.zeros((1, 2, 3)))
     with pytest.raises(ValueError, match="sigma_m must be positive"):
         ObservationConfig(sigma_m=0.0)
-    with pytest.raises(ValueError, match="floor_px must not be negative"):
-        ObservationConfig(floor_px=-1.0)
+    with pytest.raises(ValueError, match="floor_rad must be between 0 and 1"):
+        ObservationConfig(floor_rad=-1.0)
 
 
 def test_cameras_may_differ_from_row_to_row(five_cameras, two_people):

@@ -23,9 +23,9 @@ def test_nothing_was_learnt_from_anybody_in_them(shared_data):
 def test_the_mean_of_shares_of_joints_is_over_joints():
     """Of six joints all are inside, of two a half: seven of eight. A stretch without such joints has no say."""
     scores = {
-        "a": {"f1": 90.0, "joints_long_unseen": 6, "unseen_inside_50": 100.0},
-        "b": {"f1": 80.0, "joints_long_unseen": 2, "unseen_inside_50": 50.0},
-        "c": {"f1": 100.0, "joints_long_unseen": 0, "unseen_inside_50": None},
+        "a": {"f1": 90.0, "joints_unseen": 6, "unseen_inside_50": 100.0},
+        "b": {"f1": 80.0, "joints_unseen": 2, "unseen_inside_50": 50.0},
+        "c": {"f1": 100.0, "joints_unseen": 0, "unseen_inside_50": None},
     }
     mean = with_mean(scores)["mean"]
     assert mean["f1"] == pytest.approx(90.0)

@@ -57,7 +57,7 @@ def test_true_covariances_hold_95_percent(scene):
     confidence = np.full(count, 0.8)
     scatter = np.full(count, 1.3)
     weight = (0.8**CONFIG.confidence_power + CONFIG.least_weight) / (1 + CONFIG.least_weight)
-    sigma = 1.3 * np.hypot(CONFIG.sigma_m * camera.K[0, 0] / depth[0], CONFIG.floor_px) / np.sqrt(weight)
+    sigma = 1.3 * camera.K[0, 0] * np.hypot(CONFIG.sigma_m / depth[0], CONFIG.floor_rad) / np.sqrt(weight)
     xy = true + rng.normal(size=(count, 2)) * sigma
     covariance = np.broadcast_to(root @ root.T, (count, 3, 3))
     squared = squared_distances(camera, xy, confidence, points, covariance, scatter, CONFIG)

@@ -217,6 +217,9 @@ def test_nees_by_hand_and_nan_left_out():
     covariances = np.array([[np.diag([1.0, 1, 4]), np.eye(3)]])
     calibration = covariance_calibration(errors, covariances)
     np.testing.assert_allclose(calibration.nees, [2.0])
+    # -(2 + log det C + 3 log 2 pi) / 2 with det C = 4.
+    assert calibration.log_score == pytest.approx(-1 - np.log(4) / 2 - 1.5 * np.log(2 * np.pi))
+    assert covariance_calibration(100 * errors, covariances).log_score == -50.0
     assert calibration.coverage == {0.5: 1.0, 0.9: 1.0, 0.95: 1.0}
     assert np.isnan(covariance_calibration(np.zeros((0, 3)), np.zeros((0, 3, 3))).mean_nees)
     with pytest.raises(ValueError, match="positive definite"):

@@ -215,7 +215,7 @@ def test_joints_long_unseen_are_judged_apart(truth, scene):
     confidence[hidden, 7], covariance[hidden, 7] = 0.0, 0.01 * np.eye(3)
     score = score_tracks(replace(people, confidence=confidence, covariance=covariance), truth, scene.fps)
     assert len(score.long_unseen.nees) == 3 * 6  # frames 14 to 19
-    assert len(score.seen.nees) == 3 * (20 * 25 - 15)
+    assert len(score.seen.nees) == 3 * (20 * 25 - 15) and len(score.no_view.nees) == 3 * 15
     assert score.long_unseen.coverage[0.5] == 1.0
 
 
@@ -226,7 +226,7 @@ def test_doubles_phantoms_and_missed(truth, scene):
     rows = Reconstruction.concatenate([people.rows(people.person != 2), double])
     score = score_tracks(rows, truth, scene.fps)
     assert (score.rows_of_nobody, score.joints.people_missed) == (20, 20)
-    assert score.identities.tracks_of_nobody == 1
+    assert (score.identities.tracks_of_nobody, score.identities.longest_of_nobody) == (1, 20)
     assert score.identities.idf1 == pytest.approx(40 / 60)
 
 

@@ -33,7 +33,7 @@ def tracker() -> Tracker:
 def followed(tracker):
     """A function (rig, frames of Detections, times) -> rows of all frames, one `Observations`."""
 
-    def run(rig: Rig, frames, times=None, following=FollowingConfig()):
+    def run(rig: Rig, frames, times=None, following=FollowingConfig(), tracker=tracker):
         from shapepose_fg.observations import Observations
 
         times = np.arange(len(frames)) / FPS if times is None else times

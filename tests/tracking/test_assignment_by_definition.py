@@ -10,7 +10,7 @@ from shapepose_fg.observations import Observations
 from shapepose_fg.skeleton import BODY_25
 from shapepose_fg.tracking import view_assignment
 from shapepose_fg.tracking.following import Input
-from shapepose_fg.tracking.reassociation import Survival, _gone, reassociate
+from shapepose_fg.tracking.reassociation import Survival, _existence, _gone, reassociate
 from shapepose_fg.tracking.view_assignment import AssignmentConfig, assign
 
 CORE = list(BODY_25.core)
@@ -37,7 +37,7 @@ DEFAULTS = {
     "farthest_m": 0.5,
     "least_affinity": 0.3,
     "reach_m": 0.8,
-    "overlap_px": 6.0,
+    "overlap_m": 0.03,
     "passes": 2,
 }
 """What is documented, so that another default is noticed."""
@@ -80,8 +80,8 @@ def assigned(places, sigma, lost, crowded, rig, config: SimpleNamespace) -> np.n
                     likely = metres < gate and score >= 2 * config.least_affinity
                 if likely:
                     offers.append((score, person, row))
-                if px < config.overlap_px and affinity >= config.least_affinity:
-                    shared.append((px, person, row))
+                if metres < config.overlap_m and affinity >= config.least_affinity:
+                    shared.append((metres, person, row))
         chosen[:], used = -1, set()
         for _, person, row in sorted(offers, key=lambda offer: -offer[0]):
             slot = person, int(crowded.joint[row]), int(crowded.view[row])
@@ -98,15 +98,15 @@ def assigned(places, sigma, lost, crowded, rig, config: SimpleNamespace) -> np.n
 
 
 @pytest.mark.parametrize(
-    "settings", [{}, {"passes": 1, "overlap_px": 60.0, "farthest_m": 0.2}, {"least_affinity": 0.0}]
+    "settings", [{}, {"passes": 1, "overlap_m": 0.3, "farthest_m": 0.2}, {"least_affinity": 0.0}]
 )
 def test_detections_are_taken_best_first_by_nearness_and_affinity(settings, predicted, crowded, five_cameras):
     expected = assigned(*predicted, crowded, five_cameras, SimpleNamespace(**DEFAULTS | settings))
     found = assign(*predicted, crowded, five_cameras, BODY_25, AssignmentConfig(**settings))
     np.testing.assert_array_equal(found, expected)
     assert (found >= 0).mean() > 0.5 and (found[predicted[2]] >= 0).any(), "lost joints are found, too"
-    wider = assign(*predicted, crowded, five_cameras, BODY_25, AssignmentConfig(overlap_px=1.0))
-    assert (wider != found).any() or "overlap_px" not in settings, "overlaps happen here"
+    wider = assign(*predicted, crowded, five_cameras, BODY_25, AssignmentConfig(overlap_m=0.005))
+    assert (wider != found).any() or "overlap_m" not in settings, "overlaps happen here"
 
 
 def test_a_detection_that_serves_two_is_theirs_with_a_probability_of_one_at_most(
@@ -114,7 +114,7 @@ def test_a_detection_that_serves_two_is_theirs_with_a_probability_of_one_at_most
 ):
     """Marginals of competitors that form a cycle are not exact: those of one detection may add up to more."""
     monkeypatch.setattr(view_assignment, "probabilities", lambda score, *_: np.full(score.shape, 0.6))
-    asked = *predicted, crowded, five_cameras, BODY_25, AssignmentConfig(passes=1, overlap_px=60.0, farthest_m=0.2)
+    asked = *predicted, crowded, five_cameras, BODY_25, AssignmentConfig(passes=1, overlap_m=0.3, farthest_m=0.2)
     chosen, probability = view_assignment.assign_with_probability(*asked)
     owners = np.bincount(chosen[chosen >= 0], minlength=len(crowded))
     assert (owners > 1).any(), "overlaps happen here"
@@ -135,11 +135,15 @@ def three(five_cameras, two_people, seen_exactly):
 
 def test_who_has_too_little_or_is_a_double_goes(three):
     frame, candidate, places = three
+
+    def gone(candidate, places, survival):
+        return _gone(_existence(frame, candidate, places, BODY_25), places, BODY_25, survival)
+
     any_share = Survival(min_probability=0.0)
-    assert _gone(frame, candidate, places, BODY_25, any_share).tolist() == [False, False, True], "a double"
+    assert gone(candidate, places, any_share).tolist() == [False, False, True], "a double"
     closer = replace(any_share, double_m=0.14)
-    assert not _gone(frame, candidate, places, BODY_25, closer).any()
-    assert _gone(frame, candidate, places, BODY_25, replace(closer, min_probability=0.5)).tolist() == [
+    assert not gone(candidate, places, closer).any()
+    assert gone(candidate, places, replace(closer, min_probability=0.5)).tolist() == [
         False,
         False,
         True,
@@ -147,16 +151,16 @@ def test_who_has_too_little_or_is_a_double_goes(three):
     # Joints that one view sees are next to nothing.
     few = candidate.copy()
     few[1, :, 1:] = -1
-    assert _gone(frame, few[:2], places[:2], BODY_25, Survival()).tolist() == [False, True]
+    assert gone(few[:2], places[:2], Survival()).tolist() == [False, True]
     # Of two that have equally much the later one goes; who is not placed is nobody's double.
     equal = np.stack([candidate[0], candidate[1], candidate[0]])
-    assert _gone(frame, equal, places, BODY_25, any_share).tolist() == [False, False, True]
+    assert gone(equal, places, any_share).tolist() == [False, False, True]
     lost = places.copy()
     lost[2] = np.nan
-    assert not _gone(frame, candidate, lost, BODY_25, any_share).any()
+    assert not gone(candidate, lost, any_share).any()
     part = places.copy()
     part[2, CORE[:10]] = np.nan  # the distance is of the joints that both have
-    assert _gone(frame, candidate, part, BODY_25, any_share).tolist() == [False, False, True]
+    assert gone(candidate, part, any_share).tolist() == [False, False, True]
 
 
 def test_rows_without_a_joint_are_carried_by_motion_unless_they_must_survive(three, two_people):

@@ -85,12 +85,14 @@ def test_people_in_view_for_a_quarter_of_a_second_at_either_end(followed, five_c
 
 
 @pytest.mark.parametrize(("count", "people"), [(4, 1), (9, 1), (12, 2)])
-def test_who_is_seen_for_less_than_a_third_of_a_second_is_nobody(
-    followed, five_cameras, seen_exactly, walking, count, people
+def test_who_is_seen_for_less_than_a_third_of_a_second_is_nobody_and_that_is_noted(
+    followed, tracker, five_cameras, seen_exactly, walking, count, people
 ):
     """Two ends cost 0.25 s, and 0.1 s of evidence must be left: 0.35 s of all that can be seen."""
-    truth = walking[1]
-    rows = followed(five_cameras, present(five_cameras, seen_exactly, truth, range(17, 17 + count)))
+    truth, noted, here = walking[1], [], range(17, 17 + count)
+    taking_notes = replace(tracker, drop=lambda _, frames: noted.append(frames))
+    rows = followed(five_cameras, present(five_cameras, seen_exactly, truth, here), tracker=taking_notes)
+    assert noted == ([list(here)] if people == 1 else [])
     assert len(np.unique(rows.track)) == people and len(rows) == 45 + (count if people == 2 else 0)
 
 

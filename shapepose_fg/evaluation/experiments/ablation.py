@@ -42,7 +42,7 @@ SWITCHES: dict[str, tuple[str, ...]] = {
         "observations.least_weight",
         "observations.by_joint",
         "observations.sigma_m",
-        "observations.floor_px",
+        "observations.floor_rad",
     ),
     "lengths at the joint, not pixels": ("observations.fixed_depth_m",),
     "robust kernel": ("observations.kernel",),

@@ -15,7 +15,7 @@ from shapepose_fg.evaluation.tracking import score_tracks, stature_by_person
 from shapepose_fg.pipeline import PipelineConfig
 from shapepose_fg.simulation.truth import truth_of
 
-_UNSEEN = "joints_long_unseen"
+_UNSEEN = "joints_unseen"
 COLUMNS = {
     "F1": ("f1", 1),
     "F1 19": ("f1_some_joints", 1),

@@ -11,7 +11,7 @@ from shapepose_fg.evaluation import (
     shelf_tables,
     visibility_agreement,
 )
-from shapepose_fg.evaluation.experiments import body_fitters, box, crowd, footage, over_time
+from shapepose_fg.evaluation.experiments import body_fitters, box, crowd, footage, over_time, who_is_there
 from shapepose_fg.evaluation.experiments.ablation import ablation
 from shapepose_fg.evaluation.experiments.detector_joints import detector_joints, detector_joints_shelf
 from shapepose_fg.evaluation.experiments.experiment import Experiment, whole
@@ -39,6 +39,7 @@ def experiments(scale: Scale, images: Path | None = None, others: Path | None = 
         yield over_time.experiment(scale, temporal=True)
         yield over_time.experiment(scale, temporal=False)
     yield from _there(held_back(scale))
+    yield from _there(who_is_there.experiment(scale))
     yield crowd.experiment(scale)
     yield box.experiment(scale)
     for make in (footage.shelf_events, footage.held_out_views, footage.single_person, footage.alone_beside_time):

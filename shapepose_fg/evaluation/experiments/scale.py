@@ -9,8 +9,8 @@ from shapepose_fg.estimation.estimator import ExtraFactors
 from shapepose_fg.frame_times import FrameTimes
 from shapepose_fg.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.reconstruction import Reconstruction
-from shapepose_fg.simulation import Scene, built_in_scene, simulate
-from shapepose_fg.simulation.files import cut, named_scene
+from shapepose_fg.simulation import Scene, simulate
+from shapepose_fg.simulation.files import cut, cuts_of, named_scene
 from shapepose_fg.simulation.room import SequenceConfig
 from shapepose_fg.simulation.sequences import Split
 
@@ -50,6 +50,8 @@ class Stretch:
     """Of the built-in scene; a sequence has its own."""
     made: SequenceConfig | None = None
     """What a sequence is made of, in place of the named one's."""
+    fps: float | None = None
+    """Frames a second; None: the scene's own."""
     mocap: Path | None = field(default=None, compare=False)
     """The recorded motions; None: where SHAPEPOSE_DATA says."""
 
@@ -75,9 +77,16 @@ class Stretch:
         extra_factors: ExtraFactors | None = None,
     ) -> Reconstruction:
         """Reconstructed at the scene's rate; only `frames` of the stretch, if given."""
-        times = FrameTimes.from_fps(self.scene.fps, len(self.span))
-        rig = self.scene.rig
-        return reconstruct(self.detections, rig, config, frames=frames, times=times, extra_factors=extra_factors)
+        scene = self.scene
+        return reconstruct(
+            self.detections,
+            scene.rig,
+            config,
+            frames=frames,
+            times=FrameTimes.from_fps(scene.fps, len(self.span)),
+            cuts=cuts_of(scene),
+            extra_factors=extra_factors,
+        )
 
 
 @dataclass(frozen=True)
@@ -142,8 +151,14 @@ def shorter(stretch: Stretch, frames: int) -> Stretch:
 @lru_cache(maxsize=2)
 def _scene(stretch: Stretch) -> Scene:
     if stretch.name == "demo":
-        frames = max(60, stretch.span.stop)
-        whole = built_in_scene(stretch.seed, people=stretch.people, cameras=stretch.cameras, frames=frames)
+        whole = named_scene(
+            "demo",
+            cameras=stretch.cameras,
+            people=stretch.people,
+            frames=stretch.span.stop,
+            seed=stretch.seed,
+            fps=stretch.fps,
+        )
         return cut(whole, stretch.span)
     whole = named_scene(
         stretch.name,
@@ -152,6 +167,7 @@ def _scene(stretch: Stretch) -> Scene:
         frames=stretch.span.stop,
         mocap=stretch.mocap,
         config=stretch.made,
+        fps=stretch.fps,
     )
     return cut(whole, stretch.span)
 
