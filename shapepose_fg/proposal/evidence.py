@@ -25,7 +25,7 @@ _BROKEN = 0.5
 _SHORT, _LONG = 0.4, 1.15
 """Lengths of a bone that nobody has, as shares of its longest."""
 _USUAL = 0.59
-"""Length of people's bones, as a share of its longest: medians of core bones of simulated people are 0.53 to 0.64."""
+"""Length of people's bones, as a share of the longest: simulated people's core bones have 0.53 to 0.64."""
 _SPREAD, _PHANTOMS_SPREAD = 0.08, 0.35
 """Sigma of its logarithm, in people and in phantoms."""
 _PHANTOMS_SHIFT = 0.08
@@ -33,11 +33,11 @@ _PHANTOMS_SHIFT = 0.08
 _PLACED_M = 0.03
 """What two joints' errors add to a bone's sigma."""
 _ASTRAY = 0.1
-"""Share of people's bones that have phantoms' lengths: a joint is wrong. These five from 5779 hypotheses of simulated
-crowds before two to six cameras."""
+"""Share of people's bones that have phantoms' lengths: a joint is wrong. All these from 5779 hypotheses of
+simulated crowds before two to six cameras."""
 _BONE = 0.3
-"""What a unit of log-likelihood of a bone counts, for they are not independent: crowds of eight before three to six
-cameras have 1 to 5 points more people found than without, and no more phantoms; with 0.6 more phantoms."""
+"""What a unit of a bone's log-likelihood counts: bones are not independent. In simulated crowds before three to
+six cameras 0 to 5 points more people are found than without, and no more phantoms, which 0.6 makes."""
 _UNAFFILIATED = 0.3
 """Affinity of a detection none of whose neighbours is seen, which says nothing."""
 

@@ -20,8 +20,9 @@ _SAME_M = 0.2
 _SAME_SHARE = 0.8
 """These are most."""
 _MOST = 64
-"""Hypotheses that are looked at in a round, the heaviest first. Simulated crowds of eight before four and six cameras: as
-many people found as with 256, a third fewer phantoms, 70 ms a frame for 190 with six; 32 loses people."""
+"""Hypotheses that are looked at in a round, the heaviest first. In simulated crowds of eight before four and six
+cameras as many people are found as with 256, with a third fewer phantoms, and in 70 ms a frame for 190 with six
+cameras; 32 loses people."""
 _PASSES = 3
 """How often detections are chosen around the joints, and joints triangulated."""
 
