@@ -9,8 +9,8 @@ from shapepose_fg.proposal.evidence import Evidence
 from shapepose_fg.proposal.hypotheses import Array, Frame, Hypotheses, settled
 from shapepose_fg.proposal.pairs_of_people import pooled
 
-_ROUNDS = 3
-"""How often people are sought among what those who were found leave: 2D people are put together anew there."""
+_ROUNDS = 8
+"""How often people are sought at most, among what those who were found leave: 2D people are put together anew."""
 _PASSES = 2
 """How often detections are given out around the joints of those who were chosen."""
 _SHARED = 0.2

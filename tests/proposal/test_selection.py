@@ -140,20 +140,36 @@ def test_joints_hang_together_as_far_as_bones_reach(five_cameras, two_people, se
 
 
 def test_what_others_explain_is_no_evidence(five_cameras, two_people, seen_exactly):
-    """All detections agree: confidence times affinity each, less what odd bones cost. A double has nothing."""
+    """All detections agree: confidence times affinity each, and what bones count. A double has nothing."""
     detections = seen_exactly(five_cameras, two_people[:1])
     frame = frame_of(detections, five_cameras)
     one = settled(two_people[:1], every_detection(detections), frame, 1)
     evidence = Evidence.of(one, frame)
     nobody_else = np.zeros(len(detections), dtype=bool)
-    expected = (detections.confidence * detections.affinity[0]).sum() - 0.5 * evidence.broken[0]
+    expected = (detections.confidence * detections.affinity[0]).sum() + evidence.bones[0]
     np.testing.assert_allclose(evidence.score(nobody_else), expected, rtol=1e-6)
     # 125 places without a detection of one's own, in views that see nothing else of the person: 0.07 each, twice.
-    np.testing.assert_allclose(
-        evidence.score(~nobody_else), -125 * (0.07 + 0.07) - 0.5 * evidence.broken[0], rtol=1e-9
-    )
+    np.testing.assert_allclose(evidence.score(~nobody_else), -125 * (0.07 + 0.07) + evidence.bones[0], rtol=1e-9)
     assert existence(one, frame)[0] > 0.99
     assert existence(one.with_more(one), frame).max() < 0.01
+
+
+def test_bones_of_usual_length_speak_for_a_person(five_cameras, two_people, seen_exactly):
+    """The same pose half again as large, or two thirds as large, is nobody's, though all detections agree."""
+
+    def bones(size, keep=lambda detections: detections.view >= 0):
+        places = two_people[:1] * size
+        detections = seen_exactly(five_cameras, places)
+        detections = detections.only(keep(detections))
+        frame = frame_of(detections, five_cameras)
+        return Evidence.of(settled(places, every_detection(detections), frame, 1), frame).bones[0]
+
+    assert bones(1.0) > 1
+    assert bones(1.0) - bones(1.5) > 3
+    assert bones(1.0) - bones(2 / 3) > 3
+    # A wrist that one view sees may be anywhere: its bone says nothing, whatever its length.
+    one_view = bones(1.0, lambda detections: (detections.joint != 4) | (detections.view == 0))
+    assert 0 < bones(1.0) - one_view < 0.6
 
 
 def test_a_view_that_misses_a_joint_and_sees_the_rest_speaks_against_it(five_cameras, two_people, seen_exactly):
