@@ -41,9 +41,7 @@ def limbs_to_exchange(joints: Sequence[str]) -> NDArray[np.intp]:
     return np.array([[place[name] for name in limb] for limb in there], dtype=np.intp).reshape(-1, 3)
 
 
-def exchange_spread(
-    joints: Array, bodies: Array, frame: NDArray[np.integer], limbs: NDArray[np.intp]
-) -> Array:
+def exchange_spread(joints: Array, bodies: Array, frame: NDArray[np.integer], limbs: NDArray[np.intp]) -> Array:
     """(N, J, 3, 3) outer products of the ways from joints to others' that may be theirs, m².
 
     Of `joints` (N, J, 3) in the `frame` (N,). Two people's limbs can have been exchanged for long, and each frame

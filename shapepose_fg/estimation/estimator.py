@@ -295,12 +295,12 @@ class Estimator:
         views: Views,
     ) -> NDArray[np.float64]:
         """Covariances (N, J, 3, 3) with all doubts: over time as calibrated, in frames alone of the detections."""
-        body, count = solution.body, solution.inlier.sum(axis=-1)
-        of_body = from_body(X, covariance, body.xyz, body.information)
+        body, count, solved = solution.body, solution.inlier.sum(axis=-1), solution.joints
+        of_body = from_body(solved, covariance, body.xyz, body.information)
         association = association_spread(observations, sigmas, final, body, views, self.config.observations)
-        moved = np.nan_to_num(X - observations.initial)
+        moved = np.nan_to_num(solved - observations.initial)
         draft = moved[..., None] * moved[..., None, :]
-        exchange = exchange_spread(X, solution.fit.joints, observations.frame, self._exchanged)
+        exchange = exchange_spread(solved, solution.fit.joints, observations.frame, self._exchanged)
         alone = np.ones(len(X), dtype=bool)
         for window in windows:
             rows, times_s = window.rows, window.graph.times_s
