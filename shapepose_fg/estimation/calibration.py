@@ -1,4 +1,4 @@
-"""What a joint's covariance is, of all that tells how well it is known: numbers that were fitted to simulated errors."""
+"""What covariances of joints are made of: all that tells how well each is known, weighed by measured numbers."""
 
 from dataclasses import dataclass
 from importlib.resources import as_file, files
@@ -32,13 +32,12 @@ class Clues:
     disagreement: Array
     """(N, J) squared Mahalanobis distance of the joint from where the body has it (`from_body`)."""
     association: Array
-    """(N, J, 3, 3) between the places with and without its doubtful observations (`doubt.association_spread`), m²."""
+    """(N, J, 3, 3) between places with and without its doubtful observations (`doubt.association_spread`), m²."""
     draft: Array
     """(N, J, 3, 3) outer product of the way from the draft, around which detections were given out, to the joint,
     m²."""
     exchange: Array
-    """(N, J, 3, 3) between the places that it has if somebody else's limb is not its own (`doubt.exchange_spread`),
-    m²."""
+    """(N, J, 3, 3) between it and others' joints that may be its own (`doubt.exchange_spread`), m²."""
 
     def rows(self, index: NDArray[np.intp]) -> "Clues":
         """Some of the rows."""
@@ -64,7 +63,7 @@ class Calibration:
 
     @classmethod
     def load(cls, joints: tuple[str, ...]) -> "Calibration":
-        """For a detector's joints, as `scripts/fit_covariances.py` wrote it; others than it names are as the mean."""
+        """For a detector's joints, as `scripts/fit_covariances.py` wrote it; joints it lacks are as the mean."""
         with as_file(files("shapepose_fg.estimation") / "data" / "calibration.json") as path:
             data = read_json(path)
         known = data["scale"]
@@ -80,8 +79,8 @@ class Calibration:
 
 
 def from_body(joints: Array, covariance: Array, prior_xyz: Array, information: Array) -> Array:
-    """(N, J) squared Mahalanobis distance of `joints` (N, J, 3), known to `covariance` (N, J, 3, 3), from where the
-    body has them, known by `information` (N, J, 3, 3): 0 where it says nothing, or they are not known.
+    """(N, J) squared Mahalanobis distance of `joints` (N, J, 3), known to `covariance` (N, J, 3, 3), from where
+    the body has them, known by `information` (N, J, 3, 3): 0 where it says nothing, or they are not known.
     """
     known = np.asarray(np.isfinite(joints).all(axis=-1) & np.isfinite(covariance).all(axis=(-2, -1)))
     away = np.where(known[..., None], joints - np.nan_to_num(prior_xyz), 0.0)[..., None]

@@ -13,8 +13,8 @@ from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter
 from shapepose_fg.camera import Rig, Views
 from shapepose_fg.estimation.alternation import Solution, Window, alternate, final_bodies
 from shapepose_fg.estimation.body_step import joint_targets
-from shapepose_fg.estimation.contact import feet_of
 from shapepose_fg.estimation.calibration import Calibration, Clues, from_body, lasting_mean
+from shapepose_fg.estimation.contact import feet_of
 from shapepose_fg.estimation.doubt import association_spread, exchange_spread, limbs_to_exchange
 from shapepose_fg.estimation.draft import (
     NARROWING,
@@ -339,7 +339,8 @@ class Estimator:
             moved = near_in_time(weak[rows], window.graph.times_s, STEP_S) & ~window.graph.touched
             lengths = limb_lengths(solution.fit.joints[rows], self._limbs)
             stepped = smoothed_in_time(steps[rows], window.graph.times_s, STEP_S)
-            stepped = X[rows] + np.where(unseen[rows][..., None], stepped, 0.0)
+            into = np.minimum(waited_s(~unseen[rows], window.graph.times_s) / STEP_S, 1.0)
+            stepped = X[rows] + into[..., None] * stepped
             placed[rows] = with_lengths(stepped, covariance[rows], moved, lengths, self._limbs)
         return placed
 

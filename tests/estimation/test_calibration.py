@@ -45,8 +45,8 @@ def test_the_numbers_that_ship():
 
 
 def test_disagreement_is_the_distance_in_both_sigmas():
-    """10 cm between a joint of 3 cm and a body of 4 cm is two sigmas; a body that says nothing does not contradict,
-    nor does anybody contradict a joint that is not known."""
+    """10 cm between a joint of 3 cm and a body of 4 cm is two sigmas. A body that says nothing contradicts
+    nobody, and nobody contradicts a joint that is not known."""
     joints = np.zeros((1, 3, 3))
     joints[0, 2] = np.nan
     covariance = np.broadcast_to(9e-4 * I3, (1, 3, 3, 3))

@@ -82,21 +82,18 @@ def test_two_limbs_that_both_bodies_can_have_may_be_exchanged():
 
 
 def test_an_exchange_needs_both_bodies_and_feet_within_reach():
-    """A child's foot fits an adult's knee, but not the adult's the child's; and what is over 60 cm away is nobody
-    else's."""
-    adult, child = [[0, 0, 0.43], [0, 0, 0]], [[0.3, 0, 0.3], [0.3, 0, 0]]
-    limbs = limbs_to_exchange(("RKnee", "RAnkle"))
-    length = np.array([adult, [[0.3, 0, 0.3], [0.3, 0, 0]]])
-    joints = np.array([adult, child])
-    unlike = np.trace(exchange_spread(joints, length, np.zeros(2, dtype=int), limbs)[0, 1])
-    alike = np.trace(
-        exchange_spread(
-            np.array([adult, np.add(adult, [0.15, 0, 0])]), length[[0, 0]], np.zeros(2, dtype=int), limbs
-        )[0, 1]
-    )
-    assert alike / 0.15**2 > 5 * unlike / 0.3**2 > 0
-    away = np.array([adult, np.add(adult, [0.7, 0, 0])])
-    assert not exchange_spread(away, length[[0, 0]], np.zeros(2, dtype=int), limbs).any()
+    """15 cm beside each other two shins of 43 cm may be exchanged, one of them and one of 30 hardly; and what is over
+    60 cm away is nobody else's."""
+    limbs, both = limbs_to_exchange(("RKnee", "RAnkle")), np.zeros(2, dtype=int)
+
+    def doubted(beside_m, shin_m):
+        joints = np.array([[[0, 0, 0.43], [0, 0, 0]], [[beside_m, 0, 0.43], [beside_m, 0, 0.43 - shin_m]]])
+        away = joints[1, 1] - joints[0, 1]
+        return np.trace(exchange_spread(joints, joints, both, limbs)[0, 1]) / (away @ away)
+
+    assert doubted(0.15, 0.43) > 0.7
+    assert 0 < doubted(0.15, 0.3) < 0.01
+    assert doubted(0.7, 0.43) == 0
 
 
 def test_who_has_no_body_or_no_place_exchanges_nothing():
