@@ -12,6 +12,10 @@ Array = NDArray[np.float64]
 
 LASTS_S = 0.25
 """Doubts are the same before and after, over this time, seconds, one sigma; 0.5 and 1 s scored less."""
+SURE_M = 0.02
+"""Joints that views see are known to this, metres."""
+CARRIED_MOST = 3.0
+"""A joint that no view sees is as doubtful at any sigma over this many times as much: it has room enough then."""
 
 
 @dataclass(frozen=True)
@@ -39,9 +43,11 @@ class Clues:
     exchange: Array
     """(N, J, 3, 3) between it and others' joints that may be its own (`doubt.exchange_spread`), m²."""
 
-    def rows(self, index: NDArray[np.intp]) -> "Clues":
-        """Some of the rows."""
-        return Clues(**{name: values[index] for name, values in vars(self).items()})
+    @property
+    def carried(self) -> Array:
+        """(N, J) sigma over `SURE_M` of joints that no view sees, from 1 to `CARRIED_MOST`; 1 of others."""
+        sigma_m = np.sqrt(np.trace(self.covariance, axis1=-2, axis2=-1) / 3)
+        return np.where(self.views == 0, np.clip(sigma_m / SURE_M, 1.0, CARRIED_MOST), 1.0)
 
 
 @dataclass(frozen=True)
@@ -53,6 +59,9 @@ class Calibration:
     recording's errors a shoulder or a hip is known less well than the graph takes it, a nose or a knee better."""
     power: float
     """And with one plus the disagreement, to this."""
+    unseen: float
+    """And, of a joint that no view sees, with its sigma over `SURE_M`, to this, where that is over 1: body and
+    motion, which carry it then, err rarely and by much."""
     association: float
     """How many times the clue of this name is added: single doubts of several views, of neighbouring joints and of
     frames are one."""
@@ -69,11 +78,11 @@ class Calibration:
         known = data["scale"]
         mean = float(np.exp(np.mean(np.log(list(known.values())))))
         scale = np.array([known.get(name, mean) for name in joints])
-        return cls(scale, *(float(data[name]) for name in ("power", "association", "draft", "exchange")))
+        return cls(scale, *(float(data[name]) for name in ("power", "unseen", "association", "draft", "exchange")))
 
     def covariance(self, clues: Clues) -> Array:
         """(N, J, 3, 3) covariances to report, m²."""
-        times = self.scale * (1 + clues.disagreement) ** self.power
+        times = self.scale * (1 + clues.disagreement) ** self.power * clues.carried**self.unseen
         added = self.association * clues.association + self.draft * clues.draft + self.exchange * clues.exchange
         return times[..., None, None] * clues.covariance + added
 

@@ -82,7 +82,7 @@ def test_two_limbs_that_both_bodies_can_have_may_be_exchanged():
 
 
 def test_an_exchange_needs_both_bodies_and_feet_within_reach():
-    """15 cm beside each other two shins of 43 cm may be exchanged, one of them and one of 30 hardly; and what is over
+    """15 cm beside each other two shins of 43 cm may be exchanged, one of 43 and one of 30 hardly; what is over
     60 cm away is nobody else's."""
     limbs, both = limbs_to_exchange(("RKnee", "RAnkle")), np.zeros(2, dtype=int)
 
