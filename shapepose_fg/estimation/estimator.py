@@ -13,8 +13,9 @@ from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter
 from shapepose_fg.camera import Rig, Views
 from shapepose_fg.estimation.alternation import Solution, Window, alternate, final_bodies
 from shapepose_fg.estimation.body_step import joint_targets
+from shapepose_fg.estimation.calibration import Calibration, Clues, from_body, lasting_mean
 from shapepose_fg.estimation.contact import feet_of
-from shapepose_fg.estimation.doubt import association_spread, lasting_spread
+from shapepose_fg.estimation.doubt import association_spread, exchange_spread, limbs_to_exchange
 from shapepose_fg.estimation.draft import (
     NARROWING,
     WholeFitter,
@@ -26,6 +27,7 @@ from shapepose_fg.estimation.draft import (
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.limb_lengths import limb_lengths, limbs_of, with_lengths
 from shapepose_fg.estimation.linearisation import (
+    ViewEvidence,
     linearise,
     mean_confidence,
     observation_sigmas,
@@ -39,7 +41,6 @@ from shapepose_fg.estimation.outcome import (
     how_known,
     problems,
     reported_covariance,
-    since,
     strong,
     waited_s,
 )
@@ -117,7 +118,9 @@ class Estimator:
         self.joints = joints
         self._limbs = limbs_of(joints)
         self._hiding = limbs_that_hide(joints)
+        self._exchanged = limbs_to_exchange(joints)
         self._motion = MotionModel.load(joints, self.config.motion)
+        self._calibration = Calibration.load(joints)
 
     def estimate(
         self, observations: Observations, extra_factors: ExtraFactors | None = None, views: Views | None = None
@@ -254,15 +257,11 @@ class Estimator:
             X = self._limbs_kept(X, covariance, windows, solution)
         fit = final_bodies(solution, covariance, windows, self.fitter)
         final = linearise(observations, sigmas, X, views, self.config.observations)
-        spread = association_spread(observations, sigmas, final, solution.body, views, self.config.observations)
+        covariance = self._calibrated(X, covariance, observations, sigmas, final, windows, solution, views)
         reported, sizes = strong(solution, observations), self.rig.image_sizes
         elsewhere = elsewhere_variance(X, observations.frame, reported, views, sizes, self._hiding)
         for window in windows:
-            count, times_s = solution.inlier[window.rows].sum(axis=-1), window.graph.times_s
-            if window.graph.temporal:
-                covariance[window.rows] *= since(count >= 2, times_s)[..., None, None]
-            covariance[window.rows] += lasting_spread(spread[window.rows], count > 0, times_s)
-            waited = waited_s(np.asarray(reported[window.rows].any(axis=-1)), times_s)
+            waited = waited_s(np.asarray(reported[window.rows].any(axis=-1)), window.graph.times_s)
             moved = np.minimum(elsewhere[window.rows], (SPEED_M_S * waited) ** 2)
             covariance[window.rows] += moved[..., None, None] * np.eye(3)
         wrong = problems(observations, windows, solution, first, covariance)
@@ -282,6 +281,38 @@ class Estimator:
             fit=fit,
             status=status,
             problems=wrong,
+        )
+
+    def _calibrated(
+        self,
+        X: NDArray[np.float64],
+        covariance: NDArray[np.float64],
+        observations: Observations,
+        sigmas: NDArray[np.float64],
+        final: ViewEvidence,
+        windows: Sequence[Window],
+        solution: Solution,
+        views: Views,
+    ) -> NDArray[np.float64]:
+        """Covariances (N, J, 3, 3) with all doubts: over time as calibrated, in frames alone of the detections."""
+        body, count, solved = solution.body, solution.inlier.sum(axis=-1), solution.joints
+        of_body = from_body(solved, covariance, body.xyz, body.information)
+        association = association_spread(observations, sigmas, final, body, views, self.config.observations)
+        moved = np.nan_to_num(solved - observations.initial)
+        draft = moved[..., None] * moved[..., None, :]
+        exchange = exchange_spread(solved, solution.fit.joints, observations.frame, self._exchanged)
+        alone = np.ones(len(X), dtype=bool)
+        for window in windows:
+            rows, times_s = window.rows, window.graph.times_s
+            alone[rows] = not window.graph.temporal
+            association[rows] = lasting_mean(association[rows], times_s, count[rows] > 0)
+            for clue in (of_body, draft, exchange):
+                clue[rows] = lasting_mean(clue[rows], times_s)
+        clues = Clues(observations.frame, X, count, covariance, of_body, association, draft, exchange)
+        return np.where(
+            alone[:, None, None, None],
+            covariance + self._calibration.association * association,
+            self._calibration.covariance(clues),
         )
 
     def _limbs_kept(
@@ -308,7 +339,8 @@ class Estimator:
             moved = near_in_time(weak[rows], window.graph.times_s, STEP_S) & ~window.graph.touched
             lengths = limb_lengths(solution.fit.joints[rows], self._limbs)
             stepped = smoothed_in_time(steps[rows], window.graph.times_s, STEP_S)
-            stepped = X[rows] + np.where(unseen[rows][..., None], stepped, 0.0)
+            into = np.minimum(waited_s(~unseen[rows], window.graph.times_s) / STEP_S, 1.0)
+            stepped = X[rows] + into[..., None] * stepped
             placed[rows] = with_lengths(stepped, covariance[rows], moved, lengths, self._limbs)
         return placed
 

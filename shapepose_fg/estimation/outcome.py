@@ -17,9 +17,6 @@ RUNAWAY_M = 1.0
 RUNAWAY_SIGMA = 20.0
 """So has one that ends this many standard deviations, and half a metre, from what views and body say of it."""
 _HALF_M = 0.5
-GROWS_S, GROWS_POWER, GROWS_MOST_S = 0.3, 0.2, 3.0
-"""The variance of a joint that two views saw t seconds ago grows with (1 + t / 0.3 s)^0.2, up to 3 s. Chosen as
-`doubt.TOGETHER`: log score of joints of one view 7.09 -> 7.12, of none 5.0 -> 5.15."""
 WEAK_SCORE = 0.3
 """Detections of a lower score are weak: in simulated crowds one in 18 is not the person's, of others one in 60."""
 WEAK_PROBABILITY = 0.5
@@ -67,14 +64,6 @@ def reported_covariance(
     own = (1 - f) / f**2 * marginal @ said @ marginal
     total = np.where(seen[..., None, None], (1 - kept) * marginal, marginal + own) + (1 - f + kept * f) * left
     return np.where(simple[..., None, None], total, marginal)
-
-
-def since(twice: NDArray[np.bool_], times_s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(T, J) what covariances are multiplied with for the time to the nearest frame in which two views see it.
-
-    `twice` (T, J). 1 where they do; what one view or none leaves open drifts for longer than the model has it.
-    """
-    return (1 + np.minimum(waited_s(twice, times_s), GROWS_MOST_S) / GROWS_S) ** GROWS_POWER
 
 
 def waited_s(seen: NDArray[np.bool_], times_s: NDArray[np.float64]) -> NDArray[np.float64]:

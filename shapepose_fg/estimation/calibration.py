@@ -1,0 +1,110 @@
+"""What covariances of joints are made of: all that tells how well each is known, weighed by measured numbers."""
+
+from dataclasses import dataclass
+from importlib.resources import as_file, files
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.files import read_json
+
+Array = NDArray[np.float64]
+
+LASTS_S = 0.25
+"""Doubts are the same before and after, over this time, seconds, one sigma; 0.5 and 1 s scored less."""
+SURE_M = 0.02
+"""Joints that views see are known to this, metres."""
+CARRIED_MOST = 3.0
+"""A joint that no view sees is as doubtful at any sigma over this many times as much: it has room enough then."""
+
+
+@dataclass(frozen=True)
+class Clues:
+    """How well the joints of N rows, solved over time, are known: what the graph says, and what speaks against it.
+
+    All but `covariance` are means over the frames around (`lasting_mean`).
+    """
+
+    frame: NDArray[np.integer]
+    """(N,) frame of each row."""
+    joints: Array
+    """(N, J, 3) the joints, metres; NaN where unknown."""
+    views: NDArray[np.integer]
+    """(N, J) how many views see each."""
+    covariance: Array
+    """(N, J, 3, 3) of the graph, errors that last in it, m²."""
+    disagreement: Array
+    """(N, J) squared Mahalanobis distance of the joint from where the body has it (`from_body`)."""
+    association: Array
+    """(N, J, 3, 3) between places with and without its doubtful observations (`doubt.association_spread`), m²."""
+    draft: Array
+    """(N, J, 3, 3) outer product of the way from the draft, around which detections were given out, to the joint,
+    m²."""
+    exchange: Array
+    """(N, J, 3, 3) between it and others' joints that may be its own (`doubt.exchange_spread`), m²."""
+
+    @property
+    def carried(self) -> Array:
+        """(N, J) sigma over `SURE_M` of joints that no view sees, from 1 to `CARRIED_MOST`; 1 of others."""
+        sigma_m = np.sqrt(np.trace(self.covariance, axis1=-2, axis2=-1) / 3)
+        return np.where(self.views == 0, np.clip(sigma_m / SURE_M, 1.0, CARRIED_MOST), 1.0)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What each clue weighs."""
+
+    scale: Array
+    """(J,) what the variances of each joint are multiplied with where nothing speaks against them: by the whole
+    recording's errors a shoulder or a hip is known less well than the graph takes it, a nose or a knee better."""
+    power: float
+    """And with one plus the disagreement, to this."""
+    unseen: float
+    """And, of a joint that no view sees, with its sigma over `SURE_M`, to this, where that is over 1: body and
+    motion, which carry it then, err rarely and by much."""
+    association: float
+    """How many times the clue of this name is added: single doubts of several views, of neighbouring joints and of
+    frames are one."""
+    draft: float
+    """Likewise."""
+    exchange: float
+    """Likewise: how probable it is that two limbs that both bodies can have are exchanged."""
+
+    @classmethod
+    def load(cls, joints: tuple[str, ...]) -> "Calibration":
+        """For a detector's joints, as `scripts/fit_covariances.py` wrote it; joints it lacks are as the mean."""
+        with as_file(files("shapepose_fg.estimation") / "data" / "calibration.json") as path:
+            data = read_json(path)
+        known = data["scale"]
+        mean = float(np.exp(np.mean(np.log(list(known.values())))))
+        scale = np.array([known.get(name, mean) for name in joints])
+        return cls(scale, *(float(data[name]) for name in ("power", "unseen", "association", "draft", "exchange")))
+
+    def covariance(self, clues: Clues) -> Array:
+        """(N, J, 3, 3) covariances to report, m²."""
+        times = self.scale * (1 + clues.disagreement) ** self.power * clues.carried**self.unseen
+        added = self.association * clues.association + self.draft * clues.draft + self.exchange * clues.exchange
+        return times[..., None, None] * clues.covariance + added
+
+
+def from_body(joints: Array, covariance: Array, prior_xyz: Array, information: Array) -> Array:
+    """(N, J) squared Mahalanobis distance of `joints` (N, J, 3), known to `covariance` (N, J, 3, 3), from where
+    the body has them, known by `information` (N, J, 3, 3): 0 where it says nothing, or they are not known.
+    """
+    known = np.asarray(np.isfinite(joints).all(axis=-1) & np.isfinite(covariance).all(axis=(-2, -1)))
+    away = np.where(known[..., None], joints - np.nan_to_num(prior_xyz), 0.0)[..., None]
+    both = np.eye(3) + information @ np.where(known[..., None, None], covariance, 0.0)
+    return (away.mT @ np.linalg.solve(both, information @ away))[..., 0, 0]
+
+
+def lasting_mean(values: Array, times_s: Array, where: NDArray[np.bool_] | None = None) -> Array:
+    """Values (T, J, ...) of one person's joints, averaged over the frames around in which they are `where` (T, J).
+
+    What leads a joint astray in one frame does so in the next; and a joint that is not seen is where doubtful
+    frames left it.
+    """
+    where = np.ones(values.shape[:2], dtype=bool) if where is None else where
+    near = np.exp(-0.5 * ((times_s[:, None] - times_s) / LASTS_S) ** 2) + 1e-9
+    flat = values.reshape(*values.shape[:2], -1)
+    total = np.maximum(near @ where, 1e-9)
+    return (np.einsum("ts,sjk->tjk", near, flat * where[..., None]) / total[..., None]).reshape(values.shape)
