@@ -28,7 +28,7 @@ from shapepose_fg.simulation.scene import Scene
 from shapepose_fg.simulation.sequences import SEQUENCES, Split, sequence
 from shapepose_fg.skeleton import BODY_25
 
-CASES = (
+CASES: tuple[tuple[str, Split, int, int], ...] = (
     ("crowd", "tune", 7001, 3), ("crossing", "tune", 7002, 3), ("crowd", "tune", 7003, 4),
     ("crossing", "tune", 7004, 4), ("two", "tune", 7005, 2), ("crowd", "tune", 7006, 3),
     ("crossing", "tune", 7007, 3), ("two", "tune", 7008, 2), ("crowd", "tune", 7009, 6),

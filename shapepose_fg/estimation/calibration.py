@@ -22,7 +22,7 @@ CARRIED_MOST = 3.0
 class Clues:
     """How well the joints of N rows, solved over time, are known: what the graph says, and what speaks against it.
 
-    All but `covariance` are means over the frames around (`lasting_mean`).
+    The last four are means over the frames around (`lasting_mean`).
     """
 
     frame: NDArray[np.integer]
