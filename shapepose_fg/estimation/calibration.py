@@ -22,7 +22,7 @@ CARRIED_MOST = 3.0
 class Clues:
     """How well the joints of N rows, solved over time, are known: what the graph says, and what speaks against it.
 
-    All but `covariance` are means over the frames around (`lasting_mean`).
+    The last four are means over the frames around (`lasting_mean`).
     """
 
     frame: NDArray[np.integer]
@@ -94,7 +94,7 @@ def from_body(joints: Array, covariance: Array, prior_xyz: Array, information: A
     known = np.asarray(np.isfinite(joints).all(axis=-1) & np.isfinite(covariance).all(axis=(-2, -1)))
     away = np.where(known[..., None], joints - np.nan_to_num(prior_xyz), 0.0)[..., None]
     both = np.eye(3) + information @ np.where(known[..., None, None], covariance, 0.0)
-    return (away.mT @ np.linalg.solve(both, information @ away))[..., 0, 0]
+    return np.asarray((away.mT @ np.linalg.solve(both, information @ away))[..., 0, 0], dtype=np.float64)
 
 
 def lasting_mean(values: Array, times_s: Array, where: NDArray[np.bool_] | None = None) -> Array:

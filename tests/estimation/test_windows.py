@@ -246,7 +246,7 @@ def test_a_joint_lost_from_sight_keeps_its_place_beside_the_body(walk, five_came
 @pytest.mark.usefixtures("out_of_sight")
 def test_a_joint_lost_for_long_goes_to_the_body(walk, five_cameras, two_people):
     """Hidden from frame 5 on: after a second, what was known of it has faded, and the covariance is the body's
-    15 cm, and a little more."""
+    15 cm, and half as much again, as carried joints err."""
     observations, truth = walk
     rows = np.flatnonzero((observations.track == 0) & (observations.frame >= 5))
     beside = np.array([0.0, 0.12, 0.0])
@@ -254,7 +254,7 @@ def test_a_joint_lost_for_long_goes_to_the_body(walk, five_cameras, two_people):
     off = (found.joints[rows, WRIST] - truth[rows, WRIST]) @ beside / 0.12
     assert off[0] < 0.01 and off[-1] > 0.04 and (np.diff(off[3:]) > 0).all()
     sigma = np.sqrt(np.trace(found.covariance[rows, WRIST], axis1=1, axis2=2) / 3)
-    assert (np.diff(sigma) > 0).all() and 0.09 < sigma[-1] < 0.18
+    assert (np.diff(sigma) > 0).all() and 0.15 < sigma[-1] < 0.25
 
 
 def test_frames_may_be_missing(walk, five_cameras, two_people):
