@@ -33,7 +33,7 @@ from shapepose_fg.skeleton import BODY_25
 FRAMES = 6
 SAME_M = 1e-3
 few = settings(
-    max_examples=3, derandomize=True, database=None, deadline=None, suppress_health_check=list(HealthCheck)
+    max_examples=2, derandomize=True, database=None, deadline=None, suppress_health_check=list(HealthCheck)
 )
 
 

@@ -51,11 +51,11 @@ def named_scene(
         raise InputError(f"{name}: there is no such scene; give one of {' '.join(NAMES)}")
     if not 2 <= cameras <= 12:
         raise InputError(f"--cameras {cameras}: must be 2 to 12")
+    rate: dict[str, Any] = {} if fps is None else {"fps": fps}
     if name == "demo":
         people = 4 if people is None else people
         if not 0 <= people <= 12:
             raise InputError(f"--people {people}: must be 0 to 12")
-        rate = {} if fps is None else {"fps": fps}
         return built_in_scene(seed, people=people, cameras=cameras, frames=max(60, frames), **rate)
     if split not in get_args(Split):
         raise InputError(f"--split {split}: must be {' or '.join(get_args(Split))}")
@@ -65,7 +65,6 @@ def named_scene(
         )
     until = frames if frames > 0 else None
     motions = Mocap.load(_motions(mocap))
-    rate = {} if fps is None else {"fps": fps}
     return sequence(name, split, motions, cameras=cameras, until=until, config=config, **rate)  # type: ignore[arg-type]
 
 

@@ -41,7 +41,7 @@ class Box:
 
 def experiment(scale: Scale) -> Experiment:
     """Wrists with the box and without, with time and without, before three cameras and six."""
-    frames = range(10 if scale.quick else 60)
+    frames = range(4 if scale.quick else 60)
     cases = []
     for count in CAMERAS:
         stretches = [Stretch("demo", frames, cameras=count, seed=seed, people=1) for seed in SEEDS]
