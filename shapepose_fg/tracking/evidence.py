@@ -18,6 +18,12 @@ _PRICE = 0.15
 """What a second of being there costs, in seconds in which every joint is seen by every view. A person is believed
 in where the share of places with detections of their own is over price / (1 + price), an eighth: people in
 simulated crowds have a half of theirs and people behind others a quarter, phantoms less."""
+_PRICE_HIDDEN = 0.15
+"""x"""
+_LIMB_M = 0.12
+"""x"""
+_IN_FRONT_M = 0.15
+"""x"""
 _SURE_AFFINITY = 0.6
 """Mean affinity to the person's other detections from which on a detection counts wholly."""
 _ALONE = 0.5
@@ -60,31 +66,70 @@ class Chosen:
 
 
 def weighed(
-    candidate: NDArray[np.intp], places: Array, detections: Detections, rig: Rig, skeleton: Skeleton
-) -> tuple[Array, NDArray[np.intp]]:
-    """What each detection of A people counts (A, J, V), and how many places they should be seen at (A,).
-
-    `candidate` (A, J, V) are detections of one frame, -1 for none, `places` (A, J, 3) the joints, metres, NaN
-    where unknown. A detection counts by its affinity to the same person's others. A place is a joint in the
-    picture of a view; joints whose place is unknown are thought to be where the others are in the mean.
+    candidate: NDArray[np.intp],
+    places: Array,
+    detections: Detections,
+    rig: Rig,
+    skeleton: Skeleton,
+    world: NDArray[np.intp],
+) -> tuple[Array, Array]:
+    """What each detection of A people counts (A, J, V), and the price of being there (A,), both as shares of the
+    places where they should be seen.
     """
     known = np.asarray(np.isfinite(places).all(axis=-1))[..., None]
     centre = np.where(known, places, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
     xy, depth = rig.project(np.where(known, places, centre[:, None]))
     inside = ((xy >= 0) & (xy < rig.image_sizes[:, None, None])).all(axis=-1) & (depth > 0)
+    expected = np.maximum(inside.sum(axis=(0, 2)), 1)
+    hidden = _hidden(xy, depth, known[..., 0], rig, skeleton, world)
+    price = np.where(inside, np.where(hidden, _PRICE_HIDDEN, _PRICE), 0.0)
     weight = np.zeros(candidate.shape)
     seen = candidate >= 0
     if seen.any():
         affinity, neighbours = mean_affinity(owned(candidate, len(detections)), detections, skeleton, len(rig))
         counts = np.where(neighbours > 0, np.clip(affinity / _SURE_AFFINITY, 0.0, 1.0), _ALONE)
         weight[seen] = counts[np.nonzero(seen)[0], candidate[seen]]
-    return weight, inside.sum(axis=(0, 2))
+    weight *= 1 + np.moveaxis(price, 0, 2)
+    return weight / expected[:, None, None], price.sum(axis=(0, 2)) / expected
+
+
+def _hidden(
+    xy: Array,
+    depth: Array,
+    known: NDArray[np.bool_],
+    rig: Rig,
+    skeleton: Skeleton,
+    world: NDArray[np.intp],
+) -> NDArray[np.bool_]:
+    """(V, A, J) joints in front of which a limb of somebody else of the same world is."""
+    limbs = np.array([(c, skeleton.parents[c]) for c in skeleton.core if skeleton.parents[c] in skeleton.core])
+    seen = np.where(known[..., None], xy, np.nan)
+    margin = 2 * _LIMB_M * rig.focal_px[:, None] / np.maximum(np.nanmin(np.where(known,depth,np.nan), axis=2), 0.3)
+    low, high = np.nanmin(seen, axis=2) - margin[..., None], np.nanmax(seen, axis=2) + margin[..., None]
+    other = (world[:, None] == world) & ~np.eye(len(world), dtype=bool)
+    near = (low[:, :, None] < high[:, None]).all(-1) & (low[:, None] < high[:, :, None]).all(-1)
+    front = np.nanmin(np.where(known,depth,np.nan), axis=2)[:, None] < np.nanmax(np.where(known,depth,np.nan), axis=2)[:, :, None] - _IN_FRONT_M
+    view, whose, who = np.nonzero(near & other & front)
+    hidden = np.zeros(depth.shape, dtype=bool)
+    f = np.float32
+    p, z = xy[view, whose].astype(f), depth[view, whose].astype(f)
+    a, b = (np.where(known[who][:, limbs[:, n], None], xy[view, who][:, limbs[:, n]], np.nan).astype(f) for n in (0, 1))
+    za, zb = (depth[view, who][:, limbs[:, n]].astype(f) for n in (0, 1))
+    along = b - a
+    to = p[:, :, None] - a[:, None]
+    at = np.clip((to * along[:, None]).sum(-1) / np.maximum((along**2).sum(-1), f(1e-6))[:, None], f(0), f(1))
+    off = ((to - at[..., None] * along[:, None])**2).sum(-1)
+    zl = za[:, None] + at * (zb - za)[:, None]
+    hides = (off * zl**2 < (_LIMB_M * rig.focal_px[view].astype(f)[:, None, None])**2) & (zl < z[:, :, None] - _IN_FRONT_M) & (zl > 0)
+    row, joint = np.nonzero(hides.any(axis=2))
+    hidden[view[row], whose[row], joint] = True
+    return hidden
 
 
 def choose(
     candidate: NDArray[np.integer],
     weight: NDArray[np.floating],
-    expected: NDArray[np.integer],
+    price: NDArray[np.floating],
     there: NDArray[np.bool_],
     world: NDArray[np.intp],
     counts: NDArray[np.intp],
@@ -100,7 +145,7 @@ def choose(
     over from one person to another, always to who is seen better, is better than either of them, and leaves the
     others with too little.
     """
-    account = _Account.of(candidate, weight, expected, there, counts, lasts_s)
+    account = _Account.of(candidate, weight, price, there, counts, lasts_s)
     if len(there) == 0:
         return account.chosen(np.zeros(0, dtype=bool))
     bound = np.bincount(world, np.maximum(_best_stretches(account.alone)[0], 0.0))
@@ -117,8 +162,8 @@ class _Account:
     """(H, T, J V) each detection's place among those of all frames; one more stands for none."""
     weight: NDArray[np.float32]
     """(H, T, J V) what it counts."""
-    expected: NDArray[np.integer]
-    """(H, T) places in which the person should be seen."""
+    price: NDArray[np.floating]
+    """(H, T) what being there costs."""
     there: NDArray[np.bool_]
     """(H, T) where there is something to say."""
     lasts_s: Array
@@ -131,7 +176,7 @@ class _Account:
         cls,
         candidate: NDArray[np.integer],
         weight: NDArray[np.floating],
-        expected: NDArray[np.integer],
+        price: NDArray[np.floating],
         there: NDArray[np.bool_],
         counts: NDArray[np.intp],
         lasts_s: Array,
@@ -141,7 +186,7 @@ class _Account:
         first, count = np.cumsum(counts) - counts, int(counts.sum())
         place = np.where(candidate >= 0, candidate + first[:, None, None], count).reshape(shape)
         weights = np.where(candidate >= 0, weight, 0.0).reshape(shape).astype(np.float32)
-        return cls(place, weights, np.maximum(expected, 1), there, lasts_s, count)
+        return cls(place, weights, price, there, lasts_s, count)
 
     @property
     def free(self) -> NDArray[np.float32]:
@@ -155,8 +200,8 @@ class _Account:
 
     def gains(self, free: NDArray[np.float32], span: slice) -> Array:
         """(H, S) evidence of each hypothesis in the frames of `span`, seconds, of detections that are `free`."""
-        share = np.einsum("htk,htk->ht", self.weight[:, span], free[self.place[:, span]]) / self.expected[:, span]
-        return np.where(self.there[:, span], ((1 + _PRICE) * share - _PRICE) * self.lasts_s[span], -np.inf)
+        share = np.einsum("htk,htk->ht", self.weight[:, span], free[self.place[:, span]])
+        return np.where(self.there[:, span], (share - self.price[:, span]) * self.lasts_s[span], -np.inf)
 
     def chosen(self, first: NDArray[np.bool_]) -> Chosen:
         """People one after the other, the best of those `first` (H,) before all others."""

@@ -63,8 +63,8 @@ class Hypotheses:
     """(H, T, J, 3) where their joints would be, metres; NaN where that is not known well."""
     weight: NDArray[np.float32]
     """(H, T, J, V) what each detection counts as evidence (`weighed`)."""
-    expected: NDArray[np.int32]
-    """(H, T) in how many places they should be seen."""
+    price: NDArray[np.float32]
+    """(H, T) what being there costs."""
     joints: JointStates
     """Where their joints are in the frame from which people are carried on."""
 
@@ -125,7 +125,7 @@ def times_of(frames: Sequence[Input]) -> Array:
 def _choose(found: Hypotheses, frames: Sequence[Input]) -> Chosen:
     counts = np.array([len(frame.detections) for frame in frames], dtype=np.intp)
     lasts_s = lasting(times_of(frames))
-    return choose(found.candidate, found.weight, found.expected, found.there, found.world, counts, lasts_s)
+    return choose(found.candidate, found.weight, found.price, found.there, found.world, counts, lasts_s)
 
 
 def lasting(times_s: Array) -> Array:
@@ -173,7 +173,7 @@ def _restarts(
     T = len(frames)
     placed = np.isfinite(found.places[chosen.hypothesis]).all(axis=-1).any(axis=-1)
     there = np.array([chosen.during(t) for t in range(T)]).T & placed
-    share = found.weight[chosen.hypothesis].sum(axis=(2, 3)) / np.maximum(found.expected[chosen.hypothesis], 1)
+    share = found.weight[chosen.hypothesis].sum(axis=(2, 3))
     worth = np.where(there, share, -0.5).sum(axis=0)
     parts = np.array_split(np.arange(T), min(T, max(1, round((times[-1] - times[0]) / _RESTART_S))))
     seeds = []
@@ -251,7 +251,7 @@ class _Log:
         self.tracker, self.frames, self.keep = tracker, frames, keep
         self.shape = (len(tracker.skeleton), len(frames[0].rig))
         self.carried, self.world = list[int](), list[int]()
-        self.parts = list[tuple[int, NDArray[np.intp], NDArray[np.intp], Array, Array, NDArray[np.intp]]]()
+        self.parts = list[tuple[int, NDArray[np.intp], NDArray[np.intp], Array, Array, Array]]()
         self.kept = list[tuple[NDArray[np.intp], JointStates]]()
 
     def numbered(self, seeds: Sequence[Seed]) -> list[NDArray[np.intp]]:
@@ -274,8 +274,10 @@ class _Log:
             return
         frame, joints = self.frames[t], tracks.joints
         places = np.where((joints.sigma_m < _PLACED_M)[..., None], joints.position, np.nan)
-        weight, expected = weighed(candidate, places, frame.detections, frame.rig, self.tracker.skeleton)
-        self.parts.append((t, tracks.ids, candidate, places, weight, expected))
+        weight, price = weighed(
+            candidate, places, frame.detections, frame.rig, self.tracker.skeleton, tracks.world
+        )
+        self.parts.append((t, tracks.ids, candidate, places, weight, price))
         if t == self.keep:
             self.kept.append((tracks.ids, joints))
 
@@ -283,14 +285,14 @@ class _Log:
         """All of it."""
         H, T, (J, V) = len(self.carried), len(self.frames), self.shape
         there = np.zeros((H, T), dtype=bool)
-        candidate, expected = np.full((H, T, J, V), -1, dtype=np.int32), np.zeros((H, T), dtype=np.int32)
+        candidate, price = np.full((H, T, J, V), -1, dtype=np.int32), np.zeros((H, T), dtype=np.float32)
         places, weight = np.full((H, T, J, 3), np.nan), np.zeros((H, T, J, V), dtype=np.float32)
-        for t, ids, own, at, counts, many in self.parts:
+        for t, ids, own, at, counts, costs in self.parts:
             there[ids, t], candidate[ids, t], places[ids, t] = True, own, at
-            weight[ids, t], expected[ids, t] = counts, many
+            weight[ids, t], price[ids, t] = counts, costs
         mean, covariance = np.zeros((H, J, 6)), np.zeros((H, J, 6, 6))
         for ids, joints in self.kept:
             mean[ids], covariance[ids] = joints.mean, joints.covariance
         carried, world = (np.array(each, dtype=np.intp) for each in (self.carried, self.world))
         joints = JointStates(mean, covariance)
-        return Hypotheses(carried, world, there, candidate, places, weight, expected, joints)
+        return Hypotheses(carried, world, there, candidate, places, weight, price, joints)
