@@ -14,11 +14,11 @@ from shapepose_fg.skeleton import Skeleton
 
 Array = NDArray[np.float64]
 
-_PRICE = 0.15
+_PRICE = 0.3
 """What a second of being there costs, in seconds in which every joint is seen by every view. A person is believed
 in where the share of places with detections of their own is over price / (1 + price), an eighth: people in
 simulated crowds have a half of theirs and people behind others a quarter, phantoms less."""
-_PRICE_HIDDEN = 0.15
+_PRICE_HIDDEN = 0.05
 """x"""
 _LIMB_M = 0.12
 """x"""

@@ -190,10 +190,11 @@ def follow_worlds(tracker: Tracker, frames: Sequence[Input], seeds: Sequence[See
     """Follow all `seeds` forwards and backwards through T frames, side by side."""
     log = _Log(tracker, frames, keep)
     numbers = log.numbered(seeds)
+    born = list[tuple[int, Seed, NDArray[np.intp]]]()
     for forwards in (True, False):
         part = [(w, s, n) for w, (s, n) in enumerate(zip(seeds, numbers, strict=True))]
         part = [each for each in part if (each[1].forwards if forwards else each[1].backwards)]
-        _follow(tracker, frames, part, log, forwards=forwards)
+        born = _follow(tracker, frames, part + born, log, forwards=forwards)
     return log.hypotheses()
 
 
@@ -204,9 +205,10 @@ def _follow(
     log: "_Log",
     *,
     forwards: bool,
-) -> None:
+) -> list[tuple[int, Seed, NDArray[np.intp]]]:
     """One way through the frames: (world, seed, numbers of its people) begin in the seed's frame."""
     tracks, births = Tracks.none(tracker.skeleton), dict[int, int]()
+    born = list[tuple[int, Seed, NDArray[np.intp]]]()
     begins = dict[int, list[tuple[Tracks, NDArray[np.intp]]]]()
     for world, seed, numbers in seeds:
         place = np.full(len(numbers), world, dtype=np.intp)
@@ -241,7 +243,9 @@ def _follow(
                     places, log.more(len(places), world), np.full(len(places), world, dtype=np.intp), time_s
                 )
                 log.add(t, new, theirs)
+                born.append((world, Seed(t, new, theirs), new.ids))
                 tracks, candidate = tracks.joined(new), np.concatenate([candidate, theirs])
+    return born
 
 
 class _Log:
