@@ -102,27 +102,29 @@ def _hidden(
     world: NDArray[np.intp],
 ) -> NDArray[np.bool_]:
     """(V, A, J) joints in front of which a limb of somebody else of the same world is."""
-    limbs = np.array([(c, skeleton.parents[c]) for c in skeleton.core if skeleton.parents[c] in skeleton.core])
-    seen = np.where(known[..., None], xy, np.nan)
-    margin = 2 * _LIMB_M * rig.focal_px[:, None] / np.maximum(np.nanmin(np.where(known,depth,np.nan), axis=2), 0.3)
-    low, high = np.nanmin(seen, axis=2) - margin[..., None], np.nanmax(seen, axis=2) + margin[..., None]
+    core = set(skeleton.core)
+    ends = np.array([(skeleton.parents[j], j) for j in skeleton.core if skeleton.parents[j] in core]).T
+    away = np.where(known, depth, np.nan)
+    least_m, most_m = np.fmin.reduce(away, axis=2), np.fmax.reduce(away, axis=2)
+    focal_px, flat = rig.focal_px.astype(np.float32), np.where(known[..., None], xy, np.nan)
+    margin = (_LIMB_M * focal_px[:, None] / np.maximum(least_m, _LIMB_M))[..., None]
+    low, high = np.fmin.reduce(flat, axis=2) - margin, np.fmax.reduce(flat, axis=2) + margin
     other = (world[:, None] == world) & ~np.eye(len(world), dtype=bool)
-    near = (low[:, :, None] < high[:, None]).all(-1) & (low[:, None] < high[:, :, None]).all(-1)
-    front = np.nanmin(np.where(known,depth,np.nan), axis=2)[:, None] < np.nanmax(np.where(known,depth,np.nan), axis=2)[:, :, None] - _IN_FRONT_M
-    view, whose, who = np.nonzero(near & other & front)
+    other = other & (low[:, :, None] < high[:, None]).all(axis=-1) & (low[:, None] < high[:, :, None]).all(axis=-1)
+    view, whose, who = np.nonzero(other & (least_m[:, None] < most_m[:, :, None] - _IN_FRONT_M))
+    # Everything in arrays (pairs, joints, limbs), a coordinate each: sums over an axis of two are slow.
+    x, y, z = (of.astype(np.float32) for of in (flat[..., 0], flat[..., 1], away))
+    (x0, x1), (y0, y1), (z0, z1) = ([of[view, who][:, None, end] for end in ends] for of in (x, y, z))
+    place, deep = xy[view, whose, :, None].astype(np.float32), depth[view, whose, :, None]
+    to_x, to_y, dx, dy = place[..., 0] - x0, place[..., 1] - y0, x1 - x0, y1 - y0
+    along = np.clip((to_x * dx + to_y * dy) / np.maximum(dx * dx + dy * dy, 1e-6), 0.0, 1.0)
+    at = z0 + along * (z1 - z0)
+    to_x, to_y = to_x - along * dx, to_y - along * dy
+    hides = (to_x * to_x + to_y * to_y) * at * at < ((_LIMB_M * focal_px[view]) ** 2)[:, None, None]
+    hides &= at < deep.astype(np.float32) - _IN_FRONT_M
     hidden = np.zeros(depth.shape, dtype=bool)
-    f = np.float32
-    p, z = xy[view, whose].astype(f), depth[view, whose].astype(f)
-    a, b = (np.where(known[who][:, limbs[:, n], None], xy[view, who][:, limbs[:, n]], np.nan).astype(f) for n in (0, 1))
-    za, zb = (depth[view, who][:, limbs[:, n]].astype(f) for n in (0, 1))
-    along = b - a
-    to = p[:, :, None] - a[:, None]
-    at = np.clip((to * along[:, None]).sum(-1) / np.maximum((along**2).sum(-1), f(1e-6))[:, None], f(0), f(1))
-    off = ((to - at[..., None] * along[:, None])**2).sum(-1)
-    zl = za[:, None] + at * (zb - za)[:, None]
-    hides = (off * zl**2 < (_LIMB_M * rig.focal_px[view].astype(f)[:, None, None])**2) & (zl < z[:, :, None] - _IN_FRONT_M) & (zl > 0)
-    row, joint = np.nonzero(hides.any(axis=2))
-    hidden[view[row], whose[row], joint] = True
+    pair, joint = np.nonzero(hides.any(axis=2))
+    hidden[view[pair], whose[pair], joint] = True
     return hidden
 
 
