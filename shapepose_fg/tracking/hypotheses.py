@@ -64,7 +64,7 @@ class Hypotheses:
     weight: NDArray[np.float32]
     """(H, T, J, V) what each detection counts as evidence (`weighed`)."""
     price: NDArray[np.float32]
-    """(H, T) what being there costs."""
+    """(H, T) what being there costs (`weighed`)."""
     joints: JointStates
     """Where their joints are in the frame from which people are carried on."""
 
@@ -107,14 +107,13 @@ def explained(tracker: Tracker, frames: Sequence[Input], carried: Tracks, keep: 
     """
     times = times_of(frames)
     found = follow_worlds(tracker, frames, _seeds(tracker, frames, carried), keep)
-    chosen = _choose(found, frames)
     for _ in range(_ROUNDS if len(frames) > 1 else 0):
-        if len(chosen) == 0:
+        on_trial = _choose(found, frames, on_trial=True)
+        if len(on_trial) == 0:
             break
-        again = _restarts(tracker, frames, times, found, chosen)
+        again = _restarts(tracker, frames, times, found, on_trial)
         found = Hypotheses.concatenate([found, follow_worlds(tracker, frames, again, keep)])
-        chosen = _choose(found, frames)
-    return found, chosen
+    return found, _choose(found, frames)
 
 
 def times_of(frames: Sequence[Input]) -> Array:
@@ -122,10 +121,11 @@ def times_of(frames: Sequence[Input]) -> Array:
     return np.array([float(frame.time_s.mean()) for frame in frames])
 
 
-def _choose(found: Hypotheses, frames: Sequence[Input]) -> Chosen:
+def _choose(found: Hypotheses, frames: Sequence[Input], *, on_trial: bool = False) -> Chosen:
     counts = np.array([len(frame.detections) for frame in frames], dtype=np.intp)
     lasts_s = lasting(times_of(frames))
-    return choose(found.candidate, found.weight, found.price, found.there, found.world, counts, lasts_s)
+    explains = found.candidate, found.weight, found.price, found.there, found.world
+    return choose(*explains, counts, lasts_s, on_trial=on_trial)
 
 
 def lasting(times_s: Array) -> Array:
@@ -187,7 +187,10 @@ def _restarts(
 
 
 def follow_worlds(tracker: Tracker, frames: Sequence[Input], seeds: Sequence[Seed], keep: int) -> Hypotheses:
-    """Follow all `seeds` forwards and backwards through T frames, side by side."""
+    """Follow all `seeds` forwards and backwards through T frames, side by side.
+
+    Who is found on the way forwards is followed back, too.
+    """
     log = _Log(tracker, frames, keep)
     numbers = log.numbered(seeds)
     born = list[tuple[int, Seed, NDArray[np.intp]]]()
@@ -206,7 +209,10 @@ def _follow(
     *,
     forwards: bool,
 ) -> list[tuple[int, Seed, NDArray[np.intp]]]:
-    """One way through the frames: (world, seed, numbers of its people) begin in the seed's frame."""
+    """One way through the frames: (world, seed, numbers of its people) begin in the seed's frame.
+
+    Returns who was found on the way, in the same form.
+    """
     tracks, births = Tracks.none(tracker.skeleton), dict[int, int]()
     born = list[tuple[int, Seed, NDArray[np.intp]]]()
     begins = dict[int, list[tuple[Tracks, NDArray[np.intp]]]]()
