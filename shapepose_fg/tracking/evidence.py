@@ -30,8 +30,8 @@ _SURE_AFFINITY = 0.6
 _ALONE = 0.5
 """What a detection counts whose neighbours on the skeleton nobody saw: affinities say nothing of it."""
 _APPEARS_S = 0.125
-"""What it costs to appear or vanish while others are watched, as much as 0.3 seconds in plain view of all cameras unseen: people
-are where they were, and nobody comes out of nothing."""
+"""What it costs to appear or vanish while others are watched, as much as not being seen in plain view for 0.3
+seconds: people are where they were, and nobody comes out of nothing."""
 _WORLDS = 4
 """How many worlds are tried as those that come first, the most promising ones."""
 _LEAST_S = 0.1
@@ -156,10 +156,10 @@ def choose(
     `candidate` (H, T, J, V) are the detections of H hypotheses in T frames, of `counts` (T,) in each frame, with
     the `weight` (H, T, J, V) and the `price` (H, T) of `weighed`; `there` (H, T) tells where a hypothesis says
     something, in frames that each stand for `lasts_s` (T,) seconds. `world` (H,) are people who were followed
-    together; `on_trial` takes those, too, who lack a little to be chosen. The best stretch of the best hypothesis comes first; its detections are evidence of
-    nobody else then. Where that is worse all in all, the people of one world come first: a hypothesis that goes
-    over from one person to another, always to who is seen better, is better than either of them, and leaves the
-    others with too little.
+    together; `on_trial` takes those, too, who lack a little to be chosen. The best stretch of the best hypothesis
+    comes first; its detections are evidence of nobody else then. Where that is worse all in all, the people of one
+    world come first: a hypothesis that goes over from one person to another, always to who is seen better, is
+    better than either of them, and leaves the others with too little.
     """
     account = _Account.of(candidate, weight, price, there, counts, lasts_s, _ON_TRIAL if on_trial else 1.0)
     if len(there) == 0:

@@ -4,6 +4,8 @@ A hypothesis is a list of frames, each with the detections that are its (of at m
 is not followed.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
@@ -17,7 +19,10 @@ STEP_S = 0.1
 
 
 def evidence_of(
-    *rows: tuple[list[list[int]], int], times: int | None = None, step_s: float = STEP_S, on_trial: bool = False
+    *rows: tuple[Sequence[list[int] | None], int],
+    times: int | None = None,
+    step_s: float = STEP_S,
+    on_trial: bool = False,
 ) -> Chosen:
     """Choose among (detections in each frame, world); detections are numbers in the frame, at most 8. Each place
     costs `PRICE` unseen."""
