@@ -122,7 +122,7 @@ def _rows(given: Input, t: int, found: Hypotheses, chosen: Chosen, identity: NDA
     here = here[np.sort(first)]
     who = chosen.hypothesis[here]
     own = found.candidate[who, t].astype(np.intp)
-    evidence = own_evidence(own, found.weight[who, t], found.expected[who, t])
+    evidence = own_evidence(own, found.weight[who, t], found.price[who, t])
     return replace(_observed(given, own, found.places[who, t], identity[here]), evidence=evidence)
 
 

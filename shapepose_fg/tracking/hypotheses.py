@@ -32,9 +32,9 @@ _ROUNDS = 2
 """How often that is done."""
 _PLACED_M = 0.2
 """Sigma of a track's joint that counts as placed."""
-_PLAIN_SHARE, _PLAIN_S = 0.3, 0.3
-"""People who are seen in so large a share of their places, at any time for so many seconds, are followed once:
-in simulated crowds others are found for people who had less."""
+_PLAIN, _PLAIN_S = 0.2, 0.3
+"""People whose evidence is so much a second, at any time for so many seconds, are followed once: in simulated
+crowds others are found for people who had less."""
 _SAME_M = 0.02
 """Worlds with the same detections whose people are nowhere farther apart are one from there on."""
 _GAIN = 0.01
@@ -71,8 +71,8 @@ class Hypotheses:
     """(H, T, J, 3) where their joints would be, metres; NaN where that is not known well."""
     weight: NDArray[np.float32]
     """(H, T, J, V) what each detection counts as evidence (`weighed`)."""
-    expected: NDArray[np.int32]
-    """(H, T) in how many places they should be seen."""
+    price: NDArray[np.float32]
+    """(H, T) what being there costs (`weighed`)."""
     joints: JointStates
     """Where their joints are in the frame from which people are carried on."""
 
@@ -119,25 +119,24 @@ def explained(tracker: Tracker, frames: Sequence[Input], carried: Tracks, keep: 
     if len(frames) == 1 or _plain(found, times):
         return found, _choose(found, frames)
     found = Hypotheses.concatenate([found, follow_worlds(tracker, frames, _seeds(tracker, frames), keep)])
-    chosen, before = _choose(found, frames), 0.0
+    before = 0.0
     for _ in range(_ROUNDS):
-        if chosen.evidence_s.sum() <= (1 + _GAIN) * before:
+        on_trial = _choose(found, frames, on_trial=True)
+        if on_trial.evidence_s.sum() <= (1 + _GAIN) * before:
             break
-        before = float(chosen.evidence_s.sum())
-        again = _restarts(tracker, frames, times, found, chosen)
+        before = float(on_trial.evidence_s.sum())
+        again = _restarts(tracker, frames, times, found, on_trial)
         found = Hypotheses.concatenate([found, follow_worlds(tracker, frames, again, keep)])
-        chosen = _choose(found, frames)
-    return found, chosen
+    return found, _choose(found, frames)
 
 
 def _plain(found: Hypotheses, times: Array) -> bool:
     """Whether everybody is there in all frames, and always seen well."""
     if not found.there.all():
         return False
-    share = found.weight.sum(axis=(2, 3)) / np.maximum(found.expected, 1)
+    evidence = found.weight.sum(axis=(2, 3)) - found.price
     frames = min(len(times), max(1, round(_PLAIN_S / float(np.median(np.diff(times))))))
-    lately = sliding_window_view(share, frames, axis=1).mean(axis=-1)
-    return bool((lately >= _PLAIN_SHARE).all())
+    return bool((sliding_window_view(evidence, frames, axis=1).mean(axis=-1) >= _PLAIN).all())
 
 
 def times_of(frames: Sequence[Input]) -> Array:
@@ -147,13 +146,13 @@ def times_of(frames: Sequence[Input]) -> Array:
 
 def unlikely(found: Hypotheses, chosen: Chosen, frames: Sequence[Input]) -> Chosen:
     """Who was not chosen for too little evidence, or for being there too briefly."""
-    counts, lasts_s = _weighing(frames)
-    return left_over(found.candidate, found.weight, found.expected, found.there, counts, lasts_s, chosen)
+    explains = found.candidate, found.weight, found.price, found.there
+    return left_over(*explains, *_weighing(frames), chosen)
 
 
-def _choose(found: Hypotheses, frames: Sequence[Input]) -> Chosen:
-    counts, lasts_s = _weighing(frames)
-    return choose(found.candidate, found.weight, found.expected, found.there, found.world, counts, lasts_s)
+def _choose(found: Hypotheses, frames: Sequence[Input], *, on_trial: bool = False) -> Chosen:
+    explains = found.candidate, found.weight, found.price, found.there, found.world
+    return choose(*explains, *_weighing(frames), on_trial=on_trial)
 
 
 def _weighing(frames: Sequence[Input]) -> tuple[NDArray[np.intp], Array]:
@@ -203,7 +202,7 @@ def _restarts(
     T = len(frames)
     placed = np.isfinite(found.places[chosen.hypothesis]).all(axis=-1).any(axis=-1)
     there = np.array([chosen.during(t) for t in range(T)]).T & placed
-    share = found.weight[chosen.hypothesis].sum(axis=(2, 3)) / np.maximum(found.expected[chosen.hypothesis], 1)
+    share = found.weight[chosen.hypothesis].sum(axis=(2, 3))
     worth = np.where(there, share, -0.5).sum(axis=0)
     parts = np.array_split(np.arange(T), min(T, max(1, round((times[-1] - times[0]) / _RESTART_S))))
     seeds = []
@@ -217,13 +216,17 @@ def _restarts(
 
 
 def follow_worlds(tracker: Tracker, frames: Sequence[Input], seeds: Sequence[Seed], keep: int) -> Hypotheses:
-    """Follow all `seeds` forwards and backwards through T frames, side by side."""
+    """Follow all `seeds` forwards and backwards through T frames, side by side.
+
+    Who is found on the way forwards is followed back, too.
+    """
     log = _Log(tracker, frames, keep)
     numbers = log.numbered(seeds)
+    born = list[tuple[int, Seed, NDArray[np.intp]]]()
     for forwards in (True, False):
         part = [(w, s, n) for w, (s, n) in enumerate(zip(seeds, numbers, strict=True))]
         part = [each for each in part if (each[1].forwards if forwards else each[1].backwards)]
-        _follow(tracker, frames, part, log, forwards=forwards)
+        born = _follow(tracker, frames, part + born, log, forwards=forwards)
     return log.hypotheses()
 
 
@@ -234,9 +237,13 @@ def _follow(
     log: "_Log",
     *,
     forwards: bool,
-) -> None:
-    """One way through the frames: (world, seed, numbers of its people) begin in the seed's frame."""
+) -> list[tuple[int, Seed, NDArray[np.intp]]]:
+    """One way through the frames: (world, seed, numbers of its people) begin in the seed's frame.
+
+    Returns who was found on the way, in the same form.
+    """
     tracks, births = Tracks.none(tracker.skeleton), dict[int, int]()
+    born = list[tuple[int, Seed, NDArray[np.intp]]]()
     begins = dict[int, list[tuple[Tracks, NDArray[np.intp]]]]()
     for world, seed, numbers in seeds:
         place = np.full(len(numbers), world, dtype=np.intp)
@@ -277,7 +284,9 @@ def _follow(
                     places, log.more(len(places), world), np.full(len(places), world, dtype=np.intp), time_s
                 )
                 log.add(t, new, theirs)
+                born.append((world, Seed(t, new, theirs), new.ids))
                 tracks, candidate = tracks.joined(new), np.concatenate([candidate, theirs])
+    return born
 
 
 def _twins(
@@ -307,7 +316,7 @@ class _Log:
         self.tracker, self.frames, self.keep = tracker, frames, keep
         self.shape = (len(tracker.skeleton), len(frames[0].rig))
         self.carried, self.world = list[int](), list[int]()
-        self.parts = list[tuple[int, NDArray[np.intp], NDArray[np.intp], Array, Array, NDArray[np.intp]]]()
+        self.parts = list[tuple[int, NDArray[np.intp], NDArray[np.intp], Array, Array, Array]]()
         self.kept = list[tuple[NDArray[np.intp], JointStates]]()
         self.twins = list[tuple[slice, NDArray[np.intp], NDArray[np.intp]]]()
 
@@ -331,8 +340,10 @@ class _Log:
             return
         frame, joints = self.frames[t], tracks.joints
         places = np.where((joints.sigma_m < _PLACED_M)[..., None], joints.position, np.nan)
-        weight, expected = weighed(candidate, places, frame.detections, frame.rig, self.tracker.skeleton)
-        self.parts.append((t, tracks.ids, candidate, places, weight, expected))
+        weight, price = weighed(
+            candidate, places, frame.detections, frame.rig, self.tracker.skeleton, tracks.world
+        )
+        self.parts.append((t, tracks.ids, candidate, places, weight, price))
         if t == self.keep:
             self.kept.append((tracks.ids, joints))
 
@@ -344,19 +355,19 @@ class _Log:
         """All of it."""
         H, T, (J, V) = len(self.carried), len(self.frames), self.shape
         there = np.zeros((H, T), dtype=bool)
-        candidate, expected = np.full((H, T, J, V), -1, dtype=np.int32), np.zeros((H, T), dtype=np.int32)
+        candidate, price = np.full((H, T, J, V), -1, dtype=np.int32), np.zeros((H, T), dtype=np.float32)
         places, weight = np.full((H, T, J, 3), np.nan), np.zeros((H, T, J, V), dtype=np.float32)
-        for t, ids, own, at, counts, many in self.parts:
+        for t, ids, own, at, counts, costs in self.parts:
             there[ids, t], candidate[ids, t], places[ids, t] = True, own, at
-            weight[ids, t], expected[ids, t] = counts, many
+            weight[ids, t], price[ids, t] = counts, costs
         mean, covariance = np.zeros((H, J, 6)), np.zeros((H, J, 6, 6))
         for ids, joints in self.kept:
             mean[ids], covariance[ids] = joints.mean, joints.covariance
         for span, ids, others in reversed(self.twins):
-            for each in (there, candidate, expected, places, weight):
+            for each in (there, candidate, price, places, weight):
                 each[ids, span] = each[others, span]
             if self.keep in range(T)[span]:
                 mean[ids], covariance[ids] = mean[others], covariance[others]
         carried, world = (np.array(each, dtype=np.intp) for each in (self.carried, self.world))
         joints = JointStates(mean, covariance)
-        return Hypotheses(carried, world, there, candidate, places, weight, expected, joints)
+        return Hypotheses(carried, world, there, candidate, places, weight, price, joints)

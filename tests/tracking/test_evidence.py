@@ -4,6 +4,8 @@ A hypothesis is a list of frames, each with the detections that are its (of at m
 is not followed.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
@@ -12,16 +14,19 @@ from shapepose_fg.tracking.evidence import Chosen, choose, left_over, own_eviden
 from shapepose_fg.tracking.hypotheses import lasting
 
 PLACES = 4
+PRICE = 0.15
 STEP_S = 0.1
 
 
 def evidence_of(
-    *rows: tuple[list[list[int]], int], times: int | None = None, step_s: float = STEP_S, left: bool = False
+    *rows: tuple[Sequence[list[int] | None], int],
+    times: int | None = None,
+    step_s: float = STEP_S,
+    on_trial: bool = False,
+    left: bool = False,
 ) -> Chosen:
-    """Choose among (detections in each frame, world); detections are numbers in the frame, at most 8.
-
-    With `left` those whom the chosen leave over.
-    """
+    """Choose among (detections in each frame, world); detections are numbers in the frame, at most 8. Each place
+    costs `PRICE` unseen. With `left` those whom the chosen leave over."""
     T = times or len(rows[0][0])
     candidate = np.full((len(rows), T, PLACES, 1), -1)
     there = np.zeros((len(rows), T), dtype=bool)
@@ -30,11 +35,11 @@ def evidence_of(
             there[h, t] = own is not None
             if own:
                 candidate[h, t, : len(own), 0] = own
-    expected = np.full((len(rows), T), PLACES)
+    weight, price = np.full(candidate.shape, (1 + PRICE) / PLACES), np.full((len(rows), T), PRICE)
     world = np.array([world for _, world in rows])
     counts, lasts_s = np.full(T, 8), np.full(T, step_s)
-    given = candidate, np.ones(candidate.shape), expected, there
-    chosen = choose(*given, world, counts, lasts_s)
+    given = candidate, weight, price, there
+    chosen = choose(*given, world, counts, lasts_s, on_trial=on_trial)
     return left_over(*given, counts, lasts_s, chosen) if left else chosen
 
 
@@ -75,8 +80,8 @@ def test_evidence_of_one_s_own_in_a_frame():
     """All of four places; a half, of which one is another's, too; with a weight of 0.5; nothing."""
     candidate = np.array([[0, 1, 2, 3], [4, 5, -1, -1], [5, 6, -1, -1], [-1] * 4])[..., None]
     weight = np.where(candidate == 6, 0.5, 1.0)
-    found = own_evidence(candidate, weight, np.full(4, 4))
-    np.testing.assert_allclose(found, 1.15 * np.array([1, 0.25, 0.125, 0]) - 0.15)
+    found = own_evidence(candidate, weight * (1 + PRICE) / 4, np.full(4, PRICE))
+    np.testing.assert_allclose(found, (1 + PRICE) * np.array([1, 0.25, 0.125, 0]) - PRICE)
 
 
 def test_how_probable_people_were_in_simulated_recordings():
@@ -131,6 +136,13 @@ def test_how_long_somebody_must_be_seen_is_a_matter_of_seconds(step_s, seconds, 
     assert (len(evidence_of((frames, 0), step_s=step_s)) == 1) == there
 
 
+def test_on_trial_a_quarter_of_what_is_asked_for_is_enough():
+    """0.2 s of all places, less two ends at 0.03 s each; six frames later, a frame that is half seen is nobody."""
+    frames = [None] * 5 + [ANNA] * 2 + [None] * 6 + [ANNA[:2]] + [None] * 6
+    assert stretches(evidence_of((frames, 0), on_trial=True)) == [(0, 5, 7)]
+    assert len(evidence_of((frames, 0))) == 0
+
+
 def test_a_frame_alone_stands_for_a_second_and_others_up_to_halfway_to_their_neighbours():
     np.testing.assert_allclose(lasting(np.array([3.0])), [1.0])
     np.testing.assert_allclose(lasting(np.array([0.0, 0.1, 0.4, 0.5])), [0.1, 0.2, 0.2, 0.1])
@@ -168,19 +180,50 @@ def test_detections_count_by_the_affinity_to_the_same_person_s(five_cameras, two
     candidate[0, wrist, 1] = own[1, wrist, 1]
     candidate[1, :, 2] = -1
     candidate[1, elbow, 2] = own[1, elbow, 2]
-    weight, expected = weighed(candidate, two_people, detections, five_cameras, BODY_25)
-    assert weight[0, wrist, 1] == 0.0 and weight[1, elbow, 2] == 0.5
-    assert weight[1, :, 2].sum() == 0.5, "what nobody has counts nothing"
-    assert (weight[0, :, [0, 2, 3, 4]] == 1.0).all() and (weight[1, :, [0, 1, 3, 4]] == 1.0).all()
-    assert expected.tolist() == [125, 125]
+    weight, _ = weighed(candidate, two_people, detections, five_cameras, BODY_25, np.arange(2))
+    whole = weight[0, wrist, 0]
+    assert weight[0, wrist, 1] == 0.0 and weight[1, elbow, 2] == whole / 2
+    assert weight[1, :, 2].sum() == whole / 2, "what nobody has counts nothing"
+    assert (weight[0, :, [0, 2, 3, 4]] == whole).all() and (weight[1, :, [0, 1, 3, 4]] == whole).all()
 
 
-def test_joints_outside_the_picture_are_not_expected(five_cameras, two_people, seen_exactly):
-    """Nobody is expected behind a camera; a joint whose place is unknown is expected where the others are."""
+def test_who_is_seen_wholly_has_a_second_of_evidence_in_a_second(five_cameras, two_people, seen_exactly):
+    """Whatever hides them: a place that is seen costs nothing. Unseen in plain view they cost 0.4."""
+    detections = seen_exactly(five_cameras, two_people[:1])
+    own = np.full((1, 25, 5), -1)
+    own[0, detections.joint, detections.view] = np.arange(len(detections))
+    beside = np.concatenate([two_people[:1], two_people[:1] + 0.3])
+    for places, candidate in ((two_people[:1], own), (beside, np.concatenate([own, np.full_like(own, -1)]))):
+        weight, price = weighed(candidate, places, detections, five_cameras, BODY_25, np.zeros(len(places), int))
+        np.testing.assert_allclose(weight[0].sum() - price[0], 1.0)
+    assert weighed(np.full_like(own, -1), two_people[:1], detections, five_cameras, BODY_25, np.zeros(1, int))[
+        1
+    ] == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize(("metres", "hides"), [(0.6, True), (0.05, False), (-0.6, False)])
+def test_a_joint_behind_somebody_else_costs_little_unseen(five_cameras, two_people, seen_exactly, metres, hides):
+    """Somebody else stands on the way to the first of five cameras, or so near that nobody is in front, or behind.
+    What is in front of most joints of one view of five, and nothing of most others, makes the price lower by about
+    a fifth of 0.35; in other worlds nobody is in the way."""
+    person = two_people[:1]
+    to_camera = -np.linalg.inv(five_cameras.cTw[0, :, :3]) @ five_cameras.cTw[0, :, 3] - person[0].mean(axis=0)
+    other = person + metres * to_camera / np.linalg.norm(to_camera)
+    places, none = np.concatenate([person, other]), np.full((2, 25, 5), -1)
+    detections = seen_exactly(five_cameras, person)
+    price = weighed(none, places, detections, five_cameras, BODY_25, np.zeros(2, int))[1][0]
+    assert (price < 0.4 - 0.8 * 0.35 / 5) == hides
+    apart = weighed(none, places, detections, five_cameras, BODY_25, np.arange(2))[1]
+    np.testing.assert_allclose(apart, 0.4)
+
+
+def test_joints_outside_the_picture_cost_nothing_and_unknown_ones_little(five_cameras, two_people, seen_exactly):
+    """Nobody is expected behind a camera; of 25 joints 15 are unknown: 15 of 25 places at 0.05, 10 at 0.4."""
     far = two_people[:1] + np.array([0.0, 0.0, 100.0])
     detections = seen_exactly(five_cameras, two_people)
-    none = np.full((1, 25, 5), -1)
-    assert weighed(none, far, detections, five_cameras, BODY_25)[1].tolist() == [0]
+    none, zero = np.full((1, 25, 5), -1), np.zeros(1, dtype=np.intp)
+    assert weighed(none, far, detections, five_cameras, BODY_25, zero)[1].tolist() == [0]
     half = two_people[:1].copy()
     half[0, 10:] = np.nan
-    assert weighed(none, half, detections, five_cameras, BODY_25)[1].tolist() == [125]
+    price = weighed(none, half, detections, five_cameras, BODY_25, zero)[1]
+    np.testing.assert_allclose(price, (10 * 0.4 + 15 * 0.05) / 25)

@@ -8,7 +8,7 @@ import pytest
 from shapepose_fg.detections import Detections
 from shapepose_fg.runs.checkpoint import Checkpoint, checkpoint_arrays, checkpoint_of
 from shapepose_fg.tracking.following import BLOCK_S, FollowingConfig, FollowState, finish, follow
-from shapepose_fg.tracking.hypotheses import Input
+from shapepose_fg.tracking.hypotheses import Input, Seed, follow_worlds
 from shapepose_fg.tracking.tracker import Tracks
 from shapepose_fg.windows import StreamState
 
@@ -161,8 +161,9 @@ def test_the_order_of_detections_does_not_matter(followed, five_cameras, walking
     np.testing.assert_array_equal(other.xy, one.xy)
 
 
-def test_who_is_found_late_was_there_before(followed, five_cameras, seen_exactly, walking):
-    """The hips of the second person are not detected at first: stage I finds nobody, the way back does."""
+@pytest.fixture
+def found_late(five_cameras, seen_exactly, walking) -> list[Detections]:
+    """Two people walking; the hips of the second are not detected in the first 12 frames: stage I finds nobody."""
     frames, truth = walking
     hips = [8, 9, 12]
     seen = []
@@ -173,7 +174,23 @@ def test_who_is_found_late_was_there_before(followed, five_cameras, seen_exactly
             own = np.linalg.norm(detections.xy - xy[detections.view, detections.joint], axis=1) < 1e-6
             detections = detections.only(~(own & np.isin(detections.joint, hips)))
         seen.append(detections)
-    rows = followed(five_cameras, seen)
+    return seen
+
+
+def test_who_is_found_on_the_way_forwards_is_followed_back_in_the_same_world(tracker, five_cameras, found_late):
+    """A world that begins with nobody in the first frame has two people, and both in every frame."""
+    frames = [Input(t, np.full(5, t / 30), each, five_cameras) for t, each in enumerate(found_late)]
+    none = np.zeros((0, len(tracker.skeleton), 5), dtype=np.intp)
+    found = follow_worlds(tracker, frames, [Seed(0, Tracks.none(tracker.skeleton), none, births=True)], 0)
+    assert found.there.shape == (2, len(frames)) and found.there.all()
+    seen = (found.candidate >= 0).sum(axis=(2, 3))
+    assert (seen[0] == 5 * 25).all() and (seen[1, 12:] == 5 * 25).all() and (seen[1, :12] == 5 * 22).all()
+
+
+def test_who_is_found_late_was_there_before(followed, five_cameras, walking, found_late):
+    """Stage I finds nobody at first, the way back does."""
+    frames, truth = walking
+    rows = followed(five_cameras, found_late)
     tracks = identities(rows, truth)
     assert all(len(own) == 1 for own in tracks.values()) and len(rows) == 2 * len(frames)
     before = (rows.frame < 12) & (who(rows, truth)[0] == 1)
