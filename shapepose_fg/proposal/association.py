@@ -27,7 +27,7 @@ _REACH_M = 0.6
 from a joint to the next is longer, the trunk aside."""
 _LEAST_AFFINITY = 0.3
 """A joint whose place is not known is only taken by an affinity of at least this to an observed neighbour."""
-_OVERLAP_M = 0.03
+_OVERLAP_M = 0.025
 """Two people's projected joints closer than this overlap, as a length at their depth: the one detection there
 serves both. A detector is 2 to 3 cm off."""
 _PASSES = 2

@@ -28,7 +28,7 @@ _LEAST_AFFINITY = 0.3
 """What counts as affinity where no neighbour is seen; unrelated pairs are mostly 0, true ones above 0.4."""
 _SURE_AFFINITY = 0.5
 """Mean affinity that takes a detection for a joint whose place nobody knows."""
-_OVERLAP_M = 0.03
+_OVERLAP_M = 0.025
 """Two people's projected joints closer than this overlap, as a length at their depth: the one detection there
 serves both. A detector is 2 to 3 cm off."""
 _KERNEL_M = 0.03

@@ -34,7 +34,7 @@ class AssignmentConfig(Settings):
     of the least score of all others. Unrelated pairs are mostly 0, true ones above 0.4."""
     reach_m: Metres = 0.8
     """A lost joint is sought this far around its neighbour on the skeleton."""
-    overlap_m: Metres = 0.03
+    overlap_m: Metres = 0.025
     """Two people's predicted joints closer than this overlap, as a length at their depth: the one detection there
     serves both. A detector is 2 to 3 cm off."""
     passes: Repeats = 2

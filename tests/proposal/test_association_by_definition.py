@@ -59,7 +59,7 @@ def chosen_for(places, owns, crowded, rig) -> np.ndarray:
             score = np.exp(-0.5 * (away / 0.08) ** 2) + (affinity if joints else 0.3)
             if away < 0.25 and score >= 0.6:
                 offers.append((score, person, row))
-            if away < 0.03 and affinity >= 0.3:
+            if away < 0.025 and affinity >= 0.3:
                 shared.append((away, person, row))
     used: set[int] = set()
     for _, person, row in sorted(offers, key=lambda offer: -offer[0]):

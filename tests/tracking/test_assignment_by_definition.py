@@ -37,7 +37,7 @@ DEFAULTS = {
     "farthest_m": 0.5,
     "least_affinity": 0.3,
     "reach_m": 0.8,
-    "overlap_m": 0.03,
+    "overlap_m": 0.025,
     "passes": 2,
 }
 """What is documented, so that another default is noticed."""
