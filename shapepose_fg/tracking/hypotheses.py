@@ -32,7 +32,7 @@ _ROUNDS = 2
 """How often that is done."""
 _PLACED_M = 0.2
 """Sigma of a track's joint that counts as placed."""
-_PLAIN, _PLAIN_S = 0.2, 0.3
+_PLAIN, _PLAIN_S = 0.25, 0.3
 """People whose evidence is so much a second, at any time for so many seconds, are followed once: in simulated
 crowds others are found for people who had less."""
 _SAME_M = 0.02
