@@ -37,8 +37,8 @@ class ObservationConfig(Settings):
     """w_0 in it: what the least confident observation weighs."""
     by_joint: bool = True
     """Whether sigma differs from joint to joint (`JOINT_SCATTER`): a detector knows an eye better than a hip."""
-    floor_rad: Share = 0.0005
-    """What the detector's grid costs at any size: an angle, one pixel where the focal length is 2,000. A detector
+    floor_rad: Share = 0.001
+    """What the detector's grid costs at any size: an angle, one pixel where the focal length is 1,000. A detector
     scales a picture to its own size, so that it is no number of the picture's pixels."""
     rho_2d_m: Factor = 0.15
     """rho_2D of Eq. 2, as a length at the joint's depth: an observation farther from the projected joint is

@@ -132,8 +132,7 @@ def settled(
         places, gap_m = triangulated(chosen, frame)
         chosen = np.where(np.nan_to_num(gap_m) < _FAR_M, chosen, -1)
         part = connected(places, frame)
-        size = (part[:, None] == np.arange(part.shape[1])[:, None]).sum(axis=2)
-        astray = (part >= 0) & (part != size.argmax(axis=1)[:, None])
+        astray = (part >= 0) & (part != sizes(part).argmax(axis=1)[:, None])
         places = np.where(astray[..., None], np.nan, places)
         chosen = np.where(astray[..., None], -1, chosen)
         owns = owned(chosen, len(frame.detections))
@@ -221,3 +220,10 @@ def connected(places: Array, frame: Frame) -> NDArray[np.intp]:
         if (least == part).all():
             return np.where(part < joints, part, -1)
         part = least
+
+
+def sizes(part: NDArray[np.intp]) -> NDArray[np.intp]:
+    """(H, J) how many joints each part of `connected` has, at the number of the part."""
+    people, joints = part.shape
+    row, column = np.nonzero(part >= 0)
+    return np.bincount(row * joints + part[row, column], minlength=people * joints).reshape(people, joints)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.proposal.candidates import PairPoints
-from shapepose_fg.proposal.hypotheses import Array, Frame, Hypotheses, connected, settled
+from shapepose_fg.proposal.hypotheses import Array, Frame, Hypotheses, connected, settled, sizes
 from shapepose_fg.proposal.people_2d import group_people
 
 _LEAST_JOINTS = 3
@@ -36,16 +36,20 @@ def pooled(points: PairPoints, free: NDArray[np.bool_], frame: Frame) -> Hypothe
     group = _groups(free, frame)
     places, owners = _meeting(points, group, frame)
     part = connected(places, frame)
-    size = (part[:, None] == np.arange(part.shape[1])[:, None]).sum(axis=2)
-    hypothesis, first = np.nonzero(size >= _LEAST_JOINTS)
+    hypothesis, first = np.nonzero(sizes(part) >= _LEAST_JOINTS)
     places = np.where((part[hypothesis] == first[:, None])[..., None], places[hypothesis], np.nan)
-    detections = frame.detections
-    owns = (group == owners[hypothesis, :1]) | (group == owners[hypothesis, 1:])
-    owns &= np.isfinite(places[:, detections.joint, 0])
-    different = _different(places, np.where(owns, detections.confidence, 0.0).sum(axis=1))
+    owners, detections = owners[hypothesis], frame.detections
+    confidence = np.zeros((group.max(initial=-1) + 1, places.shape[1]))
+    grouped = np.flatnonzero(group >= 0)
+    np.add.at(confidence, (group[grouped], detections.joint[grouped]), detections.confidence[grouped])
+    has = np.isfinite(places[..., 0])
+    different = _different(places, np.where(has, confidence[owners].sum(axis=1), 0.0).sum(axis=1))
     if len(different) == 0:
         return Hypotheses.none(frame)
-    return settled(places[different], owns[different], frame, _PASSES)
+    owners = owners[different]
+    owns = (group == owners[:, :1]) | (group == owners[:, 1:])
+    owns &= has[different][:, detections.joint]
+    return settled(places[different], owns, frame, _PASSES)
 
 
 def _groups(free: NDArray[np.bool_], frame: Frame) -> NDArray[np.intp]:

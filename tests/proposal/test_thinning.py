@@ -132,7 +132,7 @@ def test_a_crowd_of_strangers_ends():
     rig = ring_of_cameras(5, np.random.default_rng(0))
     detections, start = crowd(rig, 120), time.process_time()
     people = find_people(detections, rig, BODY_25, PipelineConfig())
-    assert time.process_time() - start < 30  # 3 s on one core; the bound is for slow machines
+    assert time.process_time() - start < 30  # 10 s on one core; the bound is for slow machines
     assert len(people) <= 3 * PipelineConfig().proposals.most_people
 
 
