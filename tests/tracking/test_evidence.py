@@ -85,7 +85,7 @@ def test_evidence_of_one_s_own_in_a_frame():
 
 
 def test_how_probable_people_were_in_simulated_recordings():
-    """Of so many people with this evidence in the mean so many were there (two to four cameras): within 2 sigma."""
+    """Of so many people with this evidence in the mean so many were there, within 2 sigma."""
     for evidence, people, there in ((0.123, 23, 18), (0.212, 71, 67), (0.298, 167, 161), (0.503, 585, 585)):
         said = probability(evidence)
         assert there / people == pytest.approx(said, abs=2 * np.sqrt(said * (1 - said) / people))
