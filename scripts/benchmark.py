@@ -22,16 +22,16 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import DetectionSequence
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import DetectionSequence
+from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.provenance import versions
 from shapepose_fg.evaluation.seams import compare_seams
 from shapepose_fg.evaluation.speed import STAGES, BackAndForth, Spent, peak_mib, rows_mib, spend, stage_two
-from shapepose_fg.frame_times import FrameTimes
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
-from shapepose_fg.pipeline import PipelineConfig
-from shapepose_fg.provenance import versions
-from shapepose_fg.runs.chunks import cut_in_chunks
+from shapepose_fg.pipeline.pipeline import PipelineConfig
+from shapepose_fg.pipeline.runs.chunks import cut_in_chunks
 from shapepose_fg.simulation import Scene, built_in_scene, simulate
 from shapepose_fg.simulation.files import NAMES, cut, named_scene
 

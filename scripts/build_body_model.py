@@ -24,7 +24,7 @@ from scipy.sparse import coo_matrix
 from scipy.spatial import KDTree
 
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS
-from shapepose_fg.skeleton import BODY_25, SMPL_24
+from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 
 Floats = NDArray[np.float64]
 

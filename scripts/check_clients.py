@@ -72,10 +72,10 @@ def make(folder: Path) -> None:
     import torch
 
     from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
-    from shapepose_fg.cli import main as shapepose
-    from shapepose_fg.frame_times import FrameTimes
+    from shapepose_fg.cli.main import main as shapepose
+    from shapepose_fg.core.frame_times import FrameTimes
     from shapepose_fg.io.calibration import write_rig
-    from shapepose_fg.pipeline import reconstruct
+    from shapepose_fg.pipeline.pipeline import reconstruct
     from shapepose_fg.simulation import built_in_scene, simulate
 
     torch.set_num_threads(1)

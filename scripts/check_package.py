@@ -20,7 +20,7 @@ from pathlib import Path
 import factors, shapepose_fg
 assert Path(shapepose_fg.__file__).is_relative_to(sys.prefix), shapepose_fg.__file__
 from shapepose_fg import read_detections, read_rig, reconstruct
-from shapepose_fg.cli import main
+from shapepose_fg.cli.main import main
 
 try:
     main(["simulate", "demo", "--people", "1", "--cameras", "3", "--frames", ":6", "--output", "simulated"])
@@ -30,7 +30,7 @@ rig = read_rig("simulated/calibration.json")
 found = reconstruct(read_detections("simulated", rig), rig)
 found.save("results")
 assert len(found) == 6, len(found)
-from shapepose_fg.report.writing import write_report
+from shapepose_fg.viz.report.writing import write_report
 write_report(Path("results"), found, rig)
 """
 

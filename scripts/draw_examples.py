@@ -32,8 +32,8 @@ from shapepose_fg.evaluation.shelf import ACTORS, match_actors
 from shapepose_fg.evaluation.shelf_events import lost_limbs
 from shapepose_fg.evaluation.shelf_ground_truth import read_shelf_ground_truth
 from shapepose_fg.evaluation.smpl_only import SamePeople
-from shapepose_fg.pipeline import PipelineConfig
-from shapepose_fg.viewer import demo_picture
+from shapepose_fg.pipeline.pipeline import PipelineConfig
+from shapepose_fg.viz.viewer import demo_picture
 
 FRAMES = 150
 """Of each stretch that examples are picked from."""

@@ -18,8 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import DetectionSequence
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.evaluation.spoiled_setups import spoiled
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections

@@ -33,10 +33,10 @@ os.environ["OMP_NUM_THREADS"] = "1"  # before torch is loaded: the forks must no
 
 from fault_runs import WINDOW, Command, Run, Watched, emptied, parts, phase, state
 
-from shapepose_fg.errors import InputError
-from shapepose_fg.output_folder import only_run_in
-from shapepose_fg.reconstruction import Reconstruction
-from shapepose_fg.runs.manifest import PARTS, frames_done
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.storage.output_folder import only_run_in
+from shapepose_fg.pipeline.runs.manifest import PARTS, frames_done
 
 _INSIDE = "SHAPEPOSE_FAULTS_INSIDE"
 """Set in the mount namespace where a disk may be filled."""

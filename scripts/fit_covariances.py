@@ -18,15 +18,15 @@ import numpy as np
 import torch
 from scipy.optimize import linear_sum_assignment
 
+from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.calibration import Calibration, Clues
-from shapepose_fg.frame_times import FrameTimes
-from shapepose_fg.pipeline import reconstruct
+from shapepose_fg.pipeline.pipeline import reconstruct
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.files import cut, cuts_of
 from shapepose_fg.simulation.mocap import Mocap
 from shapepose_fg.simulation.scene import Scene
 from shapepose_fg.simulation.sequences import SEQUENCES, Split, sequence
-from shapepose_fg.skeleton import BODY_25
 
 CASES: tuple[tuple[str, Split, int, int], ...] = (
     ("crowd", "tune", 7001, 3), ("crossing", "tune", 7002, 3), ("crowd", "tune", 7003, 4),

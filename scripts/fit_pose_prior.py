@@ -15,11 +15,17 @@ from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.fitting.pose_prior import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel
-from shapepose_fg.skeleton import SMPL_24
-from shapepose_fg.training.mixture import MixtureConfig
-from shapepose_fg.training.motions import Motions, load_motions
-from shapepose_fg.training.prior import PriorConfig, angles_of, expected_angles, learn_pose_prior, log_likelihood
-from shapepose_fg.training.split import TEST_SUBJECTS, VALIDATION_SUBJECTS
+from shapepose_fg.body.training.mixture import MixtureConfig
+from shapepose_fg.body.training.motions import Motions, load_motions
+from shapepose_fg.body.training.prior import (
+    PriorConfig,
+    angles_of,
+    expected_angles,
+    learn_pose_prior,
+    log_likelihood,
+)
+from shapepose_fg.body.training.split import TEST_SUBJECTS, VALIDATION_SUBJECTS
+from shapepose_fg.core.skeleton import SMPL_24
 
 Array = NDArray[np.float64]
 

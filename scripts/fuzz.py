@@ -115,7 +115,7 @@ def work(name: str, held_out: bool, seed: int, seconds: int) -> None:
     with atheris.instrument_imports(include=["shapepose_fg"]):
         prepare = readers()[name]
     mutated = importlib.import_module("mutations").mutated
-    from shapepose_fg.errors import InputError
+    from shapepose_fg.core.errors import InputError
 
     shared = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
     folder = Path(tempfile.mkdtemp(dir=shared))

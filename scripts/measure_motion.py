@@ -12,16 +12,16 @@ from pathlib import Path
 
 from shapepose_fg.body.fitting.fitters import BodyConfig, make_fitter
 from shapepose_fg.body.threads import torch_threads
-from shapepose_fg.estimation.motion_model import FORMAT
-from shapepose_fg.simulation.files import cut, named_scene
-from shapepose_fg.training.foot_speeds import foot_speeds
-from shapepose_fg.training.motion_statistics import (
+from shapepose_fg.body.training.foot_speeds import foot_speeds
+from shapepose_fg.body.training.motion_statistics import (
     LastingErrors,
     densities,
     detected,
     lasting_errors,
     recorded_joints,
 )
+from shapepose_fg.estimation.motion_model import FORMAT
+from shapepose_fg.simulation.files import cut, named_scene
 
 SEQUENCES = {"salsa": 0, "crossing": 100}
 """Sequences of `tune`, and the first of the 120 frames that are taken."""

@@ -34,7 +34,7 @@ PACKAGES = {
     "tracking": ("shapepose_fg/tracking/*.py",),
     "readers": (
         "shapepose_fg/io/**/*.py",
-        "shapepose_fg/files.py",
+        "shapepose_fg/core/storage/files.py",
         "shapepose_fg/body/model/smpl_*.py",
         "shapepose_fg/body/model/pickle_records.py",
     ),

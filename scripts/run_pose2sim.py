@@ -26,14 +26,14 @@ from typing import Any
 
 from marked_tables import ROOT
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import DetectionSequence, Recording
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import DetectionSequence, Recording
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.experiments.interactions import contacts
 from shapepose_fg.evaluation.experiments.others import FILTERED, RAW, folder_name
 from shapepose_fg.evaluation.experiments.scale import Scale
 from shapepose_fg.evaluation.footage import SHELF_FPS, shelf_footage
 from shapepose_fg.io.write_detections import write_openpose
-from shapepose_fg.skeleton import BODY_25
 
 VERSION = "0.10.49"
 """Of Pose2Sim: the settings below are those of its demo `Demo_MultiPerson`."""

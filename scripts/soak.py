@@ -21,12 +21,12 @@ from pathlib import Path
 
 import numpy as np
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import DetectionSequence
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import DetectionSequence
+from shapepose_fg.core.storage.kept_arrays import InFolder, KeptArrays
 from shapepose_fg.evaluation.speed import BackAndForth
 from shapepose_fg.io.write_detections import write_association
-from shapepose_fg.kept_arrays import InFolder, KeptArrays
-from shapepose_fg.runs.manifest import PARTS
+from shapepose_fg.pipeline.runs.manifest import PARTS
 from shapepose_fg.simulation import built_in_scene, simulate
 
 _FPS = 25.0

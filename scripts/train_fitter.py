@@ -25,13 +25,13 @@ from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.weights import FitterWeights, fingerprint
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
-from shapepose_fg.errors import InputError
-from shapepose_fg.provenance import versions
-from shapepose_fg.training.calibration import calibrated
-from shapepose_fg.training.checkpoint import load_checkpoint, save_checkpoint
-from shapepose_fg.training.motions import Motions, load_motions
-from shapepose_fg.training.split import TEST_SUBJECTS, VALIDATION_SUBJECTS
-from shapepose_fg.training.train import PeopleSource, Trainer, TrainingConfig, body_points, prepared
+from shapepose_fg.body.training.calibration import calibrated
+from shapepose_fg.body.training.checkpoint import load_checkpoint, save_checkpoint
+from shapepose_fg.body.training.motions import Motions, load_motions
+from shapepose_fg.body.training.split import TEST_SUBJECTS, VALIDATION_SUBJECTS
+from shapepose_fg.body.training.train import PeopleSource, Trainer, TrainingConfig, body_points, prepared
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.provenance import versions
 
 VALIDATION_PEOPLE = 2048
 ACKNOWLEDGEMENT = (

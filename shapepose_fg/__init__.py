@@ -9,23 +9,23 @@ from typing import TYPE_CHECKING, Any
 os.environ.setdefault("MKL_CBWR", "AUTO")
 
 if TYPE_CHECKING:
-    from shapepose_fg.errors import InputError as InputError
+    from shapepose_fg.core.errors import InputError as InputError
+    from shapepose_fg.core.reconstruction import Reconstruction as Reconstruction
     from shapepose_fg.io.calibration import read_rig as read_rig
     from shapepose_fg.io.calibration import write_rig as write_rig
     from shapepose_fg.io.config import read_config as read_config
     from shapepose_fg.io.detections import read_detections as read_detections
-    from shapepose_fg.pipeline import PipelineConfig as PipelineConfig
-    from shapepose_fg.pipeline import reconstruct as reconstruct
-    from shapepose_fg.reconstruction import Reconstruction as Reconstruction
+    from shapepose_fg.pipeline.pipeline import PipelineConfig as PipelineConfig
+    from shapepose_fg.pipeline.pipeline import reconstruct as reconstruct
 
 _HOMES = {
-    "InputError": "shapepose_fg.errors",
-    "PipelineConfig": "shapepose_fg.pipeline",
-    "Reconstruction": "shapepose_fg.reconstruction",
+    "InputError": "shapepose_fg.core.errors",
+    "PipelineConfig": "shapepose_fg.pipeline.pipeline",
+    "Reconstruction": "shapepose_fg.core.reconstruction",
     "read_config": "shapepose_fg.io.config",
     "read_detections": "shapepose_fg.io.detections",
     "read_rig": "shapepose_fg.io.calibration",
-    "reconstruct": "shapepose_fg.pipeline",
+    "reconstruct": "shapepose_fg.pipeline.pipeline",
     "write_rig": "shapepose_fg.io.calibration",
 }
 """Where each public name lives. It is imported when it is asked for, so that this import loads no torch."""

@@ -8,7 +8,7 @@ def main() -> None:
     """Run the command line. Until it is loaded, Ctrl-C ends the program without a word."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, lambda *_: os._exit(130))
-    from shapepose_fg.cli import main as run
+    from shapepose_fg.cli.main import main as run
 
     run()
 

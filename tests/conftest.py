@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import Detections
-from shapepose_fg.skeleton import BODY_25, Skeleton
-from shapepose_fg.workers import get_ready
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.skeleton import BODY_25, Skeleton
+from shapepose_fg.pipeline.workers import get_ready
 
 # Some tests import others from this folder, where `factors` is the folder of the library's tests: the project goes
 # first, for processes that are begun by a test, too.
@@ -32,7 +32,7 @@ STANDING = np.array(
 @pytest.fixture(scope="session", autouse=True)
 def _torch_is_loaded_once_for_all_processes() -> None:
     """Worker processes of any test are forked off one that has torch; the first test's would leave it out."""
-    get_ready("shapepose_fg.pipeline")
+    get_ready("shapepose_fg.pipeline.pipeline")
 
 
 @pytest.fixture(scope="session")

@@ -17,34 +17,34 @@ import test_calibration_formats as rigs
 import test_people_formats as people
 import test_reconstruction as results
 
-from shapepose_fg.batch.standing import Standing, Standings, read_standings
-from shapepose_fg.batch.table import read_table
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS, read_smpl_file
 from shapepose_fg.body.shapes import SubjectShapes, read_body
-from shapepose_fg.camera import Rig
+from shapepose_fg.cli.batch.standing import Standing, Standings, read_standings
+from shapepose_fg.cli.batch.table import read_table
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.observation_table import ObservationTable
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.skeleton import BODY_25, COCO_17
 from shapepose_fg.detection2d.onnx_file import read_onnx
 from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
 from shapepose_fg.evaluation.other_results.reading import read_people
-from shapepose_fg.export.exporting import export_result
-from shapepose_fg.export.markers import Markers, opensim_names
-from shapepose_fg.export.registry import chosen
-from shapepose_fg.export.trc import trc_text
 from shapepose_fg.io.calibration import read_rig, write_rig
 from shapepose_fg.io.config import read_config, toml_text
 from shapepose_fg.io.corrections import correct, read_corrections, take_back
 from shapepose_fg.io.detections import read_detections
+from shapepose_fg.io.export.exporting import export_result
+from shapepose_fg.io.export.markers import Markers, opensim_names
+from shapepose_fg.io.export.registry import chosen
+from shapepose_fg.io.export.trc import trc_text
 from shapepose_fg.io.footage.used import read_used_footage
 from shapepose_fg.io.pose2sim_project import read_pose2sim_project
 from shapepose_fg.io.skeleton_file import read_skeleton
 from shapepose_fg.io.timestamps import read_timestamps
-from shapepose_fg.observation_table import ObservationTable
-from shapepose_fg.pipeline import PipelineConfig
-from shapepose_fg.reconstruction import Reconstruction
-from shapepose_fg.report.writing import report_of
-from shapepose_fg.skeleton import BODY_25, COCO_17
+from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.tracking.edits import Action, Edit
 from shapepose_fg.tracking.listing import list_saved_tracks
+from shapepose_fg.viz.report.writing import report_of
 
 Read = Callable[[], object]
 """Reads the files; raises InputError, or returns."""

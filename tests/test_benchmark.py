@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.speed import (
     PARTS,
     STAGES,
@@ -18,10 +20,8 @@ from shapepose_fg.evaluation.speed import (
     spend,
     stage_two,
 )
-from shapepose_fg.pipeline import PipelineConfig
-from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.simulation import built_in_scene, simulate
-from shapepose_fg.skeleton import BODY_25
 
 SCRIPT = Path(__file__).parents[1] / "scripts" / "benchmark.py"
 

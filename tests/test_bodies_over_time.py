@@ -7,16 +7,21 @@ import numpy as np
 import pytest
 import torch
 
-from shapepose_fg.bodies_over_time import STRETCH_ROWS, BodiesOverTime, fit_everybody, with_bodies_over_time
 from shapepose_fg.body.fitting.body_sequence import Shapes
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.fitting.learned import LearnedFitter
 from shapepose_fg.body.fitting.weights import fingerprint
 from shapepose_fg.body.model.body_model import BodyParameters
 from shapepose_fg.body.shapes import SubjectShapes
-from shapepose_fg.kept_arrays import InMemory
-from shapepose_fg.person_bodies import Person
-from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.storage.kept_arrays import InMemory
+from shapepose_fg.pipeline.bodies_over_time import (
+    STRETCH_ROWS,
+    BodiesOverTime,
+    fit_everybody,
+    with_bodies_over_time,
+)
+from shapepose_fg.pipeline.person_bodies import Person
 from shapepose_fg.simulation import Scene, built_in_scene
 from shapepose_fg.simulation.truth import truth_of
 

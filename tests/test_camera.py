@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from shapepose_fg.camera import Camera, Rig
+from shapepose_fg.core.camera import Camera, Rig
 
 K = np.array([[1000.0, 2.0, 500.0], [0.0, 1010.0, 400.0], [0.0, 0.0, 1.0]])
 LENS = np.array([-0.3, 0.1, 0.001, -0.002, 0.02])

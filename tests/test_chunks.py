@@ -6,21 +6,21 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from shapepose_fg.chunk_work import ChunkJob, solve_chunk
-from shapepose_fg.detections import Detections
-from shapepose_fg.engine import Setup
-from shapepose_fg.frame_times import FrameTimes
-from shapepose_fg.kept_arrays import InFolder
-from shapepose_fg.pipeline import PipelineConfig, reconstruct, reconstruct_parts
-from shapepose_fg.runs import chunks
-from shapepose_fg.runs.borders import Border, same_people
-from shapepose_fg.runs.chunks import Chunk, cut_in_chunks, windows_of
+from shapepose_fg.cli.stopping import Stopped
+from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.core.storage.kept_arrays import InFolder
+from shapepose_fg.pipeline.chunk_work import ChunkJob, solve_chunk
+from shapepose_fg.pipeline.engine import Setup
+from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct, reconstruct_parts
+from shapepose_fg.pipeline.runs import chunks
+from shapepose_fg.pipeline.runs.borders import Border, same_people
+from shapepose_fg.pipeline.runs.chunks import Chunk, cut_in_chunks, windows_of
+from shapepose_fg.pipeline.windows import Engine, WindowConfig
 from shapepose_fg.simulation import built_in_scene, simulate
-from shapepose_fg.skeleton import BODY_25
-from shapepose_fg.stopping import Stopped
 from shapepose_fg.tracking.following import FollowingConfig
 from shapepose_fg.tracking.hypotheses import Input
-from shapepose_fg.windows import Engine, WindowConfig
 
 CONFIG = PipelineConfig(
     batch_frames=12, following=FollowingConfig(look_ahead_s=0.3), windows=WindowConfig(overlap_s=0.16)

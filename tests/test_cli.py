@@ -12,17 +12,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import shapepose_fg.reconstruct_run
-from shapepose_fg.bodies_over_time import BodiesOverTime
+import shapepose_fg.cli.reconstruct.run
 from shapepose_fg.body.shapes import SubjectShapes
-from shapepose_fg.cli import main
-from shapepose_fg.frame_times import FrameTimes
-from shapepose_fg.observation_table import ObservationTable
-from shapepose_fg.reconstruction import Known, Reconstruction, Status
-from shapepose_fg.runs.assembly import Assembly
-from shapepose_fg.runs.notes import Notes
-from shapepose_fg.runs.parts import Part, Parts
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.cli.main import main
+from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.observation_table import ObservationTable
+from shapepose_fg.core.reconstruction import Known, Reconstruction, Status
+from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.pipeline.bodies_over_time import BodiesOverTime
+from shapepose_fg.pipeline.runs.assembly import Assembly
+from shapepose_fg.pipeline.runs.notes import Notes
+from shapepose_fg.pipeline.runs.parts import Part, Parts
 
 K = [1000.0, 0, 500, 0, 1000, 400, 0, 0, 1]
 
@@ -83,7 +83,7 @@ def pipeline(monkeypatch) -> dict:
         }
         return Assembly(parts, BODY_25.joints, rig.names, run=run)
 
-    monkeypatch.setattr(shapepose_fg.reconstruct_run, "reconstruct_parts", fake)
+    monkeypatch.setattr(shapepose_fg.cli.reconstruct.run, "reconstruct_parts", fake)
     return called
 
 
@@ -156,7 +156,7 @@ def test_times_cuts_and_time_itself_reach_the_pipeline(recording, pipeline, tmp_
 
 
 def test_shapes_are_kept_from_one_recording_to_the_next(recording, pipeline, tmp_path, monkeypatch, capsys):
-    fake, file = shapepose_fg.reconstruct_run.reconstruct_parts, tmp_path / "kept" / "subjects.npz"
+    fake, file = shapepose_fg.cli.reconstruct.run.reconstruct_parts, tmp_path / "kept" / "subjects.npz"
 
     def with_shapes(*arguments, shapes, **options):
         result = fake(*arguments, shapes=shapes, **options)
@@ -170,7 +170,7 @@ def test_shapes_are_kept_from_one_recording_to_the_next(recording, pipeline, tmp
         bodies = BodiesOverTime(result.parts.kept, places, found)
         return replace(result, bodies=bodies)
 
-    monkeypatch.setattr(shapepose_fg.reconstruct_run, "reconstruct_parts", with_shapes)
+    monkeypatch.setattr(shapepose_fg.cli.reconstruct.run, "reconstruct_parts", with_shapes)
     assert run(*recording, "--shapes", str(file)) == 0
     assert len(pipeline["shapes"]) == 0
     assert "shapes of 1 people" in " ".join(capsys.readouterr().out.split())
@@ -274,7 +274,7 @@ def test_a_disk_that_is_full_is_one_sentence_too(recording, pipeline, monkeypatc
     def full(stream, columns):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(shapepose_fg.result_files, "write_npz", full)
+    monkeypatch.setattr(shapepose_fg.core.result_files, "write_npz", full)
     assert run(*recording) == 2
     out = Path(recording[recording.index("--output") + 1])
     assert f"{out}/people.npz: No space left on device; " in capsys.readouterr().err
@@ -283,7 +283,7 @@ def test_a_disk_that_is_full_is_one_sentence_too(recording, pipeline, monkeypatc
 
 
 def test_inputs_that_go_while_it_runs_do_no_harm(recording, pipeline, tmp_path, monkeypatch):
-    fake = shapepose_fg.reconstruct_run.reconstruct_parts
+    fake = shapepose_fg.cli.reconstruct.run.reconstruct_parts
     left = hashlib.sha256((tmp_path / "left.txt").read_bytes()).hexdigest()
 
     def vanishing(*arguments, **options):
@@ -291,7 +291,7 @@ def test_inputs_that_go_while_it_runs_do_no_harm(recording, pipeline, tmp_path, 
         (tmp_path / "right.txt").write_text("something else")
         return fake(*arguments, **options)
 
-    monkeypatch.setattr(shapepose_fg.reconstruct_run, "reconstruct_parts", vanishing)
+    monkeypatch.setattr(shapepose_fg.cli.reconstruct.run, "reconstruct_parts", vanishing)
     assert run(*recording) == 0
     assert Reconstruction.load(tmp_path / "out").run["inputs"][str(tmp_path / "left.txt")] == left
 
@@ -342,7 +342,7 @@ def short_scene(monkeypatch):
     """The demo on five frames of its scene."""
     from shapepose_fg.simulation import built_in_scene
 
-    monkeypatch.setattr("shapepose_fg.demo.built_in_scene", lambda: built_in_scene(frames=5))
+    monkeypatch.setattr("shapepose_fg.cli.demo.built_in_scene", lambda: built_in_scene(frames=5))
 
 
 def test_demo_compares_with_the_truth_and_leaves_a_picture(short_scene, tmp_path, monkeypatch, capsys):
@@ -392,7 +392,7 @@ def test_demo_without_matplotlib_says_what_to_install(short_scene, tmp_path, mon
 
 
 def test_the_scene_is_what_the_demo_says_it_is():
-    from shapepose_fg.cli import _DEMO
+    from shapepose_fg.cli.main import _DEMO
     from shapepose_fg.simulation import built_in_scene
 
     scene = built_in_scene()
@@ -401,11 +401,11 @@ def test_the_scene_is_what_the_demo_says_it_is():
 
 LIGHT = """
 import sys
-import shapepose_fg, shapepose_fg.cli
+import shapepose_fg, shapepose_fg.cli.main
 from shapepose_fg import InputError, Reconstruction, read_detections, read_rig
 assert "torch" not in sys.modules, "torch is loaded"
 try:
-    shapepose_fg.cli.main(["--help"])
+    shapepose_fg.cli.main.main(["--help"])
 except SystemExit as end:
     assert end.code == 0
 assert "torch" not in sys.modules, "help loads torch"
@@ -422,7 +422,7 @@ def test_a_reader_that_stops_reading_is_no_error():
     """`shapepose-fg version | head -n 0`: no traceback, no sentence."""
     reader, writer = os.pipe()
     os.close(reader)
-    command = [sys.executable, "-m", "shapepose_fg.cli", "version"]
+    command = [sys.executable, "-m", "shapepose_fg.cli.main", "version"]
     result = subprocess.run(command, check=False, timeout=60, stdout=writer, stderr=subprocess.PIPE, text=True)
     os.close(writer)
     assert result.stderr == ""

@@ -6,8 +6,8 @@ import time
 
 import pytest
 
-from shapepose_fg.cluster import Cluster, _program, _work, has_dashboard, local_cluster
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.pipeline.cluster import Cluster, _program, _work, has_dashboard, local_cluster
 
 
 def power(base: int, exponent: int) -> int:

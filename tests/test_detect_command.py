@@ -7,14 +7,14 @@ import cv2
 import numpy as np
 import pytest
 
-from shapepose_fg.cli import main
+from shapepose_fg.cli.main import main
+from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.detection2d.network import HeatMapNetwork
 from shapepose_fg.detection2d.networks import layouts
 from shapepose_fg.evaluation.single_person import man_of
 from shapepose_fg.io.calibration import read_rig, write_rig
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.io.timestamps import read_timestamps
-from shapepose_fg.reconstruction import Reconstruction
 from shapepose_fg.simulation.scene import ring_of_cameras
 
 

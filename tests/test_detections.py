@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from shapepose_fg.detections import Detections, Recording
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.core.detections import Detections, Recording
+from shapepose_fg.core.skeleton import BODY_25
 
 
 def one_limb() -> dict[str, np.ndarray]:

@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shapepose_fg.cli import main
-from shapepose_fg.detections import Detections, Recording
+from shapepose_fg.cli.main import main
+from shapepose_fg.core.detections import Detections, Recording
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.experiments.made_with import changes, made_with
 from shapepose_fg.evaluation.metrics import joint_metrics
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.config import toml_text
-from shapepose_fg.pipeline import PipelineConfig
-from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.simulation import Scene, built_in_scene, simulate
-from shapepose_fg.skeleton import BODY_25
 
 ROOT = Path(__file__).parents[1]
 EVALUATION = ROOT / "docs" / "evaluation.md"

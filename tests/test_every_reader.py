@@ -15,7 +15,7 @@ sys.path.append(str(Path(__file__).parent))
 from mutations import mutated
 from readers import READERS
 
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.errors import InputError
 
 FOUND = Path(__file__).parent / "data" / "fuzz"
 """What `scripts/fuzz.py` found once: folders called after the reader, with the files as they were."""

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
+from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.contact import feet_of
-from shapepose_fg.frame_times import FrameTimes
-from shapepose_fg.pipeline import PipelineConfig, reconstruct
+from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.simulation import built_in_scene, simulate
-from shapepose_fg.skeleton import BODY_25
 
 FEET = feet_of(BODY_25.joints)
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from shapepose_fg.frame_times import FrameTimes, check_cuts, stretches
+from shapepose_fg.core.frame_times import FrameTimes, check_cuts, stretches
 
 
 def test_times_from_a_rate():

@@ -22,15 +22,15 @@ from readers import READERS, tiny_body
 
 from shapepose_fg.body.fitting.weights import FitterWeights
 from shapepose_fg.body.model.smpl_file import read_smpl_file
-from shapepose_fg.errors import InputError
-from shapepose_fg.files import read_json, read_text, read_toml
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.storage.files import read_json, read_text, read_toml
+from shapepose_fg.core.storage.npz_reader import read_npz
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.config import read_config
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.io.timestamps import read_timestamps
-from shapepose_fg.npz_reader import read_npz
-from shapepose_fg.pipeline import PipelineConfig
-from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.simulation.scene import ring_of_cameras
 
 
@@ -48,9 +48,9 @@ def in_little_memory(code: str, *arguments: object, before: str = "") -> str:
         "resource.setrlimit(resource.RLIMIT_AS, (used + 300 * 2**20,) * 2)\n"
     )
     begin = (
-        "import sys\nfrom pathlib import Path\nfrom shapepose_fg.errors import InputError\n"
+        "import sys\nfrom pathlib import Path\nfrom shapepose_fg.core.errors import InputError\n"
         "from shapepose_fg.body.model.smpl_file import read_smpl_file\n"
-        "from shapepose_fg.npz_reader import read_npz\n"
+        "from shapepose_fg.core.storage.npz_reader import read_npz\n"
     )
     end = f"try:\n    {code}\n    print('read')\nexcept InputError as error:\n    print(error)\n"
     command = [sys.executable, "-c", begin + before + limit + end, *map(str, arguments)]
@@ -367,7 +367,7 @@ def test_numbers_by_which_rows_are_chosen_are_numbers(tmp_path, column):
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's device that is always full")
 @pytest.mark.parametrize(("streams", "code"), [(">&-", 0), (">&- 2>&-", 0), (">/dev/full", 2), ("| true", 1)])
 def test_any_stdout(streams, code):
-    command = f"set -o pipefail; {sys.executable} -m shapepose_fg.cli --help {streams}"
+    command = f"set -o pipefail; {sys.executable} -m shapepose_fg.cli.main --help {streams}"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=60, check=False)
     # Whether `true` ends before anything is written is chance.
     assert done.returncode in {code, 0 if streams == "| true" else code}
@@ -377,7 +377,14 @@ def test_any_stdout(streams, code):
 def test_a_path_that_the_terminal_cannot_write(tmp_path):
     name = os.fsdecode(b"caf\xe9\xff")
     environment = os.environ | {"PYTHONIOENCODING": "ascii"}
-    command = [sys.executable, "-m", "shapepose_fg.cli", "check-calibration", "--calibration", tmp_path / name]
+    command = [
+        sys.executable,
+        "-m",
+        "shapepose_fg.cli.main",
+        "check-calibration",
+        "--calibration",
+        tmp_path / name,
+    ]
     command += ["--detections", tmp_path]
     done = subprocess.run(command, capture_output=True, timeout=60, check=False, env=environment)
     assert done.returncode == 2 and b"there is no such file" in done.stderr and b"Traceback" not in done.stderr

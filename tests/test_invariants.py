@@ -20,15 +20,15 @@ from scipy.spatial.transform import Rotation
 
 sys.path.append(str(Path(__file__).parent))
 
-from shapepose_fg.camera import Camera, Rig
-from shapepose_fg.detections import Detections, Recording
-from shapepose_fg.frame_times import FrameTimes
+from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.detections import Detections, Recording
+from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.io.calibration import read_rig, write_rig
-from shapepose_fg.pipeline import PipelineConfig, reconstruct
+from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.proposal.candidates import triangulate_pairs, vote
-from shapepose_fg.reconstruction import Reconstruction
 from shapepose_fg.simulation import built_in_scene, simulate
-from shapepose_fg.skeleton import BODY_25
 
 FRAMES = 6
 SAME_M = 1e-3

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shapepose_fg.kept_arrays import InFolder, InMemory, KeptArrays
+from shapepose_fg.core.storage.kept_arrays import InFolder, InMemory, KeptArrays
 
 
 @pytest.fixture(params=["memory", "folder"])

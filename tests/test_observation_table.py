@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shapepose_fg.errors import InputError
-from shapepose_fg.observation_table import Gate, ObservationTable, place_in_view
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.observation_table import Gate, ObservationTable, place_in_view
 
 
 def table() -> ObservationTable:
@@ -121,7 +121,7 @@ def test_a_detection_s_place_among_those_of_its_view():
 
 def test_the_table_of_solved_rows(five_cameras, two_people, seen_exactly):
     """Detections without error, joints moved by hand: residuals are what the cameras say, reasons as they must."""
-    from shapepose_fg.observations import Observations
+    from shapepose_fg.core.observations import Observations
 
     seen = seen_exactly(five_cameras, two_people)
     candidate = np.full((2, 25, 5), -1)

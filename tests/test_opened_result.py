@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import shapepose_fg.saved_table
-from shapepose_fg.errors import InputError
-from shapepose_fg.export.reading import read_take
-from shapepose_fg.observation_table import Gate, ObservationTable
-from shapepose_fg.reconstruction import Known, Reconstruction
-from shapepose_fg.report.writing import report_of
-from shapepose_fg.skeleton import BODY_25
+import shapepose_fg.core.storage.saved_table
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.observation_table import Gate, ObservationTable
+from shapepose_fg.core.reconstruction import Known, Reconstruction
+from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.io.export.reading import read_take
 from shapepose_fg.tracking.listing import list_saved_tracks, list_tracks
+from shapepose_fg.viz.report.writing import report_of
 
 PEOPLE, FRAMES, VIEWS = 3, 400, ("a", "b")
 
@@ -116,7 +116,7 @@ def test_rows_in_the_middle_take_the_memory_of_these_rows(folder, result):
 
 
 def test_what_does_not_fit_in_memory_is_a_sentence(folder, monkeypatch):
-    monkeypatch.setattr(shapepose_fg.saved_table, "free_memory", lambda: 1_000_000)
+    monkeypatch.setattr(shapepose_fg.core.storage.saved_table, "free_memory", lambda: 1_000_000)
     with pytest.raises(InputError, match=r"people\.npz: 934 rows would take .* and 1\.0 MB are free; take some"):
         Reconstruction.load(folder)
     with pytest.raises(InputError, match=r"rows would take"):
@@ -127,7 +127,7 @@ def test_what_does_not_fit_in_memory_is_a_sentence(folder, monkeypatch):
 
 def test_many_people_in_many_frames_are_a_sentence(folder, monkeypatch):
     """A place for everybody in every frame: 12,000 people in as many frames took a gigabyte from 83 KB."""
-    monkeypatch.setattr("shapepose_fg.export.take.free_memory", lambda: 1000)
+    monkeypatch.setattr("shapepose_fg.io.export.take.free_memory", lambda: 1000)
     with pytest.raises(
         InputError, match=r"people\.npz: \d+ people over \d+ frames would take .* \(--frames, --person\)"
     ):
@@ -159,7 +159,7 @@ def test_a_part_is_exported_listed_and_shown_as_the_whole_would_be(folder, resul
         listed = list_saved_tracks(opened)
     without = [[replace(track, stature_m=0.0) for track in each] for each in (listed, list_tracks(result))]
     assert without[0] == without[1]  # without a body nobody has a height
-    monkeypatch.setattr("shapepose_fg.report.writing.MOST_ROWS", 300)
+    monkeypatch.setattr("shapepose_fg.viz.report.writing.MOST_ROWS", 300)
     page = report_of(folder, up="z").read_text()
     assert "every 4th frame" in page
     thin = list_tracks(result.rows(result.frame % 4 == 0), every=4)

@@ -7,13 +7,13 @@ import cv2
 import numpy as np
 import pytest
 
-from shapepose_fg.cli import main
-from shapepose_fg.frame_times import FrameTimes
+from shapepose_fg.cli.main import main
+from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.footage.placement import Placement, PlacementKind
 from shapepose_fg.io.footage.used import CameraFootage, write_used_footage
-from shapepose_fg.pipeline import reconstruct
-from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.pipeline.pipeline import reconstruct
 from shapepose_fg.simulation import built_in_scene, simulate
 
 FRAMES = 3

@@ -8,19 +8,19 @@ import pytest
 import torch
 
 from factors import isotropic
-from shapepose_fg.detections import Detections, Recording
+from shapepose_fg.core.detections import Detections, Recording
+from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.reconstruction import Known, Reconstruction, Status
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.detector_offsets import OffsetConfig
 from shapepose_fg.evaluation.metrics import joint_metrics
 from shapepose_fg.evaluation.shelf import evaluate_shelf, read_shelf_ground_truth
-from shapepose_fg.frame_times import FrameTimes
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
-from shapepose_fg.pipeline import PipelineConfig, find_people, reconstruct
+from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people, reconstruct
 from shapepose_fg.proposal.proposals import ProposalConfig
-from shapepose_fg.reconstruction import Known, Reconstruction, Status
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.scene import Scene
-from shapepose_fg.skeleton import BODY_25
 
 WRISTS = [BODY_25.index("RWrist"), BODY_25.index("LWrist")]
 

@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 
 from shapepose_fg.body.fitting.fitter import BodyFit, FitStatus
-from shapepose_fg.camera import Views
-from shapepose_fg.cli import main
-from shapepose_fg.detections import Detections
+from shapepose_fg.cli.main import main
+from shapepose_fg.core.camera import Views
+from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.body_step import JOINT_SIGMA_M, BodyStep, joint_targets
 from shapepose_fg.estimation.draft import MODEL_SIGMA_M
 from shapepose_fg.estimation.estimator import Estimator
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.linearisation import linearise, observation_sigmas
 from shapepose_fg.io.config import read_config
-from shapepose_fg.observations import Observations
-from shapepose_fg.pipeline import PipelineConfig, find_people
+from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people
 from shapepose_fg.proposal.candidates import triangulate_pairs, vote
-from shapepose_fg.skeleton import BODY_25
 
 PAPER = PipelineConfig.paper()
 STAGE_II = EstimatorConfig(PAPER.observations, PAPER.window_graph, PAPER.refine, PAPER.motion)

@@ -6,8 +6,8 @@ import platform
 import numpy as np
 import pytest
 
-from shapepose_fg.errors import InputError
-from shapepose_fg.provenance import ReadInputs, checksums, program_digest, versions
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.provenance import ReadInputs, checksums, program_digest, versions
 
 
 def test_versions_are_those_that_run():

@@ -11,11 +11,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shapepose_fg.errors import InputError
-from shapepose_fg.files import write_atomically
-from shapepose_fg.observation_table import Gate, ObservationTable
-from shapepose_fg.reconstruction import Known, Reconstruction, Status
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.observation_table import Gate, ObservationTable
+from shapepose_fg.core.reconstruction import Known, Reconstruction, Status
+from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.core.storage.files import write_atomically
 
 
 def people(frames: list[int], seed: int = 0) -> Reconstruction:
@@ -234,7 +234,7 @@ def test_run_that_json_cannot_hold_leaves_the_old_files(tmp_path):
 
 KILLED = """
 import os, signal, sys
-from shapepose_fg.files import write_atomically
+from shapepose_fg.core.storage.files import write_atomically
 from pathlib import Path
 
 def write(stream):

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from shapepose_fg.camera import Camera
-from shapepose_fg.rendering import (
+from shapepose_fg.core.camera import Camera
+from shapepose_fg.viz.rendering import (
     first_surface_at,
     look_at,
     rasterise,
@@ -115,7 +115,7 @@ def test_what_is_behind_the_camera_or_nan_is_not_drawn(camera: Camera):
 def test_large_images_are_drawn_in_pieces(monkeypatch: pytest.MonkeyPatch, camera: Camera):
     vertices, faces = sphere(30)
     whole = render_depth(vertices, faces, camera)
-    monkeypatch.setattr("shapepose_fg.rendering._CHUNK_PIXELS", 97)
+    monkeypatch.setattr("shapepose_fg.viz.rendering._CHUNK_PIXELS", 97)
     pieces = render_depth(vertices, faces, camera)
     np.testing.assert_array_equal(whole.depth, pieces.depth)
     np.testing.assert_array_equal(whole.face, pieces.face)

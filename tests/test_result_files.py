@@ -8,12 +8,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-import shapepose_fg.result_files
-from shapepose_fg.errors import InputError
-from shapepose_fg.files import write_together
-from shapepose_fg.npz_writer import Column, write_npz
-from shapepose_fg.reconstruction import Reconstruction, Status
-from shapepose_fg.result_files import write_result
+import shapepose_fg.core.result_files
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.reconstruction import Reconstruction, Status
+from shapepose_fg.core.result_files import write_result
+from shapepose_fg.core.storage.files import write_together
+from shapepose_fg.core.storage.npz_writer import Column, write_npz
 from shapepose_fg.simulation import built_in_scene
 from shapepose_fg.simulation.truth import truth_of
 
@@ -125,7 +125,7 @@ def test_a_disk_that_is_full_at_any_write_leaves_the_old_files_and_is_named(two_
 
             write_together({path: full(write) for path, write in files.items()})
 
-        monkeypatch.setattr(shapepose_fg.result_files, "write_together", limited)
+        monkeypatch.setattr(shapepose_fg.core.result_files, "write_together", limited)
         with pytest.raises(OSError, match="No space left on device") as caught:
             write_result(a, new.columns(), None, new.run)
         assert caught.value.filename in (str(a / "people.npz"), str(a / "run.json"))

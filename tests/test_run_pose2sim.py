@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shapepose_fg.detections import Recording
+from shapepose_fg.core.detections import Recording
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
-from shapepose_fg.skeleton import BODY_25
 
 SCRIPTS = Path(__file__).parents[1] / "scripts"
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from shapepose_fg.body.model.target_skeletons import TARGET_SKELETONS, slots
-from shapepose_fg.skeleton import BODY_25, COCO_17, SKELETONS, SMPL_24, Skeleton
+from shapepose_fg.core.skeleton import BODY_25, COCO_17, SKELETONS, SMPL_24, Skeleton
 
 
 def test_body_25_is_openpose_s():

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.evaluation.speed import BackAndForth
 from shapepose_fg.io.write_detections import write_association
-from shapepose_fg.reconstruction import Reconstruction
 from shapepose_fg.simulation import built_in_scene, simulate
 
 _FILE = Path(__file__).parents[1] / "scripts" / "soak.py"

@@ -10,19 +10,19 @@ import pytest
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
-from shapepose_fg.cli import main
-from shapepose_fg.errors import InputError
+from shapepose_fg.cli.main import main
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.observation_table import Gate
+from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.estimation.estimator import Estimator
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.solved_setup import CAMERAS, read_setup
-from shapepose_fg.observation_table import Gate
-from shapepose_fg.pipeline import PipelineConfig, reconstruct
-from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
+from shapepose_fg.pipeline.solving import solve_rows
+from shapepose_fg.pipeline.windows import WindowConfig
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.scene import Scene
-from shapepose_fg.solving import solve_rows
 from shapepose_fg.tracking.edits import Action, Edit, apply, solve_anew
-from shapepose_fg.windows import WindowConfig
 
 FRAMES = 12
 CONFIG = PipelineConfig(batch_frames=8)

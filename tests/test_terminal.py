@@ -6,8 +6,8 @@ import pytest
 from rich.progress import TextColumn
 from rich.table import Table
 
+from shapepose_fg.cli.terminal import progress, show
 from shapepose_fg.setup_check.camera_use import CameraUse, Distances, use_table
-from shapepose_fg.terminal import progress, show
 
 
 @pytest.mark.parametrize("name", ["cam[left]", "a[/b]", ":cat:", "[red]"])

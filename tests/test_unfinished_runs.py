@@ -16,23 +16,23 @@ import numpy as np
 import pytest
 
 from shapepose_fg.body.shapes import SubjectShapes
-from shapepose_fg.cli import main
-from shapepose_fg.errors import InputError
+from shapepose_fg.cli.main import main
+from shapepose_fg.cli.stopping import Stopped
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.storage.kept_arrays import InFolder
+from shapepose_fg.core.storage.output_folder import only_run_in
 from shapepose_fg.estimation.detector_offsets import OffsetConfig
 from shapepose_fg.io.config import toml_text
-from shapepose_fg.kept_arrays import InFolder
-from shapepose_fg.output_folder import only_run_in
-from shapepose_fg.pipeline import PipelineConfig, reconstruct, reconstruct_parts
-from shapepose_fg.reconstruction import Reconstruction
-from shapepose_fg.runs.known_people import checksum_at_start, people_at_start, write_people
-from shapepose_fg.runs.manifest import end_run, open_run
-from shapepose_fg.runs.room import check_room, expected_bytes
+from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct, reconstruct_parts
+from shapepose_fg.pipeline.runs.known_people import checksum_at_start, people_at_start, write_people
+from shapepose_fg.pipeline.runs.manifest import end_run, open_run
+from shapepose_fg.pipeline.runs.room import check_room, expected_bytes
+from shapepose_fg.pipeline.windows import WindowConfig
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.files import write_simulated
-from shapepose_fg.stopping import Stopped
 from shapepose_fg.tracking import following
 from shapepose_fg.tracking.following import FollowingConfig
-from shapepose_fg.windows import WindowConfig
 
 CONFIG = PipelineConfig(
     batch_frames=6,
@@ -224,7 +224,7 @@ import shapepose_fg.__main__ as begin
 
 class Interrupting:
     def find_spec(self, name, *_):
-        if name == "shapepose_fg.cli":
+        if name == "shapepose_fg.cli.main":
             os.kill(os.getpid(), signal.SIGINT)
 
 sys.meta_path.insert(0, Interrupting())
@@ -250,7 +250,7 @@ def begun(tmp_path) -> Iterator[dict]:
 
 
 def test_a_run_goes_on_with_the_same_only(tmp_path, begun, monkeypatch):
-    monkeypatch.setattr("shapepose_fg.runs.manifest.Parts", lambda kept: _Done())
+    monkeypatch.setattr("shapepose_fg.pipeline.runs.manifest.Parts", lambda kept: _Done())
     with pytest.raises(InputError, match=r"was stopped here after 8 frames; go on with --resume, or begin anew"):
         open_run(tmp_path, begun)
     open_run(tmp_path, begun, resume=True)
@@ -270,7 +270,7 @@ class _Done:
     """Parts of eight frames."""
 
     def notes(self):
-        from shapepose_fg.runs.notes import Notes
+        from shapepose_fg.pipeline.runs.notes import Notes
 
         return Notes(frames=8)
 
@@ -319,7 +319,7 @@ def test_a_kill_while_a_run_is_removed_leaves_nothing_to_be_refused(tmp_path, be
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("shapepose_fg.runs.manifest.shutil.rmtree", killed)
+        patch.setattr("shapepose_fg.pipeline.runs.manifest.shutil.rmtree", killed)
         with pytest.raises(KeyboardInterrupt):
             open_run(tmp_path, begun, restart=True) if by == "restart" else end_run(tmp_path)
     kept = open_run(tmp_path, begun, resume=True)

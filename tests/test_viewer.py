@@ -8,15 +8,15 @@ import cv2
 import numpy as np
 import pytest
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.errors import InputError
-from shapepose_fg.reconstruction import Reconstruction
-from shapepose_fg.rendering import look_at, render_depth
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.simulation import DetectorConfig, Scene, built_in_scene, simulate
-from shapepose_fg.skeleton import BODY_25
-from shapepose_fg.viewer import demo_picture
-from shapepose_fg.viewer.figures import Figures, Mesh, floor_under, framed, free_viewpoint, two_views
-from shapepose_fg.viewer.floor import Floor, floor_picture
+from shapepose_fg.viz.rendering import look_at, render_depth
+from shapepose_fg.viz.viewer import demo_picture
+from shapepose_fg.viz.viewer.figures import Figures, Mesh, floor_under, framed, free_viewpoint, two_views
+from shapepose_fg.viz.viewer.floor import Floor, floor_picture
 
 pytest.importorskip("matplotlib")
 UP = np.array([0.0, 0.0, 1.0])

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shapepose_fg.detections import Recording
-from shapepose_fg.frame_times import FrameTimes
-from shapepose_fg.pipeline import PipelineConfig, reconstruct
+from shapepose_fg.core.detections import Recording
+from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
+from shapepose_fg.pipeline.windows import WindowConfig
 from shapepose_fg.simulation import built_in_scene, simulate
-from shapepose_fg.skeleton import BODY_25
-from shapepose_fg.windows import WindowConfig
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +106,7 @@ def test_one_frame_is_what_it_is_without_time(scene, recording, times):
 
 
 def test_an_empty_recording_and_one_that_begins_empty(scene, recording):
-    from shapepose_fg.detections import Detections
+    from shapepose_fg.core.detections import Detections
 
     nothing = [Detections.empty()] * 5
     assert len(reconstruct(Recording(BODY_25, nothing), scene.rig)) == 0
@@ -116,8 +116,8 @@ def test_an_empty_recording_and_one_that_begins_empty(scene, recording):
 
 
 def test_people_are_carried_through_frames_in_which_no_camera_sees_anything(scene, recording, times):
-    from shapepose_fg.detections import Detections
-    from shapepose_fg.reconstruction import Known
+    from shapepose_fg.core.detections import Detections
+    from shapepose_fg.core.reconstruction import Known
 
     gap = range(10, 14)
     frames = [Detections.empty() if t in gap else recording[t] for t in range(24)]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from shapepose_fg.workers import Workers, suitable_workers, what_workers_inherit
+from shapepose_fg.pipeline.workers import Workers, suitable_workers, what_workers_inherit
 
 
 def times(shared: int, item: int) -> int:
@@ -40,7 +40,7 @@ def what_is_loaded(module: str, _: int) -> tuple[bool, int]:
 
 _READY = """
 import os
-from shapepose_fg.workers import Workers, get_ready
+from shapepose_fg.pipeline.workers import Workers, get_ready
 from test_workers import what_is_loaded
 if __name__ == "__main__":
     get_ready("wave")

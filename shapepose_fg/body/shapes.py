@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from shapepose_fg.body.model.smpl_file import SmplArrays, read_smpl_file
-from shapepose_fg.columns import checked
-from shapepose_fg.errors import InputError
-from shapepose_fg.files import write_atomically
-from shapepose_fg.npz_reader import read_npz
-from shapepose_fg.npz_writer import write_npz
+from shapepose_fg.core.columns import checked
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import write_atomically
+from shapepose_fg.core.storage.npz_reader import read_npz
+from shapepose_fg.core.storage.npz_writer import write_npz
 
 _OPEN_BODY = Path(__file__).with_name("data") / "open_body.npz"
 _COLUMNS = ("names", "betas", "information", "body")

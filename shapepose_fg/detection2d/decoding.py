@@ -12,7 +12,7 @@ import numpy as np
 from annotated_types import Interval
 from numpy.typing import NDArray
 
-from shapepose_fg.bounds import Settings, Share
+from shapepose_fg.core.bounds import Settings, Share
 from shapepose_fg.detection2d.networks import NetworkLayout
 
 

@@ -7,8 +7,8 @@ import numpy as np
 from annotated_types import Interval
 from numpy.typing import NDArray
 
-from shapepose_fg.bounds import Settings
-from shapepose_fg.camera import Camera
+from shapepose_fg.core.bounds import Settings
+from shapepose_fg.core.camera import Camera
 from shapepose_fg.detection2d.decoding import Candidates, DecodingConfig, decode
 from shapepose_fg.detection2d.network import HeatMapNetwork
 from shapepose_fg.detection2d.upright import UprightView, roll_of

@@ -8,9 +8,9 @@ import urllib.request
 from collections.abc import Callable
 from pathlib import Path
 
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.detection2d.networks import KnownNetwork, known_networks
-from shapepose_fg.errors import InputError
-from shapepose_fg.files import write_atomically
 
 _CHUNK = 1 << 16
 _TIMEOUT_S = 30.0

@@ -10,9 +10,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.detection2d.networks import NetworkLayout, find_layout
 from shapepose_fg.detection2d.onnx_file import read_onnx
-from shapepose_fg.errors import InputError
 
 Backend = Literal["opencv", "onnxruntime"]
 """What runs the network."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.errors import InputError
 
 
 @dataclass(frozen=True)

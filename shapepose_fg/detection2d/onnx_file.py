@@ -4,8 +4,8 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from shapepose_fg.errors import InputError
-from shapepose_fg.files import open_regular
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import open_regular
 
 MOST_BYTES = 2**29
 """Networks of OpenPose's kind have 2 to 200 MB."""

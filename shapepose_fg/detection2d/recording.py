@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import read_json, write_atomically
 from shapepose_fg.detection2d.blocks import Block, DetectionRun, write_block, write_text
-from shapepose_fg.errors import InputError
-from shapepose_fg.files import read_json, write_atomically
 from shapepose_fg.io.footage.used import FOOTAGE, CameraFootage, write_used_footage
 
 BLOCK = 16

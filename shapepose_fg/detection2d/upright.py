@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Camera
+from shapepose_fg.core.camera import Camera
 from shapepose_fg.detection2d.networks import NetworkLayout
 
 LEVEL_DEG = 5.0

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus, JointTargets
-from shapepose_fg.camera import Views
+from shapepose_fg.core.camera import Views
+from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.body_step import BodyStep, Tie, disagreement
 from shapepose_fg.estimation.contact import walking
 from shapepose_fg.estimation.draft import WholeFitter
@@ -16,7 +17,6 @@ from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.linearisation import ViewEvidence, linearise, mean_confidence
 from shapepose_fg.estimation.motion_model import LOST_M
 from shapepose_fg.estimation.window_graph import Message, WindowGraph
-from shapepose_fg.observations import Observations
 
 
 @dataclass(frozen=True)

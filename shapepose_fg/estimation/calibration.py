@@ -6,7 +6,7 @@ from importlib.resources import as_file, files
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.files import read_json
+from shapepose_fg.core.storage.files import read_json
 
 Array = NDArray[np.float64]
 

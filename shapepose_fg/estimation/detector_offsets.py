@@ -10,11 +10,11 @@ from shapepose_fg.body.fitting.fitter import BodyFitter, JointTargets
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.offsets.estimation import OffsetPrior
-from shapepose_fg.bounds import Count, Metres, Settings, Share
-from shapepose_fg.camera import Rig, Views
+from shapepose_fg.core.bounds import Count, Metres, Settings, Share
+from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas, triangulate
-from shapepose_fg.observations import Observations
-from shapepose_fg.skeleton import BODY_25
 
 
 @dataclass(frozen=True)

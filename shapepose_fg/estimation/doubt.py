@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import kernel_weight
-from shapepose_fg.camera import Views
+from shapepose_fg.core.camera import Views
+from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.linearisation import LEAST_PROBABILITY, ObservationConfig, ViewEvidence
 from shapepose_fg.estimation.window_graph import Message
-from shapepose_fg.observations import Observations
 
 Array = NDArray[np.float64]
 

@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from factors import make_camera
 from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter
-from shapepose_fg.camera import Rig, Views
+from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.reconstruction import Status
 from shapepose_fg.estimation.alternation import Solution, Window, alternate, final_bodies
 from shapepose_fg.estimation.body_step import joint_targets
 from shapepose_fg.estimation.calibration import Calibration, Clues, from_body, lasting_mean
@@ -48,8 +50,6 @@ from shapepose_fg.estimation.plain_view import SPEED_M_S, elsewhere_variance, li
 from shapepose_fg.estimation.smoothing import smoothed
 from shapepose_fg.estimation.state_covariances import state_covariances
 from shapepose_fg.estimation.window_graph import WindowGraph, near_in_time
-from shapepose_fg.observations import Observations
-from shapepose_fg.reconstruction import Status
 
 ExtraFactors = Callable[[WindowGraph, NDArray[np.int64]], Iterable[gtsam.NonlinearFactor]]
 """Your own factors for a person's window, made from its keys (T, J)."""

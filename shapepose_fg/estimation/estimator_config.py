@@ -6,7 +6,7 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Interval
 
-from shapepose_fg.bounds import Metres, MetresOrNone, Repeats, Settings
+from shapepose_fg.core.bounds import Metres, MetresOrNone, Repeats, Settings
 from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.estimation.motion_model import MotionConfig
 from shapepose_fg.estimation.window_graph import WindowGraphConfig

@@ -10,9 +10,9 @@ from annotated_types import Interval
 from numpy.typing import NDArray
 
 from factors import KernelName, in_front, inlier_gate, kernel_weight, sigma_px
-from shapepose_fg.bounds import Factor, Metres, MetresOrNone, Settings, Share
-from shapepose_fg.camera import Views
-from shapepose_fg.observations import Observations
+from shapepose_fg.core.bounds import Factor, Metres, MetresOrNone, Settings, Share
+from shapepose_fg.core.camera import Views
+from shapepose_fg.core.observations import Observations
 
 MIN_DEPTH_M = 0.2
 """An observation counts only if the joint is at least this far in front of the camera."""

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.bounds import Factor, Seconds, Settings
-from shapepose_fg.errors import InputError
-from shapepose_fg.files import read_json
+from shapepose_fg.core.bounds import Factor, Seconds, Settings
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import read_json
 
 FORMAT = "shapepose-fg motion model 1"
 LOST_M = 0.1

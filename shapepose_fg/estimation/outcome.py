@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.reconstruction import Known
 from shapepose_fg.estimation.alternation import Solution, Window
 from shapepose_fg.estimation.linearisation import weakest_sigma
 from shapepose_fg.estimation.motion_model import Lasting
-from shapepose_fg.observations import Observations
-from shapepose_fg.reconstruction import Known
 
 RUNAWAY_M = 1.0
 """A joint with a factor of the user's own that ends this far from where its views first put it has run away."""

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Views
+from shapepose_fg.core.camera import Views
 
 Array = NDArray[np.float64]
 

@@ -30,7 +30,7 @@ from factors import (
     standing_factors,
     velocity_keys,
 )
-from shapepose_fg.bounds import Factor, MetresOrNone, Settings, Share
+from shapepose_fg.core.bounds import Factor, MetresOrNone, Settings, Share
 from shapepose_fg.estimation.motion_model import Lasting, MotionModel
 
 _OF_VIEWS, _OF_BODY = 0, 1

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from shapepose_fg.reconstruction import Known, Reconstruction
+from shapepose_fg.core.reconstruction import Known, Reconstruction
 
 APART_M = 0.15
 """A joint this far away is elsewhere: a hand's length, or rho_2D."""

@@ -5,13 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Rig, Views
-from shapepose_fg.detections import DetectionSequence
+from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.detections import DetectionSequence
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.estimation.linearisation import triangulate
 from shapepose_fg.evaluation.matching import match_people
-from shapepose_fg.observations import Observations
-from shapepose_fg.pipeline import PipelineConfig, find_people
-from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people
 
 
 @dataclass(frozen=True)

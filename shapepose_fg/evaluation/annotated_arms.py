@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import project_with_jacobian
-from shapepose_fg.camera import Rig
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.opponent.triangulation import triangulate_robustly
-from shapepose_fg.reconstruction import Reconstruction
-from shapepose_fg.skeleton import BODY_25
 
 Array = NDArray[np.float64]
 

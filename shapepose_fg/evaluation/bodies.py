@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.shapes import statures_m
-from shapepose_fg.reconstruction import Reconstruction
-from shapepose_fg.skeleton import SMPL_24
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.skeleton import SMPL_24
 
 TWIST_JUMP = np.deg2rad(20.0)
 """From one frame to the next, in radians: at 30 frames a second more than 600 degrees a second."""

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from shapepose_fg.body.fitting.pose_prior import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.core.skeleton import BODY_25
 
 _ACROSS = (("RShoulder", "LShoulder"), ("RHip", "LHip"), ("REar", "LEar"))
 """Lengths that tell of the shape, besides the limbs of BODY_25."""

@@ -23,8 +23,8 @@ from shapepose_fg.body.fitting.pose_prior import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.rotation import exp_so3, log_so3
 from shapepose_fg.body.model.target_skeletons import slots
+from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 from shapepose_fg.evaluation.bone_lengths import BoneLengths
-from shapepose_fg.skeleton import BODY_25, SMPL_24
 
 _SPINE = ("spine1", "spine2", "spine3")
 _NECK = ("neck", "head")

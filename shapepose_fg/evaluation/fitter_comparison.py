@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitter import BodyFit, JointTargets
 from shapepose_fg.body.model.body_model import BodyModel
-from shapepose_fg.errors import InputError
+from shapepose_fg.body.training.motions import load_motions
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.evaluation.fitting import (
     SETTINGS,
     Corruption,
@@ -32,7 +33,6 @@ from shapepose_fg.evaluation.fitting_methods import (
     timed_fit,
 )
 from shapepose_fg.simulation.sequences import DANCERS
-from shapepose_fg.training.motions import load_motions
 
 BODIES = 2048
 """Half of them dance salsa, half are everybody else of the test subjects."""

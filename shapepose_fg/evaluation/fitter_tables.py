@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter
 from shapepose_fg.body.fitting.fitter import BodyFitter
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import DetectionSequence
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import DetectionSequence
+from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.evaluation.fitter_comparison import BATCH, LARGE_BATCH, Comparison, first, learned
 from shapepose_fg.evaluation.fitting import (
     GROUPS,
@@ -29,8 +30,7 @@ from shapepose_fg.evaluation.footage import shelf_footage
 from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.metrics import joint_metrics
 from shapepose_fg.evaluation.shelf import evaluate_shelf, read_shelf_ground_truth
-from shapepose_fg.pipeline import PipelineConfig, reconstruct
-from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.simulation import simulate
 from shapepose_fg.simulation.mocap import Mocap
 from shapepose_fg.simulation.sequences import SEQUENCES, sequence

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.fitting.fitter import BodyFit, JointTargets
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.metrics import CovarianceCalibration, covariance_calibration
-from shapepose_fg.skeleton import BODY_25
 
 Array = NDArray[np.float64]
 

@@ -3,13 +3,13 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.frame_times import FrameTimes
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.detections import read_detections
-from shapepose_fg.pipeline import PipelineConfig, reconstruct
-from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 
 SHELF_FPS, SINGLE_FPS = 25.0, 60.0
 """Frames a second of Shelf, and of Pose2Sim's demo recording of one man."""

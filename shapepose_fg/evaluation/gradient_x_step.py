@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from factors import make_camera
 from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus
-from shapepose_fg.camera import Rig, Views
+from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.body_step import BodyStep
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, mean_confidence, weakest_sigma
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.window_graph import Message, WindowGraph
-from shapepose_fg.observations import Observations
 
 _NO_GATE_M = 1e6
 """Farther than anything in a room."""

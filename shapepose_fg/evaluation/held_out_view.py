@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import project_with_jacobian, sigma_px
-from shapepose_fg.camera import Camera, Rig
-from shapepose_fg.detections import Detections, DetectionSequence
+from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.detections import Detections, DetectionSequence
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.linearisation import MIN_DEPTH_M, ObservationConfig
 from shapepose_fg.evaluation.matching import match_people
-from shapepose_fg.reconstruction import Reconstruction
-from shapepose_fg.skeleton import Skeleton
 
 NEAR_M = 0.3
 """A candidate that the gate refused is compared as long as it lies within this length of the joint."""

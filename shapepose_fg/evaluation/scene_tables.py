@@ -6,12 +6,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.evaluation.alternation import BeforeRefinement, alternation_errors, before_refinement
 from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.matching import match_people
 from shapepose_fg.evaluation.metrics import JointMetrics, covariance_calibration, joint_metrics
-from shapepose_fg.pipeline import PipelineConfig, reconstruct
-from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.simulation import built_in_scene, simulate
 
 SEEDS = (2000, 2001, 2002, 2003, 2004)

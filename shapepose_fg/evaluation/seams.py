@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.core.reconstruction import Reconstruction
 
 _FAR_M = 1.0
 """Two rows of a frame that lie farther apart in the mean are two people."""

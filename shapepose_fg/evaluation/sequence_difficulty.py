@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from shapepose_fg.detections import Recording
+from shapepose_fg.core.detections import Recording
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.metrics import joint_metrics
-from shapepose_fg.pipeline import PipelineConfig, reconstruct
+from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.simulation import simulate
 from shapepose_fg.simulation.mocap import Mocap
 from shapepose_fg.simulation.sequences import SEQUENCES, Sequence, Split, sequence
-from shapepose_fg.skeleton import BODY_25
 
 ALONE = replace(PipelineConfig(), temporal=False)
 """Every frame by itself."""

@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.run_summary import covered_frames
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.matching import People
 from shapepose_fg.evaluation.other_results.skeleton_text import SHELF_JOINTS
 from shapepose_fg.evaluation.shelf_ground_truth import (
@@ -19,8 +21,6 @@ from shapepose_fg.evaluation.shelf_ground_truth import (
     read_shelf_ground_truth,
     shelf_joints,
 )
-from shapepose_fg.run_summary import covered_frames
-from shapepose_fg.skeleton import BODY_25
 
 __all__ = ["ShelfGroundTruth", "ShelfScore", "evaluate_shelf", "read_shelf_ground_truth", "shelf_joints"]
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.other_results.skeleton_text import SHELF_JOINTS, read_skeleton_text
-from shapepose_fg.skeleton import BODY_25
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitters import make_fitter
-from shapepose_fg.camera import Rig, Views
+from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.body_step import disagreement, joint_targets
 from shapepose_fg.estimation.linearisation import linearise, observation_sigmas, triangulate
 from shapepose_fg.evaluation.alternation import before_refinement
@@ -17,9 +19,7 @@ from shapepose_fg.evaluation.bodies import body_joints
 from shapepose_fg.evaluation.footage import shelf_footage
 from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.shelf import LIMB_NAMES, ShelfScore, evaluate_shelf, read_shelf_ground_truth
-from shapepose_fg.observations import Observations
-from shapepose_fg.pipeline import PipelineConfig, find_people
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people
 
 CONFIG = replace(PipelineConfig(), temporal=False)
 """Every frame by itself."""

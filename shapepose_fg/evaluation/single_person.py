@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.model.body_model import BodyModel
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import DetectionSequence
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import DetectionSequence
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 from shapepose_fg.evaluation.bodies import body_joints, bone_joints
 from shapepose_fg.evaluation.footage import SINGLE_FPS
 from shapepose_fg.evaluation.trajectories import FOREARMS, WRISTS, limb_lengths
 from shapepose_fg.proposal.candidates import CandidateConfig, triangulate_pairs
-from shapepose_fg.reconstruction import Reconstruction
-from shapepose_fg.skeleton import BODY_25, SMPL_24
 
 Array = NDArray[np.float64]
 

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.threads import torch_threads
-from shapepose_fg.camera import Rig, Views
+from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.estimation.linearisation import triangulate
 from shapepose_fg.evaluation.smplify import MultiViewSmplify, SmplifyConfig, SmplifyPeople
 from shapepose_fg.evaluation.stage_two import StageTwo, solve_alone
-from shapepose_fg.observations import Observations
-from shapepose_fg.pipeline import PipelineConfig
-from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.pipeline.pipeline import PipelineConfig
 
 Array = NDArray[np.float64]
 

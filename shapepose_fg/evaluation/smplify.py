@@ -19,8 +19,8 @@ from shapepose_fg.body.fitting.pose_prior import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.rotation import log_so3
 from shapepose_fg.body.model.target_skeletons import slots
-from shapepose_fg.camera import Rig
-from shapepose_fg.observations import Observations
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.observations import Observations
 
 Array = NDArray[np.float64]
 

@@ -18,11 +18,11 @@ from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.fitting.learned import LearnedFitter
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import Detections, DetectionSequence
-from shapepose_fg.pipeline import PipelineConfig, reconstruct
-from shapepose_fg.reconstruction import Reconstruction
-from shapepose_fg.skeleton import Skeleton
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import Detections, DetectionSequence
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 
 STAGES = (
     "read",

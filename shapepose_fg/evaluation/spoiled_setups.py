@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.camera import Axis, Camera, Rig
-from shapepose_fg.detections import Detections, DetectionSequence, Recording
+from shapepose_fg.core.camera import Axis, Camera, Rig
+from shapepose_fg.core.detections import Detections, DetectionSequence, Recording
 from shapepose_fg.setup_check.changes import Kind
 from shapepose_fg.setup_check.diagnosis import Finding
 

@@ -11,12 +11,12 @@ from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.fitting.learned import LearnedFitter
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.threads import torch_threads
-from shapepose_fg.camera import Rig
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.estimator import Estimates, Estimator
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
-from shapepose_fg.observations import Observations
-from shapepose_fg.pipeline import PipelineConfig
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.pipeline.pipeline import PipelineConfig
 
 
 @dataclass(frozen=True)

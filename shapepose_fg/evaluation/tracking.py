@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.evaluation.bodies import TWIST_JUMP, body_joints, bone_rotations, statures, twists
 from shapepose_fg.evaluation.identities import IdentityMetrics, identity_metrics
 from shapepose_fg.evaluation.matching import match_people
@@ -28,7 +29,6 @@ from shapepose_fg.evaluation.trajectories import (
     spread_by_identity,
     velocities,
 )
-from shapepose_fg.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.identities import NOBODY
 from shapepose_fg.evaluation.matching import Matches
-from shapepose_fg.skeleton import BODY_25
 
 Array = NDArray[np.float64]
 

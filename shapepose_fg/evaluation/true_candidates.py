@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import DetectionSequence
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import DetectionSequence
+from shapepose_fg.core.observations import Observations
 from shapepose_fg.evaluation.opponent.giving_out import nearest_given
-from shapepose_fg.observations import Observations
 
 NEAR_M = 0.12
 """A detection is a true joint's if it lies within this length of its projection, at the joint's depth."""

@@ -13,9 +13,9 @@ from typing import Any, TypeVar, cast, get_type_hints
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from shapepose_fg.bounds import range_of
-from shapepose_fg.errors import InputError
-from shapepose_fg.files import read_toml
+from shapepose_fg.core.bounds import range_of
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import read_toml
 from shapepose_fg.io.validation import describe, first_problem
 
 T = TypeVar("T")

@@ -9,11 +9,11 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from shapepose_fg.errors import InputError
-from shapepose_fg.files import read_json, write_atomically
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.provenance import checksums
+from shapepose_fg.core.reconstruction import MOST_NUMBER, Reconstruction
+from shapepose_fg.core.storage.files import read_json, write_atomically
 from shapepose_fg.io.validation import first_problem, key_text
-from shapepose_fg.provenance import checksums
-from shapepose_fg.reconstruction import MOST_NUMBER, Reconstruction
 from shapepose_fg.tracking.edits import Edit, Edited, Solve, apply, solve_anew, undo
 
 CORRECTIONS, UNCORRECTED = "corrections.json", "uncorrected"

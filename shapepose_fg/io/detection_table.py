@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.detections import Detections
-from shapepose_fg.kept_arrays import Arrays, KeptArrays
-from shapepose_fg.skeleton import Skeleton
+from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.core.storage.kept_arrays import Arrays, KeptArrays
 
 BLOCK_FRAMES = 128
 """Frames that are read, kept and taken together."""

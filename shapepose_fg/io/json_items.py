@@ -5,8 +5,8 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
-from shapepose_fg.errors import InputError
-from shapepose_fg.files import MIDDLE, bounded, has_long_number, not_json, text_pieces, unique_keys
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import MIDDLE, bounded, has_long_number, not_json, text_pieces, unique_keys
 
 _SPACE = " \t\n\r"
 _NEAR = 16

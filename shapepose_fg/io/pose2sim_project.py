@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from shapepose_fg.errors import InputError
-from shapepose_fg.files import read_toml
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import read_toml
 from shapepose_fg.io.calibration.content import load
 from shapepose_fg.io.calibration.reading import FORMATS
 from shapepose_fg.io.detections.frame_files import frame_files, frame_number

@@ -6,10 +6,10 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
-from shapepose_fg.errors import InputError
-from shapepose_fg.files import read_toml
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.skeleton import MID_HIP, SKELETONS, Skeleton
+from shapepose_fg.core.storage.files import read_toml
 from shapepose_fg.io.validation import first_problem, key_text
-from shapepose_fg.skeleton import MID_HIP, SKELETONS, Skeleton
 
 _Pair = Annotated[list[str], Field(min_length=2, max_length=2)]
 _CURE = "docs/conventions.md describes the file"

@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
-from shapepose_fg.camera import Rig
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.config import ANOTHER_VERSION, config_from
-from shapepose_fg.reconstruction import Reconstruction
 
 CAMERAS = "cameras.json"
 """The cameras of a result, as a rig file of our own, beside its people.npz."""

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.errors import InputError
-from shapepose_fg.files import read_text
-from shapepose_fg.frame_times import FrameTimes
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.storage.files import read_text
 
 _FRAME, _TIME = "frame", "time_s"
 """Columns with a meaning of their own; every other column is a camera's."""

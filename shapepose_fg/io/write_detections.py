@@ -12,14 +12,14 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Camera, Rig
-from shapepose_fg.detections import Detections, DetectionSequence
-from shapepose_fg.errors import InputError
-from shapepose_fg.files import write_atomically
+from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.detections import Detections, DetectionSequence
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.io.detections.association_skeletons import TEXT_SKELETONS, TextSkeleton
 from shapepose_fg.io.detections.view_streams import MARGIN
 from shapepose_fg.proposal.people_2d import group_people
-from shapepose_fg.skeleton import BODY_25
 
 SMALLEST_PERSON = 3
 """Groups of fewer joints are nobody, as in OpenPose's default settings."""

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.bounds import Settings, Share
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import Detections
-from shapepose_fg.observations import Observations
+from shapepose_fg.core.bounds import Settings, Share
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.assignment import match_best_first
 from shapepose_fg.proposal.candidates import Candidates
 from shapepose_fg.proposal.proposals import Proposals
-from shapepose_fg.skeleton import Skeleton
 
 _NEAR_M = 0.08
 """How closeness to the projected joint falls off: sigma of a Gaussian, as a length at the joint's depth. A

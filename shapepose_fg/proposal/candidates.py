@@ -11,9 +11,9 @@ from annotated_types import Interval
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from shapepose_fg.bounds import Count, Metres, Settings
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import Detections
+from shapepose_fg.core.bounds import Count, Metres, Settings
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import Detections
 
 _ANYWHERE_M = 10.0
 """A gate that no pair of rays in a room fails."""

@@ -10,11 +10,11 @@ import numpy as np
 from annotated_types import Interval
 from numpy.typing import NDArray
 
-from shapepose_fg.bounds import Metres, MetresOrNone, RepeatsOrNone, Settings, Share
-from shapepose_fg.detections import Detections
+from shapepose_fg.core.bounds import Metres, MetresOrNone, RepeatsOrNone, Settings, Share
+from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.assignment import match_best_first
 from shapepose_fg.proposal.candidates import Candidates
-from shapepose_fg.skeleton import Skeleton
 
 
 @dataclass(frozen=True)

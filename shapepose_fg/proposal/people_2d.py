@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.detections import Detections
+from shapepose_fg.core.detections import Detections
 
 
 def without_repeats(found: Detections) -> tuple[Detections, NDArray[np.intp]]:

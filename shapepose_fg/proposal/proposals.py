@@ -11,12 +11,12 @@ import numpy as np
 from annotated_types import Interval
 from numpy.typing import NDArray
 
-from shapepose_fg.bounds import Count, Metres, MetresOrNone, Settings, Share
-from shapepose_fg.detections import Detections
+from shapepose_fg.core.bounds import Count, Metres, MetresOrNone, Settings, Share
+from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.assignment import lesser
 from shapepose_fg.proposal.candidates import Candidates
 from shapepose_fg.proposal.growth import GrowthConfig, Links, grow, link
-from shapepose_fg.skeleton import Skeleton
 
 _HIP_WIDTH_M = 0.4
 """Two hips of one person are not farther apart: their middle is a root where no two views saw one."""

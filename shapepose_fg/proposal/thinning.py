@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.detections import Detections, DetectionSequence
+from shapepose_fg.core.detections import Detections, DetectionSequence
+from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.candidates import CandidateConfig, Candidates, PairPoints
-from shapepose_fg.skeleton import Skeleton
 
 _LEAST_IN_A_VIEW = 8
 """Detections of a joint that a view may always have, however many views there are."""

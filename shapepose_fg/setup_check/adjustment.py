@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Views
+from shapepose_fg.core.camera import Views
 from shapepose_fg.setup_check.structure import Structure
 
 Array = NDArray[np.float64]

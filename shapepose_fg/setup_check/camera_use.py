@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from shapepose_fg.camera import Rig, Views
-from shapepose_fg.detections import DetectionSequence
-from shapepose_fg.observation_table import Gate, ObservationTable
-from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.detections import DetectionSequence
+from shapepose_fg.core.observation_table import Gate, ObservationTable
+from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.setup_check.sightings import size_of
 from shapepose_fg.setup_check.structure import triangulate
 

@@ -7,7 +7,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Views
+from shapepose_fg.core.camera import Views
 from shapepose_fg.setup_check.adjustment import FOCAL, POSE, TURN
 from shapepose_fg.setup_check.evidence import Look, Setup
 from shapepose_fg.setup_check.fit import (

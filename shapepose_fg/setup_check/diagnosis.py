@@ -5,8 +5,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import DetectionSequence
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.setup_check.changes import Change, Kind, lag_of
 from shapepose_fg.setup_check.duplicates import Duplicate, duplicates
 from shapepose_fg.setup_check.evidence import Evidence, Look, Setup, gather

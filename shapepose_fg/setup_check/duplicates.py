@@ -5,7 +5,7 @@ from itertools import combinations
 
 import numpy as np
 
-from shapepose_fg.camera import Camera, Rig
+from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.setup_check.evidence import Evidence
 from shapepose_fg.setup_check.matching import same_frame
 

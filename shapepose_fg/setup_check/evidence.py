@@ -6,8 +6,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Rig, Views
-from shapepose_fg.detections import DetectionSequence
+from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.setup_check.fit import Others, Pinhole, match, possible_matches
 from shapepose_fg.setup_check.matching import GATE, Groups, Pairs, errors_of, group, median_of, pair_up
 from shapepose_fg.setup_check.sightings import Sightings, sightings_of

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Rig
+from shapepose_fg.core.camera import Rig
 from shapepose_fg.setup_check.diagnosis import Diagnosis
 from shapepose_fg.setup_check.evidence import Look
 from shapepose_fg.setup_check.fit import match, possible_matches

@@ -178,7 +178,7 @@ def refined(others: Others, seen: Sightings, camera: Pinhole, columns: tuple[int
 
 def _solved(points: Array, xy: Array, width_px: Array, camera: Pinhole, columns: list[int]) -> Pinhole:
     """Robust Gauss-Newton on points (N, 3) seen at xy (N, 2)."""
-    from shapepose_fg.camera import Views
+    from shapepose_fg.core.camera import Views
     from shapepose_fg.setup_check.adjustment import Q, camera_derivatives, changed
 
     for _ in range(_STEPS):

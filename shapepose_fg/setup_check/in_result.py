@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import DetectionSequence
-from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import DetectionSequence
+from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.setup_check.camera_use import CameraUse, camera_use
 from shapepose_fg.setup_check.changes import Kind
 from shapepose_fg.setup_check.report import SetupReport

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Axis
-from shapepose_fg.skeleton import Skeleton
+from shapepose_fg.core.camera import Axis
+from shapepose_fg.core.skeleton import Skeleton
 
 Array = NDArray[np.float64]
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from shapepose_fg.camera import Rig
+from shapepose_fg.core.camera import Rig
 from shapepose_fg.io.footage.footage import glance, open_footage
 from shapepose_fg.io.footage.places import VIDEOS, find_footage
 from shapepose_fg.setup_check.changes import Kind

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from typing import Any
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import DetectionSequence
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.setup_check.diagnosis import Diagnosis, Finding, diagnose
 from shapepose_fg.setup_check.figures import CameraFigures, PairFigures, camera_figures, pair_figures, plain
 from shapepose_fg.setup_check.words import sentence

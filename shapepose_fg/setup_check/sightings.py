@@ -7,9 +7,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.detections import Detections, DetectionSequence
+from shapepose_fg.core.detections import Detections, DetectionSequence
+from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.people_2d import group_people
-from shapepose_fg.skeleton import Skeleton
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Views
+from shapepose_fg.core.camera import Views
 from shapepose_fg.setup_check.adjustment import CENTRE, FOCAL, POSE, Normal, Q, changed, normal_equations
 from shapepose_fg.setup_check.evidence import Look
 from shapepose_fg.setup_check.fit import difference

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from shapepose_fg.camera import Rig
+from shapepose_fg.core.camera import Rig
 from shapepose_fg.setup_check.changes import Kind
 from shapepose_fg.setup_check.diagnosis import Finding
 

@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.simulation.detector_statistics import LIMB_GROUP, DetectorStatistics
-from shapepose_fg.skeleton import BODY_25
 
 Array = NDArray[np.float64]
 

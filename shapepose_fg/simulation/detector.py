@@ -16,8 +16,9 @@ from scipy.special import ndtr, ndtri
 
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.threads import torch_threads
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import Detections, Recording
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import Detections, Recording
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.simulation.affinities import affinities
 from shapepose_fg.simulation.detector_statistics import JOINT_GROUP, DetectorStatistics, measured
 from shapepose_fg.simulation.facing import seen_from_the_front
@@ -25,7 +26,6 @@ from shapepose_fg.simulation.lookout import Lookout
 from shapepose_fg.simulation.memory import FalseCandidates, Ghosts, LastingNoise
 from shapepose_fg.simulation.scene import Scene
 from shapepose_fg.simulation.visibility import Skin, Visibility, VisibilityConfig
-from shapepose_fg.skeleton import BODY_25
 
 _MIRROR = np.array(BODY_25.mirror)
 _MIRROR_APART_M = 0.12

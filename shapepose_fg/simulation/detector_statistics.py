@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.core.skeleton import BODY_25
 
 _FILE = Path(__file__).parent / "data" / "detector.json"
 _MIRROR = np.array(BODY_25.mirror)

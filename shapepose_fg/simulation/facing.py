@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.core.skeleton import BODY_25
 
 FACE = tuple(BODY_25.index(name) for name in ("Nose", "REye", "LEye", "REar", "LEar"))
 _EARS = [BODY_25.index("REar"), BODY_25.index("LEar")]

@@ -5,11 +5,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from shapepose_fg.detections import DetectionSequence
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.detections import DetectionSequence
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.provenance import versions
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.write_detections import refuse_leftovers, write_association, write_openpose
-from shapepose_fg.provenance import versions
 from shapepose_fg.simulation import Scene, built_in_scene
 from shapepose_fg.simulation.mocap import Mocap
 from shapepose_fg.simulation.motion import Motion

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Rig
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.pipeline.workers import Workers
 from shapepose_fg.simulation.visibility import Skin, Visibility, VisibilityConfig, see
-from shapepose_fg.workers import Workers
 
 People = tuple[NDArray[np.float64], NDArray[np.float32]]
 """One frame: BODY_25 joints (P, 25, 3) and surfaces (P, M, 3) of everybody, metres."""

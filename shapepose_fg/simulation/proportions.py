@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.smpl_file import NUM_BETAS, SMPL_PARENTS
-from shapepose_fg.skeleton import SMPL_24
+from shapepose_fg.core.skeleton import SMPL_24
 
 Array = NDArray[np.float64]
 

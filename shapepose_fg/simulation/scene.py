@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
-from shapepose_fg.camera import Camera, Rig
-from shapepose_fg.rendering import look_at
+from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.simulation.motion import Build, Motion, close_motion
+from shapepose_fg.viz.rendering import look_at
 
 if TYPE_CHECKING:  # torch comes with it: processes that only look at people do without
     from shapepose_fg.body.model.body_model import BodyModel, BodyParameters

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from shapepose_fg.reconstruction import Reconstruction, Status
+from shapepose_fg.core.reconstruction import Reconstruction, Status
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.simulation.scene import Scene
-from shapepose_fg.skeleton import BODY_25
 
 
 def truth_of(scene: Scene) -> Reconstruction:

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.rendering import first_surface_at, scaled
-from shapepose_fg.skeleton import SMPL_24
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.skeleton import SMPL_24
+from shapepose_fg.viz.rendering import first_surface_at, scaled
 
 if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel

@@ -11,7 +11,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.reconstruction import MOST_NUMBER, Reconstruction
+from shapepose_fg.core.reconstruction import MOST_NUMBER, Reconstruction
 
 Solve = Callable[[Reconstruction], Reconstruction]
 """Rows of some people with their `observations` to rows of the same people, solved anew; other frames may join."""

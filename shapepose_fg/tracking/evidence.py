@@ -7,10 +7,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import Detections
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.association import mean_affinity, owned
-from shapepose_fg.skeleton import Skeleton
 
 Array = NDArray[np.float64]
 

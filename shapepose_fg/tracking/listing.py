@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from shapepose_fg.body.model.smpl_file import SmplArrays
 from shapepose_fg.body.shapes import statures_m
-from shapepose_fg.frame_times import ASSUMED_FPS
-from shapepose_fg.reconstruction import Known, OpenedReconstruction, Reconstruction
+from shapepose_fg.core.frame_times import ASSUMED_FPS
+from shapepose_fg.core.reconstruction import Known, OpenedReconstruction, Reconstruction
 
 _STEP_S = 0.5
 """Walked distance is measured between mean places of this long: a joint's noise, summed up, is no walk."""

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.skeleton import Skeleton
+from shapepose_fg.core.skeleton import Skeleton
 
 
 def torn_joints(

@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.bone_reach import longest_bones
-from shapepose_fg.observations import Observations
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.assignment import lesser
 from shapepose_fg.proposal.hypotheses import Frame, Hypotheses, gaps
 from shapepose_fg.proposal.selection import PRIOR_WITH_BODY, existence
-from shapepose_fg.skeleton import Skeleton
 from shapepose_fg.tracking.following import core_distance
 from shapepose_fg.tracking.hypotheses import Input
 from shapepose_fg.tracking.view_assignment import AssignmentConfig, assign_with_probability

@@ -11,8 +11,8 @@ from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from shapepose_fg.bounds import Settings
-from shapepose_fg.skeleton import Skeleton
+from shapepose_fg.core.bounds import Settings
+from shapepose_fg.core.skeleton import Skeleton
 
 Array = NDArray[np.float64]
 

@@ -11,13 +11,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.bounds import Count, Seconds, Settings
-from shapepose_fg.camera import Rig, Views
-from shapepose_fg.detections import Detections
+from shapepose_fg.core.bounds import Count, Seconds, Settings
+from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas, triangulate
-from shapepose_fg.observations import Observations
 from shapepose_fg.proposal.association import seen_twice
-from shapepose_fg.skeleton import Skeleton
 from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.plausibility import torn_joints
 from shapepose_fg.tracking.view_assignment import AssignmentConfig, assign

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.bounds import Metres, Repeats, Settings, Share
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import Detections
+from shapepose_fg.core.bounds import Metres, Repeats, Settings, Share
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.association import (
     match_views,
     mean_affinity,
@@ -15,7 +16,6 @@ from shapepose_fg.proposal.association import (
     projected_distances,
     share_overlaps,
 )
-from shapepose_fg.skeleton import Skeleton
 
 
 @dataclass(frozen=True)

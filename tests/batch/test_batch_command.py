@@ -11,22 +11,22 @@ from pathlib import Path
 
 import pytest
 
-from shapepose_fg.batch.table import read_table
-from shapepose_fg.cli import main
-from shapepose_fg.errors import InputError
+from shapepose_fg.cli.batch.table import read_table
+from shapepose_fg.cli.main import main
+from shapepose_fg.cli.reconstruct.request import carry_out
+from shapepose_fg.cli.stopping import Stopped
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.estimation.detector_offsets import OffsetConfig
-from shapepose_fg.frame_times import FrameTimes
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.config import toml_text
 from shapepose_fg.io.detections import read_detections
-from shapepose_fg.pipeline import PipelineConfig, reconstruct
-from shapepose_fg.reconstruct_request import carry_out
-from shapepose_fg.runs.manifest import frames_done
+from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
+from shapepose_fg.pipeline.runs.manifest import frames_done
+from shapepose_fg.pipeline.windows import WindowConfig
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.files import write_simulated
-from shapepose_fg.stopping import Stopped
 from shapepose_fg.tracking.following import FollowingConfig
-from shapepose_fg.windows import WindowConfig
 
 CONFIG = PipelineConfig(
     batch_frames=6,
@@ -135,7 +135,9 @@ def test_an_archive_is_interrupted_goes_on_and_is_what_each_recording_alone_give
 
 
 def test_what_can_be_known_before_is_said_before(archive, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("shapepose_fg.cluster.local_cluster", lambda *_, **__: pytest.fail("no work may begin"))
+    monkeypatch.setattr(
+        "shapepose_fg.pipeline.cluster.local_cluster", lambda *_, **__: pytest.fail("no work may begin")
+    )
     table = archive / "wrong.toml"
 
     def said(text: str, *more: str) -> str:
@@ -168,7 +170,7 @@ def test_what_can_be_known_before_is_said_before(archive, tmp_path, capsys, monk
 
 
 def test_another_program_on_a_worker_is_noticed(monkeypatch):
-    from shapepose_fg import cluster
+    from shapepose_fg.pipeline import cluster
 
     class Client:
         def __init__(self, theirs):

@@ -6,16 +6,16 @@ from pathlib import Path
 
 import pytest
 
-from shapepose_fg.batch import campaign as module
-from shapepose_fg.batch.campaign import Campaign
-from shapepose_fg.batch.leader import Assignment, Failed, Leader
-from shapepose_fg.batch.standing import Standing, Standings, read_standings
-from shapepose_fg.batch.table import Entry
-from shapepose_fg.batch_command import _standings
-from shapepose_fg.errors import InputError
-from shapepose_fg.reconstruct_outcome import Ended
-from shapepose_fg.reconstruct_request import Request
-from shapepose_fg.stopping import Stopped
+from shapepose_fg.cli.batch import campaign as module
+from shapepose_fg.cli.batch.campaign import Campaign
+from shapepose_fg.cli.batch.command import _standings
+from shapepose_fg.cli.batch.leader import Assignment, Failed, Leader
+from shapepose_fg.cli.batch.standing import Standing, Standings, read_standings
+from shapepose_fg.cli.batch.table import Entry
+from shapepose_fg.cli.reconstruct.outcome import Ended
+from shapepose_fg.cli.reconstruct.request import Request
+from shapepose_fg.cli.stopping import Stopped
+from shapepose_fg.core.errors import InputError
 
 DONE = Ended(10, 20, 2, ("cam1 is late",))
 

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from shapepose_fg.batch.table import asked, read_table
-from shapepose_fg.errors import InputError
+from shapepose_fg.cli.batch.table import asked, read_table
+from shapepose_fg.core.errors import InputError
 
 
 def read(folder: Path, text: str):

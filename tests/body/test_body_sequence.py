@@ -14,7 +14,7 @@ from shapepose_fg.body.fitting.fitter import FitStatus, JointTargets
 from shapepose_fg.body.fitting.learned import LearnedFitter
 from shapepose_fg.body.fitting.pose_prior import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
-from shapepose_fg.skeleton import BODY_25, SMPL_24
+from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 
 PEOPLE, FRAMES, FPS = 3, 60, 30.0
 NOISE_M = 0.015

@@ -5,9 +5,9 @@ from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.fitting.pose_prior import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
+from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 from shapepose_fg.evaluation.bone_lengths import BoneLengths
 from shapepose_fg.evaluation.closed_form import ClosedFormStart
-from shapepose_fg.skeleton import BODY_25, SMPL_24
 
 SIGMA_M = 0.02
 LEG = [BODY_25.index(f"L{part}") for part in ("Hip", "Knee", "Ankle", "BigToe", "SmallToe", "Heel")]

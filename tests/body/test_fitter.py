@@ -8,7 +8,7 @@ from shapepose_fg.body.fitting.evidence import EvidenceConfig
 from shapepose_fg.body.fitting.fitter import BodyFit, FitStatus, JointTargets
 from shapepose_fg.body.fitting.pose_prior import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.core.skeleton import BODY_25
 
 WRIST, ELBOW, ANKLE = BODY_25.index("RWrist"), BODY_25.index("RElbow"), BODY_25.index("LAnkle")
 

@@ -17,7 +17,7 @@ from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.pose_energy import PoseEnergy
 from shapepose_fg.body.fitting.pose_prior import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
-from shapepose_fg.skeleton import BODY_25, SMPL_24
+from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 
 ROWS = 3
 

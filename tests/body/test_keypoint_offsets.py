@@ -9,8 +9,8 @@ import torch
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.keypoint_offsets import RIDES_ON, KeypointOffsets
 from shapepose_fg.body.model.rotation import exp_so3, log_so3
-from shapepose_fg.errors import InputError
-from shapepose_fg.skeleton import BODY_25, SMPL_24
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 
 
 def random_offsets() -> KeypointOffsets:

@@ -17,7 +17,7 @@ from shapepose_fg.body.fitting.pose_prior import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, TARGET_SKELETONS
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.core.skeleton import BODY_25
 
 COUNT = 32
 WRIST, ELBOW = BODY_25.index("RWrist"), BODY_25.index("RElbow")

@@ -18,7 +18,7 @@ from shapepose_fg.body.fitting.pose_prior import PosePrior
 from shapepose_fg.body.fitting.posterior import LIMB_M, joint_covariance
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.target_skeletons import TARGET_SKELETONS
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.core.skeleton import BODY_25
 
 MODEL_SIGMA_M = 0.02
 NOISE_M = 0.01

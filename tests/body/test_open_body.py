@@ -8,7 +8,7 @@ import torch
 
 import shapepose_fg.body.model.body_model
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
-from shapepose_fg.skeleton import BODY_25, SMPL_24
+from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 
 
 @pytest.fixture(scope="module")

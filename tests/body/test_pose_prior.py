@@ -3,9 +3,9 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from shapepose_fg.body.fitting.pose_prior import PosePrior
-from shapepose_fg.skeleton import SMPL_24
-from shapepose_fg.training.motions import load_motions
-from shapepose_fg.training.prior import expected_angles
+from shapepose_fg.body.training.motions import load_motions
+from shapepose_fg.body.training.prior import expected_angles
+from shapepose_fg.core.skeleton import SMPL_24
 
 ARRAYS = ("weights", "means", "covariances", "lower", "upper")
 

@@ -7,7 +7,7 @@ import torch
 from shapepose_fg.body.fitting.weights import fingerprint
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.shapes import SubjectShapes, read_body, recognise, statures_m
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.errors import InputError
 
 
 def two_shapes(body: str = "a body") -> SubjectShapes:

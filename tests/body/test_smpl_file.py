@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
-from shapepose_fg.errors import InputError
-from shapepose_fg.skeleton import BODY_25, SMPL_24
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ import pytest
 import scipy.sparse
 
 from shapepose_fg.body.model.body_model import BodyModel
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.errors import InputError
 
 
 class _Python2Pickler(pickle._Pickler):  # type: ignore[name-defined]

@@ -7,7 +7,7 @@ import torch
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.keypoint_offsets import RIDES_ON, KeypointOffsets
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, MIRROR, TARGET_SKELETONS, slots
-from shapepose_fg.skeleton import BODY_25, SMPL_24
+from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 
 
 def points_of_the_mesh(model: BodyModel, parameters: BodyParameters) -> dict[str, np.ndarray]:

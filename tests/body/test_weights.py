@@ -18,7 +18,7 @@ from shapepose_fg.body.fitting.pose_prior import PosePrior
 from shapepose_fg.body.fitting.weights import FitterWeights, fingerprint
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.errors import InputError
 
 
 @pytest.fixture(scope="module")

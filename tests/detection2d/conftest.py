@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from shapepose_fg.camera import Camera, Rig
+from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.detection2d.network import HeatMapNetwork
 from shapepose_fg.detection2d.networks import layouts
-from shapepose_fg.rendering import look_at
+from shapepose_fg.viz.rendering import look_at
 
 CODES = np.array([code for code in itertools.product((0, 128, 255), repeat=3) if any(code)][:25])
 """The colour of each joint of BODY_25."""

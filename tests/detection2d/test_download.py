@@ -6,10 +6,10 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
 
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.detection2d import download
 from shapepose_fg.detection2d.download import cache_folder, find_network
 from shapepose_fg.detection2d.networks import KnownNetwork, known_networks
-from shapepose_fg.errors import InputError
 
 CONTENT = bytes(range(256)) * 400
 

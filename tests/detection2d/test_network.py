@@ -3,10 +3,10 @@ import re
 import numpy as np
 import pytest
 
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.detection2d import onnx_file as onnx_file_reader
 from shapepose_fg.detection2d.network import HeatMapNetwork
 from shapepose_fg.detection2d.networks import layouts
-from shapepose_fg.errors import InputError
 from tests.detection2d.conftest import _bytes, _number, onnx_file
 
 

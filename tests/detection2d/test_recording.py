@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import shapepose_fg.detection2d.recording as recording
-from shapepose_fg.camera import Rig
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.detection2d.detector import CameraDetector, DetectionConfig
 from shapepose_fg.detection2d.recording import DetectionRun, run_detection
-from shapepose_fg.errors import InputError
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.io.footage.footage import open_footage
 from shapepose_fg.io.footage.lockstep import CameraClock, align

@@ -2,10 +2,10 @@ import cv2
 import numpy as np
 import pytest
 
-from shapepose_fg.camera import Camera
+from shapepose_fg.core.camera import Camera
 from shapepose_fg.detection2d.networks import layouts
 from shapepose_fg.detection2d.upright import UprightView, roll_of
-from shapepose_fg.rendering import look_at
+from shapepose_fg.viz.rendering import look_at
 
 LAYOUT = layouts()["tf-pose"]
 UP = np.array([0.0, 0.0, 1.0])

@@ -9,17 +9,17 @@ import pytest
 from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitter import BodyFit, FitStatus, JointTargets
-from shapepose_fg.camera import Rig, Views
-from shapepose_fg.detections import Detections
+from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.observation_table import Gate
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.reconstruction import Status
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.estimator import Estimates, Estimator
 from shapepose_fg.estimation.estimator_config import EstimatorConfig, RefineConfig
 from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas, triangulate
 from shapepose_fg.estimation.window_graph import WindowGraph, WindowGraphConfig
-from shapepose_fg.observation_table import Gate
-from shapepose_fg.observations import Observations
-from shapepose_fg.reconstruction import Status
-from shapepose_fg.skeleton import BODY_25
-from shapepose_fg.solved_rows import result_rows
+from shapepose_fg.pipeline.solved_rows import result_rows
 
 WRIST, ELBOW, KNEE = 4, 3, 13
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.calibration import LASTS_S, Calibration, Clues, from_body, lasting_mean
-from shapepose_fg.skeleton import BODY_25
 
 I3 = np.eye(3)
 

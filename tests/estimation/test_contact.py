@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from shapepose_fg.core.skeleton import BODY_25, COCO_17
 from shapepose_fg.estimation.contact import FIRST, FREE_M2_S, LASTS_S, NEXT, feet_of, smoothed, standing_density
-from shapepose_fg.skeleton import BODY_25, COCO_17
 
 
 def walk(fps: float, noise: float, swing: float = 1.5):

@@ -11,17 +11,17 @@ from shapepose_fg.body.fitting.fitter import BodyFit, JointTargets
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.offsets.estimation import OffsetPrior, learn_offsets
-from shapepose_fg.detections import Recording
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.detections import Recording
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.detector_offsets import OffsetConfig, confident_targets, spread_frames
 from shapepose_fg.estimation.linearisation import ObservationConfig
-from shapepose_fg.observations import Observations
-from shapepose_fg.pipeline import PipelineConfig, estimate_offsets, reconstruct
+from shapepose_fg.pipeline.pipeline import PipelineConfig, estimate_offsets, reconstruct
 from shapepose_fg.proposal.candidates import CandidateConfig
 from shapepose_fg.proposal.thinning import ThinnedFrames
 from shapepose_fg.simulation import DetectorConfig, built_in_scene, simulate
 from shapepose_fg.simulation.scene import Scene
-from shapepose_fg.skeleton import BODY_25
 
 ODD = KeypointOffsets.symmetric(
     {

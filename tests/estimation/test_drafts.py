@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from shapepose_fg.body.fitting.fitters import BodyConfig, make_fitter
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation import draft
 from shapepose_fg.estimation.estimator import Estimator
 from shapepose_fg.estimation.estimator_config import EstimatorConfig, RefineConfig
-from shapepose_fg.observations import Observations
 from shapepose_fg.simulation import built_in_scene
-from shapepose_fg.skeleton import BODY_25
 
 LEG = [BODY_25.joints.index(name) for name in ("RKnee", "RAnkle", "RHeel", "RBigToe", "RSmallToe")]
 FRAMES = range(0, 40, 4)

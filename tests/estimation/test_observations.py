@@ -8,7 +8,9 @@ import pytest
 from numpy.typing import NDArray
 
 from factors import joint_information, make_camera, projection_factors, robust_kernel
-from shapepose_fg.camera import Camera, Rig, Views
+from shapepose_fg.core.camera import Camera, Rig, Views
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.linearisation import (
     ObservationConfig,
     linearise,
@@ -16,8 +18,6 @@ from shapepose_fg.estimation.linearisation import (
     observation_sigmas,
     triangulate,
 )
-from shapepose_fg.observations import Observations
-from shapepose_fg.skeleton import BODY_25
 
 
 def observations_of(

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from shapepose_fg.body.fitting.fitter import BodyFit
+from shapepose_fg.core.reconstruction import Known
 from shapepose_fg.estimation.draft import drafted, limb_steps, smoothed_in_time
 from shapepose_fg.estimation.limb_lengths import with_lengths
 from shapepose_fg.estimation.linearisation import ViewEvidence
 from shapepose_fg.estimation.motion_model import Lasting
 from shapepose_fg.estimation.outcome import how_known, problems, reported_covariance
-from shapepose_fg.reconstruction import Known
 
 I3 = np.eye(3)
 

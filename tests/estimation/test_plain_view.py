@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from shapepose_fg.camera import Rig, Views
+from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.plain_view import ELSEWHERE_M, MISSED, UNUSUAL, elsewhere_variance, limbs_that_hide
-from shapepose_fg.skeleton import BODY_25
 
 WRIST = BODY_25.index("RWrist")
 

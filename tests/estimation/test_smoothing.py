@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation import smoothing
 from shapepose_fg.estimation.motion_model import MotionModel
-from shapepose_fg.skeleton import BODY_25
 
 MOTION = MotionModel.load(BODY_25.joints)
 WRIST = BODY_25.index("RWrist")

@@ -10,16 +10,16 @@ import pytest
 from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitter import BodyFit, FitStatus
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.reconstruction import Known, Status
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.alternation import interpolated
 from shapepose_fg.estimation.estimator import Estimates, Estimator, window_rows
 from shapepose_fg.estimation.estimator_config import EstimatorConfig, RefineConfig
 from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
 from shapepose_fg.estimation.state_covariances import Chains, state_covariances
 from shapepose_fg.estimation.window_graph import WindowGraph, near_in_time, symmetric_roots
-from shapepose_fg.observations import Observations
-from shapepose_fg.reconstruction import Known, Status
-from shapepose_fg.skeleton import BODY_25
 
 FPS = 25.0
 FRAMES = 30

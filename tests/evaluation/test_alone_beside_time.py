@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from shapepose_fg.core.reconstruction import Known, Reconstruction
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.alone_beside_time import beside
-from shapepose_fg.reconstruction import Known, Reconstruction
-from shapepose_fg.skeleton import BODY_25
 
 WRIST, ANKLE, NOSE = (BODY_25.joints.index(name) for name in ("RWrist", "LAnkle", "Nose"))
 

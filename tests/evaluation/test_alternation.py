@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.evaluation.alternation import BeforeRefinement, alternation_errors, before_refinement
-from shapepose_fg.pipeline import PipelineConfig, reconstruct
-from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.simulation import DetectorConfig, built_in_scene, simulate
 
 

@@ -3,7 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.annotated_arms import (
     ANNOTATION,
     ARMS,
@@ -16,7 +17,6 @@ from shapepose_fg.evaluation.footage import single_footage
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.simulation import built_in_scene
 from shapepose_fg.simulation.truth import truth_of
-from shapepose_fg.skeleton import BODY_25
 
 JOINTS = [BODY_25.index(name) for name in ARMS]
 

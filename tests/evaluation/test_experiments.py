@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.evaluation.experiments import runner
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment
 from shapepose_fg.evaluation.experiments.made_with import changes, fingerprint, made_with

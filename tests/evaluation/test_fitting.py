@@ -5,6 +5,7 @@ import torch
 from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter
 from shapepose_fg.body.fitting.pose_prior import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.fitting import (
     GROUPS,
     LIMBS,
@@ -28,7 +29,6 @@ from shapepose_fg.evaluation.fitting_methods import (
 )
 from shapepose_fg.evaluation.fitting_optimum import check_optimum
 from shapepose_fg.evaluation.gradient_descent import GradientDescentFitter
-from shapepose_fg.skeleton import BODY_25
 
 NOISY = SETTINGS[2]
 

@@ -3,7 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shapepose_fg.detections import Recording
+from shapepose_fg.core.detections import Recording
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.evaluation.held_out_view import (
     INSIDE_95,
@@ -12,9 +13,8 @@ from shapepose_fg.evaluation.held_out_view import (
     held_out,
     squared_distances,
 )
-from shapepose_fg.pipeline import reconstruct
+from shapepose_fg.pipeline.pipeline import reconstruct
 from shapepose_fg.simulation import built_in_scene, simulate
-from shapepose_fg.skeleton import BODY_25
 
 CONFIG = ObservationConfig()
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.matching import match_people, mean_distance
 from shapepose_fg.evaluation.metrics import covariance_calibration, joint_metrics
-from shapepose_fg.skeleton import BODY_25
 
 J = 25
 MIRROR = np.array(BODY_25.mirror)

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from shapepose_fg.detections import Recording
+from shapepose_fg.core.detections import Recording
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.metrics import joint_metrics
 from shapepose_fg.evaluation.opponent.cross_view import consistent_matches, geometric_affinity, people_of
 from shapepose_fg.evaluation.opponent.giving_out import grown, nearest_given
@@ -13,7 +14,6 @@ from shapepose_fg.evaluation.opponent.over_time import OverTimeConfig, over_time
 from shapepose_fg.evaluation.opponent.people_2d import people_in_views
 from shapepose_fg.evaluation.opponent.triangulation import triangulate_robustly
 from shapepose_fg.simulation import built_in_scene, simulate
-from shapepose_fg.skeleton import BODY_25
 
 
 def test_what_is_seen_exactly_is_found_exactly(five_cameras, two_people, seen_exactly):

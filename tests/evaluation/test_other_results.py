@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from shapepose_fg.camera import Axis
-from shapepose_fg.cli import main
-from shapepose_fg.errors import InputError
+from shapepose_fg.cli.main import main
+from shapepose_fg.core.camera import Axis
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.skeleton import BODY_25, HALPE_26
 from shapepose_fg.evaluation.other_results.reading import read_people
 from shapepose_fg.evaluation.other_results.skeleton_text import SHELF_JOINTS, SKEL_15, SKEL_17, SKEL_19
 from shapepose_fg.evaluation.other_results.trc import read_trc
 from shapepose_fg.evaluation.shelf import shelf_joints
-from shapepose_fg.export.markers import Markers, opensim_names
-from shapepose_fg.export.trc import trc_text
-from shapepose_fg.skeleton import BODY_25, HALPE_26
+from shapepose_fg.io.export.markers import Markers, opensim_names
+from shapepose_fg.io.export.trc import trc_text
 from tests.conftest import STANDING
 
 

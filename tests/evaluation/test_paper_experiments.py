@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from shapepose_fg.body.fitting.fitter import BodyFit, FitStatus
-from shapepose_fg.camera import Views
+from shapepose_fg.core.camera import Views
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.linearisation import observation_sigmas
 from shapepose_fg.evaluation.experiments import ablation, graph_solver, iterations, prior_confidence
 from shapepose_fg.evaluation.experiments.scale import Scale
 from shapepose_fg.evaluation.gradient_x_step import GradientStep, GraphStep, alternate_with
-from shapepose_fg.observations import Observations
-from shapepose_fg.pipeline import PipelineConfig
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.pipeline.pipeline import PipelineConfig
 
 PAPER = PipelineConfig.paper()
 STAGE_II = EstimatorConfig(

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.experiments.others import PlainPeople
 from shapepose_fg.evaluation.experiments.scale import Stretch
 from shapepose_fg.evaluation.pictures.choice import (
@@ -19,7 +20,6 @@ from shapepose_fg.evaluation.pictures.choice import (
 )
 from shapepose_fg.evaluation.pictures.close_up import clear_views
 from shapepose_fg.evaluation.pictures.pages import draw_before_after, draw_failures, draw_methods
-from shapepose_fg.skeleton import BODY_25
 
 STRETCH = Stretch("demo", range(30))
 WRIST = BODY_25.index("RWrist")

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.other_results.skeleton_text import SHELF_JOINTS
 from shapepose_fg.evaluation.shelf import (
     LIMB_NAMES,
@@ -14,7 +15,6 @@ from shapepose_fg.evaluation.shelf import (
     read_shelf_ground_truth,
     shelf_joints,
 )
-from shapepose_fg.skeleton import BODY_25
 
 UPRIGHT = dict(
     RAnkle=(0.09, 0, 0.1),

@@ -3,7 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shapepose_fg.detections import Detections, Recording
+from shapepose_fg.core.detections import Detections, Recording
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.single_person import (
     ARM_UP,
     BYSTANDER_M,
@@ -14,10 +15,9 @@ from shapepose_fg.evaluation.single_person import (
 )
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
-from shapepose_fg.pipeline import PipelineConfig, reconstruct
+from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.simulation import built_in_scene
 from shapepose_fg.simulation.truth import truth_of
-from shapepose_fg.skeleton import BODY_25
 
 RWRIST, RSHOULDER = BODY_25.index("RWrist"), BODY_25.index("RShoulder")
 

@@ -7,7 +7,9 @@ import pytest
 import torch
 
 from shapepose_fg.body.fitting.energy import robust_cost
-from shapepose_fg.camera import Views
+from shapepose_fg.core.camera import Views
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.linearisation import ObservationConfig, triangulate
 from shapepose_fg.evaluation.experiments.others import OTHERS, PlainPeople, mean_of, read_others, scored
 from shapepose_fg.evaluation.metrics import joint_metrics
@@ -15,10 +17,8 @@ from shapepose_fg.evaluation.smpl_only import SamePeople
 from shapepose_fg.evaluation.smplify import MultiViewSmplify, SmplifyConfig, _ViewTargets
 from shapepose_fg.evaluation.stage_two import solve_alone
 from shapepose_fg.evaluation.true_candidates import true_observations
-from shapepose_fg.observations import Observations
-from shapepose_fg.pipeline import PipelineConfig, reconstruct
+from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.simulation import built_in_scene, simulate
-from shapepose_fg.skeleton import BODY_25
 
 FRAMES = 3
 

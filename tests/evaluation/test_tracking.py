@@ -6,6 +6,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 from shapepose_fg.evaluation.bodies import body_joints, statures, twists
 from shapepose_fg.evaluation.identities import identity_metrics
 from shapepose_fg.evaluation.matching import match_people
@@ -17,10 +19,8 @@ from shapepose_fg.evaluation.trajectories import (
     limb_lengths,
     spread_by_identity,
 )
-from shapepose_fg.reconstruction import Reconstruction
 from shapepose_fg.simulation import built_in_scene
 from shapepose_fg.simulation.truth import truth_of
-from shapepose_fg.skeleton import BODY_25, SMPL_24
 
 FPS = 30.0
 J = 25

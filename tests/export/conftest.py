@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from shapepose_fg.body.shapes import read_body
+from shapepose_fg.core.observation_table import Gate, ObservationTable
+from shapepose_fg.core.reconstruction import Known, Reconstruction
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.io.calibration import write_rig
-from shapepose_fg.observation_table import Gate, ObservationTable
-from shapepose_fg.reconstruction import Known, Reconstruction
 from shapepose_fg.simulation import Scene, built_in_scene
-from shapepose_fg.skeleton import BODY_25
 
 FRAMES, FPS, FIRST = 24, 25.0, 100
 AWAY = range(108, 116)

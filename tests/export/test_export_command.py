@@ -10,14 +10,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shapepose_fg.cli import main
-from shapepose_fg.errors import InputError
-from shapepose_fg.export.bones import bones_of
-from shapepose_fg.export.light_mesh import thinned
-from shapepose_fg.export.registry import FORMATS
-from shapepose_fg.export.rerun_scene import viewer_file
-from shapepose_fg.export.rerun_statistics import switch_off
-from shapepose_fg.skeleton import BODY_25, COCO_17
+from shapepose_fg.cli.main import main
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.skeleton import BODY_25, COCO_17
+from shapepose_fg.io.export.bones import bones_of
+from shapepose_fg.io.export.light_mesh import thinned
+from shapepose_fg.io.export.registry import FORMATS
+from shapepose_fg.io.export.rerun_scene import viewer_file
+from shapepose_fg.io.export.rerun_statistics import switch_off
 
 from .conftest import AWAY, FIRST, FRAMES
 
@@ -181,7 +181,7 @@ def test_view_without_rerun_names_the_command(copied, capsys, monkeypatch):
 
 def test_commands_load_no_torch(copied):
     call = f"main(['export', {str(copied)!r}, 'trc', 'bvh', 'glb'])"
-    code = f"import sys; from shapepose_fg.cli import main\ntry:\n    {call}\n"
+    code = f"import sys; from shapepose_fg.cli.main import main\ntry:\n    {call}\n"
     code += "except SystemExit as end:\n    assert not end.code and 'torch' not in sys.modules"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr

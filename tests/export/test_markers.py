@@ -8,18 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shapepose_fg.errors import InputError
-from shapepose_fg.export.amass import write_amass
-from shapepose_fg.export.bvh import write_bvh
-from shapepose_fg.export.c3d import c3d_bytes, write_c3d
-from shapepose_fg.export.job import Job
-from shapepose_fg.export.markers import Markers, MarkerSet, opensim_names
-from shapepose_fg.export.reading import read_take
-from shapepose_fg.export.table import COLUMNS, csv_text
-from shapepose_fg.export.take import Take
-from shapepose_fg.export.trc import write_trc
-from shapepose_fg.reconstruction import Reconstruction
-from shapepose_fg.skeleton import BODY_25, COCO_17, HALPE_26, SMPL_24
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.skeleton import BODY_25, COCO_17, HALPE_26, SMPL_24
+from shapepose_fg.io.export.amass import write_amass
+from shapepose_fg.io.export.bvh import write_bvh
+from shapepose_fg.io.export.c3d import c3d_bytes, write_c3d
+from shapepose_fg.io.export.job import Job
+from shapepose_fg.io.export.markers import Markers, MarkerSet, opensim_names
+from shapepose_fg.io.export.reading import read_take
+from shapepose_fg.io.export.table import COLUMNS, csv_text
+from shapepose_fg.io.export.take import Take
+from shapepose_fg.io.export.trc import write_trc
 
 from .conftest import AWAY, FIRST, FPS, FRAMES, GUESSED, LOST
 

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shapepose_fg.cli import main
-from shapepose_fg.export import parquet
-from shapepose_fg.observation_table import ObservationTable
-from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.cli.main import main
+from shapepose_fg.core.observation_table import ObservationTable
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.io.export import parquet
 
 arrow_parquet = pytest.importorskip("pyarrow.parquet")
 

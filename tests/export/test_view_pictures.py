@@ -6,15 +6,15 @@ import cv2
 import numpy as np
 import pytest
 
-from shapepose_fg.camera import Camera, Rig
-from shapepose_fg.cli import main
-from shapepose_fg.errors import InputError
-from shapepose_fg.export.reading import read_take
-from shapepose_fg.export.rerun_pictures import log_pictures, undistorting
-from shapepose_fg.export.rerun_scene import new_stream
+from shapepose_fg.cli.main import main
+from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.calibration import write_rig
+from shapepose_fg.io.export.reading import read_take
+from shapepose_fg.io.export.rerun_pictures import log_pictures, undistorting
+from shapepose_fg.io.export.rerun_scene import new_stream
 from shapepose_fg.io.footage.placement import Placement, PlacementKind
-from shapepose_fg.overlay.result_pictures import pictures_of
+from shapepose_fg.viz.overlay.result_pictures import pictures_of
 
 from .conftest import FIRST
 

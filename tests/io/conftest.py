@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shapepose_fg.camera import Camera, Rig
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.skeleton import BODY_25
 
 K = np.array([[1000.0, 0, 500], [0, 1000, 400], [0, 0, 1]])
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.skeleton import BODY_25, COCO_18
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.io.detections.association_skeletons import TEXT_SKELETONS
 from shapepose_fg.io.write_detections import association_lines
-from shapepose_fg.skeleton import BODY_25, COCO_18
 
 KIND = TEXT_SKELETONS["COCO_18"]
 NECK, RHIP, LHIP, MIDHIP = (COCO_18.index(name) for name in ("Neck", "RHip", "LHip", "MidHip"))

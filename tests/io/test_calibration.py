@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shapepose_fg.camera import Camera, Rig
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.calibration import RIG_FORMAT, read_rig, write_rig
 
 # A camera at (0, -4, 1) that looks along +y, in a world with z up: x right, -z down, y forward.

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from shapepose_fg.camera import Camera, Rig
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.calibration import read_rig, write_rig
 
 DATA = Path(__file__).parent / "data"

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.config import read_config, toml_text
 from shapepose_fg.io.validation import describe
-from shapepose_fg.pipeline import PipelineConfig
+from shapepose_fg.pipeline.pipeline import PipelineConfig
 
 
 class Kernel(StrEnum):

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shapepose_fg.cli import main
-from shapepose_fg.errors import InputError
+from shapepose_fg.cli.main import main
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.io.corrections import correct, read_corrections, refuse_corrected, take_back
-from shapepose_fg.reconstruction import Reconstruction
 from shapepose_fg.simulation import built_in_scene
 from shapepose_fg.simulation.truth import truth_of
 from shapepose_fg.tracking.edits import Action, Edit

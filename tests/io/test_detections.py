@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
-from shapepose_fg.skeleton import BODY_25
 
 LIMBS = BODY_25.limbs
 

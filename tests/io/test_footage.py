@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.footage.footage import PictureFiles, Video, open_footage
 from shapepose_fg.io.footage.given import _rate, _start
 from shapepose_fg.io.footage.placement import Placement, PlacementKind, place

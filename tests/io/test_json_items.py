@@ -5,9 +5,9 @@ import re
 
 import pytest
 
-from shapepose_fg import files
-from shapepose_fg.errors import InputError
-from shapepose_fg.files import read_json
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage import files
+from shapepose_fg.core.storage.files import read_json
 from shapepose_fg.io import json_items
 from shapepose_fg.io.json_items import JsonItems
 

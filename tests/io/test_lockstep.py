@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.footage.lockstep import CameraClock, align
 
 

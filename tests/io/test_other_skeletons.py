@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from shapepose_fg import read_detections, read_rig, reconstruct, write_rig
+from shapepose_fg.core.skeleton import BODY_25, COCO_17, HALPE_26, Skeleton
 from shapepose_fg.proposal.people_2d import group_people
 from shapepose_fg.simulation import built_in_scene, simulate
-from shapepose_fg.skeleton import BODY_25, COCO_17, HALPE_26, Skeleton
 
 FRAMES = 4
 

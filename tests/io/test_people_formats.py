@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Camera, Rig
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.skeleton import BODY_25, COCO_17, COCO_18, COCO_133, HALPE_26, SKELETONS, Skeleton
 from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.io.skeleton_file import read_skeleton
 from shapepose_fg.proposal.people_2d import group_people
-from shapepose_fg.skeleton import BODY_25, COCO_17, COCO_18, COCO_133, HALPE_26, SKELETONS, Skeleton
 
 DATA = Path(__file__).parent / "data"
 K = np.array([[1000.0, 0, 500], [0, 1000, 400], [0, 0, 1]])

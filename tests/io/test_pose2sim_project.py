@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shapepose_fg.cli import main
-from shapepose_fg.errors import InputError
-from shapepose_fg.export.pose2sim_files import write_pose2sim_files
+from shapepose_fg.cli.main import main
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.reconstruction import Known, Reconstruction
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.io.calibration import write_rig
+from shapepose_fg.io.export.pose2sim_files import write_pose2sim_files
 from shapepose_fg.io.pose2sim_project import read_pose2sim_project
-from shapepose_fg.reconstruction import Known, Reconstruction
-from shapepose_fg.skeleton import BODY_25
 
 CONFIG = """
 [project]

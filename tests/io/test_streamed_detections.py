@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shapepose_fg import files
-from shapepose_fg.detections import Recording
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.detections import Recording
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage import files
+from shapepose_fg.core.storage.kept_arrays import InFolder
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.io.detections.one_file import read_one_file
 from shapepose_fg.io.write_detections import write_association
-from shapepose_fg.kept_arrays import InFolder
 from shapepose_fg.simulation import Scene, built_in_scene, simulate
 
 COLUMNS = ("view", "joint", "xy", "confidence", "pairs", "affinity")

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.timestamps import read_timestamps
 from shapepose_fg.simulation.scene import ring_of_cameras
 

@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import Detections, Recording
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import Detections, Recording
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.skeleton import BODY_25, Skeleton
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.io.write_detections import write_association, write_openpose
 from shapepose_fg.proposal.people_2d import group_people
 from shapepose_fg.simulation import built_in_scene, simulate
-from shapepose_fg.skeleton import BODY_25, Skeleton
 
 LIMBS = (
     "1-8 9-10 10-11 8-9 8-12 12-13 13-14 1-2 2-3 3-4 2-17 1-5 5-6 6-7 5-18 1-0 0-15 0-16 15-17 16-18 "

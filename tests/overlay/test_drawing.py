@@ -1,9 +1,11 @@
 import numpy as np
 import pytest
 
-from shapepose_fg.camera import Camera
+from shapepose_fg.core.camera import Camera
+from shapepose_fg.core.skeleton import BODY_25, COCO_18
 from shapepose_fg.io.footage.placement import Placement, PlacementKind
-from shapepose_fg.overlay.drawing import (
+from shapepose_fg.simulation import built_in_scene
+from shapepose_fg.viz.overlay.drawing import (
     GATED,
     Skeletons,
     bones_of,
@@ -12,9 +14,7 @@ from shapepose_fg.overlay.drawing import (
     draw_label,
     draw_skeletons,
 )
-from shapepose_fg.overlay.picture_view import PictureView
-from shapepose_fg.simulation import built_in_scene
-from shapepose_fg.skeleton import BODY_25, COCO_18
+from shapepose_fg.viz.overlay.picture_view import PictureView
 
 RED = (30, 30, 220)
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import Detections
-from shapepose_fg.observations import Observations
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.proposal.association import AssociationConfig, associate
 from shapepose_fg.proposal.candidates import CandidateConfig, triangulate_pairs, vote
 from shapepose_fg.proposal.proposals import ProposalConfig, propose
-from shapepose_fg.skeleton import BODY_25
 
 UP = np.array([0.0, 0.0, 1.0])
 HIP, WRIST, KNEE = (BODY_25.index(name) for name in ("MidHip", "RWrist", "LKnee"))

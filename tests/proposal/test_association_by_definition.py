@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.proposal.association import AssociationConfig, _by_support, associate, owned
 from shapepose_fg.proposal.candidates import CandidateConfig, triangulate_pairs, vote
 from shapepose_fg.proposal.proposals import ProposalConfig, Proposals, propose
-from shapepose_fg.skeleton import BODY_25
 
 CORE = list(BODY_25.core)
 NEIGHBOURS = [{j for limb in BODY_25.limbs if joint in limb for j in limb if j != joint} for joint in range(25)]

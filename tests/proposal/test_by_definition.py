@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from shapepose_fg.detections import Detections
+from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.skeleton import BODY_25, Skeleton
 from shapepose_fg.proposal.association import mean_affinity, share_overlaps
 from shapepose_fg.proposal.candidates import CandidateConfig, Candidates, PairPoints, triangulate_pairs, vote
 from shapepose_fg.proposal.growth import GrowthConfig, Links, grow, link
 from shapepose_fg.proposal.proposals import ProposalConfig, _apart, _Search
-from shapepose_fg.skeleton import BODY_25, Skeleton
 
 CONFIG = CandidateConfig()
 GATE_M, ANGLE_DEG, RHO_M = 0.07, 3.0, 0.12

@@ -2,8 +2,8 @@ import cv2
 import numpy as np
 import pytest
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import Detections
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import Detections
 from shapepose_fg.proposal.candidates import CandidateConfig, PairPoints, _greedy_seeds, triangulate_pairs, vote
 
 
@@ -36,7 +36,7 @@ def test_agrees_with_opencv_s_linear_triangulation(five_cameras, two_people, see
 def test_rays_that_meet_behind_a_camera_make_no_point():
     ahead = np.eye(4)
     ahead[0, 3] = 1.0
-    from shapepose_fg.camera import Camera
+    from shapepose_fg.core.camera import Camera
 
     K = np.array([[1000.0, 0, 500], [0, 1000, 400], [0, 0, 1]])
     rig = Rig((Camera("a", K, np.eye(4), (1000, 800)), Camera("b", K, ahead, (1000, 800))), "z")

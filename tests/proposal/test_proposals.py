@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import Detections
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.proposal.assignment import match_best_first
 from shapepose_fg.proposal.association import AssociationConfig, associate
 from shapepose_fg.proposal.candidates import CandidateConfig, Candidates, triangulate_pairs, vote
 from shapepose_fg.proposal.growth import GrowthConfig, Links, grow, link
 from shapepose_fg.proposal.proposals import ProposalConfig, Proposals, propose
 from shapepose_fg.simulation.scene import ring_of_cameras
-from shapepose_fg.skeleton import BODY_25
 
 UP = np.array([0.0, 0.0, 1.0])
 NECK, ELBOW, WRIST, HIP = (BODY_25.index(name) for name in ("Neck", "RElbow", "RWrist", "MidHip"))

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from shapepose_fg.body.fitting.bone_reach import longest_bones
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import Detections
-from shapepose_fg.pipeline import PipelineConfig, find_people
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people
 from shapepose_fg.proposal.candidates import CandidateConfig, triangulate_pairs
 from shapepose_fg.proposal.evidence import Evidence
 from shapepose_fg.proposal.hypotheses import Frame, Hypotheses, connected, settled, triangulated
 from shapepose_fg.proposal.people_2d import without_repeats
 from shapepose_fg.proposal.selection import choose, existence
 from shapepose_fg.simulation import built_in_scene, simulate
-from shapepose_fg.skeleton import BODY_25
 
 HIPS = [8, 9, 12]
 UPPER_BODY = [0, 1, 2, 3, 4, 5, 6, 7, 15, 16, 17, 18]

@@ -6,9 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import Detections, Recording
-from shapepose_fg.pipeline import PipelineConfig, find_people, reconstruct
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import Detections, Recording
+from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people, reconstruct
 from shapepose_fg.proposal.candidates import (
     CandidateConfig,
     Candidates,
@@ -19,7 +20,6 @@ from shapepose_fg.proposal.candidates import (
 )
 from shapepose_fg.proposal.thinning import ThinnedFrames, kept_detections, thinned_candidates, thinned_points
 from shapepose_fg.simulation.scene import ring_of_cameras
-from shapepose_fg.skeleton import BODY_25
 
 
 def crowd(rig: Rig, people: int, seed: int = 0) -> Detections:

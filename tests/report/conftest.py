@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.reconstruction import Reconstruction
-from shapepose_fg.report.writing import write_report
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.simulation import Scene
+from shapepose_fg.viz.report.writing import write_report
 
 from ..export.conftest import result, saved, scene, true_bodies
 

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from shapepose_fg.export.light_mesh import thinned
-from shapepose_fg.report.skins import CELL_M
+from shapepose_fg.io.export.light_mesh import thinned
+from shapepose_fg.viz.report.skins import CELL_M
 
 from ..export.conftest import BARE, FIRST, FPS, FRAMES
 from .browser import Browser, chromium

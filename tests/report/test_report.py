@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shapepose_fg.cli import main
-from shapepose_fg.observation_table import Gate
-from shapepose_fg.pipeline import PipelineConfig
-from shapepose_fg.reconstruction import Reconstruction
-from shapepose_fg.report.figures import camera_figures, known_counts
-from shapepose_fg.report.writing import report_of, write_report
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.cli.main import main
+from shapepose_fg.core.observation_table import Gate
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.pipeline.pipeline import PipelineConfig
+from shapepose_fg.viz.report.figures import camera_figures, known_counts
+from shapepose_fg.viz.report.writing import report_of, write_report
 
 from ..export.conftest import AWAY, FIRST, FPS, FRAMES, GUESSED, LOST
 from .conftest import HOSTILE
@@ -116,7 +116,7 @@ def test_the_scene_holds_every_joint_to_a_millimetre(page, result):
 
 @pytest.mark.parametrize("up", ["x", "-x", "y", "-y", "-z"])
 def test_people_stand_upright_whatever_axis_is_up(result, tmp_path, up):
-    from shapepose_fg.export.axes import z_up
+    from shapepose_fg.io.export.axes import z_up
 
     turned = replace(result, joints=result.joints @ z_up(up))
     page = Page(write_report(tmp_path, turned, None))

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import Detections, Recording
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import Detections, Recording
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.simulation.scene import ring_of_cameras
-from shapepose_fg.skeleton import BODY_25
 
 FRAMES = 60
 

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import Detections, Recording
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import Detections, Recording
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.spoiled_setups import (
     delayed,
     exchanged,
@@ -24,7 +25,6 @@ from shapepose_fg.io.detections import read_detections
 from shapepose_fg.setup_check.changes import Kind
 from shapepose_fg.setup_check.diagnosis import diagnose
 from shapepose_fg.setup_check.words import sentence
-from shapepose_fg.skeleton import BODY_25
 
 
 def only_finding(recording, rig):

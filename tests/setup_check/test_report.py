@@ -5,14 +5,14 @@ import json
 import numpy as np
 import pytest
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.cli import main
+from shapepose_fg.cli.main import main
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.frame_times import spans_of
+from shapepose_fg.core.observation_table import Gate, ObservationTable
+from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.evaluation.spoiled_setups import turned, zoomed
-from shapepose_fg.frame_times import spans_of
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.write_detections import write_openpose
-from shapepose_fg.observation_table import Gate, ObservationTable
-from shapepose_fg.reconstruction import Reconstruction
 from shapepose_fg.setup_check.camera_use import Distances, camera_use
 from shapepose_fg.setup_check.changes import Kind
 from shapepose_fg.setup_check.diagnosis import Finding

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.simulation.mocap import Mocap
-from shapepose_fg.skeleton import SMPL_24
 
 PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
 LEG_M = 0.8

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from scipy.special import ndtr, ndtri
 
-from shapepose_fg.camera import Camera, Rig
-from shapepose_fg.detections import Detections
-from shapepose_fg.rendering import look_at
+from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.simulation import DetectorConfig, Scene, built_in_scene, detector_statistics, simulate
 from shapepose_fg.simulation.detector import Detector
 from shapepose_fg.simulation.detector_statistics import JOINT_GROUP, LIMB_GROUP, DetectorStatistics, measured
 from shapepose_fg.simulation.facing import FACE, facing
 from shapepose_fg.simulation.visibility import Visibility
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.viz.rendering import look_at
 
 LIMBS = np.array(BODY_25.limbs)
 MIRROR = np.array(BODY_25.mirror)

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shapepose_fg.cli import main
+from shapepose_fg.cli.main import main
+from shapepose_fg.core.reconstruction import Reconstruction, Status
 from shapepose_fg.evaluation.metrics import joint_metrics
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
-from shapepose_fg.reconstruction import Reconstruction, Status
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.files import cut, named_scene, write_simulated
 from shapepose_fg.simulation.sequences import Sequence

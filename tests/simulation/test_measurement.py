@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.measurement.classes import GROUP, GROUPS, joint_states
 from shapepose_fg.simulation.measurement.comparison import kolmogorov_smirnov
@@ -11,7 +12,6 @@ from shapepose_fg.simulation.measurement.misses import tetrachoric
 from shapepose_fg.simulation.measurement.people import CONFIG, find, tracks, twin
 from shapepose_fg.simulation.measurement.sample import pool, take_sample
 from shapepose_fg.simulation.measurement.statistics import statistics
-from shapepose_fg.skeleton import BODY_25
 
 LAGS = np.array([1, 2, 3, 4, 5, 6, 8, 10, 15, 20, 30, 40])
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.model.body_model import BodyModel
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.simulation.bystanders import endless, stand, walk_along
 from shapepose_fg.simulation.holding import hold_hands
 from shapepose_fg.simulation.mocap import Clip, Mocap

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from shapepose_fg.camera import Rig
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.simulation import Scene, built_in_scene
-from shapepose_fg.skeleton import BODY_25
 
 
 @pytest.fixture(scope="module")

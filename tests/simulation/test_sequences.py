@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.simulation.mocap import Mocap
 from shapepose_fg.simulation.room import SequenceConfig, clearance_m
 from shapepose_fg.simulation.scene import Scene
@@ -20,7 +21,6 @@ from shapepose_fg.simulation.sequences import (
     salsa_takes,
     sequence,
 )
-from shapepose_fg.skeleton import BODY_25
 
 HIP = BODY_25.index("MidHip")
 SPLITS: tuple[Split, Split] = ("tune", "report")

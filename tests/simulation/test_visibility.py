@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Camera, Rig
-from shapepose_fg.rendering import look_at
+from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 from shapepose_fg.simulation import Scene, built_in_scene
 from shapepose_fg.simulation.visibility import (
     BORDER,
@@ -17,7 +17,7 @@ from shapepose_fg.simulation.visibility import (
     coarsen,
     see,
 )
-from shapepose_fg.skeleton import BODY_25, SMPL_24
+from shapepose_fg.viz.rendering import look_at
 
 X, Y, Z = np.eye(3)
 K = np.array([[900.0, 0, 640], [0, 900.0, 360], [0, 0, 1]])

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import Detections
-from shapepose_fg.pipeline import PipelineConfig, find_people
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people
 from shapepose_fg.tracking.following import FollowingConfig, FollowState, finish, follow
 from shapepose_fg.tracking.hypotheses import Input
 from shapepose_fg.tracking.tracker import BodyScale, Tracker, TrackingConfig, Tracks
@@ -34,7 +34,7 @@ def followed(tracker):
     """A function (rig, frames of Detections, times) -> rows of all frames, one `Observations`."""
 
     def run(rig: Rig, frames, times=None, following=FollowingConfig(), tracker=tracker):
-        from shapepose_fg.observations import Observations
+        from shapepose_fg.core.observations import Observations
 
         times = np.arange(len(frames)) / FPS if times is None else times
         state, decided = FollowState(Tracks.none(BODY_25)), []

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shapepose_fg.detections import Detections
-from shapepose_fg.observations import Observations
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.tracking import view_assignment
 from shapepose_fg.tracking.following import Input
 from shapepose_fg.tracking.plausibility import torn_joints

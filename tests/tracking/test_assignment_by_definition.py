@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from shapepose_fg.observations import Observations
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.tracking import view_assignment
 from shapepose_fg.tracking.following import Input
 from shapepose_fg.tracking.reassociation import Survival, _existence, _gone, reassociate

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shapepose_fg.observation_table import ObservationTable
-from shapepose_fg.reconstruction import Reconstruction
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.core.observation_table import ObservationTable
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.tracking.edits import Action, Edit, Edited, apply, free_number, replay, solve_anew, undo
 
 

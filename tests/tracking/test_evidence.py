@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.tracking.evidence import Chosen, choose, left_over, own_evidence, probability, weighed
 from shapepose_fg.tracking.hypotheses import lasting
 

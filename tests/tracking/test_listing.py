@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from shapepose_fg.body.shapes import read_body, statures_m
-from shapepose_fg.reconstruction import Known, Reconstruction
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.core.reconstruction import Known, Reconstruction
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.tracking.listing import list_tracks
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linear_sum_assignment
 
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.tracking.stitching import Ends, StitchingConfig, Trace
 from shapepose_fg.tracking.stitching import stitch as stitch_traces
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shapepose_fg.detections import Detections
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.tracker import Tracks, _apart
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from shapepose_fg.training.foot_speeds import foot_speeds
+from shapepose_fg.body.training.foot_speeds import foot_speeds
 
 
 def test_finds_the_speeds_that_feet_were_made_with():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from shapepose_fg.training.mixture import Mirror, MixtureConfig, fit_mixture
+from shapepose_fg.body.training.mixture import Mirror, MixtureConfig, fit_mixture
 
 MIRROR = Mirror(np.array([1, 0, 2]), np.array([1.0, 1.0, -1.0]))
 """Two values that change places and one that changes its sign."""

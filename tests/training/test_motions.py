@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.errors import InputError
-from shapepose_fg.skeleton import SMPL_24
-from shapepose_fg.training.motions import SUBJECT_CAP, WALK_CAP, Motions, frame_weights, load_motions
-from shapepose_fg.training.split import SPLITS, TEST_SUBJECTS, VALIDATION_SUBJECTS, split_of
+from shapepose_fg.body.training.motions import SUBJECT_CAP, WALK_CAP, Motions, frame_weights, load_motions
+from shapepose_fg.body.training.split import SPLITS, TEST_SUBJECTS, VALIDATION_SUBJECTS, split_of
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.skeleton import SMPL_24
 
 Z_UP = Rotation.from_rotvec([np.pi / 2, 0.0, 0.0])
 

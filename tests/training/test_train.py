@@ -15,11 +15,11 @@ from shapepose_fg.body.fitting.weights import FitterWeights, fingerprint
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
-from shapepose_fg.errors import InputError
-from shapepose_fg.training.calibration import INSIDE, calibrated, left_out_squared
-from shapepose_fg.training.checkpoint import load_checkpoint, save_checkpoint
-from shapepose_fg.training.motions import Motions, mirror_joints
-from shapepose_fg.training.train import PeopleSource, Trainer, TrainingConfig, body_points, prepared
+from shapepose_fg.body.training.calibration import INSIDE, calibrated, left_out_squared
+from shapepose_fg.body.training.checkpoint import load_checkpoint, save_checkpoint
+from shapepose_fg.body.training.motions import Motions, mirror_joints
+from shapepose_fg.body.training.train import PeopleSource, Trainer, TrainingConfig, body_points, prepared
+from shapepose_fg.core.errors import InputError
 
 ALL = tuple(range(len(BODY_POINTS)))
 SMALL = TrainingConfig(

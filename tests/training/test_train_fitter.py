@@ -16,8 +16,8 @@ from shapepose_fg.body.fitting.learned import LearnedFitter, LearnedFitterConfig
 from shapepose_fg.body.fitting.pose_prior import PosePrior
 from shapepose_fg.body.fitting.weights import FitterWeights
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
-from shapepose_fg.errors import InputError
-from shapepose_fg.training.train import Trainer
+from shapepose_fg.body.training.train import Trainer
+from shapepose_fg.core.errors import InputError
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "train_fitter.py"
 

@@ -22,7 +22,7 @@ from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.rotation import log_so3
 from shapepose_fg.body.model.target_skeletons import slots
-from shapepose_fg.bounds import Factor, Settings
+from shapepose_fg.core.bounds import Factor, Settings
 
 Array = NDArray[np.float64]
 

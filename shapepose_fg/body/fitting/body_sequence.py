@@ -18,7 +18,7 @@ from shapepose_fg.body.fitting.fitter import BodyFit, FitStatus, JointTargets
 from shapepose_fg.body.fitting.motion_prior import MotionPrior
 from shapepose_fg.body.fitting.posterior import joint_covariance
 from shapepose_fg.body.fitting.shared_shape import check_groups
-from shapepose_fg.bounds import Factor, Repeats, Seconds, Settings
+from shapepose_fg.core.bounds import Factor, Repeats, Seconds, Settings
 
 Array = NDArray[np.float64]
 

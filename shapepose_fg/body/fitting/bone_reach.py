@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from shapepose_fg.body.fitting.pose_prior import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
-from shapepose_fg.skeleton import Skeleton
+from shapepose_fg.core.skeleton import Skeleton
 
 _SAMPLES = 2000
 _MARGIN, _NOISE_M = 1.25, 0.05

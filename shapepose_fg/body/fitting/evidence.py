@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitter import STATUS_TYPE, FitStatus, JointTargets
-from shapepose_fg.bounds import Metres, Settings
+from shapepose_fg.core.bounds import Metres, Settings
 
 Array = NDArray[np.float64]
 

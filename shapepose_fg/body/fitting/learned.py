@@ -24,7 +24,7 @@ from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.rotation import log_so3
 from shapepose_fg.body.model.skinned_points import SkinnedPoints
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, slots
-from shapepose_fg.bounds import Factor, RepeatsOrNone, Settings
+from shapepose_fg.core.bounds import Factor, RepeatsOrNone, Settings
 
 Array = NDArray[np.float64]
 

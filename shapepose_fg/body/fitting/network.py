@@ -8,7 +8,7 @@ from annotated_types import Interval
 from torch import Tensor, nn
 
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
-from shapepose_fg.bounds import Settings
+from shapepose_fg.core.bounds import Settings
 
 NUM_ROTATIONS = 22
 """Root and the 21 joints of SMPL that are not hands: what the network turns."""

@@ -16,8 +16,8 @@ from shapepose_fg.body.fitting.network import NetworkConfig, UpdateNetwork
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
-from shapepose_fg.errors import InputError
-from shapepose_fg.files import open_regular
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import open_regular
 
 _DEFAULT = Path(__file__).parents[1] / "data" / "fitter.safetensors"
 _FORMAT = "shapepose-fg fitter 1"

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.errors import InputError
-from shapepose_fg.files import read_json, write_atomically
-from shapepose_fg.skeleton import BODY_25, SMPL_24
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.skeleton import BODY_25, SMPL_24
+from shapepose_fg.core.storage.files import read_json, write_atomically
 
 _FORMAT = "shapepose-fg keypoint offsets 1"
 _RIDES_ON = {

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.skeleton import BODY_25, SMPL_24
+from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 
 _HEIGHT_M = (0.4, 3.0)
 """From a newborn to nobody: a template in centimetres or millimetres is far outside."""

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from shapepose_fg.body.model.pickle_records import RefusedPickle
 from shapepose_fg.body.model.plausible_body import implausible
 from shapepose_fg.body.model.smpl_pickle import as_array, read_smpl_pickle
-from shapepose_fg.errors import InputError
-from shapepose_fg.npz_reader import read_npz
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.core.storage.npz_reader import read_npz
 
 NUM_BETAS = 10
 """Shape components in use; a file may hold more."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.model.pickle_records import Name, Record, RefusedPickle, read_records
-from shapepose_fg.files import read_bytes
+from shapepose_fg.core.storage.files import read_bytes
 
 _MOST_BYTES = 2**30
 """SMPL's own files have 40 to 250 MB."""

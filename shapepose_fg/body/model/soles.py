@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
-from shapepose_fg.skeleton import SMPL_24
+from shapepose_fg.core.skeleton import SMPL_24
 
 _BONES = tuple([SMPL_24.index(f"{side}_{name}") for name in ("ankle", "foot")] for side in ("right", "left"))
 _ANKLES, _KNEES = ([SMPL_24.index(f"{side}_{name}") for side in ("right", "left")] for name in ("ankle", "knee"))

@@ -1,6 +1,6 @@
 """Which points of a body a detector's joints are: one list of all, and the skeletons as parts of it."""
 
-from shapepose_fg.skeleton import BODY_25, SMPL_24
+from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 
 HEAD_TOP = "Head"
 """HALPE's top of the head."""

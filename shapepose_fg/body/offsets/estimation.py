@@ -26,8 +26,8 @@ from shapepose_fg.body.fitting.fitter import BodyFit, JointTargets
 from shapepose_fg.body.fitting.pose_prior import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import LARGEST_M, RIDES_ON, KeypointOffsets
-from shapepose_fg.bounds import Metres, Repeats, Settings
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.core.bounds import Metres, Repeats, Settings
+from shapepose_fg.core.skeleton import BODY_25
 
 Array = NDArray[np.floating]
 

@@ -10,7 +10,7 @@ from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Fig
 from shapepose_fg.evaluation.experiments.scale import Scale, Stretch, shorter
 from shapepose_fg.evaluation.experiments.scene_scores import mean_of, solve_and_score
 from shapepose_fg.evaluation.markdown import rule
-from shapepose_fg.pipeline import PipelineConfig
+from shapepose_fg.pipeline.pipeline import PipelineConfig
 
 FRAMES = 30
 """Of each stretch."""

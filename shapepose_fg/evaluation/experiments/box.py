@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import isotropic
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
 from shapepose_fg.evaluation.experiments.scale import Scale, Stretch
 from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.metrics import covariance_calibration
-from shapepose_fg.pipeline import PipelineConfig
-from shapepose_fg.reconstruction import Reconstruction
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.pipeline.pipeline import PipelineConfig
 
 SIGMA_M = 0.01
 """How well a width is known: what is given is off by so much, drawn anew in every frame."""

@@ -17,6 +17,8 @@ from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.offsets.estimation import learn_offsets
 from shapepose_fg.body.threads import torch_threads
+from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.detector_offsets import confident_targets, spread_frames
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
 from shapepose_fg.evaluation.experiments.scale import QUICK_FRAMES, Scale, Stretch, shorter
@@ -24,9 +26,7 @@ from shapepose_fg.evaluation.footage import Footage, shelf_footage
 from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.matching import match_people
 from shapepose_fg.evaluation.metrics import metrics_of
-from shapepose_fg.frame_times import FrameTimes
-from shapepose_fg.observations import Observations
-from shapepose_fg.pipeline import PipelineConfig, find_people, reconstruct
+from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people, reconstruct
 from shapepose_fg.simulation import DetectorConfig, simulate
 from shapepose_fg.simulation.foreign import DETECTOR_S_OWN
 

@@ -17,7 +17,7 @@ from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.shelf import evaluate_shelf, match_actors, read_shelf_ground_truth
 from shapepose_fg.evaluation.shelf_events import identity_switches, lost_limbs, pcp_interval
 from shapepose_fg.evaluation.single_person import man_of, measure_single_person
-from shapepose_fg.pipeline import PipelineConfig, reconstruct
+from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 
 QUICK = range(20)
 """Frames of a recording that a quick run takes."""

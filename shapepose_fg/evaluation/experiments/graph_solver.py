@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.threads import torch_threads
-from shapepose_fg.camera import Views
+from shapepose_fg.core.camera import Views
+from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.linearisation import observation_sigmas
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
@@ -17,8 +18,7 @@ from shapepose_fg.evaluation.experiments.scale import Scale, Stretch, shorter
 from shapepose_fg.evaluation.gradient_x_step import Alternated, GradientStep, GraphStep, alternate_with
 from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.matching import match_people
-from shapepose_fg.observations import Observations
-from shapepose_fg.pipeline import PipelineConfig, find_people
+from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people
 
 FRAMES = 20
 """Of each stretch."""

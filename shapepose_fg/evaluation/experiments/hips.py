@@ -7,13 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import Detections, DetectionSequence, Recording
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import Detections, DetectionSequence, Recording
+from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.experiments.experiment import Figures
-from shapepose_fg.frame_times import FrameTimes
-from shapepose_fg.pipeline import PipelineConfig, find_people, reconstruct
+from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people, reconstruct
 from shapepose_fg.simulation import Scene
-from shapepose_fg.skeleton import BODY_25
 
 Array = NDArray[np.float64]
 

@@ -29,7 +29,7 @@ from shapepose_fg.evaluation.opponent.over_time import over_time
 from shapepose_fg.evaluation.smpl_only import SamePeople
 from shapepose_fg.evaluation.stage_two import solve_alone
 from shapepose_fg.evaluation.true_candidates import true_observations
-from shapepose_fg.pipeline import PipelineConfig, estimate_offsets
+from shapepose_fg.pipeline.pipeline import PipelineConfig, estimate_offsets
 
 ROWS = {
     **dict.fromkeys(OTHERS),

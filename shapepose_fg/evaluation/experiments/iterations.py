@@ -11,7 +11,7 @@ from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Fig
 from shapepose_fg.evaluation.experiments.scale import Scale, Stretch, shorter
 from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.metrics import joint_metrics
-from shapepose_fg.pipeline import PipelineConfig, find_people
+from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people
 
 FRAMES = 30
 """Of each stretch."""

@@ -10,7 +10,7 @@ from typing import Any
 
 from shapepose_fg.body.fitting.fitters import BodyConfig
 from shapepose_fg.evaluation.experiments.experiment import Basis
-from shapepose_fg.pipeline import PipelineConfig
+from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.simulation import DetectorConfig
 
 MadeWith = dict[str, str]

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.experiments.experiment import Figures
 from shapepose_fg.evaluation.experiments.scale import Stretch
 from shapepose_fg.evaluation.matching import People
 from shapepose_fg.evaluation.metrics import joint_metrics
 from shapepose_fg.evaluation.other_results.reading import read_people
 from shapepose_fg.evaluation.other_results.skeleton_text import SKEL_19
-from shapepose_fg.reconstruction import Reconstruction
-from shapepose_fg.skeleton import BODY_25
 
 FILTERED, RAW = "pose2sim", "pose2sim-raw"
 """Pose2Sim with time (gaps interpolated, outliers rejected, low-pass), and frame by frame."""

@@ -12,7 +12,7 @@ from shapepose_fg.evaluation.experiments.others import COMMON
 from shapepose_fg.evaluation.experiments.scale import Scale, Stretch
 from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.tracking import score_tracks, stature_by_person
-from shapepose_fg.pipeline import PipelineConfig
+from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.simulation.truth import truth_of
 
 _UNSEEN = "joints_unseen"

@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.threads import torch_threads
-from shapepose_fg.detections import DetectionSequence
+from shapepose_fg.core.detections import DetectionSequence
+from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.estimator import Estimator
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
 from shapepose_fg.evaluation.experiments.scale import Scale, Stretch, shorter
 from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.matching import match_people
-from shapepose_fg.observations import Observations
-from shapepose_fg.pipeline import PipelineConfig, find_people, reconstruct
+from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people, reconstruct
 from shapepose_fg.simulation import DetectorConfig, Scene, simulate
 from shapepose_fg.simulation.foreign import DETECTOR_S_OWN, people_of, recast
 

@@ -7,10 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import read_json, write_atomically
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
 from shapepose_fg.evaluation.experiments.made_with import changes, made_with
-from shapepose_fg.files import read_json, write_atomically
 
 
 @dataclass(frozen=True)

@@ -4,11 +4,11 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 
-from shapepose_fg.detections import DetectionSequence
+from shapepose_fg.core.detections import DetectionSequence
+from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.estimation.estimator import ExtraFactors
-from shapepose_fg.frame_times import FrameTimes
-from shapepose_fg.pipeline import PipelineConfig, reconstruct
-from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.simulation import Scene, simulate
 from shapepose_fg.simulation.files import cut, cuts_of, named_scene
 from shapepose_fg.simulation.room import SequenceConfig

@@ -6,16 +6,16 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.detections import DetectionSequence
+from shapepose_fg.core.detections import DetectionSequence
+from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.evaluation.bodies import body_joints
 from shapepose_fg.evaluation.experiments.experiment import Figures
 from shapepose_fg.evaluation.identities import identity_metrics
 from shapepose_fg.evaluation.matching import match_people
 from shapepose_fg.evaluation.metrics import covariance_calibration, metrics_of
 from shapepose_fg.evaluation.tracking import views_used
-from shapepose_fg.frame_times import FrameTimes
-from shapepose_fg.pipeline import PipelineConfig, reconstruct
-from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.simulation import Scene
 
 

@@ -17,7 +17,7 @@ from shapepose_fg.evaluation.opponent.opponent import find_everybody
 from shapepose_fg.evaluation.opponent.over_time import over_time
 from shapepose_fg.evaluation.shelf import ACTORS, LIMB_NAMES, evaluate_shelf, read_shelf_ground_truth
 from shapepose_fg.evaluation.smpl_only import SamePeople
-from shapepose_fg.pipeline import PipelineConfig
+from shapepose_fg.pipeline.pipeline import PipelineConfig
 
 METHODS = (
     "ours, over time",

@@ -11,7 +11,7 @@ from shapepose_fg.evaluation.experiments.others import PlainPeople, mean_of, sco
 from shapepose_fg.evaluation.experiments.scale import Scale, Stretch, shorter
 from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.smpl_only import SamePeople
-from shapepose_fg.pipeline import PipelineConfig
+from shapepose_fg.pipeline.pipeline import PipelineConfig
 
 FRAMES = 60
 """Of each stretch."""

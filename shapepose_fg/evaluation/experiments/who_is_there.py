@@ -9,12 +9,12 @@ from functools import partial
 
 import numpy as np
 
+from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
 from shapepose_fg.evaluation.experiments.scale import Scale, Stretch
 from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.tracking import score_tracks
-from shapepose_fg.pipeline import PipelineConfig
-from shapepose_fg.reconstruction import Reconstruction
+from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.simulation.files import cuts_of
 from shapepose_fg.simulation.sequences import SEQUENCES
 from shapepose_fg.simulation.truth import truth_of

@@ -7,7 +7,7 @@ appearance: section 3.1 (affinity from epipolar distances) and 3.2 (cycle consis
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Rig
+from shapepose_fg.core.camera import Rig
 from shapepose_fg.evaluation.opponent.people_2d import People2D
 
 Array = NDArray[np.float64]

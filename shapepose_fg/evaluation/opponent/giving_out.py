@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import Detections
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import Detections
 from shapepose_fg.proposal.assignment import match_best_first
 
 Array = NDArray[np.float64]

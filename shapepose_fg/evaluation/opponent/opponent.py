@@ -5,13 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import Detections, DetectionSequence
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import Detections, DetectionSequence
+from shapepose_fg.core.skeleton import BODY_25, Skeleton
 from shapepose_fg.evaluation.opponent.cross_view import consistent_matches, geometric_affinity, people_of
 from shapepose_fg.evaluation.opponent.giving_out import grown, nearest_given
 from shapepose_fg.evaluation.opponent.people_2d import people_in_views, sure_enough
 from shapepose_fg.evaluation.opponent.triangulation import triangulate_robustly
-from shapepose_fg.skeleton import BODY_25, Skeleton
 
 Array = NDArray[np.float64]
 

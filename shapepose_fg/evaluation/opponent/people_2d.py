@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import Detections
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import Detections
 from shapepose_fg.proposal.people_2d import group_people
 
 

@@ -5,7 +5,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Rig
+from shapepose_fg.core.camera import Rig
 
 Array = NDArray[np.float64]
 

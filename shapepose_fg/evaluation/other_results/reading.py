@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Axis
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.camera import Axis
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.reconstruction import Reconstruction, Status
+from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.core.storage.files import open_regular
 from shapepose_fg.evaluation.other_results.skeleton_text import SHELF_JOINTS, joint_names, read_skeleton_text
 from shapepose_fg.evaluation.other_results.trc import is_trc, read_trc
-from shapepose_fg.files import open_regular
-from shapepose_fg.reconstruction import Reconstruction, Status
-from shapepose_fg.skeleton import BODY_25
 
 _FAR_M = 1e5
 """Nobody is so far from the origin of a room, metres: another unit, or a damaged file."""

@@ -8,8 +8,8 @@ from typing import NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.errors import InputError
-from shapepose_fg.files import read_text
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import read_text
 
 SHELF_JOINTS = tuple(
     "RAnkle RKnee RHip LHip LKnee LAnkle RWrist RElbow RShoulder LShoulder LElbow LWrist Neck HeadTop "

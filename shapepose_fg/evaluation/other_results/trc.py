@@ -8,11 +8,11 @@ from typing import NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Axis
-from shapepose_fg.errors import InputError
-from shapepose_fg.export.axes import opensim_axes
-from shapepose_fg.files import read_text
-from shapepose_fg.skeleton import MID_HIP
+from shapepose_fg.core.camera import Axis
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.skeleton import MID_HIP
+from shapepose_fg.core.storage.files import read_text
+from shapepose_fg.io.export.axes import opensim_axes
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """What a unit of the header is."""

@@ -8,13 +8,13 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.alternation import before_refinement
 from shapepose_fg.evaluation.experiments.scale import Stretch
 from shapepose_fg.evaluation.matching import People, match_people
 from shapepose_fg.evaluation.trajectories import LIMB_ENDS
-from shapepose_fg.pipeline import PipelineConfig
-from shapepose_fg.reconstruction import Reconstruction
-from shapepose_fg.skeleton import BODY_25
+from shapepose_fg.pipeline.pipeline import PipelineConfig
 
 Array = NDArray[np.float64]
 

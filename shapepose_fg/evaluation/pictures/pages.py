@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.model.body_model import BodyModel
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import DetectionSequence
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import DetectionSequence
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.pictures.choice import (
     ODD_SHARE,
     WRONG_M,
@@ -35,13 +37,11 @@ from shapepose_fg.evaluation.shelf import LIMB_NAMES, LIMBS
 from shapepose_fg.evaluation.shelf_events import LostLimb
 from shapepose_fg.evaluation.shelf_ground_truth import ShelfGroundTruth
 from shapepose_fg.evaluation.trajectories import LIMB_ENDS
-from shapepose_fg.reconstruction import Reconstruction
 from shapepose_fg.simulation import Scene
-from shapepose_fg.skeleton import BODY_25
-from shapepose_fg.viewer.drawing import INK, QUIET, panel, tag
-from shapepose_fg.viewer.figures import Figures, Mesh, floor_under, framed
-from shapepose_fg.viewer.floor import Floor
-from shapepose_fg.viewer.palette import PALETTE
+from shapepose_fg.viz.viewer.drawing import INK, QUIET, panel, tag
+from shapepose_fg.viz.viewer.figures import Figures, Mesh, floor_under, framed
+from shapepose_fg.viz.viewer.floor import Floor
+from shapepose_fg.viz.viewer.palette import PALETTE
 
 Array = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.calibration.written import Format, ImageSize, Row3, WrittenCamera, WrittenRig, pose, sentence
 

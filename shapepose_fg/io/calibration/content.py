@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from shapepose_fg.files import MIDDLE, parse_toml, read_bytes, read_json, read_text
+from shapepose_fg.core.storage.files import MIDDLE, parse_toml, read_bytes, read_json, read_text
 from shapepose_fg.io.calibration.filestorage import load_storage, parse_xml, parse_yaml
 
 Syntax = Literal["JSON", "TOML", "XML", "OpenCV", "YAML", "text", "folder", "pickle"]

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from shapepose_fg.errors import InputError
-from shapepose_fg.files import bounded
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import bounded
 
 _XML_DECLARATION = re.compile(r"<!(DOCTYPE|ENTITY)")
 _YAML_VERSION = re.compile(r"\A%YAML[^\n]*\n")

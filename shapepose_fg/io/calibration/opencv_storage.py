@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from shapepose_fg.camera import Lens
-from shapepose_fg.errors import InputError
-from shapepose_fg.files import MIDDLE, read_text
+from shapepose_fg.core.camera import Lens
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import MIDDLE, read_text
 from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.calibration.filestorage import load_storage
 from shapepose_fg.io.calibration.written import ONE_CAMERA, Format, WrittenCamera, WrittenRig, picture_size, pose

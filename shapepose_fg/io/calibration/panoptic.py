@@ -5,7 +5,7 @@ from typing import Annotated, Any, TypeVar
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.calibration.written import (
     Format,

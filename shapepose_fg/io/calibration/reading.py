@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import get_args
 
-from shapepose_fg.camera import Axis, Rig
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.camera import Axis, Rig
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.calibration.association import ASSOCIATION
 from shapepose_fg.io.calibration.camera_tables import CAMERA_TABLES
 from shapepose_fg.io.calibration.colmap import COLMAP

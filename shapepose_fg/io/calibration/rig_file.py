@@ -7,9 +7,9 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
-from shapepose_fg.camera import Axis, Lens, Rig
-from shapepose_fg.errors import InputError
-from shapepose_fg.files import write_atomically
+from shapepose_fg.core.camera import Axis, Lens, Rig
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.calibration.written import (
     Format,

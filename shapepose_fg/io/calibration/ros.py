@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from shapepose_fg.camera import Lens
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.camera import Lens
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.calibration.content import Content, load
 from shapepose_fg.io.calibration.written import (
     ONE_CAMERA,

@@ -4,7 +4,7 @@ import xml.etree.ElementTree as ET
 
 import numpy as np
 
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.calibration.written import Format, WrittenCamera, WrittenRig, intrinsics, pose, rotation_of
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, FiniteFloat, ValidationError
 
-from shapepose_fg.camera import Axis, Camera, Lens, padded_distortion
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.camera import Axis, Camera, Lens, padded_distortion
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.validation import first_problem, key_text
 

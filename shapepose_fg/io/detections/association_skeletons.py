@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.skeleton import BODY_25, COCO_18, Skeleton
 from shapepose_fg.io.detections.view_streams import ViewCandidates
 from shapepose_fg.proposal.assignment import match_best_first
-from shapepose_fg.skeleton import BODY_25, COCO_18, Skeleton
 
 SKELETON_TYPES = ("SKEL19", "SKEL17", "SKEL15", "COCO18", "BODY25", "OPTITRACK21", "SHELF15", "MPIIHAND21")
 """What the format's skeleton numbers mean."""

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Camera
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.camera import Camera
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections.association_skeletons import (
     SKELETON_TYPES,
@@ -22,7 +23,6 @@ from shapepose_fg.io.detections.association_skeletons import (
 from shapepose_fg.io.detections.number_stream import NumberStream
 from shapepose_fg.io.detections.scores import OVERSHOOT
 from shapepose_fg.io.detections.view_streams import ViewCandidates, ViewStream
-from shapepose_fg.skeleton import Skeleton
 
 
 def read_association_text(path: Path, camera: Camera) -> tuple[ViewStream, Skeleton]:

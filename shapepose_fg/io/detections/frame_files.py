@@ -11,8 +11,8 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, FiniteFloat, TypeAdapter, ValidationError
 
-from shapepose_fg.errors import InputError
-from shapepose_fg.files import MIDDLE, read_json, read_text
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import MIDDLE, read_json, read_text
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock
 from shapepose_fg.io.validation import first_problem, key_text

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.errors import InputError
-from shapepose_fg.files import text_pieces
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import text_pieces
 
 _LONGEST_WORD = 2**20
 """No number is as long."""

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections.view_streams import ViewCandidates, ViewStream
-from shapepose_fg.skeleton import Skeleton
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.camera_names import match_names
 
 _EXPECTED = (

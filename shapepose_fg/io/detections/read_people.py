@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from shapepose_fg.core.storage.kept_arrays import KeptArrays
 from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock
 from shapepose_fg.io.detections.scores import ScoreRule, Scores
-from shapepose_fg.kept_arrays import KeptArrays
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.skeleton import BODY_25, SKELETONS, Skeleton
+from shapepose_fg.core.storage.kept_arrays import InMemory, KeptArrays
 from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.detections.association_text import read_association_text
 from shapepose_fg.io.detections.frame_files import frame_files, read_frame_files
@@ -16,8 +18,6 @@ from shapepose_fg.io.detections.read_people import ReadPeople, read_whole
 from shapepose_fg.io.detections.scores import Scores, as_probabilities
 from shapepose_fg.io.detections.view_streams import assemble
 from shapepose_fg.io.skeleton_file import find_skeleton
-from shapepose_fg.kept_arrays import InMemory, KeptArrays
-from shapepose_fg.skeleton import BODY_25, SKELETONS, Skeleton
 
 
 def read_detections(

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Camera, Rig
-from shapepose_fg.detections import Detections
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.core.storage.kept_arrays import InMemory, KeptArrays
 from shapepose_fg.io.detection_table import BLOCK_FRAMES, DetectionTable, keep_block
-from shapepose_fg.kept_arrays import InMemory, KeptArrays
-from shapepose_fg.skeleton import Skeleton
 
 MARGIN = 0.25
 """How far outside the picture a detector may place a joint, as a part of the picture's size."""

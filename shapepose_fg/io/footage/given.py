@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.footage.footage import Footage
 from shapepose_fg.io.footage.lockstep import CameraClock
 from shapepose_fg.io.footage.placement import Placement, PlacementKind, place

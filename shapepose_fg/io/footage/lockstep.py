@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.errors import InputError
 
 _SAME_RATE = 0.01
 """Rates that differ by less than this share are the same."""

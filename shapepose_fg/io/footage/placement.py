@@ -6,7 +6,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.errors import InputError
+from shapepose_fg.core.errors import InputError
 
 _BLOCK = 16
 """Video coders work in blocks of this many pixels: a few columns or rows come and go with them."""

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from shapepose_fg.errors import InputError
-from shapepose_fg.files import read_json, write_atomically
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import read_json, write_atomically
 from shapepose_fg.io.footage.placement import Placement, PlacementKind
 from shapepose_fg.io.validation import first_problem, key_text
 

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.detections import Recording
+from shapepose_fg.core.detections import Recording
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.simulation import DetectorConfig
 from shapepose_fg.simulation.detector import Detector
 from shapepose_fg.simulation.detector_statistics import DetectorStatistics
@@ -17,7 +18,6 @@ from shapepose_fg.simulation.measurement.sample import Sample, pool, take_sample
 from shapepose_fg.simulation.measurement.statistics import statistics
 from shapepose_fg.simulation.scene import Scene
 from shapepose_fg.simulation.visibility import Skin, Visibility, VisibilityConfig, see
-from shapepose_fg.skeleton import BODY_25
 
 SEEDS = 3
 """Simulated recordings in each round of calibration."""

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from shapepose_fg.camera import Rig
+from shapepose_fg.core.camera import Rig
 from shapepose_fg.simulation.measurement.classes import GROUP, GROUPS, LEVELS, rounded
 from shapepose_fg.simulation.measurement.memories import memory_of
 from shapepose_fg.simulation.measurement.sample import Sample

@@ -8,10 +8,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.simulation.measurement.classes import GROUPS
 from shapepose_fg.simulation.measurement.comparison import LAGS, STATES, Measured
 from shapepose_fg.simulation.measurement.errors import whitened
-from shapepose_fg.skeleton import BODY_25
 
 COLOURS = {"real": "black", "simulated": "#d95f02"}
 

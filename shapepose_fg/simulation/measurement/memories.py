@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import ndtri
 
-from shapepose_fg.camera import Rig
+from shapepose_fg.core.camera import Rig
 from shapepose_fg.simulation.measurement.classes import LAGS, LONGEST_S, rounded
 from shapepose_fg.simulation.measurement.errors import whitened
 from shapepose_fg.simulation.measurement.misses import FREE, tetrachoric

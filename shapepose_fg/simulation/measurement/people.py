@@ -11,21 +11,21 @@ from scipy.spatial.transform import Rotation
 from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter
 from shapepose_fg.body.fitting.fitter import BodyFit
 from shapepose_fg.body.model.body_model import BodyModel
-from shapepose_fg.camera import Rig, Views
-from shapepose_fg.detections import DetectionSequence
+from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.detections import DetectionSequence
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.estimator import Estimator
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.linearisation import linearise, observation_sigmas, triangulate
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
-from shapepose_fg.observations import Observations
-from shapepose_fg.pipeline import PipelineConfig, find_people
+from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people
 from shapepose_fg.proposal.assignment import match_best_first
 from shapepose_fg.simulation.facing import seen_from_the_front
 from shapepose_fg.simulation.motion import Motion
 from shapepose_fg.simulation.scene import Scene
 from shapepose_fg.simulation.visibility import Skin, Visibility, VisibilityConfig, see
-from shapepose_fg.skeleton import BODY_25
 
 OTHERS = 3
 """Other views that must agree on a joint before it is used to judge a view."""

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import DetectionSequence
-from shapepose_fg.pipeline import PipelineConfig
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import DetectionSequence
+from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.proposal.assignment import match_best_first
 from shapepose_fg.simulation.measurement.people import People, left_out
 from shapepose_fg.simulation.measurement.sample_tables import (
@@ -20,7 +21,6 @@ from shapepose_fg.simulation.measurement.sample_tables import (
     expected_table,
     pair_table,
 )
-from shapepose_fg.skeleton import BODY_25
 
 GATE_M = 0.25
 """A candidate farther than this from a joint, as a length at its depth, is not that joint's."""

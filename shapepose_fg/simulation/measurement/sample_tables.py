@@ -3,10 +3,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.camera import Rig
-from shapepose_fg.detections import Detections
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.simulation.measurement.people import People
-from shapepose_fg.skeleton import BODY_25
 
 STRANGER_JOINTS = 5
 """Unowned candidates that affinities join in groups of so many are people whom nobody reconstructed."""

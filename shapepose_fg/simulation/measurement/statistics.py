@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from shapepose_fg.camera import Rig
+from shapepose_fg.core.camera import Rig
 from shapepose_fg.simulation.measurement.affinities import affinity_tables
 from shapepose_fg.simulation.measurement.classes import GROUP, GROUPS, LEVELS, joint_states
 from shapepose_fg.simulation.measurement.confusions import capture, false_candidates, merging, swaps

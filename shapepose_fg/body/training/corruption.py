@@ -1,0 +1,210 @@
+"""What a detector and a triangulation make of true joints: the targets that a fitter is trained on.
+
+Half of the people are seen by a few virtual cameras: each view hides some joints, misses some, and reports the
+others with a confidence and an error drawn from the simulator's tables; the views' rays are triangulated with the
+weights that the pipeline gives them. So depth is worse than width, a joint may be a single ray, and claims are
+sometimes wrong. The rest have plain isotropic noise. Then whole limbs, sides and halves go missing, joints are
+outliers, sides swap.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from shapepose_fg.body.model.small_matrices import inverse_3x3
+from shapepose_fg.body.model.target_skeletons import BODY_POINTS, MIRROR
+from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.simulation.detector_statistics import JOINT_GROUP, DetectorStatistics, measured
+
+_NEAREST = {
+    "Head": "Nose", "pelvis": "MidHip", "spine1": "MidHip", "spine2": "MidHip", "spine3": "Neck", "neck": "Neck",
+    "head": "Nose", "collar": "Neck", "hip": "LHip", "knee": "LKnee", "ankle": "LAnkle", "foot": "LBigToe",
+    "shoulder": "LShoulder", "elbow": "LElbow", "wrist": "LWrist", "hand": "LWrist",
+}  # fmt: skip
+"""Points that the detector has no statistics for err as their nearest joint does."""
+_GROUP = torch.tensor(
+    [
+        int(JOINT_GROUP[BODY_25.index(name if name in BODY_25.joints else _NEAREST[name.split("_")[-1]])])
+        for name in BODY_POINTS
+    ]
+)
+"""(K,) rows of the statistics' tables."""
+
+
+def _named(*parts: str) -> Tensor:
+    """(K,) 1 for the points whose name holds one of `parts`."""
+    return torch.tensor([float(any(part in name for part in parts)) for name in BODY_POINTS])
+
+
+_LEFT = torch.tensor([float(name.startswith(("L", "left"))) for name in BODY_POINTS])
+_RIGHT = torch.tensor([float(name.startswith(("R", "right"))) for name in BODY_POINTS])
+_FOOT = _named("Toe", "Heel", "foot")
+_SHIN = _FOOT + _named("Ankle", "ankle")
+_LEG = _SHIN + _named("Knee", "knee", "LHip", "RHip", "left_hip", "right_hip")
+_HAND = _named("Wrist", "wrist", "left_hand", "right_hand")
+_ARM = _HAND + _named("Elbow", "elbow", "Shoulder", "shoulder")
+_FACE = _named("Nose", "Eye", "Ear", "Head") + torch.tensor([float(name == "head") for name in BODY_POINTS])
+_FOREARM = _ARM - _named("Shoulder", "shoulder")
+_LIMBS = torch.stack([part * side for part in (_ARM, _LEG, _SHIN, _FOREARM) for side in (_LEFT, _RIGHT)])
+"""(8, K) arms and legs, whole and without their first joint."""
+_REGIONS = torch.stack([_LEFT, _RIGHT, _LEG, _ARM, _FACE, 1 - _LEG])
+"""(6, K) one side, everything below the hips, both arms, the head, everything but the legs."""
+_SWAPPED = torch.stack([_LEG, _SHIN, _ARM, _HAND, _LEG + _ARM])
+_MIRROR = torch.tensor(MIRROR)
+
+_PIPELINE_SIGMA_M = 0.013
+"""The pipeline's claim: this over the confidence (see `observations`)."""
+
+
+@dataclass(frozen=True)
+class CorruptionConfig:
+    """How often what happens; shares of people unless it says otherwise."""
+
+    triangulated: float = 0.5
+    """Seen by virtual cameras; the rest have isotropic noise."""
+    clean: float = 0.3
+    """Of the rest, those without noise."""
+    limb: float = 0.45
+    """One limb is missing; two with this squared."""
+    region: float = 0.08
+    """A side, a half or the head is missing."""
+    single: float = 0.5
+    """Largest share of joints that are missing one by one."""
+    complete: float = 0.25
+    """Nothing at all is taken away."""
+    outlier: float = 0.012
+    """Of the joints: off by 25 cm (one sigma and axis), with the claim of a good one."""
+    swap: float = 0.04
+    """Left and right of a limb change places."""
+
+
+def corrupt(
+    xyz: Tensor, offered: Tensor, generator: torch.Generator, config: CorruptionConfig | None = None
+) -> tuple[Tensor, Tensor]:
+    """Targets (B, K, 3), metres, and their information (B, K, 3, 3), 1/m², of true points `xyz` (B, K, 3).
+
+    `offered` (B, K) is 1 for the points of each one's skeleton. y is up.
+    """
+    config = CorruptionConfig() if config is None else config
+    draw = _Draw(generator)
+    seen_xyz, seen_information = triangulated(xyz, draw, measured())
+    noisy_xyz, noisy_information = _isotropic(xyz, draw, config.clean)
+    by_views = draw.uniform(len(xyz), 1) < config.triangulated
+    target = torch.where(by_views[..., None], seen_xyz, noisy_xyz)
+    information = torch.where(by_views[..., None, None], seen_information, noisy_information)
+    jump = draw.uniform(*xyz.shape[:2], 1) < config.outlier
+    target = target + 0.25 * jump * draw.normal(*xyz.shape)
+    swapped = (draw.uniform(len(xyz), 1) < config.swap) * _SWAPPED[draw.integers(len(_SWAPPED), len(xyz))] > 0
+    target = torch.where(swapped[..., None], target[:, _MIRROR], target)
+    information = torch.where(swapped[..., None, None], information[:, _MIRROR], information)
+    return target, information * (_kept(xyz, draw, config) * offered)[..., None, None]
+
+
+class _Draw:
+    """Random tensors from one generator."""
+
+    def __init__(self, generator: torch.Generator):
+        self.generator = generator
+
+    def uniform(self, *shape: int) -> Tensor:
+        return torch.rand(shape, generator=self.generator)
+
+    def normal(self, *shape: int) -> Tensor:
+        return torch.randn(shape, generator=self.generator)
+
+    def integers(self, high: int, *shape: int) -> Tensor:
+        return torch.randint(high, shape, generator=self.generator)
+
+
+def _kept(xyz: Tensor, draw: _Draw, config: CorruptionConfig) -> Tensor:
+    """(B, K) 0 for what is missing, 1 for the rest."""
+    B, K = xyz.shape[:2]
+    gone = (draw.uniform(B, K) < config.single * draw.uniform(B, 1)).float()
+    for _ in range(2):
+        limb = _LIMBS[draw.integers(len(_LIMBS), B)]
+        gone = torch.maximum(gone, (draw.uniform(B, 1) < config.limb) * limb)
+    gone = torch.maximum(gone, (draw.uniform(B, 1) < config.region) * _REGIONS[draw.integers(len(_REGIONS), B)])
+    return 1 - gone * (draw.uniform(B, 1) >= config.complete)
+
+
+def _isotropic(xyz: Tensor, draw: _Draw, clean: float) -> tuple[Tensor, Tensor]:
+    """The same noise along every axis, 2 to 40 mm before they are made unlike from joint to joint."""
+    B, K = xyz.shape[:2]
+    base = torch.exp(torch.log(torch.tensor(0.002)) + draw.uniform(B, 1) * torch.log(torch.tensor(20.0)))
+    base = base * (draw.uniform(B, 1) >= clean)
+    sigma = base * torch.exp(0.4 * draw.normal(B, K) * (draw.uniform(B, 1) < 0.5))
+    claimed = sigma.clamp_min(0.005) * torch.exp(0.3 * draw.normal(B, 1) * (draw.uniform(B, 1) < 0.3))
+    information = torch.eye(3) / claimed.square()[..., None, None]
+    return xyz + sigma[..., None] * draw.normal(B, K, 3), information
+
+
+def triangulated(xyz: Tensor, draw: _Draw, statistics: DetectorStatistics) -> tuple[Tensor, Tensor]:
+    """Joints as 2 to 8 virtual cameras around the person would give them, far enough for parallel rays."""
+    B, K = xyz.shape[:2]
+    target, information = torch.zeros(B, K, 3), torch.zeros(B, K, 3, 3)
+    number = 2 + draw.integers(7, B, 1)
+    across_first = None
+    for view in range(8):
+        direction, across = _camera(B, draw)
+        across_first = direction if across_first is None else across_first
+        state = _hidden(xyz, direction, across, draw)
+        missed, sigma, claimed = _reports(state, draw, statistics)
+        there = (~missed & (view < number))[..., None, None]
+        plane = torch.eye(3) - direction[:, None, :, None] * direction[:, None, None, :]
+        weight = there * plane / claimed.square()[..., None, None]
+        error = sigma[..., None] * draw.normal(B, K, 3)
+        information = information + weight
+        target = target + (weight @ (xyz + error)[..., None]).squeeze(-1)
+    # Along a single ray nothing is known: the triangulation puts the joint anywhere.
+    anywhere = xyz + 0.4 * draw.normal(B, K, 3)
+    little = 0.5
+    solved = inverse_3x3(information + little * torch.eye(3)) @ (target + little * anywhere)[..., None]
+    return solved.squeeze(-1), information
+
+
+def _camera(B: int, draw: _Draw) -> tuple[Tensor, Tensor]:
+    """Unit vectors (B, 3) from the person to a camera, and one in the image's plane."""
+    turn, rise = 2 * torch.pi * draw.uniform(B), torch.deg2rad(60 * draw.uniform(B) - 10)
+    direction = torch.stack((rise.cos() * turn.cos(), rise.sin(), rise.cos() * turn.sin()), -1)
+    tilt = 2 * torch.pi * draw.uniform(B)
+    side = torch.stack((-turn.sin(), torch.zeros(B), turn.cos()), -1)
+    up = torch.linalg.cross(side, direction)
+    return direction, tilt.cos()[:, None] * side + tilt.sin()[:, None] * up
+
+
+def _hidden(xyz: Tensor, direction: Tensor, across: Tensor, draw: _Draw) -> Tensor:
+    """(B, K) 0 visible, 1 hidden by the own body, 2 by another person, whose edge runs straight over the image."""
+    B, K = xyz.shape[:2]
+    middle = xyz.mean(1, keepdim=True)
+    behind = ((xyz - middle) @ direction[..., None]).squeeze(-1) < -0.05
+    own = behind & (draw.uniform(B, K) < 0.45)
+    place = ((xyz - middle) @ across[..., None]).squeeze(-1)
+    other = (place > 0.35 * draw.normal(B, 1)) & (draw.uniform(B, 1) < 0.3)
+    return torch.where(other, 2, own.long())
+
+
+def _reports(state: Tensor, draw: _Draw, statistics: DetectorStatistics) -> tuple[Tensor, Tensor, Tensor]:
+    """What one view makes of joints in `state` (B, K): missed or not, true sigma and claimed sigma, metres."""
+    B, K = state.shape
+    group = _GROUP.expand(B, K)
+    missed = draw.uniform(B, K) < _table(statistics.miss)[group, state]
+    rank = draw.uniform(B, K)
+    levels = _table(statistics.levels)
+    at = (torch.searchsorted(levels, rank, right=True) - 1).clamp(0, len(levels) - 2)
+    part = (rank - levels[at]) / (levels[at + 1] - levels[at])
+    quantiles = _table(statistics.confidence)
+    low, high = quantiles[group, state, at], quantiles[group, state, at + 1]
+    confidence = (low + part * (high - low)).clamp(0.05, 1.0)
+    knots = _table(statistics.knots)
+    knot = (torch.searchsorted(knots, confidence) - 1).clamp(0, len(knots) - 2)
+    part = ((confidence - knots[knot]) / (knots[knot + 1] - knots[knot])).clamp(0, 1)
+    sigmas, tails = _table(statistics.sigma_m), _table(statistics.tail)
+    sigma = torch.lerp(sigmas[state, knot], sigmas[state, knot + 1], part)
+    tail = torch.lerp(tails[state, knot], tails[state, knot + 1], part)
+    sigma = sigma * _table(statistics.joint_scale).mean(-1)[group] * torch.exp(tail * draw.normal(B, K))
+    return missed, sigma.clamp_max(0.25), _PIPELINE_SIGMA_M / confidence
+
+
+def _table(values: object) -> Tensor:
+    return torch.as_tensor(values, dtype=torch.float32)

@@ -1,0 +1,216 @@
+"""Poses of recorded people, frame by frame: from CMU's .npz or a folder of AMASS files, split by subject."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from shapepose_fg.body.training.split import SPLITS, Split, split_of
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.skeleton import SMPL_24
+from shapepose_fg.core.storage.npz_reader import read_npz
+from shapepose_fg.simulation.mocap import Clip, Mocap
+from shapepose_fg.simulation.shoulder import COLLARS, shoulder_rhythm
+
+SEGMENT_CAP = 300
+"""Frames' worth of weight that one recording may have (10 s)."""
+SUBJECT_CAP = 1500
+"""Frames' worth of weight that one subject may have: 13,000 frames of one climber are one person's habit."""
+WALK_CAP = 0.25
+"""Share of the weight of a split that all walking together may have. Learning from 0.25 instead of 0.15 gave walks
+of unseen people 1.6 nats a frame and took 0.1 from everything else; without a cap 0.6 more for 0.1 more."""
+TARGET_FPS = 30.0
+"""AMASS recordings are thinned to about this many frames a second: every k-th frame, nothing interpolated."""
+
+_WRISTS, _HANDS, _TOES = (20, 21), (22, 23), (10, 11)
+_BODY_COLUMNS = 66
+"""Root and 21 body joints, three columns each: what SMPL, SMPL+H and SMPL-X files agree on."""
+_Y_UP = Rotation.from_rotvec([-np.pi / 2, 0.0, 0.0])
+"""AMASS has z up, SMPL's own frame y."""
+_NOT_MOTIONS = ("shape.npz", "_stagei.npz")
+"""Files that AMASS lays beside its motions."""
+
+
+@dataclass(frozen=True)
+class Motions:
+    """Poses of many people in SMPL's structure: N frames of S recordings.
+
+    Collars that were not recorded follow the arms as they do in the simulator; unrecorded wrists, toes and hands
+    are zero. World frame: y up, SMPL's own.
+    """
+
+    poses: NDArray[np.float32]
+    """(N, 24, 3) axis-angle, rad: the root's in the world, the other joints' relative to their parents."""
+    observed: NDArray[np.bool_]
+    """(N, 24) whether the rotation was recorded; else it is a guess or zero."""
+    weight: NDArray[np.float64]
+    """(N,) how many frames this one counts for, at most 1: recordings, subjects and walking are capped within
+    their split."""
+    subject: NDArray[np.str_]
+    """(N,) who was recorded."""
+    sequence: NDArray[np.intp]
+    """(N,) recording, an index into `names`; frames of one recording follow each other."""
+    names: tuple[str, ...]
+    """(S,) names of the recordings."""
+    fps: NDArray[np.float64]
+    """(S,) frames a second of each recording."""
+
+    def __post_init__(self) -> None:
+        N = len(self.poses)
+        expected = {"poses": (N, 24, 3), "observed": (N, 24), "weight": (N,), "subject": (N,), "sequence": (N,)}
+        for name, shape in (expected | {"fps": (len(self.names),)}).items():
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"{name} must be {shape}, got {getattr(self, name).shape}")
+        if not np.isfinite(self.poses).all():
+            raise ValueError("poses must be finite: leave frames that were not recorded out")
+
+    def __len__(self) -> int:
+        """Count of frames, N."""
+        return len(self.poses)
+
+    def rows(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> "Motions":
+        """The frames `index`, indices or a mask; names and rates of all recordings stay."""
+        kept = {name: getattr(self, name)[index] for name in _FRAME_FIELDS}
+        return replace(self, **kept)
+
+    def of(self, split: Split) -> "Motions":
+        """The frames of the subjects of one part."""
+        if split not in SPLITS:
+            raise ValueError(f"split must be one of {' '.join(SPLITS)}, got {split!r}")
+        subjects, place = np.unique(self.subject, return_inverse=True)
+        return self.rows(np.array([split_of(str(name)) == split for name in subjects], dtype=bool)[place])
+
+    def mirrored(self) -> "Motions":
+        """The same recordings seen in a mirror: left and right change sides, the world's x its sign."""
+        order, sign = np.array(mirror_joints()), np.array([1, -1, -1], dtype=np.float32)
+        return replace(self, poses=self.poses[:, order] * sign, observed=self.observed[:, order])
+
+
+_FRAME_FIELDS = ("poses", "observed", "weight", "subject", "sequence")
+
+
+@dataclass(frozen=True)
+class _Recording:
+    """One recording as it is read."""
+
+    name: str
+    subject: str
+    walking: bool
+    fps: float
+    poses: NDArray[np.float32]
+    observed: NDArray[np.bool_]
+
+
+def mirror_joints() -> tuple[int, ...]:
+    """Index of each SMPL joint's partner on the other side of the body; its own for joints in the middle."""
+    swap = {"left": "right", "right": "left"}
+    parts = [name.partition("_") for name in SMPL_24]
+    return tuple(
+        SMPL_24.index(f"{swap[side]}_{part}" if side in swap else name)
+        for name, (side, _, part) in zip(SMPL_24, parts, strict=True)
+    )
+
+
+def load_motions(path: str | Path) -> Motions:
+    """All recordings in `path`; InputError where it cannot be used.
+
+    A file is read as CMU's motions in SMPL's structure (`simulation.mocap`), a folder as AMASS: every `.npz` in it
+    and below, `poses` (T, 66 or more), `mocap_framerate` or `mocap_frame_rate`; the folder that holds a file names
+    its subject.
+    """
+    path = Path(path)
+    recordings = _read_amass_folder(path) if path.is_dir() else _read_cmu(path)
+    length = np.array([len(recording.poses) for recording in recordings])
+    subject = np.array([recording.subject for recording in recordings])
+    walking = np.array([recording.walking for recording in recordings])
+    return Motions(
+        poses=np.concatenate([recording.poses for recording in recordings]),
+        observed=np.repeat(np.stack([recording.observed for recording in recordings]), length, axis=0),
+        weight=np.repeat(frame_weights(length, subject, walking), length),
+        subject=np.repeat(subject, length),
+        sequence=np.repeat(np.arange(len(recordings)), length),
+        names=tuple(recording.name for recording in recordings),
+        fps=np.array([recording.fps for recording in recordings]),
+    )
+
+
+def frame_weights(
+    length: NDArray[np.integer], subject: NDArray[np.str_], walking: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Weight (S,) of a frame of each of S recordings: recordings, subjects and walking are capped, by split.
+
+    Parameters: frames of each recording (S,), who was recorded (S,), whether it is walking (S,).
+    """
+    total = np.minimum(length.astype(np.float64), SEGMENT_CAP)
+    for name in np.unique(subject):
+        rows = subject == name
+        total[rows] *= min(1.0, SUBJECT_CAP / total[rows].sum())
+    splits = np.array([split_of(str(name)) for name in subject])
+    for split in SPLITS:
+        walks, rest = walking & (splits == split), total[~walking & (splits == split)].sum()
+        if walks.any() and rest > 0:
+            total[walks] *= min(1.0, rest * WALK_CAP / (1 - WALK_CAP) / total[walks].sum())
+    return total / length
+
+
+def _read_cmu(path: Path) -> list[_Recording]:
+    """The clips of CMU's file, collars that follow the arms put in."""
+    mocap = Mocap.load(path)
+    if len(mocap) == 0:
+        raise InputError(f"{path}: holds no recordings; give a file that has some")
+    return [_of_clip(mocap.clip(index)) for index in range(len(mocap))]
+
+
+def _of_clip(clip: Clip) -> _Recording:
+    observed = np.ones(24, dtype=bool)
+    observed[[*COLLARS, *_HANDS]] = False
+    observed[list(_WRISTS)], observed[list(_TOES)] = clip.wrist_valid, clip.toe_valid
+    rotations = shoulder_rhythm(clip.rotations)
+    vectors = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_rotvec().reshape(-1, 24, 3)
+    vectors[:, 1:][:, ~observed[1:] & ~np.isin(np.arange(1, 24), COLLARS)] = 0.0
+    walking = "walk" in clip.action.lower()
+    return _Recording(clip.name, clip.subject, walking, clip.fps, vectors.astype(np.float32), observed)
+
+
+def _read_amass_folder(folder: Path) -> list[_Recording]:
+    """Every motion below the folder, in the order of the paths."""
+    paths = [path for path in sorted(folder.rglob("*.npz")) if not path.name.endswith(_NOT_MOTIONS)]
+    if len(paths) == 0:
+        raise InputError(f"{folder}: there is no .npz in it; give a folder of AMASS motions")
+    return [_read_amass(path) for path in paths]
+
+
+def _read_amass(path: Path) -> _Recording:
+    """One AMASS file, thinned to about 30 frames a second and turned to y up; hands are left out."""
+    poses, fps = _amass_arrays(path)
+    step = max(1, round(fps / TARGET_FPS))
+    kept = np.zeros((len(poses[::step]), 24, 3))
+    kept[:, :22] = poses[::step, :_BODY_COLUMNS].reshape(-1, 22, 3)
+    kept[:, 0] = (_Y_UP * Rotation.from_rotvec(kept[:, 0])).as_rotvec()
+    observed = np.arange(24) < 22
+    walking, subject = "walk" in path.stem.lower(), path.parent.name
+    return _Recording(f"{subject}/{path.stem}", subject, walking, fps / step, kept.astype(np.float32), observed)
+
+
+def _amass_arrays(path: Path) -> tuple[NDArray[np.float64], float]:
+    """`poses` (T, 66 or more) and frame rate of an AMASS file, checked."""
+    rates = ("mocap_framerate", "mocap_frame_rate")
+    arrays = read_npz(path, ("poses", *rates), "copy it again")
+    rate = next((name for name in rates if name in arrays), None)
+    if rate is None or "poses" not in arrays:
+        missing = "poses" if rate is not None else rates[0]
+        raise InputError(f"{path}: array {missing!r} is missing; give motions in AMASS's format")
+    if any(arrays[name].dtype.kind == "U" for name in ("poses", rate)):
+        raise InputError(f"{path}: poses and {rate} must be numbers; give motions in AMASS's format")
+    poses, fps = arrays["poses"].astype(np.float64), arrays[rate].astype(np.float64)
+    if poses.ndim != 2 or len(poses) == 0 or poses.shape[1] < _BODY_COLUMNS or poses.shape[1] % 3:
+        raise InputError(
+            f"{path}: poses must be (T, 66 or more), is {poses.shape}; give motions in AMASS's format"
+        )
+    if not np.isfinite(poses).all():
+        raise InputError(f"{path}: poses holds values that are not finite; leave the file out")
+    if fps.size != 1 or not np.isfinite(fps).all() or fps.item() <= 0:
+        raise InputError(f"{path}: {rate} must be one positive number; correct it")
+    return poses, float(fps.item())

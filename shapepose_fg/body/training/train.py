@@ -1,0 +1,219 @@
+"""Trains the update network: draw people, corrupt their joints, unroll, and judge every iterate."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from shapepose_fg.body.fitting.descent import BodyState, DescentTargets, LearnedDescent
+from shapepose_fg.body.fitting.network import NUM_ROTATIONS, NetworkConfig, UpdateNetwork
+from shapepose_fg.body.fitting.person_frame import PersonFrame
+from shapepose_fg.body.model.body_model import BodyModel, accumulate
+from shapepose_fg.body.model.rotation import exp_so3
+from shapepose_fg.body.model.small_matrices import inverse_3x3
+from shapepose_fg.body.model.target_skeletons import BODY_POINTS, TARGET_SKELETONS, slots
+from shapepose_fg.body.training.corruption import CorruptionConfig, corrupt
+from shapepose_fg.body.training.motions import Motions, mirror_joints
+
+_ALL = tuple(range(len(BODY_POINTS)))
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """How the network is trained."""
+
+    iterations: int = 18_000
+    """Batches in all."""
+    batch: int = 256
+    """People in each."""
+    learning_rate: float = 1.5e-3
+    """At its highest, after a twentieth of the iterations; falls to zero by a cosine."""
+    weight_decay: float = 0.02
+    """AdamW's."""
+    averaging: float = 0.999
+    """Of the weights over iterations (exponential); the averaged ones are shipped."""
+    model_sigma_m: float = 0.02
+    """Added to every target, as the fitter's evidence does."""
+    kernel_scale: float = 6.0
+    """Of the energy whose gradient the network sees."""
+    shake_rad: float = 0.05
+    """Sigma added to recorded angles: bodies and recordings have play."""
+    exchange: float = 0.15
+    """Share of people who get an arm or a leg from somebody else."""
+    skeletons: tuple[float, ...] = (0.55, 0.15, 0.15, 0.15)
+    """Shares of BODY_25, COCO_17, HALPE_26, SMPL_24."""
+    rotation_m: float = 0.05
+    """What a rotation that is wrong by a radian costs, in metres of a joint."""
+    shape_m: float = 0.01
+    """What a wrong beta costs, the same."""
+    corruption: CorruptionConfig = field(default_factory=CorruptionConfig)
+    """How targets are made."""
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    """Size of the network."""
+    seed: int = 0
+    """Of everything that is drawn."""
+
+
+@dataclass(frozen=True)
+class People:
+    """True bodies upright in front of nobody's camera: pelvis at the origin, any heading."""
+
+    state: BodyState
+    """Shape and pose."""
+    points: Tensor
+    """(B, K, 3) all `BODY_POINTS`, metres."""
+
+
+class PeopleSource:
+    """Draws bodies: shapes from the model's own distribution, poses from recordings."""
+
+    def __init__(self, motions: Motions, model: BodyModel, frame: PersonFrame, config: TrainingConfig):
+        self.config, self.model, self._frame = config, model, frame
+        self._poses = torch.from_numpy(motions.poses)
+        self._weight = torch.from_numpy(motions.weight).double().cumsum(0)
+        self._mirror = torch.tensor(mirror_joints())
+
+    def draw(self, count: int, generator: torch.Generator) -> People:
+        """`count` people."""
+        pose = self._pose(count, generator)
+        other = self._pose(count, generator)
+        exchanged = torch.rand(count, generator=generator) < self.config.exchange
+        part = _CHAINS[torch.randint(len(_CHAINS), (count,), generator=generator)] & exchanged[:, None]
+        pose = torch.where(part[..., None], other, pose)
+        local = exp_so3(pose)
+        shake = self.config.shake_rad * torch.randn(count, 24, 3, generator=generator)
+        shake[:, 0] = 0
+        betas = torch.randn(count, 10, generator=generator).clamp(-3, 3)
+        local = local @ exp_so3(shake)
+        state = BodyState(betas, local, self._frame.transl.expand(count, 3))
+        return People(state, body_points(self.model, state))
+
+    def _pose(self, count: int, generator: torch.Generator) -> Tensor:
+        """(count, 24, 3) axis-angle, half of them in the mirror."""
+        at = torch.rand(count, generator=generator, dtype=torch.float64) * self._weight[-1]
+        pose = self._poses[torch.searchsorted(self._weight, at).clamp_max(len(self._poses) - 1)]
+        flipped = pose[:, self._mirror] * torch.tensor([1.0, -1.0, -1.0])
+        return torch.where(torch.rand(count, 1, 1, generator=generator) < 0.5, pose, flipped)
+
+
+def body_points(model: BodyModel, state: BodyState) -> Tensor:
+    """(B, K, 3) all `BODY_POINTS` of a state, differentiable."""
+    points = model.points
+    feature = None if points.offsets_pose is None else (state.local[:, 1:] - torch.eye(3)).flatten(1)
+    return points.positions(accumulate(state.local), state.betas, state.transl, feature)
+
+
+def _chain(joints: tuple[int, ...]) -> Tensor:
+    chain = torch.zeros(24, dtype=torch.bool)
+    chain[list(joints)] = True
+    return chain
+
+
+_CHAINS = torch.stack(
+    [_chain((13, 16, 18, 20)), _chain((14, 17, 19, 21)), _chain((1, 4, 7, 10)), _chain((2, 5, 8, 11))]
+)
+"""(4, 24) arms and legs."""
+
+
+class Trainer:
+    """One run of training, which can be stopped and continued to the bit (see `checkpoint`)."""
+
+    def __init__(self, source: PeopleSource, frame: PersonFrame, network: UpdateNetwork, config: TrainingConfig):
+        self.source, self.frame, self.config = source, frame, config
+        self.network = network
+        self.averaged = UpdateNetwork(config.network).to(network.gradient_scale.device)
+        self.averaged.load_state_dict(network.state_dict())
+        self.optimiser = torch.optim.AdamW(
+            network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
+        )
+        self.iteration = 0
+
+    def run(self, iterations: int) -> Iterator[list[float]]:
+        """Goes on for some `iterations`; yields the mean joint error in mm of every iterate."""
+        for _ in range(iterations):
+            yield self._iterate()
+
+    def _iterate(self) -> list[float]:
+        config = self.config
+        # Everything that is drawn follows from seed and iteration: a run that was stopped goes on the same.
+        generator = torch.Generator().manual_seed(config.seed * 10_000_019 + self.iteration)
+        torch.manual_seed(config.seed * 10_000_019 + self.iteration)  # dropout
+        for group in self.optimiser.param_groups:
+            group["lr"] = _learning_rate(config, self.iteration)
+        people = self.source.draw(config.batch, generator)
+        targets, state, truth, true_points = prepared(people, self.frame, config, generator)
+        self.network.train()
+        descent = LearnedDescent(self.source.model.points, _ALL, self.network, config.kernel_scale)
+        self.optimiser.zero_grad()
+        errors = []
+        for iterate in descent.unroll(state, targets):
+            error, loss = _judge(self.source.model, iterate, truth, true_points, config)
+            loss.backward()
+            errors.append(1000 * float(error))
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+        self.optimiser.step()
+        self.iteration += 1
+        self._average()
+        return errors
+
+    @torch.no_grad()
+    def _average(self) -> None:
+        share = min(self.config.averaging, 1 - 1 / (self.iteration + 1))
+        for mean, new in zip(self.averaged.parameters(), self.network.parameters(), strict=True):
+            mean.lerp_(new, 1 - share)
+
+
+def _learning_rate(config: TrainingConfig, iteration: int) -> float:
+    done = iteration / config.iterations
+    warm = min(1.0, done / 0.05) if done < 0.05 else 0.5 * (1 + float(torch.cos(torch.tensor(torch.pi * done))))
+    return config.learning_rate * max(warm, 1e-4)
+
+
+@torch.no_grad()
+def prepared(
+    people: People, frame: PersonFrame, config: TrainingConfig, generator: torch.Generator
+) -> tuple[DescentTargets, BodyState, BodyState, Tensor]:
+    """Corrupted targets, the start, the true state and true points, all in the person's frame as it is found."""
+    B = len(people.points)
+    offered = _OFFERED[torch.multinomial(torch.tensor(config.skeletons), B, True, generator=generator)]
+    xyz, information = corrupt(people.points, offered, generator, config.corruption)
+    information = information @ inverse_3x3(torch.eye(3) + config.model_sigma_m**2 * information)
+    xyz = torch.where((information != 0).any(-1).any(-1)[..., None], xyz, 0.0)
+    variance = mean_variance(information)
+    enough = torch.isfinite(variance).sum(1) >= 4
+    xyz, information, variance, points = (value[enough] for value in (xyz, information, variance, people.points))
+    local, betas = people.state.local[enough], people.state.betas[enough]
+    rotation, origin = frame.place(xyz, variance, _ALL)
+    inside = lambda places: (places - origin[:, None]) @ rotation  # noqa: E731
+    turned = rotation.mT[:, None] @ information @ rotation[:, None]
+    true_local = torch.cat((rotation.mT[:, None] @ local[:, :1], local[:, 1:]), 1)
+    truth = BodyState(betas, true_local, torch.zeros(len(xyz), 3))
+    start = BodyState(torch.zeros(len(xyz), 10), frame.local.expand(len(xyz), 24, 3, 3),
+                      frame.transl.expand(len(xyz), 3))  # fmt: skip
+    return DescentTargets(inside(xyz), turned), start, truth, inside(points)
+
+
+def mean_variance(information: Tensor) -> Tensor:
+    """(B, K) mean variance over the axes, m²; infinite where that is over `_SEEN_M` squared, a ray for example."""
+    variance = torch.diagonal(inverse_3x3(information + 0.1 * torch.eye(3)), dim1=-2, dim2=-1).mean(-1)
+    return torch.where(variance < _SEEN_M**2, variance, torch.inf)
+
+
+_SEEN_M = 0.2
+"""Joints less sure than this say nothing about where a person stands."""
+_OFFERED = torch.zeros(len(TARGET_SKELETONS), len(BODY_POINTS))
+for _row, _names in enumerate(TARGET_SKELETONS.values()):
+    _OFFERED[_row, list(slots(_names))] = 1
+
+
+def _judge(
+    model: BodyModel, state: BodyState, truth: BodyState, true_points: Tensor, config: TrainingConfig
+) -> tuple[Tensor, Tensor]:
+    """Mean joint error in metres, and the loss: joints, rotations, shape."""
+    distance = torch.linalg.vector_norm(body_points(model, state) - true_points, dim=-1)
+    turn = (state.local[:, :NUM_ROTATIONS] - truth.local[:, :NUM_ROTATIONS]).square().sum((-1, -2))
+    turn = (turn / 2 + 1e-4).sqrt().mean()
+    shape = (state.betas - truth.betas).abs().mean()
+    error = distance.mean()
+    return error.detach(), error + config.rotation_m * turn + config.shape_m * shape

@@ -1,0 +1,166 @@
+"""`shapepose-fg batch`: all recordings of a table, on this machine's processes or those of a Dask cluster."""
+
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from shapepose_fg.cli.options import check_workers
+from shapepose_fg.cli.stopping import Stopped
+from shapepose_fg.cli.terminal import note, show, warn
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.output_folder import only_run_in
+
+if TYPE_CHECKING:
+    from shapepose_fg.cli.batch.standing import Standing
+    from shapepose_fg.cli.batch.table import Entry
+    from shapepose_fg.pipeline.cluster import Scheduler
+
+# Everything else is imported inside the command: `--help` must not wait for torch.
+
+
+def batch(
+    table: Annotated[Path, typer.Argument(metavar="RECORDINGS.TOML", help="The recordings: see docs/batch.md.")],
+    output: Annotated[
+        Path, typer.Option(help="Folder for a folder of results of each recording, and batch.json.")
+    ],
+    cluster: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS", help="Dask scheduler (tcp://host:8786) whose processes solve; else this machine's."
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="Processes of this machine that solve; by default one a core.")
+    ] = None,
+    at_once: Annotated[
+        int | None, typer.Option(help="Recordings under way at a time; by default as many as keep all busy.")
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with what is not done in --output; who failed is tried again.")
+    ] = False,
+    restart: Annotated[
+        bool, typer.Option("--restart", help="Begin all recordings anew, whatever is in --output.")
+    ] = False,
+) -> None:
+    """Reconstruct all recordings of a table: each as `reconstruct` would, to the byte, in one queue of work.
+
+    A recording that fails twice is left, and the others go on. Exit code 1 where one failed, 0 where none did.
+    """
+    from shapepose_fg.cli.batch.table import read_table
+
+    check_workers(workers)
+    if cluster is not None and workers is not None:
+        raise InputError(
+            "--cluster and --workers: these are processes of the cluster, or of this machine; give one"
+        )
+    if at_once is not None and not 1 <= at_once <= 64:
+        raise InputError(f"--at-once {at_once}: must be 1 to 64; leave it out for as many as keep all busy")
+    if resume and restart:
+        raise InputError("--resume and --restart: a batch goes on or begins anew; give one of them")
+    entries = read_table(table)
+    from shapepose_fg.cli.batch.standing import BATCH
+
+    with only_run_in(output, [BATCH]):
+        _run(table, entries, output, cluster, workers, at_once, resume=resume, restart=restart)
+
+
+def _run(
+    table: Path,
+    entries: "list[Entry]",
+    output: Path,
+    address: str | None,
+    workers: int | None,
+    at_once: int | None,
+    *,
+    resume: bool,
+    restart: bool,
+) -> None:
+    """The batch in a folder where nobody else writes."""
+    from shapepose_fg.cli.batch.campaign import Campaign
+    from shapepose_fg.cli.batch.check import look_at_all
+    from shapepose_fg.cli.batch.standing import BATCH, Standings
+    from shapepose_fg.cli.batch.summary import bars, failures, table_of
+    from shapepose_fg.pipeline.cluster import local_cluster, look_at
+    from shapepose_fg.pipeline.workers import cores
+
+    begin = time.monotonic()
+    standings = Standings(output / BATCH, str(table))
+    standings.of = _standings(entries, output, resume=resume, restart=restart)
+    todo = [entry for entry in entries if standings.of[entry.name].status == "waiting"]
+    sizes = look_at_all(table, todo, output, begun=resume or restart)
+    if len(todo) > 0:
+        with ExitStack() as opened:
+            if address is None:
+                scheduler = opened.enter_context(local_cluster(workers or cores(), dashboard=True))
+            else:
+                scheduler = look_at(address)
+            count = min(at_once or _at_once(scheduler.processes, cores()), len(todo))
+            _say(scheduler, len(entries), len(todo), count, here=address is None)
+            standings.write()
+            campaign = Campaign(entries, sizes, output, scheduler.address, count)
+            try:
+                with bars(standings) as watcher:
+                    campaign.run(standings, watcher)
+            except Stopped as stop:
+                done = len(standings.names("done"))
+                where = f"{done} of {len(entries)} recordings are done in {output}; go on with --resume"
+                raise Stopped(stop.number, where) from None
+    show(table_of(standings, time.monotonic() - begin))
+    print(f"written  {output / BATCH}")
+    for sentence in failures(standings):
+        warn(sentence)
+    if len(standings.names("failed")) > 0:
+        raise typer.Exit(1)
+
+
+def _standings(entries: "list[Entry]", output: Path, *, resume: bool, restart: bool) -> "dict[str, Standing]":
+    """How far every recording is, and who begins anew: by `restart`, or with something else wanted."""
+    from shapepose_fg.cli.batch.standing import BATCH, Standing, read_standings
+    from shapepose_fg.cli.batch.table import asked
+    from shapepose_fg.core.result_files import PEOPLE, RUN
+
+    file = output / BATCH
+    if file.exists() and not (resume or restart):
+        raise InputError(f"{file}: a batch was begun here; go on with --resume, or begin anew with --restart")
+    if resume and not file.exists():
+        note(f"{output}: no batch was begun here; this one is")
+    before = read_standings(file) if resume and file.exists() else {}
+    found: dict[str, Standing] = {}
+    for entry in entries:
+        wanted = asked(entry.request)
+        old = before.get(entry.name, Standing(wanted, anew=restart))
+        there = all((output / entry.name / name).is_file() for name in (PEOPLE, RUN))
+        changed = old.asked != wanted
+        if changed:
+            note(f"{entry.name}: something else is wanted of it than before; it begins anew")
+        is_done = not changed and old.status == "done" and there
+        found[entry.name] = old if is_done else Standing(wanted, anew=changed or old.anew)
+    return found
+
+
+def _at_once(processes: int, cores: int) -> int:
+    """Recordings that are led side by side.
+
+    One leader keeps five processes busy where it follows people itself, and ten where it does not; and while one
+    recording is read or written another fills the queue.
+    """
+    return max(2, min(1 + processes // 6, cores))
+
+
+def _say(scheduler: "Scheduler", count: int, todo: int, at_once: int, *, here: bool) -> None:
+    """What is going to be done, and where to look at it."""
+    done = "" if todo == count else f", {count - todo} of them done before"
+    place = "here" if here else f"at {scheduler.address}"
+    print(
+        f"{count} recordings{done}; {scheduler.processes} processes {place}, {at_once} recordings at once",
+        flush=True,
+    )
+    if scheduler.processes == 0:
+        note(f"no process has come to {scheduler.address} yet; the work waits for one (`dask worker`)")
+    if scheduler.dashboard is not None:
+        print(f"what every process does: {scheduler.dashboard}", flush=True)
+    elif here:
+        note('Dask\'s dashboard, which shows what every process does, needs bokeh: pip install "dask[dashboard]"')

@@ -1,0 +1,143 @@
+"""recordings.toml: which recordings an archive has, and what is wanted of each."""
+
+import re
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from shapepose_fg.cli.reconstruct.request import Request
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.skeleton import SKELETONS
+from shapepose_fg.core.storage.files import read_toml
+from shapepose_fg.io.config import config_from
+from shapepose_fg.io.validation import describe
+
+_NAME = re.compile(r"\w[\w.-]{0,99}")
+_MOST = 10_000
+"""Recordings of one table."""
+_PATHS = ("calibration", "detections", "project", "config", "body", "timestamps", "shapes")
+_CURE = "docs/batch.md describes the table"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One recording of the table."""
+
+    name: str
+    """What it is called; its results go into a folder of that name."""
+    request: Request
+    """What is wanted of it."""
+    after: str | None = None
+    """The recording whose people's shapes it begins with, so that it has to wait for it."""
+
+
+def read_table(path: Path) -> list[Entry]:
+    """The recordings of a table, in its order.
+
+    Paths are relative to the table's folder and do not lead out of it, unless they are absolute. InputError that
+    names the file, the recording and the cure.
+    """
+    tables = read_toml(path)
+    for key in tables.keys() - {"defaults", "recordings"}:
+        raise InputError(f"{path}: {key} is not a known table; write [defaults] and [recordings.NAME]")
+    defaults = _table(tables.get("defaults", {}), path, "defaults")
+    recordings = _table(tables.get("recordings", {}), path, "recordings")
+    if not 1 <= len(recordings) <= _MOST:
+        raise InputError(
+            f"{path}: {len(recordings)} recordings; give 1 to {_MOST} of them, each as [recordings.NAME]"
+        )
+    _check_names(list(recordings), path)
+    config_from(defaults, Request, path, place="defaults", cure=_CURE)
+    entries = []
+    for name, own in recordings.items():
+        place = f"recordings.{name}"
+        values = _over(defaults, _table(own, path, place))
+        entries.append(
+            Entry(name, _located(config_from(values, Request, path, place=place, cure=_CURE), path, place))
+        )
+    return _in_turn(entries, path)
+
+
+def _table(value: Any, path: Path, place: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise InputError(f"{path}: {place} must be a table, got {describe(value)}; {_CURE}")
+    return value
+
+
+def _check_names(names: list[str], path: Path) -> None:
+    """Refuse names that are no folders' names, or the same one on some systems."""
+    seen: dict[str, str] = {}
+    for name in names:
+        if _NAME.fullmatch(name) is None:
+            raise InputError(
+                f"{path}: recordings.{name[:100]}: a name has up to 100 letters, digits, dots, - and _, and begins"
+                " with a letter or digit, because a folder is called so; rename it"
+            )
+        if name.lower() in ("batch.json", *seen):
+            other = seen.get(name.lower(), "batch.json")
+            raise InputError(f"{path}: recordings.{name}: {other} has this name on some systems, too; rename it")
+        seen[name.lower()] = name
+
+
+def _over(defaults: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
+    """A recording's own words over those for all; when frames were taken is said in one way only."""
+    if own.keys() & {"fps", "timestamps"}:
+        defaults = {key: value for key, value in defaults.items() if key not in ("fps", "timestamps")}
+    return defaults | own
+
+
+def _located(request: Request, path: Path, place: str) -> Request:
+    """The same with its paths found from the table's folder."""
+    given = {name: getattr(request, name) for name in _PATHS}
+    if request.skeleton is not None and request.skeleton not in SKELETONS:
+        given["skeleton"] = Path(request.skeleton)
+    found = {name: _inside(value, path, f"{place}.{name}") for name, value in given.items() if value is not None}
+    return replace(request, **{name: str(value) if name == "skeleton" else value for name, value in found.items()})
+
+
+def _inside(given: Path, path: Path, place: str) -> Path:
+    """A path relative to the table's folder, inside it; or an absolute one."""
+    found = path.parent / given  # itself, where it is absolute
+    try:
+        inside = found.resolve().is_relative_to(path.parent.resolve())
+    except (OSError, RuntimeError, ValueError):  # links in a circle, a zero byte
+        raise InputError(f"{path}: {place}: no file has the name {str(given)[:80]!r}; correct it") from None
+    if not (inside or given.is_absolute()):
+        raise InputError(
+            f"{path}: {place}: {given} leads out of the table's folder; if that is meant, write an absolute path"
+        )
+    return found
+
+
+def _in_turn(entries: list[Entry], path: Path) -> list[Entry]:
+    """The same; those that share a file of shapes wait for each other, so that their order is the table's."""
+    last: dict[Path, str] = {}
+    projects: dict[tuple[Path, str | None], str] = {}
+    found = []
+    for each in entries:
+        shapes, project = each.request.shapes, each.request.project
+        if project is not None:
+            key = project.resolve(), each.request.frames
+            if key in projects:
+                raise InputError(
+                    f"{path}: recordings.{each.name}: {project} is that of {projects[key]}, too, and TRC of"
+                    " one would be written over those of the other; leave one out"
+                )
+            projects[key] = each.name
+        if shapes is not None:
+            each = replace(each, after=last.get(shapes.resolve()))
+            last[shapes.resolve()] = each.name
+        found.append(each)
+    return found
+
+
+def asked(request: Request) -> dict[str, Any]:
+    """What is wanted, as plain values: equal where the same is wanted."""
+    values = {field.name: getattr(request, field.name) for field in fields(request)}
+    plain = {name: str(value) if isinstance(value, Path) else value for name, value in values.items()}
+    default = Request()
+    return {
+        name: list(value) if isinstance(value, tuple) else value
+        for name, value in plain.items()
+        if value != getattr(default, name)
+    }

@@ -1,0 +1,113 @@
+"""What `shapepose-fg reconstruct` says at its end: who was found, how well it went, and what looks wrong."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from shapepose_fg.cli.terminal import show, warn
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from shapepose_fg.core.reconstruction import Reconstruction
+    from shapepose_fg.pipeline.runs.assembly import Assembly
+    from shapepose_fg.setup_check.in_result import ResultCheck
+
+
+def summary_table(
+    result: "Assembly", people: "Reconstruction", span: range, camera_count: int, seconds: float, output: Path
+) -> "Table":
+    """What was reconstructed, how well it went, how long it took, and where it is.
+
+    `people` are rows of the `result` that say how sure the joints are.
+    """
+    import numpy as np
+    from rich.table import Table
+
+    from shapepose_fg.core.frame_times import rate_words
+    from shapepose_fg.io.solved_setup import CAMERAS
+
+    frame, run, counts = result.columns()["frame"].array(), result.run, result.counts()
+    per_frame = np.bincount(frame - span.start, minlength=len(span))
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    table.add_column(style="bold")
+    table.add_column(overflow="fold")
+    table.add_row("frames", f"{len(span)} ({span.start}:{span.stop}) of {camera_count} cameras{rate_words(run)}")
+    over_time = run.get("configuration", {}).get("temporal", False)
+    count = f"{len(result.people.counts)} people over time" if over_time else "no identities"
+    table.add_row("people", f"{count}, {per_frame.mean():.1f} a frame ({per_frame.min()} to {per_frame.max()})")
+    table.add_row("rows", f"{len(result)} in all")
+    for status, count in sorted(counts["status"].items()):
+        table.add_row("", f"{count} {status}", style="green" if status == "ok" else "yellow")
+    if len(doubtful := _doubtful(run)) > 0:
+        table.add_row("", doubtful, style="yellow")
+    for reason, count in run.get("people", {}).get("dropped", {}).items():
+        where = _frames_words(run.get("dropped_frames", {}).get(reason, []))
+        table.add_row("", f"{count} dropped: {reason}{where}", style="dim")
+    for what, spans in run.get("thinned_frames", {}).items():
+        table.add_row("", f"too many {what}, the surest were taken{_frames_words(spans)}", style="yellow")
+    if len(people) > 0:
+        table.add_row("joints", _joints(counts["joints"], people))
+    # Loading torch and the body takes a second or two, once; it says nothing about the time of a frame.
+    stages = {name: spent for name, spent in run.get("seconds", {}).items() if name != "load"}
+    per_stage = "  ".join(f"{name} {1e3 * spent / len(span):.1f}" for name, spent in stages.items())
+    table.add_row("time", f"{1e3 * sum(stages.values()) / len(span):.1f} ms a frame, {seconds:.1f} s in all")
+    table.add_row("", per_stage, style="dim")
+    table.add_row("written", str(output / "people.npz"))
+    table.add_row("", str(output / "run.json"))
+    if len(result) > 0:
+        table.add_row("", str(output / "observations.npz"))
+    table.add_row("", str(output / CAMERAS))
+    return table
+
+
+_SURE = 0.9
+"""Whoever is less probable is named."""
+
+
+def _doubtful(run: dict[str, Any]) -> str:
+    """Who is less probable than `_SURE`; without identities how many rows; empty where nobody is."""
+    said = run.get("probability", [])
+    if isinstance(said, dict):
+        count = sum(rows for tenth, rows in said.items() if float(tenth) < _SURE)
+        return f"{count} are less probable than {_SURE}" if count > 0 else ""
+    few = [f"{each['person']} ({each['probability']:.2f})" for each in said if each["probability"] < _SURE]
+    return f"less probable than {_SURE}: person {', '.join(few[:8])}{' ...' * (len(few) > 8)}" if few else ""
+
+
+def _frames_words(spans: list[list[int]]) -> str:
+    """In which frames, as far as there is room: run.json has all."""
+    told = [f"{start}" if stop == start + 1 else f"{start}-{stop - 1}" for start, stop in spans[:4]]
+    more = " ..." if len(spans) > len(told) else ""
+    return f" (frames {' '.join(told)}{more})" if told else ""
+
+
+def _joints(count: dict[str, int], people: "Reconstruction") -> str:
+    """How the joints are known, as shares, and how sure they are, as words."""
+    import numpy as np
+
+    words = {"seen": "seen by two views", "weak": "seen by one or weakly", "body": "inferred from the body"}
+    words |= {"motion": "carried by motion", "unknown": "unknown"}
+    total = max(sum(count.values()), 1)
+    shares = ", ".join(f"{100 * count[how] / total:.1f} % {word}" for how, word in words.items() if count[how] > 0)
+    variance = np.trace(people.covariance, axis1=-2, axis2=-1) / 3
+    variance = variance[np.isfinite(variance) & (variance >= 0)]
+    sigma = f"; median sigma {1e3 * np.sqrt(np.median(variance)):.0f} mm" if len(variance) > 0 else ""
+    return shares + sigma
+
+
+def show_check(checked: "ResultCheck") -> None:
+    """How far each camera is from the result, and on stderr what looks wrong."""
+    from rich.text import Text
+
+    from shapepose_fg.setup_check.camera_use import use_table
+
+    if len(checked.cameras) > 0:
+        print()
+        show(use_table(checked.cameras))
+        meaning = (
+            "error: median / 90 % of all detections given to people, before gates; used: after;\n"
+            "left out: median, from where the other cameras alone put the joint"
+        )
+        show(Text(meaning, style="dim"))
+    for each in checked.warnings:
+        warn(each)

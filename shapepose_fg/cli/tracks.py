@@ -1,0 +1,239 @@
+"""The command `tracks`: who is in a result over time, and who is who, corrected by hand."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from shapepose_fg.cli.terminal import show
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.result_options import results_folder
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from rich.console import RenderableType
+
+    from shapepose_fg.body.model.smpl_file import SmplArrays
+    from shapepose_fg.core.reconstruction import Reconstruction
+    from shapepose_fg.tracking.edits import Edited, Solve
+
+# Everything else is imported inside the commands: `--help` must not wait for it.
+
+tracks = typer.Typer(invoke_without_command=True)
+
+Person = Annotated[int, typer.Argument(metavar="A", help="Number of a person.", min=0)]
+Other = Annotated[int, typer.Argument(metavar="B", help="Number of another person.", min=0)]
+From = Annotated[int, typer.Argument(metavar="FRAME", help="First frame that changes.", min=0)]
+
+
+@tracks.callback()
+def people_over_time(
+    context: typer.Context,
+    results: Annotated[Path, typer.Argument(metavar="RESULTS", help="Folder of a reconstruction.")],
+) -> None:
+    """List the people of a result over time, or correct who is who: shapepose-fg tracks RESULTS merge 3 9.
+
+    Without a command everybody is listed. The result as it was before the first correction stays in
+    RESULTS/uncorrected, and `undo` takes corrections back one by one.
+    """
+    context.obj = results
+    if context.invoked_subcommand is None:
+        list_people(context)
+
+
+@tracks.command("list")
+def list_people(
+    context: typer.Context,
+    as_json: Annotated[bool, typer.Option("--json", help="Print them as JSON.")] = False,
+) -> None:
+    """Everybody: frames, gaps, stature, how often seen, how far they walked."""
+    from shapepose_fg.core.reconstruction import Reconstruction
+    from shapepose_fg.tracking.listing import list_saved_tracks
+
+    if not as_json:
+        show(_tracks_table(context.obj))
+        return
+    with Reconstruction.open(context.obj) as opened:
+        listed = [asdict(track) for track in list_saved_tracks(opened, _body_of(opened.run))]
+    plain = [{name: None if value != value else value for name, value in track.items()} for track in listed]
+    print(json.dumps(plain, indent=2, allow_nan=False))
+
+
+@tracks.command("merge")
+def merge_people(context: typer.Context, person: Person, other: Other) -> None:
+    """B is A: B's rows become A's."""
+    _correct(context, "merge", person, other=other)
+
+
+@tracks.command("split")
+def split_person(
+    context: typer.Context,
+    person: Person,
+    frame: From,
+    new: Annotated[
+        int | None, typer.Option(help="Number of the new person; by default the next free one.")
+    ] = None,
+) -> None:
+    """From FRAME on A is somebody else: a new person."""
+    _correct(context, "split", person, other=new, frame=frame)
+
+
+@tracks.command("rename")
+def rename_person(context: typer.Context, person: Person, other: Other) -> None:
+    """A gets the number B, which must be free."""
+    _correct(context, "rename", person, other=other)
+
+
+@tracks.command("drop")
+def drop_person(context: typer.Context, person: Person) -> None:
+    """A is nobody: A's rows are taken out."""
+    _correct(context, "drop", person)
+
+
+@tracks.command("swap")
+def swap_people(context: typer.Context, person: Person, other: Other, frame: From) -> None:
+    """From FRAME on A is B and B is A."""
+    _correct(context, "swap", person, other=other, frame=frame)
+
+
+@tracks.command("undo")
+def undo_correction(context: typer.Context) -> None:
+    """Take the last correction back."""
+    from shapepose_fg.io.corrections import take_back
+
+    folder = results_folder(context.obj)
+    edit, _ = take_back(folder, _solver(folder))
+    print(f"taken back: {edit}")
+    show(_tracks_table(context.obj))
+    _renew_report(folder)
+
+
+def _tracks_table(results: Path) -> "RenderableType":
+    """Everybody of a result, and what was corrected."""
+    from rich.console import Group
+    from rich.padding import Padding
+    from rich.table import Table
+
+    from shapepose_fg.core.frame_times import rate_words
+    from shapepose_fg.core.reconstruction import Reconstruction
+    from shapepose_fg.io.corrections import read_corrections
+    from shapepose_fg.tracking.listing import list_saved_tracks
+
+    with Reconstruction.open(results) as opened:
+        run, rows = opened.run, len(opened)
+        listed = list_saved_tracks(opened, _body_of(run))
+    table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
+    for name in ("person", "frames", "rows", "gaps", "stature", "seen", "confidence", "walked"):
+        table.add_column(name, justify="right")
+    for track in listed:
+        table.add_row(
+            str(track.person),
+            f"{track.first}-{track.last}",
+            str(track.rows),
+            str(track.gaps),
+            _or_dash(track.stature_m, "{:.2f} m"),
+            _or_dash(100 * track.seen, "{:.0f} %"),
+            f"{track.confidence:.2f}",
+            f"{track.walked_m:.1f} m",
+        )
+    lines = [f"{len(listed)} people, {rows} rows{rate_words(run)}"]
+    if not run.get("configuration", {}).get("temporal", True):
+        lines.append("every frame stands alone here: a number is nobody's over time")
+    edits = read_corrections(results_folder(results))
+    if len(edits) > 0:
+        lines.append(f"corrected: {'; '.join(map(str, edits))}")
+    return Group(*([table] if listed else []), Padding("\n".join(lines), (1 if listed else 0, 0, 0, 0)))
+
+
+def _or_dash(value: float, text: str) -> str:
+    """`value` as `text` formats it; a dash where it is NaN."""
+    return "-" if value != value else text.format(value)
+
+
+def _body_of(run: "Mapping[str, Any]") -> "SmplArrays | None":
+    """The body model that a result was made with; None where its file is not there any more."""
+    from shapepose_fg.body.shapes import read_body
+
+    file = run.get("body")
+    if file is None:
+        return read_body()
+    return read_body(Path(file)) if Path(file).is_file() else None
+
+
+def _correct(context: typer.Context, action: str, person: int, **more: int | None) -> None:
+    """Make one correction, and say what came of it."""
+    from shapepose_fg.core.reconstruction import Reconstruction
+    from shapepose_fg.io.corrections import correct
+    from shapepose_fg.tracking.edits import Action, Edit, free_number
+
+    folder = results_folder(context.obj)
+    if action == "split" and more["other"] is None:
+        with Reconstruction.open(folder) as opened:
+            more["other"] = free_number(opened.person)
+    edit = Edit(Action(action), person, **more)
+    solve = _solver(folder)
+    edited = correct(folder, edit, solve)
+    print(f"done: {edit}{_solved_words(edited, solve)}")
+    show(_tracks_table(context.obj))
+    print(f"take it back: shapepose-fg tracks {context.obj} undo")
+    _renew_report(folder)
+
+
+def _renew_report(folder: Path) -> None:
+    """The page of a result that was corrected, where there is one: it would say what is no longer true."""
+    from shapepose_fg.viz.report.writing import REPORT, report_of
+
+    page = folder / REPORT
+    if not page.is_file():
+        return
+    try:
+        print(f"{report_of(folder)} is up to date")
+    except InputError as problem:
+        page.unlink()
+        print(f"{page} is removed: {problem}")
+
+
+def _solver(folder: Path) -> "Solve | None":
+    """What solves rows of the result in `folder` anew.
+
+    None where the result does not hold what that takes, or without time: then every row is solved by itself,
+    whoever it is.
+    """
+    from shapepose_fg.core.reconstruction import Reconstruction
+    from shapepose_fg.io.solved_setup import CAMERAS
+
+    needed = [folder / name for name in ("run.json", "observations.npz", CAMERAS)]
+    if not all(file.is_file() for file in needed):
+        return None
+    with Reconstruction.open(folder) as opened:
+        temporal = opened.run.get("configuration", {}).get("temporal", False)
+    if not temporal:
+        return None
+
+    def solve(rows: "Reconstruction") -> "Reconstruction":
+        from shapepose_fg.body.fitting.fitters import make_fitter
+        from shapepose_fg.body.model.body_model import BodyModel
+        from shapepose_fg.io.solved_setup import read_setup
+        from shapepose_fg.pipeline.pipeline import PipelineConfig
+        from shapepose_fg.pipeline.solving import solve_rows
+
+        setup = read_setup(folder, rows, PipelineConfig)
+        model = BodyModel.default() if setup.body is None else BodyModel.load(setup.body)
+        fitter = make_fitter(setup.settings.body, model.with_keypoints(tuple(rows.joint_names.tolist())))
+        if setup.offsets is not None:
+            fitter = fitter.with_keypoint_offsets(setup.offsets)
+        return solve_rows(rows, setup.rig, setup.settings, fitter)
+
+    return solve
+
+
+def _solved_words(edited: "Edited", solve: "Solve | None") -> str:
+    """Who was solved anew, in words."""
+    if len(edited.changed) == 0:
+        return ""
+    if solve is None:
+        return "; joints and bodies stay as they were solved"
+    return f"; solved anew: {' '.join(map(str, sorted(edited.changed)))}"

@@ -1,0 +1,1 @@
+"""What all rooms speak of: cameras, skeletons, detections, observations, times, results."""

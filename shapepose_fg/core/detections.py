@@ -1,0 +1,99 @@
+"""What the detector saw: 2D joint candidates of all views of one frame, and the affinities between them."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.core.skeleton import Skeleton
+
+
+@dataclass(frozen=True)
+class Detections:
+    """The 2D joint candidates of one frame in all views, and their part affinities."""
+
+    view: NDArray[np.intp]
+    """(D,) index of the camera in the rig."""
+    joint: NDArray[np.intp]
+    """(D,) index of the joint in the skeleton."""
+    xy: NDArray[np.float64]
+    """(D, 2) position, undistorted pixels."""
+    confidence: NDArray[np.float64]
+    """(D,) the detector's score, 0 to 1."""
+    pairs: NDArray[np.intp]
+    """(E, 2) two candidates of one view that a limb of the skeleton joins, first joint of the limb first."""
+    affinity: NDArray[np.float64]
+    """(E,) how well the image supports that the two belong to one person; a pair not listed has 0."""
+
+    def __post_init__(self) -> None:
+        count = len(self.view)
+        shapes = {"view": (count,), "joint": (count,), "xy": (count, 2), "confidence": (count,)}
+        shapes |= {"pairs": (len(self.affinity), 2), "affinity": (len(self.affinity),)}
+        for name, shape in shapes.items():
+            if np.shape(getattr(self, name)) != shape:
+                raise ValueError(f"{name} must be {shape}, got {np.shape(getattr(self, name))}")
+
+    def __len__(self) -> int:
+        return len(self.view)
+
+    def only(self, keep: NDArray[np.bool_]) -> "Detections":
+        """The candidates of the mask `keep` (D,), and the affinities between them."""
+        return self.rows(np.flatnonzero(keep))
+
+    def rows(self, index: NDArray[np.intp]) -> "Detections":
+        """The candidates `index` (K,), each once, in that order, and the affinities between them."""
+        place = np.full(len(self), -1, dtype=np.intp)
+        place[index] = np.arange(len(index))
+        pairs = place[self.pairs]
+        both = (pairs >= 0).all(axis=1)
+        return Detections(
+            self.view[index],
+            self.joint[index],
+            self.xy[index],
+            self.confidence[index],
+            pairs[both],
+            self.affinity[both],
+        )
+
+    @classmethod
+    def empty(cls) -> "Detections":
+        """A frame in which no view saw anything."""
+        none = np.zeros(0, dtype=np.intp)
+        return cls(none, none, np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2), dtype=np.intp), np.zeros(0))
+
+
+class DetectionSequence(Protocol):
+    """Frames of detections, in order: what readers and the simulator give and the pipeline takes.
+
+    Any object with these members serves; a list of `Detections` in a `Recording` is the simplest.
+    """
+
+    @property
+    def skeleton(self) -> Skeleton:
+        """The detector's joints."""
+        ...
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, frame: int, /) -> Detections: ...
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A sequence of detections held in memory."""
+
+    skeleton: Skeleton
+    """The detector's joints."""
+    frames: Sequence[Detections]
+    """One entry per frame, frame 0 first."""
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, frame: int, /) -> Detections:
+        return self.frames[frame]
+
+    def __iter__(self) -> Iterator[Detections]:
+        return iter(self.frames)

@@ -1,0 +1,107 @@
+"""Where a result comes from: versions of what ran, and checksums of what was read."""
+
+import hashlib
+import platform
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from importlib import metadata
+from pathlib import Path
+
+from shapepose_fg.core.errors import InputError
+
+_PACKAGES = {
+    "shapepose-fg": ("shapepose-fg",),
+    "numpy": ("numpy",),
+    "scipy": ("scipy",),
+    "gtsam": ("gtsam",),
+    "torch": ("torch",),
+    "opencv": ("opencv-python-headless", "opencv-python", "opencv-contrib-python"),
+}
+"""Name in run.json, and the distributions that provide it."""
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that decide about numbers; nothing is imported for it."""
+    found = {"python": platform.python_version()}
+    for name, distributions in _PACKAGES.items():
+        found[name] = next(filter(None, map(_version, distributions)), "not installed")
+    return found
+
+
+_INPUTS = (".txt", ".json", ".toml", ".yml", ".yaml", ".xml")
+"""Files of a folder that may be read: calibrations and detections."""
+
+
+def checksums(inputs: Iterable[str | Path]) -> dict[str, str]:
+    """sha256 of every input file; of a folder, of its files of numbers by name and content.
+
+    A recording of 10,000 JSON files is one line of run.json, and a file renamed or lost changes it.
+    """
+    return {str(path): _digest(Path(path)) for path in inputs}
+
+
+class ReadInputs:
+    """Input files while they are read: their checksums are those of what was read, or it is said.
+
+    Made before anything is read; `checksums` comes when all has been.
+    """
+
+    def __init__(self, paths: Iterable[str | Path | None]) -> None:
+        self._before = dict(_states(paths))
+
+    def checksums(self, inputs: Iterable[str | Path | None]) -> dict[str, str]:
+        """`checksums` of what was read; InputError where one of these files has changed since this was made.
+
+        `inputs` are, or are in, the files and folders that this was made of.
+        """
+        inputs = [path for path in inputs if path is not None]
+        found = checksums(inputs)
+        for file, state in _states(inputs):
+            if self._before.get(file) != state:
+                raise InputError(f"{file}: this changed while it was read; start again when it is written")
+        return found
+
+
+def program_digest() -> str:
+    """sha256 of this program itself, its data included: whether two runs are by the same version."""
+    whole, here = hashlib.sha256(), Path(__file__).parents[1]
+    for package in (here, here.with_name("factors")):
+        for file in sorted(package.rglob("*")):
+            if file.suffix in (".py", ".npz", ".json", ".safetensors"):
+                whole.update(f"{file.relative_to(package).as_posix()} {_digest(file)}\n".encode())
+    return whole.hexdigest()
+
+
+def _states(paths: Iterable[str | Path | None]) -> Iterator[tuple[str, int]]:
+    """Size and time of last change, as one number, of files, and of the files of numbers in folders.
+
+    Plain values: hours of footage are half a million files.
+    """
+    for path in (Path(path) for path in paths if path is not None):
+        files = (file for file in path.rglob("*") if file.suffix in _INPUTS) if path.is_dir() else (path,)
+        for file in files:
+            with suppress(OSError):
+                state = file.stat()
+                yield str(file), state.st_size << 64 | state.st_mtime_ns
+
+
+def _version(distribution: str) -> str | None:
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _digest(path: Path) -> str:
+    """sha256 in hexadecimal."""
+    try:
+        if path.is_dir():
+            files = sorted(file for file in path.rglob("*") if file.suffix in _INPUTS)
+            whole = hashlib.sha256()
+            for file in files:
+                whole.update(f"{file.relative_to(path).as_posix()} {_digest(file)}\n".encode())
+            return whole.hexdigest()
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from None

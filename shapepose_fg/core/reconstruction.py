@@ -1,0 +1,425 @@
+"""What comes out: the people of every frame, as arrays with one row per person and frame."""
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from enum import IntEnum, StrEnum
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.body.shapes import SubjectShapes
+from shapepose_fg.core.columns import check_codes, checked, code_names
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.observation_table import ObservationTable
+from shapepose_fg.core.result_files import OBSERVATIONS, PEOPLE, RUN, RUN_ID, check_id, write_result
+from shapepose_fg.core.run_summary import check_run, merged_run
+from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.core.storage.files import read_json
+from shapepose_fg.core.storage.npz_writer import Column
+from shapepose_fg.core.storage.saved_table import SavedTable
+
+
+class Status(StrEnum):
+    """How far the reconstruction of one person in one frame came."""
+
+    OK = "ok"
+    """Joints and body are determined."""
+    TOO_FEW_VIEWS = "too few views"
+    """No joint is seen by two views, or too few are: nothing fixes the person in space."""
+    BODY_UNDETERMINED = "body undetermined"
+    """Joints are there, but too few of them to fit a body; what no view saw stays NaN."""
+    NOT_SOLVED = "not solved"
+    """A joint ran away from what was seen of it, or nothing determines it: `run` names person, frame and joint."""
+
+
+class Known(IntEnum):
+    """How the position of one joint in one frame is known."""
+
+    UNKNOWN = 0
+    """The joint is not placed (NaN); or the file is older than this column."""
+    SEEN = 1
+    """Two views' detections of the joint were used in this frame that are the person's as far as one can tell
+    (`estimation.outcome.how_known`); in files from before `WEAK`, one view's."""
+    BODY = 2
+    """No detection in this frame: inferred from the body, which other joints place."""
+    MOTION = 3
+    """Neither: carried by motion from the frames before and after."""
+    WEAK = 4
+    """Less than two such views: a joint that one view saw, or whose detections are hardly sure. Body and motion
+    have as much to say."""
+
+    @classmethod
+    def observed(cls, known: NDArray[np.integer]) -> NDArray[np.bool_]:
+        """Of which joints (...) any view's detection was used."""
+        return np.isin(known, (cls.SEEN, cls.WEAK))
+
+
+_LATER: Any = None
+"""In place of a column that is not given: nothing is known of it."""
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """The people of a recording: N rows, one per person and frame, sorted as they were added."""
+
+    frame: NDArray[np.integer]
+    """(N,) frame of each row, counted from 0 in the file."""
+    person: NDArray[np.integer]
+    """(N,) identity of the person; without tracking, a number within the frame."""
+    joint_names: NDArray[np.str_]
+    """(J,) names of the joints, as OpenPose writes them."""
+    joints: NDArray[np.float64]
+    """(N, J, 3) joint positions in the world, metres; NaN where unknown."""
+    covariance: NDArray[np.float64]
+    """(N, J, 3, 3) covariance of each joint's position, square metres; NaN where unknown."""
+    confidence: NDArray[np.float64]
+    """(N, J) mean confidence of a joint's observations over all views, 0 to 1."""
+    betas: NDArray[np.float64]
+    """(N, 10) shape of the body, standard deviations; NaN where there is no body."""
+    global_orient: NDArray[np.float64]
+    """(N, 3) orientation of the pelvis in the world, axis times angle, radians."""
+    body_pose: NDArray[np.float64]
+    """(N, 23, 3) rotation of every other body joint against its parent, axis times angle, radians."""
+    transl: NDArray[np.float64]
+    """(N, 3) translation of the body, metres."""
+    status: NDArray[np.str_]
+    """(N,) one of the values of `Status`."""
+    time_s: NDArray[np.float64] = _LATER
+    """(N,) when the row's frame was taken, seconds; NaN where unknown, as it is where the column is not given."""
+    velocity: NDArray[np.float64] = _LATER
+    """(N, J, 3) velocity of each joint in the world, m/s; NaN where unknown or not given."""
+    velocity_covariance: NDArray[np.float64] = _LATER
+    """(N, J, 3, 3) covariance of each joint's velocity, (m/s)²; NaN where unknown or not given."""
+    known: NDArray[np.uint8] = _LATER
+    """(N, J) how each joint is known: codes of `Known`; unknown where not given."""
+    run: dict[str, Any] = field(default_factory=dict)
+    """How this came about: configuration, versions, checksums, times (goes to run.json)."""
+    observations: ObservationTable | None = None
+    """What each row was solved from, row by row (goes to observations.npz); None where that is not recorded."""
+    shapes: SubjectShapes | None = None
+    """The shape of each identity with its covariance, named by its number; `save` leaves them out."""
+
+    ROWS: ClassVar = (
+        "frame person time_s joints covariance velocity velocity_covariance known confidence"
+        " betas global_orient body_pose transl status".split()
+    )
+    """The columns that have one entry per row."""
+
+    def __post_init__(self) -> None:
+        """Check every shape and type, once."""
+        N, J = np.size(self.frame), np.size(self.joint_names)
+        shapes = {"frame": (N,), "person": (N,), "joint_names": (J,), "time_s": (N,), "joints": (N, J, 3)}
+        shapes |= {"covariance": (N, J, 3, 3), "velocity": (N, J, 3), "velocity_covariance": (N, J, 3, 3)}
+        shapes |= {"known": (N, J), "confidence": (N, J), "betas": (N, 10), "global_orient": (N, 3)}
+        shapes |= {"body_pose": (N, 23, 3), "transl": (N, 3), "status": (N,)}
+        for name, shape in shapes.items():
+            value, dtype = getattr(self, name), _TYPES.get(name, np.float64)
+            if value is None and name in _ADDED:
+                value = np.full(shape, Known.UNKNOWN if name == "known" else np.nan, dtype=dtype)
+            object.__setattr__(self, name, checked(name, value, shape, dtype))
+        check_codes("known", self.known, Known)
+        unknown = set(np.unique(self.status).tolist()) - set(Status)
+        if len(unknown) > 0:
+            raise ValueError(f"status must be one of {[*map(str, Status)]}, got {sorted(unknown)}")
+        self._check_observations()
+
+    def _check_values(self) -> None:
+        """ValueError for what no reconstruction gives: negative frames, joints thousands of kilometres away."""
+        for name in self.ROWS:
+            if name in _LARGEST:
+                check_range(name, getattr(self, name))
+
+    def _check_observations(self) -> None:
+        """ValueError where `observations` are of other rows."""
+        table = self.observations
+        if table is None:
+            return
+        for name in ("frame", "person", "joint_names"):
+            if not np.array_equal(getattr(table, name), getattr(self, name)):
+                raise ValueError(
+                    f"observations must have the same {name} as the people, row by row (see `relabelled`)"
+                )
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    @classmethod
+    def empty(cls, joint_names: Sequence[str] = BODY_25.joints) -> "Reconstruction":
+        """Nobody."""
+        J = len(joint_names)
+        return cls(
+            frame=np.zeros(0, dtype=np.int64),
+            person=np.zeros(0, dtype=np.int64),
+            joint_names=np.array(joint_names),
+            joints=np.zeros((0, J, 3)),
+            covariance=np.zeros((0, J, 3, 3)),
+            confidence=np.zeros((0, J)),
+            betas=np.zeros((0, 10)),
+            global_orient=np.zeros((0, 3)),
+            body_pose=np.zeros((0, 23, 3)),
+            transl=np.zeros((0, 3)),
+            status=np.zeros(0, dtype="U1"),
+        )
+
+    @classmethod
+    def concatenate(cls, parts: Sequence["Reconstruction"]) -> "Reconstruction":
+        """The rows of `parts`, one after the other.
+
+        `run` says what all parts together are (`merged_run`): ValueError where their configurations differ or
+        two of them cover the same frame. `observations` are kept where every part that has rows has them, `shapes`
+        are not.
+        """
+        if len(parts) == 0:
+            return cls.empty()
+        first = parts[0]
+        for part in parts:
+            if not np.array_equal(part.joint_names, first.joint_names):
+                raise ValueError("parts must have the same joint_names")
+        columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in cls.ROWS}
+        filled = [part.observations for part in parts if len(part) > 0]
+        tables = [table for table in filled if table is not None]
+        together = ObservationTable.concatenate(tables) if 0 < len(tables) == len(filled) else None
+        # A part without rows and without a run has nothing to say of the whole.
+        runs = [part.run for part in parts if len(part) > 0 or len(part.run) > 0]
+        return replace(first, **columns, observations=together, shapes=None, run=merged_run(runs))
+
+    def rows(self, index: NDArray) -> "Reconstruction":
+        """The rows that `index` picks: a mask (N,) or row numbers."""
+        columns = {name: getattr(self, name)[index] for name in self.ROWS}
+        table = None if self.observations is None else self.observations.rows(index)
+        return replace(self, **columns, observations=table)
+
+    def at(self, frame: int) -> "Reconstruction":
+        """The people of one frame."""
+        return self.rows(self.frame == frame)
+
+    def with_run(self, **entries: Any) -> "Reconstruction":
+        """The same people, with more to say in run.json."""
+        return replace(self, run=self.run | entries)
+
+    def relabelled(self, person: NDArray[np.integer]) -> "Reconstruction":
+        """The same rows with other identities (N,), in `observations` too."""
+        table = None if self.observations is None else replace(self.observations, person=person)
+        return replace(self, person=person, observations=table)
+
+    def counts(self) -> dict[str, Any]:
+        """What run.json says of the rows: how many, with which status, and how their joints are known."""
+        return count_rows([(self.status, self.known)])
+
+    def columns(self) -> dict[str, Column]:
+        """What people.npz holds."""
+        columns = {name: Column.of(getattr(self, name), _STORED.get(name)) for name in self.ROWS}
+        return columns | shared_columns(self.joint_names)
+
+    def save(self, folder: str | Path) -> None:
+        """Write people.npz, run.json and observations.npz into `folder`, each whole or not at all.
+
+        A process killed on the way leaves each file as it was or as it shall be, and `load` says where they do not
+        belong together (docs/conventions.md). Without `observations`, those of an earlier result are removed.
+        OSError where `folder` cannot be written.
+        """
+        observations = None if self.observations is None else self.observations.columns()
+        write_result(Path(folder), self.columns(), observations, self.run)
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Reconstruction":
+        """Read what `save` wrote: its folder, or the people.npz in it. InputError on anything else.
+
+        `run` is empty where there is no run.json beside it, and `observations` are None where there is no
+        observations.npz. Columns that files of earlier versions lack are unknown.
+        """
+        with cls.open(path) as opened:
+            return opened.rows()
+
+    @classmethod
+    def open(cls, path: str | Path) -> "OpenedReconstruction":
+        """What `load` reads, of which rows come into memory when they are asked for."""
+        return OpenedReconstruction(Path(path))
+
+
+class OpenedReconstruction:
+    """A saved result, open: who is where is in memory, rows are read when they are asked for.
+
+    A context, at whose end the files are closed. Who asks for frames in rising order unpacks the files once. What
+    is read is checked as `Reconstruction.load` does; the files' own checksums are, where all rows are read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """InputError where there is no result, or its files are of two runs."""
+        file = path / PEOPLE if path.is_dir() else path
+        self._observed: SavedTable | None = None
+        self._block = range(0), Reconstruction.empty()
+        self._people = SavedTable(
+            file,
+            rows=Reconstruction.ROWS,
+            shared=("joint_names",),
+            code_names={"known_names": code_names(Known)},
+            added=_ADDED,
+            cure=_CURE,
+        )
+        try:
+            self.frame = self._numbers("frame")
+            """(N,) frame of each row."""
+            self.person = self._numbers("person")
+            """(N,) identity of each row's person."""
+            self.run = self._read_run(file.with_name(RUN))
+            """What run.json says."""
+            table = file.with_name(OBSERVATIONS)
+            if table.is_file():
+                self._observed = ObservationTable.open(table, self._people.run_id)
+        except InputError:
+            self.close()
+            raise
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    @property
+    def observed(self) -> bool:
+        """Whether it is known what the rows were solved from."""
+        return self._observed is not None
+
+    def at(self, frame: int) -> Reconstruction:
+        """The people of one frame. The next ones come into memory with it, for whoever goes on to them."""
+        if frame not in self._block[0]:
+            block = range(frame, frame + _BLOCK)
+            self._block = block, self.frames(block.start, block.stop)
+        return self._block[1].at(frame)
+
+    def frames(self, start: int, stop: int) -> Reconstruction:
+        """Everybody in the frames from `start` to before `stop`."""
+        return self.rows(np.flatnonzero((self.frame >= start) & (self.frame < stop)))
+
+    def people(self, numbers: Iterable[int], *, observations: bool = True) -> Reconstruction:
+        """These people, in all their frames; see `rows`."""
+        return self.rows(np.flatnonzero(np.isin(self.person, list(numbers))), observations=observations)
+
+    def thinned(self, most_rows: int) -> tuple[Reconstruction, int]:
+        """Every so many frames, at most so many rows; and how many: 1 where all are given."""
+        every = max(1, -(-len(self) // most_rows))
+        return self.rows(None if every == 1 else np.flatnonzero(self.frame % every == 0)), every
+
+    def rows(self, index: NDArray[np.intp] | None = None, *, observations: bool = True) -> Reconstruction:
+        """The rows `index` (R,), rising, or all; with what they were solved from, where that is wanted.
+
+        InputError where a file is damaged, or they would not fit in memory.
+        """
+        try:
+            columns: dict[str, Any] = self._people.columns(index)
+            people = Reconstruction(**columns, run=self.run)
+            people._check_values()
+        except InputError:
+            raise
+        except ValueError as error:
+            raise InputError(f"{self._people.file}: {error}; {_CURE}") from None
+        if self._observed is None or not observations:
+            return people
+        try:
+            return replace(people, observations=ObservationTable(**self._observed.columns(index)))
+        except InputError:
+            raise
+        except ValueError as error:
+            raise InputError(
+                f"{self._observed.file}: {error}; delete it or run the reconstruction again"
+            ) from None
+
+    def close(self) -> None:
+        """Nothing can be read any more."""
+        self._people.close()
+        if self._observed is not None:
+            self._observed.close()
+
+    def __enter__(self) -> "OpenedReconstruction":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _numbers(self, name: str) -> NDArray[np.integer]:
+        """A column of frames or identities, of which rows are chosen before the others are read."""
+        try:
+            column = checked(name, self._people.column(name), (self._people.count,), np.int64)
+            check_range(name, column)
+        except InputError:
+            raise
+        except ValueError as error:
+            raise InputError(f"{self._people.file}: {error}; {_CURE}") from None
+        return column
+
+    def _read_run(self, file: Path) -> dict[str, Any]:
+        """What run.json says, if it is of the same run; empty where there is none."""
+        run = read_json(file) if file.is_file() else {}
+        if not isinstance(run, dict):
+            raise InputError(f"{file}: must hold an object; restore it or delete it")
+        try:
+            check_run(run)
+        except ValueError as error:
+            raise InputError(f"{file}: {error}; restore it or delete it") from None
+        # Whoever changes the people and saves them gives them another id.
+        check_id(self._people.run_id, run.pop(RUN_ID, None), file)
+        return run
+
+
+_BLOCK = 128
+"""Frames that are read together by `OpenedReconstruction.at`; as many as detections are kept in."""
+_CURE = "give the people.npz of a reconstruction"
+_TYPES: dict[str, type] = {
+    "frame": np.int64,
+    "person": np.int64,
+    "joint_names": np.str_,
+    "status": np.str_,
+    "known": np.uint8,
+}
+"""The type of a column; every other column is float64."""
+_ADDED = frozenset({"time_s", "velocity", "velocity_covariance", "known"})
+"""Columns that files of version 0.1 lack."""
+MOST_NUMBER = 2**53 - 1
+"""The highest number of a frame or a person: the last whole number that all real ones below it are."""
+_LARGEST: dict[str, float] = {
+    "frame": MOST_NUMBER,
+    "person": MOST_NUMBER,
+    "time_s": 1e12,
+    "joints": 1e6,
+    "covariance": 1e12,
+    "velocity": 1e9,
+    "velocity_covariance": 1e18,
+    "confidence": 1e3,
+    "betas": 1e3,
+    "global_orient": 1e3,
+    "body_pose": 1e3,
+    "transl": 1e6,
+}
+"""The largest magnitude that is read: far beyond what people do, and such that products of it are numbers."""
+_STORED: dict[str, Any] = {"status": np.dtype(f"U{max(map(len, Status))}")}
+"""Types in people.npz that do not depend on the rows."""
+
+
+def check_range(name: str, column: NDArray[Any]) -> None:
+    """ValueError where a number in the column `name` is larger than any result has, or a whole one negative."""
+    if column.size == 0:
+        return
+    if column.dtype.kind == "i" and column.min() < 0:
+        raise ValueError(f"{name} must not be negative, got {column.min()}")
+    largest = max(np.fmax.reduce(column, axis=None), -np.fmin.reduce(column, axis=None))
+    if largest > _LARGEST[name]:
+        raise ValueError(f"{name} must be at most {_LARGEST[name]:g} or unknown (NaN), got {largest:g}")
+
+
+def shared_columns(joint_names: NDArray[np.str_]) -> dict[str, Column]:
+    """What people.npz holds beside its rows."""
+    return {"joint_names": Column.of(joint_names), "known_names": Column.of(code_names(Known))}
+
+
+def count_rows(pieces: Iterable[tuple[NDArray[np.str_], NDArray[np.uint8]]]) -> dict[str, Any]:
+    """`Reconstruction.counts` of rows that come piece by piece: `status` (R,) and `known` (R, J) of each."""
+    status: Counter[str] = Counter()
+    known = np.zeros(len(Known), dtype=np.int64)
+    for their_status, their_known in pieces:
+        status.update(their_status.tolist())
+        known += np.bincount(their_known.ravel(), minlength=len(Known))
+    order = (Known.SEEN, Known.WEAK, Known.BODY, Known.MOTION, Known.UNKNOWN)
+    joints = {kind.name.lower(): int(known[kind]) for kind in order}
+    return {"found": status.total(), "status": dict(status), "joints": joints}

@@ -1,0 +1,1 @@
+"""Arrays in files: written in columns, read without running anything."""

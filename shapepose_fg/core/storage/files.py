@@ -1,0 +1,287 @@
+"""Files, read within bounds and with one clear error, and written whole or not at all."""
+
+import codecs
+import glob
+import json
+import os
+import re
+import stat
+import tempfile
+import tomllib
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from shapepose_fg.core.errors import InputError
+
+SMALL, MIDDLE, LARGE = 2**20, 2**26, 2**32
+"""Bytes that a file may have: settings and tables of a few lines; cameras, or one frame; a recording."""
+PIECE = 2**20
+"""Bytes that are read at a time where a file may be larger than memory."""
+_MOST_DEPTH = 64
+"""Lists in lists and objects in objects: no format goes a fifth as deep."""
+_MOST_DOTS = 100
+"""Dots in a line of TOML: the parser takes the square of a dotted key's parts."""
+_LONG_NUMBER = re.compile(r"\d{19}")
+
+
+def open_regular(path: Path, cure: str = "check the path") -> BinaryIO:
+    """The file at `path`, open for reading bytes.
+
+    InputError where it is missing, unreadable, or no regular file: a pipe would wait for ever, and a device may
+    have no end.
+    """
+    try:
+        _refuse_irregular(path, path.stat().st_mode)
+        # Whatever takes the file's place in between is not waited for.
+        flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+        stream = os.fdopen(os.open(path, flags), "rb")
+    except InputError:
+        raise
+    except FileNotFoundError:
+        raise InputError(f"{path}: there is no such file; {cure}") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
+    except ValueError:  # a zero byte
+        raise InputError(f"{str(path)!r}: no file has such a name; check the path") from None
+    _refuse_irregular(path, os.fstat(stream.fileno()).st_mode)
+    return stream
+
+
+def read_bytes(path: Path, most: int = LARGE) -> bytes:
+    """What is in the file at `path`; InputError as of `open_regular`, and where it has more than `most` bytes."""
+    with open_regular(path) as stream:
+        check_size(path, os.fstat(stream.fileno()).st_size, most)
+        content = stream.read(most + 1)
+    check_size(path, len(content), most)
+    return content
+
+
+def check_size(path: Path, size: int, most: int) -> None:
+    """InputError where the file at `path` has more than `most` bytes."""
+    if size > most:
+        raise InputError(
+            f"{path}: over {most >> 20} MiB are too much for such a file; check that this is the file"
+        )
+
+
+def read_text(path: Path, *, may_be_empty: bool = False, most: int = LARGE) -> str:
+    """Text of the UTF-8 file at `path`; InputError as of `read_bytes`, and where it is not text, or empty."""
+    try:
+        text = read_bytes(path, most).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise not_text(path, error.start) from None
+    if not may_be_empty and not text.strip():
+        raise InputError(f"{path}: the file is empty; write or copy it again")
+    return text
+
+
+def text_pieces(path: Path) -> Iterator[str]:
+    """Text of the UTF-8 file at `path` in pieces of up to `PIECE` bytes; InputError as of `read_text`."""
+    decoder, at, empty = codecs.getincrementaldecoder("utf-8-sig")(), 0, True
+    with open_regular(path) as stream:
+        check_size(path, os.fstat(stream.fileno()).st_size, LARGE)
+        while True:
+            read = stream.read(PIECE)
+            check_size(path, at + len(read), LARGE)
+            waiting = len(decoder.getstate()[0])
+            try:
+                text = decoder.decode(read, final=len(read) == 0)
+            except UnicodeDecodeError as error:
+                raise not_text(path, at - waiting + error.start) from None
+            at, empty = at + len(read), empty and not text.strip()
+            if len(text) > 0:
+                yield text
+            if len(read) == 0:
+                break
+    if empty:
+        raise InputError(f"{path}: the file is empty; write or copy it again")
+
+
+def read_json(path: Path, *, most: int = LARGE) -> Any:
+    """Value of the JSON file at `path`; InputError that names the line, also for a key that occurs twice.
+
+    NaN and Infinity are let through as floats: who checks the values names their key.
+    """
+    text = read_text(path, most=most)
+    try:
+        value = json.loads(text, object_pairs_hook=lambda pairs: unique_keys(pairs, path))
+    except json.JSONDecodeError as error:
+        raise not_json(path, error.lineno, error.colno, error.msg, cut=error.pos >= len(text.rstrip())) from None
+    except InputError:
+        raise
+    except (ValueError, RecursionError) as error:  # an integer of 5,000 digits, or 10,000 open brackets
+        raise InputError(f"{path}: cannot be read as JSON ({error}); write the file again") from None
+    return bounded(value, path, numbers=has_long_number(text))
+
+
+def not_text(path: Path, byte: int) -> InputError:
+    """An error about a file whose `byte` is none of UTF-8 text."""
+    return InputError(f"{path}: byte {byte} is not UTF-8 text; check that this is the file that you mean")
+
+
+def not_json(path: Path, line: int, column: int, problem: str, *, cut: bool) -> InputError:
+    """An error about JSON text, at a line and column from 1; `cut` says that the text ends there."""
+    ends = " (the file ends too early)" if cut else ""
+    return InputError(
+        f"{path}: line {line} column {column} is not JSON: {problem}{ends};"
+        " correct it there or write the file again"
+    )
+
+
+def has_long_number(text: str, start: int = 0, stop: int | None = None) -> bool:
+    """Whether some number of a JSON text may have more than 64 bits."""
+    return _LONG_NUMBER.search(text, start, len(text) if stop is None else stop) is not None
+
+
+def read_toml(path: Path, *, may_be_empty: bool = False) -> dict[str, Any]:
+    """Tables of the TOML file at `path`; InputError that names what is wrong with it."""
+    return parse_toml(path, read_text(path, may_be_empty=may_be_empty, most=SMALL))
+
+
+def parse_toml(path: Path, text: str) -> dict[str, Any]:
+    """Tables of `text`, read from `path`."""
+    if len(text) > SMALL:
+        raise InputError(f"{path}: {len(text)} characters are too many for TOML; check that this is the file")
+    for number, line in enumerate(text.splitlines(), 1):
+        if line.count(".") > _MOST_DOTS and not line.lstrip().startswith("#"):
+            raise InputError(f"{path}: line {number} has over {_MOST_DOTS} dots; break it into several lines")
+    try:
+        return bounded(tomllib.loads(text), path)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: this is not TOML: {error}; correct it there or write the file again") from None
+    except InputError:
+        raise
+    except (ValueError, RecursionError) as error:  # a date that is none, an integer of 5,000 digits
+        raise InputError(f"{path}: cannot be read as TOML ({error}); write the file again") from None
+
+
+def bounded(value: Any, path: Path, *, numbers: bool = True) -> Any:
+    """`value`, parsed from `path`, if its lists and objects are not absurdly deep.
+
+    With `numbers`, also if its whole numbers have 64 bits: longer ones fit no float and no array, and take the
+    square of their length to print.
+    """
+    level = [value] if isinstance(value, dict | list) else []
+    for _ in range(_MOST_DEPTH):
+        if len(level) == 0:
+            break
+        inner = [child for each in level for child in (each.values() if isinstance(each, dict) else each)]
+        if numbers and any(type(child) is int and not -(2**63) <= child < 2**63 for child in inner):
+            place = "".join(_way_to_long_number(value)).removeprefix(".")
+            raise InputError(f"{path}: {place[:80]} is a whole number of over 18 digits; correct it there")
+        level = [child for child in inner if type(child) in (dict, list)]
+    if len(level) > 0:
+        raise InputError(f"{path}: its lists are over {_MOST_DEPTH} deep; write the file again")
+    return value
+
+
+def _way_to_long_number(value: Any, depth: int = 0) -> list[str]:
+    """Keys and indices that lead to a number of more than 64 bits; none where there is none."""
+    if depth > _MOST_DEPTH:
+        return []
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, child in items:
+        here = f"[{key}]" if isinstance(key, int) else f".{key}"
+        if type(child) is int and not -(2**63) <= child < 2**63:
+            return [here]
+        below = _way_to_long_number(child, depth + 1)
+        if below:
+            return [here, *below]
+    return []
+
+
+def _refuse_irregular(path: Path, mode: int) -> None:
+    if stat.S_ISDIR(mode):
+        raise InputError(f"{path}: this is a folder; give the file inside it")
+    if not stat.S_ISREG(mode):
+        raise InputError(f"{path}: this is a pipe or a device, no file; write it into a file first")
+
+
+def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
+    """Let `write` fill a temporary file beside `path`, then put it in place in one step.
+
+    Whoever reads `path`, whenever this process dies, finds the old file or the whole new one. OSError that names
+    `path` where that fails.
+    """
+    write_together({path: write})
+
+
+def write_together(files: Mapping[Path, Callable[[BinaryIO], object]]) -> None:
+    """`write_atomically` of several files in order, none of which is put in place before all are complete."""
+    temporary: dict[Path, Path] = {}
+    try:
+        for path, write in files.items():
+            with _naming(path):
+                path.parent.mkdir(parents=True, exist_ok=True)
+                handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=_PART)
+                temporary[path] = Path(name)
+                with os.fdopen(handle, "wb") as stream:
+                    write(stream)
+                    stream.flush()
+                    os.fsync(stream.fileno())
+                Path(name).chmod(0o666 & ~_umask())  # mkstemp makes files that only their owner reads
+        for path in files:
+            with _naming(path):
+                temporary[path].replace(path)
+            del temporary[path]
+    finally:
+        for left in temporary.values():
+            left.unlink(missing_ok=True)
+    for folder in {path.parent for path in files}:
+        _sync_folder(folder)
+
+
+def sweep(folder: Path, name: str | None = None) -> None:
+    """Remove what a killed process was writing in `folder`, as the file `name` or as any.
+
+    Nobody else may be writing there.
+    """
+    for left in folder.glob(f".*{_PART}" if name is None else f".{glob.escape(name)}.*{_PART}"):
+        left.unlink(missing_ok=True)
+
+
+_PART = ".part"
+"""What temporary files end with."""
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """An OSError inside the block names `path`, where it names none, or a temporary file beside `path`."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is not None and not Path(str(error.filename)).name.startswith(f".{path.name}."):
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+def unique_keys(pairs: list[tuple[str, Any]], path: Path) -> dict[str, Any]:
+    """An object's members, if no key occurs twice: JSON itself would keep the last one in silence."""
+    members = dict(pairs)
+    if len(members) < len(pairs):
+        twice = next(key for key, count in Counter(key for key, _ in pairs).items() if count > 1)
+        raise InputError(f'{path}: key "{twice}" occurs twice in one object; give each its own name')
+    return members
+
+
+def _umask() -> int:
+    """The process's file mode mask; it can only be read by setting it."""
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make the new name itself survive a power cut, where the system can."""
+    if os.name != "posix":
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError:  # some network file systems cannot
+        pass
+    finally:
+        os.close(descriptor)

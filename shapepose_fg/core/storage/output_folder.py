@@ -1,0 +1,69 @@
+"""The folder that results are written into: tried before the long work and not after, and one run's at a time."""
+
+import os
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import sweep
+
+_LOCK = ".lock"
+
+
+def prepare_output(folder: Path, names: Iterable[str] = ()) -> None:
+    """Make the folder, and try whether the files `names` can be written there; InputError where they cannot."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as trial:
+            trial.write(b"trial")
+    except OSError as error:
+        raise InputError(
+            f"{folder}: results cannot be written here ({error.strerror}); give a folder that can be written"
+        ) from None
+    for name in names:
+        if (folder / name).is_dir():
+            raise InputError(f"{folder / name}: this is a folder, and a file is to be written here; move it away")
+
+
+@contextmanager
+def only_run_in(folder: Path, names: Iterable[str]) -> Iterator[None]:
+    """`prepare_output`, and nobody else writes results there while the block runs; InputError where somebody does.
+
+    What a killed run was writing is removed, and so is a new folder into which nothing was written. The lock is
+    the system's: it ends with the process, however that ends.
+    """
+    names, is_new = tuple(names), not folder.exists()
+    prepare_output(folder, names)
+    file = folder / _LOCK
+    lock = FileLock(file, timeout=0)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise InputError(
+            f"{folder}: another run writes its results here{_whose(file)}; wait for it, or give another --output"
+        ) from None
+    try:
+        file.write_text(f"{os.getpid()}\n")
+        for name in names:
+            sweep(folder, name)
+        yield
+    finally:
+        # Before it is released: who waits for it then sees that it is gone, and makes a new one.
+        file.unlink(missing_ok=True)
+        lock.release()
+        if is_new:
+            with suppress(OSError):  # it has something in it
+                folder.rmdir()
+
+
+def _whose(file: Path) -> str:
+    """The process that holds a lock, in words."""
+    try:
+        number = file.read_text().strip()
+    except OSError:
+        return ""
+    return f" (process {number})" if number.isdecimal() else ""

@@ -1,0 +1,86 @@
+"""What a writer is given, and what it says it has done."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+
+from shapepose_fg.body.model.smpl_file import SmplArrays
+from shapepose_fg.body.shapes import read_body
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.io.export.markers import MarkerSet
+from shapepose_fg.io.export.take import Take
+
+_VISIBLE_M = 1e-3
+"""Differences below this are nobody's concern."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A take, where its files go, and what was asked for."""
+
+    take: Take
+    """What is exported."""
+    folder: Path
+    """Where the files go."""
+    body_file: Path | None = None
+    """File of the body model; None for the one that ships."""
+    markers: MarkerSet = MarkerSet.OPENSIM
+    """What TRC and C3D hold."""
+    fill_gaps_s: float = 0.2
+    """Holes in a body's motion up to this long are interpolated where a format can have none."""
+
+    @cached_property
+    def arrays(self) -> SmplArrays:
+        """The body model; InputError where its file is not there any more."""
+        try:
+            return read_body(self.body_file)
+        except InputError as error:
+            if self.body_file is None or self.body_file.exists():
+                raise
+            raise InputError(
+                f"{self.body_file}: the body model of this result is not there any more; put it back, "
+                "or say with --body where it is"
+            ) from error
+
+    @property
+    def marker_body(self) -> SmplArrays | None:
+        """The body model where markers need it."""
+        return self.arrays if self.markers == MarkerSet.BODY else None
+
+    def longest_hole(self, fps: float) -> int:
+        """Missing frames in a row, at most, that are filled."""
+        return int(self.fill_gaps_s * fps + 1e-6)
+
+
+@dataclass
+class Written:
+    """What came of a format."""
+
+    files: list[Path] = field(default_factory=list)
+    """The files, whole."""
+    notes: list[str] = field(default_factory=list)
+    """What was left out or changed, a sentence each."""
+
+    def note_rate(self, lost: int, fps: float) -> None:
+        """Say how many frames have no place at one rate."""
+        if lost > 0:
+            self.notes.append(f"{lost} frames left out: at {fps:g} a second others are nearer to their place")
+
+    def note_shape(self, kind: str, who: int, spread_m: float) -> None:
+        """Say where a person has several shapes, of which a file can have one."""
+        if spread_m > _VISIBLE_M:
+            self.notes.append(
+                f"{kind}: person {who} has several shapes, and the mean of them in the file: joints are up to"
+                f" {1e3 * spread_m:.0f} mm from where they were"
+            )
+
+
+def optional(module: str, extra: str) -> ModuleType:
+    """A package of an extra; InputError with the command where it is not installed."""
+    try:
+        return import_module(module)
+    except ImportError:
+        package = module.partition(".")[0]
+        raise InputError(f'{package} is not installed; pip install "shapepose-fg[{extra}]"') from None

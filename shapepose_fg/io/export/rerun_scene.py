@@ -1,0 +1,129 @@
+"""A take as a rerun recording, for a file and for the viewer alike: what is logged, and how it is laid out."""
+
+import shutil
+import sysconfig
+from typing import Any
+
+import numpy as np
+
+from shapepose_fg.body.model.smpl_file import SmplArrays
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.io.export.job import Job, optional
+from shapepose_fg.io.export.rerun_people import log_people, person_path
+from shapepose_fg.io.export.rerun_views import camera_path, log_cameras, log_observations
+from shapepose_fg.io.export.take import Take
+
+APPLICATION = "shapepose-fg"
+_CONNECT_S = 10.0
+"""How long a viewer may take to answer."""
+_UP = {
+    "x": "RIGHT_HAND_X_UP", "-x": "RIGHT_HAND_X_DOWN", "y": "RIGHT_HAND_Y_UP",
+    "-y": "RIGHT_HAND_Y_DOWN", "z": "RIGHT_HAND_Z_UP", "-z": "RIGHT_HAND_Z_DOWN",
+}  # fmt: skip
+
+
+def new_stream() -> Any:
+    """An empty recording; InputError where rerun-sdk is not installed."""
+    rr = optional("rerun", "view")
+    stream = rr.RecordingStream(APPLICATION)
+    rr.set_log_time_enabled(False, recording=stream)
+    rr.set_log_tick_enabled(False, recording=stream)
+    return stream
+
+
+def open_viewer(stream: Any, take: Take, url: str | None) -> None:
+    """Send a recording to the viewer at `url`, or to one that is started; InputError where that fails."""
+    rr = optional("rerun", "view")
+    try:
+        if url is not None:
+            stream.connect_grpc(url, default_blueprint=layout(take))
+            stream.flush(timeout_sec=_CONNECT_S)
+            return
+        rr.spawn(
+            recording=stream,
+            default_blueprint=layout(take),
+            executable_path=viewer_file(),
+            hide_welcome_screen=True,  # it would ask the network for examples
+        )
+    except (RuntimeError, ValueError, OSError) as error:
+        place = "started" if url is None else f"reached at {url}"
+        raise InputError(f"the rerun viewer cannot be {place}: {' '.join(str(error).split())}") from None
+
+
+def viewer_file() -> str | None:
+    """The viewer that came with rerun-sdk, also where its folder is not on the PATH; any other; or None."""
+    return shutil.which("rerun", path=sysconfig.get_path("scripts")) or shutil.which("rerun")
+
+
+def body_if_there(job: Job) -> tuple[SmplArrays | None, str | None]:
+    """The body model, or a sentence where its file is not there any more: the rest can be looked at without it."""
+    try:
+        return job.arrays, None
+    except InputError as error:
+        return None, f"no bodies are drawn ({error})"
+
+
+def log_take(stream: Any, take: Take, arrays: SmplArrays | None) -> None:
+    """Log everything of a take on the timelines `frame` and `time` (seconds).
+
+    Cameras and what they saw where they are known; bodies where `arrays`, the body model, is given.
+    """
+    rr = optional("rerun", "view")
+    stream.log("world", getattr(rr.ViewCoordinates, _UP[take.up]), static=True)
+    if take.rig is not None:
+        log_cameras(rr, stream, take.rig)
+        log_observations(rr, stream, take)
+    log_people(rr, stream, take, arrays)
+    stream.reset_time()
+
+
+def layout(take: Take) -> Any:
+    """The viewer's first layout: the world, every camera with people drawn over what it saw, and two plots."""
+    optional("rerun", "view")
+    import rerun.blueprint as rrb
+
+    cameras = () if take.rig is None else take.rig.cameras
+    world = rrb.Spatial3DView(
+        origin="world",
+        name="world",
+        contents=["$origin/**", *(f"- {camera_path(camera.name)}/seen/**" for camera in cameras)],
+        line_grid=rrb.LineGrid3D(visible=False),
+        eye_controls=_eye(rrb, take),
+    )
+    plots = [rrb.TimeSeriesView(origin="plots/sigma", name="median sigma, mm")]
+    if len(cameras) > 0:
+        plots.append(rrb.TimeSeriesView(origin="plots/residual", name="median residual, px"))
+    bones = [f"{person_path(who)}/bones" for who in take.persons.tolist()]
+    views = [
+        rrb.Spatial2DView(
+            origin=camera_path(camera.name),
+            name=camera.name,
+            contents=["$origin/**", *bones],
+            visual_bounds=rrb.VisualBounds2D(x_range=[0, camera.image_size[0]], y_range=[0, camera.image_size[1]]),
+        )
+        for camera in cameras
+    ]
+    beside = (
+        rrb.Vertical(rrb.Grid(*views), rrb.Horizontal(*plots), row_shares=[3, 1])
+        if views
+        else rrb.Vertical(*plots)
+    )
+    return rrb.Blueprint(
+        rrb.Horizontal(world, beside, column_shares=[1, 1]),
+        rrb.TimePanel(timeline="time", state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.BlueprintPanel(state="collapsed"),
+    )
+
+
+def _eye(rrb: Any, take: Take) -> Any:
+    """Looks down on the people from the side, from far enough to see all of them."""
+    joints = take.people.joints.reshape(-1, 3)
+    joints = joints[np.isfinite(joints).all(axis=1)]
+    low, high = np.quantile(joints, [0.02, 0.98], axis=0) if len(joints) > 0 else (np.zeros(3), np.ones(3))
+    middle, reach = (low + high) / 2, max(float(np.linalg.norm(high - low)), 2.0)
+    up = np.zeros(3)
+    up["xyz".index(take.up[-1])] = -1 if take.up.startswith("-") else 1
+    side = np.roll(up, 1) + 0.6 * np.roll(up, 2)
+    place = middle + reach * (1.0 * side / np.linalg.norm(side) + 0.45 * up)
+    return rrb.EyeControls3D(position=place, look_target=middle, eye_up=up)

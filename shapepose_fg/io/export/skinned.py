@@ -1,0 +1,148 @@
+"""The bodies of a take as bones and a skin, in NumPy: what BVH, glTF, AMASS and marker files are made of."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from shapepose_fg.body.model.smpl_file import SMPL_PARENTS, SmplArrays
+from shapepose_fg.io.export.take import Take
+
+BONES = len(SMPL_PARENTS)
+
+
+@dataclass(frozen=True)
+class RestBody:
+    """A person's body in the T-pose: y up, facing +z, metres."""
+
+    arrays: SmplArrays
+    """The body model."""
+    betas: NDArray[np.float64]
+    """(10,) the person's shape."""
+
+    @cached_property
+    def joints(self) -> NDArray[np.float64]:
+        """(24, 3) the joints."""
+        return rest_joints(self.arrays, self.betas[None])[0]
+
+    @cached_property
+    def vertices(self) -> NDArray[np.float64]:
+        """(Nv, 3) the skin."""
+        return self.arrays.template + self.arrays.shapes @ self.betas
+
+    @property
+    def offsets(self) -> NDArray[np.float64]:
+        """(24, 3) each joint from its parent; the pelvis from the origin."""
+        return _offsets(self.joints[None])[0]
+
+    def tips(self) -> dict[int, NDArray[np.float64]]:
+        """(3,) from each joint without children to the end of its bone: as far as its skin goes on."""
+        leaves = set(range(BONES)) - set(SMPL_PARENTS)
+        bone_of = self.arrays.weights.argmax(axis=1)
+        tips = {}
+        for leaf in leaves:
+            along = self.joints[leaf] - self.joints[SMPL_PARENTS[leaf]]
+            along /= np.linalg.norm(along)
+            # A mesh may give a bone no skin of its own; then it ends 1 cm on, for a bone needs a length.
+            reach = (self.vertices[bone_of == leaf] - self.joints[leaf]) @ along
+            tips[leaf] = along * max(float(reach.max(initial=0.0)), 0.01)
+        return tips
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How one person's body moves: F frames with a body, in the axes of a format."""
+
+    rest: RestBody
+    """The body, one shape for all frames."""
+    index: NDArray[np.intp]
+    """(F,) which frames of the take have a body."""
+    rotations: NDArray[np.float64]
+    """(F, 24, 4) each bone against its parent, the pelvis against the world; quaternions x y z w."""
+    pelvis: NDArray[np.float64]
+    """(F, 3) the pelvis in the world, metres."""
+    spread_m: float
+    """How far a joint lies at most from where it is with the frame's own shape; 0 where all have one shape."""
+
+    def joints(self) -> NDArray[np.float64]:
+        """(F, 24, 3) the joints in the world, metres."""
+        return pose_joints(self.rest.offsets[None], self.rotations, self.pelvis)
+
+
+def motion_of(take: Take, person: int, arrays: SmplArrays, axes: NDArray[np.float64]) -> Motion | None:
+    """The body of one person in the world turned by `axes` (3, 3); None for somebody without a body."""
+    betas = take.column("betas", person)
+    orient, pose = take.column("global_orient", person), take.column("body_pose", person)
+    transl = take.column("transl", person)
+    whole = np.concatenate([betas, orient, pose.reshape(len(pose), -1), transl], axis=1)
+    index = np.flatnonzero(np.isfinite(whole).all(axis=1))
+    if len(index) == 0:
+        return None
+    betas = betas[index]
+    vectors = np.concatenate([orient[index, None], pose[index]], axis=1)
+    own = rest_joints(arrays, betas)
+    rotations = Rotation.from_rotvec(vectors.reshape(-1, 3))
+    quaternions = rotations.as_quat().reshape(-1, BONES, 4)
+    quaternions[:, 0] = (Rotation.from_matrix(axes) * Rotation.from_quat(quaternions[:, 0])).as_quat()
+    pelvis = (own[:, 0] + transl[index]) @ axes.T
+    rest = RestBody(arrays, betas.mean(axis=0))
+    motion = Motion(rest, index, quaternions, pelvis, 0.0)
+    if (betas == betas[0]).all():
+        return motion
+    apart = np.linalg.norm(pose_joints(_offsets(own), quaternions, pelvis) - motion.joints(), axis=-1)
+    return Motion(rest, index, quaternions, pelvis, float(apart.max()))
+
+
+def rest_joints(arrays: SmplArrays, betas: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(B, 24, 3) joints of shapes (B, 10) in the T-pose, metres."""
+    mean = arrays.joint_regressor @ arrays.template
+    shapes = np.einsum("jv,vxn->jxn", arrays.joint_regressor, arrays.shapes, optimize=True)
+    return mean + np.einsum("jxn,bn->bjx", shapes, betas)
+
+
+def skin(
+    arrays: SmplArrays,
+    betas: NDArray[np.float64],
+    rotations: NDArray[np.float64],
+    pelvis: NDArray[np.float64],
+    only: NDArray[np.intp],
+) -> NDArray[np.float64]:
+    """(F, M, 3) the vertices `only` (M,) of bodies (F, 10), turned (F, 24, 4) and placed (F, 3); metres.
+
+    Without the corrections of the skin that depend on the pose, which the open body does not have.
+    """
+    rest = rest_joints(arrays, betas)
+    turn = _accumulated(rotations)
+    place = pose_joints(_offsets(rest), rotations, pelvis)
+    shift = place - (turn @ rest[..., None])[..., 0]
+    transforms = np.concatenate([turn, shift[..., None]], axis=-1).reshape(len(turn), BONES, 12)
+    blended = (arrays.weights[only] @ transforms).reshape(len(turn), -1, 3, 4)
+    shaped = arrays.template[only] + np.einsum("vxn,fn->fvx", arrays.shapes[only], betas)
+    return (blended[..., :3] @ shaped[..., None])[..., 0] + blended[..., 3]
+
+
+def pose_joints(
+    offsets: NDArray[np.float64], rotations: NDArray[np.float64], pelvis: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(F, 24, 3) joints of bones with `offsets` (F or 1, 24, 3) from their parents, turned and placed."""
+    turn = _accumulated(rotations)
+    places = [pelvis]
+    for joint, parent in enumerate(SMPL_PARENTS[1:], start=1):
+        places.append(places[parent] + (turn[:, parent] @ offsets[:, joint, :, None])[..., 0])
+    return np.stack(places, axis=1)
+
+
+def _offsets(rest: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(B, 24, 3) joints in the T-pose from their parents; the pelvis from the origin."""
+    return np.concatenate([rest[:, :1], rest[:, 1:] - rest[:, np.array(SMPL_PARENTS[1:])]], axis=1)
+
+
+def _accumulated(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(F, 24, 3, 3) world from bone, of quaternions (F, 24, 4) against the parent."""
+    local = Rotation.from_quat(rotations.reshape(-1, 4)).as_matrix().reshape(-1, BONES, 3, 3)
+    world = [local[:, 0]]
+    for joint, parent in enumerate(SMPL_PARENTS[1:], start=1):
+        world.append(world[parent] @ local[:, joint])
+    return np.stack(world, axis=1)

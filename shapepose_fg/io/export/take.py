@@ -1,0 +1,175 @@
+"""What is exported: the people of a result on one timeline, each with a place for every frame."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.filesize import decimal
+
+from shapepose_fg.core.camera import Axis, Rig
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.reconstruction import Known, Reconstruction
+from shapepose_fg.core.run_summary import covered_frames
+from shapepose_fg.core.storage.saved_table import free_memory
+
+_LONGEST = 1_000_000
+"""Frames of a file with one rate: nine hours at 30 a second. Beyond, times are in another unit or have a hole."""
+_BODY_BYTES = 2_000
+"""What one person's body takes in a frame while it is written, about."""
+_SHORTEST_S, _LONGEST_S = 1e-6, 1e5
+"""From frame to frame: outside of this times are in another unit."""
+
+
+@dataclass(frozen=True)
+class Take:
+    """P people over T frames; a person's row of a frame may be missing."""
+
+    people: Reconstruction
+    """The rows; joints that are left out are NaN in it."""
+    persons: NDArray[np.int64]
+    """(P,) identities."""
+    rows: NDArray[np.intp]
+    """(P, T) row of `people` of each person in each frame; -1 where there is none."""
+    frames: NDArray[np.int64]
+    """(T,) numbers of the frames, as in people.npz."""
+    times_s: NDArray[np.float64]
+    """(T,) when they were taken, seconds; rising."""
+    fps: float
+    """Frames a second: one over the median step."""
+    up: Axis
+    """Which axis of the world points up."""
+    rig: Rig | None = None
+    """The cameras, where they are known."""
+
+    @classmethod
+    def of(
+        cls,
+        people: Reconstruction,
+        up: Axis,
+        *,
+        rig: Rig | None = None,
+        fps: float | None = None,
+        seen_only: bool = False,
+        identities: bool = True,
+    ) -> "Take":
+        """The timeline of a result; ValueError where it has none.
+
+        `fps` takes the place of the result's own times, which must be known without it. `seen_only` leaves out
+        every joint that no view saw in that frame, and the bodies of rows where none was seen. With `identities`
+        off, a result without time is a Take too: a person is then nobody's identity over frames.
+        """
+        if len(people) == 0:
+            raise ValueError("nobody was found, so there is nothing to export")
+        if identities and not people.run.get("configuration", {}).get("temporal", True):
+            raise ValueError(
+                "every frame stands alone here, so nobody can be followed; reconstruct with --temporal, "
+                "or export csv or rrd"
+            )
+        people = _seen(people) if seen_only else people
+        frames = _frames(people)
+        persons, person = np.unique(people.person, return_inverse=True)
+        _check_memory(len(persons), len(frames))
+        rows = np.full((len(persons), len(frames)), -1, dtype=np.intp)
+        place = np.searchsorted(frames, people.frame)
+        rows[person, place] = np.arange(len(people))
+        if (rows >= 0).sum() < len(people):
+            lost = next(row for row in range(len(people)) if rows[person[row], place[row]] != row)
+            raise ValueError(
+                f"person {people.person[lost]} has two rows of frame {people.frame[lost]}; "
+                "correct that with `shapepose-fg tracks`"
+            )
+        times = _times(people, frames, fps)
+        steps = np.diff(times) / np.diff(frames)
+        if len(steps) > 0 and not _SHORTEST_S <= np.median(steps) <= _LONGEST_S:
+            raise ValueError(f"frames are {np.median(steps):g} s apart by time_s; give --fps")
+        rate = round(1 / float(np.median(steps)), 6) if len(steps) > 0 else fps or _fps_of(people)
+        return cls(people, persons.astype(np.int64), rows, frames, times, rate, up, rig)
+
+    def column(self, name: str, person: int) -> NDArray[Any]:
+        """(T, ...) a column of the result for one person; NaN, 0 in whole numbers, where there is no row."""
+        values, rows = getattr(self.people, name), self.rows[person]
+        column = np.full((len(rows), *values.shape[1:]), np.nan if values.dtype.kind == "f" else 0, values.dtype)
+        column[rows >= 0] = values[rows[rows >= 0]]
+        return column
+
+    def at_one_rate(self) -> tuple["Take", int]:
+        """The same people at exactly `fps` frames a second, for formats that know no other; and what was lost.
+
+        A frame goes to the nearest step, numbered on from the first; steps that no frame is near to are holes.
+        The number says how many frames were left out because another is nearer to their step. InputError where
+        that would be more than a million frames.
+        """
+        step = (self.times_s - self.times_s[0]) * self.fps
+        if step[-1] >= _LONGEST:
+            raise InputError(
+                f"people.npz: the times run over {self.times_s[-1] - self.times_s[0]:.0f} s, {step[-1]:.0f} frames"
+                f" at {self.fps:g} a second; give --fps, or part of it with --frames"
+            )
+        place = np.rint(step).astype(np.intp)
+        nearest = np.lexsort((np.abs(step - place), place))
+        kept = nearest[np.unique(place[nearest], return_index=True)[1]]
+        count = int(place[-1]) + 1
+        _check_memory(len(self.persons), count)
+        rows = np.full((len(self.persons), count), -1, dtype=np.intp)
+        rows[:, place[kept]] = self.rows[:, kept]
+        numbers = np.arange(count)
+        times = self.times_s[0] + numbers / self.fps
+        return replace(self, rows=rows, frames=self.frames[0] + numbers, times_s=times), len(place) - len(kept)
+
+
+def _check_memory(persons: int, frames: int) -> None:
+    """InputError where places of all people in all frames, and one person's body, need more than there is."""
+    needed, free = frames * (2 * 8 * persons + _BODY_BYTES), free_memory()
+    if free is not None and needed > free:
+        raise InputError(
+            f"people.npz: {persons} people over {frames} frames would take {decimal(needed)} of memory, and"
+            f" {decimal(free)} are free; take some frames or people at a time (--frames, --person)"
+        )
+
+
+def _seen(people: Reconstruction) -> Reconstruction:
+    """The people without what no view saw."""
+    if not (people.known != Known.UNKNOWN).any():
+        raise ValueError("people.npz does not say how joints are known; leave out --seen-only")
+    seen = Known.observed(people.known)
+    columns: dict[str, Any] = {"known": np.where(seen, people.known, Known.UNKNOWN).astype(np.uint8)}
+    for name in ("joints", "covariance", "velocity", "velocity_covariance"):
+        value = getattr(people, name)
+        columns[name] = np.where(seen.reshape(*seen.shape, *[1] * (value.ndim - 2)), value, np.nan)
+    for name in ("betas", "global_orient", "body_pose", "transl"):
+        value = getattr(people, name)
+        columns[name] = np.where(seen.any(axis=1).reshape(-1, *[1] * (value.ndim - 1)), value, np.nan)
+    return replace(people, **columns)
+
+
+def _frames(people: Reconstruction) -> NDArray[np.int64]:
+    """All frames that were reconstructed, those without people too."""
+    spans = covered_frames(people.run) or []
+    given = np.concatenate([people.frame, *(np.arange(span.start, span.stop) for span in spans)])
+    return np.unique(given).astype(np.int64)
+
+
+def _times(people: Reconstruction, frames: NDArray[np.int64], fps: float | None) -> NDArray[np.float64]:
+    """When each frame was taken: frames without a row lie between those with one."""
+    if fps is not None:
+        return frames / fps
+    known, first = np.unique(people.frame, return_index=True)
+    times = people.time_s[first]
+    known, times = known[np.isfinite(times)], times[np.isfinite(times)]
+    if len(known) == 0:
+        raise ValueError("people.npz does not say when its frames were taken; give --fps")
+    if (np.diff(times) <= 0).any():
+        raise ValueError("time_s does not rise from frame to frame; give --fps")
+    rate = (known[-1] - known[0]) / (times[-1] - times[0]) if len(known) > 1 else _fps_of(people)
+    between = np.interp(frames, known, times)
+    before, after = np.minimum(frames - known[0], 0), np.maximum(frames - known[-1], 0)
+    return between + (before + after) / rate
+
+
+def _fps_of(people: Reconstruction) -> float:
+    """Frames a second by run.json."""
+    fps = people.run.get("time", {}).get("fps")
+    if fps is None or not fps > 0:
+        raise ValueError("one frame does not say how many there are a second; give --fps")
+    return float(fps)

@@ -1,0 +1,1 @@
+"""The whole way, from detections to a result: windows, processes, chunks, resuming."""

@@ -1,0 +1,214 @@
+"""One body per person over a recording: one shape, and poses that move as people do, fitted to solved joints."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.body.fitting.body_sequence import Shapes
+from shapepose_fg.body.fitting.weights import fingerprint
+from shapepose_fg.body.shapes import SubjectShapes, recognise
+from shapepose_fg.core.reconstruction import Reconstruction, Status
+from shapepose_fg.core.storage.kept_arrays import InMemory, KeptArrays
+from shapepose_fg.estimation.floor import Floor
+from shapepose_fg.pipeline.person_bodies import Person, PersonBodies, SequenceFitting
+
+STRETCH_ROWS = 4000
+"""Rows of a person that are fitted together at the most. The shape of a longer track is what so many of its rows
+say, in pieces spread evenly over it; poses are then fitted with that shape, stretch by stretch. Neither memory nor
+the time of a row grows with the recording."""
+PIECE_ROWS = 160
+"""Rows of such a piece: some seconds, so that poses are linked in time there, too."""
+_OVERLAP_ROWS = 32
+"""Rows that a stretch has of its neighbours, on either side, when poses are fitted."""
+
+
+Fits = Callable[[Iterable[Person]], Iterable[PersonBodies]]
+"""Fits the bodies of people, in order."""
+
+_COLUMNS = ("betas", "global_orient", "body_pose", "transl")
+
+
+@dataclass(frozen=True)
+class BodiesOverTime:
+    """Everybody's bodies, kept stretch by stretch."""
+
+    kept: KeptArrays
+    """Where they are."""
+    places: Mapping[int, Mapping[str, range]]
+    """Under which names each person's are, and which of the person's own rows each name has, in order."""
+    shapes: SubjectShapes
+    """Everybody's shape; those who were recognised by their known names."""
+
+    def filled(
+        self, column: str, values: NDArray[Any], person: NDArray[np.integer], before: Mapping[int, int]
+    ) -> NDArray[Any]:
+        """Rows of a column of a result with these bodies, where there are any; `status` says that there are.
+
+        `values` (R, ...) are the rows as they were, `person` (R,) whose they are, and `before` how many rows of
+        each person there are before them. Other columns stay as they are.
+        """
+        if column not in (*_COLUMNS, "status"):
+            return values
+        values = values.copy()
+        for number in np.unique(person).tolist():
+            mine = np.flatnonzero(person == number)
+            first = before.get(number, 0)
+            part = range(first, first + len(mine))
+            ok = self._rows(number, "ok", part)
+            if column == "status":
+                undetermined = values[mine] == Status.BODY_UNDETERMINED
+                values[mine[ok & undetermined]] = Status.OK
+            else:
+                values[mine[ok]] = self._rows(number, column, part)[ok]
+        return values
+
+    def _rows(self, number: int, column: str, rows: range) -> NDArray[Any]:
+        """A column of some of a person's own rows."""
+        pieces = []
+        for name, own in self.places[number].items():
+            first, last = max(rows.start, own.start), min(rows.stop, own.stop)
+            if first < last:
+                pieces.append(self.kept.array(name, column, slice(first - own.start, last - own.start)))
+        return np.concatenate(pieces)
+
+
+def fit_everybody(
+    counts: Mapping[int, int],
+    person: Callable[[int, Sequence[range]], Person],
+    fits: Fits,
+    kept: KeptArrays,
+    known: SubjectShapes,
+    stretch_rows: int = STRETCH_ROWS,
+    piece_rows: int = PIECE_ROWS,
+) -> BodiesOverTime:
+    """Fit one body per person to the joints as they were solved; what is kept already is not fitted again.
+
+    `counts` is how many rows everybody has; `person` gives what somebody's bodies are fitted to in some of these,
+    one range after the other, and `fits` fits people, side by side if it likes. `known` are people from other
+    recordings: who is recognised by shape (`recognise`) is fitted again with that as the prior.
+    """
+    long = [number for number, count in counts.items() if count > stretch_rows]
+
+    def fitted(jobs: Mapping[str, Callable[[], Person]]) -> None:
+        """Fit what is not kept yet under these names."""
+        there = set(kept.names(""))
+        missing = [name for name in jobs if name not in there]
+        for name, bodies in zip(missing, fits(jobs[name]() for name in missing), strict=True):
+            arrays = {column: getattr(bodies, column) for column in ("ok", *_COLUMNS)}
+            kept.keep(name, arrays | {"mean": bodies.shape.mean, "information": bodies.shape.information})
+
+    def found(kind: str, prior: Mapping[int, Shapes | None]) -> dict[int, Shapes]:
+        """Some people's shapes, and their bodies where the track is short."""
+
+        def job(number: int) -> Person:
+            count = counts[number]
+            if number not in long:
+                return replace(person(number, [range(count)]), shapes=prior[number])
+            rows = person(number, _spread(count, stretch_rows, piece_rows))
+            return replace(rows, shapes=prior[number], kept=range(0))
+
+        names = {number: f"{kind}-{number}" for number in prior}
+        fitted({name: partial(job, number) for number, name in names.items()})
+        places.update({number: {name: range(counts[number])} for number, name in names.items()})
+        return {
+            number: Shapes(kept.array(name, "mean"), kept.array(name, "information"))
+            for number, name in names.items()
+        }
+
+    places: dict[int, dict[str, range]] = {}
+    shapes = found("bodies", dict.fromkeys(counts))
+    whose = recognise(_subjects(shapes, known.body), known)
+    prior = {
+        number: Shapes(known.betas[[subject]], known.information[[subject]])
+        for number, subject in zip(counts, whose.tolist(), strict=True)
+        if subject >= 0
+    }
+    shapes |= found("recognised", prior)
+
+    def stretch(number: int, own: range) -> Person:
+        first = max(own.start - _OVERLAP_ROWS, 0)
+        rows = person(number, [range(first, min(own.stop + _OVERLAP_ROWS, counts[number]))])
+        inside = range(own.start - first, own.stop - first)
+        return replace(rows, shapes=shapes[number], fixed_shapes=True, kept=inside)
+
+    for number in long:
+        stretches = _stretches(counts[number], stretch_rows)
+        places[number] = {f"stretch-{number}-{n:04d}": own for n, own in enumerate(stretches)}
+    fitted({name: partial(stretch, number, own) for number in long for name, own in places[number].items()})
+    names = _names(np.array(list(counts), dtype=np.intp), known, whose)
+    return BodiesOverTime(kept, places, _subjects(shapes, known.body).named(names))
+
+
+def _stretches(count: int, most: int) -> list[range]:
+    """So many rows in stretches of equal length, at most so long."""
+    edges = np.linspace(0, count, 1 + max(1, -(-count // most))).round().astype(int).tolist()
+    return [range(start, stop) for start, stop in pairwise(edges)]
+
+
+def _spread(count: int, most: int, length: int) -> list[range]:
+    """At most so many of `count` rows, in pieces of equal `length`, spread evenly from the first to the last."""
+    length = min(length, most)
+    starts = np.linspace(0, count - length, most // length).round().astype(int).tolist()
+    return [range(start, start + length) for start in starts]
+
+
+def with_bodies_over_time(
+    people: Reconstruction,
+    fitter: SequenceFitting,
+    known: SubjectShapes | None = None,
+    floor: Floor | None = None,
+) -> Reconstruction:
+    """The same rows with one body per person, fitted to the joints as they were solved, and everybody's shape.
+
+    `known`: see `fit_everybody`. Bodies stay above the `floor`. Nothing of this returns into the joints or their
+    covariances. Rows without a body keep the body that they had. `shapes` of the result are everybody's.
+    """
+    if len(people) == 0:
+        return people
+    known = SubjectShapes.empty(fingerprint(fitter.model)) if known is None else known
+    if known.body != fingerprint(fitter.model):
+        raise ValueError("shapes must be of the same body model as the fitter's")
+
+    numbers, counts = np.unique(people.person, return_counts=True)
+
+    def person(number: int, parts: Sequence[range]) -> Person:
+        mine = np.flatnonzero(people.person == number)[np.concatenate(parts)]
+        one = Person.of(number, people.joints[mine], people.covariance[mine], people.time_s[mine])
+        return replace(one, floor=floor)
+
+    bodies = fit_everybody(
+        dict(zip(numbers.tolist(), counts.tolist(), strict=True)),
+        person,
+        lambda jobs: (job.fitted(fitter) for job in jobs),
+        InMemory(),
+        known,
+    )
+    columns = {
+        name: bodies.filled(name, getattr(people, name), people.person, {}) for name in (*_COLUMNS, "status")
+    }
+    return replace(people, shapes=bodies.shapes, **columns)
+
+
+def _subjects(shapes: Mapping[int, Shapes], body: str) -> SubjectShapes:
+    """Everybody's shape, named by their numbers."""
+    mean, information = (
+        np.concatenate([getattr(each, name) for each in shapes.values()]) for name in ("mean", "information")
+    )
+    return SubjectShapes(np.array([str(number) for number in shapes]), mean, information, body)
+
+
+def _names(groups: NDArray[np.intp], known: SubjectShapes, whose: NDArray[np.intp]) -> list[str]:
+    """What people are called in the file of shapes: known names; strangers by their number, or the next free."""
+    names, taken = [], set(known.names.tolist())
+    for group, subject in zip(groups.tolist(), whose.tolist(), strict=True):
+        number = group
+        while subject < 0 and str(number) in taken:
+            number = 1 + max(int(name) for name in taken if name.isdecimal())
+        names.append(str(known.names[subject]) if subject >= 0 else str(number))
+        taken.add(names[-1])
+    return names

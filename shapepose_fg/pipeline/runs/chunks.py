@@ -1,0 +1,114 @@
+"""A recording cut into chunks whose people are followed apart, side by side; who is who from chunk to chunk."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.core.frame_times import stretches
+from shapepose_fg.pipeline.config import PipelineConfig
+from shapepose_fg.pipeline.runs.borders import Border, same_people
+from shapepose_fg.pipeline.windows import Engine, Span
+from shapepose_fg.tracking.following import BLOCK_S
+from shapepose_fg.tracking.hypotheses import Input
+
+WARM_S = 6.0
+"""Before a chunk people are followed for so long: who is there is known after a second or two, and people who hide
+for longer than that are rare. Following takes a tenth of the time."""
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Frames that are reconstructed apart from all others."""
+
+    own: range
+    """The frames whose rows are its own."""
+    first: int
+    """People are followed from this frame on."""
+    until: int
+    """And up to the one before this: the last own window is known then."""
+    ended: bool
+    """Whether the recording ends, or is cut, at `until`."""
+
+
+def cut_in_chunks(
+    frames: range, cuts: Sequence[int], time_s: NDArray[np.float64], config: PipelineConfig, chunk_frames: int
+) -> list[Chunk]:
+    """Chunks of about `chunk_frames` whose borders are those of windows, so that windows are as without chunks.
+
+    `time_s` (T,) are the times of all frames of the recording. What is followed before a chunk is whole windows,
+    at least `WARM_S` of them. A stretch between cuts is cut for itself.
+    """
+    batch = config.batch_frames
+    step = max(1, round(chunk_frames / batch)) * batch
+    found = []
+    for stretch in stretches(frames, cuts):
+        # The last window takes up to half a window more than its own frames (`Engine.follow`).
+        borders = [at for at in stretch[step::step] if at + batch // 2 < stretch.stop]
+        for start, stop in zip((stretch.start, *borders), (*borders, stretch.stop), strict=True):
+            first = start
+            while first > stretch.start and time_s[start] - time_s[first] < WARM_S:
+                first -= batch
+            until = _until(stop, stretch, first, time_s, config)
+            found.append(Chunk(range(start, stop), first, until, until == stretch.stop))
+    return found
+
+
+def _until(stop: int, stretch: range, first: int, time_s: NDArray[np.float64], config: PipelineConfig) -> int:
+    """How far people must be followed for the window that ends at `stop`: half a window and the overlap beyond it,
+    the block in which that is decided, as far as following looks ahead, and two frames to spare, in whole batches.
+
+    `Engine` compares means over the cameras' times, which round differently: a frame more or less, twice.
+    """
+    beyond = stop + config.batch_frames // 2 + 1
+    while beyond < stretch.stop and time_s[beyond] - time_s[stop] <= config.windows.overlap_s:
+        beyond += 1
+    if beyond >= stretch.stop:
+        return stretch.stop
+    newest = beyond
+    ahead_s = BLOCK_S + config.following.look_ahead_s
+    while newest < stretch.stop and time_s[newest] - time_s[beyond] < ahead_s:
+        newest += 1
+    newest += 2
+    batches = -(-(newest + 1 - first) // config.batch_frames)
+    return min(first + batches * config.batch_frames, stretch.stop)
+
+
+def windows_of(engine: Engine, chunk: Chunk, read: Callable[[int], Input]) -> Iterator[Span]:
+    """The windows of a chunk, whose people are followed from `chunk.first` on."""
+    state, done = engine.start(), chunk.first
+    for start in range(chunk.first, chunk.until, engine.frames):
+        batch = range(start, min(start + engine.frames, chunk.until))
+        last = chunk.ended and batch.stop == chunk.until
+        given = [read(frame) for frame in batch]
+        spans, state = engine.follow(state, given, last=last)
+        for span in spans:
+            if done in chunk.own:
+                yield span
+            done = span.decided[span.stop - 1][0].frame + 1
+
+
+class Identities:
+    """What the tracks of one chunk after the other are called, so that a person keeps the name."""
+
+    def __init__(self, next_id: int, border: Border | None) -> None:
+        """The next new person's identity, and who was where at the end of the chunk before."""
+        self.next_id = next_id
+        self.border = border
+
+    def names(self, begins: Border, *, alone: bool) -> dict[int, int]:
+        """What tracks of a chunk are called that were there in the one before; `alone`: nothing carries over."""
+        return {} if alone or self.border is None else same_people(self.border, begins)
+
+    def name(self, track: int, names: dict[int, int]) -> int:
+        """What a track is called; whoever has no name gets the next."""
+        if track not in names:
+            names[track] = self.next_id
+            self.next_id += 1
+        return names[track]
+
+    def remember(self, ends: Border, names: dict[int, int]) -> None:
+        """Who is where at the end of a chunk."""
+        track = [self.name(each, names) for each in ends.track.tolist()]
+        self.border = replace(ends, track=np.array(track, dtype=np.intp))

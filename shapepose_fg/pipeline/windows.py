@@ -1,0 +1,201 @@
+"""Frames in, solved rows out: people are followed, and solved in windows of frames that overlap.
+
+`Engine.follow` goes from (frames, state) to (windows, state): it is quick, and memory does not grow with the
+recording. `WindowSolver.solve` goes from a window to rows: windows know nothing of each other, and are solved here
+or in other processes.
+"""
+
+import time
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+import numpy as np
+from annotated_types import Interval
+from numpy.typing import NDArray
+
+from shapepose_fg.core.bounds import RepeatsOrNone, Settings
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.estimation.estimator import Estimates, Estimator, ExtraFactors
+from shapepose_fg.tracking.following import Decided, FollowingConfig, FollowState, alone, finish, follow
+from shapepose_fg.tracking.hypotheses import Input
+from shapepose_fg.tracking.reassociation import Survival, reassociate
+from shapepose_fg.tracking.tracker import Tracker, Tracks
+from shapepose_fg.tracking.view_assignment import AssignmentConfig
+
+
+@dataclass(frozen=True)
+class WindowConfig(Settings):
+    """How frames are cut into windows."""
+
+    overlap_s: Annotated[float, Interval(ge=0, le=60)] = 0.4
+    """What a window takes of the frames before and after its own, and does not return: smoothing reaches a few
+    frames. Windows of other lengths move joints by under 2 mm in the median (tests/test_windows.py)."""
+    again_over_time: RepeatsOrNone = 3
+    """How often detections are given out again around a draft of a window."""
+    again_alone: RepeatsOrNone = 5
+    """The same for frames that stand alone. From time to time more is asked of who stays (`Survival`): whoever
+    goes leaves detections to others, so the least goes first."""
+
+
+def window_stop(start: int, end: int, frames: int) -> int:
+    """Where the window that begins at `start` stops, of `frames` frames, in a stretch that ends before `end`.
+
+    The last takes up to half a window more: one of a few frames would know its people less well than the others.
+    """
+    stop = start + frames
+    return stop if stop + frames // 2 < end else end
+
+
+def near_border(times_s: NDArray[np.float64], border_s: float, overlap_s: float) -> NDArray[np.bool_]:
+    """(T,) which frames, at `times_s` (T,), are so near to the border between two windows that both have them."""
+    return np.abs(times_s - border_s) <= overlap_s
+
+
+@dataclass(frozen=True)
+class Span:
+    """Frames whose people are known, and wait to be solved; nothing else is needed for it."""
+
+    decided: tuple[Decided, ...]
+    """The frames with their rows, and before and after them those that a window overlaps."""
+    start: int
+    """The first of `decided` whose rows are to be returned."""
+    stop: int
+    """The one after the last."""
+    alone: bool = False
+    """Whether every frame is a recording of its own."""
+
+
+@dataclass(frozen=True)
+class Solved:
+    """Rows that are done."""
+
+    observations: Observations
+    """Who, when, and from what."""
+    estimates: Estimates
+    """Joints and bodies."""
+    frames: int
+    """How many frames they are of."""
+    seconds: dict[str, float]
+    """What it took, by stage."""
+    nobody: tuple[int, ...] = ()
+    """The frame of each row that was nobody when detections were given out again: a phantom, or a double."""
+
+
+@dataclass(frozen=True)
+class WindowSolver:
+    """From frames whose people are known to solved rows: plain data, which can be sent to another process."""
+
+    estimator: Estimator
+    """Stage II."""
+    skeleton: Skeleton
+    """The detector's joints."""
+    assignment: AssignmentConfig
+    """How detections are given out."""
+    windows: WindowConfig
+    """How often they are."""
+    extra_factors: ExtraFactors | None = None
+    """The user's own factors."""
+
+    def solve(self, span: Span) -> Solved:
+        """One window."""
+        given = [frame for frame, _ in span.decided]
+        rows = Observations.concatenate([part for _, part in span.decided])
+        before = rows.frame
+        again = self.windows.again_alone if span.alone else self.windows.again_over_time
+        began = time.perf_counter()
+        for n in range(again if len(rows) > 0 else 0):
+            joints, covariance = self.estimator.draft(rows, over_time=not span.alone)
+            survival = Survival().at(n / max(again - 1, 1)) if span.alone else None
+            rows = reassociate(given, rows, joints, covariance, self.skeleton, self.assignment, survival)
+        associated = time.perf_counter()
+        estimates = self.estimator.estimate(rows, self.extra_factors)
+        own = {frame.frame for frame in given[span.start : span.stop]}
+        left = Counter(before.tolist()) - Counter(rows.frame.tolist())
+        index = np.flatnonzero(np.isin(rows.frame, list(own)))
+        problems = tuple(problem for problem in estimates.problems if problem.frame in own)
+        return Solved(
+            rows.rows(index),
+            replace(estimates.rows(index), problems=problems),
+            frames=span.stop - span.start,
+            seconds={"associate again": associated - began, "solve": time.perf_counter() - associated},
+            nobody=tuple(sorted(frame for frame in left.elements() if frame in own)),
+        )
+
+
+@dataclass(frozen=True)
+class StreamState:
+    """What is carried from call to call."""
+
+    follow: FollowState
+    """The tracks, and the frames that are not decided."""
+    decided: tuple[Decided, ...] = ()
+    """Frames that wait to be solved, and before them those that the next window overlaps."""
+    before: int = 0
+    """How many of `decided` have been returned already."""
+
+
+@dataclass(frozen=True)
+class Engine:
+    """All steps from frames to rows, and their settings."""
+
+    tracker: Tracker
+    """Follows people; finds new ones."""
+    following: FollowingConfig
+    """What becomes of tracks."""
+    solver: WindowSolver
+    """Solves windows."""
+    frames: int
+    """Frames that a window returns."""
+
+    def start(self, next_id: int = 0) -> StreamState:
+        """Before the first frame, or after a cut; identities count from `next_id`."""
+        return StreamState(FollowState(Tracks.none(self.tracker.skeleton), next_id))
+
+    def follow(
+        self, state: StreamState, frames: Iterable[Input], *, last: bool = False
+    ) -> tuple[list[Span], StreamState]:
+        """Take in `frames`: the windows that can be solved now, each by itself, in any process.
+
+        With `last` the recording ends, or is cut, behind them.
+        """
+        following, decided = state.follow, list(state.decided)
+        for frame in frames:
+            following, more = follow(self.tracker, following, frame, self.following)
+            decided += more
+        if last:
+            following, more = finish(self.tracker, following)
+            decided += more
+        before, spans = state.before, list[Span]()
+        while (cut := self._next(decided, before, last)) is not None:
+            stop, end = cut
+            spans.append(Span(tuple(decided[:end]), before, stop))
+            keep = self._overlap(decided, stop, -1)
+            decided, before = decided[keep:], stop - keep
+        return spans, StreamState(following, tuple(decided), before)
+
+    def alone(self, frames: Iterable[Input]) -> Span:
+        """Frames that have nothing to do with each other, in one window because bodies are fitted fastest so."""
+        decided, people = list[Decided](), 0
+        for frame in frames:
+            decided.append((frame, alone(self.tracker, frame, people)))
+            people += len(decided[-1][1])
+        return Span(tuple(decided), 0, len(decided), alone=True)
+
+    def _next(self, decided: Sequence[Decided], before: int, last: bool) -> tuple[int, int] | None:
+        """Where the next window's own frames stop, and where it ends; None where there is too little."""
+        stop = window_stop(before, len(decided), self.frames)
+        if stop < len(decided):
+            end = self._overlap(decided, stop, 1)
+            if end < len(decided) or last:
+                return stop, end
+        return (len(decided), len(decided)) if last and len(decided) > before else None
+
+    def _overlap(self, decided: Sequence[Decided], at: int, direction: int) -> int:
+        """The frame `overlap_s` before or after the border at `at`."""
+        times = np.array([frame.time_s.mean() for frame, _ in decided])
+        border = times[min(at, len(times) - 1)]
+        near = near_border(times, border, self.solver.windows.overlap_s)
+        return int(np.flatnonzero(near)[0]) if direction < 0 else int(np.flatnonzero(near)[-1]) + 1

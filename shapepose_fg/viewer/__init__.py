@@ -1,5 +1,0 @@
-"""Pictures of a reconstruction."""
-
-from shapepose_fg.viewer.picture import demo_picture
-
-__all__ = ["demo_picture"]

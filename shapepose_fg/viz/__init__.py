@@ -1,0 +1,1 @@
+"""Pictures, pages and viewers of a result."""

@@ -1,0 +1,168 @@
+"""Bodies, skeletons, detections and names on a picture."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.core.skeleton import BODY_25, SKELETONS
+from shapepose_fg.io.footage.footage import Picture
+from shapepose_fg.viz.overlay.picture_view import PictureView
+from shapepose_fg.viz.rendering import rasterise
+
+Colour = tuple[int, int, int]
+"""Blue, green, red, 0 to 255."""
+
+GATED: Colour = (40, 40, 255)
+"""Detections that were not used."""
+_WHITE: Colour = (255, 255, 255)
+_DARK: Colour = (30, 30, 30)
+_BEND = 8
+"""Pieces in which a bone is drawn, because a lens bends it."""
+_OPACITY = 0.45
+"""Of bodies: what is under them stays visible."""
+_FINE = 8
+"""Bits of a pixel's fraction in OpenCV's drawing."""
+_NOT_BONES = {("RShoulder", "REar"), ("LShoulder", "LEar")}
+"""Links of detectors that are no bones."""
+
+
+def bones_of(joint_names: Sequence[str]) -> NDArray[np.intp]:
+    """(B, 2) joints that bones join: those of the known skeleton with these joints, else BODY_25's among them."""
+    names = list(joint_names)
+    known = next((each for each in SKELETONS.values() if list(each.joints) == names), None)
+    pairs = [(each.joints[a], each.joints[b]) for each in (known or BODY_25,) for a, b in each.limbs]
+    bones = [pair for pair in pairs if pair not in _NOT_BONES and pair[0] in names and pair[1] in names]
+    return np.array([(names.index(a), names.index(b)) for a, b in bones], dtype=np.intp).reshape(-1, 2)
+
+
+def stroke_of(size: tuple[int, int]) -> int:
+    """How wide bones are drawn on a picture of `size`, pixels."""
+    return max(2, round(max(size) / 320))
+
+
+def draw_bodies(
+    picture: Picture,
+    view: PictureView,
+    vertices: NDArray[np.floating],
+    faces: NDArray[np.integer],
+    colours: Sequence[Colour],
+) -> Picture:
+    """The surfaces `vertices` (P, Nv, 3), metres, half transparent in a colour each, lit from the camera."""
+    people, count = vertices.shape[:2]
+    if people == 0:
+        return picture
+    points = vertices.reshape(-1, 3).astype(np.float64)
+    corners = (faces[None] + count * np.arange(people)[:, None, None]).reshape(-1, 3)
+    xy, depth = view.project(points)
+    surface = rasterise(xy, depth, corners, view.size, cull_back=True)
+    row, column = np.nonzero(surface.face >= 0)
+    met = surface.face[row, column]
+    first, second, third = points[corners[met].T]
+    normal = np.cross(second - first, third - first)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    light = 0.35 + 0.65 * np.clip(-(normal @ view.camera.wTc[:3, 2]), 0.0, 1.0)
+    own = np.array(colours, dtype=np.float64)[met // len(faces)]
+    drawn = picture.copy()
+    drawn[row, column] = ((1 - _OPACITY) * picture[row, column] + _OPACITY * light[:, None] * own).astype(np.uint8)
+    return drawn
+
+
+@dataclass(frozen=True)
+class Skeletons:
+    """People's joints in one frame."""
+
+    joints: NDArray[np.float64]
+    """(P, J, 3) metres; NaN where unknown."""
+    seen: NDArray[np.bool_]
+    """(P, J) whether a view saw the joint in this frame; others are inferred."""
+    bones: NDArray[np.intp]
+    """(B, 2) joints that are joined."""
+    colours: Sequence[Colour]
+    """(P,) one for each person."""
+    labels: Sequence[str]
+    """(P,) what is written above each person."""
+
+
+def draw_skeletons(picture: Picture, view: PictureView, people: Skeletons) -> None:
+    """Draw bones, joints (rings where they are inferred) and labels on `picture`."""
+    stroke = stroke_of(view.size)
+    part = np.linspace(0.0, 1.0, _BEND + 1)[:, None]
+    tops = []
+    for joints, seen, colour in zip(people.joints, people.seen, people.colours, strict=True):
+        ends = joints[people.bones]
+        lines, _ = view.project(ends[:, :1] * (1 - part) + ends[:, 1:] * part)
+        lines = lines[np.isfinite(lines).all(axis=(1, 2))]
+        fine = _fine(lines)
+        for width, paint in ((stroke + 2, _DARK), (stroke, colour)):
+            cv2.polylines(picture, list(fine), False, paint, width, cv2.LINE_AA, _FINE)
+        xy, _ = view.project(joints)
+        known = np.isfinite(xy).all(axis=1)
+        radius = round((stroke + 0.5) * (1 << _FINE))
+        for centre, filled in zip(_fine(xy[known]).tolist(), seen[known].tolist(), strict=True):
+            cv2.circle(picture, centre, radius, _WHITE if filled else _DARK, -1, cv2.LINE_AA, _FINE)
+            cv2.circle(picture, centre, radius, colour, max(1, stroke // 2), cv2.LINE_AA, _FINE)
+        tops.append(_top(xy[known], view.size))
+    # Names last: nobody's limbs cross them.
+    for top, colour, label in zip(tops, people.colours, people.labels, strict=True):
+        if top is not None:
+            draw_label(picture, label, (top[0], top[1] - 5 * stroke), colour)
+
+
+def _top(xy: NDArray[np.float64], size: tuple[int, int]) -> tuple[float, float] | None:
+    """The middle of a person's width, and the highest of their joints `xy` (K, 2); None outside the picture."""
+    inside = np.all((xy >= 0) & (xy < np.array(size)), axis=1)
+    if not inside.any():
+        return None
+    xy = xy[inside]
+    return float((xy[:, 0].min() + xy[:, 0].max()) / 2), float(xy[:, 1].min())
+
+
+def draw_detections(
+    picture: Picture, xy: NDArray[np.float64], used: NDArray[np.bool_], colours: NDArray[np.integer]
+) -> None:
+    """Draw detections at drawn pixels `xy` (K, 2): squares in `colours` (K, 3), red crosses where not used."""
+    reach = max(2, stroke_of(picture.shape[1::-1]))
+    there = np.isfinite(xy).all(axis=1)
+    for (x, y), good, colour in zip(
+        _fine(xy[there]).tolist(), used[there].tolist(), colours[there].tolist(), strict=True
+    ):
+        arm = reach << _FINE
+        if good:
+            box = ((x - arm, y - arm), (x + arm, y + arm))
+            cv2.rectangle(picture, *box, _DARK, 3, cv2.LINE_AA, _FINE)
+            light = tuple((np.asarray(colour) + 255) / 2)
+            cv2.rectangle(picture, *box, light, 1, cv2.LINE_AA, _FINE)
+        else:
+            arm = round(1.5 * arm)
+            for width, paint in ((max(3, reach), _DARK), (max(1, reach // 2), GATED)):
+                cv2.line(picture, (x - arm, y - arm), (x + arm, y + arm), paint, width, cv2.LINE_AA, _FINE)
+                cv2.line(picture, (x - arm, y + arm), (x + arm, y - arm), paint, width, cv2.LINE_AA, _FINE)
+
+
+def draw_label(
+    picture: Picture, text: str, at: tuple[float, float], colour: Colour, *, centred: bool = True
+) -> None:
+    """Write `text` on a filled box with its lower edge at `at`, moved into the picture where it would leave it."""
+    height, width = picture.shape[:2]
+    size = max(0.4, max(height, width) / 1500)
+    thick = max(1, round(1.6 * size))
+    (across, tall), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, thick)
+    pad = max(2, round(5 * size))
+    left = round(at[0] - (across / 2 + pad if centred else 0))
+    left = max(0, min(left, width - across - 2 * pad))
+    bottom = max(tall + below + 2 * pad, min(round(at[1]), height - 1))
+    top = bottom - tall - below - 2 * pad
+    cv2.rectangle(picture, (left, top), (left + across + 2 * pad, bottom), colour, -1)
+    light = np.dot(colour, (0.114, 0.587, 0.299)) > 150
+    place = (left + pad, bottom - pad - below)
+    cv2.putText(
+        picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, size, _DARK if light else _WHITE, thick, cv2.LINE_AA
+    )
+
+
+def _fine(xy: NDArray[np.float64]) -> NDArray[np.int32]:
+    """Pixels as OpenCV's drawing takes them with fractions."""
+    return np.round(np.clip(xy, -30000, 30000) * (1 << _FINE)).astype(np.int32)

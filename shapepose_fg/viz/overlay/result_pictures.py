@@ -1,0 +1,120 @@
+"""Where the pictures of a result are, and which of them belongs to which of its frames."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.cli.terminal import note, progress
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.io.footage.footage import Footage, open_footage
+from shapepose_fg.io.footage.given import placements_of
+from shapepose_fg.io.footage.placement import Placement
+from shapepose_fg.io.footage.places import find_footage
+from shapepose_fg.io.footage.used import FOOTAGE, CameraFootage, read_used_footage
+
+
+def pictures_of(
+    run: Mapping[str, Any],
+    rig: Rig,
+    drawn: Sequence[str],
+    videos: Sequence[str] | None,
+    detections: Path | None,
+    image_placement: Sequence[str],
+) -> list[tuple[CameraFootage, Footage]]:
+    """The pictures of the cameras `drawn`, and which belongs to which frame.
+
+    `run` is what the result's run.json says. They are those of `videos`, as the command line gives them, or else
+    those that `detect` says it read: in its folder `detections`, or beside the detections that the result was made
+    from. InputError where they are missing.
+    """
+    used = {each.name: each for each in _used_footage(run, detections)}
+    if videos is not None:
+        places = find_footage(videos, drawn)
+        paths = dict(zip(drawn, places.paths, strict=True))
+        for text in places.notes:
+            note(text)
+    else:
+        missing = next((name for name in drawn if name not in used), None)
+        if missing is not None:
+            raise InputError(
+                f"nothing says where the pictures of camera {missing} are; give --videos, or with --detections the"
+                " folder that `shapepose-fg detect` wrote"
+            )
+        paths = {name: used[name].path for name in drawn}
+    opened: dict[str, Footage] = {}
+    for name, path in paths.items():
+        if not path.exists():
+            raise InputError(f"{path}: the pictures of camera {name} are not there any more; give --videos")
+        with progress(f"looking through {name}") as done:
+            opened[name] = open_footage(path, done)
+        for text in opened[name].notes:
+            note(text)
+    # What detect was told of the pictures holds as long as they have the same size.
+    alike = {
+        name: used[name].placement
+        for name, each in opened.items()
+        if name in used and used[name].placement.picture_size == each.size and not image_placement
+    }
+    sizes = {name: each.size for name, each in opened.items() if name not in alike}
+    for name, placement in alike.items():
+        _refuse_other_calibration(name, placement, rig)
+    placements, notes = placements_of(image_placement, sizes, rig)
+    counted = [name for name in drawn if name not in used]
+    if len(counted) > 0:
+        notes.append(f"frame 0 of the result is taken to be the first picture of {' '.join(counted)}, and so on")
+    for text in notes:
+        note(text)
+    placements |= alike
+    pairs = []
+    for name, footage in opened.items():
+        index = used[name].places if name in used else _counted(footage)
+        index = np.where(index < len(footage.number), index, -1)
+        pairs.append((CameraFootage(name, footage.path, placements[name], index), footage))
+    return pairs
+
+
+_MOST_FRAMES = 10_000_000
+"""No recording is as long: numbers in the names of pictures that are not those of frames."""
+
+
+def _counted(footage: Footage) -> NDArray[np.intp]:
+    """(T,) the picture of each frame, counted from the first picture's number; -1 where one is missing."""
+    count = int(footage.number[-1] - footage.number[0]) + 1
+    if count > _MOST_FRAMES:
+        raise InputError(
+            f"{footage.path}: pictures are numbered from {footage.number[0]} to {footage.number[-1]}; number them"
+            " by the frames of the recording"
+        )
+    index = np.full(count, -1, dtype=np.intp)
+    index[footage.number - footage.number[0]] = np.arange(len(footage.number))
+    return index
+
+
+def _refuse_other_calibration(name: str, placement: Placement, rig: Rig) -> None:
+    """InputError where what `detect` wrote is of pictures that were calibrated at another size."""
+    size = rig.cameras[rig.names.index(name)].image_size
+    if placement.calibrated_size != size:
+        theirs, ours = (f"{width} x {height}" for width, height in (placement.calibrated_size, size))
+        raise InputError(
+            f"{FOOTAGE}: camera {name} was calibrated for pictures of {theirs}, and the cameras.json of the result"
+            f" is for {ours}; give --detections with the folder of this result, or --image-placement"
+        )
+
+
+def _used_footage(run: Mapping[str, Any], detections: Path | None) -> list[CameraFootage]:
+    """What `detect` wrote of the pictures, beside the detections that the result was made from."""
+    if detections is not None:
+        file = detections / FOOTAGE if detections.is_dir() else detections
+        if not file.is_file():
+            raise InputError(f"{file}: there is no such file; give the folder that `shapepose-fg detect` wrote")
+        return read_used_footage(file)
+    inputs = run.get("inputs")
+    for text in inputs if isinstance(inputs, dict) else ():
+        file = Path(str(text)).parent / FOOTAGE
+        if Path(str(text)).suffix == ".txt" and file.is_file():
+            return read_used_footage(file)
+    return []

@@ -1,0 +1,340 @@
+"""What a camera sees of triangle meshes: one z-buffer for visibility and for pictures.
+
+Pixels follow OpenCV: the centre of the first pixel is (0, 0). A surface nearer than `NEAR_M` is not drawn.
+"""
+
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.core.camera import Camera
+
+NEAR_M = 0.05
+"""Faces with a corner nearer than this are dropped, metres: nothing is clipped."""
+_FAR_M = 100.0
+"""Faces beyond this are not drawn by OpenCV, metres."""
+_NUMBER = np.float32(2.0**-20)
+"""What a vertex counts as colour: OpenCV takes colours of 0 to 1, and float32 holds these exactly."""
+_FLAT = (
+    cv2.TriangleRasterizeSettings()
+    .setShadingType(cv2.RASTERIZE_SHADING_FLAT)
+    .setCullingMode(cv2.RASTERIZE_CULLING_CW)
+)
+_CHUNK_PIXELS = 2_000_000
+"""Pixels tested at once: bounds the memory that large triangles take."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """The first surface on the ray of every pixel."""
+
+    depth: NDArray[np.float32]
+    """(H, W) depth along the optical axis, metres; inf where the ray meets nothing."""
+    face: NDArray[np.int32]
+    """(H, W) index of the face that is met; -1 where there is none."""
+
+
+def look_at(eye: NDArray[np.float64], target: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pose `wTc` (4, 4) of a camera at `eye` (3,) that looks at `target` (3,), image up towards `up` (3,)."""
+    forward = np.asarray(target, dtype=np.float64) - eye
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, up)
+    if np.linalg.norm(right) < 1e-9:
+        raise ValueError("look_at: the line of sight must not be parallel to up; move the eye or the target")
+    right /= np.linalg.norm(right)
+    wTc = np.eye(4)
+    wTc[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
+    wTc[:3, 3] = eye
+    return wTc
+
+
+def zoom(camera: Camera, box: tuple[float, float, float, float], width: int) -> Camera:
+    """The camera of an enlarged window of the image: `box` (left, top, right, bottom) px, `width` px wide."""
+    left, top, right, bottom = box
+    scale = width / (right - left)
+    K = camera.K.copy()
+    # Edges, not centres, of pixels are scaled: hence the half pixels.
+    K[:2, 2] = (K[:2, 2] + 0.5 - (left, top)) * scale - 0.5
+    K[:2, :2] *= scale
+    return Camera(camera.name, K, camera.wTc, (width, max(1, round((bottom - top) * scale))))
+
+
+def scaled(camera: Camera, scale: float) -> Camera:
+    """The same camera with an image of `scale` times the size, without its distortion."""
+    width, height = camera.image_size
+    return zoom(camera, (0.0, 0.0, width, height), max(1, round(width * scale)))
+
+
+def render_depth(
+    vertices: NDArray[np.floating], faces: NDArray[np.integer], camera: Camera, *, cull_back: bool = False
+) -> Surface:
+    """Depth and face index of the mesh `vertices` (N, 3) world, `faces` (F, 3), in `camera`'s image.
+
+    `cull_back` leaves out faces seen from behind: right, and twice as fast, for closed meshes whose faces
+    turn counter-clockwise when seen from outside.
+    """
+    points = vertices @ camera.cTw[:, :3].T.astype(vertices.dtype) + camera.cTw[:, 3].astype(vertices.dtype)
+    depth = points[:, 2]
+    safe = np.where(depth > NEAR_M, depth, np.nan)
+    pixels = points[:, :2] / safe[:, None] @ camera.K[:2, :2].T + camera.K[:2, 2]
+    return rasterise(pixels, depth, faces, camera.image_size, cull_back=cull_back)
+
+
+def first_surface_at(
+    points_world: NDArray[np.floating],
+    faces: NDArray[np.integer],
+    camera: Camera,
+    column: NDArray[np.intp],
+    row: NDArray[np.intp],
+) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+    """Depth and vertex, each of the shape of `column` and `row`, of the first surface on the rays of some pixels.
+
+    The vertex is the first corner of the face that is met. inf and -1 where nothing is. The same picture as
+    `render_depth` with `cull_back` makes, by OpenCV and in half the time. At most 2**20 points.
+    """
+    width, height = camera.image_size
+    cTw = camera.cTw.astype(np.float32)
+    points = cTw[:, :3] @ np.asarray(points_world, dtype=np.float32).T
+    points += cTw[:, 3:]
+    near = points[2] <= NEAR_M
+    if near.any():  # OpenCV draws a face that reaches behind the camera all over the image
+        faces = faces[~near[faces].any(axis=1)]
+    if len(faces) == 0:
+        return np.full(row.shape, np.inf, dtype=np.float32), np.full(row.shape, -1, dtype=np.intp)
+    colour, depth = _canvas.blank(height, width)
+    corners, number = _as_opengl(points, camera), _numbers(points.shape[1])
+    cv2.triangleRasterize(corners, faces, number, colour, depth, np.eye(4), 1.0, NEAR_M, _FAR_M, _FLAT)
+    met = colour[row, column, 0]
+    vertex = np.where(met >= 0, np.rint(met / _NUMBER), -1).astype(np.intp)
+    return np.where(met >= 0, depth[row, column], np.float32(np.inf)), vertex
+
+
+def _as_opengl(points: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:
+    """(N, 3) of points (3, N) in camera coordinates, where a camera of 1 radian, y up, z back, sees them alike."""
+    (width, height), K = camera.image_size, camera.K
+    focal = height / 2 / np.tan(0.5)
+    # OpenCV's pixels have their centres at halves there; a shear moves the principal point to the middle.
+    right, down, ahead = points
+    seen = np.empty((len(right), 3), dtype=np.float32)
+    seen[:, 0] = (K[0, 0] * right + K[0, 1] * down + (K[0, 2] + 0.5 - width / 2) * ahead) / focal
+    seen[:, 1] = (K[1, 1] * down + (K[1, 2] + 0.5 - height / 2) * ahead) / -focal
+    seen[:, 2] = -ahead
+    return seen
+
+
+class _Canvas(threading.local):
+    """The picture that a thread draws into, again and again: fresh memory takes a third of the time of drawing."""
+
+    def __init__(self) -> None:
+        self._colour = self._depth = np.empty(0, dtype=np.float32)
+
+    def blank(self, height: int, width: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Colour (H, W, 3), -1 everywhere, and depth (H, W), `_FAR_M` everywhere; until the next call."""
+        if self._depth.shape != (height, width):
+            self._colour = np.empty((height, width, 3), dtype=np.float32)
+            self._depth = np.empty((height, width), dtype=np.float32)
+        self._colour.fill(-1.0)
+        self._depth.fill(_FAR_M)
+        return self._colour, self._depth
+
+
+_canvas = _Canvas()
+
+
+@lru_cache(maxsize=4)
+def _numbers(count: int) -> NDArray[np.float32]:
+    """(N, 3) the number of each vertex as its colour."""
+    number = np.zeros((count, 3), dtype=np.float32)
+    number[:, 0] = np.arange(count, dtype=np.float32) * _NUMBER
+    return number
+
+
+def rasterise(
+    xy: NDArray[np.floating],
+    depth: NDArray[np.floating],
+    faces: NDArray[np.integer],
+    size: tuple[int, int],
+    *,
+    cull_back: bool = False,
+) -> Surface:
+    """Draw triangles with corners at pixels `xy` (N, 2) and `depth` (N,) into an image of `size` (W, H).
+
+    1/depth is linear in the image, so that depth is exact inside a face. Corners that are NaN, or nearer
+    than `NEAR_M`, drop their faces.
+    """
+    width, height = size
+    x, y = np.ascontiguousarray(xy, dtype=np.float64).T.copy()
+    nearness = np.where(depth > NEAR_M, 1.0 / np.maximum(depth, NEAR_M), np.nan).astype(np.float64)
+    x[~np.isfinite(nearness)] = np.nan
+    index, first_row, rows, room = _rows(x, y, faces, size, cull_back)
+    a, b, c = _planes(x, y, nearness, faces[index])
+    buffer = np.zeros(width * height, dtype=np.uint64)
+    for part in _chunks(room):
+        which, row = _ranges(first_row[part], rows[part])
+        which += part.start
+        first, count = _spans(a[:3, which], b[:3, which] * row + c[:3, which], width)
+        span, column = _ranges(first, count)
+        which, row = which[span], row[span]
+        near = a[3, which] * column + b[3, which] * row + c[3, which]
+        # Nearness in the high bits, face in the low ones: the maximum of one integer keeps both.
+        bits = near.astype(np.float32).view(np.uint32).astype(np.uint64) << np.uint64(32)
+        np.maximum.at(buffer, row * width + column, bits | index[which].astype(np.uint64))
+    hit = buffer > 0
+    near = (buffer >> np.uint64(32)).astype(np.uint32).view(np.float32)
+    met = np.full(width * height, np.inf, dtype=np.float32)
+    np.divide(np.float32(1.0), near, out=met, where=hit)
+    face = np.where(hit, (buffer & np.uint64(0xFFFFFFFF)).astype(np.int64), -1).astype(np.int32)
+    return Surface(met.reshape(height, width), face.reshape(height, width))
+
+
+def _rows(
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    faces: NDArray[np.integer],
+    size: tuple[int, int],
+    cull_back: bool,
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """Faces with a pixel centre in their box: index, first row, count of rows, pixels of the box, each (G,)."""
+    i, j, k = faces.T
+    xs, ys = (x[i], x[j], x[k]), (y[i], y[j], y[k])
+    area = (xs[1] - xs[0]) * (ys[2] - ys[0]) - (xs[2] - xs[0]) * (ys[1] - ys[0])
+    keep = area < -1e-12 if cull_back else np.abs(area) > 1e-12  # NaN compares false: such faces go
+    low_x = np.maximum(np.ceil(np.minimum(np.minimum(*xs[:2]), xs[2])), 0)
+    high_x = np.minimum(np.floor(np.maximum(np.maximum(*xs[:2]), xs[2])), size[0] - 1)
+    low_y = np.maximum(np.ceil(np.minimum(np.minimum(*ys[:2]), ys[2])), 0)
+    high_y = np.minimum(np.floor(np.maximum(np.maximum(*ys[:2]), ys[2])), size[1] - 1)
+    index = np.flatnonzero(keep & (high_x >= low_x) & (high_y >= low_y))
+    rows = (high_y - low_y)[index].astype(np.intp) + 1
+    return index, low_y[index].astype(np.intp), rows, rows * ((high_x - low_x)[index].astype(np.intp) + 1)
+
+
+def _spans(
+    a: NDArray[np.float64], rest: NDArray[np.float64], width: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """First column and count (S,) of the pixels of a row where all three a x + rest (3, S) are at least 0."""
+    low, high = np.full(rest.shape[1], -np.inf), np.full(rest.shape[1], np.inf)
+    outside = np.zeros(rest.shape[1], dtype=bool)
+    for slope, value in zip(a, rest, strict=True):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            edge = -value / slope
+        # The margin lets neighbours both draw a pixel centre on their common edge: no gaps.
+        low = np.where(slope > 0, np.maximum(low, edge - 1e-7), low)
+        high = np.where(slope < 0, np.minimum(high, edge + 1e-7), high)
+        outside |= (slope == 0) & (value < -1e-9)
+    first = np.ceil(np.clip(low, 0, width)).astype(np.intp)
+    last = np.floor(np.clip(high, -1, width - 1)).astype(np.intp)
+    return first, np.where(outside, 0, np.maximum(last - first + 1, 0))
+
+
+def _ranges(first: NDArray[np.intp], count: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Members of ranges that begin at `first` (G,) and have `count` (G,): whose each is, and the number."""
+    which = np.repeat(np.arange(len(count)), count)
+    return which, np.arange(len(which)) + (first - np.cumsum(count) + count)[which]
+
+
+def _planes(
+    x: NDArray[np.float64], y: NDArray[np.float64], nearness: NDArray[np.float64], faces: NDArray[np.integer]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Coefficients a, b, c, each (4, G), of a x + b y + c: three barycentric coordinates and 1/depth."""
+    px, py = x[faces.T], y[faces.T]
+    nx, ny = np.roll(px, -1, axis=0), np.roll(py, -1, axis=0)
+    lx, ly = np.roll(px, 1, axis=0), np.roll(py, 1, axis=0)
+    # Coordinate m vanishes on the edge from the next corner to the last one and is 1 at corner m.
+    a, b = ny - ly, lx - nx
+    c = nx * ly - lx * ny
+    area = (a * px + b * py + c)[0]
+    a, b, c = a / area, b / area, c / area
+    corner = nearness[faces.T]
+    return tuple(np.concatenate([q, (q * corner).sum(axis=0, keepdims=True)]) for q in (a, b, c))  # type: ignore[return-value]
+
+
+def _chunks(counts: NDArray[np.intp]) -> Iterator[slice]:
+    """Ranges of faces with about `_CHUNK_PIXELS` pixels in their boxes."""
+    if len(counts) == 0:
+        return
+    group = np.cumsum(counts) // _CHUNK_PIXELS
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(group)) + 1, [len(counts)]])
+    for start, stop in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+        yield slice(start, stop)
+
+
+def vertex_normals(vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> NDArray[np.float64]:
+    """Unit normals (N, 3): the mean of the adjacent faces', weighted by their areas."""
+    a, b, c = (np.asarray(vertices, dtype=np.float64)[faces[:, m]] for m in range(3))
+    normal = np.cross(b - a, c - a)
+    total = np.stack(
+        [np.bincount(faces.ravel(), np.repeat(normal[:, axis], 3), minlength=len(vertices)) for axis in range(3)],
+        axis=1,
+    )
+    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
+
+
+def render_shaded(
+    vertices: NDArray[np.floating],
+    faces: NDArray[np.integer],
+    colours: NDArray[np.floating],
+    camera: Camera,
+    *,
+    light: NDArray[np.float64],
+    ambient: float = 0.45,
+    samples: int = 3,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Picture of shaded meshes: colour (H, W, 3) in 0..1, multiplied by coverage, and coverage (H, W).
+
+    `colours` (N, 3) are the vertices' own, 0..1; `light` (3,) points from the scene to the light. Lambert's
+    law with light from both sides of the sky (half-Lambert), so that no part goes black. Each pixel is the
+    mean of `samples` x `samples` rays.
+    """
+    fine = scaled(camera, samples)
+    surface = render_depth(vertices, faces, fine, cull_back=True)
+    row, column = np.nonzero(surface.face >= 0)
+    corners = faces[surface.face[row, column]]
+    weight = _barycentric(vertices, corners, fine, column, row)
+    normal = (vertex_normals(vertices, faces)[corners] * weight[..., None]).sum(axis=1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    toward_eye = -fine.wTc[:3, 2]
+    lit = 0.5 + 0.5 * normal @ (light / np.linalg.norm(light))
+    # A grazing surface darkens a little: limbs of one colour stay apart.
+    rim = 0.75 + 0.25 * np.clip(normal @ toward_eye, 0.0, 1.0) ** 0.5
+    shade = (ambient + (1.0 - ambient) * lit) * rim
+    base = (np.asarray(colours, dtype=np.float64)[corners] * weight[..., None]).sum(axis=1)
+    picture = np.zeros((*surface.face.shape, 4), dtype=np.float32)
+    picture[row, column, :3] = np.clip(base * shade[:, None], 0.0, 1.0)
+    picture[row, column, 3] = 1.0
+    picture = np.asarray(cv2.resize(picture, camera.image_size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+    shadow = _nearness_shadow(surface.depth[samples // 2 :: samples, samples // 2 :: samples])
+    return picture[..., :3] * shadow[..., None], picture[..., 3]
+
+
+def _nearness_shadow(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Darker (H, W) where something nearer is beside a pixel, so that who is in front stands out.
+
+    The depth buffer minus its own blur (Luft, Colditz and Deussen 2006), over pixels that hold a surface.
+    """
+    hit = np.isfinite(depth).astype(np.float32)
+    filled = np.where(hit > 0, depth, 0.0).astype(np.float32)
+    sigma = 0.012 * depth.shape[0]
+    near, weight = (np.asarray(cv2.GaussianBlur(q, (0, 0), sigma), dtype=np.float32) for q in (filled, hit))
+    mean = near / np.maximum(weight, 1e-3)
+    return (1.0 - 0.45 * hit * np.clip((filled - mean) / 0.3, 0.0, 1.0)).astype(np.float32)
+
+
+def _barycentric(
+    vertices: NDArray[np.floating],
+    corners: NDArray[np.integer],
+    camera: Camera,
+    column: NDArray[np.intp],
+    row: NDArray[np.intp],
+) -> NDArray[np.float64]:
+    """Perspective-correct weights (M, 3) of the corners (M, 3) of the faces met at pixels column, row (M,)."""
+    points = (vertices @ camera.cTw[:, :3].T + camera.cTw[:, 3])[corners]
+    ray = np.stack([column, row, np.ones(len(row))], axis=1) @ np.linalg.inv(camera.K).T
+    a, b, c = points[:, 0], points[:, 1], points[:, 2]
+    # The ray through the pixel is a mix of the corners with weights proportional to signed volumes.
+    volumes = np.stack([np.einsum("mi,mi->m", ray, np.cross(p, q)) for p, q in ((b, c), (c, a), (a, b))], axis=1)
+    return volumes / volumes.sum(axis=1, keepdims=True)

@@ -1,0 +1,179 @@
+"""The 3D scene of a report: people, bodies, cameras and floor as small arrays for the page's own drawing."""
+
+import base64
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.body.model.smpl_file import SmplArrays
+from shapepose_fg.core.camera import Camera
+from shapepose_fg.core.reconstruction import Known
+from shapepose_fg.io.export.axes import z_up
+from shapepose_fg.io.export.bones import bones_of
+from shapepose_fg.io.export.markers import sigma_m
+from shapepose_fg.io.export.take import Take
+from shapepose_fg.viz.report.skins import ROW_BYTES, TURN, Skins, skins_of
+from shapepose_fg.viz.viewer.palette import PALETTE
+
+_MISSING = -32768
+"""In place of a coordinate that is not known."""
+_FINEST_MM = 1.0
+"""Places are rounded to this, or more coarsely where the room is more than 65 m wide."""
+_OCTAVE, _LEVELS = 8, 63
+"""Sigma is one of 63 levels, eight to each doubling, from 1 mm on: 9 % apart, in six bits."""
+_FLOOR_M = 0.3
+"""The floor is drawn at height 0 where people's feet are within this of it."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a page draws, and which of a recording's frames that is."""
+
+    data: dict[str, Any]
+    """What the page's script reads: plain values for JSON."""
+    every: int
+    """One frame in so many is there."""
+    kept: int
+    """How many that is."""
+    frames: int
+    """How many the recording has."""
+
+
+def scene_of(take: Take, arrays: SmplArrays | None, most_bytes: int) -> Scene:
+    """The scene in at most about `most_bytes`, for which every second, third ... frame is taken if need be.
+
+    The page's axes are those of the world turned so that z is up. Bodies where `arrays`, the body model, is given.
+    """
+    J = len(take.people.joint_names)
+    row_bytes = 4 / 3 * (6 * J + J + 2 + (ROW_BYTES if arrays is not None else 0))
+    every = max(1, int(np.ceil(len(take.people) * row_bytes / most_bytes)))
+    index = np.arange(0, len(take.frames), every)
+    axes = z_up(take.up)
+    # By frame, and within a frame by person.
+    frame, person = np.nonzero(take.rows[:, index].T >= 0)
+    rows = take.rows[person, index[frame]]
+    joints = take.people.joints[rows] @ axes.T
+    cameras = () if take.rig is None else take.rig.cameras
+    centres = np.array([camera.centre for camera in cameras]).reshape(-1, 3) @ axes.T
+    pack, unit = _packing(joints)
+    sigma = sigma_m(take.people.covariance[rows])
+    counts = np.bincount(frame, minlength=len(index))
+    scene = {
+        "unit": unit,
+        "origin": pack.origin.tolist(),
+        "axes": axes.T.tolist(),
+        "frames": _base64(take.frames[index], "<i4"),
+        "times": _base64(take.times_s[index] - take.times_s[0], "<f4"),
+        "starts": _base64(np.r_[0, np.cumsum(counts)], "<i4"),
+        "who": _base64(person, "<u2"),
+        "joints": _base64(pack(joints), "<i2"),
+        "known": _base64(_known_and_sigma(take.people.known[rows], sigma), "u1"),
+        "joint_names": take.people.joint_names.tolist(),
+        "bones": bones_of(tuple(take.people.joint_names.tolist())).tolist(),
+        "people": [{"id": int(who), "colour": PALETTE[who % len(PALETTE)]} for who in take.persons],
+        "cameras": [_camera(camera, axes) for camera in cameras],
+        "floor": _floor(joints),
+        "view": _view(joints, centres),
+    }
+    if arrays is not None:
+        scene |= _bodies(skins_of(take, arrays, axes, index[frame], person), pack)
+    return Scene(scene, every, len(index), len(take.frames))
+
+
+@dataclass(frozen=True)
+class _Packing:
+    """Places as whole numbers of a unit from an origin."""
+
+    origin: NDArray[np.float64]
+    """(3,) metres."""
+    unit_m: float
+    """Metres."""
+
+    def __call__(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(..., 3) whole numbers of points (..., 3); missing where a point is not known or too far."""
+        steps = np.rint((points - self.origin) / self.unit_m)
+        near = np.isfinite(steps).all(axis=-1, keepdims=True) & (np.abs(steps) < -_MISSING).all(-1, keepdims=True)
+        return np.where(near, steps, _MISSING)
+
+
+def _packing(joints: NDArray[np.float64]) -> tuple[_Packing, float]:
+    """How places are rounded, and the unit in metres."""
+    placed = joints[np.isfinite(joints).all(axis=-1)]
+    if len(placed) == 0:
+        return _Packing(np.zeros(3), 1e-3 * _FINEST_MM), 1e-3 * _FINEST_MM
+    low, high = placed.min(axis=0), placed.max(axis=0)
+    # Bodies reach a little farther than joints.
+    unit = 1e-3 * max(_FINEST_MM, float(np.ceil(1e3 * (np.ptp(placed, axis=0).max() + 2.0) / 2 / 32000)))
+    return _Packing((low + high) / 2, unit), unit
+
+
+def _known_and_sigma(known: NDArray[np.uint8], sigma: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """How a joint is known in the two low bits, its sigma's level in the six above; level 0 is not known.
+
+    A joint that is seen weakly is drawn like one that the body places.
+    """
+    known = np.where(known == Known.WEAK, Known.BODY, known)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        level = 1 + np.rint(_OCTAVE * np.log2(1e3 * sigma))
+    level = np.where(np.isfinite(level), np.clip(level, 1, _LEVELS), 0)
+    return (known + 4 * level).astype(np.uint8)
+
+
+def _floor(joints: NDArray[np.float64]) -> float:
+    """Height of the floor, metres: 0 where feet are near it, else where the lowest joints are."""
+    height = joints[..., 2]
+    placed = np.isfinite(height)
+    if not placed.any():
+        return 0.0
+    lowest = np.min(np.where(placed, height, np.inf), axis=1)
+    ground = float(np.quantile(lowest[np.isfinite(lowest)], 0.2))
+    return 0.0 if abs(ground) < _FLOOR_M else ground
+
+
+def _view(joints: NDArray[np.float64], centres: NDArray[np.float64]) -> dict[str, Any]:
+    """Where the people are, for the first look: the box around them, and how far they and the cameras reach."""
+    points = joints.reshape(-1, 3)
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) == 0:
+        points = np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 1.8]])
+    # A joint that ran away is not looked at.
+    low, high = np.quantile(points, [0.003, 0.997], axis=0)
+    low, high = np.minimum(low, high - 1.0), np.maximum(high, low + 1.0)
+    middle = (low + high) / 2
+    reach = float(np.linalg.norm(high - low)) / 2
+    away = np.linalg.norm((centres - middle)[:, :2], axis=1).max(initial=0.0)
+    box = {"low": low.tolist(), "high": high.tolist(), "middle": middle.tolist()}
+    return box | {"reach": max(reach, 1.0), "cameras": float(away)}
+
+
+def _camera(camera: Camera, axes: NDArray[np.float64]) -> dict[str, Any]:
+    """A camera in the page's axes; the columns of `turn` point right, down and forward."""
+    width, height = camera.image_size
+    return {
+        "name": camera.name,
+        "centre": (axes @ camera.centre).tolist(),
+        "turn": (axes @ camera.wTc[:3, :3]).T.tolist(),
+        "K": [camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]],
+        "size": [width, height],
+    }
+
+
+def _bodies(skins: Skins, pack: _Packing) -> dict[str, Any]:
+    """People's bodies as the page's script reads them."""
+    millimetres = _Packing(np.zeros(3), 1e-3)
+    return {
+        "mesh": {
+            name: _base64(values, "u1" if name == "weights" else "<i2") for name, values in skins.mesh.items()
+        },
+        "rest": _base64(millimetres(skins.rest), "<i2"),
+        "rest_joints": _base64(millimetres(skins.joints), "<i2"),
+        "turns": _base64(np.rint(TURN * np.nan_to_num(skins.turns)), "<i2"),
+        "pelvis": _base64(pack(skins.pelvis), "<i2"),
+    }
+
+
+def _base64(values: NDArray[Any], kind: str) -> str:
+    """Numbers as the page's script reads them into a typed array."""
+    return base64.b64encode(np.ascontiguousarray(values, dtype=np.dtype(kind)).tobytes()).decode("ascii")

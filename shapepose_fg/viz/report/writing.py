@@ -1,0 +1,130 @@
+"""A result's report.html, from a result in memory or in its folder."""
+
+from pathlib import Path
+
+import numpy as np
+
+from shapepose_fg.body.model.smpl_file import SmplArrays
+from shapepose_fg.body.shapes import read_body
+from shapepose_fg.core.camera import Axis, Rig
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.frame_times import ASSUMED_FPS
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.result_options import results_folder
+from shapepose_fg.core.storage.files import write_atomically
+from shapepose_fg.io.calibration import read_rig
+from shapepose_fg.io.export.take import Take
+from shapepose_fg.io.solved_setup import CAMERAS
+from shapepose_fg.tracking.listing import list_tracks
+from shapepose_fg.viz.report.figures import camera_figures
+from shapepose_fg.viz.report.page import Content, page_text
+from shapepose_fg.viz.report.scene import Scene, scene_of
+
+MOST_ROWS = 40_000
+"""Rows that check and report look at, about 400 MB: of longer results every second, third ... frame."""
+REPORT = "report.html"
+"""The report of a result, beside its people.npz."""
+_SCENE_BYTES = 8_000_000
+"""What people and bodies may take: a page of 10 MB opens at once and still fits in a mail."""
+
+
+def write_report(
+    folder: Path,
+    people: Reconstruction,
+    rig: Rig | None,
+    *,
+    up: Axis | None = None,
+    fps: float | None = None,
+    body: Path | None = None,
+    scene_bytes: int = _SCENE_BYTES,
+    every: int = 1,
+) -> Path:
+    """Write report.html of `people` into `folder`, whole or not at all; returns its path.
+
+    `rig` are the cameras, None where they are not known. `up` is the axis that is up where they are not, by
+    default the one along which people stand. `fps` takes the place of the result's times. `body` is the body
+    model's file where it is no longer where run.json says. `scene_bytes` is what the scene may take; of longer
+    recordings every second, third ... frame is drawn. `people` are those of every frame of the result, or of
+    `every` so many. Where people cannot be put on one timeline, the page has no
+    scene and says why.
+    """
+    arrays, remarks = _body(people, body)
+    if every > 1:
+        remarks.append(f"the result is long: all on this page is of every {th(every)} frame")
+    if rig is None:
+        up = up or _standing(people)
+        remarks.append(f"{CAMERAS} is not there: no cameras are drawn, and {up} is taken to be up")
+    else:
+        up = rig.up
+    scene: Scene | None = None
+    if len(people) > 0:
+        if fps is None and not _timed(people):
+            fps = ASSUMED_FPS
+            remarks.append(f"nothing says when the frames were taken: the scene plays {fps:g} a second (--fps)")
+        try:
+            scene = scene_of(Take.of(people, up, rig=rig, fps=fps, identities=False), arrays, scene_bytes)
+        except ValueError as error:
+            remarks.append(f"there is no scene: {error}")
+    title = folder.resolve().name or str(folder)
+    tracks = list_tracks(people, arrays, every)
+    text = page_text(Content(title, people, tracks, camera_figures(people), scene, remarks))
+    file = folder / REPORT
+    # A name may hold half of a pair of surrogates, which no file can.
+    write_atomically(file, lambda stream: stream.write(text.encode("utf-8", "replace")))
+    return file
+
+
+def report_of(
+    results: Path, *, up: Axis | None = None, fps: float | None = None, body: Path | None = None
+) -> Path:
+    """Write report.html of the saved result at `results` anew; InputError where it cannot be read."""
+    folder = results_folder(results)
+    with Reconstruction.open(results) as opened:
+        people, every = opened.thinned(MOST_ROWS)
+    if up is not None and up not in ("x", "-x", "y", "-y", "z", "-z"):
+        raise InputError(f"--up {up}: must be one of x -x y -y z -z")
+    cameras = folder / CAMERAS
+    rig = read_rig(cameras) if cameras.is_file() else None
+    return write_report(folder, people, rig, up=up, fps=fps, body=body, every=every)
+
+
+def th(number: int) -> str:
+    """An ordinal."""
+    return {2: "second", 3: "third"}.get(number, f"{number}th")
+
+
+def _body(people: Reconstruction, given: Path | None) -> tuple[SmplArrays | None, list[str]]:
+    """The body model of a result; None, and a remark, where its file is not there any more."""
+    named = people.run.get("body")
+    file = given if given is not None else None if named is None else Path(str(named))
+    try:
+        return read_body(file), []
+    except InputError as error:
+        if given is not None:
+            raise
+        return None, [f"no bodies and heights: {error}"]
+
+
+def _timed(people: Reconstruction) -> bool:
+    """Whether a result says when its frames were taken: by two times, or by a time and the rate."""
+    times = np.unique(people.time_s[np.isfinite(people.time_s)])
+    rate = people.run.get("time", {}).get("fps")
+    return len(times) > 1 or (len(times) == 1 and rate is not None and rate > 0)
+
+
+def _standing(people: Reconstruction) -> Axis:
+    """The axis along which people stand: from their hips to their heads, mostly."""
+    names = people.joint_names.tolist()
+    heads = [names.index(name) for name in ("Neck", "Nose", "Head") if name in names]
+    feet = [names.index(name) for name in ("RAnkle", "LAnkle", "RKnee", "LKnee") if name in names]
+    if len(people) == 0 or not heads or not feet:
+        return "z"
+    joints = people.joints
+    along = (joints[:, heads][:, :, None] - joints[:, feet][:, None]).reshape(-1, 3)
+    along = along[np.isfinite(along).all(axis=1)]
+    if len(along) == 0:
+        return "z"
+    mean = np.median(along, axis=0)
+    axes: tuple[tuple[Axis, Axis], ...] = (("x", "-x"), ("y", "-y"), ("z", "-z"))
+    best = int(np.abs(mean).argmax())
+    return axes[best][0 if mean[best] > 0 else 1]

@@ -1,0 +1,5 @@
+"""Pictures of a reconstruction."""
+
+from shapepose_fg.viz.viewer.picture import demo_picture
+
+__all__ = ["demo_picture"]
