@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 LEVELS = (
-    "factors core.errors",
+    "factors core.errors core.moved",
     "core.camera core.skeleton",
     "core.storage.files core.bounds",
     "core.storage.output_folder core.storage.npz_writer core.storage.npz_reader core.storage.kept_arrays"

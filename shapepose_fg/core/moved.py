@@ -1,0 +1,66 @@
+"""Modules that have moved: their old names still work, with a warning that says the new one."""
+
+import sys
+import warnings
+from collections.abc import Sequence
+from importlib import import_module
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+
+_ROOMS = {
+    "core": "errors camera skeleton detections observations observation_table frame_times bounds columns"
+    " reconstruction provenance result_options run_summary result_files",
+    "core.storage": "files npz_reader npz_writer saved_table kept_arrays output_folder",
+    "pipeline": "engine windows workers cluster chunk_work solving person_bodies bodies_over_time solved_rows"
+    " runs",
+    "cli": "options terminal stopping demo batch",
+    "viz": "rendering overlay report viewer",
+    "io": "export",
+    "body": "training",
+}
+"""What was in the package's root until 0.1, by where it is now."""
+_RENAMED = {
+    "pipeline_config": "pipeline.config",
+    "batch_command": "cli.batch.command",
+    **{f"{name}_command": f"cli.{name}" for name in "tracks detect overlay export report view setup".split()},
+    **{
+        f"reconstruct_{name}": f"cli.reconstruct.{name}"
+        for name in "command ending inputs outcome request run summary".split()
+    },
+}
+MOVED = {name: f"{room}.{name}" for room, names in _ROOMS.items() for name in names.split()} | _RENAMED
+"""Old names to new ones, both within the package."""
+
+
+class _Loader(Loader):
+    """Gives the module at its new place."""
+
+    def __init__(self, place: str) -> None:
+        self.place = place
+
+    def create_module(self, spec: ModuleSpec) -> None:
+        return None
+
+    def exec_module(self, module: ModuleType) -> None:
+        warnings.warn(f"{module.__name__} is {self.place} now", DeprecationWarning, stacklevel=2)
+        sys.modules[module.__name__] = import_module(self.place)
+
+
+class _Finder(MetaPathFinder):
+    """Finds modules by their old names."""
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        package, _, rest = fullname.partition(".")
+        first, *inner = rest.split(".")
+        if package != "shapepose_fg" or first not in MOVED:
+            return None
+        return ModuleSpec(fullname, _Loader(".".join([package, MOVED[first], *inner])))
+
+
+def install() -> None:
+    """From now on old names are found."""
+    if not any(isinstance(finder, _Finder) for finder in sys.meta_path):
+        sys.meta_path.insert(0, _Finder())
