@@ -101,7 +101,7 @@ def test_no_workers_are_refused(lookout: Lookout, scene: Scene, workers: int):
 INTERRUPTED = """
 from contextlib import contextmanager
 import multiprocessing, signal, sys
-from shapepose_fg.cli import main
+from shapepose_fg.cli import main as cli
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # whoever runs the tests may ignore it
 signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
