@@ -207,20 +207,7 @@ def left_over(
 ) -> Chosen:
     """Who would be there besides those whom `choose` has `chosen` of them, if appearing cost nothing."""
     account = replace(_Account.of(candidate, weight, price, there, counts, lasts_s, 1.0), appears_s=0.0)
-    free, found = account.free, list[tuple[int, int, int, float]]()
-    for h, start, stop in zip(chosen.hypothesis, chosen.start, chosen.stop, strict=True):
-        free[account.place[h, start:stop]] = 0.0
-    gains = account.gains(free, slice(0, len(lasts_s)))
-    while len(gains) > 0:
-        value, start, stop = account.best_stretches(gains)
-        best = int(value.argmax())
-        if value[best] < account.least_s:
-            break
-        span = slice(int(start[best]), int(stop[best]))
-        found.append((best, span.start, span.stop, float(value[best])))
-        free[account.place[best, span]] = 0.0
-        gains[:, span] = account.gains(free, span)
-    return Chosen.of(found)
+    return account.chosen(np.zeros(len(there), dtype=bool), chosen)
 
 
 @dataclass(frozen=True)
@@ -284,10 +271,15 @@ class _Account:
         share = np.einsum("htk,htk->ht", self.weight[:, span], free[self.place[:, span]])
         return np.where(self.there[:, span], (share - self.price[:, span]) * self.lasts_s[span], -np.inf)
 
-    def chosen(self, first: NDArray[np.bool_]) -> Chosen:
-        """People one after the other, the best of those `first` (H,) before all others."""
+    def chosen(self, first: NDArray[np.bool_], before: Chosen | None = None) -> Chosen:
+        """People one after the other, the best of those `first` (H,) before all others, besides those `before`."""
         free, gains, chosen = self.free, self.alone.copy(), list[tuple[int, int, int, float]]()
         taken, least = np.zeros(self.there.shape, dtype=bool), self.least_s
+        if before is not None:
+            for h, start, stop in zip(before.hypothesis, before.start, before.stop, strict=True):
+                free[self.place[h, start:stop]] = 0.0
+                taken[h, start:stop] = True
+            gains = np.where(taken, -np.inf, self.gains(free, slice(0, len(self.lasts_s))))
         while len(gains) > 0:
             value, start, stop = self.best_stretches(gains)
             if first.any() and value[first].max() < least:

@@ -113,8 +113,8 @@ def explained(tracker: Tracker, frames: Sequence[Input], carried: Tracks, keep: 
 
     `carried` are the people of the frame before; `keep` is the index of the frame from which they are carried on.
     """
-    times, none = times_of(frames), np.zeros((0, len(tracker.skeleton), len(frames[0].rig)), dtype=np.intp)
-    on = Seed(-1, carried, np.full((len(carried), *none.shape[1:]), -1), backwards=False, births=True)
+    times, unseen = times_of(frames), np.full((len(carried), len(tracker.skeleton), len(frames[0].rig)), -1)
+    on = Seed(-1, carried, unseen, backwards=False, births=True)
     found = follow_worlds(tracker, frames, [on], keep)
     if len(frames) == 1 or _plain(found, times):
         return found, _choose(found, frames)
