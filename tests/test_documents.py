@@ -1,4 +1,4 @@
-"""README.md and docs/extending.md, typed as a reader would type them; and links that lead somewhere."""
+"""README.md, docs/using.md and docs/extending.md, typed as a reader would type them; and links that lead somewhere."""
 
 import json
 import re
@@ -29,11 +29,12 @@ def blocks(page: Path, language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL)
 
 
-def run(page: Path) -> dict:
-    """Run all Python of a page, one block after the other; returns the names that it leaves."""
+def run(*pages: Path) -> dict:
+    """Run all Python of the pages, one block after the other; returns the names that it leaves."""
     names: dict = {}
-    for block in blocks(page, "python"):
-        exec(compile(block, str(page), "exec"), names)
+    for page in pages:
+        for block in blocks(page, "python"):
+            exec(compile(block, str(page), "exec"), names)
     return names
 
 
@@ -72,8 +73,8 @@ def recording(tmp_path, monkeypatch) -> Scene:
     return scene
 
 
-def test_readme_in_python(recording, tmp_path):
-    names = run(ROOT / "README.md")
+def test_readme_and_using_in_python(recording, tmp_path):
+    names = run(ROOT / "README.md", ROOT / "docs" / "using.md")
     saved = Reconstruction.load(tmp_path / "results")
     metrics = joint_metrics(saved, recording.keypoints)
     assert metrics.everyone_once
