@@ -1,4 +1,4 @@
-"""README.md, docs/using.md and docs/extending.md, typed as a reader would type them; and links that lead somewhere."""
+"""README.md, docs/using.md and docs/extending.md, typed as a reader would type them; and links that lead on."""
 
 import json
 import re
