@@ -298,16 +298,17 @@ class _Account:
         """The stretch with the greatest sum of each row of `gains` (H, T): value (H,), start (H,), stop (H,).
 
         Where a stretch begins after the first frame in which anything is seen, or stops before the last, it costs
-        `appears_s` each.
+        `appears_s` each. No part of it costs more than to vanish and to appear again.
         """
         H, T = gains.shape
-        running, since = np.full(H, -np.inf), np.zeros(H, dtype=np.intp)
+        running, peak, since = np.full(H, -np.inf), np.full(H, -np.inf), np.zeros(H, dtype=np.intp)
         value, start, stop = np.full(H, -np.inf), np.zeros(H, dtype=np.intp), np.zeros(H, dtype=np.intp)
         for t in range(T):
             afresh = -self.appears_s if t > self.begins else 0.0
-            begins = running < afresh
+            begins = running < np.maximum(afresh, peak - 2 * self.appears_s)
             since = np.where(begins, t, since)
             running = np.where(begins, afresh, running) + gains[:, t]
+            peak = np.where(begins, running, np.maximum(peak, running))
             ends = running - (self.appears_s if t < self.ends else 0.0)
             better = ends > value
             value, start, stop = (

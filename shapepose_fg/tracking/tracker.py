@@ -60,7 +60,7 @@ class TrackingConfig(Settings):
 
     assignment: AssignmentConfig = field(default_factory=AssignmentConfig)
     """Which detections are a track's."""
-    min_new_joints: Count = 6
+    min_new_joints: Count = 4
     """Core joints that two views must see, by detections that no track has, for a new person. In frames that stand
     alone three are enough: evidence decides there."""
     patience_s: Seconds = 0.5
