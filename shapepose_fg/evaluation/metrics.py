@@ -139,11 +139,6 @@ class CovarianceCalibration:
         """3 if the covariances are true; more if they promise too much; NaN without joints."""
         return float(self.nees.mean()) if len(self.nees) else float("nan")
 
-    @property
-    def median_nees(self) -> float:
-        """2.37 if the covariances are true; does not see outliers."""
-        return float(np.median(self.nees)) if len(self.nees) else float("nan")
-
 
 def covariance_calibration(
     errors: NDArray[np.floating], covariances: NDArray[np.floating]

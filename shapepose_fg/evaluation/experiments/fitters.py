@@ -74,7 +74,7 @@ def measure(motions: Path, kind: str, name: str) -> Figures:
     joints, covariance = (
         np.concatenate([getattr(fit, part) for fit in fits]) for part in ("joints", "covariance")
     )
-    error, fitted = joints - truth, np.isfinite(joints).all(axis=(1, 2))
+    error, fitted = joints - truth, np.asarray(np.isfinite(joints).all(axis=(1, 2)))
     figures: Figures = {"mm": _mean_mm(error[fitted]), "ms": ms, "without": int((~fitted).sum())}
     for group, mask in (("seen", ~missing), ("missing", missing)):
         mask = mask & fitted[:, None]
@@ -87,7 +87,7 @@ def measure(motions: Path, kind: str, name: str) -> Figures:
 
 def corrupt(
     keypoints: Array, sigma_m: float, share: float, rng: np.random.Generator
-) -> tuple[JointTargets, NDArray]:
+) -> tuple[JointTargets, NDArray[np.bool_]]:
     """Targets of joints (N, 25, 3), and which are missing (N, 25): NaN there, and without information.
 
     Half of what is missing goes with its whole limb, half singly.

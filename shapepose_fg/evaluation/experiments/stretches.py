@@ -30,7 +30,7 @@ STRETCHES: dict[Split, dict[str, tuple[range, ...]]] = {
     },
 }
 """Stretches of the named sequences without a cut, 300 frames each."""
-QUICK_FRAMES = 6
+QUICK_FRAMES = 4
 """Frames of a scene that a quick run takes."""
 
 
