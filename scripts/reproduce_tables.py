@@ -15,17 +15,21 @@ names the commit that has the code that measured it.
 """
 
 import argparse
+import json
 import os
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
-from marked_tables import ROOT, write_table
 
-from shapepose_fg.evaluation.experiments.made_with import made_with
+from shapepose_fg.evaluation.experiments.made_with import fingerprint, made_with
 from shapepose_fg.evaluation.experiments.registry import experiments
 from shapepose_fg.evaluation.experiments.runner import Kept, measured
 from shapepose_fg.evaluation.experiments.stretches import Scale
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
 
 
 def main() -> None:
@@ -91,6 +95,24 @@ def has_words(name: str, words: str) -> bool:
     """Whether a case has all of these words in its name: "crowd 3 cameras" finds "crowd 6301 3 cameras 10 Hz"."""
     there, wanted = (re.split(r"[\s,:]+", each.casefold()) for each in (name, words))
     return set(wanted) <= set(there)
+
+
+def write_table(name: str, text: str, made_with: Mapping[str, str]) -> bool:
+    """Put `text` between the marks of `name` on each page that has them; returns whether one has.
+
+    The mark names the file in docs/made_with that says what it was made with.
+    """
+    marked = re.compile(rf"<!-- {re.escape(name)}( @\w+)? -->\n.*?(<!-- end -->)", re.DOTALL)
+    pages = {page: page.read_text(encoding="utf-8") for page in (ROOT / "README.md", *sorted(DOCS.glob("*.md")))}
+    pages = {page: old for page, old in pages.items() if marked.search(old) is not None}
+    digits = fingerprint(made_with)
+    for page, old in pages.items():
+        (DOCS / "made_with" / f"{digits}.json").write_text(
+            json.dumps(made_with, indent=1) + "\n", encoding="utf-8"
+        )
+        new = marked.sub(lambda found: f"<!-- {name} @{digits} -->\n\n{text}\n\n{found[2]}", old)
+        page.write_text(new, encoding="utf-8")
+    return len(pages) > 0
 
 
 if __name__ == "__main__":

@@ -130,8 +130,8 @@ def _bodies(folder: Path) -> People:
 
 
 _SHELF: dict[str, Callable[[Path], People]] = {
-    "**shapepose-fg, with time**": partial(_ours, mode="over time"),
-    "**shapepose-fg, without time**": partial(_ours, mode="frame by frame"),
+    "**shapepose-fg, with time**": lambda folder: _ours(folder, "over time"),
+    "**shapepose-fg, without time**": lambda folder: _ours(folder, "frame by frame"),
     "(ours) stage I alone": _stage_one,
     "(ours) bodies' joints": _bodies,
     "SMPL-only, of the same people and detections": _without_graph,
