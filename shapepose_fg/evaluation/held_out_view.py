@@ -1,16 +1,15 @@
 """Honest covariances without any truth: a view is left out, and what it saw is compared with the rest."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from factors import project_with_jacobian, sigma_px
 from shapepose_fg.core.camera import Camera, Rig
-from shapepose_fg.core.detections import Detections, DetectionSequence
+from shapepose_fg.core.detections import DetectionSequence, Recording
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.linearisation import MIN_DEPTH_M, ObservationConfig
 from shapepose_fg.evaluation.matching import match_people
 
@@ -22,30 +21,6 @@ INSIDE_95 = 5.991
 Array = NDArray[np.float64]
 Solve = Callable[[DetectionSequence, Rig], Reconstruction]
 """Reconstruct a recording: `reconstruct`, with the settings in it."""
-
-
-@dataclass(frozen=True)
-class WithoutView:
-    """A recording as if one camera had not been there."""
-
-    sequence: DetectionSequence
-    """The whole recording."""
-    view: int
-    """The camera that is left out; those after it move up by one."""
-
-    @property
-    def skeleton(self) -> Skeleton:
-        """The detector's joints."""
-        return self.sequence.skeleton
-
-    def __len__(self) -> int:
-        return len(self.sequence)
-
-    def __getitem__(self, frame: int, /) -> Detections:
-        detections = self.sequence[frame]
-        kept = detections.only(detections.view != self.view)
-        view = kept.view - (kept.view > self.view)
-        return Detections(view, kept.joint, kept.xy, kept.confidence, kept.pairs, kept.affinity)
 
 
 @dataclass(frozen=True)
@@ -63,6 +38,15 @@ class HeldOut:
         return float((self.squared <= INSIDE_95).mean()) if len(self.squared) > 0 else float("nan")
 
 
+def without_view(sequence: DetectionSequence, view: int) -> Recording:
+    """A recording as if one camera had not been there; those after it move up by one."""
+    frames = []
+    for frame in range(len(sequence)):
+        kept = sequence[frame].only(sequence[frame].view != view)
+        frames.append(replace(kept, view=kept.view - (kept.view > view)))
+    return Recording(sequence.skeleton, frames)
+
+
 def held_out(
     recording: DetectionSequence,
     rig: Rig,
@@ -76,7 +60,7 @@ def held_out(
     ValueError where `people` come without their observations.
     """
     others = Rig(tuple(camera for n, camera in enumerate(rig.cameras) if n != view), rig.up)
-    return compare_view(rig.cameras[view], view, people, solve(WithoutView(recording, view), others), config)
+    return compare_view(rig.cameras[view], view, people, solve(without_view(recording, view), others), config)
 
 
 def compare_view(

@@ -6,10 +6,10 @@ import pytest
 from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.evaluation.held_out_view import (
     INSIDE_95,
-    WithoutView,
     compare_view,
     held_out,
     squared_distances,
+    without_view,
 )
 from shapepose_fg.pipeline.pipeline import reconstruct
 from shapepose_fg.simulation import built_in_scene, simulate
@@ -33,7 +33,7 @@ def people(scene, recording):
 
 
 def test_a_recording_without_a_view(recording):
-    without = WithoutView(recording, 1)
+    without = without_view(recording, 1)
     assert len(without) == 4
     whole, part = recording[2], without[2]
     assert len(part) == (whole.view != 1).sum()
