@@ -41,6 +41,10 @@ def test_every_experiment_makes_a_table_of_plain_figures(name, tmp_path):
     assert any(re.search(r"\d", cell) for cell in rows[-1].split("|")[2:]), "no figure in the last row"
 
 
+def test_what_has_no_data_is_no_experiment():
+    assert [each.name for each in experiments(Scale())] == ["scenes", "who is there"]
+
+
 def counting(times: list[str], fails: str = "") -> Experiment:
     """Two cases that note down when they are measured; one of them may fail."""
 

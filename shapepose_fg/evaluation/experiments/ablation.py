@@ -70,7 +70,6 @@ def ablation(scale: Scale) -> Experiment:
     rows = {
         name: [case(f"{name} {stretch.label}", stretch, config) for stretch in scale.one_each(FRAMES)]
         for name, config in configurations(QUICK if scale.quick else tuple(SWITCHES))
-        if len(scale.stretches) > 0
     }
     return Experiment("ablation", rows, COLUMNS)
 

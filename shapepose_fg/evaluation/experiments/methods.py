@@ -51,7 +51,6 @@ def interactions(scale: Scale) -> Experiment:
     rows = {
         label: [Case(f"{label} {each.label}", partial(make, shorter(each, FRAMES))) for each in scale.stretches]
         for label, make in METHODS.items()
-        if len(scale.stretches) > 0
     }
     return Experiment("interactions", rows, COLUMNS)
 

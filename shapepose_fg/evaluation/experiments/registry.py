@@ -19,4 +19,4 @@ _EVERY = (
 
 def experiments(scale: Scale) -> Iterator[Experiment]:
     """Those whose data are there."""
-    return (found for make in _EVERY if len((found := make(scale)).rows) > 0)
+    return (found for make in _EVERY if len((found := make(scale)).cases) > 0)

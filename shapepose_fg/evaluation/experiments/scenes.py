@@ -137,7 +137,7 @@ def held_back(scale: Scale) -> Experiment:
     stretches = () if scale.mocap is None or scale.quick else held_back_stretches(scale.mocap)
     for name, config in MODES.items():
         cases = [case(f"{each.label} {name}", each, config) for each in stretches]
-        rows |= with_mean(cases, f"**mean, {name}**") if len(cases) > 0 else {}
+        rows |= with_mean(cases, f"**mean, {name}**")
     return Experiment("held back", rows, COLUMNS)
 
 
@@ -160,7 +160,7 @@ def foreign(scale: Scale) -> Experiment:
     """Truths with other bodies than the one that is fitted, and a detector with another skeleton."""
     rows = dict[str, list[Case]]()
     for label, (bodies, own_joints) in FOREIGN.items():
-        if len(scale.stretches) > 0 and not (scale.quick and label not in ("all of these", PEOPLE[0])):
+        if not scale.quick or label == "all of these":
             rows[label] = [
                 case(f"{label} {each.label}", replace(each, bodies=bodies, own_joints=own_joints))
                 for each in scale.one_each(100)
