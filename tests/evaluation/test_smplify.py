@@ -120,3 +120,4 @@ def test_scores_by_hand(scene):
     assert found[0.05] == pytest.approx([200 / 3, 50, 400 / 7])
     assert figures["mpjpe_mm"] == pytest.approx(80 / 3)
     assert (figures["missed"], figures["false_positives"]) == (1, 0)
+    assert (figures["precision_hip"], figures["recall_hip"]) == (100, 75)
