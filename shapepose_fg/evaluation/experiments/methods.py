@@ -46,7 +46,7 @@ class PlainPeople:
 
     frame: NDArray[np.integer]
     """(N,) frame of each row."""
-    joints: NDArray[np.float64]
+    joints: NDArray[np.floating]
     """(N, J, 3) metres; NaN where unknown."""
 
 
