@@ -13,7 +13,7 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.evaluation.opponent.triangulation import triangulate_robustly
+from shapepose_fg.evaluation.baseline.triangulation import triangulate_robustly
 
 Array = NDArray[np.float64]
 
@@ -74,8 +74,8 @@ class ArmErrors:
         return ArmErrors(arms, self.error_m[there], self.squared[there])
 
     def as_dict(self) -> dict[str, Any]:
-        """Medians in metres, shares in per cent; None where there is nothing to measure."""
-        figures = {"arms": len(self.arms)} | {f"{joint}_m": _median(self.of(joint).error_m) for joint in ARMS}
+        """Medians in millimetres, shares in per cent; None where there is nothing to measure."""
+        figures = {"arms": len(self.arms)} | {f"{joint}_mm": _median_mm(self.of(joint).error_m) for joint in ARMS}
         shares = {"arms_wrong": self.error_m > WRONG_M, "arms_inside_50": self.squared <= INSIDE_50}
         shares["arms_inside_95"] = self.squared <= INSIDE_95
         return figures | {
@@ -131,6 +131,6 @@ def _with_covariance(
     return AnnotatedArms(key[:, 0], key[:, 1], xyz, covariance, residual)
 
 
-def _median(errors: Array) -> float | None:
-    middle = float(np.median(errors)) if len(errors) > 0 else np.inf
+def _median_mm(errors: Array) -> float | None:
+    middle = 1e3 * float(np.median(errors)) if len(errors) > 0 else np.inf
     return middle if np.isfinite(middle) else None

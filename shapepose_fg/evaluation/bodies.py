@@ -20,24 +20,17 @@ _TWISTING = (
 """The bone that starts at the first joint, and the joint at its end."""
 
 
-def body_joints(people: Reconstruction, model: BodyModel | None = None) -> NDArray[np.float64]:
+def body_joints(people: Reconstruction) -> NDArray[np.float64]:
     """(N, J, 3) the joints of the fitted bodies, where the detector puts them; NaN where there is no body.
 
     The offsets are those that the run learnt (`run["keypoint_offsets"]`); without any, the model's own joints.
     """
-    model = BodyModel.default() if model is None else model
+    model = BodyModel.default()
     offsets = people.run.get("keypoint_offsets")
     if offsets is not None:
         model = model.with_keypoint_offsets(KeypointOffsets.from_dict(offsets))
     with torch.no_grad():
         return model.keypoints(_parameters(people, model)).double().numpy()
-
-
-def bone_joints(people: Reconstruction, model: BodyModel | None = None) -> NDArray[np.float64]:
-    """(N, 24, 3) SMPL's joints of the fitted bodies, where bones meet, metres; NaN where there is no body."""
-    model = BodyModel.default() if model is None else model
-    with torch.no_grad():
-        return model.joints(_parameters(people, model)).double().numpy()
 
 
 def statures(betas: NDArray[np.float64], model: BodyModel | None = None) -> NDArray[np.float64]:
@@ -46,20 +39,20 @@ def statures(betas: NDArray[np.float64], model: BodyModel | None = None) -> NDAr
     return statures_m(np.asarray(betas, dtype=np.float64), model.arrays)
 
 
-def bone_rotations(people: Reconstruction, model: BodyModel | None = None) -> NDArray[np.float64]:
+def bone_rotations(people: Reconstruction) -> NDArray[np.float64]:
     """(N, 24, 3, 3) world from bone, of every bone of the bodies; NaN where there is no body."""
-    model = BodyModel.default() if model is None else model
+    model = BodyModel.default()
     with torch.no_grad():
         return model.bone_rotations(_parameters(people, model)).double().numpy()
 
 
-def twists(rotations: NDArray[np.float64], model: BodyModel | None = None) -> NDArray[np.float64]:
+def twists(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
     """(T - 1, P, 8) by how many radians limbs turn about their own axes from one frame to the next.
 
     `rotations` (T, P, 24, 3, 3) are world from bone. The turn between two frames is a swing of the axis and a
     twist about it (swing-twist decomposition of the relative rotation, in the bone's frame).
     """
-    model = BodyModel.default() if model is None else model
+    model = BodyModel.default()
     rest = model.joints(BodyParameters.zeros(1, model.dtype))[0].double().numpy()
     bones, ends = (np.array([SMPL_24.index(limb[i]) for limb in _TWISTING]) for i in (0, 1))
     axis = rest[ends] - rest[bones]

@@ -1,16 +1,15 @@
 """Honest covariances without any truth: a view is left out, and what it saw is compared with the rest."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from factors import project_with_jacobian, sigma_px
 from shapepose_fg.core.camera import Camera, Rig
-from shapepose_fg.core.detections import Detections, DetectionSequence
+from shapepose_fg.core.detections import DetectionSequence, Recording
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.linearisation import MIN_DEPTH_M, ObservationConfig
 from shapepose_fg.evaluation.matching import match_people
 
@@ -25,35 +24,9 @@ Solve = Callable[[DetectionSequence, Rig], Reconstruction]
 
 
 @dataclass(frozen=True)
-class WithoutView:
-    """A recording as if one camera had not been there."""
-
-    sequence: DetectionSequence
-    """The whole recording."""
-    view: int
-    """The camera that is left out; those after it move up by one."""
-
-    @property
-    def skeleton(self) -> Skeleton:
-        """The detector's joints."""
-        return self.sequence.skeleton
-
-    def __len__(self) -> int:
-        return len(self.sequence)
-
-    def __getitem__(self, frame: int, /) -> Detections:
-        detections = self.sequence[frame]
-        kept = detections.only(detections.view != self.view)
-        view = kept.view - (kept.view > self.view)
-        return Detections(view, kept.joint, kept.xy, kept.confidence, kept.pairs, kept.affinity)
-
-
-@dataclass(frozen=True)
 class HeldOut:
     """What `held_out` found for one view."""
 
-    name: str
-    """The camera."""
     squared: Array
     """(M,) squared Mahalanobis distance of each candidate from where the other views put the joint."""
     unmatched: int
@@ -65,22 +38,29 @@ class HeldOut:
         return float((self.squared <= INSIDE_95).mean()) if len(self.squared) > 0 else float("nan")
 
 
+def without_view(sequence: DetectionSequence, view: int) -> Recording:
+    """A recording as if one camera had not been there; those after it move up by one."""
+    frames = []
+    for frame in range(len(sequence)):
+        kept = sequence[frame].only(sequence[frame].view != view)
+        frames.append(replace(kept, view=kept.view - (kept.view > view)))
+    return Recording(sequence.skeleton, frames)
+
+
 def held_out(
     recording: DetectionSequence,
     rig: Rig,
+    view: int,
     people: Reconstruction,
     solve: Solve,
     config: ObservationConfig,
-) -> list[HeldOut]:
-    """Solve without each camera in turn, and compare with what that camera saw of the `people` of the whole run.
+) -> HeldOut:
+    """Solve without a camera, and compare with what it saw of the `people` of the whole run.
 
     ValueError where `people` come without their observations.
     """
-    found = []
-    for view, camera in enumerate(rig.cameras):
-        others = Rig(tuple(other for other in rig.cameras if other is not camera), rig.up)
-        found.append(compare_view(camera, view, people, solve(WithoutView(recording, view), others), config))
-    return found
+    others = Rig(tuple(camera for n, camera in enumerate(rig.cameras) if n != view), rig.up)
+    return compare_view(rig.cameras[view], view, people, solve(without_view(recording, view), others), config)
 
 
 def compare_view(
@@ -91,31 +71,34 @@ def compare_view(
     Rows are matched frame by frame (Hungarian, mean joint distance under 0.5 m). Compared are detections that
     were given to a joint, those that were not used as long as they are near it.
     """
-    if len(people) == 0:
-        return HeldOut(camera.name, np.zeros(0), 0)
-    table = people.observations
-    if table is None:
+    if people.observations is None:
         raise ValueError("people come without observations: give what `reconstruct` returns, or load its folder")
+    table = people.observations
     xy, confidence = (values[:, :, view].astype(np.float64) for values in (table.xy, table.confidence))
     there = np.isfinite(xy).all(axis=-1) & (table.used[:, :, view] | _near(camera, xy, people.joints))
-    frames = np.unique(people.frame)
-    row = _row_of(people, frames)
-    joints = np.where((row >= 0)[..., None, None], people.joints[np.maximum(row, 0)], np.nan)
-    matches = match_people(without.frame, without.joints, joints, frames.tolist())
-    matched = row[matches.frame, matches.person]
-    pair, joint = np.nonzero(there[matched] & np.isfinite(without.joints[matches.row]).all(axis=-1))
-    ours, theirs = matched[pair], matches.row[pair]
-    squared = squared_distances(
-        camera,
-        xy[ours, joint],
-        confidence[ours, joint],
-        without.joints[theirs, joint],
-        without.covariance[theirs, joint],
-        config.scatter(people.joint_names.tolist())[joint],
-        config,
-    )
-    known = np.isfinite(squared)
-    return HeldOut(camera.name, squared[known], int(there.sum()) - int(known.sum()))
+    squared = [np.zeros(0)]
+    for frame in np.unique(people.frame).tolist():
+        ours, theirs = np.flatnonzero(people.frame == frame), np.flatnonzero(without.frame == frame)
+        matches = match_people(
+            np.zeros(len(theirs), dtype=np.intp), without.joints[theirs], people.joints[ours][None]
+        )
+        ours, theirs = ours[matches.person], theirs[matches.row]
+        pair, joint = np.nonzero(there[ours] & np.isfinite(without.joints[theirs]).all(axis=-1))
+        ours, theirs = ours[pair], theirs[pair]
+        squared.append(
+            squared_distances(
+                camera,
+                xy[ours, joint],
+                confidence[ours, joint],
+                without.joints[theirs, joint],
+                without.covariance[theirs, joint],
+                config.scatter(people.joint_names.tolist())[joint],
+                config,
+            )
+        )
+    found = np.concatenate(squared)
+    known = found[np.isfinite(found)]
+    return HeldOut(known, int(there.sum()) - len(known))
 
 
 def squared_distances(
@@ -158,14 +141,3 @@ def _near(camera: Camera, xy: Array, joints: Array) -> NDArray[np.bool_]:
 
 def _focal(camera: Camera) -> float:
     return float(camera.K[[0, 1], [0, 1]].mean())
-
-
-def _row_of(people: Reconstruction, frames: NDArray[np.integer]) -> NDArray[np.intp]:
-    """(T, P) row of each person of each frame in `people`; -1 where there are fewer than P."""
-    index = np.searchsorted(frames, people.frame)
-    order = np.argsort(index, kind="stable")
-    rank = np.empty(len(order), dtype=np.intp)
-    rank[order] = np.arange(len(order)) - np.searchsorted(index[order], index[order])
-    table = np.full((len(frames), int(rank.max(initial=-1)) + 1), -1)
-    table[index, rank] = np.arange(len(index))
-    return table

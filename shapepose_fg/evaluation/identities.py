@@ -1,4 +1,4 @@
-"""Whether an identity stays with its person: IDF1, switches, interruptions, tracks that are nobody."""
+"""Whether an identity stays with its person: IDF1, switches, false tracks."""
 
 from dataclasses import dataclass
 
@@ -7,6 +7,9 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from shapepose_fg.evaluation.matching import MAX_DISTANCE_M, Matches, pair_distance
+
+UNMATCHED = np.iinfo(np.int64).min
+"""Stands for no identity: any other number may be one."""
 
 
 @dataclass(frozen=True)
@@ -21,29 +24,17 @@ class IdentityMetrics:
     """People in frames in which they have a joint."""
     switches: int
     """Times that a person is matched with another identity than the last time."""
-    fragmentations: int
-    """Times that a person who was matched is not, and later is again."""
     tracks: int
     """Identities."""
-    tracks_of_nobody: int
-    """Identities at most half of whose rows are matched with anybody."""
-    longest_of_nobody: int
-    """The most rows of one identity that are matched with nobody."""
+    false_tracks: int
+    """Identities at most half of whose rows are matched with a person."""
+    longest_false_positive: int
+    """The most rows of one identity that are matched with no person."""
 
     @property
     def idf1(self) -> float:
         """2 IDTP / (rows + true people); NaN where there is neither (Ristani et al., 2016)."""
         return _share(2 * self.true_positives, self.rows + self.people_true)
-
-    @property
-    def id_precision(self) -> float:
-        """IDTP / rows."""
-        return _share(self.true_positives, self.rows)
-
-    @property
-    def id_recall(self) -> float:
-        """IDTP / true people."""
-        return _share(self.true_positives, self.people_true)
 
 
 def identity_metrics(
@@ -60,8 +51,8 @@ def identity_metrics(
     Row n has `identity` (N,), `joints` (N, J, 3) in metres and belongs to frame `index` (N,) of the truth, -1
     for a frame that is not scored. For IDF1 every identity is one person for good, and every person one identity,
     so that as many rows as possible are nearer than `max_distance_m` to theirs (Ristani et al., "Performance
-    Measures and a Data Set for Multi-Target, Multi-Camera Tracking", 2016). Switches and fragmentations go by
-    `matches`, which are made frame by frame.
+    Measures and a Data Set for Multi-Target, Multi-Camera Tracking", 2016). Switches go by `matches`, which are
+    made frame by frame.
     """
     scored = np.flatnonzero((index >= 0) & np.isfinite(joints.sum(axis=2)).any(axis=1))
     present = np.isfinite(truth.sum(axis=3)).any(axis=2)
@@ -76,41 +67,17 @@ def identity_metrics(
     best = linear_sum_assignment(together, maximize=True)
     matched = np.bincount(number[np.isin(scored, matches.row)], minlength=len(names))
     length = np.bincount(number, minlength=len(names))
-    by_frame = identity_table(matches, identity, truth.shape[:2])
+    by_frame = np.full(truth.shape[:2], UNMATCHED)
+    by_frame[matches.frame, matches.person] = identity[matches.row]
     return IdentityMetrics(
         true_positives=int(together[best].sum()),
         rows=len(scored),
         people_true=int(present.sum()),
-        switches=sum(_switches(column[column != NOBODY]) for column in by_frame.T),
-        fragmentations=sum(
-            _interruptions((column != NOBODY)[there]) for column, there in zip(by_frame.T, present.T, strict=True)
-        ),
+        switches=sum(int((np.diff(column[column != UNMATCHED]) != 0).sum()) for column in by_frame.T),
         tracks=len(names),
-        tracks_of_nobody=int((2 * matched <= length).sum()),
-        longest_of_nobody=int((length - matched).max(initial=0)),
+        false_tracks=int((2 * matched <= length).sum()),
+        longest_false_positive=int((length - matched).max(initial=0)),
     )
-
-
-NOBODY = np.iinfo(np.int64).min
-"""Stands for no identity: any other number may be one."""
-
-
-def identity_table(matches: Matches, identity: NDArray[np.integer], shape: tuple[int, int]) -> NDArray[np.int64]:
-    """(T, P) the identity with which each person is matched in each frame; `NOBODY` where with none."""
-    table = np.full(shape, NOBODY)
-    table[matches.frame, matches.person] = identity[matches.row]
-    return table
-
-
-def _switches(identities: NDArray[np.int64]) -> int:
-    """How often one is not the same as the last."""
-    return int((identities[1:] != identities[:-1]).sum())
-
-
-def _interruptions(matched: NDArray[np.bool_]) -> int:
-    """How often matched begins again."""
-    starts = int((matched[1:] & ~matched[:-1]).sum()) + int(matched[:1].sum())
-    return max(starts - 1, 0)
 
 
 def _share(part: float, whole: float) -> float:

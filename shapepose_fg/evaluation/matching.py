@@ -37,11 +37,11 @@ class Matches:
     person: NDArray[np.intp]
     """(M,) index of the person in the truth."""
     duplicated: NDArray[np.intp]
-    """Rows of predictions near a person whom another prediction already is."""
+    """Rows of predictions near a person who is matched with another prediction."""
     invented: NDArray[np.intp]
-    """Rows of predictions that are nobody."""
+    """Rows of predictions that are near no person."""
     missed: NDArray[np.intp]
-    """(K, 2) frame and person of the people whom no prediction is."""
+    """(K, 2) frame and person of the people who are matched with no prediction."""
 
 
 def match_people(
@@ -126,11 +126,11 @@ def _match_frame(
     near = cost[at_row, at_person] < max_distance_m
     at_row, at_person = at_row[near], at_person[near]
     left = np.setdiff1d(np.arange(len(rows)), at_row)
-    is_double = (cost[left] < max_distance_m).any(axis=1)
+    duplicate = (cost[left] < max_distance_m).any(axis=1)
     missing = np.setdiff1d(people, people[at_person])
     return (
         np.stack([rows[at_row], np.full(len(at_row), index), people[at_person]], axis=1),
-        rows[left[is_double]],
-        rows[left[~is_double]],
+        rows[left[duplicate]],
+        rows[left[~duplicate]],
         np.stack([np.full(len(missing), index), missing], axis=1),
     )

@@ -2,11 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.table import Table
 from scipy.special import gammaincinv
 
 from shapepose_fg.evaluation.matching import Matches, People, match_people
@@ -27,7 +25,7 @@ class JointMetrics:
     joints_correct: int
     """Predicted joints within 0.2 m of the true joint of the person they are matched with."""
     joints_predicted: int
-    """Predicted joints, of people who are nobody too."""
+    """Predicted joints, of false positives too."""
     joints_true: int
     """Joints that the truth knows."""
     mpjpe_mm: float
@@ -35,11 +33,11 @@ class JointMetrics:
     people_true: int
     """People who were there."""
     people_found: int
-    """People whom a prediction is (mean joint distance under 0.5 m)."""
+    """People who are matched with a prediction (mean joint distance under 0.5 m)."""
     people_duplicated: int
     """Further predictions of people who were found already."""
     people_invented: int
-    """Predictions that are nobody."""
+    """Predictions that are near no person."""
 
     @property
     def precision(self) -> float:
@@ -58,45 +56,18 @@ class JointMetrics:
 
     @property
     def people_missed(self) -> int:
-        """People whom no prediction is."""
+        """People who are matched with no prediction."""
         return self.people_true - self.people_found
 
     @property
+    def false_positives(self) -> int:
+        """Predictions that are matched with no person: duplicates, and people who are not there."""
+        return self.people_duplicated + self.people_invented
+
+    @property
     def everyone_once(self) -> bool:
-        """Whether every person was found in every frame, exactly once, and nobody else."""
+        """Whether every person was found in every frame, exactly once, and there was no false positive."""
         return self.people_missed == self.people_duplicated == self.people_invented == 0
-
-    def as_dict(self) -> dict[str, Any]:
-        """The figures under plain names, for JSON; None where there is nothing to measure."""
-        figures = {
-            "precision": self.precision,
-            "recall": self.recall,
-            "f1": self.f1,
-            "mpjpe_mm": self.mpjpe_mm,
-        }
-        counts = {
-            "people": self.people_true,
-            "people_found": self.people_found,
-            "people_missed": self.people_missed,
-            "people_duplicated": self.people_duplicated,
-            "people_invented": self.people_invented,
-        }
-        return {name: value if np.isfinite(value) else None for name, value in figures.items()} | counts
-
-    def table(self, title: str = "Joints against the truth") -> Table:
-        """The figures for a terminal."""
-        table = Table(title=title, show_header=False)
-        table.add_column("figure")
-        table.add_column("value", justify="right")
-        table.add_row("precision at 0.2 m", _cell(100 * self.precision, " %"))
-        table.add_row("recall at 0.2 m", _cell(100 * self.recall, " %"))
-        table.add_row("F1", _cell(100 * self.f1, " %"))
-        table.add_row("MPJPE", _cell(self.mpjpe_mm, " mm"))
-        table.add_section()
-        table.add_row("people found", f"{self.people_found} of {self.people_true}")
-        table.add_row("found twice", str(self.people_duplicated))
-        table.add_row("invented", str(self.people_invented))
-        return table
 
 
 def joint_metrics(
@@ -137,10 +108,10 @@ def metrics_of(
     true_known = np.isfinite(truth.sum(axis=3))
     distance = np.linalg.norm(joints[matches.row] - truth[matches.frame, matches.person], axis=2)
     both = np.isfinite(distance)
-    strangers = np.concatenate([matches.duplicated, matches.invented])
+    false = np.concatenate([matches.duplicated, matches.invented])
     return JointMetrics(
         joints_correct=int((distance <= correct_m).sum()),
-        joints_predicted=int(both.sum() + np.isfinite(joints[strangers]).all(axis=2).sum()),
+        joints_predicted=int(both.sum() + np.isfinite(joints[false]).all(axis=2).sum()),
         joints_true=int(true_known.sum()),
         mpjpe_mm=1e3 * float(distance[both].mean()) if both.any() else float("nan"),
         people_true=int(true_known.any(axis=2).sum()),
@@ -167,25 +138,6 @@ class CovarianceCalibration:
     def mean_nees(self) -> float:
         """3 if the covariances are true; more if they promise too much; NaN without joints."""
         return float(self.nees.mean()) if len(self.nees) else float("nan")
-
-    @property
-    def median_nees(self) -> float:
-        """2.37 if the covariances are true; does not see outliers."""
-        return float(np.median(self.nees)) if len(self.nees) else float("nan")
-
-    def table(self, title: str = "Covariances against the truth") -> Table:
-        """The figures for a terminal."""
-        table = Table(title=title)
-        for heading in ("figure", "measured", "if true"):
-            table.add_column(heading, justify="left" if heading == "figure" else "right")
-        table.add_row("joints", str(len(self.nees)), "")
-        table.add_row("mean NEES", _cell(self.mean_nees), "3.00")
-        table.add_row("median NEES", _cell(self.median_nees), f"{_chi_squared_3(0.5):.2f}")
-        for level, share in self.coverage.items():
-            table.add_row(
-                f"inside the {100 * level:.0f} % ellipsoid", _cell(100 * share, " %"), f"{100 * level:.0f} %"
-            )
-        return table
 
 
 def covariance_calibration(
@@ -230,7 +182,3 @@ def _chi_squared_3(level: float) -> float:
 
 def _share(part: float, whole: float) -> float:
     return float(part / whole) if whole > 0 else float("nan")
-
-
-def _cell(value: float, unit: str = "") -> str:
-    return f"{value:.2f}{unit}" if np.isfinite(value) else "-"

@@ -6,6 +6,7 @@ narrows.
 """
 
 import math
+import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,17 +18,21 @@ from shapepose_fg.body.fitting.energy import BodyEnergy, robust_weight
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.pose_prior import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
+from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.rotation import log_so3
 from shapepose_fg.body.model.target_skeletons import slots
-from shapepose_fg.core.camera import Rig
+from shapepose_fg.body.threads import torch_threads
+from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.estimation.linearisation import ObservationConfig, triangulate
 
 Array = NDArray[np.float64]
 
 TORSO = ("Neck", "RShoulder", "LShoulder", "MidHip", "RHip", "LHip")
 """What the root is found by."""
 _MOMENTUM, _MEMORY, _TINY = 0.8, 0.95, 1e-8
-"""Adam's averages, as in `gradient_descent.py`."""
+"""Adam's averages."""
 _MIN_DEPTH_M = 0.2
 _START_SIGMA_M = 0.05
 _MIN_START_JOINTS = 3
@@ -69,6 +74,36 @@ class SmplifyPeople:
     """The bodies, NaN where there is none."""
     iterations: int
     """Steps that each body took."""
+
+
+@dataclass(frozen=True)
+class SmplOnly:
+    """SMPL-only beside a result without time, row by row, from the same detections."""
+
+    people: SmplifyPeople
+    """Bodies fitted to the detections directly."""
+    triangulated: Array
+    """(N, J, 3) X_0: robust triangulation of the views alone, metres; NaN where no two views agree."""
+    cpu_s: float
+    """Processor time of the fit of all rows, seconds."""
+
+
+def smpl_only(people: Reconstruction, rig: Rig, config: ObservationConfig) -> SmplOnly:
+    """SMPL-only on the people and detections of a result without time.
+
+    `config` is how that triangulated. ValueError where the result does not say what it was solved from.
+    """
+    if people.observations is None:
+        raise ValueError("people without observations: reconstruct them again")
+    observations = people.observations.observations(np.full_like(people.joints, np.nan), people.time_s)
+    offsets, model = people.run.get("keypoint_offsets"), BodyModel.default()
+    if offsets is not None:
+        model = model.with_keypoint_offsets(KeypointOffsets.from_dict(offsets))
+    start, fitter = triangulate(observations, Views.of(rig), config), MultiViewSmplify(model)
+    with torch_threads(1):
+        began = time.process_time()
+        fitted = fitter.fit(observations, rig, start)
+        return SmplOnly(fitted, start, time.process_time() - began)
 
 
 class MultiViewSmplify:

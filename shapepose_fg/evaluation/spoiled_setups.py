@@ -25,7 +25,7 @@ class Spoiled:
     kind: Kind
     """What the check should name."""
     cameras: tuple[int, ...]
-    """Whom it should name; empty where the mistake is nobody's, or everybody's."""
+    """The cameras that it should name; empty where the mistake is of none, or of all."""
     amount: float | None = None
     """Frames that should be named, within one."""
 

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.evaluation.bodies import TWIST_JUMP, body_joints, bone_rotations, statures, twists
 from shapepose_fg.evaluation.identities import IdentityMetrics, identity_metrics
@@ -19,14 +18,11 @@ from shapepose_fg.evaluation.metrics import (
     metrics_of,
 )
 from shapepose_fg.evaluation.trajectories import (
-    FOREARMS,
     LONG_UNSEEN,
     Chains,
     acceleration_errors,
     fast_joint_errors,
     frames_unseen,
-    limb_lengths,
-    spread_by_identity,
     velocities,
 )
 
@@ -43,12 +39,6 @@ class MotionScore:
     """Mean length of the difference between a joint's acceleration and the true one, m/s²."""
     fast_wrist_error_mm: float
     """Median error of the wrists whose truth is faster than 1.5 m/s, millimetres."""
-    fast_wrists: int
-    """How many those are."""
-    forearm_spread: float
-    """Standard deviation over mean of a forearm's length, the mean over identities and sides."""
-    limb_spread: float
-    """The same of all upper and lower arms and legs."""
 
 
 @dataclass(frozen=True)
@@ -56,11 +46,9 @@ class TrackingScore:
     """What `score_tracks` found."""
 
     joints: JointMetrics
-    """Precision, recall, F1 at 0.2 m, MPJPE, people found twice or invented."""
-    some_joints: JointMetrics | None
-    """The same of the joints that were asked for apart, with the same matches; None where none were."""
+    """Precision, recall, F1 at 0.2 m, MPJPE, duplicates and other false positives."""
     identities: IdentityMetrics | None
-    """IDF1, switches, fragmentations, tracks; None where `person` is no identity."""
+    """IDF1, switches, tracks; None where `person` is no identity."""
     motion: MotionScore
     """The motion of the joints."""
     bodies: MotionScore
@@ -71,21 +59,9 @@ class TrackingScore:
     """Bones of bodies that turn about their own axis by 20 degrees more from a frame to the next than in truth."""
     velocity_error: float
     """Mean length of the difference between a joint's velocity and the true one, m/s; NaN without velocities."""
-    velocity: CovarianceCalibration
-    """Covariances of the velocities."""
-    seen: CovarianceCalibration
-    """Covariances of the joints of matched rows that two views or more see in that frame."""
-    one_view: CovarianceCalibration
-    """Covariances of those that one view sees."""
-    no_view: CovarianceCalibration
-    """Covariances of those that none sees."""
-    long_unseen: CovarianceCalibration
-    """Covariances of those that no view has seen in this frame and the nine before."""
-
-    @property
-    def rows_of_nobody(self) -> int:
-        """Rows that are matched with nobody: people found twice, and phantoms."""
-        return self.joints.people_duplicated + self.joints.people_invented
+    calibration: dict[str, CovarianceCalibration]
+    """Covariances of `velocity`, and of the joints of matched rows that two views or more see in that frame
+    (`seen`), one view (`one_view`), none (`no_view`), and none in this frame and the nine before (`unseen`)."""
 
     def as_dict(self) -> dict[str, Any]:
         """The figures under plain names, for tables and JSON; None where there is nothing to measure."""
@@ -93,34 +69,22 @@ class TrackingScore:
             "f1": 100 * self.joints.f1,
             "precision": 100 * self.joints.precision,
             "recall": 100 * self.joints.recall,
-            "f1_some_joints": np.nan if self.some_joints is None else 100 * self.some_joints.f1,
             "idf1": np.nan if self.identities is None else 100 * self.identities.idf1,
             "stature_spread_cm": 100 * self.stature_spread_m,
             "velocity_error": self.velocity_error,
         }
         for prefix, motion in {"": self.motion, "body_": self.bodies}.items():
             figures |= {f"{prefix}{name}": value for name, value in vars(motion).items()}
-        for name, calibration in self._calibrations.items():
+        counts = {"false_positives": self.joints.false_positives, "people_missed": self.joints.people_missed}
+        counts |= {"twist_jumps": self.twist_jumps}
+        for name, calibration in self.calibration.items():
             figures |= {f"{name}_inside_{100 * level:.0f}": 100 * s for level, s in calibration.coverage.items()}
             figures[f"{name}_log_score"] = calibration.log_score
-        return {name: float(v) if np.isfinite(v) else None for name, v in figures.items()} | self._counts()
-
-    @property
-    def _calibrations(self) -> dict[str, CovarianceCalibration]:
-        return {
-            "seen": self.seen,
-            "one_view": self.one_view,
-            "no_view": self.no_view,
-            "unseen": self.long_unseen,
-            "velocity": self.velocity,
-        }
-
-    def _counts(self) -> dict[str, int]:
-        counts = {"rows_of_nobody": self.rows_of_nobody, "people_missed": self.joints.people_missed}
-        counts |= {"twist_jumps": self.twist_jumps}
-        counts |= {f"joints_{name}": len(each.nees) for name, each in self._calibrations.items()}
-        names = ("tracks", "tracks_of_nobody", "longest_of_nobody", "switches", "fragmentations")
-        return counts if self.identities is None else counts | {n: getattr(self.identities, n) for n in names}
+            counts[f"joints_{name}"] = len(calibration.nees)
+        if self.identities is not None:
+            names = ("tracks", "false_tracks", "longest_false_positive", "switches")
+            counts |= {name: getattr(self.identities, name) for name in names}
+        return {name: float(v) if np.isfinite(v) else None for name, v in figures.items()} | counts
 
 
 def score_tracks(
@@ -130,15 +94,12 @@ def score_tracks(
     *,
     identities: bool = True,
     frames: Sequence[int] | range | None = None,
-    some_joints: Sequence[int] | None = None,
-    model: BodyModel | None = None,
 ) -> TrackingScore:
     """Compare `people` with the `truth` of a recording of `fps` frames a second (`truth_of`, or any result).
 
     `frames` are the frame numbers that are scored, by default those from the truth's first to its last. Without
     `identities` the column `person` only counts the people of a frame; what asks for one and the same person then
-    goes by the person of the truth with whom a row is matched. `some_joints` are indices of joints to be scored
-    apart. `model` is the body whose parameters `people` holds. ValueError for an identity twice in one frame.
+    goes by the person of the truth with whom a row is matched. ValueError for an identity twice in one frame.
     """
     numbers = _span(truth) if frames is None else np.asarray(frames, dtype=np.int64)
     true = joints_by_frame(truth, numbers)
@@ -148,71 +109,46 @@ def score_tracks(
     )
     found, index = people.rows(matches.row), frame_index(people.frame, numbers)
     views = views_used(found)
-    unseen = frames_unseen(views > 0, found.frame, chains.identity) >= LONG_UNSEEN
     error = found.joints - true[matches.frame, matches.person]
     moving = found.velocity - velocities(true, numbers, fps)[matches.frame, matches.person]
-    chosen = None if some_joints is None else list(some_joints)
+    classes = {
+        "seen": views >= 2,
+        "one_view": views == 1,
+        "no_view": views == 0,
+        "unseen": frames_unseen(views > 0, found.frame, chains.identity) >= LONG_UNSEEN,
+    }
+    calibration = {
+        name: covariance_calibration(error[those], found.covariance[those]) for name, those in classes.items()
+    }
     return TrackingScore(
         metrics_of(matches, people.joints, true),
-        None if chosen is None else metrics_of(matches, people.joints[:, chosen], true[:, :, chosen]),
         identity_metrics(matches, index, people.person, people.joints, true) if identities else None,
         motion=_motion(found.joints, true, chains, fps),
-        bodies=_motion(body_joints(found, model), true, chains, fps),
-        stature_spread_m=_widest(statures(found.betas, model), chains.identity),
-        twist_jumps=_twist_jumps(found, truth, numbers, chains, model),
+        bodies=_motion(body_joints(found), true, chains, fps),
+        stature_spread_m=_widest(statures(found.betas), chains.identity),
+        twist_jumps=_twist_jumps(found, truth, numbers, chains),
         velocity_error=_mean(np.linalg.norm(moving, axis=-1)),
-        velocity=covariance_calibration(moving, found.velocity_covariance),
-        **{
-            name: covariance_calibration(error[those], found.covariance[those])
-            for name, those in (
-                ("seen", views >= 2),
-                ("one_view", views == 1),
-                ("no_view", views == 0),
-                ("long_unseen", unseen),
-            )
-        },
+        calibration=calibration | {"velocity": covariance_calibration(moving, found.velocity_covariance)},
     )
-
-
-def stature_by_person(
-    people: Reconstruction, truth: Reconstruction, model: BodyModel | None = None
-) -> NDArray[np.float64]:
-    """(P,) median stature, metres, of the bodies matched with each person of the `truth`; NaN without any."""
-    frames = np.intersect1d(people.frame, truth.frame)
-    matches = match_people(people.frame, people.joints, joints_by_frame(truth, frames), frames.tolist())
-    height = statures(people.betas[matches.row], model)
-    count = len(np.unique(truth.person))
-    found = [height[(matches.person == person) & np.isfinite(height)] for person in range(count)]
-    return np.array([np.median(each) if len(each) > 0 else np.nan for each in found])
 
 
 def _motion(joints: Array, truth: Array, chains: Chains, fps: float) -> MotionScore:
     """Score `joints` (M, J, 3) of the matched rows, metres, against `truth` (T, P, J, 3)."""
     placed = chains.placed(joints)
     fast = fast_joint_errors(placed, truth, chains.frames, fps)
-    mean, sigma = spread_by_identity(limb_lengths(joints), chains.identity)
     return MotionScore(
         mpjpe_mm=1e3 * _mean(np.linalg.norm(placed - truth, axis=-1)),
         acceleration_error=_mean(acceleration_errors(placed, truth, chains.consecutive, fps)),
         fast_wrist_error_mm=1e3 * float(np.median(fast)) if len(fast) > 0 else float("nan"),
-        fast_wrists=len(fast),
-        forearm_spread=_mean((sigma / mean)[:, list(FOREARMS)]),
-        limb_spread=_mean(sigma / mean),
     )
 
 
-def _twist_jumps(
-    found: Reconstruction,
-    truth: Reconstruction,
-    frames: NDArray[np.int64],
-    chains: Chains,
-    model: BodyModel | None,
-) -> int:
+def _twist_jumps(found: Reconstruction, truth: Reconstruction, frames: NDArray[np.int64], chains: Chains) -> int:
     """Count of `TrackingScore.twist_jumps` of the matched rows `found`."""
     index, person = frame_index(truth.frame, frames), np.unique(truth.person, return_inverse=True)[1]
     rotations = np.full((*chains.consecutive.shape, 24, 3, 3), np.nan)
-    rotations[index[index >= 0], person[index >= 0]] = bone_rotations(truth, model)[index >= 0]
-    turned, true = twists(chains.placed(bone_rotations(found, model)), model), twists(rotations, model)
+    rotations[index[index >= 0], person[index >= 0]] = bone_rotations(truth)[index >= 0]
+    turned, true = twists(chains.placed(bone_rotations(found))), twists(rotations)
     jumps = (np.abs(turned) > TWIST_JUMP) & (np.abs(turned - true) > TWIST_JUMP)
     return int(jumps[chains.consecutive[1:]].sum())
 
@@ -254,13 +190,8 @@ def _span(truth: Reconstruction) -> NDArray[np.int64]:
 def _widest(values: Array, identity: NDArray[np.integer]) -> float:
     """The largest over identities of largest minus smallest value; NaN where there is none."""
     known = np.isfinite(values)
-    names, number = np.unique(identity[known], return_inverse=True)
-    if len(names) == 0:
-        return float("nan")
-    low, high = np.full(len(names), np.inf), np.full(len(names), -np.inf)
-    np.minimum.at(low, number, values[known])
-    np.maximum.at(high, number, values[known])
-    return float((high - low).max())
+    parts = [values[known & (identity == name)] for name in np.unique(identity[known])]
+    return max((float(np.ptp(part)) for part in parts), default=float("nan"))
 
 
 def _mean(values: Array) -> float:

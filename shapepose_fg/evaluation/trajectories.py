@@ -1,4 +1,4 @@
-"""How people move against the truth: accelerations, fast joints, lengths of limbs, joints long unseen."""
+"""How people move against the truth: accelerations, velocities, fast joints, joints long unseen."""
 
 from dataclasses import dataclass
 
@@ -6,19 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.evaluation.identities import NOBODY
+from shapepose_fg.evaluation.identities import UNMATCHED
 from shapepose_fg.evaluation.matching import Matches
 
 Array = NDArray[np.float64]
 
-LIMBS = (
-    *(("RShoulder", "RElbow"), ("RElbow", "RWrist"), ("LShoulder", "LElbow"), ("LElbow", "LWrist")),
-    *(("RHip", "RKnee"), ("RKnee", "RAnkle"), ("LHip", "LKnee"), ("LKnee", "LAnkle")),
-)
-"""Upper and lower arms and legs: what does not change its length."""
-LIMB_ENDS = tuple((BODY_25.index(first), BODY_25.index(second)) for first, second in LIMBS)
-FOREARMS = (1, 3)
-"""Which of `LIMBS` are forearms."""
 WRISTS = (BODY_25.index("RWrist"), BODY_25.index("LWrist"))
 FAST_M_S = 1.5
 """A wrist faster than this is where a smoother that is too stiff shows, metres a second."""
@@ -44,10 +36,10 @@ class Chains:
         cls, matches: Matches, frames: NDArray[np.int64], people: int, identity: NDArray[np.integer]
     ) -> "Chains":
         """From the matches, the truth's frame numbers (T,), its people, the `identity` (M,) of matched rows."""
-        who = np.full((len(frames), people), NOBODY)
+        who = np.full((len(frames), people), UNMATCHED)
         who[matches.frame, matches.person] = identity
         follows = np.zeros(who.shape, dtype=bool)
-        follows[1:] = (who[1:] != NOBODY) & (who[1:] == who[:-1]) & (np.diff(frames) == 1)[:, None]
+        follows[1:] = (who[1:] != UNMATCHED) & (who[1:] == who[:-1]) & (np.diff(frames) == 1)[:, None]
         return cls(matches, frames, identity.astype(np.int64), follows)
 
     def placed(self, values: Array) -> Array:
@@ -87,25 +79,6 @@ def fast_joint_errors(
     fast = np.linalg.norm(velocities(true, frames, fps), axis=-1) > FAST_M_S
     error = np.linalg.norm(placed[:, :, list(joints)] - true, axis=-1)
     return error[fast & np.isfinite(error)]
-
-
-def limb_lengths(joints: Array) -> Array:
-    """(N, 8) lengths of `LIMBS` in BODY_25's `joints` (N, 25, 3), metres."""
-    first, second = np.array(LIMB_ENDS).T
-    return np.linalg.norm(joints[:, first] - joints[:, second], axis=-1)
-
-
-def spread_by_identity(values: Array, identity: NDArray[np.integer]) -> tuple[Array, Array]:
-    """Mean and standard deviation (K, ...) of `values` (N, ...) over the rows of K identities; NaN left out."""
-    names, number = np.unique(identity, return_inverse=True)
-    known = np.isfinite(values)
-    count, total, square = (np.zeros((len(names), *values.shape[1:])) for _ in range(3))
-    np.add.at(count, number, known)
-    np.add.at(total, number, np.where(known, values, 0.0))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean = total / count
-        np.add.at(square, number, np.where(known, (values - mean[number]) ** 2, 0.0))
-        return mean, np.sqrt(square / count)
 
 
 def frames_unseen(seen: NDArray[np.bool_], frame: NDArray[np.integer], identity: NDArray[np.integer]) -> NDArray:

@@ -48,14 +48,12 @@ def seen(rig, people):
 
 def test_a_perfect_man(scene, truth):
     found = measure_single_person(truth, seen(scene.rig, truth), scene.rig, fps=scene.fps)
-    assert (found.frames, found.man_found, found.torn_limbs) == (40, 40, 0)
-    assert found.residual_px == pytest.approx(0.0, abs=1e-6)
-    assert found.bone_forearm_spread < 1e-5 < found.body_forearm_spread < 0.05  # one shape: bones keep, skin moves
-    height = truth.joints[:, [RSHOULDER, RWRIST], 2]
-    np.testing.assert_allclose(
-        found.wrist_below_shoulder_m, (height[:, 0] - height[:, 1])[ARM_UP.start : ARM_UP.stop]
-    )
-    assert (found.bystander_seen, found.bystander_found) == (0, 0)
+    assert (found["frames"], found["man_found"], found["torn_limbs"]) == (40, 40, 0)
+    assert found["residual_px"] == pytest.approx(0.0, abs=1e-6)
+    assert found["forearm_spread"] < 5  # per cent: bones keep their length, the skin over them moves
+    height = truth.joints[ARM_UP.start : ARM_UP.stop, [RSHOULDER, RWRIST], 2]
+    assert found["lowest_wrist_m"] == pytest.approx((height[:, 0] - height[:, 1]).max())
+    assert (found["bystander_seen"], found["bystander_found"]) == (0, 0)
 
 
 def test_a_forearm_torn_in_two_frames(scene, truth):
@@ -63,10 +61,10 @@ def test_a_forearm_torn_in_two_frames(scene, truth):
     joints[[5, 20], RWRIST] += 2.0 * (joints[[5, 20], RWRIST] - joints[[5, 20], BODY_25.index("RElbow")])
     torn = measure_single_person(replace(truth, joints=joints), seen(scene.rig, truth), scene.rig, fps=scene.fps)
     whole = measure_single_person(truth, seen(scene.rig, truth), scene.rig, fps=scene.fps)
-    assert torn.torn_limbs == 2
-    assert torn.forearm_spread > whole.forearm_spread + 0.1
-    assert torn.wrist_acceleration > whole.wrist_acceleration + 10
-    assert torn.body_forearm_spread == whole.body_forearm_spread
+    assert torn["torn_limbs"] == 2
+    assert torn["forearm_spread"] > whole["forearm_spread"] + 10
+    assert torn["wrist_acceleration"] > whole["wrist_acceleration"] + 10
+    assert torn["largest_acceleration"] > torn["wrist_acceleration"]
 
 
 def test_the_residual_is_that_of_the_nearest_detection(scene, truth):
@@ -83,10 +81,10 @@ def test_the_man_is_in_the_middle_and_missing_frames_are_missing(scene, truth):
     far = replace(truth, joints=truth.joints + np.array([4.0, 0, 0]))
     both = type(truth).concatenate([far, truth.rows(truth.frame != 7)])
     assert len(man_of(both, scene.rig)) == 39
-    assert measure_single_person(both, seen(scene.rig, truth), scene.rig).man_found == 39
+    assert measure_single_person(both, seen(scene.rig, truth), scene.rig)["man_found"] == 39
     nobody = measure_single_person(truth.rows(truth.frame < 0), seen(scene.rig, truth), scene.rig)
-    assert nobody.man_found == 0
-    assert nobody.as_dict()["forearm_spread"] is None
+    assert nobody["man_found"] == 0
+    assert nobody["forearm_spread"] is None
 
 
 def test_the_bystander(scene, truth):
@@ -100,8 +98,9 @@ def test_the_bystander(scene, truth):
     found = measure_single_person(
         type(truth).concatenate([truth, other.rows(other.frame < 10)]), recording, scene.rig
     )
-    assert found.man_found == 40
-    assert found.bystander_found == bystander_seen(recording, scene.rig)[:10].sum()
+    assert found["man_found"] == 40
+    seen_in = bystander_seen(recording, scene.rig)
+    assert found["bystander_found"] == pytest.approx(100 * seen_in[:10].sum() / seen_in.sum())
 
 
 def test_the_recording(shared_data):
@@ -113,5 +112,5 @@ def test_the_recording(shared_data):
     recording = read_detections(folder / "openpose", rig)
     some = Recording(recording.skeleton, [recording[t] for t in range(10)])
     found = measure_single_person(reconstruct(some, rig, PipelineConfig()), some, rig)
-    assert found.man_found >= 9
-    assert found.bystander_seen == 10
+    assert found["man_found"] >= 9
+    assert found["bystander_seen"] == 10

@@ -11,12 +11,9 @@ from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.linearisation import ObservationConfig, triangulate
-from shapepose_fg.evaluation.experiments.others import OTHERS, PlainPeople, mean_of, read_others, scored
+from shapepose_fg.evaluation.experiments.methods import PlainPeople, scored
 from shapepose_fg.evaluation.metrics import joint_metrics
-from shapepose_fg.evaluation.smpl_only import SamePeople
-from shapepose_fg.evaluation.smplify import MultiViewSmplify, SmplifyConfig, _ViewTargets
-from shapepose_fg.evaluation.stage_two import solve_alone
-from shapepose_fg.evaluation.true_candidates import true_observations
+from shapepose_fg.evaluation.smplify import MultiViewSmplify, SmplifyConfig, _ViewTargets, smpl_only
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.simulation import built_in_scene, simulate
 
@@ -98,45 +95,17 @@ def test_forces_are_the_slope_of_the_energy(scene, exact):
     np.testing.assert_allclose(forces.numpy(), xyz.grad.numpy() / 2, rtol=1e-6, atol=1e-6)
 
 
-@pytest.fixture(scope="module")
-def solved(scene):
-    detections, config = simulate(scene), replace(PipelineConfig(), temporal=False)
-    return detections, config, reconstruct(detections, scene.rig, config)
-
-
-def test_ours_from_the_same_detections_is_ours(scene, solved):
-    """Stage II alone, from what a run says it was given, ends where the run did, but for where it began."""
-    _, config, people = solved
-    same = SamePeople.of(people, scene.rig, config)
-    again = same.stage_two(scene.rig, config)
-    apart = np.linalg.norm(again.estimates.joints - people.joints, axis=-1)
-    assert np.nanmedian(apart) < 1e-3
-    assert np.nanpercentile(apart, 95) < 0.01
-    # Three steps of the network and one after it, in one to three alternations.
-    assert 4 <= again.body_steps <= 24
-    assert again.cpu_s > 0
-    bodies, spent = same.smpl_only(scene.rig)
-    assert spent > 0
-    assert (
-        joint_metrics(bodies, scene.keypoints).mpjpe_mm
-        < joint_metrics(PlainPeople(people.frame, same.triangulated), scene.keypoints).mpjpe_mm
-    )
-
-
-def test_the_truth_s_own_choice_is_a_ceiling(scene, solved):
-    detections, config, people = solved
-    rows = true_observations(detections, scene.rig, scene.keypoints, range(FRAMES))
-    assert len(rows) == FRAMES * scene.people
-    assert np.isnan(rows.initial).all()  # where the joints are is not told
-    xy = np.moveaxis(scene.rig.project(scene.keypoints.reshape(-1, 25, 3))[0], 0, 2)
-    depth = np.moveaxis(scene.rig.project(scene.keypoints.reshape(-1, 25, 3))[1], 0, 2)
-    away_m = np.linalg.norm(rows.xy - xy, axis=-1) * depth / scene.rig.focal_px
-    assert away_m[rows.seen].max() <= 0.12
-    assert rows.seen.mean() > 0.6
-    ceiling = solve_alone(rows, scene.rig, config, None)
-    best = joint_metrics(PlainPeople(rows.frame, ceiling.estimates.joints), scene.keypoints)
-    assert best.f1 >= joint_metrics(people, scene.keypoints).f1 - 1e-9
-    assert best.everyone_once
+def test_smpl_only_is_of_the_same_people_and_detections(scene):
+    """Fitted bodies are nearer to the truth than what the same detections are triangulated to."""
+    config = replace(PipelineConfig(), temporal=False)
+    people = reconstruct(simulate(scene), scene.rig, config)
+    same = smpl_only(people, scene.rig, config.observations)
+    assert same.cpu_s > 0
+    assert same.people.frame.tolist() == people.frame.tolist()
+    before = joint_metrics(PlainPeople(people.frame, same.triangulated), scene.keypoints)
+    assert joint_metrics(same.people, scene.keypoints).mpjpe_mm < before.mpjpe_mm
+    with pytest.raises(ValueError, match="without observations"):
+        smpl_only(replace(people, observations=None), scene.rig, config.observations)
 
 
 def test_scores_by_hand(scene):
@@ -144,19 +113,11 @@ def test_scores_by_hand(scene):
     joints = scene.keypoints[:1, :3].copy()
     joints[0, 0] += [0.08, 0, 0]
     figures = scored(PlainPeople(np.zeros(3, dtype=int), joints[0]), scene.keypoints[:1])
-    for which in ("common", "all"):
-        assert figures[which]["at"]["0.2"] == pytest.approx({"precision": 100, "recall": 75, "f1": 600 / 7})
-        assert figures[which]["at"]["0.05"] == pytest.approx({"precision": 200 / 3, "recall": 50, "f1": 400 / 7})
-        assert figures[which]["mpjpe_mm"] == pytest.approx(80 / 3)
-        assert (figures[which]["missed"], figures[which]["nobody"]) == (1, 0)
-    mean = mean_of([{"a": 1, "b": {"c": 2.0}, "d": None}, {"a": 2, "b": {"c": 4.0}, "d": 1.0}])
-    assert mean == {"a": 1.5, "b": {"c": 3.0}, "d": None}
-
-
-def test_results_of_others_are_found_by_their_folders(tmp_path):
-    assert read_others(tmp_path, "shelf") == {}
-    (tmp_path / "shelf").mkdir()
-    name = "Zhang et al. 2020, over time"
-    (tmp_path / "shelf" / OTHERS[name]).write_text("19 1\n0\n")
-    found = read_others(tmp_path, "shelf")
-    assert list(found) == [name] and len(found[name]) == 0
+    found = {
+        limit: [figures[f"{name}_{limit}"] for name in ("precision", "recall", "f1")] for limit in (0.2, 0.05)
+    }
+    assert found[0.2] == pytest.approx([100, 75, 600 / 7])
+    assert found[0.05] == pytest.approx([200 / 3, 50, 400 / 7])
+    assert figures["mpjpe_mm"] == pytest.approx(80 / 3)
+    assert (figures["missed"], figures["false_positives"]) == (1, 0)
+    assert (figures["precision_hip"], figures["recall_hip"]) == (100, 75)

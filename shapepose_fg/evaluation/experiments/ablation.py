@@ -1,24 +1,23 @@
 """What each thing is worth that we do differently from the paper: added to its method, and taken from ours."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import fields, is_dataclass, replace
-from functools import partial
 from operator import attrgetter
 from typing import Any
 
-from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
-from shapepose_fg.evaluation.experiments.scale import Scale, Stretch, shorter
-from shapepose_fg.evaluation.experiments.scene_scores import mean_of, solve_and_score
-from shapepose_fg.evaluation.markdown import rule
+from shapepose_fg.evaluation.experiments.experiment import Column, Experiment
+from shapepose_fg.evaluation.experiments.scenes import FRAME_BY_FRAME, OVER_TIME, case
+from shapepose_fg.evaluation.experiments.stretches import Scale
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 
 FRAMES = 30
 """Of each stretch."""
-
-OURS = replace(PipelineConfig(), temporal=False)
-"""What each is taken from: time stands in a row of its own."""
 PAPER = PipelineConfig.paper()
-"""What each is added to."""
+"""What each is added to; what each is taken from is ours frame by frame, as time stands in a row of its own."""
+COLUMNS = (
+    *(Column("F1, %", "f1"), Column("MPJPE, mm", "mpjpe_mm")),
+    *(Column("false positives", "false_positives", 0, "sum"), Column("missed", "people_missed", 0, "sum")),
+)
 
 SWITCHES: dict[str, tuple[str, ...]] = {
     "pairs whose rays pass each other": ("candidates.gate_m", "candidates.min_angle_deg"),
@@ -27,14 +26,14 @@ SWITCHES: dict[str, tuple[str, ...]] = {
     "what two views see is kept": ("candidates.weak", "candidates.min_view_fraction", "proposals.weak_anchors"),
     "people from pairs of 2D people, by evidence": ("proposals.evidence",),
     "60 % of the parts": ("proposals.min_parts",),
-    "phantoms end early": (
+    "false positives end early": (
         "proposals.min_grown_parts",
         "proposals.split_m",
         "association.min_observed_parts",
         "tracking.min_new_joints",
     ),
     "gaps are bridged": ("proposals.growth.bridge_m",),
-    "detections are given out again": ("windows.again_alone", "refine.draft_reach_m"),
+    "reassociation": ("windows.again_alone", "refine.draft_reach_m"),
     "around bodies that others' limbs do not pull": ("refine.draft_reach_m",),
     "X_0 is made complete": ("refine.complete_start",),
     "sigma as measured": (
@@ -66,47 +65,27 @@ QUICK = ("leave-one-out",)
 """The switches of a quick run."""
 
 
-def ablation(scale: Scale) -> Experiment | None:
-    """A row for each switch, the first two for none and for time."""
-    if not scale.has_scenes:
-        return None
-    stretches = [shorter(stretch, FRAMES) for stretch in scale.one_each]
-    configs = dict(configurations(QUICK if scale.quick else tuple(SWITCHES)))
-    cases = [
-        Case(_case_name(name, stretch), partial(_measure, stretch, config))
-        for stretch in stretches  # outside: it is simulated once
-        for name, config in configs.items()
-    ]
-
-    def table(figures: Mapping[str, Figures]) -> list[str]:
-        def cells(name: str) -> str:
-            m = mean_of(figures[_case_name(name, stretch)] for stretch in stretches)
-            return f"{m['f1']:.1f} | {m['error_mm']:.1f} | {m['nobody']:.0f} | {m['missed']:.0f}"
-
-        head = "F1, % | MPJPE, mm | nobody | missed"
-        rows = [f"| | the paper, with it: {head} | ours, without it: {head} |", rule(9)]
-        rows.append(f"| **nothing switched** | {cells('paper')} | {cells('ours')} |")
-        rows.append(f"| time (on the right: ours, with it) | {cells('paper + time')} | {cells('ours + time')} |")
-        for switch in SWITCHES:
-            if f"paper + {switch}" in configs:
-                rows.append(f"| {switch} | {cells(f'paper + {switch}')} | {cells(f'ours - {switch}')} |")
-        rows.append(f"| limbs are kept (over time) | - | - | - | - | {cells('ours + time - limbs')} |")
-        return rows
-
-    return Experiment("ablation", cases, table)
+def ablation(scale: Scale) -> Experiment:
+    """A row for each configuration, over one stretch of each sequence."""
+    rows = {
+        name: [case(f"{name} {stretch.label}", stretch, config) for stretch in scale.one_each(FRAMES)]
+        for name, config in configurations(QUICK if scale.quick else tuple(SWITCHES))
+    }
+    return Experiment("ablation", rows, COLUMNS)
 
 
 def configurations(switches: Sequence[str]) -> Iterator[tuple[str, PipelineConfig]]:
     """Everything that is measured, by name."""
-    yield "paper", PAPER
-    yield "ours", OURS
-    yield "paper + time", replace(PAPER, temporal=True)
-    over_time = PipelineConfig()
-    yield "ours + time", over_time
-    yield "ours + time - limbs", replace(over_time, motion=replace(over_time.motion, keep_limbs=False))
+    yield "the paper", PAPER
+    yield "the paper + time", replace(PAPER, temporal=True)
     for name in switches:
-        yield f"paper + {name}", with_settings_of(PAPER, OURS, SWITCHES[name])
-        yield f"ours - {name}", with_settings_of(OURS, PAPER, SWITCHES[name])
+        yield f"the paper + {name}", with_settings_of(PAPER, FRAME_BY_FRAME, SWITCHES[name])
+    yield "ours, frame by frame", FRAME_BY_FRAME
+    yield "ours, over time", OVER_TIME
+    for name in switches:
+        yield f"ours - {name}", with_settings_of(FRAME_BY_FRAME, PAPER, SWITCHES[name])
+    without_limbs = replace(OVER_TIME, motion=replace(OVER_TIME.motion, keep_limbs=False))
+    yield "ours, over time - limbs are kept", without_limbs
 
 
 def with_settings_of(config: PipelineConfig, other: PipelineConfig, names: Sequence[str]) -> PipelineConfig:
@@ -131,11 +110,3 @@ def differing(one: Any, other: Any, prefix: str = "") -> list[str]:
 def _with(config: Any, name: str, value: Any) -> Any:
     first, _, rest = name.partition(".")
     return replace(config, **{first: _with(getattr(config, first), rest, value) if rest else value})
-
-
-def _case_name(name: str, stretch: Stretch) -> str:
-    return f"{name}, {stretch.label}"
-
-
-def _measure(stretch: Stretch, config: PipelineConfig) -> Figures:
-    return solve_and_score(stretch.scene, stretch.detections, config)

@@ -1,16 +1,17 @@
-"""What an experiment is: cases that are measured one by one, and the table that is made of their figures."""
+"""What an experiment is: cases that are measured one by one, and a table whose rows pool their figures."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+import numpy as np
+
 Figures = dict[str, Any]
-"""What a case measured: numbers, texts, lists and dicts of them, as JSON has them."""
+"""What a case measured: numbers and texts by name, None where there is nothing to measure; JSON holds them."""
+Basis = Literal["pipeline", "bodies"]
+"""What figures depend on: every setting and all data that ship, or only those of fitting bodies."""
 
-
-Basis = Literal["pipeline", "bodies", "detector"]
-"""What figures depend on: every setting and all data that ship, or only those of fitting bodies, or of the
-simulated detector."""
+_POOLED = {"mean": np.average, "least": np.min, "most": np.max, "sum": np.sum}
 
 
 @dataclass(frozen=True)
@@ -24,23 +25,65 @@ class Case:
 
 
 @dataclass(frozen=True)
+class Column:
+    """A column of the table."""
+
+    heading: str
+    """What stands above it."""
+    figure: str
+    """Which figure of the cases it shows."""
+    decimals: int = 1
+    """Digits after the point."""
+    pool: Literal["mean", "least", "most", "sum"] = "mean"
+    """What is made of the figures of a row's cases. Shares of joints of a class are weighted by their count."""
+
+    def cell(self, cases: Sequence[Figures]) -> str:
+        """What stands in a row of these cases; a dash where none has the figure."""
+        those = [case for case in cases if case.get(self.figure) is not None]
+        values = [case[self.figure] for case in those]
+        if len(values) == 0 or isinstance(values[0], str):
+            return values[0] if len(values) > 0 else "-"
+        if self.pool != "mean":
+            return f"{_POOLED[self.pool](values):.{self.decimals}f}"
+        count = f"joints_{self.figure.partition('_inside_')[0].removesuffix('_log_score')}"
+        weights = [case[count] for case in those] if all(case.get(count) for case in those) else None
+        return f"{np.average(values, weights=weights):.{self.decimals}f}"
+
+
+@dataclass(frozen=True)
 class Experiment:
     """A table of the documents."""
 
     name: str
     """That of its marks in the documents."""
-    cases: Sequence[Case]
-    """What is measured; the order is that of the time it is done in."""
-    table: Callable[[Mapping[str, Figures]], list[str]]
-    """The lines of Markdown that the figures of all cases, by name, make."""
+    rows: Mapping[str, Sequence[Case]]
+    """What a row is called, and the cases whose figures it pools; a case may be in several rows."""
+    columns: Sequence[Column]
+    """The table's columns but for the first, which has the names of the rows."""
     basis: Basis = "pipeline"
     """What makes the figures old when it changes."""
 
-    def only(self, cases: Sequence[Case]) -> "Experiment":
-        """The same with some of its cases."""
-        return replace(self, cases=cases)
+    @property
+    def cases(self) -> list[Case]:
+        """Every case once, in the order in which they are measured. ValueError for two of one name."""
+        every = {id(case): case for row in self.rows.values() for case in row}.values()
+        names = [case.name for case in every]
+        if len(set(names)) < len(names):
+            raise ValueError(f"{self.name}: two cases have one name: {sorted(names)}")
+        return list(every)
 
+    def only(self, wanted: Callable[[str], bool]) -> "Experiment":
+        """The same with the cases whose names are wanted."""
+        rows = {label: [case for case in row if wanted(case.name)] for label, row in self.rows.items()}
+        return replace(self, rows={label: row for label, row in rows.items() if len(row) > 0})
 
-def whole(name: str, table: Callable[[], list[str]], basis: Basis = "pipeline") -> Experiment:
-    """An experiment of one case, whose figures are the lines of its table."""
-    return Experiment(name, (Case("table", lambda: {"lines": table()}),), lambda f: f["table"]["lines"], basis)
+    def table(self, figures: Mapping[str, Figures]) -> list[str]:
+        """The lines of Markdown that the figures of all cases, by name, make."""
+        lines = [
+            f"| | {' | '.join(column.heading for column in self.columns)} |",
+            "|---" * (1 + len(self.columns)) + "|",
+        ]
+        for label, row in self.rows.items():
+            those = [figures[case.name] for case in row]
+            lines.append(f"| {label} | {' | '.join(column.cell(those) for column in self.columns)} |")
+        return lines

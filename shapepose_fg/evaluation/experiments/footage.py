@@ -1,203 +1,196 @@
-"""Real footage: Shelf's lost limbs as events, its cameras left out one by one, Pose2Sim's demo recording, and
-frames alone beside the same frames over time.
-"""
+"""Real footage: Shelf by its annotation, and by cameras that are left out; Pose2Sim's recording of one man."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
-from shapepose_fg.evaluation.alone_beside_time import beside
-from shapepose_fg.evaluation.annotated_arms import ANNOTATION, ARMS, measure_arms, read_annotated_arms
-from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
-from shapepose_fg.evaluation.experiments.scale import Scale
-from shapepose_fg.evaluation.footage import Footage, shelf_footage, single_footage
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.evaluation.alternation import before_refinement
+from shapepose_fg.evaluation.annotated_arms import ANNOTATION, measure_arms, read_annotated_arms
+from shapepose_fg.evaluation.baseline.over_time import over_time
+from shapepose_fg.evaluation.baseline.people import FoundPeople, find_everybody
+from shapepose_fg.evaluation.bodies import body_joints
+from shapepose_fg.evaluation.experiments.experiment import Case, Column, Experiment, Figures
+from shapepose_fg.evaluation.experiments.scenes import FRAME_BY_FRAME, MODES, OVER_TIME
+from shapepose_fg.evaluation.experiments.stretches import Scale
+from shapepose_fg.evaluation.footage import SHELF_FPS, Footage, shelf_footage, single_footage
 from shapepose_fg.evaluation.held_out_view import held_out
-from shapepose_fg.evaluation.markdown import rule
-from shapepose_fg.evaluation.shelf import evaluate_shelf, match_actors, read_shelf_ground_truth
-from shapepose_fg.evaluation.shelf_events import identity_switches, lost_limbs, pcp_interval
+from shapepose_fg.evaluation.matching import People
+from shapepose_fg.evaluation.shelf import ACTORS, LIMB_NAMES, ShelfScore, evaluate_shelf, read_shelf_ground_truth
 from shapepose_fg.evaluation.single_person import man_of, measure_single_person
+from shapepose_fg.evaluation.smplify import smpl_only
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 
 QUICK = range(20)
 """Frames of a recording that a quick run takes."""
-SINGLE = {
-    "frames with the man, of all": lambda f: f"{f['man_found']} of {f['frames']}",
-    "limbs over 1.25 times their own median": lambda f: str(f["torn_limbs"]),
-    "forearm, standard deviation over mean: joints, %": lambda f: f"{f['forearm_spread']:.2f}",
-    "the same of the bodies' points where the detector puts elbow and wrist, %": lambda f: (
-        f"{f['body_forearm_spread']:.2f}"
+SHELF_COLUMNS = (
+    *(Column(f"actor {actor + 1}", f"actor_{actor + 1}", 2) for actor in ACTORS),
+    *(Column("Avg", "average", 2), Column("all limbs", "pooled", 2)),
+    *(
+        Column("MPJPE, mm", "mpjpe_mm"),
+        Column("recall at 0.2 m, %", "recall", 2),
+        Column("people found", "found", 0),
     ),
-    "the same of the bodies' bones, %": lambda f: f"{f['bone_forearm_spread']:.2f}",
-    "wrists, mean acceleration, m/s²": lambda f: f"{f['wrist_acceleration']:.1f}",
-    "wrists, largest acceleration, m/s²": lambda f: f"{f['largest_wrist_acceleration']:.0f}",
-    "raised wrist under the shoulder, at the most, m": lambda f: f"{f['lowest_wrist_m']:.3f}",
-    "arms to the nearest detection, median, px": lambda f: f"{f['residual_px']:.2f}",
-    "bystander found, of the frames in which two views have five joints, %": lambda f: (
-        f"{f['bystander_found']:.0f}"
-    ),
+)
+LIMB_COLUMNS = tuple(Column(heading, heading, 0) for heading in ("actor 1", "actor 2", "actor 3", "lost"))
+ZHANG = {
+    "Zhang et al. 2020, with time": (99.47, 99.47, 96.45, 98.46),
+    "Zhang et al. 2020, without time": (96.34, 92.11, 96.13, 94.86),
 }
-"""What a row is called, and its words."""
-ANNOTATED = {
-    "annotated elbows and wrists: right elbow, right wrist, left elbow, left wrist, median error, mm": lambda f: (
-        ", ".join("-" if f[f"{joint}_m"] is None else f"{1000 * f[f'{joint}_m']:.0f}" for joint in ARMS)
+"""The strongest other method: what its results on these frames and detections score, actors 1 to 3 and Avg."""
+SINGLE_COLUMNS = (
+    *(Column("frames with the man", "man_found", 0), Column("of", "frames", 0)),
+    Column("limbs over 1.25 times their own median", "torn_limbs", 0),
+    Column("forearm, standard deviation over mean, %", "forearm_spread", 2),
+    *(
+        Column("wrists, mean acceleration, m/s²", "wrist_acceleration"),
+        Column("largest", "largest_acceleration", 0),
     ),
-    "further than 20 cm, %": lambda f: f"{f['arms_wrong']:.1f} of {f['arms']}",
-    "inside the 50 and 95 % ellipsoids, %": lambda f: f"{f['arms_inside_50']:.1f} / {f['arms_inside_95']:.1f}",
+    Column("raised wrist under the shoulder, at the most, m", "lowest_wrist_m", 3),
+    Column("arms to the nearest detection, median, px", "residual_px", 2),
+    Column("bystander found, %", "bystander_found", 0),
+    *(
+        Column(f"{side} {joint}, median error, mm", f"{side[0].upper()}{joint.capitalize()}_mm", 0)
+        for side in ("right", "left")
+        for joint in ("elbow", "wrist")
+    ),
+    Column("further than 20 cm, %", "arms_wrong"),
+    *(Column("inside 50 %, %", "arms_inside_50"), Column("inside 95 %, %", "arms_inside_95")),
+)
+"""The last seven are of elbows and wrists that were annotated by hand."""
+
+
+def shelf(scale: Scale) -> Experiment:
+    """PCP of ours, of steps of it, and of others on the whole recording."""
+    rows = dict[str, list[Case]]()
+    if scale.shelf is not None and not scale.quick:
+        rows = {name: [Case(name, partial(_scores, scale.shelf, name))] for name in _SHELF}
+        for name, (*actors, average) in ZHANG.items():
+            figures = {f"actor_{n}": value for n, value in enumerate(actors, 1)} | {"average": average}
+            rows[name] = [Case(name, partial(dict, figures))]
+    return Experiment("shelf", rows, SHELF_COLUMNS)
+
+
+def shelf_limbs(scale: Scale) -> Experiment:
+    """How many of each actor's limbs are right, over time."""
+    folder = None if scale.quick else scale.shelf
+    rows = {
+        name: [Case(name, partial(_limb, folder, n))] for n, name in enumerate(LIMB_NAMES) if folder is not None
+    }
+    return Experiment("shelf limbs", rows, LIMB_COLUMNS)
+
+
+def views(scale: Scale) -> Experiment:
+    """Shelf solved without each of its cameras: what it saw against the 95 % regions of the rest."""
+    rows = {}
+    if scale.shelf is not None:
+        cameras = shelf_footage(scale.shelf).rig.names
+        rows = {name: [Case(name, partial(_view, scale, view))] for view, name in enumerate(cameras)}
+    columns = (
+        *(Column("inside the 95 % region, %", "inside"), Column("of its candidates", "of", 0)),
+        Column("joints that the others do not place", "unmatched", 0),
+    )
+    return Experiment("views", rows, columns)
+
+
+def single(scale: Scale) -> Experiment:
+    """Pose2Sim's demo recording, whose truth is a few joints that were annotated by hand."""
+    there = scale.pose2sim_single is not None
+    rows = {name: [Case(name, partial(_single, scale, config))] for name, config in MODES.items() if there}
+    return Experiment("single", rows, SINGLE_COLUMNS)
+
+
+@cache
+def _ours(folder: Path, mode: str) -> Reconstruction:
+    return shelf_footage(folder).reconstruct(MODES[mode])
+
+
+@cache
+def _baseline(folder: Path) -> FoundPeople:
+    recording = shelf_footage(folder)
+    return find_everybody(recording.detections, recording.rig)
+
+
+def _without_graph(folder: Path) -> People:
+    """SMPL-only of the people and detections of ours frame by frame."""
+    people = _ours(folder, "frame by frame")
+    return smpl_only(people, shelf_footage(folder).rig, FRAME_BY_FRAME.observations).people
+
+
+def _stage_one(folder: Path) -> People:
+    recording = shelf_footage(folder)
+    return before_refinement(recording.detections, recording.rig, FRAME_BY_FRAME)
+
+
+def _bodies(folder: Path) -> People:
+    """The joints of the bodies in place of those of the graphs."""
+    people = _ours(folder, "frame by frame")
+    return replace(people, joints=body_joints(people))
+
+
+_SHELF: dict[str, Callable[[Path], People]] = {
+    "**shapepose-fg, with time**": lambda folder: _ours(folder, "over time"),
+    "**shapepose-fg, without time**": lambda folder: _ours(folder, "frame by frame"),
+    "(ours) stage I alone": _stage_one,
+    "(ours) bodies' joints": _bodies,
+    "SMPL-only, of the same people and detections": _without_graph,
+    "baseline, with time": lambda folder: over_time(_baseline(folder), SHELF_FPS),
+    "baseline, without time": _baseline,
 }
-"""Rows about the joints that were annotated by hand."""
+"""What is measured on Shelf."""
 
 
-def shelf_events(scale: Scale) -> Experiment | None:
-    """Avg PCP with an interval over blocks of frames, lost limbs as events, identities that change."""
-    folder = scale.shelf
-    if folder is None:
-        return None
-    cases = [Case(name, partial(_shelf, scale, temporal)) for name, temporal in _MODES.items()]
-    return Experiment("shelf events", cases, _events_table)
+@cache
+def _score(folder: Path, name: str) -> ShelfScore:
+    return evaluate_shelf(_SHELF[name](folder), read_shelf_ground_truth(folder / "gt_dev.txt"))
 
 
-def held_out_views(scale: Scale) -> Experiment | None:
-    """Solve without each of Shelf's cameras: what it saw against the 95 % regions of the rest."""
-    return (
-        None if scale.shelf is None else Experiment("views", [Case("shelf", partial(_views, scale))], _view_table)
-    )
-
-
-def single_person(scale: Scale) -> Experiment | None:
-    """Pose2Sim's demo recording, which has no truth."""
-    folder = scale.pose2sim_single
-    if folder is None:
-        return None
-    return Experiment(
-        "single", [Case(name, partial(_single, scale, on)) for name, on in _MODES.items()], _single_table
-    )
-
-
-def alone_beside_time(scale: Scale) -> Experiment | None:
-    """Frames alone beside time on both recordings, and what the kernel of drafts is worth there."""
-    if scale.shelf is None or scale.pose2sim_single is None:
-        return None
-    return Experiment(
-        "beside time", [Case(name, partial(_beside, scale, name)) for name in _FOOTAGE], _beside_table
-    )
-
-
-_MODES = {"with time": True, "without time": False}
-
-
-def _shelf(scale: Scale, temporal: bool) -> Figures:
-    shelf = shelf_footage(_there(scale.shelf))
-    config = replace(PipelineConfig(), temporal=temporal)
-    people = shelf.reconstruct(config, _frames(scale, shelf))
-    truth = read_shelf_ground_truth(_there(scale.shelf) / "gt_dev.txt")
-    matched = match_actors(people, truth)
-    return {
-        "average": evaluate_shelf(people, truth).pcp_average,
-        "interval": list(pcp_interval(matched)),
-        "switches": identity_switches(matched, people.person) if temporal else None,
-        "lost": [str(event) for event in lost_limbs(matched)],
+def _scores(folder: Path, name: str) -> Figures:
+    score = _score(folder, name)
+    actors = {f"actor_{actor + 1}": float(score.pcp[actor]) for actor in ACTORS}
+    return actors | {
+        "average": score.pcp_average,
+        "pooled": score.pcp_pooled,
+        "mpjpe_mm": score.mpjpe_mm,
+        "recall": 100 * score.recall,
+        "found": score.people_found,
     }
 
 
-def _events_table(found: Mapping[str, Figures]) -> list[str]:
-    rows = []
-    for name, each in found.items():
-        low, high = each["interval"]
-        switches = "-" if each["switches"] is None else each["switches"]
-        cells = f"{each['average']:.2f} | {low:.1f} to {high:.1f} | {len(each['lost'])} | {switches}"
-        rows.append(f"| {name} | {cells} |")
-    head = (
-        "| Shelf | Avg PCP, % | 95 % interval over blocks of 15 frames | limbs lost, events | identity switches |"
-    )
-    lost = found.get("with time", {}).get("lost", [])
-    return [head, rule(5), *rows, "", "With time: " + "; ".join(lost) + "."]
+def _limb(folder: Path, limb: int) -> Figures:
+    score = _score(folder, next(iter(_SHELF)))
+    right, count = score.limbs_right[:, limb], score.limbs_all[:, limb]
+    words = {f"actor {actor + 1}": f"{right[actor]} of {count[actor]}" for actor in ACTORS}
+    return words | {"lost": int(count.sum() - right.sum())}
 
 
-def _views(scale: Scale) -> Figures:
-    shelf, config = shelf_footage(_there(scale.shelf)), PipelineConfig()
-    solve: Callable = partial(reconstruct, config=config, frames=_frames(scale, shelf), times=shelf.times)
-    people = solve(shelf.detections, shelf.rig)
-    cameras = held_out(shelf.detections, shelf.rig, people, solve, config.observations)
-    return {
-        camera.name: {"inside": 100 * camera.inside, "of": len(camera.squared), "unmatched": camera.unmatched}
-        for camera in cameras
-    }
+def _view(scale: Scale, view: int) -> Figures:
+    assert scale.shelf is not None
+    recording, people = shelf_footage(scale.shelf), _whole(scale)
+    solve = partial(reconstruct, frames=_frames(scale, recording), times=recording.times)
+    found = held_out(recording.detections, recording.rig, view, people, solve, OVER_TIME.observations)
+    return {"inside": 100 * found.inside, "of": len(found.squared), "unmatched": found.unmatched}
 
 
-def _view_table(found: Mapping[str, Figures]) -> list[str]:
-    rows = [
-        f"| {name} | {each['inside']:.1f} | {each['of']} | {each['unmatched']} |"
-        for name, each in found["shelf"].items()
-    ]
-    head = (
-        "| camera left out | inside the 95 % region, % | of its candidates | joints that the others do not place |"
-    )
-    return [head, rule(4), *rows]
+@cache
+def _whole(scale: Scale) -> Reconstruction:
+    assert scale.shelf is not None
+    recording = shelf_footage(scale.shelf)
+    return recording.reconstruct(frames=_frames(scale, recording))
 
 
-def _single(scale: Scale, temporal: bool) -> Figures:
-    single = single_footage(_there(scale.pose2sim_single))
-    frames = _frames(scale, single)
-    people = single.reconstruct(replace(PipelineConfig(), temporal=temporal), frames)
-    figures = measure_single_person(people, single.detections, single.rig).as_dict()
+def _single(scale: Scale, config: PipelineConfig) -> Figures:
+    assert scale.pose2sim_single is not None
+    recording = single_footage(scale.pose2sim_single)
+    frames = _frames(scale, recording)
+    people = recording.reconstruct(config, frames)
+    figures = measure_single_person(people, recording.detections, recording.rig)
     if not ANNOTATION.is_file():  # it is not installed
         return figures
-    arms = read_annotated_arms(ANNOTATION, single.rig).only(frames)
-    return figures | measure_arms(people.rows(man_of(people, single.rig)), arms).as_dict()
-
-
-def _single_table(found: Mapping[str, Figures]) -> list[str]:
-    asked = SINGLE | (ANNOTATED if all("arms" in each for each in found.values()) else {})
-    rows = [f"| {name} | {' | '.join(words(each) for each in found.values())} |" for name, words in asked.items()]
-    return [f"| pose2sim_single | {' | '.join(found)} |", rule(1 + len(found)), *rows]
-
-
-_FOOTAGE: dict[str, Callable[[Scale], Footage]] = {
-    "Shelf": lambda scale: shelf_footage(_there(scale.shelf)),
-    "pose2sim_single": lambda scale: single_footage(_there(scale.pose2sim_single)),
-}
-_REACHES_M = (PipelineConfig().refine.draft_reach_m, 0.0)
-"""`refine.draft_reach_m`: ours, and drafts without it."""
-
-
-def _beside(scale: Scale, name: str) -> Figures:
-    footage = _FOOTAGE[name](scale)
-    solve = partial(footage.reconstruct, frames=_frames(scale, footage))
-    default, figures = PipelineConfig(), {}
-    timed = solve(config=default)
-    wrists = [footage.detections.skeleton.joints.index(joint) for joint in ("RWrist", "LWrist")]
-    for reach_m in _REACHES_M:
-        refine = replace(default.refine, draft_reach_m=reach_m)
-        found = beside(solve(config=replace(default, temporal=False, refine=refine)), timed)
-        figures[f"{reach_m:g}"] = {
-            "share": 100 * found.share,
-            "wrists": 100 * float(found.apart[wrists].sum() / max(found.seen[wrists].sum(), 1)),
-            "seen": int(found.seen.sum()),
-            "missing": found.missing,
-        }
-    return figures
-
-
-def _beside_table(found: Mapping[str, Figures]) -> list[str]:
-    head = "joints elsewhere, % | wrists elsewhere, % | of joints | people missing"
-    rows = [f"| frames alone beside time | {' | '.join(f'{name}: {head}' for name in found)} |"]
-    rows.append(rule(1 + 4 * len(found)))
-    words = ("**the kernel narrows to 5 cm**", "drafts without it")
-    for reach_m, name in zip(_REACHES_M, words, strict=True):
-        cells = []
-        for each in (every[f"{reach_m:g}"] for every in found.values()):
-            cells += [f"{each['share']:.2f}", f"{each['wrists']:.1f}", f"{each['seen']}", f"{each['missing']}"]
-        rows.append(f"| {name} | {' | '.join(cells)} |")
-    return rows
+    arms = read_annotated_arms(ANNOTATION, recording.rig).only(frames)
+    return figures | measure_arms(people.rows(man_of(people, recording.rig)), arms).as_dict()
 
 
 def _frames(scale: Scale, footage: Footage) -> range:
-    count = len(footage.detections)
-    return range(min(len(QUICK), count)) if scale.quick else range(count)
-
-
-def _there(folder: Path | None) -> Path:
-    if folder is None:
-        raise ValueError("the recording is not there")
-    return folder
+    return range(len(footage.detections))[: len(QUICK) if scale.quick else None]

@@ -17,18 +17,20 @@ MadeWith = dict[str, str]
 """Value of every setting, as Python writes it, and the checksum of every file, by name."""
 
 _PACKAGE = Path(__file__).parents[2]
-_DATA = {"pipeline": ("body", "estimation", "simulation"), "bodies": ("body",), "detector": ("body", "simulation")}
-"""Rooms whose data decide: bodies, weights and priors; motion and scatter of joints; the simulated detector."""
+_DATA = {"pipeline": ("body", "estimation", "simulation"), "bodies": ("body",)}
+"""Folders whose data decide: bodies, weights and priors; motion and scatter of joints; the simulated detector."""
 _FILES = ("*.npz", "*.json", "*.safetensors")
 
 
 def made_with(basis: Basis = "pipeline") -> MadeWith:
     """The default settings and the data that ship, as far as they decide about figures of `basis`."""
-    settings = {"pipeline": PipelineConfig, "bodies": BodyConfig, "detector": DetectorConfig}[basis]()
-    found = _values(settings)
-    if basis == "pipeline":
-        found |= _values(DetectorConfig(), "detector.")
-    return found | {name: digest for room in _DATA[basis] for name, digest in _checksums(room).items()}
+    bodies_only = basis == "bodies"
+    found = (
+        _values(BodyConfig())
+        if bodies_only
+        else _values(PipelineConfig()) | _values(DetectorConfig(), "detector.")
+    )
+    return found | {name: digest for folder in _DATA[basis] for name, digest in _checksums(folder).items()}
 
 
 def changes(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
@@ -58,8 +60,8 @@ def _values(settings: Any, prefix: str = "") -> MadeWith:
 
 
 @cache
-def _checksums(room: str) -> MadeWith:
-    files = sorted(file for pattern in _FILES for file in (_PACKAGE / room).rglob(pattern))
+def _checksums(folder: str) -> MadeWith:
+    files = sorted(file for pattern in _FILES for file in (_PACKAGE / folder).rglob(pattern))
     return {
         file.relative_to(_PACKAGE).as_posix(): hashlib.sha256(file.read_bytes()).hexdigest()[:16] for file in files
     }

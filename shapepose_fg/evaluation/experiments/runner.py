@@ -54,16 +54,14 @@ class Kept:
         return f", {len(found)} kept, {sum(seconds for _, seconds in found):.0f} s" if len(found) > 0 else ""
 
     def _file(self, experiment: Experiment, case: Case) -> Path:
-        return self.folder / _word(experiment.name) / f"{_word(case.name)}.json"
+        experiment_, case_ = (re.sub(r"[^A-Za-z0-9.+-]+", "_", each.name) for each in (experiment, case))
+        return self.folder / experiment_ / f"{case_}.json"
 
 
 def measured(
     experiment: Experiment, kept: Kept, told: Callable[[str], None] = print
 ) -> tuple[dict[str, Figures], float]:
     """The figures of every case by name, and the seconds that all of them took, whenever that was."""
-    names = [_word(case.name) for case in experiment.cases]
-    if len(set(names)) < len(names):
-        raise ValueError(f"{experiment.name}: two cases have one name: {sorted(names)}")
     figures, seconds = dict[str, Figures](), 0.0
     for case in experiment.cases:
         found = None if kept.afresh else kept.get(experiment, case)
@@ -78,8 +76,3 @@ def measured(
         figures[case.name] = found[0]
         seconds += found[1]
     return figures, seconds
-
-
-def _word(name: str) -> str:
-    """A name as that of a file."""
-    return re.sub(r"[^A-Za-z0-9.+-]+", "_", name)

@@ -12,7 +12,7 @@ from shapepose_fg.proposal.people_2d import group_people
 
 @dataclass(frozen=True)
 class People2D:
-    """The S people whom the views of one frame see, each in one view."""
+    """The S people that the views of one frame see, each in one view."""
 
     found: Detections
     """What they are made of."""
@@ -38,7 +38,7 @@ class People2D:
 
 
 def people_in_views(found: Detections, joints: int, min_joints: int) -> People2D:
-    """Group the candidates of one frame; groups of fewer than `min_joints` of the `joints` are nobody."""
+    """Group the candidates of one frame; groups of fewer than `min_joints` of the `joints` are left out."""
     groups = [members for members in group_people(found) if len(members) >= min_joints]
     held = np.full((len(groups), joints), -1, dtype=np.intp)
     for place, members in enumerate(groups):

@@ -1,4 +1,4 @@
-"""The opponent over time: people linked from frame to frame, jumps taken out, gaps closed, joints smoothed."""
+"""The baseline over time: people linked from frame to frame, jumps taken out, gaps closed, joints smoothed."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, median_filter
 from scipy.optimize import linear_sum_assignment
 
-from shapepose_fg.evaluation.opponent.opponent import FoundPeople
+from shapepose_fg.evaluation.baseline.people import FoundPeople
 
 Array = NDArray[np.float64]
 
@@ -21,7 +21,7 @@ class OverTimeConfig:
     unseen_s: float = 0.5
     """Somebody who is not seen for longer ends."""
     shortest_s: float = 0.3
-    """Who is there for less was nobody."""
+    """Who is there for less is a false positive."""
     jump_m: float = 0.15
     """A joint so far from the median of seven frames is missing."""
     gap_s: float = 1.0
@@ -41,16 +41,14 @@ def over_time(people: FoundPeople, fps: float, config: OverTimeConfig | None = N
             continue
         frames = np.arange(people.frame[rows].min(), people.frame[rows].max() + 1)
         joints = np.full((len(frames), *people.joints.shape[1:]), np.nan)
-        views = np.zeros(joints.shape[:2], dtype=np.intp)
         joints[people.frame[rows] - frames[0]] = people.joints[rows]
-        views[people.frame[rows] - frames[0]] = people.views[rows]
-        parts.append((frames, np.full(len(frames), who), _smoothed(joints, fps, config), views))
+        parts.append((frames, np.full(len(frames), who), _smoothed(joints, fps, config)))
     if len(parts) == 0:
         none = np.zeros(0, dtype=np.int64)
-        return FoundPeople(none, none, people.joints[:0], people.views[:0], people.joint_names)
-    frame, who, joints, views = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return FoundPeople(none, none, people.joints[:0], people.joint_names)
+    frame, who, joints = (np.concatenate(part) for part in zip(*parts, strict=True))
     order = np.lexsort((who, frame))
-    return FoundPeople(frame[order], who[order], joints[order], views[order], people.joint_names)
+    return FoundPeople(frame[order], who[order], joints[order], people.joint_names)
 
 
 def _linked(people: FoundPeople, fps: float, config: OverTimeConfig) -> NDArray[np.int64]:

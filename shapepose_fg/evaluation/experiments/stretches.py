@@ -1,18 +1,21 @@
-"""How much an experiment measures: everything, for the documents, or a little, for the tests."""
+"""Stretches of simulated scenes, and how much is measured: everything for the documents, a little for tests."""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 
+import numpy as np
+
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.estimation.estimator import ExtraFactors
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
-from shapepose_fg.simulation import Scene, simulate
+from shapepose_fg.simulation import DetectorConfig, Scene, simulate
 from shapepose_fg.simulation.files import cut, cuts_of, named_scene
+from shapepose_fg.simulation.foreign import DETECTOR_S_OWN, people_of, recast
 from shapepose_fg.simulation.room import SequenceConfig
 from shapepose_fg.simulation.sequences import Split
+from shapepose_fg.simulation.truth import truth_of
 
 STRETCHES: dict[Split, dict[str, tuple[range, ...]]] = {
     "report": {
@@ -27,9 +30,8 @@ STRETCHES: dict[Split, dict[str, tuple[range, ...]]] = {
     },
 }
 """Stretches of the named sequences without a cut, 300 frames each."""
-
-QUICK_FRAMES = 6
-"""Frames of the scene that a quick run takes."""
+QUICK_FRAMES = 4
+"""Frames of a scene that a quick run takes."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,10 @@ class Stretch:
     """What a sequence is made of, in place of the named one's."""
     fps: float | None = None
     """Frames a second; None: the scene's own."""
+    bodies: str | None = None
+    """Whose bodies: one of `simulation.foreign.PEOPLE`. None: those of the body that is fitted."""
+    own_joints: bool = False
+    """Whether the detector's joints lie elsewhere than the body's (`DETECTOR_S_OWN`)."""
     mocap: Path | None = field(default=None, compare=False)
     """The recorded motions; None: where SHAPEPOSE_DATA says."""
 
@@ -62,31 +68,27 @@ class Stretch:
 
     @property
     def scene(self) -> Scene:
-        """The people and cameras."""
-        return _scene(self)
+        """The people, with the joints that the detector means, and the cameras."""
+        scene = _scene(self)
+        return scene.with_keypoint_offsets(DETECTOR_S_OWN) if self.own_joints else scene
 
     @property
     def detections(self) -> DetectionSequence:
         """What the simulated detector saw."""
         return _detections(self)
 
-    def reconstruct(
-        self,
-        config: PipelineConfig | None = None,
-        frames: range | None = None,
-        extra_factors: ExtraFactors | None = None,
-    ) -> Reconstruction:
-        """Reconstructed at the scene's rate; only `frames` of the stretch, if given."""
+    @property
+    def truth(self) -> Reconstruction:
+        """The people as a result, in which everybody is somebody else after a cut."""
+        truth = truth_of(self.scene)
+        segment = np.searchsorted(cuts_of(self.scene), truth.frame, side="right")
+        return replace(truth, person=truth.person + segment * (int(truth.person.max(initial=0)) + 1))
+
+    def reconstruct(self, config: PipelineConfig | None = None) -> Reconstruction:
+        """Reconstructed at the scene's rate."""
         scene = self.scene
-        return reconstruct(
-            self.detections,
-            scene.rig,
-            config,
-            frames=frames,
-            times=FrameTimes.from_fps(scene.fps, len(self.span)),
-            cuts=cuts_of(scene),
-            extra_factors=extra_factors,
-        )
+        times = FrameTimes.from_fps(scene.fps, len(self.span))
+        return reconstruct(self.detections, scene.rig, config, times=times, cuts=cuts_of(scene))
 
 
 @dataclass(frozen=True)
@@ -99,22 +101,25 @@ class Scale:
     """Folder with `data/`: recordings and motions. None: there are none."""
     split: Split = "report"
     """Choose on `tune`, report on `report`."""
+    seeds: tuple[int, ...] = tuple(range(6101, 6106))
+    """Of the sequences that are drawn anew (`who is there`)."""
 
     @cached_property
     def stretches(self) -> tuple[Stretch, ...]:
-        """The stretches; one each of the sequences in `one_each`."""
+        """Two of each sequence; none where there is nothing to simulate them from."""
         if self.quick:
             return (Stretch("demo", range(QUICK_FRAMES)),)
+        if self.mocap is None:
+            return ()
         return tuple(
             Stretch(name, span, self.split, mocap=self.mocap)
             for name, spans in STRETCHES[self.split].items()
             for span in spans
         )
 
-    @property
-    def one_each(self) -> tuple[Stretch, ...]:
-        """The first stretch of each sequence, for what takes long."""
-        return self.stretches if self.quick else self.stretches[::2]
+    def one_each(self, frames: int) -> tuple[Stretch, ...]:
+        """The first so many frames of the first stretch of each sequence, for what takes long."""
+        return tuple(shorter(each, frames) for each in self.stretches[::2])
 
     @property
     def shelf(self) -> Path | None:
@@ -133,14 +138,8 @@ class Scale:
         return None if folder is None else folder / "cmu_smpl24.npz"
 
     def _at(self, name: str) -> Path | None:
-        if self.data is None or not (self.data / "data" / name).is_dir():
-            return None
-        return self.data / "data" / name
-
-    @property
-    def has_scenes(self) -> bool:
-        """Whether there is anything to simulate stretches from."""
-        return self.quick or self.mocap is not None
+        folder = None if self.data is None else self.data / "data" / name
+        return folder if folder is not None and folder.is_dir() else None
 
 
 def shorter(stretch: Stretch, frames: int) -> Stretch:
@@ -148,18 +147,9 @@ def shorter(stretch: Stretch, frames: int) -> Stretch:
     return replace(stretch, span=stretch.span[:frames])
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=8)
 def _scene(stretch: Stretch) -> Scene:
-    if stretch.name == "demo":
-        whole = named_scene(
-            "demo",
-            cameras=stretch.cameras,
-            people=stretch.people,
-            frames=stretch.span.stop,
-            seed=stretch.seed,
-            fps=stretch.fps,
-        )
-        return cut(whole, stretch.span)
+    own = {"people": stretch.people, "seed": stretch.seed} if stretch.name == "demo" else {}
     whole = named_scene(
         stretch.name,
         split=stretch.split,
@@ -168,10 +158,13 @@ def _scene(stretch: Stretch) -> Scene:
         mocap=stretch.mocap,
         config=stretch.made,
         fps=stretch.fps,
+        **own,
     )
-    return cut(whole, stretch.span)
+    scene = cut(whole, stretch.span)
+    return scene if stretch.bodies is None else recast(scene, people_of(stretch.bodies, scene.people))
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=8)
 def _detections(stretch: Stretch) -> DetectionSequence:
-    return simulate(stretch.scene, seed=stretch.seed)
+    offsets = DETECTOR_S_OWN if stretch.own_joints else None
+    return simulate(_scene(stretch), DetectorConfig(offsets=offsets), stretch.seed)

@@ -1,4 +1,4 @@
-"""The opponent: 2D grouping, matches between views, triangulation, and time."""
+"""The baseline: 2D grouping, matches between views, triangulation, and time."""
 
 from dataclasses import replace
 
@@ -6,20 +6,18 @@ import numpy as np
 
 from shapepose_fg.core.detections import Recording
 from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.evaluation.baseline.cross_view import consistent_matches, geometric_affinity, people_of
+from shapepose_fg.evaluation.baseline.over_time import OverTimeConfig, over_time
+from shapepose_fg.evaluation.baseline.people import FoundPeople, find_everybody, people_in_frame
+from shapepose_fg.evaluation.baseline.people_2d import people_in_views
+from shapepose_fg.evaluation.baseline.reassociation import grown, nearest_given
+from shapepose_fg.evaluation.baseline.triangulation import triangulate_robustly
 from shapepose_fg.evaluation.metrics import joint_metrics
-from shapepose_fg.evaluation.opponent.cross_view import consistent_matches, geometric_affinity, people_of
-from shapepose_fg.evaluation.opponent.giving_out import grown, nearest_given
-from shapepose_fg.evaluation.opponent.opponent import FoundPeople, OpponentConfig, find_everybody, people_in_frame
-from shapepose_fg.evaluation.opponent.over_time import OverTimeConfig, over_time
-from shapepose_fg.evaluation.opponent.people_2d import people_in_views
-from shapepose_fg.evaluation.opponent.triangulation import triangulate_robustly
 from shapepose_fg.simulation import built_in_scene, simulate
 
 
 def test_what_is_seen_exactly_is_found_exactly(five_cameras, two_people, seen_exactly):
-    joints, agree = people_in_frame(
-        seen_exactly(five_cameras, two_people), five_cameras, BODY_25, OpponentConfig()
-    )
+    joints, agree = people_in_frame(seen_exactly(five_cameras, two_people), five_cameras, BODY_25)
     assert agree.all()
     order = np.argsort(joints[:, 8, 0])
     np.testing.assert_allclose(joints[order], two_people, atol=1e-6)
@@ -118,7 +116,7 @@ def walking(frames: int = 20) -> FoundPeople:
     one, other = body + step, body + np.array([0.8, 0.6, 0.0]) - step
     joints = np.stack([one, other], axis=1).reshape(-1, 25, 3)
     frame = np.repeat(np.arange(frames), 2)
-    return FoundPeople(frame, np.tile([0, 1], frames), joints, np.full((2 * frames, 25), 5))
+    return FoundPeople(frame, np.tile([0, 1], frames), joints)
 
 
 def test_people_keep_their_names_and_gaps_are_closed():
@@ -127,7 +125,7 @@ def test_people_keep_their_names_and_gaps_are_closed():
     joints[20, 4] = np.nan  # a wrist is missing for a frame,
     joints[24, 4] += 0.5  # and in another it jumps
     kept = np.arange(len(joints)) != 16  # nobody sees the first person in frame 8
-    gaps = FoundPeople(people.frame[kept], people.person[kept], joints[kept], people.views[kept])
+    gaps = FoundPeople(people.frame[kept], people.person[kept], joints[kept])
     found = over_time(gaps, 25.0, config)
     np.testing.assert_array_equal(found.frame, people.frame)
     np.testing.assert_array_equal(found.person, people.person)
@@ -145,10 +143,9 @@ def test_who_is_there_for_a_moment_was_nobody():
         frame=np.append(people.frame, [3, 4]),
         person=np.append(people.person, [2, 2]),
         joints=np.concatenate([people.joints, people.joints[:2] + np.array([0, 5, 0])]),
-        views=np.concatenate([people.views, people.views[:2]]),
     )
     order = np.argsort(ghost.frame, kind="stable")
-    ghost = FoundPeople(*(getattr(ghost, name)[order] for name in ("frame", "person", "joints", "views")))
+    ghost = FoundPeople(*(getattr(ghost, name)[order] for name in ("frame", "person", "joints")))
     found = over_time(ghost, 25.0, OverTimeConfig(nearest_m=0.3))
     assert len(np.unique(found.person)) == 2
     assert found.joints[..., 1].max() < 2

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.camera import Rig
-from shapepose_fg.evaluation.opponent.people_2d import People2D
+from shapepose_fg.evaluation.baseline.people_2d import People2D
 
 Array = NDArray[np.float64]
 
 _FAR_M = 0.5
-"""Rays that miss each other by more are equally wrong: one joint of somebody else must not decide."""
+"""Rays that miss each other by more are equally wrong: one joint of another person must not decide."""
 _MIN_SHARED = 3
 """Two who have fewer joints in common cannot be compared."""
 _MIN_SINE = np.sin(np.deg2rad(3.0))
@@ -110,7 +110,7 @@ def _at_most_one(rows: Array) -> Array:
 def people_of(matches: Array, view: NDArray[np.intp], least: float) -> list[NDArray[np.intp]]:
     """The 2D people (M,) who are one person, for everybody in two views or more.
 
-    Pairs in falling order of their match, down to `least`; a pair joins its two groups unless both have somebody
+    Pairs in falling order of their match, down to `least`; a pair joins its two groups unless both have a member
     in one view.
     """
     group = np.arange(len(matches))

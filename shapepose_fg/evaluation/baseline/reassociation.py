@@ -1,4 +1,4 @@
-"""Detections given out again, one by one, around people who are placed: what 2D grouping mixed is put right."""
+"""Detections associated again, one by one, with people who are placed: what 2D grouping mixed is put right."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ def nearest_given(
     """Which detection each view has of each joint (P, J, V), -1 for none: the nearest, one-to-one.
 
     A detection goes to a joint (P, J, 3) that is projected within `gate_m` of it, at the joint's depth. Joints
-    that are not placed keep what they `held` (P, J, V), where nobody else has it now.
+    that are not placed keep what they `held` (P, J, V), where no other joint has it now.
     """
     projected, depth = rig.project(joints)  # (V, P, J, 2), (V, P, J)
     placed = np.asarray(np.isfinite(joints).all(axis=-1))
