@@ -16,12 +16,19 @@ from factors.keys import (
     joint_keys,
     offset_key,
     offset_keys,
+    reported_keys,
     split_camera_key,
     split_key,
     velocity_key,
     velocity_keys,
 )
-from factors.motion import lasting_prior_factors, motion_covariance, motion_factors, offset_factors
+from factors.motion import (
+    lasting_difference_factors,
+    lasting_prior_factors,
+    motion_covariance,
+    motion_factors,
+    offset_factors,
+)
 from factors.noise import (
     DEFAULT_WIDTH_SIGMA,
     Kernel,
@@ -71,6 +78,7 @@ __all__ = [
     "joint_key",
     "joint_keys",
     "kernel_weight",
+    "lasting_difference_factors",
     "lasting_prior_factors",
     "make_calibration",
     "make_camera",
@@ -83,6 +91,7 @@ __all__ = [
     "project_with_jacobian",
     "projection_factor",
     "projection_factors",
+    "reported_keys",
     "robust",
     "robust_kernel",
     "sigma_px",

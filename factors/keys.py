@@ -24,9 +24,9 @@ MAX_JOINT = 999
 MAX_FRAME = 99_999_999
 """Largest frame number in a key: 19 days at 60 frames a second."""
 
-_JOINT, _VELOCITY, _CAMERA, _OFFSET = 1, 2, 3, 4
+_JOINT, _VELOCITY, _CAMERA, _OFFSET, _REPORTED = 1, 2, 3, 4, 7
 _SOURCES = 3
-_NAMES = {_JOINT: "position", _VELOCITY: "velocity", _CAMERA: "camera"}
+_NAMES = {_JOINT: "position", _VELOCITY: "velocity", _CAMERA: "camera", _REPORTED: "reported position"}
 _NAMES |= {_OFFSET + source: f"offset {source}" for source in range(_SOURCES)}
 _PER_JOINT = MAX_FRAME + 1
 _PER_PERSON = (MAX_JOINT + 1) * _PER_JOINT
@@ -87,8 +87,15 @@ def offset_keys(person: int, joints: ArrayLike, frames: ArrayLike = 0, source: i
     return _pack(_offset(source), person, joints, frames)
 
 
+def reported_keys(person: int, joints: ArrayLike, frames: ArrayLike = 0) -> NDArray[np.int64]:
+    """Keys of positions (`Point3`, metres, world) with all of their error, where `joint_keys` are the positions
+    that detections, body and motion agree on; `joints` and `frames` broadcast against each other.
+    """
+    return _pack(_REPORTED, person, joints, frames)
+
+
 def split_key(key: int) -> JointKey:
-    """Person, joint and frame of the key of a joint, a velocity or an offset; ValueError for any other key."""
+    """Person, joint and frame of a key of these kinds; ValueError for a camera's and any other key."""
     kind, person, joint, frame = _unpack(key)
     if kind not in _NAMES or kind == _CAMERA:
         raise ValueError(f"{format_key(key)} is not the key of a joint, a velocity or an offset")

@@ -70,14 +70,14 @@ LONG = PipelineConfig(batch_frames=6, windows=WindowConfig(overlap_s=0.1))
 
 def solved_frames(work: Callable[[], Reconstruction]) -> tuple[list[list[int]], Reconstruction]:
     """The frames of each window that is solved meanwhile, and what comes of it."""
-    frames, estimate = [], Estimator.estimate
+    frames, solve = [], Estimator.solve
 
     def noted(self, observations, *others):
         frames.append(sorted(set(observations.frame.tolist())))
-        return estimate(self, observations, *others)
+        return solve(self, observations, *others)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Estimator, "estimate", noted)
+        patch.setattr(Estimator, "solve", noted)
         return frames, work()
 
 

@@ -50,6 +50,7 @@ from shapepose_fg.estimation.plain_view import SPEED_M_S, elsewhere_variance, li
 from shapepose_fg.estimation.smoothing import smoothed
 from shapepose_fg.estimation.state_covariances import state_covariances
 from shapepose_fg.estimation.window_graph import WindowGraph, near_in_time
+from shapepose_fg.estimation.window_solution import WindowSolution
 
 ExtraFactors = Callable[[WindowGraph, NDArray[np.int64]], Iterable[gtsam.NonlinearFactor]]
 """Your own factors for a person's window, made from its keys (T, J)."""
@@ -130,6 +131,12 @@ class Estimator:
         `extra_factors` adds factors of your own to every window. `views` are the cameras row by row, where they
         are not the rig's.
         """
+        return self.solve(observations, extra_factors, views)[0]
+
+    def solve(
+        self, observations: Observations, extra_factors: ExtraFactors | None = None, views: Views | None = None
+    ) -> tuple[Estimates, list[WindowSolution]]:
+        """The same, and every window with the graph that says it."""
         config = self.config
         views = Views.of(self.rig) if views is None else views
         if len(views) != observations.confidence.shape[2] or views.rows_known not in (None, len(observations)):
@@ -240,7 +247,7 @@ class Estimator:
         windows: Sequence[Window],
         first: NDArray[np.float64],
         solution: Solution,
-    ) -> Estimates:
+    ) -> tuple[Estimates, list[WindowSolution]]:
         """Covariances, codes and statuses of what was solved."""
         X = solution.joints
         covariance, velocity_covariance = (np.full((*X.shape, 3), np.nan) for _ in range(2))
@@ -268,7 +275,20 @@ class Estimator:
         enough = np.where(solution.enough, Status.BODY_UNDETERMINED, Status.TOO_FEW_VIEWS)
         status = np.where(fit.ok, Status.OK, enough)
         status[[problem.row for problem in wrong]] = Status.NOT_SOLVED
-        return Estimates(
+        solutions = [
+            WindowSolution(
+                rows=window.rows,
+                joints=X[window.rows],
+                covariance=covariance[window.rows],
+                bodies=fit.rows(window.rows),
+                window=window.graph,
+                solved=solution.joints[window.rows],
+                solved_covariance=of_positions,
+                lasting=self._motion.views,
+            )
+            for window, (of_positions, _) in zip(windows, found, strict=True)
+        ]
+        estimates = Estimates(
             joints=X,
             covariance=covariance,
             velocity=velocity,
@@ -282,6 +302,7 @@ class Estimator:
             status=status,
             problems=wrong,
         )
+        return estimates, solutions
 
     def _calibrated(
         self,

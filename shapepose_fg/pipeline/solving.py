@@ -1,6 +1,6 @@
-"""Rows of a result solved anew from their own observations: after who is who was corrected by hand."""
+"""Rows of a result solved anew from their own observations: after corrections by hand, and for their graphs."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,11 +10,13 @@ from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.frame_times import stretches
+from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.run_summary import covered_frames
-from shapepose_fg.estimation.estimator import Estimator, ExtraFactors
+from shapepose_fg.estimation.estimator import Estimates, Estimator, ExtraFactors
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.floor import Floor
+from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.pipeline.bodies_over_time import with_bodies_over_time
 from shapepose_fg.pipeline.person_bodies import SequenceFitting
 from shapepose_fg.pipeline.pipeline import PipelineConfig
@@ -35,26 +37,54 @@ def solve_rows(
     Detections stay with whom they were given; gates are decided anew. `fitter` knows where the detector puts its
     joints (`run["keypoint_offsets"]`). ValueError where `rows` do not say what they were solved from.
     """
+    parts = []
+    for window, part, estimates, observations, _ in _solved(rows, rig, config, fitter, extra_factors):
+        assert part.observations is not None
+        names = tuple(part.joint_names.tolist())
+        solved = result_rows(observations, estimates, part.observations.candidate, rig, names, part.person)
+        parts.append(solved.rows(_inside(part.frame, window.own)))
+    solved = replace(Reconstruction.concatenate(parts), run=rows.run) if parts else rows
+    if not isinstance(fitter, SequenceFitting):
+        return solved
+    return with_bodies_over_time(solved, fitter, floor=Floor.from_dict(rows.run.get("floor")))
+
+
+def window_solutions(
+    rows: Reconstruction,
+    rig: Rig,
+    config: PipelineConfig,
+    fitter: BodyFitter,
+    *,
+    extra_factors: ExtraFactors | None = None,
+) -> Iterator[WindowSolution]:
+    """Every person of every window of a result as one graph, whose values and marginals are the result's.
+
+    Joints and covariances are those of `rows`; the graph below is solved anew from their observations. Without
+    `extra_factors`: with them the solution says something else, and its own joints are kept. Windows overlap:
+    frames near a border are in two. ValueError as `solve_rows`.
+    """
+    for _, part, _, _, solutions in _solved(rows, rig, config, fitter, extra_factors):
+        for solution in solutions:
+            as_reported = {"joints": part.joints[solution.rows], "covariance": part.covariance[solution.rows]}
+            yield solution if extra_factors is not None else replace(solution, **as_reported)
+
+
+def _solved(
+    rows: Reconstruction, rig: Rig, config: PipelineConfig, fitter: BodyFitter, extra_factors: ExtraFactors | None
+) -> Iterator[tuple["_Window", Reconstruction, Estimates, Observations, list[WindowSolution]]]:
+    """Each window of the recording: its rows and those around it, solved."""
     if rows.observations is None:
         raise ValueError("rows without observations cannot be solved anew; reconstruct the recording again")
     settings = EstimatorConfig(config.observations, config.window_graph, config.refine, config.motion)
-    joint_names = tuple(rows.joint_names.tolist())
-    estimator = Estimator(rig, fitter, joint_names, settings)
-    parts = []
+    estimator = Estimator(rig, fitter, tuple(rows.joint_names.tolist()), settings)
     with torch_threads(config.threads):
         for window in _windows(rows, config):
             part = rows.rows(window.rows(rows, config.windows.overlap_s))
-            table = part.observations
-            assert table is not None
+            assert part.observations is not None
             # From the views: the joints as they are may be somebody else's.
-            observations = table.observations(np.full_like(part.joints, np.nan), part.time_s)
-            estimates = estimator.estimate(observations, extra_factors)
-            solved = result_rows(observations, estimates, table.candidate, rig, joint_names, part.person)
-            parts.append(solved.rows(_inside(part.frame, window.own)))
-        solved = replace(Reconstruction.concatenate(parts), run=rows.run) if parts else rows
-        if not isinstance(fitter, SequenceFitting):
-            return solved
-        return with_bodies_over_time(solved, fitter, floor=Floor.from_dict(rows.run.get("floor")))
+            observations = part.observations.observations(np.full_like(part.joints, np.nan), part.time_s)
+            estimates, solutions = estimator.solve(observations, extra_factors)
+            yield window, part, estimates, observations, solutions
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from factors import (
     joint_keys,
     offset_key,
     offset_keys,
+    reported_keys,
     split_camera_key,
     split_key,
     velocity_key,
@@ -21,7 +22,7 @@ CORNERS = [(0, 0, 0), (3, 24, 17), (MAX_PERSON, MAX_JOINT, MAX_FRAME), (0, MAX_J
 
 @pytest.mark.parametrize(("person", "joint", "frame"), CORNERS)
 def test_a_key_says_again_what_it_was_made_of(person, joint, frame):
-    for make in (joint_key, velocity_key, offset_key):
+    for make in (joint_key, velocity_key, offset_key, lambda *numbers: int(reported_keys(*numbers))):
         assert split_key(make(person, joint, frame)) == (person, joint, frame)
     assert split_camera_key(camera_key(person, frame)) == (person, frame)
 

@@ -1,0 +1,108 @@
+"""The graph of a solved window says what is reported: values, marginals, and what one makes of it."""
+
+import gtsam
+import numpy as np
+import pytest
+
+from factors import isotropic
+from shapepose_fg.body.fitting.fitters import make_fitter
+from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.estimation.window_solution import WindowSolution
+from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
+from shapepose_fg.pipeline.solving import window_solutions
+from shapepose_fg.simulation import built_in_scene, simulate
+
+WRIST, OTHER_WRIST = BODY_25.index("RWrist"), BODY_25.index("LWrist")
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return built_in_scene(people=2, cameras=3, frames=12)
+
+
+@pytest.fixture(scope="module")
+def people(scene):
+    return reconstruct(simulate(scene), scene.rig)
+
+
+def solutions(people, scene, extra_factors=None) -> list[WindowSolution]:
+    config = PipelineConfig()
+    fitter = make_fitter(config.body, BodyModel.default())
+    return list(window_solutions(people, scene.rig, config, fitter, extra_factors=extra_factors))
+
+
+def ratios(solution: WindowSolution) -> np.ndarray:
+    """(K,) sigmas of the graph's marginals over the reported ones, of all known joints."""
+    found = gtsam.Marginals(solution.graph, solution.values)
+    known = np.isfinite(solution.covariance).all(axis=(2, 3))
+    graph = np.array([np.trace(found.marginalCovariance(key)) for key in solution.keys[known].tolist()])
+    return np.sqrt(graph / np.trace(solution.covariance[known], axis1=1, axis2=2))
+
+
+def test_marginals_are_the_reported_covariances_and_values_the_reported_joints(people, scene):
+    found = solutions(people, scene)
+    assert len(found) == 2
+    for solution in found:
+        known = np.isfinite(solution.joints).all(axis=2)
+        assert known.mean() > 0.95 and len(solution.frames) == 12
+        mine = next(
+            people.joints[people.person == person]
+            for person in np.unique(people.person)
+            if np.nanmax(np.abs(people.joints[people.person == person] - solution.joints)) < 1e-9
+        )
+        at = np.array([solution.values.atPoint3(key) for key in solution.keys[known].tolist()])
+        np.testing.assert_allclose(at, mine[known], atol=1e-6)
+        # The solver's own graph has only what is new in every frame: a third of the reported sigmas.
+        assert np.median(ratios(solution)) == pytest.approx(1.0, abs=1e-3)
+        assert (np.abs(ratios(solution) - 1) < 0.05).mean() > 0.95
+        bare = gtsam.Marginals(solution.window.graph, solution.window.values)
+        wrist = solution.window.keys[6, WRIST]
+        assert np.trace(bare.marginalCovariance(wrist)) < 0.5 * np.trace(solution.covariance[6, WRIST])
+
+
+def test_the_reported_error_lasts_from_frame_to_frame(people, scene):
+    """Two measurements of the same detector are no two: the error of neighbouring frames is nearly one."""
+    solution = solutions(people, scene)[0]
+    found = gtsam.Marginals(solution.graph, solution.values)
+    keys = gtsam.KeyVector(solution.keys[[4, 5, 11], WRIST].tolist())
+    joint = found.jointMarginalCovariance(keys)
+
+    def correlation(a: int, b: int) -> float:
+        blocks = [np.trace(joint.at(keys[i], keys[k])) for i, k in ((a, b), (a, a), (b, b))]
+        return blocks[0] / np.sqrt(blocks[1] * blocks[2])
+
+    assert correlation(0, 1) > 0.6 and correlation(0, 1) > correlation(0, 2) > 0.2
+
+
+def test_a_users_isam2_takes_a_person_and_learns_of_a_wrist(people, scene):
+    """Somebody else sees a wrist 5 cm beside, to 1 cm: it goes there, and so does the frame after it."""
+    solution = solutions(people, scene)[0]
+    isam = gtsam.ISAM2()
+    isam.update(solution.graph, solution.values)
+    before, after = (int(solution.keys[frame, WRIST]) for frame in (6, 7))
+    np.testing.assert_allclose(
+        isam.marginalCovariance(before), solution.covariance[6, WRIST], rtol=0.05, atol=1e-6
+    )
+    seen = solution.joints[6, WRIST] + [0.05, 0.0, 0.0]
+    more = gtsam.NonlinearFactorGraph()
+    more.push_back(gtsam.PriorFactorPoint3(before, seen, isotropic(3, 0.01)))
+    isam.update(more, gtsam.Values())
+    now = isam.calculateEstimate()
+    moved = [now.atPoint3(key)[0] - solution.joints[frame, WRIST, 0] for key, frame in ((before, 6), (after, 7))]
+    said = solution.covariance[6, WRIST, 0, 0]
+    assert moved[0] == pytest.approx(0.05 * said / (said + 1e-4), rel=0.2) and 0.4 * moved[0] < moved[1] < moved[0]
+    assert np.trace(isam.marginalCovariance(before)) < 3.1e-4
+
+
+def test_factors_of_ones_own_are_in_it(people, scene):
+    def carries_a_box(window, keys):
+        for right, left in keys[:, [WRIST, OTHER_WRIST]].tolist():
+            yield gtsam.RangeFactor3(right, left, 0.40, isotropic(1, 0.01))
+
+    for solution in solutions(people, scene, carries_a_box):
+        width = np.linalg.norm(solution.joints[:, WRIST] - solution.joints[:, OTHER_WRIST], axis=1)
+        assert np.abs(width - 0.4).max() < 0.03
+        at = np.array([solution.values.atPoint3(key) for key in solution.keys[:, WRIST].tolist()])
+        np.testing.assert_allclose(at, solution.joints[:, WRIST], atol=1e-9)
+        assert (np.abs(ratios(solution) - 1) < 0.05).mean() > 0.95
