@@ -8,7 +8,7 @@ import typer
 from shapepose_fg.cli.options import FramesOption, ResultUpOption, check_fps, result_frames
 from shapepose_fg.cli.terminal import note
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.result_options import results_folder
+from shapepose_fg.core.result_files import results_folder
 
 if TYPE_CHECKING:
     from shapepose_fg.core.camera import Axis

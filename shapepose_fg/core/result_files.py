@@ -13,20 +13,22 @@ from numpy.typing import NDArray
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.run_summary import plain
 from shapepose_fg.core.storage.files import write_together
-from shapepose_fg.core.storage.npz_writer import Column, write_npz
+from shapepose_fg.core.storage.npz import Pieces, write_npz
+from shapepose_fg.core.storage.saved_table import RUN_ID
 
 PEOPLE, RUN, OBSERVATIONS = "people.npz", "run.json", "observations.npz"
-RUN_ID = "run_id"
-"""What ties the files: a digest of all columns of people.npz. The same people have the same id, so that a run that
-was stopped and went on leaves the same bytes as one that was not."""
 _DIGITS = 32
+"""Of the id. The same people have the same one, so that a run that was stopped and went on leaves the same bytes
+as one that was not."""
+
+
+def results_folder(results: Path) -> Path:
+    """The folder of a result, which may be given as its people.npz too."""
+    return results.parent if results.name == PEOPLE else results
 
 
 def write_result(
-    folder: Path,
-    people: Mapping[str, Column],
-    observations: Mapping[str, Column] | None,
-    run: Mapping[str, Any],
+    folder: Path, people: Mapping[str, Pieces], observations: Mapping[str, Pieces] | None, run: Mapping[str, Any]
 ) -> None:
     """Write the files of a result into `folder`, none before all are complete on the disk.
 
@@ -44,20 +46,17 @@ def write_result(
 
     def write_people(stream: BinaryIO) -> None:
         # The id is asked for when all columns before it have been written.
-        last = {RUN_ID: Column(np.dtype(f"U{_DIGITS}"), (), lambda: (np.array(id_text()),))}
+        last = {RUN_ID: Pieces(np.dtype(f"U{_DIGITS}"), (), lambda: (np.array(id_text()),))}
         write_npz(stream, {name: _told(name, each, digest.update) for name, each in people.items()} | last)
 
     def write_observations(stream: BinaryIO) -> None:
         write_npz(stream, {**(observations or {}), RUN_ID: np.array(id_text())})
 
-    def write_run(stream: BinaryIO) -> None:
-        stream.write(run_text().encode())
-
     run_text()  # what cannot be written is known before the work
-    files = {folder / PEOPLE: write_people, folder / OBSERVATIONS: write_observations, folder / RUN: write_run}
-    if observations is None:
-        del files[folder / OBSERVATIONS]
-    write_together(files)
+    # The order counts: the id is known when people.npz has been written.
+    files = {folder / PEOPLE: write_people}
+    files |= {} if observations is None else {folder / OBSERVATIONS: write_observations}
+    write_together({**files, folder / RUN: lambda stream: stream.write(run_text().encode())})
     if observations is None:
         (folder / OBSERVATIONS).unlink(missing_ok=True)
 
@@ -75,7 +74,7 @@ def check_id(people_id: object, other_id: object, file: Path) -> None:
     )
 
 
-def _told(name: str, column: Column, tell: Any) -> Column:
+def _told(name: str, column: Pieces, tell: Any) -> Pieces:
     """The same column; `tell` is given its name, type, shape and bytes when its pieces are asked for."""
 
     def pieces() -> Iterator[NDArray[Any]]:

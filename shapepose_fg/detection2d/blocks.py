@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import write_atomically
-from shapepose_fg.core.storage.npz_reader import read_npz
+from shapepose_fg.core.storage.npz import read_npz
 from shapepose_fg.detection2d.detector import CameraDetector
 from shapepose_fg.io.detections.association_skeletons import TEXT_SKELETONS
 from shapepose_fg.io.footage.footage import Footage

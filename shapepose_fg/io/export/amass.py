@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from shapepose_fg.core.storage.files import write_atomically
-from shapepose_fg.core.storage.npz_writer import write_npz
+from shapepose_fg.core.storage.npz import write_npz
 from shapepose_fg.io.export.axes import z_up
 from shapepose_fg.io.export.job import Job, Written
 from shapepose_fg.io.export.skinned import RestBody, motion_of

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.core.columns import code_names
 from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import Known, OpenedReconstruction
 from shapepose_fg.core.storage.files import write_atomically
+from shapepose_fg.core.storage.schema import code_names
 from shapepose_fg.io.export.job import Written, optional
 
 _GROUP_ROWS = 4096

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from shapepose_fg.core.camera import Axis, Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import OpenedReconstruction, Reconstruction
-from shapepose_fg.core.result_options import results_folder
+from shapepose_fg.core.result_files import results_folder
 from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.export.take import Take

@@ -5,9 +5,9 @@ import io
 
 import numpy as np
 
-from shapepose_fg.core.columns import code_names
 from shapepose_fg.core.reconstruction import Known
 from shapepose_fg.core.storage.files import write_atomically
+from shapepose_fg.core.storage.schema import code_names
 from shapepose_fg.io.export.job import Job, Written
 from shapepose_fg.io.export.markers import sigma_m
 from shapepose_fg.io.export.take import Take

@@ -12,7 +12,6 @@ from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observation_table import ObservationTable
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.core.storage.npz_writer import Column
 
 _LOOKED_AT = 200
 """Frames, spread over the run, by which people are counted."""
@@ -27,10 +26,10 @@ def expected_bytes(detections: DetectionSequence, rig: Rig, frames: range) -> in
     if len(frames) == 0:
         return 0
     spread = np.unique(np.linspace(frames.start, frames.stop - 1, min(len(frames), _LOOKED_AT)).astype(int))
-    seen = np.mean([len(detections[frame]) for frame in spread.tolist()])
-    people = seen / (len(rig) * len(joints))
-    empty = (Reconstruction.empty(joints).columns(), ObservationTable.empty(joints, rig.names).columns())
-    row = sum(_row_bytes(column) for columns in empty for column in columns.values() if column.shape[:1] == (0,))
+    people = np.mean([len(detections[frame]) for frame in spread.tolist()]) / (len(rig) * len(joints))
+    tables = (Reconstruction.empty(joints), ObservationTable.empty(joints, rig.names))
+    columns = [table.columns()[name] for table in tables for name in table.ROWS]
+    row = sum(column.dtype.itemsize * prod(column.shape[1:]) for column in columns)
     return int(2 * row * people * len(frames))
 
 
@@ -42,7 +41,3 @@ def check_room(folder: Path, needed: int) -> None:
             f"{folder}: about {decimal(needed)} are needed here, and {decimal(free)} are free; make room, give"
             " another --output, or take a part with --frames"
         )
-
-
-def _row_bytes(column: Column) -> int:
-    return column.dtype.itemsize * prod(column.shape[1:])
