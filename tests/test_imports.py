@@ -14,6 +14,7 @@ ROOT = Path(__file__).parents[1]
 LEVELS = (
     "factors core.errors core.moved",
     "core.camera core.skeleton",
+    "core.drawing",
     "core.storage.files core.bounds",
     "core.storage.npz",
     "core.storage.schema",

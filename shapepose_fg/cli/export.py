@@ -45,9 +45,8 @@ def export(
     ] = None,
 ) -> None:
     """Write a result for other programs: shapepose-fg export RESULTS amass trc c3d bvh glb csv parquet rrd."""
-    from shapepose_fg.io.export.exporting import export_result
     from shapepose_fg.io.export.markers import MarkerSet
-    from shapepose_fg.io.export.registry import FORMATS, chosen
+    from shapepose_fg.io.export.registry import FORMATS, chosen, export_result
 
     if markers not in set(MarkerSet):
         raise InputError(f"--markers {markers}: must be one of {' '.join(MarkerSet)}")

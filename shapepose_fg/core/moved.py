@@ -24,7 +24,15 @@ _MERGED = {
     "core.storage.npz": "npz_reader npz_writer core.storage.npz_reader core.storage.npz_writer",
     "core.storage.schema": "columns core.columns",
     "core.result_files": "result_options core.result_options",
+    "core.drawing": "viz.viewer.palette io.export.bones io.export.light_mesh",
     "pipeline.runs.parts": "pipeline.runs.rows_of_people",
+    "io.export.take": "io.export.axes",
+    "io.export.skinned": "io.export.stretches",
+    "io.export.registry": "io.export.exporting",
+    "io.export.tables": "io.export.table io.export.parquet",
+    "io.export.marker_files": "io.export.trc io.export.c3d io.export.pose2sim_files",
+    "io.export.rerun_app": "io.export.rerun_scene io.export.rerun_statistics io.export.rrd",
+    "io.export.rerun_log": "io.export.rerun_people io.export.rerun_views io.export.rerun_pictures",
 }
 """Modules that are others now, under whichever name."""
 _RENAMED = {

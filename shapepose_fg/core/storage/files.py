@@ -209,6 +209,12 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
     write_together({path: write})
 
 
+def write_content(path: Path, content: str | bytes) -> None:
+    """`write_atomically` of a whole content; text is UTF-8."""
+    data = content.encode() if isinstance(content, str) else content
+    write_atomically(path, lambda stream: stream.write(data))
+
+
 def write_together(files: Mapping[Path, Callable[[BinaryIO], object]]) -> None:
     """`write_atomically` of several files in order, none of which is put in place before all are complete."""
     temporary: dict[Path, Path] = {}
