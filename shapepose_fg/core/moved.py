@@ -27,6 +27,7 @@ _MERGED = {
     "core.drawing": "viz.viewer.palette io.export.bones io.export.light_mesh",
     "pipeline.runs.parts": "pipeline.runs.rows_of_people",
     "io.export.take": "io.export.axes",
+    "io.detections.association_text": "io.detections.association_skeletons",
     "io.export.skinned": "io.export.stretches",
     "io.export.registry": "io.export.exporting",
     "io.export.tables": "io.export.table io.export.parquet",

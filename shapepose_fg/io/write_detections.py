@@ -17,7 +17,7 @@ from shapepose_fg.core.detections import Detections, DetectionSequence
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.core.storage.files import write_atomically
-from shapepose_fg.io.detections.association_skeletons import TEXT_SKELETONS, TextSkeleton
+from shapepose_fg.io.detections.association_text import TEXT_SKELETONS, TextSkeleton
 from shapepose_fg.io.detections.view_streams import MARGIN
 from shapepose_fg.proposal.people_2d import group_people
 
