@@ -8,12 +8,11 @@ from typing import Annotated, Any, Literal
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field, FiniteFloat, ValidationError
+from pydantic import Field, FiniteFloat
 
 from shapepose_fg.core.camera import Axis, Camera, Lens, padded_distortion
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.calibration.content import Content
-from shapepose_fg.io.validation import first_problem, key_text
 
 Unit = Literal["m", "cm", "mm"]
 """The unit of lengths in a calibration file."""
@@ -165,11 +164,3 @@ def nearest_rotation(R: NDArray[np.float64]) -> NDArray[np.float64]:
         return R
     U, _, Vt = np.linalg.svd(R)
     return U @ Vt
-
-
-def sentence(error: ValidationError, place: str, cures: Mapping[str, str]) -> str:
-    """The first problem of `error` at `place`, with the cure for the innermost key that has one."""
-    keys, problem = first_problem(error)
-    known = [cures[str(key)] for key in reversed(keys) if key in cures]
-    cure = known[0] if known else "see docs/conventions.md for the format"
-    return f"{place}: {key_text(keys)} {problem}; {cure}"

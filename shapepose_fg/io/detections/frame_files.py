@@ -160,7 +160,8 @@ def _instances(file: Path, rerun: str) -> list[list[float]]:
         scores = person.keypoint_scores
         if len(person.keypoints) != len(scores) or any(len(each) != 2 for each in person.keypoints):
             raise InputError(
-                f"{file}: [{number}].keypoints must hold x and y for each of the {len(scores)} keypoint_scores; {rerun}"
+                f"{file}: [{number}].keypoints must hold x and y for each of the {len(scores)}"
+                f" keypoint_scores; {rerun}"
             )
         found.append(
             [value for (x, y), score in zip(person.keypoints, scores, strict=True) for value in (x, y, score)]
