@@ -29,8 +29,8 @@ _MODELS: dict[str, tuple[str, Lens]] = {
 """COLMAP's camera models that are lenses of OpenCV, and their parameters in order."""
 _ORDER: dict[str, str] = {"perspective": "k1 k2 p1 p2 k3 k4 k5 k6", "fisheye": "k1 k2 k3 k4"}
 _CURES = {
-    "unit": "pass --unit (a model is to no scale until colmap model_aligner or the cameras' known distances gave it"
-    " one)",
+    "unit": "pass --unit (a model is to no scale until colmap model_aligner or the cameras' known distances"
+    " gave it one)",
     "up": "pass --up with the axis of the model that points up",
 }
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.io.camera_names import match_names
+from shapepose_fg.io.camera_names import listing, told_by_parts
 from shapepose_fg.io.detections.formats import FORMATS
 
 _EXPECTED = (
@@ -32,26 +32,27 @@ def find_places(path: Path, rig: Rig) -> Places:
     if not path.is_dir():
         raise InputError(f"{path}: there is no such folder; check the path of the detections")
     folder = path / "detection" if (path / "detection").is_dir() else path
+    entries = sorted(each for each in folder.iterdir() if not each.name.startswith("."))
+    holds = listing([each.name for each in entries])
     for patterns in dict.fromkeys(each.names for each in FORMATS):
         found = [_named(folder, name, patterns) for name in rig.names]
-        if any(each is not None for each in found):
-            places = [
-                each or folder / patterns[0].format(name) for each, name in zip(found, rig.names, strict=True)
-            ]
-            for name, each in zip(rig.names, places, strict=True):
-                if not each.exists():
-                    raise InputError(
-                        f'{each}: the detections of camera "{name}" are missing, {folder} holds {_listing(folder)};'
-                        " add them, or take the camera out of the calibration"
-                    )
-            return Places(places)
-    alike = _alike(folder, rig)
-    if alike is None:
-        names = " ".join(rig.names)
+        missing = [name for name, place in zip(rig.names, found, strict=True) if place is None]
+        if len(missing) < len(rig):
+            if missing:
+                raise InputError(
+                    f'{folder / patterns[0].format(missing[0])}: the detections of camera "{missing[0]}" are'
+                    f" missing, {folder} holds {holds}; add them, or take the camera out of the calibration"
+                )
+            return Places([place for place in found if place is not None])
+    # `walk_Miqus_1_23087_json` of camera `23087`, `cam01_json` of camera `int_cam1`.
+    offered = [each for each in entries if each.is_dir() or each.suffix == ".json"]
+    names = [each.name.removesuffix(".json").removesuffix("_json") for each in offered]
+    told = told_by_parts(folder, rig.names, offered, names)
+    if told is None:
         raise InputError(
-            f"{folder}: no detections of the cameras {names} here, only {_listing(folder)}; {_EXPECTED}"
+            f"{folder}: no detections of the cameras {' '.join(rig.names)} here, only {holds}; {_EXPECTED}"
         )
-    return alike
+    return Places(told[0], (told[1],))
 
 
 def _named(folder: Path, name: str, patterns: Sequence[str]) -> Path | None:
@@ -61,26 +62,3 @@ def _named(folder: Path, name: str, patterns: Sequence[str]) -> Path | None:
         if place.is_file() if Path(pattern).suffix else place.is_dir():
             return place
     return None
-
-
-def _alike(folder: Path, rig: Rig) -> Places | None:
-    """Folders or files that have the cameras' names in theirs (`walk_Miqus_1_23087_json` of camera `23087`), or
-    the cameras' numbers (`cam01_json` of camera `int_cam1`).
-
-    Only where it is so for every camera, and nothing else could be meant: else nothing is guessed.
-    """
-    offered = [each for each in sorted(folder.iterdir()) if each.is_dir() or each.suffix == ".json"]
-    offered = [each for each in offered if not each.name.startswith(".")]
-    names = [each.name.removesuffix(".json").removesuffix("_json") for each in offered]
-    chosen = match_names(rig.names, names)
-    if chosen is None:
-        return None
-    places = [offered[index] for index in chosen]
-    pairs = ", ".join(f"{name} is {place.name}" for name, place in zip(rig.names, places, strict=True))
-    return Places(places, (f"{folder}: cameras were told by parts of the names: {pairs}",))
-
-
-def _listing(folder: Path) -> str:
-    """The first names in a folder, for a message."""
-    names = sorted(entry.name for entry in folder.iterdir() if not entry.name.startswith("."))
-    return (" ".join(names[:8]) or "nothing") + (f" and {len(names) - 8} more" if len(names) > 8 else "")

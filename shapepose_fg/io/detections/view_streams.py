@@ -167,7 +167,8 @@ class _Undistorted:
         self._undone.add(
             undone,
             lambda row: (
-                f"{self.source}: the distortion of camera {self.camera.name} cannot be undone at frame {seen.frame[row]}"
+                f"{self.source}: the distortion of camera {self.camera.name} cannot be undone"
+                f" at frame {seen.frame[row]}"
             ),
         )
         return _only(replace(seen, xy=xy), ~undone)
