@@ -41,9 +41,9 @@ class Gate(IntEnum):
 class ObservationTable(Table):
     """The detections of N rows (person and frame), J joints and V views; row i is row i of people.npz."""
 
-    frame: Annotated[NDArray[np.int64], Column("N", np.int64)]
+    frame: Annotated[NDArray[np.integer], Column("N", np.int64)]
     """(N,) frame of each row."""
-    person: Annotated[NDArray[np.int64], Column("N", np.int64)]
+    person: Annotated[NDArray[np.integer], Column("N", np.int64)]
     """(N,) identity of the person of each row."""
     joint_names: Annotated[NDArray[np.str_], Column("J", np.str_)]
     """(J,) names of the joints."""
@@ -145,7 +145,7 @@ class ObservationTable(Table):
     @classmethod
     def concatenate(cls, parts: Sequence["ObservationTable"]) -> "ObservationTable":
         """The rows of `parts`, one after the other; ValueError where joints or views differ."""
-        return cls.joined(parts) if len(parts) > 0 else cls.empty()
+        return ObservationTable.joined(parts) if len(parts) > 0 else cls.empty()
 
     def observations(self, initial: NDArray[np.float64], time_s: NDArray[np.float64]) -> Observations:
         """The rows as they were given to be solved, dropped detections too: to solve them anew.
@@ -194,7 +194,7 @@ class ObservationTable(Table):
     @classmethod
     def open(cls, file: Path, run_id: object = None) -> "SavedTable[ObservationTable]":
         """What `load` reads, of which rows come into memory when they are asked for."""
-        opened = SavedTable(file, cls, "give the observations.npz of a reconstruction")
+        opened = SavedTable(file, ObservationTable, "give the observations.npz of a reconstruction")
         try:
             check_id(run_id, opened.run_id, file)
         except InputError:

@@ -61,4 +61,4 @@ class Observations(Table):
     @classmethod
     def concatenate(cls, parts: Sequence["Observations"]) -> "Observations":
         """The rows of several parts, one after the other."""
-        return cls.joined(parts)
+        return Observations.joined(parts)

@@ -142,7 +142,7 @@ class Reconstruction(Table):
         together = ObservationTable.concatenate(tables) if 0 < len(tables) == len(filled) else None
         # A part without rows and without a run has nothing to say of the whole.
         runs = [part.run for part in parts if len(part) > 0 or len(part.run) > 0]
-        return cls.joined(parts, observations=together, shapes=None, run=merged_run(runs))
+        return Reconstruction.joined(parts, observations=together, shapes=None, run=merged_run(runs))
 
     def rows(self, index: NDArray) -> "Reconstruction":
         """The rows that `index` picks: a mask (N,) or row numbers."""

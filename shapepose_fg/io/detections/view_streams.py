@@ -163,7 +163,7 @@ class _Undistorted:
         certain = view.confidence >= _LEAST_SCORE
         seen = _only(view, ~outside & certain)
         xy = self.camera.undistort(seen.xy)
-        undone = ~np.isfinite(xy).all(axis=1)
+        undone = np.asarray(~np.isfinite(xy).all(axis=1))
         self._undone.add(
             undone,
             lambda row: (
