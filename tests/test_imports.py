@@ -18,7 +18,7 @@ LEVELS = (
     "core.storage.files core.bounds",
     "core.storage.npz",
     "core.storage.schema",
-    "core.storage.output_folder core.storage.saved_table core.storage.kept_arrays core.shapes core.provenance"
+    "core.storage.output_folder core.storage.kept_arrays core.shapes core.provenance"
     " core.run_summary viz.rendering pipeline.workers body.threads cli.options cli.terminal cli.stopping",
     "core.result_files",
     "body.model",

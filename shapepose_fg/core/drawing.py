@@ -8,7 +8,8 @@ from shapepose_fg.core.skeleton import BODY_25
 PALETTE = ("#3f7fb8", "#e0962f", "#2f9e80", "#c06c9c", "#6cb6dd", "#c8623f", "#7d70b8", "#a8a03c")
 """After Okabe and Ito's: apart for every kind of colour vision."""
 CELL_M = 0.02
-"""Edge of the cells of which `thinned` keeps one vertex each: a finger's width, which nobody misses in a room."""
+"""Edge of the cells of which `thinned` keeps one vertex each: a finger's width, too little to be seen across a
+room."""
 
 
 def rgb(text: str) -> tuple[float, float, float]:

@@ -101,11 +101,15 @@ def check_cuts(cuts: Sequence[int], frames: int) -> tuple[int, ...]:
     return tuple(int(cut) for cut in numbers)
 
 
-def stretches(frames: range, cuts: Sequence[int]) -> list[range]:
+def segments(frames: range, cuts: Sequence[int]) -> list[range]:
     """`frames` from one cut to the next; cuts outside of them do not matter."""
     inside = [cut for cut in cuts if frames.start < cut < frames.stop]
     edges = [frames.start, *inside, frames.stop]
     return [range(start, stop) for start, stop in pairwise(edges) if stop > start]
+
+
+stretches = segments
+"""Its name until 0.1."""
 
 
 def spans_of(frames: Iterable[int]) -> list[range]:

@@ -11,7 +11,7 @@ from types import ModuleType
 _ROOMS = {
     "core": "errors camera skeleton detections observations observation_table frame_times bounds"
     " reconstruction provenance run_summary result_files",
-    "core.storage": "files saved_table kept_arrays output_folder",
+    "core.storage": "files kept_arrays output_folder",
     "pipeline": "engine windows workers cluster chunk_work solving person_bodies bodies_over_time solved_rows"
     " runs",
     "cli": "options terminal stopping demo batch",
@@ -23,7 +23,8 @@ _ROOMS = {
 _MERGED = {
     "core.storage.npz": "npz_reader npz_writer core.storage.npz_reader core.storage.npz_writer",
     "core.storage.schema": "columns core.columns",
-    "core.result_files": "result_options core.result_options",
+    "core.result_files": "result_options core.result_options saved_table core.storage.saved_table",
+    "pipeline.runs.manifest": "pipeline.runs.room",
     "core.drawing": "viz.viewer.palette io.export.bones io.export.light_mesh",
     "pipeline.runs.parts": "pipeline.runs.rows_of_people",
     "io.export.take": "io.export.axes",

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.core.result_files import check_id
+from shapepose_fg.core.result_files import SavedTable, check_id
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.core.storage.npz import write_npz
-from shapepose_fg.core.storage.saved_table import SavedTable
 from shapepose_fg.core.storage.schema import Column, Table, code_names
 
 
@@ -60,7 +59,7 @@ class ObservationTable(Table):
     gate: Annotated[NDArray[np.uint8], Column("N J V", np.uint8, codes=Gate)]
     """(N, J, V) codes of `Gate`."""
     probability: Annotated[NDArray[np.float32], Column("N J V", np.float32, missing=1.0)] = None  # type: ignore[assignment]
-    """(N, J, V) how probable it is that the detection is this person's, and nobody else's; 0 where there is none.
+    """(N, J, V) how probable it is that the detection is this person's; 0 where there is none.
     1 where it is not said, as in files of before."""
 
     ROWS: ClassVar = "frame person candidate xy confidence residual_px gate probability".split()

@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observation_table import ObservationTable
-from shapepose_fg.core.result_files import OBSERVATIONS, PEOPLE, RUN, check_id, write_result
+from shapepose_fg.core.result_files import OBSERVATIONS, PEOPLE, RUN, RUN_ID, SavedTable, check_id, write_result
 from shapepose_fg.core.run_summary import check_run, merged_run
 from shapepose_fg.core.shapes import SubjectShapes
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.core.storage.files import read_json
-from shapepose_fg.core.storage.saved_table import RUN_ID, SavedTable
 from shapepose_fg.core.storage.schema import Column, Table
 
 
@@ -227,7 +226,7 @@ class OpenedReconstruction:
         return self._observed is not None
 
     def at(self, frame: int) -> Reconstruction:
-        """The people of one frame. The next ones come into memory with it, for whoever goes on to them."""
+        """The people of one frame. The next frames come into memory with it."""
         if frame not in self._block[0]:
             block = range(frame, frame + _BLOCK)
             self._block = block, self.frames(block.start, block.stop)
@@ -282,7 +281,7 @@ class OpenedReconstruction:
             check_run(run)
         except ValueError as error:
             raise InputError(f"{file}: {error}; restore it or delete it") from None
-        # Whoever changes the people and saves them gives them another id.
+        # People that were changed and saved have another id.
         check_id(self._people.run_id, run.pop(RUN_ID, None), file)
         return run
 

@@ -30,10 +30,11 @@ def merged_run(runs: Sequence[Run]) -> Run:
         return dict(runs[0]) if runs else {}
     settings = [run["configuration"] for run in runs if run.get("configuration") is not None]
     for other in settings[1:]:
-        name = difference(settings[0], other)
-        if name is not None:
+        found = difference(settings[0], other)
+        if found is not None:
             raise ValueError(
-                f"parts must have the same configuration, {name} differs; reconstruct them with one and the same"
+                f"parts must have the same configuration, {found[0]} differs; reconstruct them with one and the"
+                " same"
             )
     together: Run = {}
     own: list[Run] = [{} for _ in runs]
@@ -92,15 +93,17 @@ def _inputs(values: Sequence[Any]) -> Run:
     return together
 
 
-def difference(one: Any, other: Any, name: str = "") -> str | None:
-    """The dotted name of the first entry in which two sets of plain values differ; None where there is none."""
+def difference(one: Any, other: Any, name: str = "") -> tuple[str, Any, Any] | None:
+    """The dotted name of the first entry in which two sets of plain values differ, and both values; None where
+    there is none.
+    """
     if isinstance(one, dict) and isinstance(other, dict):
         for key in dict.fromkeys((*one, *other)):
             found = difference(one.get(key), other.get(key), f"{name}.{key}" if name else key)
             if found is not None:
                 return found
         return None
-    return None if _same(one, other) else name or "all of it"
+    return None if _same(one, other) else (name or "all of it", one, other)
 
 
 def _same(one: Any, other: Any) -> bool:

@@ -49,7 +49,7 @@ class SubjectShapes(Table):
 
     @classmethod
     def empty(cls, body: str) -> "SubjectShapes":
-        """Nobody is known yet."""
+        """No people."""
         return cls(np.zeros(0, dtype="U1"), np.zeros((0, 10)), np.zeros((0, 10, 10)), body)
 
     @property

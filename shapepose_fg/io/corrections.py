@@ -96,8 +96,8 @@ def correct(folder: str | Path, edit: Edit, solve: Solve | None = None) -> Edite
 def take_back(folder: str | Path, solve: Solve | None = None) -> tuple[Edit, Reconstruction]:
     """Take the last correction back; returns it and the result without it. InputError where there is none.
 
-    Without any other, the files are again what they were before the first. Of the others, only those people are
-    solved anew whom the last correction touched.
+    Without any other, the files are again what they were before the first. Only people that the last
+    correction touched are solved anew.
     """
     folder = Path(folder)
     edits = read_corrections(folder)

@@ -22,7 +22,7 @@ from shapepose_fg.io.detections.view_streams import MARGIN
 from shapepose_fg.proposal.people_2d import group_people
 
 SMALLEST_PERSON = 3
-"""Groups of fewer joints are nobody, as in OpenPose's default settings."""
+"""Groups of fewer joints are false positives, as in OpenPose's default settings."""
 
 
 def write_association(recording: DetectionSequence, rig: Rig, folder: str | Path) -> None:
@@ -54,9 +54,9 @@ def write_openpose(
 ) -> None:
     """Write <camera>/<camera>_000000000000_keypoints.json and so on into `folder`: people, as OpenPose does.
 
-    Candidates are grouped by `group_people`; groups of fewer joints than `smallest_person` are nobody, and not in
-    such files. Positions have three decimals, pixels. ValueError where the skeleton is not BODY_25 or there is no
-    frame; InputError where the folder of a camera already holds frames.
+    Candidates are grouped by `group_people`; groups of fewer joints than `smallest_person` are false positives,
+    which such files leave out. Positions have three decimals, pixels. ValueError where the skeleton is not BODY_25
+    or there is no frame; InputError where the folder of a camera already holds frames.
     """
     _check(recording)
     refuse_leftovers(rig, folder)

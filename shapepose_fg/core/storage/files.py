@@ -190,7 +190,7 @@ def _refuse_irregular(path: Path, mode: int) -> None:
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
     """Let `write` fill a temporary file beside `path`, then put it in place in one step.
 
-    Whoever reads `path`, whenever this process dies, finds the old file or the whole new one. OSError that names
+    At `path` is the old file or the whole new one, whenever this process dies. OSError that names
     `path` where that fails.
     """
     write_together({path: write})
@@ -230,7 +230,7 @@ def write_together(files: Mapping[Path, Callable[[BinaryIO], object]]) -> None:
 def sweep(folder: Path, name: str | None = None) -> None:
     """Remove what a killed process was writing in `folder`, as the file `name` or as any.
 
-    Nobody else may be writing there.
+    No other process may be writing there.
     """
     for left in folder.glob(f".*{_PART}" if name is None else f".{glob.escape(name)}.*{_PART}"):
         left.unlink(missing_ok=True)

@@ -1,6 +1,6 @@
 """A JSON file per frame: OpenPose's, Pose2Sim's (RTMLib's people written in OpenPose's way), MMPose's of pictures.
 
-Pose2Sim leaves `_keypoints` out of the names, writes NaN for people whom it dropped, and `{}` for people whom a
+Pose2Sim leaves `_keypoints` out of the names, writes NaN for people that it dropped, and `{}` for people that a
 camera does not see.
 """
 
@@ -72,7 +72,8 @@ def frame_number(file: Path) -> int:
 def read_frame_files(folder: Path) -> CameraPeople:
     """The frames that one camera saw; InputError naming file, key and cure.
 
-    A frame's number is in its file's name. Nobody is seen in frames whose files are missing in between (`gaps`).
+    A frame's number is in its file's name. No people are seen in frames whose files are missing in between
+    (`gaps`).
     """
     files = frame_files(folder)
     if len(files) == 0:
@@ -135,7 +136,7 @@ def _blocks(folder: Path, program: str, files: dict[int, Path]) -> Iterator[Peop
 
 
 def _people(file: Path, rerun: str) -> list[list[float]]:
-    """Flat keypoints of the people of a frame; empty people are nobody."""
+    """Flat keypoints of the people of a frame; people without keypoints are left out."""
     found = []
     for number, person in enumerate(validated(_Frame, read_json(file, most=MIDDLE), file, rerun).people):
         values, place = person.pose_keypoints_2d, f"{file}: people[{number}].pose_keypoints_2d"

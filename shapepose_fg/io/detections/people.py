@@ -62,10 +62,10 @@ class CameraPeople:
     last: int
     """Number of the last frame."""
     every_frame: bool = True
-    """Whether the files list every frame, those in which nobody is too. Where not, frames may be missing at both
+    """Whether the files list every frame, those without people too. Where not, frames may be missing at both
     ends, and the other cameras tell how long the recording is."""
     gaps: tuple[tuple[int, int], ...] = ()
-    """First and last number of frames in between that are missing from the files: nobody is seen in them."""
+    """First and last number of frames in between that are missing from the files: no people are seen in them."""
     rerun: str = "write the detections again"
     """How the program makes pixels of the calibrated pictures."""
 
@@ -77,7 +77,7 @@ class KeptPeople:
         """Read them, into `kept` under names that begin with `name`."""
         self.camera, self._kept, self._names = camera, kept, list[str]()
         self.keypoint_count: int | None = None
-        """K, None where nobody was seen."""
+        """K, None without people."""
         self.farthest: float | None = None
         """The largest coordinate of a keypoint that was seen, pixels; None where there is none."""
         self.score_count, self.top_score, self.visibilities = 0, 0.0, True

@@ -14,7 +14,7 @@ from shapepose_fg.core.storage.files import write_content
 from shapepose_fg.io.export.take import Take
 
 _VISIBLE_M = 1e-3
-"""Differences below this are nobody's concern."""
+"""Smaller differences are not told of."""
 
 
 class MarkerSet(StrEnum):

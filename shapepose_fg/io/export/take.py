@@ -10,8 +10,8 @@ from rich.filesize import decimal
 from shapepose_fg.core.camera import Axis, Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Known, Reconstruction
+from shapepose_fg.core.result_files import free_memory
 from shapepose_fg.core.run_summary import covered_frames
-from shapepose_fg.core.storage.saved_table import free_memory
 
 _TO_Y_UP: dict[Axis, list[list[int]]] = {
     "y": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
@@ -70,7 +70,7 @@ class Take:
 
         `fps` takes the place of the result's own times, which must be known without it. `seen_only` leaves out
         every joint that no view saw in that frame, and the bodies of rows where none was seen. With `identities`
-        off, a result without time is a Take too: a person is then nobody's identity over frames.
+        off, a result without time is a Take too: a person is then a number within the frame.
         """
         if len(people) == 0:
             raise ValueError("nobody was found, so there is nothing to export")

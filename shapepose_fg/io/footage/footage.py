@@ -193,7 +193,7 @@ class PictureFiles:
 
 
 def _capture(path: Path) -> Any:
-    """The video at `path`, opened by FFmpeg and by the rules for files that nobody vouches for."""
+    """The video at `path`, opened by FFmpeg under the rules for untrusted files."""
     if not path.is_file():
         raise InputError(f"{path}: there is no such video; check the path")
     before, level = os.environ.get(_READ_OPTIONS), cv2.utils.logging.getLogLevel()
