@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.camera import Camera, Rig
-from shapepose_fg.core.drawing import rgb
 from shapepose_fg.viz.rendering import render_depth, zoom
 from shapepose_fg.viz.viewer.drawing import draw_skeletons, light_on, over
 from shapepose_fg.viz.viewer.figures import Mesh, framed
 from shapepose_fg.viz.viewer.floor import Floor, floor_picture
+from shapepose_fg.viz.viewer.palette import rgb
 
 Array = NDArray[np.float64]
 

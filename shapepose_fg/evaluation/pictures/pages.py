@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import DetectionSequence
-from shapepose_fg.core.drawing import PALETTE
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.pictures.choice import (
@@ -42,6 +41,7 @@ from shapepose_fg.simulation import Scene
 from shapepose_fg.viz.viewer.drawing import INK, QUIET, panel, tag
 from shapepose_fg.viz.viewer.figures import Figures, Mesh, floor_under, framed
 from shapepose_fg.viz.viewer.floor import Floor
+from shapepose_fg.viz.viewer.palette import PALETTE
 
 Array = NDArray[np.float64]
 
