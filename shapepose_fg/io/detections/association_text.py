@@ -266,25 +266,20 @@ def _with_middle(view: ViewCandidates, skeleton: Skeleton, middle: int, first: i
     a_made, b_made = a[picked], b[picked]
     made = len(view.frame) + np.arange(len(picked))
     # Who else is linked to both ends of a middle.
-    width = len(view.frame) + 1
-    key, made_key = a * width + b, a_made * width + b_made
-    order = np.argsort(made_key)
-    at = np.minimum(np.searchsorted(made_key[order], key), max(len(order) - 1, 0))
-    linked = np.flatnonzero(made_key[order][at] == key) if len(order) > 0 else np.zeros(0, dtype=np.intp)
-    to_middle = np.column_stack([neighbour[linked], made[order][at[linked]]]) if len(order) > 0 else None
-    pairs = [view.pairs, np.column_stack([made, a_made]), np.column_stack([made, b_made])]
-    affinity = [view.affinity, np.ones(len(made)), np.ones(len(made))]
-    if to_middle is not None:
-        pairs.append(to_middle)
-        affinity.append((view.affinity[left] + view.affinity[right])[linked] / 2)
+    made_at = np.full(len(view.frame), -1, dtype=np.intp)
+    made_at[a_made] = np.arange(len(picked))
+    linked = np.flatnonzero(np.append(b_made, -1)[made_at[a]] == b)
+    starts = np.concatenate([made, made, neighbour[linked]])
+    ends = np.concatenate([a_made, b_made, made[made_at[a[linked]]]])
+    means = (view.affinity[left] + view.affinity[right])[linked] / 2
     return replace(
         view,
         frame=np.concatenate([view.frame, view.frame[a_made]]),
         joint=np.concatenate([view.joint, np.full(len(made), middle)]),
         xy=np.concatenate([view.xy, (view.xy[a_made] + view.xy[b_made]) / 2]),
         confidence=np.concatenate([view.confidence, np.minimum(view.confidence[a_made], view.confidence[b_made])]),
-        pairs=np.concatenate(pairs),
-        affinity=np.concatenate(affinity),
+        pairs=np.concatenate([view.pairs, np.column_stack([starts, ends])]),
+        affinity=np.concatenate([view.affinity, np.ones(2 * len(made)), means]),
     )
 
 
@@ -292,9 +287,7 @@ def _equal_pairs(left: NDArray[np.intp], right: NDArray[np.intp]) -> tuple[NDArr
     """All places i in `left` and k in `right` with equal values, as two arrays."""
     order = np.argsort(right, kind="stable")
     low, high = (np.searchsorted(right[order], left, side=side) for side in ("left", "right"))
-    count = high - low
-    i = np.repeat(np.arange(len(left)), count)
-    within = np.arange(len(i)) - (np.cumsum(count) - count)[i]
+    i, within = _expand(high - low)
     return i, order[low[i] + within]
 
 
