@@ -18,8 +18,6 @@ from shapepose_fg.io.calibration.written import (
     Unit,
     WrittenCamera,
     WrittenRig,
-    check_rotation,
-    nearest_rotation,
     pose,
 )
 from shapepose_fg.io.validation import describe, validated
@@ -102,8 +100,7 @@ def _camera(camera: _Camera, place: str) -> WrittenCamera:
         wTc = np.array(camera.wTc)
         if np.any(wTc[3] != (0, 0, 0, 1)):
             raise InputError(f"{place}: the last row of wTc must be 0 0 0 1; {_CURES['wTc']}")
-        check_rotation(wTc[:3, :3], "wTc", place)
-        wTc[:3, :3] = nearest_rotation(wTc[:3, :3])
+        wTc = pose(wTc[:3, :3], wTc[:3, 3], "wTc", place, world_from_camera=True)
     else:
         cTw = np.array(camera.cTw)
         wTc = pose(cTw[:, :3], cTw[:, 3], "cTw", place)

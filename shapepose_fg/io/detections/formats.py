@@ -1,4 +1,6 @@
-"""The formats of 2D detections that are known. One of your own is an entry here and a module beside this one."""
+"""The formats of 2D detections that are known. One of your own is an entry in `FORMATS` and a function that reads
+it.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -29,7 +31,7 @@ class Format:
 _JSON = (
     "{}", "{}_json", "{}.json", "results_{}.json", "{}_results.json", "alphapose-results_{}.json",
 )  # fmt: skip
-FORMATS = (
+FORMATS = [
     Format("4D Association's text", ("{}.txt",), lambda place: place.suffix == ".txt", read_association_text),
     Format(
         "COCO's keypoint results, AlphaPose's JSON, MMPose's JSON of a video",
@@ -43,5 +45,5 @@ FORMATS = (
         Path.is_dir,
         lambda place, camera: read_frame_files(place),
     ),
-)
+]
 """The first that recognises a camera's file or folder reads it."""
