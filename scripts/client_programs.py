@@ -205,7 +205,7 @@ def rerun(folder: Path) -> None:
     """The recording verified by rerun, joints read back from it, and opened in its viewer without a window."""
     import rerun as rr
 
-    from shapepose_fg.io.export.rerun_scene import viewer_file
+    from shapepose_fg.io.export.rerun_app import viewer_file
 
     path = folder / "export" / "people.rrd"
     done = subprocess.run(

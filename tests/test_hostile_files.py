@@ -25,7 +25,7 @@ from shapepose_fg.body.model.smpl_file import read_smpl_file
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.storage.files import read_json, read_text, read_toml
-from shapepose_fg.core.storage.npz_reader import read_npz
+from shapepose_fg.core.storage.npz import read_npz
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.config import read_config
 from shapepose_fg.io.detections import read_detections
@@ -50,7 +50,7 @@ def in_little_memory(code: str, *arguments: object, before: str = "") -> str:
     begin = (
         "import sys\nfrom pathlib import Path\nfrom shapepose_fg.core.errors import InputError\n"
         "from shapepose_fg.body.model.smpl_file import read_smpl_file\n"
-        "from shapepose_fg.core.storage.npz_reader import read_npz\n"
+        "from shapepose_fg.core.storage.npz import read_npz\n"
     )
     end = f"try:\n    {code}\n    print('read')\nexcept InputError as error:\n    print(error)\n"
     command = [sys.executable, "-c", begin + before + limit + end, *map(str, arguments)]

@@ -14,12 +14,13 @@ ROOT = Path(__file__).parents[1]
 LEVELS = (
     "factors core.errors core.moved",
     "core.camera core.skeleton",
+    "core.drawing",
     "core.storage.files core.bounds",
-    "core.storage.output_folder core.storage.npz_writer core.storage.npz_reader core.storage.kept_arrays"
-    " core.provenance core.result_options core.run_summary core.columns viz.rendering pipeline.workers"
-    " body.threads cli.options cli.terminal cli.stopping",
+    "core.storage.npz",
+    "core.storage.schema",
+    "core.storage.output_folder core.storage.kept_arrays core.shapes core.provenance"
+    " core.run_summary viz.rendering pipeline.workers body.threads cli.options cli.terminal cli.stopping",
     "core.result_files",
-    "core.storage.saved_table",
     "body.model",
     "body.fitting body.shapes",
     "body.offsets",

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import shapepose_fg.core.storage.saved_table
+import shapepose_fg.core.result_files
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.reconstruction import Known, Reconstruction
@@ -116,7 +116,7 @@ def test_rows_in_the_middle_take_the_memory_of_these_rows(folder, result):
 
 
 def test_what_does_not_fit_in_memory_is_a_sentence(folder, monkeypatch):
-    monkeypatch.setattr(shapepose_fg.core.storage.saved_table, "free_memory", lambda: 1_000_000)
+    monkeypatch.setattr(shapepose_fg.core.result_files, "free_memory", lambda: 1_000_000)
     with pytest.raises(InputError, match=r"people\.npz: 934 rows would take .* and 1\.0 MB are free; take some"):
         Reconstruction.load(folder)
     with pytest.raises(InputError, match=r"rows would take"):

@@ -13,7 +13,7 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Reconstruction, Status
 from shapepose_fg.core.result_files import write_result
 from shapepose_fg.core.storage.files import write_together
-from shapepose_fg.core.storage.npz_writer import Column, write_npz
+from shapepose_fg.core.storage.npz import Pieces, write_npz
 from shapepose_fg.simulation import built_in_scene
 from shapepose_fg.simulation.truth import truth_of
 
@@ -35,7 +35,7 @@ def test_pieces_leave_the_same_bytes_as_a_whole_and_numpy_reads_them():
     }
     cuts = {"joints": [0, 1, 1700, 1700, 3001], "status": [0, 14], "none": [0, 0], "turned": [0, 2, 6]}
     pieces = {
-        name: Column(
+        name: Pieces(
             array.dtype,
             array.shape,
             lambda array=array, at=at: (array[a:b] for a, b in pairwise(at)),
@@ -54,9 +54,9 @@ def test_pieces_leave_the_same_bytes_as_a_whole_and_numpy_reads_them():
 
 def test_pieces_that_are_not_the_shape_are_refused():
     with pytest.raises(ValueError, match="make up 2 rows"):
-        written({"x": Column(np.dtype(float), (3,), lambda: [np.zeros(2)])})
+        written({"x": Pieces(np.dtype(float), (3,), lambda: [np.zeros(2)])})
     with pytest.raises(ValueError, match=r"a piece of \(3, 2\) must not be \(3, 4\)"):
-        written({"x": Column(np.dtype(float), (3, 2), lambda: [np.zeros((3, 4))])})
+        written({"x": Pieces(np.dtype(float), (3, 2), lambda: [np.zeros((3, 4))])})
 
 
 @pytest.fixture

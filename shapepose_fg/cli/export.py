@@ -8,7 +8,7 @@ import typer
 from shapepose_fg.cli.options import FramesOption, ResultUpOption, check_fps, result_frames
 from shapepose_fg.cli.terminal import note
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.result_options import results_folder
+from shapepose_fg.core.result_files import results_folder
 
 if TYPE_CHECKING:
     from shapepose_fg.core.camera import Axis
@@ -45,9 +45,8 @@ def export(
     ] = None,
 ) -> None:
     """Write a result for other programs: shapepose-fg export RESULTS amass trc c3d bvh glb csv parquet rrd."""
-    from shapepose_fg.io.export.exporting import export_result
     from shapepose_fg.io.export.markers import MarkerSet
-    from shapepose_fg.io.export.registry import FORMATS, chosen
+    from shapepose_fg.io.export.registry import FORMATS, chosen, export_result
 
     if markers not in set(MarkerSet):
         raise InputError(f"--markers {markers}: must be one of {' '.join(MarkerSet)}")

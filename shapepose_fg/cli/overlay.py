@@ -12,7 +12,7 @@ from shapepose_fg.cli.options import FramesOption, frame_range
 from shapepose_fg.cli.terminal import note, progress
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import ASSUMED_FPS
-from shapepose_fg.core.result_options import results_folder
+from shapepose_fg.core.result_files import results_folder
 
 if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel

@@ -9,7 +9,7 @@ import typer
 
 from shapepose_fg.cli.terminal import show
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.result_options import results_folder
+from shapepose_fg.core.result_files import results_folder
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -66,9 +66,15 @@ def view(
     """Show a result in the rerun viewer: people, cameras, and what was used of what they saw, on a timeline."""
     from shapepose_fg.io.export.job import Job
     from shapepose_fg.io.export.reading import body_file, read_take
-    from shapepose_fg.io.export.rerun_pictures import log_pictures
-    from shapepose_fg.io.export.rerun_scene import body_if_there, log_take, new_stream, open_viewer, viewer_file
-    from shapepose_fg.io.export.rerun_statistics import switch_off
+    from shapepose_fg.io.export.rerun_app import (
+        body_if_there,
+        log_take,
+        new_stream,
+        open_viewer,
+        switch_off,
+        viewer_file,
+    )
+    from shapepose_fg.io.export.rerun_log import log_pictures
 
     check_fps(fps)
     take = read_take(

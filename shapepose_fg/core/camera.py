@@ -51,41 +51,38 @@ class Camera:
     """Which of OpenCV's families the coefficients belong to."""
 
     def __post_init__(self) -> None:
+        def refuse(problem: str) -> ValueError:
+            return ValueError(f"camera {self.name}: {problem}")
+
         if self.lens not in _COEFFICIENTS:
-            raise ValueError(f"camera {self.name}: lens must be perspective or fisheye, got {self.lens!r}")
+            raise refuse(f"lens must be perspective or fisheye, got {self.lens!r}")
         lengths = [(count,) for count in _COEFFICIENTS[self.lens]]
-        for name, shapes in (("K", [(3, 3)]), ("wTc", [(4, 4)]), ("distortion", lengths)):
+        for name, shapes, most in (
+            ("K", [(3, 3)], _MOST_PIXELS),
+            ("wTc", [(4, 4)], _MOST_METRES),
+            ("distortion", lengths, _MOST_DISTORTION),
+        ):
             value = np.asarray(getattr(self, name), dtype=np.float64)
             if value.shape not in shapes:
-                wanted = " or ".join(map(str, shapes))
-                raise ValueError(f"camera {self.name}: {name} must be {wanted}, got {value.shape}")
+                raise refuse(f"{name} must be {' or '.join(map(str, shapes))}, got {value.shape}")
             if not np.isfinite(value).all():
-                raise ValueError(f"camera {self.name}: {name} holds a value that is not finite")
+                raise refuse(f"{name} holds a value that is not finite")
+            if np.abs(value).max(initial=0.0) > most:
+                raise refuse(f"{name} must be at most {most:g}, got {np.abs(value).max():.3g}")
             object.__setattr__(self, name, value)
         if self.K[0, 0] <= 0 or self.K[1, 1] <= 0 or np.any(np.abs(self.K[2] - (0, 0, 1)) > 1e-9):
-            raise ValueError(f"camera {self.name}: K must have positive focal lengths and a last row 0 0 1")
+            raise refuse("K must have positive focal lengths and a last row 0 0 1")
         R = self.wTc[:3, :3]
         if np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(R) < 0:
-            raise ValueError(f"camera {self.name}: the rotation of wTc must be orthonormal with determinant 1")
-        for name, value, most in (
-            ("K", self.K, _MOST_PIXELS),
-            ("wTc", self.wTc, _MOST_METRES),
-            ("distortion", self.distortion, _MOST_DISTORTION),
-        ):
-            if np.abs(value).max(initial=0.0) > most:
-                largest = np.abs(value).max()
-                raise ValueError(f"camera {self.name}: {name} must be at most {most:g}, got {largest:.3g}")
+            raise refuse("the rotation of wTc must be orthonormal with determinant 1")
         width, height = self.image_size
         if not 0 < min(width, height) <= max(width, height) <= _MOST_PIXELS:
-            raise ValueError(
-                f"camera {self.name}: image_size must be positive and at most {_MOST_PIXELS}, got"
-                f" {self.image_size}"
-            )
+            raise refuse(f"image_size must be positive and at most {_MOST_PIXELS}, got {self.image_size}")
         if not self.name or len(self.name) > _LONGEST_NAME or not self.name.isprintable():
             raise ValueError(f"camera {self.name[:40]!r}: names must be 1 to {_LONGEST_NAME} letters, in one line")
         way = PurePath(self.name)
         if way.is_absolute() or len(way.parts) == 0 or ".." in way.parts:
-            raise ValueError(f"camera {self.name}: the name must not lead out of a folder: files are called so")
+            raise refuse("the name must not lead out of a folder: files are called so")
         object.__setattr__(self, "image_size", (int(width), int(height)))
 
     @classmethod
@@ -143,12 +140,9 @@ class Camera:
         if len(xy) == 0 or not self._bends:
             return xy
         rays = self._normalised(xy).reshape(-1, 1, 2)
-        if self.lens == "fisheye":
-            ideal = cv2.fisheye.undistortPoints(rays, np.eye(3), self.distortion, criteria=_CRITERIA)
-        else:
-            ideal = cv2.undistortPoints(rays, np.eye(3), self.distortion, criteria=_CRITERIA)
-        ideal = np.asarray(ideal, dtype=np.float64).reshape(-1, 2)
-        pixels = ideal @ self.K[:2, :2].T + self.K[:2, 2]
+        undo = cv2.fisheye.undistortPoints if self.lens == "fisheye" else cv2.undistortPoints
+        ideal = np.asarray(undo(rays, np.eye(3), self.distortion, criteria=_CRITERIA), dtype=np.float64)
+        pixels = ideal.reshape(-1, 2) @ self.K[:2, :2].T + self.K[:2, 2]
         with np.errstate(invalid="ignore", over="ignore"):
             undone = np.abs(self.distort(pixels) - xy).max(axis=1) < _UNDONE_PX
         pixels[~undone] = np.nan
@@ -187,13 +181,11 @@ _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 
 def padded_distortion(coefficients: Sequence[float], lens: Lens = "perspective") -> NDArray[np.float64]:
     """`coefficients` with zeros up to the next number that OpenCV takes; ValueError where there are too many."""
+    given = np.asarray(coefficients, dtype=np.float64)
     for count in _COEFFICIENTS[lens]:
-        if len(coefficients) <= count:
-            return np.concatenate(
-                [np.asarray(coefficients, dtype=np.float64), np.zeros(count - len(coefficients))]
-            )
-    most = _COEFFICIENTS[lens][-1]
-    raise ValueError(f"a {lens} lens has at most {most} distortion coefficients, got {len(coefficients)}")
+        if len(given) <= count:
+            return np.concatenate([given, np.zeros(count - len(given))])
+    raise ValueError(f"a {lens} lens has at most {count} distortion coefficients, got {len(given)}")
 
 
 @dataclass(frozen=True)

@@ -33,10 +33,11 @@ class FrameTimes:
         finite = np.isfinite(time_s).all(axis=cameras)
         if not finite.all():
             raise ValueError(f"time_s must be finite, at frame {int(np.argmin(finite))} it is not")
-        rising = (np.diff(time_s, axis=0) > 0).all(axis=cameras)
+        rising = np.append(True, (np.diff(time_s, axis=0) > 0).all(axis=cameras))
         if not rising.all():
-            frame = int(np.argmin(rising)) + 1
-            raise ValueError(f"time_s must rise from frame to frame, at frame {frame} it does not")
+            raise ValueError(
+                f"time_s must rise from frame to frame, at frame {int(np.argmin(rising))} it does not"
+            )
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -100,18 +101,19 @@ def check_cuts(cuts: Sequence[int], frames: int) -> tuple[int, ...]:
     return tuple(int(cut) for cut in numbers)
 
 
-def stretches(frames: range, cuts: Sequence[int]) -> list[range]:
+def segments(frames: range, cuts: Sequence[int]) -> list[range]:
     """`frames` from one cut to the next; cuts outside of them do not matter."""
     inside = [cut for cut in cuts if frames.start < cut < frames.stop]
     edges = [frames.start, *inside, frames.stop]
     return [range(start, stop) for start, stop in pairwise(edges) if stop > start]
 
 
+stretches = segments
+"""Its name until 0.1."""
+
+
 def spans_of(frames: Iterable[int]) -> list[range]:
     """Frames as ranges of those that follow each other."""
     ordered = sorted(set(frames))
-    if len(ordered) == 0:
-        return []
-    breaks = [at for at in range(1, len(ordered)) if ordered[at] != ordered[at - 1] + 1]
-    edges = [0, *breaks, len(ordered)]
-    return [range(ordered[a], ordered[b - 1] + 1) for a, b in pairwise(edges)]
+    edges = [0, *(at for at in range(1, len(ordered)) if ordered[at] != ordered[at - 1] + 1), len(ordered)]
+    return [range(ordered[a], ordered[b - 1] + 1) for a, b in pairwise(edges) if b > a]

@@ -9,9 +9,9 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 
 _ROOMS = {
-    "core": "errors camera skeleton detections observations observation_table frame_times bounds columns"
-    " reconstruction provenance result_options run_summary result_files",
-    "core.storage": "files npz_reader npz_writer saved_table kept_arrays output_folder",
+    "core": "errors camera skeleton detections observations observation_table frame_times bounds"
+    " reconstruction provenance run_summary result_files",
+    "core.storage": "files kept_arrays output_folder",
     "pipeline": "engine windows workers cluster chunk_work solving person_bodies bodies_over_time solved_rows"
     " runs",
     "cli": "options terminal stopping demo batch",
@@ -20,6 +20,23 @@ _ROOMS = {
     "body": "training",
 }
 """What was in the package's root until 0.1, by where it is now."""
+_MERGED = {
+    "core.storage.npz": "npz_reader npz_writer core.storage.npz_reader core.storage.npz_writer",
+    "core.storage.schema": "columns core.columns",
+    "core.result_files": "result_options core.result_options saved_table core.storage.saved_table",
+    "pipeline.runs.manifest": "pipeline.runs.room",
+    "core.drawing": "viz.viewer.palette io.export.bones io.export.light_mesh",
+    "pipeline.runs.parts": "pipeline.runs.rows_of_people",
+    "io.export.take": "io.export.axes",
+    "io.detections.association_text": "io.detections.association_skeletons",
+    "io.export.skinned": "io.export.stretches",
+    "io.export.registry": "io.export.exporting",
+    "io.export.tables": "io.export.table io.export.parquet",
+    "io.export.marker_files": "io.export.trc io.export.c3d io.export.pose2sim_files",
+    "io.export.rerun_app": "io.export.rerun_scene io.export.rerun_statistics io.export.rrd",
+    "io.export.rerun_log": "io.export.rerun_people io.export.rerun_views io.export.rerun_pictures",
+}
+"""Modules that are others now, under whichever name."""
 _RENAMED = {
     "pipeline_config": "pipeline.config",
     "batch_command": "cli.batch.command",
@@ -28,6 +45,7 @@ _RENAMED = {
         f"reconstruct_{name}": f"cli.reconstruct.{name}"
         for name in "command ending inputs outcome request run summary".split()
     },
+    **{old: new for new, names in _MERGED.items() for old in names.split()},
 }
 MOVED = {name: f"{room}.{name}" for room, names in _ROOMS.items() for name in names.split()} | _RENAMED
 """Old names to new ones, both within the package."""
@@ -53,11 +71,12 @@ class _Finder(MetaPathFinder):
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        package, _, rest = fullname.partition(".")
-        first, *inner = rest.split(".")
-        if package != "shapepose_fg" or first not in MOVED:
-            return None
-        return ModuleSpec(fullname, _Loader(".".join([package, MOVED[first], *inner])))
+        package, *parts = fullname.split(".")
+        for n in range(1, len(parts) + 1) if package == "shapepose_fg" else ():
+            new = MOVED.get(".".join(parts[:n]))
+            if new is not None:
+                return ModuleSpec(fullname, _Loader(".".join([package, new, *parts[n:]])))
+        return None
 
 
 def install() -> None:

@@ -1,25 +1,22 @@
 """What each row of a result was solved from: per joint and view the detection, its residual, and its gate."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.camera import Rig
-from shapepose_fg.core.columns import check_codes, checked, code_names
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.core.result_files import check_id
+from shapepose_fg.core.result_files import SavedTable, check_id
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.core.storage.files import write_atomically
-from shapepose_fg.core.storage.npz_writer import Column, write_npz
-from shapepose_fg.core.storage.saved_table import SavedTable
-
-_CURE = "give the observations.npz of a reconstruction"
+from shapepose_fg.core.storage.npz import write_npz
+from shapepose_fg.core.storage.schema import Column, Table, code_names
 
 
 class Gate(IntEnum):
@@ -39,54 +36,50 @@ class Gate(IntEnum):
     """The joint itself could not be placed: there is nothing to compare the detection with."""
 
 
-_LATER: Any = None
-"""In place of a column that is not given."""
-
-
 @dataclass(frozen=True)
-class ObservationTable:
+class ObservationTable(Table):
     """The detections of N rows (person and frame), J joints and V views; row i is row i of people.npz."""
 
-    frame: NDArray[np.int64]
+    frame: Annotated[NDArray[np.integer], Column("N", np.int64)]
     """(N,) frame of each row."""
-    person: NDArray[np.int64]
+    person: Annotated[NDArray[np.integer], Column("N", np.int64)]
     """(N,) identity of the person of each row."""
-    joint_names: NDArray[np.str_]
+    joint_names: Annotated[NDArray[np.str_], Column("J", np.str_)]
     """(J,) names of the joints."""
-    view_names: NDArray[np.str_]
+    view_names: Annotated[NDArray[np.str_], Column("V", np.str_)]
     """(V,) names of the cameras."""
-    candidate: NDArray[np.int32]
+    candidate: Annotated[NDArray[np.int32], Column("N J V", np.int32)]
     """(N, J, V) which detection: its place among all those of its view in this frame; -1 for none, or not said."""
-    xy: NDArray[np.float32]
+    xy: Annotated[NDArray[np.float32], Column("N J V 2", np.float32, "px")]
     """(N, J, V, 2) where the detection lies, undistorted pixels; NaN where there is none."""
-    confidence: NDArray[np.float32]
+    confidence: Annotated[NDArray[np.float32], Column("N J V", np.float32)]
     """(N, J, V) the detector's score, 0 to 1; 0 where there is none."""
-    residual_px: NDArray[np.float32]
+    residual_px: Annotated[NDArray[np.float32], Column("N J V 2", np.float32, "px")]
     """(N, J, V, 2) projected joint minus detection, pixels; NaN where there is none, or no joint to project."""
-    gate: NDArray[np.uint8]
+    gate: Annotated[NDArray[np.uint8], Column("N J V", np.uint8, codes=Gate)]
     """(N, J, V) codes of `Gate`."""
-    probability: NDArray[np.float32] = _LATER
-    """(N, J, V) how probable it is that the detection is this person's, and nobody else's; 0 where there is none.
+    probability: Annotated[NDArray[np.float32], Column("N J V", np.float32, missing=1.0)] = None  # type: ignore[assignment]
+    """(N, J, V) how probable it is that the detection is this person's; 0 where there is none.
     1 where it is not said, as in files of before."""
 
     ROWS: ClassVar = "frame person candidate xy confidence residual_px gate probability".split()
-    """The columns that have one entry per row."""
 
     def __post_init__(self) -> None:
-        """Check every shape and type, once; and that a detection is there or not in all columns alike."""
-        N, J, V = np.size(self.frame), np.size(self.joint_names), np.size(self.view_names)
-        columns = {"frame": ((N,), np.int64), "person": ((N,), np.int64)}
-        columns |= {"joint_names": ((J,), np.str_), "view_names": ((V,), np.str_)}
-        columns |= {"candidate": ((N, J, V), np.int32), "xy": ((N, J, V, 2), np.float32)}
-        columns |= {"confidence": ((N, J, V), np.float32), "residual_px": ((N, J, V, 2), np.float32)}
-        columns |= {"gate": ((N, J, V), np.uint8), "probability": ((N, J, V), np.float32)}
-        if self.probability is None:
-            object.__setattr__(self, "probability", np.asarray(self.gate != Gate.NOT_SEEN, dtype=np.float32))
-        for name, (shape, dtype) in columns.items():
-            object.__setattr__(self, name, checked(name, getattr(self, name), shape, dtype))
-        check_codes("gate", self.gate, Gate)
-        self._check_values()
+        """Check shapes and types, that values make sense, and that columns agree on what was seen."""
+        unsaid = self.probability is None
+        super().__post_init__()
         seen = self.gate != Gate.NOT_SEEN
+        if unsaid:
+            object.__setattr__(self, "probability", seen.astype(np.float32))
+        if not ((self.confidence >= 0) & np.isfinite(self.confidence)).all():
+            raise ValueError("confidence must be 0 or more")
+        if not ((self.probability >= 0) & (self.probability <= 1)).all():
+            raise ValueError("probability must be 0 to 1")
+        if np.isinf(self.residual_px).any():
+            raise ValueError("residual_px must be finite, or NaN where there is none")
+        for name in self.shared():
+            if len(set(getattr(self, name).tolist())) < len(getattr(self, name)):
+                raise ValueError(f"{name} must differ from each other")
         # A score may be too small for a float32, and which detection it was need not be said.
         wrong = {
             "candidate": (self.candidate >= 0) & ~seen,
@@ -100,21 +93,6 @@ class ObservationTable:
                     f"{name} and gate must agree on what was seen, at row {row}, {self.joint_names[joint]},"
                     f" view {self.view_names[view]} they do not"
                 )
-
-    def _check_values(self) -> None:
-        """ValueError for scores that are none, errors without end, and two cameras or joints of one name."""
-        if not ((self.confidence >= 0) & np.isfinite(self.confidence)).all():
-            raise ValueError("confidence must be 0 or more")
-        if not ((self.probability >= 0) & (self.probability <= 1)).all():
-            raise ValueError("probability must be 0 to 1")
-        if np.isinf(self.residual_px).any():
-            raise ValueError("residual_px must be finite, or NaN where there is none")
-        for name in ("joint_names", "view_names"):
-            if len(set(getattr(self, name).tolist())) < len(getattr(self, name)):
-                raise ValueError(f"{name} must differ from each other")
-
-    def __len__(self) -> int:
-        return len(self.frame)
 
     @classmethod
     def of(
@@ -143,16 +121,16 @@ class ObservationTable:
         gate = np.where(free & np.isnan(joints).any(axis=-1, keepdims=True), Gate.NOT_PLACED, gate)
         ahead = np.asarray(seen & (depth > 0))[..., None]
         return cls(
-            frame=frame.astype(np.int64),
-            person=person.astype(np.int64),
+            frame=frame,
+            person=person,
             joint_names=np.array(joint_names, dtype=str),
             view_names=np.array(rig.names, dtype=str),
-            candidate=np.where(seen, place, -1).astype(np.int32),
-            xy=np.where(seen[..., None], observations.xy, np.nan).astype(np.float32),
-            confidence=np.where(seen, observations.confidence, 0.0).astype(np.float32),
-            residual_px=np.where(ahead, projected - observations.xy, np.nan).astype(np.float32),
-            gate=gate.astype(np.uint8),
-            probability=np.where(seen, observations.probability, 0.0).astype(np.float32),
+            candidate=np.where(seen, place, -1),
+            xy=np.where(seen[..., None], observations.xy, np.nan),
+            confidence=np.where(seen, observations.confidence, 0.0),
+            residual_px=np.where(ahead, projected - observations.xy, np.nan),
+            gate=gate,
+            probability=np.where(seen, observations.probability, 0.0),
         )
 
     @classmethod
@@ -160,37 +138,13 @@ class ObservationTable:
         cls, joint_names: Sequence[str] = BODY_25.joints, view_names: Sequence[str] = ()
     ) -> "ObservationTable":
         """The table of a result without rows."""
-        J, V = len(joint_names), len(view_names)
-        none = np.zeros(0, dtype=np.int64)
-        return cls(
-            frame=none,
-            person=none,
-            joint_names=np.array(joint_names, dtype=str),
-            view_names=np.array(view_names, dtype=str),
-            candidate=np.zeros((0, J, V), dtype=np.int32),
-            xy=np.zeros((0, J, V, 2), dtype=np.float32),
-            confidence=np.zeros((0, J, V), dtype=np.float32),
-            residual_px=np.zeros((0, J, V, 2), dtype=np.float32),
-            gate=np.zeros((0, J, V), dtype=np.uint8),
-        )
+        names = {"joint_names": joint_names, "view_names": view_names}
+        return cls.without_rows(**{name: np.array(each, dtype=str) for name, each in names.items()})
 
     @classmethod
     def concatenate(cls, parts: Sequence["ObservationTable"]) -> "ObservationTable":
         """The rows of `parts`, one after the other; ValueError where joints or views differ."""
-        if len(parts) == 0:
-            return cls.empty()
-        first = parts[0]
-        for part in parts:
-            for name in ("joint_names", "view_names"):
-                if not np.array_equal(getattr(part, name), getattr(first, name)):
-                    raise ValueError(f"parts must have the same {name}")
-        return replace(
-            first, **{name: np.concatenate([getattr(part, name) for part in parts]) for name in cls.ROWS}
-        )
-
-    def rows(self, index: NDArray[Any]) -> "ObservationTable":
-        """The rows that `index` picks: a mask (N,) or row numbers."""
-        return replace(self, **{name: getattr(self, name)[index] for name in self.ROWS})
+        return ObservationTable.joined(parts) if len(parts) > 0 else cls.empty()
 
     def observations(self, initial: NDArray[np.float64], time_s: NDArray[np.float64]) -> Observations:
         """The rows as they were given to be solved, dropped detections too: to solve them anew.
@@ -220,11 +174,6 @@ class ObservationTable:
         names = code_names(Gate).tolist()
         return {names[gate]: int(count[gate]) for gate in Gate if gate != Gate.NOT_SEEN}
 
-    def columns(self) -> dict[str, Column]:
-        """What observations.npz holds."""
-        arrays = {name: getattr(self, name) for name in (*self.ROWS, "joint_names", "view_names")}
-        return {name: Column.of(array) for name, array in (arrays | {"gate_names": code_names(Gate)}).items()}
-
     def save(self, file: str | Path) -> None:
         """Write the table as `file`, whole or not at all; NumPy alone reads it (docs/conventions.md)."""
         write_atomically(Path(file), lambda stream: write_npz(stream, self.columns()))
@@ -237,25 +186,14 @@ class ObservationTable:
         """
         opened = cls.open(Path(file), run_id)
         try:
-            return cls(**opened.columns(None))
-        except InputError:
-            raise
-        except ValueError as error:
-            raise InputError(f"{file}: {error}; {_CURE}") from None
+            return opened.read(None)
         finally:
             opened.close()
 
     @classmethod
-    def open(cls, file: Path, run_id: object = None) -> SavedTable:
+    def open(cls, file: Path, run_id: object = None) -> "SavedTable[ObservationTable]":
         """What `load` reads, of which rows come into memory when they are asked for."""
-        opened = SavedTable(
-            file,
-            rows=cls.ROWS,
-            shared=("joint_names", "view_names"),
-            code_names={"gate_names": code_names(Gate)},
-            added={"probability"},
-            cure=_CURE,
-        )
+        opened = SavedTable(file, ObservationTable, "give the observations.npz of a reconstruction")
         try:
             check_id(run_id, opened.run_id, file)
         except InputError:

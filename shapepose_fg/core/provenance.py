@@ -22,9 +22,11 @@ _PACKAGES = {
 
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that decide about numbers; nothing is imported for it."""
-    found = {"python": platform.python_version()}
+    found = {"python": platform.python_version()} | dict.fromkeys(_PACKAGES, "not installed")
     for name, distributions in _PACKAGES.items():
-        found[name] = next(filter(None, map(_version, distributions)), "not installed")
+        for distribution in reversed(distributions):
+            with suppress(metadata.PackageNotFoundError):
+                found[name] = metadata.version(distribution)
     return found
 
 
@@ -85,20 +87,12 @@ def _states(paths: Iterable[str | Path | None]) -> Iterator[tuple[str, int]]:
                 yield str(file), state.st_size << 64 | state.st_mtime_ns
 
 
-def _version(distribution: str) -> str | None:
-    try:
-        return metadata.version(distribution)
-    except metadata.PackageNotFoundError:
-        return None
-
-
 def _digest(path: Path) -> str:
     """sha256 in hexadecimal."""
     try:
         if path.is_dir():
-            files = sorted(file for file in path.rglob("*") if file.suffix in _INPUTS)
             whole = hashlib.sha256()
-            for file in files:
+            for file in sorted(file for file in path.rglob("*") if file.suffix in _INPUTS):
                 whole.update(f"{file.relative_to(path).as_posix()} {_digest(file)}\n".encode())
             return whole.hexdigest()
         with path.open("rb") as stream:

@@ -5,21 +5,19 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum, StrEnum
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.body.shapes import SubjectShapes
-from shapepose_fg.core.columns import check_codes, checked, code_names
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observation_table import ObservationTable
-from shapepose_fg.core.result_files import OBSERVATIONS, PEOPLE, RUN, RUN_ID, check_id, write_result
+from shapepose_fg.core.result_files import OBSERVATIONS, PEOPLE, RUN, RUN_ID, SavedTable, check_id, write_result
 from shapepose_fg.core.run_summary import check_run, merged_run
+from shapepose_fg.core.shapes import SubjectShapes
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.core.storage.files import read_json
-from shapepose_fg.core.storage.npz_writer import Column
-from shapepose_fg.core.storage.saved_table import SavedTable
+from shapepose_fg.core.storage.schema import Column, Table
 
 
 class Status(StrEnum):
@@ -57,43 +55,47 @@ class Known(IntEnum):
         return np.isin(known, (cls.SEEN, cls.WEAK))
 
 
+MOST_NUMBER = 2**53 - 1
+"""The highest number of a frame or a person: the last whole number that all real ones below it are."""
 _LATER: Any = None
 """In place of a column that is not given: nothing is known of it."""
 
 
 @dataclass(frozen=True)
-class Reconstruction:
+class Reconstruction(Table):
     """The people of a recording: N rows, one per person and frame, sorted as they were added."""
 
-    frame: NDArray[np.integer]
+    frame: Annotated[NDArray[np.integer], Column("N", np.int64, most=MOST_NUMBER)]
     """(N,) frame of each row, counted from 0 in the file."""
-    person: NDArray[np.integer]
+    person: Annotated[NDArray[np.integer], Column("N", np.int64, most=MOST_NUMBER)]
     """(N,) identity of the person; without tracking, a number within the frame."""
-    joint_names: NDArray[np.str_]
+    joint_names: Annotated[NDArray[np.str_], Column("J", np.str_)]
     """(J,) names of the joints, as OpenPose writes them."""
-    joints: NDArray[np.float64]
+    joints: Annotated[NDArray[np.float64], Column("N J 3", unit="m", most=1e6)]
     """(N, J, 3) joint positions in the world, metres; NaN where unknown."""
-    covariance: NDArray[np.float64]
+    covariance: Annotated[NDArray[np.float64], Column("N J 3 3", unit="m²", most=1e12)]
     """(N, J, 3, 3) covariance of each joint's position, square metres; NaN where unknown."""
-    confidence: NDArray[np.float64]
+    confidence: Annotated[NDArray[np.float64], Column("N J", most=1e3)]
     """(N, J) mean confidence of a joint's observations over all views, 0 to 1."""
-    betas: NDArray[np.float64]
+    betas: Annotated[NDArray[np.float64], Column("N 10", most=1e3)]
     """(N, 10) shape of the body, standard deviations; NaN where there is no body."""
-    global_orient: NDArray[np.float64]
+    global_orient: Annotated[NDArray[np.float64], Column("N 3", unit="rad", most=1e3)]
     """(N, 3) orientation of the pelvis in the world, axis times angle, radians."""
-    body_pose: NDArray[np.float64]
+    body_pose: Annotated[NDArray[np.float64], Column("N 23 3", unit="rad", most=1e3)]
     """(N, 23, 3) rotation of every other body joint against its parent, axis times angle, radians."""
-    transl: NDArray[np.float64]
+    transl: Annotated[NDArray[np.float64], Column("N 3", unit="m", most=1e6)]
     """(N, 3) translation of the body, metres."""
-    status: NDArray[np.str_]
+    status: Annotated[NDArray[np.str_], Column("N", np.str_, stored=f"U{max(map(len, Status))}")]
     """(N,) one of the values of `Status`."""
-    time_s: NDArray[np.float64] = _LATER
+    time_s: Annotated[NDArray[np.float64], Column("N", unit="s", most=1e12, missing=np.nan)] = _LATER
     """(N,) when the row's frame was taken, seconds; NaN where unknown, as it is where the column is not given."""
-    velocity: NDArray[np.float64] = _LATER
+    velocity: Annotated[NDArray[np.float64], Column("N J 3", unit="m/s", most=1e9, missing=np.nan)] = _LATER
     """(N, J, 3) velocity of each joint in the world, m/s; NaN where unknown or not given."""
-    velocity_covariance: NDArray[np.float64] = _LATER
+    velocity_covariance: Annotated[
+        NDArray[np.float64], Column("N J 3 3", unit="(m/s)²", most=1e18, missing=np.nan)
+    ] = _LATER
     """(N, J, 3, 3) covariance of each joint's velocity, (m/s)²; NaN where unknown or not given."""
-    known: NDArray[np.uint8] = _LATER
+    known: Annotated[NDArray[np.uint8], Column("N J", np.uint8, missing=Known.UNKNOWN, codes=Known)] = _LATER
     """(N, J) how each joint is known: codes of `Known`; unknown where not given."""
     run: dict[str, Any] = field(default_factory=dict)
     """How this came about: configuration, versions, checksums, times (goes to run.json)."""
@@ -106,63 +108,23 @@ class Reconstruction:
         "frame person time_s joints covariance velocity velocity_covariance known confidence"
         " betas global_orient body_pose transl status".split()
     )
-    """The columns that have one entry per row."""
 
     def __post_init__(self) -> None:
-        """Check every shape and type, once."""
-        N, J = np.size(self.frame), np.size(self.joint_names)
-        shapes = {"frame": (N,), "person": (N,), "joint_names": (J,), "time_s": (N,), "joints": (N, J, 3)}
-        shapes |= {"covariance": (N, J, 3, 3), "velocity": (N, J, 3), "velocity_covariance": (N, J, 3, 3)}
-        shapes |= {"known": (N, J), "confidence": (N, J), "betas": (N, 10), "global_orient": (N, 3)}
-        shapes |= {"body_pose": (N, 23, 3), "transl": (N, 3), "status": (N,)}
-        for name, shape in shapes.items():
-            value, dtype = getattr(self, name), _TYPES.get(name, np.float64)
-            if value is None and name in _ADDED:
-                value = np.full(shape, Known.UNKNOWN if name == "known" else np.nan, dtype=dtype)
-            object.__setattr__(self, name, checked(name, value, shape, dtype))
-        check_codes("known", self.known, Known)
+        """Check every shape and type, once, and that `observations` are of these rows."""
+        super().__post_init__()
         unknown = set(np.unique(self.status).tolist()) - set(Status)
         if len(unknown) > 0:
             raise ValueError(f"status must be one of {[*map(str, Status)]}, got {sorted(unknown)}")
-        self._check_observations()
-
-    def _check_values(self) -> None:
-        """ValueError for what no reconstruction gives: negative frames, joints thousands of kilometres away."""
-        for name in self.ROWS:
-            if name in _LARGEST:
-                check_range(name, getattr(self, name))
-
-    def _check_observations(self) -> None:
-        """ValueError where `observations` are of other rows."""
-        table = self.observations
-        if table is None:
-            return
-        for name in ("frame", "person", "joint_names"):
-            if not np.array_equal(getattr(table, name), getattr(self, name)):
+        for name in ("frame", "person", "joint_names") if self.observations is not None else ():
+            if not np.array_equal(getattr(self.observations, name), getattr(self, name)):
                 raise ValueError(
                     f"observations must have the same {name} as the people, row by row (see `relabelled`)"
                 )
 
-    def __len__(self) -> int:
-        return len(self.frame)
-
     @classmethod
     def empty(cls, joint_names: Sequence[str] = BODY_25.joints) -> "Reconstruction":
-        """Nobody."""
-        J = len(joint_names)
-        return cls(
-            frame=np.zeros(0, dtype=np.int64),
-            person=np.zeros(0, dtype=np.int64),
-            joint_names=np.array(joint_names),
-            joints=np.zeros((0, J, 3)),
-            covariance=np.zeros((0, J, 3, 3)),
-            confidence=np.zeros((0, J)),
-            betas=np.zeros((0, 10)),
-            global_orient=np.zeros((0, 3)),
-            body_pose=np.zeros((0, 23, 3)),
-            transl=np.zeros((0, 3)),
-            status=np.zeros(0, dtype="U1"),
-        )
+        """Without people."""
+        return cls.without_rows(joint_names=np.array(joint_names))
 
     @classmethod
     def concatenate(cls, parts: Sequence["Reconstruction"]) -> "Reconstruction":
@@ -174,17 +136,12 @@ class Reconstruction:
         """
         if len(parts) == 0:
             return cls.empty()
-        first = parts[0]
-        for part in parts:
-            if not np.array_equal(part.joint_names, first.joint_names):
-                raise ValueError("parts must have the same joint_names")
-        columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in cls.ROWS}
         filled = [part.observations for part in parts if len(part) > 0]
         tables = [table for table in filled if table is not None]
         together = ObservationTable.concatenate(tables) if 0 < len(tables) == len(filled) else None
         # A part without rows and without a run has nothing to say of the whole.
         runs = [part.run for part in parts if len(part) > 0 or len(part.run) > 0]
-        return replace(first, **columns, observations=together, shapes=None, run=merged_run(runs))
+        return Reconstruction.joined(parts, observations=together, shapes=None, run=merged_run(runs))
 
     def rows(self, index: NDArray) -> "Reconstruction":
         """The rows that `index` picks: a mask (N,) or row numbers."""
@@ -208,11 +165,6 @@ class Reconstruction:
     def counts(self) -> dict[str, Any]:
         """What run.json says of the rows: how many, with which status, and how their joints are known."""
         return count_rows([(self.status, self.known)])
-
-    def columns(self) -> dict[str, Column]:
-        """What people.npz holds."""
-        columns = {name: Column.of(getattr(self, name), _STORED.get(name)) for name in self.ROWS}
-        return columns | shared_columns(self.joint_names)
 
     def save(self, folder: str | Path) -> None:
         """Write people.npz, run.json and observations.npz into `folder`, each whole or not at all.
@@ -250,21 +202,12 @@ class OpenedReconstruction:
     def __init__(self, path: Path) -> None:
         """InputError where there is no result, or its files are of two runs."""
         file = path / PEOPLE if path.is_dir() else path
-        self._observed: SavedTable | None = None
+        self._observed: SavedTable[ObservationTable] | None = None
         self._block = range(0), Reconstruction.empty()
-        self._people = SavedTable(
-            file,
-            rows=Reconstruction.ROWS,
-            shared=("joint_names",),
-            code_names={"known_names": code_names(Known)},
-            added=_ADDED,
-            cure=_CURE,
-        )
+        self._people = SavedTable(file, Reconstruction, "give the people.npz of a reconstruction")
         try:
-            self.frame = self._numbers("frame")
-            """(N,) frame of each row."""
-            self.person = self._numbers("person")
-            """(N,) identity of each row's person."""
+            self.frame, self.person = (self._people.numbers(name) for name in ("frame", "person"))
+            """(N,) frame of each row, and identity of each row's person."""
             self.run = self._read_run(file.with_name(RUN))
             """What run.json says."""
             table = file.with_name(OBSERVATIONS)
@@ -283,7 +226,7 @@ class OpenedReconstruction:
         return self._observed is not None
 
     def at(self, frame: int) -> Reconstruction:
-        """The people of one frame. The next ones come into memory with it, for whoever goes on to them."""
+        """The people of one frame. The next frames come into memory with it."""
         if frame not in self._block[0]:
             block = range(frame, frame + _BLOCK)
             self._block = block, self.frames(block.start, block.stop)
@@ -307,24 +250,15 @@ class OpenedReconstruction:
 
         InputError where a file is damaged, or they would not fit in memory.
         """
-        try:
-            columns: dict[str, Any] = self._people.columns(index)
-            people = Reconstruction(**columns, run=self.run)
-            people._check_values()
-        except InputError:
-            raise
-        except ValueError as error:
-            raise InputError(f"{self._people.file}: {error}; {_CURE}") from None
+        people = self._people.read(index, run=self.run)
         if self._observed is None or not observations:
             return people
+        table = self._observed.read(index)
         try:
-            return replace(people, observations=ObservationTable(**self._observed.columns(index)))
-        except InputError:
-            raise
+            return replace(people, observations=table)
         except ValueError as error:
-            raise InputError(
-                f"{self._observed.file}: {error}; delete it or run the reconstruction again"
-            ) from None
+            file = self._observed.file
+            raise InputError(f"{file}: {error}; delete it or run the reconstruction again") from None
 
     def close(self) -> None:
         """Nothing can be read any more."""
@@ -338,17 +272,6 @@ class OpenedReconstruction:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _numbers(self, name: str) -> NDArray[np.integer]:
-        """A column of frames or identities, of which rows are chosen before the others are read."""
-        try:
-            column = checked(name, self._people.column(name), (self._people.count,), np.int64)
-            check_range(name, column)
-        except InputError:
-            raise
-        except ValueError as error:
-            raise InputError(f"{self._people.file}: {error}; {_CURE}") from None
-        return column
-
     def _read_run(self, file: Path) -> dict[str, Any]:
         """What run.json says, if it is of the same run; empty where there is none."""
         run = read_json(file) if file.is_file() else {}
@@ -358,59 +281,13 @@ class OpenedReconstruction:
             check_run(run)
         except ValueError as error:
             raise InputError(f"{file}: {error}; restore it or delete it") from None
-        # Whoever changes the people and saves them gives them another id.
+        # People that were changed and saved have another id.
         check_id(self._people.run_id, run.pop(RUN_ID, None), file)
         return run
 
 
 _BLOCK = 128
 """Frames that are read together by `OpenedReconstruction.at`; as many as detections are kept in."""
-_CURE = "give the people.npz of a reconstruction"
-_TYPES: dict[str, type] = {
-    "frame": np.int64,
-    "person": np.int64,
-    "joint_names": np.str_,
-    "status": np.str_,
-    "known": np.uint8,
-}
-"""The type of a column; every other column is float64."""
-_ADDED = frozenset({"time_s", "velocity", "velocity_covariance", "known"})
-"""Columns that files of version 0.1 lack."""
-MOST_NUMBER = 2**53 - 1
-"""The highest number of a frame or a person: the last whole number that all real ones below it are."""
-_LARGEST: dict[str, float] = {
-    "frame": MOST_NUMBER,
-    "person": MOST_NUMBER,
-    "time_s": 1e12,
-    "joints": 1e6,
-    "covariance": 1e12,
-    "velocity": 1e9,
-    "velocity_covariance": 1e18,
-    "confidence": 1e3,
-    "betas": 1e3,
-    "global_orient": 1e3,
-    "body_pose": 1e3,
-    "transl": 1e6,
-}
-"""The largest magnitude that is read: far beyond what people do, and such that products of it are numbers."""
-_STORED: dict[str, Any] = {"status": np.dtype(f"U{max(map(len, Status))}")}
-"""Types in people.npz that do not depend on the rows."""
-
-
-def check_range(name: str, column: NDArray[Any]) -> None:
-    """ValueError where a number in the column `name` is larger than any result has, or a whole one negative."""
-    if column.size == 0:
-        return
-    if column.dtype.kind == "i" and column.min() < 0:
-        raise ValueError(f"{name} must not be negative, got {column.min()}")
-    largest = max(np.fmax.reduce(column, axis=None), -np.fmin.reduce(column, axis=None))
-    if largest > _LARGEST[name]:
-        raise ValueError(f"{name} must be at most {_LARGEST[name]:g} or unknown (NaN), got {largest:g}")
-
-
-def shared_columns(joint_names: NDArray[np.str_]) -> dict[str, Column]:
-    """What people.npz holds beside its rows."""
-    return {"joint_names": Column.of(joint_names), "known_names": Column.of(code_names(Known))}
 
 
 def count_rows(pieces: Iterable[tuple[NDArray[np.str_], NDArray[np.uint8]]]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What run.json of several results says when their rows are put together."""
+"""What run.json says: checked when it is read, and of several results when their rows are put together."""
 
 import json
 import math
@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 
 Run = dict[str, Any]
+_MOST_FRAMES = 10_000_000
+"""Frames of a recording: over four days at 25 a second."""
 
 
 def merged_run(runs: Sequence[Run]) -> Run:
@@ -19,10 +21,21 @@ def merged_run(runs: Sequence[Run]) -> Run:
     agree and listed under `parts` where they do not. ValueError where configurations or an input's checksum
     differ, or two parts cover the same frame. Parts of one run, with one and the same `run`, leave it as it is.
     """
-    runs = _distinct(runs)
+    distinct: list[Run] = []
+    for run in runs:
+        if not any(run is other or _same(run, other) for other in distinct):
+            distinct.append(run)
+    runs = distinct
     if len(runs) <= 1:
         return dict(runs[0]) if runs else {}
-    _refuse_other_settings([run.get("configuration") for run in runs])
+    settings = [run["configuration"] for run in runs if run.get("configuration") is not None]
+    for other in settings[1:]:
+        found = difference(settings[0], other)
+        if found is not None:
+            raise ValueError(
+                f"parts must have the same configuration, {found[0]} differs; reconstruct them with one and the"
+                " same"
+            )
     together: Run = {}
     own: list[Run] = [{} for _ in runs]
     for key in dict.fromkeys(key for run in runs for key in run):
@@ -44,134 +57,20 @@ def merged_run(runs: Sequence[Run]) -> Run:
     return together
 
 
-def covered_frames(run: Mapping[str, Any]) -> list[range] | None:
-    """The frames that a run covered, as ranges; None where it does not say. ValueError where it makes no sense."""
-    frames = run.get("frames")
-    if frames is None:
-        return None
-    try:
-        spans = frames if np.ndim(frames) == 2 else [frames]
-        return [range(int(start), int(stop)) for start, stop in spans]
-    except (TypeError, ValueError, OverflowError):
-        raise ValueError(f'"frames" must be [start, stop] or a list of those, got {frames!r}') from None
-
-
-def check_run(run: Mapping[str, Any]) -> None:
-    """ValueError where an entry that is read again is not what it must be; others may be anything finite."""
-    for key in ("configuration", "versions", "inputs", "seconds", "people", "time"):
-        if not isinstance(run.get(key, {}), dict):
-            raise ValueError(f'"{key}" must be an object, got {_short(run[key])}')
-    for key, values in (("seconds", run.get("seconds", {})), ("time", {"fps": run.get("time", {}).get("fps")})):
-        for name, value in values.items():
-            if not (value is None and name == "fps") and not _is_number(value):
-                raise ValueError(f'"{key}.{name}" must be a number, got {_short(value)}')
-    cuts = run.get("cuts", [])
-    if not isinstance(cuts, list) or not all(type(cut) is int and cut >= 0 for cut in cuts):
-        raise ValueError(f'"cuts" must be a list of frame numbers, got {_short(cuts)}')
-    if not isinstance(run.get("body"), str | None):
-        raise ValueError(f'"body" must be the name of a file or null, got {_short(run["body"])}')
-    spans = covered_frames(run) or []
-    if any(span.start < 0 or span.stop < span.start for span in spans) or _count(spans) > _MOST_FRAMES:
-        raise ValueError(
-            f'"frames" must be [start, stop] of at most {_MOST_FRAMES} frames, got {_short(run["frames"])}'
-        )
-    endless = _not_finite(run)
-    if endless is not None:  # such as 1e999, which could not be written again
-        raise ValueError(f'"{".".join(endless[:-1])[:80]}" must be a finite number, got {endless[-1]}')
-
-
-def _not_finite(value: object) -> list[str] | None:
-    """Keys and indices that lead to a number that is not finite, and the number; None where there is none."""
-    if isinstance(value, float):
-        return None if math.isfinite(value) else [str(value)]
-    items = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list) else ()
-    for key, child in items:
-        way = _not_finite(child)
-        if way is not None:
-            return [str(key), *way]
-    return None
-
-
-_MOST_FRAMES = 10_000_000
-"""Frames of a recording: over four days at 25 a second."""
-
-
-def _count(spans: Sequence[range]) -> int:
-    """Frames in all of `spans`; the length of a range may be too large for `len`."""
-    return sum(span.stop - span.start for span in spans)
-
-
-def _short(value: object) -> str:
-    """A value as a message shows it."""
-    text = repr(value)
-    return text if len(text) <= 40 else f"{text[:40]}..."
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def plain(value: object) -> object:
-    """What JSON can hold of `value`: arrays as lists, paths as text. TypeError where there is no such thing."""
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    if isinstance(value, Path):
-        return str(value)
-    raise TypeError(f"run must hold plain values, got {type(value).__name__}")
-
-
-def _distinct(runs: Sequence[Run]) -> list[Run]:
-    """Each run once."""
-    found: list[Run] = []
-    for run in runs:
-        if not any(run is other or _same(run, other) for other in found):
-            found.append(run)
-    return found
-
-
-def _same(one: Any, other: Any) -> bool:
-    return json.dumps(one, sort_keys=True, default=plain) == json.dumps(other, sort_keys=True, default=plain)
-
-
-def _refuse_other_settings(configurations: Sequence[Any]) -> None:
-    """ValueError that names the first setting in which two parts differ, of those that say their settings."""
-    known = [each for each in configurations if each is not None]
-    for other in known[1:]:
-        name = difference(known[0], other)
-        if name is not None:
-            raise ValueError(
-                f"parts must have the same configuration, {name} differs; reconstruct them with one and the same"
-            )
-
-
-def difference(one: Any, other: Any, name: str = "") -> str | None:
-    """The dotted name of the first entry in which two sets of plain values differ; None where there is none."""
-    if isinstance(one, dict) and isinstance(other, dict):
-        for key in dict.fromkeys((*one, *other)):
-            found = difference(one.get(key), other.get(key), f"{name}.{key}" if name else key)
-            if found is not None:
-                return found
-        return None
-    return None if _same(one, other) else name or "all of it"
-
-
 def _frames(values: Sequence[Any]) -> Run:
     """All parts' frames together; ValueError where two parts cover the same frame."""
     if any(value is None for value in values):
         return {}
     ranges = [span for value in values for span in covered_frames({"frames": value}) or []]
-    ordered = sorted((span for span in ranges if len(span) > 0), key=lambda span: span.start)
     spans: list[list[int]] = []
-    for span in ordered:
+    for span in sorted((span for span in ranges if len(span) > 0), key=lambda span: span.start):
         if spans and span.start < spans[-1][1]:
             raise ValueError(f"parts must not cover the same frame, two of them cover frame {span.start}")
         if spans and span.start == spans[-1][1]:
             spans[-1][1] = span.stop
         else:
             spans.append([span.start, span.stop])
-    if len(spans) == 0:
-        return {"frames": values[0]}
-    return {"frames": spans[0] if len(spans) == 1 else spans}
+    return {"frames": values[0] if len(spans) == 0 else spans[0] if len(spans) == 1 else spans}
 
 
 def _sum(values: Sequence[Any]) -> Any:
@@ -188,8 +87,87 @@ def _sum(values: Sequence[Any]) -> Any:
 def _inputs(values: Sequence[Any]) -> Run:
     """Checksums of all inputs; ValueError where a file changed between two parts."""
     together: Run = {}
-    for value in values:
-        for path, digest in (value or {}).items():
-            if together.setdefault(path, digest) != digest:
-                raise ValueError(f"parts must be made from the same inputs, {path} changed between two of them")
+    for path, digest in (pair for value in values for pair in (value or {}).items()):
+        if together.setdefault(path, digest) != digest:
+            raise ValueError(f"parts must be made from the same inputs, {path} changed between two of them")
     return together
+
+
+def difference(one: Any, other: Any, name: str = "") -> tuple[str, Any, Any] | None:
+    """The dotted name of the first entry in which two sets of plain values differ, and both values; None where
+    there is none.
+    """
+    if isinstance(one, dict) and isinstance(other, dict):
+        for key in dict.fromkeys((*one, *other)):
+            found = difference(one.get(key), other.get(key), f"{name}.{key}" if name else key)
+            if found is not None:
+                return found
+        return None
+    return None if _same(one, other) else (name or "all of it", one, other)
+
+
+def _same(one: Any, other: Any) -> bool:
+    return json.dumps(one, sort_keys=True, default=plain) == json.dumps(other, sort_keys=True, default=plain)
+
+
+def plain(value: object) -> object:
+    """What JSON can hold of `value`: arrays as lists, paths as text. TypeError where there is no such thing."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"run must hold plain values, got {type(value).__name__}")
+
+
+def covered_frames(run: Mapping[str, Any]) -> list[range] | None:
+    """The frames that a run covered, as ranges; None where it does not say. ValueError where it makes no sense."""
+    frames = run.get("frames")
+    if frames is None:
+        return None
+    try:
+        return [range(int(start), int(stop)) for start, stop in (frames if np.ndim(frames) == 2 else [frames])]
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f'"frames" must be [start, stop] or a list of those, got {frames!r}') from None
+
+
+def check_run(run: Mapping[str, Any]) -> None:
+    """ValueError where an entry that is read again is not what it must be; others may be anything finite."""
+
+    def refuse(name: str, wanted: str, value: object) -> ValueError:
+        text = repr(value)
+        return ValueError(f'"{name}" must be {wanted}, got {text if len(text) <= 40 else text[:40] + "..."}')
+
+    for key in ("configuration", "versions", "inputs", "seconds", "people", "time"):
+        if not isinstance(run.get(key, {}), dict):
+            raise refuse(key, "an object", run[key])
+    numbers = {f"seconds.{name}": value for name, value in run.get("seconds", {}).items()}
+    if run.get("time", {}).get("fps") is not None:
+        numbers["time.fps"] = run["time"]["fps"]
+    for name, value in numbers.items():
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise refuse(name, "a number", value)
+    cuts = run.get("cuts", [])
+    if not isinstance(cuts, list) or not all(type(cut) is int and cut >= 0 for cut in cuts):
+        raise refuse("cuts", "a list of frame numbers", cuts)
+    if not isinstance(run.get("body"), str | None):
+        raise refuse("body", "the name of a file or null", run["body"])
+    spans = covered_frames(run) or []
+    # The length of a range may be too large for `len`.
+    count = sum(span.stop - span.start for span in spans)
+    if any(span.start < 0 or span.stop < span.start for span in spans) or count > _MOST_FRAMES:
+        raise refuse("frames", f"[start, stop] of at most {_MOST_FRAMES} frames", run["frames"])
+    endless = _not_finite(run)
+    if endless is not None:  # such as 1e999, which could not be written again
+        raise ValueError(f'"{".".join(endless[:-1])[:80]}" must be a finite number, got {endless[-1]}')
+
+
+def _not_finite(value: object) -> list[str] | None:
+    """Keys and indices that lead to a number that is not finite, and the number; None where there is none."""
+    if isinstance(value, float):
+        return None if math.isfinite(value) else [str(value)]
+    items = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list) else ()
+    for key, child in items:
+        way = _not_finite(child)
+        if way is not None:
+            return [str(key), *way]
+    return None

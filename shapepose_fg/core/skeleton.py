@@ -68,8 +68,7 @@ class Skeleton:
                 raise ValueError(f"{name} has no joint {joint!r}; it has {' '.join(joints)}")
         made = set(keypoints)
         for joint, ends in middles.items():
-            late = next((end for end in ends if end not in made), None)
-            if late is not None:
+            for late in set(ends) - made:
                 raise ValueError(
                     f"{name}: the middle {joint} is made of {late}, which must be a keypoint or a middle before it"
                 )

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import write_atomically
-from shapepose_fg.core.storage.npz_reader import read_npz
+from shapepose_fg.core.storage.npz import read_npz
 from shapepose_fg.detection2d.detector import CameraDetector
-from shapepose_fg.io.detections.association_skeletons import TEXT_SKELETONS
+from shapepose_fg.io.detections.association_text import TEXT_SKELETONS
 from shapepose_fg.io.footage.footage import Footage
 from shapepose_fg.io.footage.lockstep import Lockstep
 from shapepose_fg.io.write_detections import association_lines

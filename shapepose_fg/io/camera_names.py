@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Sequence
+from pathlib import Path
 
 _NUMBERS = re.compile(r"\d+")
 
@@ -13,25 +14,14 @@ def match_names(cameras: Sequence[str], names: Sequence[str]) -> list[int] | Non
     only number in both (`cam01` is camera `int_cam1`). None where it is not so for every camera, or something else
     could be meant too: then nothing is guessed.
     """
-    chosen = _within(cameras, names)
-    if chosen is not None:
-        return chosen
+    words = [re.compile(rf"(?<![A-Za-z0-9]){re.escape(camera)}(?![A-Za-z0-9])") for camera in cameras]
+    found = [[index for index, name in enumerate(names) if word.search(name) is not None] for word in words]
+    if all(len(each) == 1 for each in found) and len({each[0] for each in found}) == len(found):
+        return [each[0] for each in found]
     wanted, there = _one_number_each(cameras), _one_number_each(names)
     if wanted is None or there is None or not set(wanted) <= set(there):
         return None
     return [there.index(number) for number in wanted]
-
-
-def _within(cameras: Sequence[str], names: Sequence[str]) -> list[int] | None:
-    """For each camera the only name in which its own stands as a word; None where one has none or several."""
-    chosen = []
-    for camera in cameras:
-        word = re.compile(rf"(?<![A-Za-z0-9]){re.escape(camera)}(?![A-Za-z0-9])")
-        found = [index for index, name in enumerate(names) if word.search(name) is not None]
-        if len(found) != 1:
-            return None
-        chosen += found
-    return chosen if len(set(chosen)) == len(chosen) else None
 
 
 def _one_number_each(names: Sequence[str]) -> list[int] | None:
@@ -41,3 +31,20 @@ def _one_number_each(names: Sequence[str]) -> list[int] | None:
         return None
     numbers = [int(each[0]) for each in found]
     return numbers if len(set(numbers)) == len(numbers) else None
+
+
+def told_by_parts(
+    folder: Path, cameras: Sequence[str], paths: Sequence[Path], names: Sequence[str]
+) -> tuple[tuple[Path, ...], str] | None:
+    """Of `paths` in a folder, which are called `names`, that of each camera by `match_names`, and a note of it."""
+    chosen = match_names(cameras, names)
+    if chosen is None:
+        return None
+    found = tuple(paths[index] for index in chosen)
+    pairs = ", ".join(f"{camera} is {path.name}" for camera, path in zip(cameras, found, strict=True))
+    return found, f"{folder}: cameras were told by parts of the names: {pairs}"
+
+
+def listing(names: Sequence[str], nothing: str = "nothing") -> str:
+    """The first of some names, for a message."""
+    return (" ".join(names[:8]) or nothing) + (f" and {len(names) - 8} more" if len(names) > 8 else "")

@@ -35,7 +35,7 @@ def read_config(path: str | Path, kind: type[T]) -> T:
 
 _CURE = "`shapepose-fg config` shows the defaults"
 ANOTHER_VERSION = "another version of this program wrote it; reconstruct the recording again"
-"""The cure for settings that nobody wrote by hand."""
+"""The cure for settings that no person wrote."""
 
 
 def config_from(

@@ -7,19 +7,21 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.provenance import checksums
 from shapepose_fg.core.reconstruction import MOST_NUMBER, Reconstruction
-from shapepose_fg.core.storage.files import read_json, write_atomically
-from shapepose_fg.io.validation import first_problem, key_text
+from shapepose_fg.core.result_files import OBSERVATIONS, PEOPLE, RUN
+from shapepose_fg.core.storage.files import read_json, write_content
+from shapepose_fg.io.validation import validated
 from shapepose_fg.tracking.edits import Edit, Edited, Solve, apply, solve_anew, undo
 
 CORRECTIONS, UNCORRECTED = "corrections.json", "uncorrected"
 """The list of what was corrected, and the folder of the result as it was before."""
-_FORMAT = "shapepose-fg corrections 1"
-_FILES = ("people.npz", "run.json", "observations.npz")
+_PART = f".{UNCORRECTED}.part"
+"""That folder while it is made, or deleted."""
+_FILES = (PEOPLE, RUN, OBSERVATIONS)
 _CURE = f"copy the files of {UNCORRECTED} back and delete {UNCORRECTED} and {CORRECTIONS} to begin anew"
 
 Number = Annotated[int, Field(ge=0, le=MOST_NUMBER)]
@@ -54,15 +56,10 @@ def read_corrections(folder: str | Path) -> tuple[Edit, ...]:
                 f" of {UNCORRECTED} back and delete that folder, or only delete it if people.npz is of a later run"
             )
         return ()
+    content = validated(_File, read_json(file), file, _CURE)
     try:
-        content = _File.model_validate(read_json(file))
         edits = tuple(Edit(**edit.model_dump()) for edit in content.edits)
-    except ValidationError as error:
-        place, problem = first_problem(error)
-        raise InputError(f"{file}: {key_text(place)} {problem}; {_CURE}") from None
     except ValueError as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(f"{file}: {error}; {_CURE}") from None
     if content.people != _checksum(Path(folder)):
         raise InputError(f"{file}: people.npz is not what these corrections led to; {_CURE}")
@@ -84,8 +81,14 @@ def correct(folder: str | Path, edit: Edit, solve: Solve | None = None) -> Edite
     except ValueError as error:
         raise InputError(f"{folder}: {error}") from None
     solved = edited.people if solve is None else solve_anew(edited, solve)
-    if len(edits) == 0:
-        _keep(folder)
+    if len(edits) == 0:  # the result is copied aside, whole or not at all
+        part = folder / _PART
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir()
+        for name in _FILES:
+            if (folder / name).is_file():
+                shutil.copy2(folder / name, part / name)
+        part.rename(folder / UNCORRECTED)
     _write(folder, solved, (*edits, edit))
     return replace(edited, people=solved)
 
@@ -93,8 +96,8 @@ def correct(folder: str | Path, edit: Edit, solve: Solve | None = None) -> Edite
 def take_back(folder: str | Path, solve: Solve | None = None) -> tuple[Edit, Reconstruction]:
     """Take the last correction back; returns it and the result without it. InputError where there is none.
 
-    Without any other, the files are again what they were before the first. Of the others, only those people are
-    solved anew whom the last correction touched.
+    Without any other, the files are again what they were before the first. Only people that the last
+    correction touched are solved anew.
     """
     folder = Path(folder)
     edits = read_corrections(folder)
@@ -127,14 +130,13 @@ def _write(folder: Path, people: Reconstruction, edits: Sequence[Edit]) -> None:
     counts = people.run.get("people", {})
     people.with_run(people=counts | people.counts()).save(folder)
     kept = [{name: value for name, value in vars(edit).items() if value is not None} for edit in edits]
-    content = {"format": _FORMAT, "people": _checksum(folder), "edits": kept}
-    text = json.dumps(content, indent=1) + "\n"
-    write_atomically(folder / CORRECTIONS, lambda stream: stream.write(text.encode()))
+    content = {"format": "shapepose-fg corrections 1", "people": _checksum(folder), "edits": kept}
+    write_content(folder / CORRECTIONS, json.dumps(content, indent=1) + "\n")
 
 
 def _check_kept(folder: Path) -> None:
     """InputError where the result as it was before the corrections is not there any more."""
-    file = folder / UNCORRECTED / "people.npz"
+    file = folder / UNCORRECTED / PEOPLE
     if not file.is_file():
         raise InputError(
             f"{file}: the result as it was before the corrections is not there; put it back, or delete"
@@ -142,38 +144,21 @@ def _check_kept(folder: Path) -> None:
         )
 
 
-def _keep(folder: Path) -> None:
-    """Copy the result aside, before the first correction: whole or not at all."""
-    part = folder / _PART
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir()
-    for name in _FILES:
-        if (folder / name).is_file():
-            shutil.copy2(folder / name, part / name)
-    part.rename(folder / UNCORRECTED)
-
-
 def _restore(folder: Path) -> None:
     """The files as they were before the first correction, which leaves no trace."""
     for name in _FILES:
         file = folder / UNCORRECTED / name
         if file.is_file():
-            content = file.read_bytes()
-            write_atomically(folder / name, lambda stream, content=content: stream.write(content))
+            write_content(folder / name, file.read_bytes())
         else:  # people.npz was there before; a result may lack the others
             (folder / name).unlink(missing_ok=True)
     (folder / CORRECTIONS).unlink()
     # Stopped while it is deleted, it must not be taken for the result as it was.
-    part = folder / _PART
-    shutil.rmtree(part, ignore_errors=True)
-    (folder / UNCORRECTED).rename(part)
-    shutil.rmtree(part)
-
-
-_PART = f".{UNCORRECTED}.part"
-"""The folder while it is made, or deleted."""
+    shutil.rmtree(folder / _PART, ignore_errors=True)
+    (folder / UNCORRECTED).rename(folder / _PART)
+    shutil.rmtree(folder / _PART)
 
 
 def _checksum(folder: Path) -> str:
     """Which people.npz it is."""
-    return next(iter(checksums([folder / "people.npz"]).values()))
+    return next(iter(checksums([folder / PEOPLE]).values()))

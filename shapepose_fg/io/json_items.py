@@ -24,50 +24,44 @@ class JsonItems:
         self.path = path
         self.key: str | None = None
         """The key under which the list is; None where the file is the list, or there is none."""
-        self.found = False
-        """Whether there is one."""
         self.value: Any = None
         """What is there instead: under the key, or as the whole file, an object without its values."""
         self.others: dict[str, Any] = {}
         """Values under other keys, those behind the list when all items have been read."""
         self._text = _Text(path)
-        self._in_object = False
         begin = self._text.peek()
-        if begin == "[":
-            self.found = True
-        elif begin == "{":
-            self.value, self._in_object = {}, True
-            self._text.skip("{")
+        self.found = begin == "["
+        """Whether there is one."""
+        self._in_object = begin == "{"
+        if begin == "{":
+            self.value = {}
+            self._text.next_of("{")
             if self._text.peek() == "}":
-                self._text.skip("}")
+                self._text.next_of("}")
                 self._text.end()
             else:
                 self._members(keys)
-        else:
+        elif begin != "[":
             self.value = self._text.value()
             self._text.end()
         if self.found:
-            self._text.skip("[")
+            self._text.next_of("[")
 
     def __iter__(self) -> Iterator[Any]:
         """The items, once."""
+        text = self._text
         if not self.found:
             return
-        yield from self._listed()
-        if self._in_object and self._text.one_of(",}") == ",":
+        if text.peek() == "]":
+            text.next_of("]")
+        else:
+            yield text.value()
+            while text.next_of(",]") == ",":
+                yield text.value()
+        if self._in_object and text.next_of(",}") == ",":
             self._members(())
         else:
-            self._text.end()
-
-    def _listed(self) -> Iterator[Any]:
-        text = self._text
-        if text.peek() == "]":
-            text.skip("]")
-            return
-        while True:
-            yield text.value()
-            if text.one_of(",]") == "]":
-                return
+            text.end()
 
     def _members(self, keys: Collection[str]) -> None:
         """Take in keys and values of the object, to the list under one of `keys` or to the object's end."""
@@ -76,7 +70,7 @@ class JsonItems:
             if text.peek() != '"':
                 raise text.refuse("Expecting property name enclosed in double quotes")
             key = text.value()
-            text.one_of(":")
+            text.next_of(":")
             if key in self.others or key == self.key:
                 unique_keys([(key, None), (key, None)], self.path)
             if key in keys:
@@ -87,7 +81,7 @@ class JsonItems:
                 self.value = text.value()
             else:
                 self.others[key] = text.value()
-            if text.one_of(",}") == "}":
+            if text.next_of(",}") == "}":
                 text.end()
                 return
 
@@ -113,18 +107,12 @@ class _Text:
             if not self._more():
                 return ""
 
-    def skip(self, character: str) -> None:
-        """Go on behind this character, which is the next."""
-        if self.peek() != character:
-            raise self.refuse(f"Expecting {character!r}")
-        self._at += 1
-
-    def one_of(self, characters: str) -> str:
-        """The next character, which must be one of these."""
+    def next_of(self, characters: str) -> str:
+        """Go on behind the next character, which must be one of these."""
         found = self.peek()
         if found == "" or found not in characters:
-            wanted = "',' delimiter" if "," in characters else "':' delimiter"
-            raise self.refuse(f"Expecting {wanted}")
+            wanted = "," if "," in characters else characters
+            raise self.refuse(f"Expecting {wanted!r} delimiter")
         self._at += 1
         return found
 
@@ -165,11 +153,11 @@ class _Text:
 
     def _more(self) -> bool:
         """Read on, as much again as there is; whether there was more. What is decoded is forgotten."""
-        left = len(self._left) - self._at
+        done, left = self._left[: self._at], len(self._left) - self._at
+        breaks = done.count("\n")
         if left > MIDDLE:
-            line = self._lines + self._left.count("\n", 0, self._at) + 1
             problem = f"one value has over {MIDDLE >> 20} MiB"
-            raise InputError(f"{self._path}: line {line}: {problem}; write the file again")
+            raise InputError(f"{self._path}: line {self._lines + breaks + 1}: {problem}; write the file again")
         parts, wanted = [self._left[self._at :]], max(left, 1)
         while wanted > 0 and (piece := next(self._pieces, None)) is not None:
             parts.append(piece)
@@ -177,8 +165,6 @@ class _Text:
         if len(parts) == 1:
             self._over = True
             return False
-        done = self._left[: self._at]
-        breaks = done.count("\n")
         self._lines += breaks
         self._column = len(done) - 1 - done.rfind("\n") if breaks else self._column + len(done)
         self._left, self._at = "".join(parts), 0

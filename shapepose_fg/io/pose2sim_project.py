@@ -63,8 +63,7 @@ class Pose2SimProject:
         """Frames of a recording of `count` that are wanted, counted from 0; InputError where there are none."""
         if self.frames is None:
             return range(count)
-        start, stop = (number - self.first_number for number in self.frames)
-        start, stop = max(start, 0), min(stop, count)
+        start, stop = (min(max(number - self.first_number, 0), count) for number in self.frames)
         if start >= stop:
             last = self.first_number + count
             raise InputError(
@@ -76,32 +75,43 @@ class Pose2SimProject:
 
 def read_pose2sim_project(folder: Path) -> Pose2SimProject:
     """The project, or trial of a project, in `folder`; InputError, one sentence, where something is missing."""
-    config, parent = _settings(folder)
-    project = _table(config, "project", folder / CONFIG)
-    calibration = _calibration(folder if parent is None else parent, folder)
-    videos = _videos(folder / "videos")
+    config, session = _settings(folder)
+    project = config.get("project", {})
+    if not isinstance(project, dict):
+        raise InputError(
+            f"{folder / CONFIG}: project must be a table; write [project] as Pose2Sim's demos have it"
+        )
+    calibration = _calibration(session, folder)
+    entries = sorted((folder / "videos").iterdir()) if (folder / "videos").is_dir() else []
+    videos = [each for each in entries if each.suffix.lower() in VIDEOS]
     detections = _detections(folder, calibration, videos)
-    notes = [f"{folder}: cameras from {calibration}, detections from {detections}"]
     times = detections / "times.csv"
     rate = project.get("frame_rate", "auto")
     fps, said = (
         (None, f"times from {times}") if rate == "auto" and times.is_file() else _rate(rate, videos, folder)
     )
-    notes.append(f"{folder}: {said}")
+    multi_person = project.get("multi_person", False)
+    if not isinstance(multi_person, bool):
+        raise InputError(
+            f"{folder / CONFIG}: project.multi_person must be true or false, got {multi_person!r}; correct it"
+        )
+    # Results have the numbers of the files' names, 0 where they have none.
+    folders = [each for each in detections.iterdir() if each.is_dir()]
+    numbers = (frame_number(file) for each in folders for file in frame_files(each))
     return Pose2SimProject(
         folder,
         calibration,
         detections,
         fps,
         times if fps is None else None,
-        _first_number(detections),
+        min(numbers, default=0),
         _frame_range(project.get("frame_range", "auto"), folder),
-        _flag(project.get("multi_person", False), folder),
-        tuple(notes),
+        multi_person,
+        (f"{folder}: cameras from {calibration}, detections from {detections}", f"{folder}: {said}"),
     )
 
 
-def _settings(folder: Path) -> tuple[dict[str, Any], Path | None]:
+def _settings(folder: Path) -> tuple[dict[str, Any], Path]:
     """Config.toml of a trial over that of the session above it, and the session's folder."""
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such folder; give that of a Pose2Sim project")
@@ -114,54 +124,47 @@ def _settings(folder: Path) -> tuple[dict[str, Any], Path | None]:
             f"{folder}: a session of several trials; give one of them: {' '.join(trials[:8])}"
             + (" ..." if len(trials) > 8 else "")
         )
+    config = read_toml(own, may_be_empty=True)
     if not above.is_file():
-        return _toml(own), None
-    return _over(_toml(above), _toml(own)), above.parent
-
-
-def _toml(path: Path) -> dict[str, Any]:
-    return read_toml(path, may_be_empty=True)
+        return config, folder
+    return _over(read_toml(above, may_be_empty=True), config), above.parent
 
 
 def _over(below: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
     """Settings `own` over those `below`, table by table."""
-    together = dict(below)
-    for key, value in own.items():
-        under = together.get(key)
-        together[key] = _over(under, value) if isinstance(value, dict) and isinstance(under, dict) else value
+    together = below | own
+    for key in own.keys() & below.keys():
+        if isinstance(own[key], dict) and isinstance(below[key], dict):
+            together[key] = _over(below[key], own[key])
     return together
 
 
-def _table(config: dict[str, Any], name: str, path: Path) -> dict[str, Any]:
-    table = config.get(name, {})
-    if not isinstance(table, dict):
-        raise InputError(f"{path}: {name} must be a table; write [{name}] as Pose2Sim's demos have it")
-    return table
-
-
 def _calibration(session: Path, folder: Path) -> Path:
-    """The calibration of a session: the newest TOML, as Pose2Sim takes it, else a file of another known format."""
+    """The calibration of a session: the newest TOML, as Pose2Sim takes it, else a file of another known format, or
+    the folder itself, where a format has several files.
+    """
     places = dict.fromkeys((session.resolve(), folder.resolve()))
-    rooms = [each for place in places for each in _folders(place) if "calib" in each.name.lower()]
+    rooms = [
+        each
+        for place in places
+        for each in sorted(place.iterdir())
+        if each.is_dir() and "calib" in each.name.lower()
+    ]
     if len(rooms) == 0:
         raise InputError(
             f"{session}: no folder of the calibration here; put the cameras into {session}/calibration"
         )
-    files = sorted((each for room in rooms for each in room.iterdir() if each.is_file()), key=_age, reverse=True)
+    files = [each for room in rooms for each in room.iterdir() if each.is_file()]
+    files.sort(key=lambda file: (file.stat().st_mtime, file.name), reverse=True)
     files.sort(key=lambda file: file.suffix != ".toml")  # the newest stays first among its kind
-    found = next((file for file in files if _is_calibration(file)), None)
-    return _whole_folder(rooms[0]) if found is None else found
-
-
-def _whole_folder(room: Path) -> Path:
-    """The folder itself, where a format has several files; InputError where it has none."""
-    if _is_calibration(room):
-        return room
-    there = " ".join(sorted(each.name for each in room.iterdir())[:8]) or "nothing"
-    raise InputError(
-        f"{room}: no calibration that is known here, only {there}; run Pose2Sim's calibration, or put one"
-        " of the formats of docs/conventions.md there"
-    )
+    found = next((each for each in (*files, rooms[0]) if _is_calibration(each)), None)
+    if found is None:
+        there = " ".join(sorted(each.name for each in rooms[0].iterdir())[:8]) or "nothing"
+        raise InputError(
+            f"{rooms[0]}: no calibration that is known here, only {there}; run Pose2Sim's calibration, or put one"
+            " of the formats of docs/conventions.md there"
+        )
+    return found
 
 
 def _is_calibration(path: Path) -> bool:
@@ -171,21 +174,6 @@ def _is_calibration(path: Path) -> bool:
     except InputError:
         return False
     return content.syntax != "pickle" and any(each.recognise(content) for each in FORMATS)
-
-
-def _folders(place: Path) -> list[Path]:
-    return sorted(each for each in place.iterdir() if each.is_dir())
-
-
-def _age(path: Path) -> tuple[float, str]:
-    """Files in the order in which they were written."""
-    return path.stat().st_mtime, path.name
-
-
-def _videos(folder: Path) -> list[Path]:
-    if not folder.is_dir():
-        return []
-    return sorted(each for each in folder.iterdir() if each.suffix.lower() in VIDEOS)
 
 
 def _detections(folder: Path, calibration: Path, videos: Sequence[Path]) -> Path:
@@ -213,12 +201,6 @@ def _is_pose(path: Path) -> bool:
     return len(frame_files(path)) > 0 if path.is_dir() else path.suffix in (".json", ".txt")
 
 
-def _first_number(detections: Path) -> int:
-    """The number of the first frame in the files' names; 0 where they have none."""
-    numbers = (frame_number(file) for each in _folders(detections) for file in frame_files(each))
-    return min(numbers, default=0)
-
-
 def _rate(given: Any, videos: Sequence[Path], folder: Path) -> tuple[float, str]:
     """Frames a second, and where that comes from."""
     if given == "auto":
@@ -244,11 +226,3 @@ def _frame_range(given: Any, folder: Path) -> tuple[int, int] | None:
             f" 300], got {given!r}; correct it"
         )
     return given[0], given[1]
-
-
-def _flag(given: Any, folder: Path) -> bool:
-    if not isinstance(given, bool):
-        raise InputError(
-            f"{folder / CONFIG}: project.multi_person must be true or false, got {given!r}; correct it"
-        )
-    return given

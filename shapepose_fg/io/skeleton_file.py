@@ -3,16 +3,15 @@
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import MID_HIP, SKELETONS, Skeleton
 from shapepose_fg.core.storage.files import read_toml
-from shapepose_fg.io.validation import first_problem, key_text
+from shapepose_fg.io.validation import validated
 
 _Pair = Annotated[list[str], Field(min_length=2, max_length=2)]
-_CURE = "docs/conventions.md describes the file"
 _FACE_AND_TOES = {
     "REye", "LEye", "REar", "LEar", "Head", "LBigToe", "RBigToe", "LSmallToe", "RSmallToe", "LHeel", "RHeel",
     "left_hand", "right_hand", "left_foot", "right_foot",
@@ -22,8 +21,6 @@ _HIPS = ({"RHip", "LHip"}, {"right_hip", "left_hip"})
 
 
 class _File(BaseModel):
-    """The whole file."""
-
     model_config = ConfigDict(strict=True, extra="forbid")
     name: Annotated[str, Field(min_length=1)]
     keypoints: Annotated[list[str], Field(min_length=3)]
@@ -55,11 +52,7 @@ def read_skeleton(path: str | Path) -> Skeleton:
     InputError, one sentence that names the file, the key and the cure.
     """
     path = Path(path)
-    try:
-        file = _File.model_validate(read_toml(path))
-    except ValidationError as error:
-        place, problem = first_problem(error)
-        raise InputError(f"{path}: {key_text(place)} {problem}; {_CURE}") from None
+    file = validated(_File, read_toml(path), path, "docs/conventions.md describes the file")
     points = _points(file, path)
 
     def pairs(rows: list[list[str]]) -> list[tuple[str, str]]:

@@ -13,7 +13,6 @@ from shapepose_fg.io.config import ANOTHER_VERSION, config_from
 
 CAMERAS = "cameras.json"
 """The cameras of a result, as a rig file of our own, beside its people.npz."""
-
 Settings = TypeVar("Settings")
 
 
@@ -36,22 +35,15 @@ def read_setup(folder: Path, people: Reconstruction, kind: type[Settings]) -> So
 
     InputError, one sentence, where a file is missing or damaged, or the settings are another version's.
     """
-    run_file = folder / "run.json"
+    run_file, run, table = folder / "run.json", people.run, people.observations
     rig = read_rig(folder / CAMERAS)
-    table = people.observations
     if table is not None and tuple(table.view_names.tolist()) != tuple(rig.names):
         raise InputError(
             f"{folder / CAMERAS}: the cameras are not those of observations.npz; reconstruct the recording again"
         )
-    configuration: Any = people.run.get("configuration")
+    configuration: Any = run.get("configuration")
     if not isinstance(configuration, dict):
         raise InputError(f"{run_file}: configuration is missing; reconstruct the recording again")
     settings = config_from(configuration, kind, run_file, cure=ANOTHER_VERSION)
-    learnt = people.run.get("keypoint_offsets") is not None
-    body = people.run.get("body")
-    return SolvedSetup(
-        rig=rig,
-        settings=settings,
-        offsets=KeypointOffsets.load(run_file) if learnt else None,
-        body=None if body is None else Path(str(body)),
-    )
+    offsets = KeypointOffsets.load(run_file) if run.get("keypoint_offsets") is not None else None
+    return SolvedSetup(rig, settings, offsets, None if run.get("body") is None else Path(str(run["body"])))

@@ -42,15 +42,27 @@ def read_timestamps(path: str | Path, rig: Rig, frames: int) -> FrameTimes:
     else:
         picked = np.arange(frames)
     time_s = numbers[picked][:, columns]
-    _refuse_falling(path, time_s, lines[picked])
-    _refuse_other_units(path, time_s)
+    steps, apart = np.diff(time_s, axis=0), np.ptp(time_s, axis=1)
+    if (steps <= 0).any():
+        line = lines[picked][int(np.argmax((steps <= 0).any(axis=1))) + 1]
+        raise InputError(
+            f"{path}: line {line} must be later than the frame before; put frames in order of their times"
+        )
+    if len(time_s) > 1 and np.median(steps) > _LONGEST_STEP_S:
+        raise InputError(
+            f"{path}: frames would be {np.median(steps):.0f} s apart; write seconds, not milliseconds"
+        )
+    if (apart > _SAME_CLOCK_S).any():
+        frame = int(np.argmax(apart > _SAME_CLOCK_S))
+        raise InputError(
+            f"{path}: the cameras' times of frame {frame} are {apart[frame]:.3g} s apart; give times of one clock"
+        )
     return FrameTimes(time_s[:, 0] if len(columns) == 1 else time_s, source=str(path))
 
 
 def _table(path: Path, rig: Rig) -> tuple[list[str], NDArray[np.float64], NDArray[np.intp]]:
     """Names of the columns, the numbers (T, C), and the line of the file that each row is from."""
-    names: list[str] = []
-    rows, lines = [], []
+    names, rows, lines = list[str](), list[list[float]](), list[int]()
     for line, text in enumerate(read_text(path, most=_MOST_BYTES).splitlines(), start=1):
         words = [word for word in re.split(r"[,\s]+", text.split("#")[0].strip()) if word]
         if len(words) == 0:
@@ -117,26 +129,3 @@ def _lines_of_frames(
             f"{path}: no time of frame {missing[0]}, the recording has frames 0 to {frames - 1}; add its line"
         )
     return first[np.searchsorted(found, np.arange(frames))]
-
-
-def _refuse_falling(path: Path, time_s: NDArray[np.float64], lines: NDArray[np.intp]) -> None:
-    """InputError where a time is not later than that of the frame before."""
-    falls = (np.diff(time_s, axis=0) <= 0).any(axis=1)
-    if falls.any():
-        frame = int(np.argmax(falls)) + 1
-        raise InputError(
-            f"{path}: line {lines[frame]} must be later than the frame before; put frames in order of their times"
-        )
-
-
-def _refuse_other_units(path: Path, time_s: NDArray[np.float64]) -> None:
-    """InputError where the numbers can hardly be seconds of one clock."""
-    step = float(np.median(np.diff(time_s, axis=0))) if len(time_s) > 1 else 0.0
-    if step > _LONGEST_STEP_S:
-        raise InputError(f"{path}: frames would be {step:.0f} s apart; write seconds, not milliseconds")
-    apart = np.ptp(time_s, axis=1)
-    if (apart > _SAME_CLOCK_S).any():
-        frame = int(np.argmax(apart > _SAME_CLOCK_S))
-        raise InputError(
-            f"{path}: the cameras' times of frame {frame} are {apart[frame]:.3g} s apart; give times of one clock"
-        )

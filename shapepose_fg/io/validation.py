@@ -1,9 +1,46 @@
 """What pydantic found wrong, said once and plainly."""
 
 import math
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, TypeVar
 
-from pydantic import ValidationError
+from pydantic import BaseModel, TypeAdapter, ValidationError
+
+from shapepose_fg.core.errors import InputError
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def validated(model: type[Model], value: object, place: object, cure: str | Mapping[str, str]) -> Model:
+    """`value`, of a file, as the `model`; InputError that names place, key and cure where it is none.
+
+    `cure` may have one for each key: the innermost that is known is given.
+    """
+    try:
+        return model.model_validate(value)
+    except ValidationError as error:
+        raise refused(error, place, cure) from None
+
+
+def validated_list(
+    kind: TypeAdapter[list[Model]], value: object, place: object, cure: str, start: int = 0
+) -> list[Model]:
+    """The same of a list, whose first item is number `start` in the file."""
+    try:
+        return kind.validate_python(value)
+    except ValidationError as error:
+        raise refused(error, place, cure, start) from None
+
+
+def refused(error: ValidationError, place: object, cure: str | Mapping[str, str], start: int = 0) -> InputError:
+    """The first problem of `error` as a sentence."""
+    keys, problem = first_problem(error)
+    if start > 0 and isinstance(keys[0], int):
+        keys = (keys[0] + start, *keys[1:])
+    if not isinstance(cure, str):
+        known = [cure[str(key)] for key in reversed(keys) if key in cure]
+        cure = known[0] if known else "see docs/conventions.md for the format"
+    return InputError(f"{place}: {key_text(keys)} {problem}; {cure}")
 
 
 def first_problem(error: ValidationError) -> tuple[tuple[int | str, ...], str]:
@@ -38,31 +75,6 @@ def describe(value: object) -> str:
     return str(value)[:40]
 
 
-def _complaint(kind: str, problem: Any) -> str:
-    """What is wrong with the value, after its key."""
-    got = describe(problem["input"])
-    context = problem.get("ctx", {})
-    if kind == "missing":
-        return "is missing"
-    if kind == "extra_forbidden":
-        return "is not a known key"
-    if kind in ("too_short", "too_long"):
-        bound = context["min_length" if kind == "too_short" else "max_length"]
-        return f"must hold {bound} value{'s' if bound != 1 else ''}, got {len(problem['input'])}"
-    if kind == "finite_number":
-        return f"must be a finite number, got {got}"
-    if kind == "greater_than":
-        return f"must be greater than {context['gt']}, got {got}"
-    if kind in ("literal_error", "enum"):
-        return f"must be {context['expected']}, got {got}"
-    wanted = _WANTED.get(kind)
-    if wanted is not None:
-        return f"must be {wanted}, got {got}"
-    if kind in ("value_error", "assertion_error"):
-        return f"is refused: {context.get('error', problem['msg'])}"
-    return f"is refused: {problem['msg'][:1].lower()}{problem['msg'][1:]}, got {got}"
-
-
 _WANTED = {
     "float_type": "a number",
     "float_parsing": "a number",
@@ -76,5 +88,27 @@ _WANTED = {
     "dict_type": "an object",
     "model_type": "an object",
     "dataclass_type": "a table",
+    "finite_number": "a finite number",
 }
 """What each of pydantic's type errors asks for, in words."""
+
+
+def _complaint(kind: str, problem: Any) -> str:
+    """What is wrong with the value, after its key."""
+    got, context = describe(problem["input"]), problem.get("ctx", {})
+    if kind == "missing":
+        return "is missing"
+    if kind == "extra_forbidden":
+        return "is not a known key"
+    if kind in ("too_short", "too_long"):
+        bound = context["min_length" if kind == "too_short" else "max_length"]
+        return f"must hold {bound} value{'s' if bound != 1 else ''}, got {len(problem['input'])}"
+    if kind == "greater_than":
+        return f"must be greater than {context['gt']}, got {got}"
+    if kind in ("literal_error", "enum"):
+        return f"must be {context['expected']}, got {got}"
+    if kind in _WANTED:
+        return f"must be {_WANTED[kind]}, got {got}"
+    if kind in ("value_error", "assertion_error"):
+        return f"is refused: {context.get('error', problem['msg'])}"
+    return f"is refused: {problem['msg'][:1].lower()}{problem['msg'][1:]}, got {got}"

@@ -16,13 +16,13 @@ from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.detections import Detections, DetectionSequence
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.core.storage.files import write_atomically
-from shapepose_fg.io.detections.association_skeletons import TEXT_SKELETONS, TextSkeleton
+from shapepose_fg.core.storage.files import write_atomically, write_content
+from shapepose_fg.io.detections.association_text import TEXT_SKELETONS, TextSkeleton
 from shapepose_fg.io.detections.view_streams import MARGIN
 from shapepose_fg.proposal.people_2d import group_people
 
 SMALLEST_PERSON = 3
-"""Groups of fewer joints are nobody, as in OpenPose's default settings."""
+"""Groups of fewer joints are false positives, as in OpenPose's default settings."""
 
 
 def write_association(recording: DetectionSequence, rig: Rig, folder: str | Path) -> None:
@@ -43,7 +43,7 @@ def write_association(recording: DetectionSequence, rig: Rig, folder: str | Path
         )
     folder = Path(folder)
     calibration = {camera.name: _calibration(camera) for camera in rig.cameras}
-    _write(folder / "calibration.json", json.dumps(calibration, indent=1, allow_nan=False))
+    write_content(folder / "calibration.json", json.dumps(calibration, indent=1, allow_nan=False))
     for view, camera in enumerate(rig.cameras):
         content = partial(_write_frames, recording=recording, view=view, camera=camera)
         write_atomically(folder / "detection" / f"{camera.name}.txt", content)
@@ -54,9 +54,9 @@ def write_openpose(
 ) -> None:
     """Write <camera>/<camera>_000000000000_keypoints.json and so on into `folder`: people, as OpenPose does.
 
-    Candidates are grouped by `group_people`; groups of fewer joints than `smallest_person` are nobody, and not in
-    such files. Positions have three decimals, pixels. ValueError where the skeleton is not BODY_25 or there is no
-    frame; InputError where the folder of a camera already holds frames.
+    Candidates are grouped by `group_people`; groups of fewer joints than `smallest_person` are false positives,
+    which such files leave out. Positions have three decimals, pixels. ValueError where the skeleton is not BODY_25
+    or there is no frame; InputError where the folder of a camera already holds frames.
     """
     _check(recording)
     refuse_leftovers(rig, folder)
@@ -175,7 +175,3 @@ def _frame_object(found: Detections, people: list[NDArray[np.intp]], camera: Cam
         keypoints[found.joint[members], 2] = found.confidence[members].round(6)
         listed.append({"person_id": [-1], "pose_keypoints_2d": keypoints.ravel().tolist()})
     return {"version": 1.3, "people": listed}
-
-
-def _write(path: Path, text: str) -> None:
-    write_atomically(path, lambda stream: stream.write(text.encode()))

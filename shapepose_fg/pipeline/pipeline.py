@@ -41,8 +41,7 @@ from shapepose_fg.pipeline.runs.assembly import Assembly
 from shapepose_fg.pipeline.runs.checkpoint import Checkpoint
 from shapepose_fg.pipeline.runs.chunks import Chunk, Identities, cut_in_chunks
 from shapepose_fg.pipeline.runs.notes import Notebook, Notes
-from shapepose_fg.pipeline.runs.parts import Part, Parts
-from shapepose_fg.pipeline.runs.rows_of_people import RowsOfPeople
+from shapepose_fg.pipeline.runs.parts import Part, Parts, RowsOfPeople
 from shapepose_fg.pipeline.runs.standing import floor_of
 from shapepose_fg.pipeline.solved_rows import result_rows
 from shapepose_fg.pipeline.windows import Engine, Solved, Span

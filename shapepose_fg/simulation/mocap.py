@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.storage.npz_reader import read_npz
+from shapepose_fg.core.storage.npz import read_npz
 
 Array = NDArray[np.float64]
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.camera import Camera
+from shapepose_fg.core.drawing import vertex_normals
 
 NEAR_M = 0.05
 """Faces with a corner nearer than this are dropped, metres: nothing is clipped."""
@@ -261,17 +262,6 @@ def _chunks(counts: NDArray[np.intp]) -> Iterator[slice]:
     edges = np.concatenate([[0], np.flatnonzero(np.diff(group)) + 1, [len(counts)]])
     for start, stop in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
         yield slice(start, stop)
-
-
-def vertex_normals(vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> NDArray[np.float64]:
-    """Unit normals (N, 3): the mean of the adjacent faces', weighted by their areas."""
-    a, b, c = (np.asarray(vertices, dtype=np.float64)[faces[:, m]] for m in range(3))
-    normal = np.cross(b - a, c - a)
-    total = np.stack(
-        [np.bincount(faces.ravel(), np.repeat(normal[:, axis], 3), minlength=len(vertices)) for axis in range(3)],
-        axis=1,
-    )
-    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
 
 
 def render_shaded(

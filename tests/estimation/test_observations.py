@@ -257,7 +257,7 @@ def test_people_of_several_frames_follow_each_other(five_cameras, two_people):
 
 
 def test_refuses_shapes_and_settings_that_make_no_sense():
-    with pytest.raises(ValueError, match=r"xy must be \(N, J, V, 2\)"):
+    with pytest.raises(ValueError, match=r"confidence must be \(1, 2, 3\), got \(1, 2, 4\)"):
         Observations(np.zeros((1, 2, 3, 2)), np.zeros((1, 2, 4)), np.zeros((1, 2, 3)))
     with pytest.raises(ValueError, match="sigma_m must be positive"):
         ObservationConfig(sigma_m=0.0)

@@ -11,13 +11,11 @@ import numpy as np
 import pytest
 
 from shapepose_fg.cli.main import main
+from shapepose_fg.core.drawing import bones_of, thinned
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25, COCO_17
-from shapepose_fg.io.export.bones import bones_of
-from shapepose_fg.io.export.light_mesh import thinned
 from shapepose_fg.io.export.registry import FORMATS
-from shapepose_fg.io.export.rerun_scene import viewer_file
-from shapepose_fg.io.export.rerun_statistics import switch_off
+from shapepose_fg.io.export.rerun_app import switch_off, viewer_file
 
 from .conftest import AWAY, FIRST, FRAMES
 

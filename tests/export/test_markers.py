@@ -13,13 +13,12 @@ from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25, COCO_17, HALPE_26, SMPL_24
 from shapepose_fg.io.export.amass import write_amass
 from shapepose_fg.io.export.bvh import write_bvh
-from shapepose_fg.io.export.c3d import c3d_bytes, write_c3d
 from shapepose_fg.io.export.job import Job
+from shapepose_fg.io.export.marker_files import c3d_bytes, write_c3d, write_trc
 from shapepose_fg.io.export.markers import Markers, MarkerSet, opensim_names
 from shapepose_fg.io.export.reading import read_take
-from shapepose_fg.io.export.table import COLUMNS, csv_text
+from shapepose_fg.io.export.tables import COLUMNS, csv_text
 from shapepose_fg.io.export.take import Take
-from shapepose_fg.io.export.trc import write_trc
 
 from .conftest import AWAY, FIRST, FPS, FRAMES, GUESSED, LOST
 

@@ -9,7 +9,7 @@ import pytest
 from shapepose_fg.cli.main import main
 from shapepose_fg.core.observation_table import ObservationTable
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.io.export import parquet
+from shapepose_fg.io.export import tables
 
 arrow_parquet = pytest.importorskip("pyarrow.parquet")
 
@@ -48,7 +48,7 @@ def same(table, people: Reconstruction) -> None:
 def test_all_columns_come_back_in_groups_of_rows(saved, tmp_path, monkeypatch):
     people = Reconstruction.load(saved)
     people.save(tmp_path)
-    monkeypatch.setattr(parquet, "_GROUP_ROWS", 7)
+    monkeypatch.setattr(tables, "_GROUP_ROWS", 7)
     table, about = exported(tmp_path)
     same(table, people)
     assert arrow_parquet.ParquetFile(tmp_path / "export" / "people.parquet").num_row_groups == -(-len(people) // 7)

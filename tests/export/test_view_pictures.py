@@ -11,8 +11,8 @@ from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.export.reading import read_take
-from shapepose_fg.io.export.rerun_pictures import log_pictures, undistorting
-from shapepose_fg.io.export.rerun_scene import new_stream
+from shapepose_fg.io.export.rerun_app import new_stream
+from shapepose_fg.io.export.rerun_log import log_pictures, undistorting
 from shapepose_fg.io.footage.placement import Placement, PlacementKind
 from shapepose_fg.viz.overlay.result_pictures import pictures_of
 

@@ -6,7 +6,7 @@ import pytest
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25, COCO_18
 from shapepose_fg.io.detections import read_detections
-from shapepose_fg.io.detections.association_skeletons import TEXT_SKELETONS
+from shapepose_fg.io.detections.association_text import TEXT_SKELETONS
 from shapepose_fg.io.write_detections import association_lines
 
 KIND = TEXT_SKELETONS["COCO_18"]

@@ -89,7 +89,7 @@ def test_a_first_correction_that_was_stopped_half_way_is_told(folder, monkeypatc
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("shapepose_fg.io.corrections.write_atomically", stop)
+        patch.setattr("shapepose_fg.io.corrections.write_content", stop)
         with pytest.raises(KeyboardInterrupt):
             correct(folder, Edit(Action.DROP, 2))
     assert set(Reconstruction.load(folder).person.tolist()) == {0, 1}

@@ -12,7 +12,8 @@ from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25, COCO_17, COCO_18, COCO_133, HALPE_26, SKELETONS, Skeleton
 from shapepose_fg.io.detection_table import DetectionTable
-from shapepose_fg.io.detections import read_detections
+from shapepose_fg.io.detections import formats, read_detections
+from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock
 from shapepose_fg.io.skeleton_file import read_skeleton
 from shapepose_fg.proposal.people_2d import group_people
 
@@ -512,3 +513,31 @@ def test_nobody_anywhere(tmp_path, rig):
     (tmp_path / "b").mkdir()
     coco(tmp_path / "b", {name: [[]] for name in rig.names})
     refuses(tmp_path / "b", rig, "recognised as COCO's keypoint results, where no camera lists a frame")
+
+
+def test_a_format_of_the_user_s_own(tmp_path, rig):
+    """An entry in the registry and a function: which files are whose, scores and skeletons are as of every
+    other."""
+    people = people_of(COCO_17)
+    for name, frames in people.items():
+        rows = [[frame, *person.ravel()] for frame, found in enumerate(frames) for person in found]
+        np.savetxt(tmp_path / f"{name}.csv", np.array(rows), delimiter=",", fmt="%.17g")
+
+    def read(file: Path, camera: Camera) -> CameraPeople:
+        rows = np.loadtxt(file, delimiter=",", ndmin=2)
+        block = PeopleBlock(rows[:, 0].astype(np.intp), rows[:, 1:].reshape(len(rows), -1, 3))
+        return CameraPeople(file, "our CSV", iter([block]), 0, 2)
+
+    ours = formats.Format("our CSV", ("{}.csv",), lambda place: place.suffix == ".csv", read)
+    formats.FORMATS.insert(0, ours)
+    try:
+        table = read_detections(tmp_path, rig)
+    finally:
+        formats.FORMATS.remove(ours)
+    coco(tmp_path, people)
+    expected = read_detections(tmp_path, rig)
+    assert table.skeleton is COCO_17 and len(table) == len(expected) == 3
+    for mine, theirs in zip(table, expected, strict=True):
+        # That writer lists people in another order.
+        np.testing.assert_allclose(*(np.sort(each.xy[:, 0]) for each in (mine, theirs)), atol=1e-9)
+        assert len(mine.pairs) == len(theirs.pairs)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from shapepose_fg.io.export.light_mesh import thinned
+from shapepose_fg.core.drawing import thinned
 from shapepose_fg.viz.report.skins import CELL_M
 
 from ..export.conftest import BARE, FIRST, FPS, FRAMES

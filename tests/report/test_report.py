@@ -116,7 +116,7 @@ def test_the_scene_holds_every_joint_to_a_millimetre(page, result):
 
 @pytest.mark.parametrize("up", ["x", "-x", "y", "-y", "-z"])
 def test_people_stand_upright_whatever_axis_is_up(result, tmp_path, up):
-    from shapepose_fg.io.export.axes import z_up
+    from shapepose_fg.io.export.take import z_up
 
     turned = replace(result, joints=result.joints @ z_up(up))
     page = Page(write_report(tmp_path, turned, None))

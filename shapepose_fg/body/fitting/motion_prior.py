@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.pose_prior import NUM_ANGLES
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.storage.npz_reader import read_npz
+from shapepose_fg.core.storage.npz import read_npz
 
 Array = NDArray[np.float64]
 

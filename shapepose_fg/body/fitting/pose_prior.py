@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.storage.npz_reader import read_npz
+from shapepose_fg.core.storage.npz import read_npz
 
 NUM_ANGLES = 69
 """The 23 local rotations below the root, axis-angle, in SMPL's order."""

@@ -12,7 +12,7 @@ from shapepose_fg.body.model.plausible_body import implausible
 from shapepose_fg.body.model.smpl_pickle import as_array, read_smpl_pickle
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.core.storage.npz_reader import read_npz
+from shapepose_fg.core.storage.npz import read_npz
 
 NUM_BETAS = 10
 """Shape components in use; a file may hold more."""

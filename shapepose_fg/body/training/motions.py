@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from shapepose_fg.body.training.split import SPLITS, Split, split_of
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import SMPL_24
-from shapepose_fg.core.storage.npz_reader import read_npz
+from shapepose_fg.core.storage.npz import read_npz
 from shapepose_fg.simulation.mocap import Clip, Mocap
 from shapepose_fg.simulation.shoulder import COLLARS, shoulder_rhythm
 

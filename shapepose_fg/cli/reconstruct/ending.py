@@ -11,7 +11,7 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.io.detection_table import DetectionTable
-from shapepose_fg.io.export.pose2sim_files import write_pose2sim_files
+from shapepose_fg.io.export.marker_files import write_pose2sim_files
 from shapepose_fg.io.pose2sim_project import Pose2SimProject
 from shapepose_fg.pipeline.runs.assembly import Assembly
 from shapepose_fg.setup_check.diagnosis import diagnose

@@ -27,8 +27,7 @@ from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.solved_setup import CAMERAS
 from shapepose_fg.pipeline.pipeline import PipelineConfig, Progress, reconstruct_parts
 from shapepose_fg.pipeline.runs.known_people import checksum_at_start, people_at_start, write_people
-from shapepose_fg.pipeline.runs.manifest import PARTS, end_run, frames_done, open_run
-from shapepose_fg.pipeline.runs.room import check_room, expected_bytes
+from shapepose_fg.pipeline.runs.manifest import PARTS, check_room, end_run, expected_bytes, frames_done, open_run
 
 
 @dataclass(frozen=True)

@@ -164,33 +164,20 @@ def bounded(value: Any, path: Path, *, numbers: bool = True) -> Any:
     With `numbers`, also if its whole numbers have 64 bits: longer ones fit no float and no array, and take the
     square of their length to print.
     """
-    level = [value] if isinstance(value, dict | list) else []
-    for _ in range(_MOST_DEPTH):
-        if len(level) == 0:
-            break
-        inner = [child for each in level for child in (each.values() if isinstance(each, dict) else each)]
-        if numbers and any(type(child) is int and not -(2**63) <= child < 2**63 for child in inner):
-            place = "".join(_way_to_long_number(value)).removeprefix(".")
-            raise InputError(f"{path}: {place[:80]} is a whole number of over 18 digits; correct it there")
-        level = [child for child in inner if type(child) in (dict, list)]
-    if len(level) > 0:
-        raise InputError(f"{path}: its lists are over {_MOST_DEPTH} deep; write the file again")
+    waiting: list[tuple[tuple[Any, ...], Any]] = [((), value)]
+    while len(waiting) > 0:
+        way, each = waiting.pop()
+        if len(way) > _MOST_DEPTH:
+            raise InputError(f"{path}: its lists are over {_MOST_DEPTH} deep; write the file again")
+        items = each.items() if isinstance(each, dict) else enumerate(each) if isinstance(each, list) else ()
+        for key, child in items:
+            if isinstance(child, dict | list):
+                waiting.append(((*way, key), child))
+            elif numbers and type(child) is int and not -(2**63) <= child < 2**63:
+                place = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in (*way, key))
+                place = place.removeprefix(".")[:80]
+                raise InputError(f"{path}: {place} is a whole number of over 18 digits; correct it there")
     return value
-
-
-def _way_to_long_number(value: Any, depth: int = 0) -> list[str]:
-    """Keys and indices that lead to a number of more than 64 bits; none where there is none."""
-    if depth > _MOST_DEPTH:
-        return []
-    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    for key, child in items:
-        here = f"[{key}]" if isinstance(key, int) else f".{key}"
-        if type(child) is int and not -(2**63) <= child < 2**63:
-            return [here]
-        below = _way_to_long_number(child, depth + 1)
-        if below:
-            return [here, *below]
-    return []
 
 
 def _refuse_irregular(path: Path, mode: int) -> None:
@@ -203,10 +190,16 @@ def _refuse_irregular(path: Path, mode: int) -> None:
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
     """Let `write` fill a temporary file beside `path`, then put it in place in one step.
 
-    Whoever reads `path`, whenever this process dies, finds the old file or the whole new one. OSError that names
+    At `path` is the old file or the whole new one, whenever this process dies. OSError that names
     `path` where that fails.
     """
     write_together({path: write})
+
+
+def write_content(path: Path, content: str | bytes) -> None:
+    """`write_atomically` of a whole content; text is UTF-8."""
+    data = content.encode() if isinstance(content, str) else content
+    write_atomically(path, lambda stream: stream.write(data))
 
 
 def write_together(files: Mapping[Path, Callable[[BinaryIO], object]]) -> None:
@@ -237,7 +230,7 @@ def write_together(files: Mapping[Path, Callable[[BinaryIO], object]]) -> None:
 def sweep(folder: Path, name: str | None = None) -> None:
     """Remove what a killed process was writing in `folder`, as the file `name` or as any.
 
-    Nobody else may be writing there.
+    No other process may be writing there.
     """
     for left in folder.glob(f".*{_PART}" if name is None else f".{glob.escape(name)}.*{_PART}"):
         left.unlink(missing_ok=True)

@@ -36,15 +36,12 @@ class KeptArrays(Protocol):
 
     def keep(self, name: str, arrays: Arrays, about: Any = None) -> None:
         """Keep a set, whole or not at all; one of the same name is replaced."""
-        ...
 
     def drop(self, name: str) -> None:
         """Forget a set, if there is one."""
-        ...
 
     def about(self, name: str) -> Any:
         """What is said about a set."""
-        ...
 
     def array(self, name: str, key: str, rows: slice = slice(None)) -> NDArray[Any]:
         """Rows of an array of a set."""
@@ -56,7 +53,7 @@ class KeptArrays(Protocol):
 
 
 class InMemory:
-    """Sets of arrays in memory. That of a set that is dropped goes back to the system at once."""
+    """`KeptArrays` in memory. That of a set that is dropped goes back to the system at once."""
 
     lasting = False
 
@@ -64,27 +61,21 @@ class InMemory:
         self._sets: dict[str, tuple[Arrays, Any]] = {}
 
     def names(self, prefix: str) -> list[str]:
-        """See `KeptArrays`."""
         return sorted(name for name in self._sets if name.startswith(prefix))
 
     def keep(self, name: str, arrays: Arrays, about: Any = None) -> None:
-        """See `KeptArrays`."""
         self._sets[name] = (_mapped(arrays), about)
 
     def drop(self, name: str) -> None:
-        """See `KeptArrays`."""
         self._sets.pop(name, None)
 
     def about(self, name: str) -> Any:
-        """See `KeptArrays`."""
         return self._sets[name][1]
 
     def array(self, name: str, key: str, rows: slice = slice(None)) -> NDArray[Any]:
-        """See `KeptArrays`."""
         return self._sets[name][0][key][rows]
 
     def keys(self, name: str) -> list[str]:
-        """See `KeptArrays`."""
         return list(self._sets[name][0])
 
 
@@ -102,7 +93,7 @@ def _mapped(arrays: Arrays) -> Arrays:
 
 
 class InFolder:
-    """A file per set in a folder: safetensors, which holds no code and gives single arrays and rows of them.
+    """`KeptArrays` as a file per set: safetensors, which holds no code and gives single arrays and rows of them.
 
     A file is on the disk when `keep` returns. Reading raises InputError that names a file that is damaged.
     """
@@ -113,32 +104,26 @@ class InFolder:
         self.folder = folder
 
     def names(self, prefix: str) -> list[str]:
-        """See `KeptArrays`."""
         found = (file.name for file in self.folder.glob(f"*{_SUFFIX}") if not file.name.startswith("."))
         return sorted(name.removesuffix(_SUFFIX) for name in found if name.startswith(prefix))
 
     def keep(self, name: str, arrays: Arrays, about: Any = None) -> None:
-        """See `KeptArrays`."""
         said = {"about": json.dumps(about)}
         content = save({key: np.ascontiguousarray(array) for key, array in arrays.items()}, said)
         write_atomically(self._file(name), lambda stream: stream.write(content))
 
     def drop(self, name: str) -> None:
-        """See `KeptArrays`."""
         self._file(name).unlink(missing_ok=True)
 
     def about(self, name: str) -> Any:
-        """See `KeptArrays`."""
         with _opened(self._file(name)) as file:
             return json.loads(file.metadata()["about"])
 
     def array(self, name: str, key: str, rows: slice = slice(None)) -> NDArray[Any]:
-        """See `KeptArrays`."""
         with _opened(self._file(name)) as file:
             return file.get_tensor(key) if rows == slice(None) else file.get_slice(key)[rows]
 
     def keys(self, name: str) -> list[str]:
-        """See `KeptArrays`."""
         with _opened(self._file(name)) as file:
             return list(file.keys())
 
@@ -157,9 +142,3 @@ def _opened(file: Path) -> Iterator[Any]:
         raise InputError(
             f"{file}: a part of an unfinished run cannot be read ({reason}); begin that run anew with --restart"
         ) from None
-
-
-def split(arrays: NDArray[Any], lengths: NDArray[np.integer]) -> Iterator[NDArray[Any]]:
-    """An array in pieces of the given lengths."""
-    ends = np.cumsum(lengths)
-    return (arrays[end - length : end] for end, length in zip(ends.tolist(), lengths.tolist(), strict=True))

@@ -31,7 +31,8 @@ def prepare_output(folder: Path, names: Iterable[str] = ()) -> None:
 
 @contextmanager
 def only_run_in(folder: Path, names: Iterable[str]) -> Iterator[None]:
-    """`prepare_output`, and nobody else writes results there while the block runs; InputError where somebody does.
+    """`prepare_output`, as the only run that writes results there during the block; InputError if another one
+    does.
 
     What a killed run was writing is removed, and so is a new folder into which nothing was written. The lock is
     the system's: it ends with the process, however that ends.

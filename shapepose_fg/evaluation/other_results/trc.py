@@ -12,7 +12,7 @@ from shapepose_fg.core.camera import Axis
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import MID_HIP
 from shapepose_fg.core.storage.files import read_text
-from shapepose_fg.io.export.axes import opensim_axes
+from shapepose_fg.io.export.take import opensim_axes
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """What a unit of the header is."""

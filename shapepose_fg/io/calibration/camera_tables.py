@@ -3,19 +3,21 @@
 `rotation` and `translation` are camera-from-world in all of them. They differ in what is known of the world.
 """
 
-from pathlib import Path
+from collections.abc import Mapping
+from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.camera import Axis
 from shapepose_fg.io.calibration.content import Content
-from shapepose_fg.io.calibration.written import Format, Matrix33, Row3, WrittenCamera, WrittenRig, pose, sentence
+from shapepose_fg.io.calibration.written import Format, Matrix33, Row3, Unit, WrittenCamera, WrittenRig, pose
+from shapepose_fg.io.validation import validated
 
-_OWN_AXES = (
-    "the axis of the world that points up with --up; the world is often the first camera, whose -y is up where it"
-    " stood level"
+_UP = (
+    "pass the axis of the world that points up with --up; the world is often the first camera, whose -y is up"
+    " where it stood level"
 )
 _CURES = {
     "matrix": "write the 3x3 intrinsic matrix as three rows, in pixels",
@@ -52,8 +54,7 @@ def _tables(content: Content) -> dict[str, dict[str, Any]]:
 
 
 def _is_caliscope(content: Content) -> bool:
-    tables = _tables(content)
-    return len(tables) > 0 and any("cam_id" in table or "port" in table for table in tables.values())
+    return any("cam_id" in table or "port" in table for table in _tables(content).values())
 
 
 def _is_freemocap(content: Content) -> bool:
@@ -67,64 +68,42 @@ def _is_pose2sim(content: Content) -> bool:
     return len(tables) > 0 and all(table.get("fisheye") is False for table in tables.values())
 
 
-def _is_anipose(content: Content) -> bool:
-    return len(_tables(content)) > 0
-
-
-def _cameras(content: Content) -> list[WrittenCamera]:
+def _read(content: Content, unit: Unit | None, up: Axis | None, cures: Mapping[str, str]) -> WrittenRig:
     """The cameras that are not to be ignored, in the order of the file."""
-    cameras = [_camera(key, table, content.path) for key, table in _tables(content).items()]
-    return [camera for camera in cameras if camera is not None]
+    cameras = []
+    for key, table in _tables(content).items():
+        if table.get("ignore") is True:
+            continue
+        place = f'{content.path}: camera "{key}"'
+        camera = validated(_Camera, table, place, _CURES)
+        # Caliscope's videos are called cam_0.mp4, those of its older versions port_0.mp4.
+        numbered = None if camera.cam_id is None else f"cam_{camera.cam_id}"
+        numbered = f"port_{camera.port}" if camera.port is not None else numbered
+        width, height = camera.size
+        cameras.append(
+            WrittenCamera(
+                camera.name or numbered or key,
+                np.array(camera.matrix),
+                pose(camera.rotation, camera.translation, "rotation", place),
+                (round(width), round(height)),
+                camera.distortions,
+                "fisheye" if camera.fisheye else "perspective",
+            )
+        )
+    return WrittenRig(cameras, unit, up, cures)
 
 
-def _camera(key: str, table: dict[str, Any], path: Path) -> WrittenCamera | None:
-    if table.get("ignore") is True:
-        return None
-    place = f'{path}: camera "{key}"'
-    try:
-        camera = _Camera.model_validate(table)
-    except ValidationError as error:
-        raise InputError(sentence(error, place, _CURES)) from None
-    # Caliscope's videos are called cam_0.mp4, those of its older versions port_0.mp4.
-    numbered = None if camera.cam_id is None else f"cam_{camera.cam_id}"
-    numbered = f"port_{camera.port}" if camera.port is not None else numbered
-    width, height = camera.size
-    return WrittenCamera(
-        camera.name or numbered or key,
-        np.array(camera.matrix),
-        pose(camera.rotation, camera.translation, "rotation", place),
-        (round(width), round(height)),
-        camera.distortions,
-        "fisheye" if camera.fisheye else "perspective",
-    )
-
-
-def _read_caliscope(content: Content) -> WrittenRig:
-    """Caliscope: metres."""
-    return WrittenRig(_cameras(content), "m", None, {"up": f"pass {_OWN_AXES}"})
-
-
-def _read_freemocap(content: Content) -> WrittenRig:
-    """FreeMoCap: the file names no unit, and its world is the first camera."""
-    cures = {"unit": "pass --unit (FreeMoCap works in mm)", "up": f"pass {_OWN_AXES}"}
-    return WrittenRig(_cameras(content), None, None, cures)
-
-
-def _read_pose2sim(content: Content) -> WrittenRig:
-    """Pose2Sim: metres, z up."""
-    return WrittenRig(_cameras(content), "m", "z")
-
-
-def _read_anipose(content: Content) -> WrittenRig:
-    """AniPose: in the unit in which the board was given, in a world that nothing levels."""
-    cures = {"unit": "pass --unit, that of the board's squares", "up": f"pass {_OWN_AXES}"}
-    return WrittenRig(_cameras(content), None, None, cures)
-
-
+_FREEMOCAP = {"unit": "pass --unit (FreeMoCap works in mm)", "up": _UP}
+_ANIPOSE = {"unit": "pass --unit, that of the board's squares", "up": _UP}
 CAMERA_TABLES = (
-    Format("Caliscope's TOML", _is_caliscope, _read_caliscope),
-    Format("FreeMoCap's TOML", _is_freemocap, _read_freemocap),
-    Format("Pose2Sim's TOML", _is_pose2sim, _read_pose2sim),
-    Format("AniPose's TOML", _is_anipose, _read_anipose),
+    Format("Caliscope's TOML", _is_caliscope, partial(_read, unit="m", up=None, cures={"up": _UP})),
+    Format("FreeMoCap's TOML", _is_freemocap, partial(_read, unit=None, up=None, cures=_FREEMOCAP)),
+    Format("Pose2Sim's TOML", _is_pose2sim, partial(_read, unit="m", up="z", cures={})),
+    Format(
+        "AniPose's TOML",
+        lambda content: len(_tables(content)) > 0,
+        partial(_read, unit=None, up=None, cures=_ANIPOSE),
+    ),
 )
-"""The dialects; the first that recognises a file reads it."""
+"""The dialects; the first that recognises a file reads it. AniPose's world is one that nothing levels, in the unit
+of the board; FreeMoCap's is the first camera."""

@@ -1,6 +1,6 @@
 """COLMAP's text model: cameras.txt and images.txt. Camera from world; no unit and no up axis of its own."""
 
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -28,16 +28,11 @@ _MODELS: dict[str, tuple[str, Lens]] = {
 }
 """COLMAP's camera models that are lenses of OpenCV, and their parameters in order."""
 _ORDER: dict[str, str] = {"perspective": "k1 k2 p1 p2 k3 k4 k5 k6", "fisheye": "k1 k2 k3 k4"}
-
-
-@dataclass(frozen=True)
-class _Lens:
-    """A line of cameras.txt."""
-
-    K: np.ndarray
-    image_size: tuple[int, int]
-    distortion: list[float]
-    lens: Lens
+_CURES = {
+    "unit": "pass --unit (a model is to no scale until colmap model_aligner or the cameras' known distances"
+    " gave it one)",
+    "up": "pass --up with the axis of the model that points up",
+}
 
 
 def recognise(content: Content) -> bool:
@@ -56,18 +51,11 @@ def read(content: Content) -> WrittenRig:
             if (folder / binary).is_file():
                 cure = f"{binary} is COLMAP's binary: run colmap model_converter --output_type TXT"
             raise InputError(f"{folder / name}: this half of COLMAP's model is missing; {cure}")
-    lenses = _lenses(folder / _FILES[0])
-    cameras = _images(folder / _FILES[1], lenses)
-    cures = {
-        "unit": "pass --unit (a model is to no scale until colmap model_aligner or the cameras' known distances"
-        " gave it one)",
-        "up": "pass --up with the axis of the model that points up",
-    }
-    return WrittenRig(cameras, None, None, cures)
+    return WrittenRig(_images(folder / _FILES[1], _lenses(folder / _FILES[0])), None, None, _CURES)
 
 
-def _lenses(path: Path) -> dict[str, _Lens]:
-    """The cameras of cameras.txt by their id: CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]."""
+def _lenses(path: Path) -> dict[str, WrittenCamera]:
+    """The cameras of cameras.txt, without poses, by their id: CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]."""
     lenses = {}
     for number, line in enumerate(read_text(path, most=LARGE).splitlines(), 1):
         words = line.split()
@@ -87,11 +75,12 @@ def _lenses(path: Path) -> dict[str, _Lens]:
         distortion = [given.get(name, 0.0) for name in _ORDER[lens].split()]
         while len(distortion) > 5 and distortion[-1] == 0:
             distortion.pop()
-        lenses[words[0]] = _Lens(K, (round(values[0]), round(values[1])), distortion, lens)
+        size = round(values[0]), round(values[1])
+        lenses[words[0]] = WrittenCamera("", K, np.eye(4), size, distortion, lens)
     return lenses
 
 
-def _images(path: Path, lenses: dict[str, _Lens]) -> list[WrittenCamera]:
+def _images(path: Path, lenses: dict[str, WrittenCamera]) -> list[WrittenCamera]:
     """images.txt: IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; each followed by a line of points."""
     every = enumerate(read_text(path, most=LARGE).splitlines(), 1)
     lines = iter([(number, line) for number, line in every if line[:1] != "#"])
@@ -110,8 +99,7 @@ def _images(path: Path, lenses: dict[str, _Lens]) -> list[WrittenCamera]:
             )
         qw, qx, qy, qz, *t = _numbers(words[1:8], 7, place)
         wTc = pose(rotation_of([qx, qy, qz, qw], "QW QX QY QZ", place), t, "QW QX QY QZ", place)
-        lens = lenses[words[8]]
-        cameras.append(WrittenCamera(name, lens.K, wTc, lens.image_size, lens.distortion, lens.lens))
+        cameras.append(replace(lenses[words[8]], name=name, wTc=wTc))
     return cameras
 
 

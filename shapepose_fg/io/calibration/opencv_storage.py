@@ -1,5 +1,8 @@
-"""YAML and XML of OpenCV's FileStorage: OpenCV's own multi-view calibration, and files with a node per camera."""
+"""YAML and XML of OpenCV's FileStorage: OpenCV's own multi-view calibration, files with a node per camera,
+EasyMocap's.
+"""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -167,5 +170,70 @@ def _stack(nodes: dict[str, Any], key: str, path: object) -> np.ndarray:
     return values
 
 
+def recognise_easymocap(content: Content) -> bool:
+    """Whether this is one of the two files, or the folder of both."""
+    if content.syntax == "folder":
+        return any(_is_part(path.name) for path in content.value)
+    there = content.syntax == "OpenCV" and _is_part(content.path.name)
+    return there and isinstance(content.value.get("names"), list)
+
+
+def read_easymocap(content: Content) -> WrittenRig:
+    """EasyMocap's intri.yml and extri.yml, metres, z up: the cameras in the order of the names in the
+    intrinsics.
+    """
+    folder = content.syntax == "folder"
+    one = next(path for path in content.value if _is_part(path.name)) if folder else content.path
+    intri = one.with_name(one.name.replace("extri", "intri"))
+    extri = one.with_name(one.name.replace("intri", "extri"))
+    for path in (intri, extri):
+        if not path.is_file():
+            raise InputError(
+                f"{path}: this half of EasyMocap's calibration is missing; put both files into one folder"
+            )
+    inner, outer = (load_storage(path, read_text(path, most=MIDDLE)) for path in (intri, extri))
+    names = inner.get("names")
+    if not isinstance(names, list) or not all(isinstance(name, str | int) for name in names):
+        raise InputError(f"{intri}: names must be a list of the cameras' names; write it with EasyMocap again")
+    cameras = [
+        _easymocap_camera(str(name), number, inner, outer, intri, extri) for number, name in enumerate(names, 1)
+    ]
+    return WrittenRig(cameras, "m", "z")
+
+
+def _is_part(name: str) -> bool:
+    return name.endswith((".yml", ".yaml")) and ("intri" in name or "extri" in name)
+
+
+def _easymocap_camera(
+    name: str, number: int, inner: dict[str, Any], outer: dict[str, Any], intri: Path, extri: Path
+) -> WrittenCamera:
+    # EasyMocap writes K_<name>; Pose2Sim's writer numbers them from 1.
+    tags = (name, str(number))
+    K = _matrix(inner, "K", tags, 9, intri).reshape(3, 3)
+    distortion = _matrix(inner, "dist", tags, None, intri)
+    rotation = "Rot" if any(f"Rot_{tag}" in outer for tag in tags) else "R"
+    R = _matrix(outer, rotation, tags, 9 if rotation == "Rot" else 3, extri)
+    wTc = pose(R, _matrix(outer, "T", tags, 3, extri), f"{rotation}_{name}", str(extri))
+    width, height = (inner.get(f"{letter}_{name}") for letter in "WH")
+    size = picture_size(width, height, f'{intri}: camera "{name}"')
+    return WrittenCamera(name, K, wTc, size, distortion.tolist())
+
+
+def _matrix(nodes: dict[str, Any], key: str, tags: tuple[str, ...], count: int | None, path: Path) -> np.ndarray:
+    """The numbers of the matrix `key`_<tag>, flat."""
+    value = next((nodes[f"{key}_{tag}"] for tag in tags if f"{key}_{tag}" in nodes), None)
+    if not isinstance(value, np.ndarray) or (count is not None and value.size != count):
+        got = f"got {value.size}" if isinstance(value, np.ndarray) else "it is missing"
+        wanted = "a matrix" if count is None else f"a matrix of {count} numbers"
+        raise InputError(f"{path}: {key}_{tags[0]} must be {wanted}, {got}; write it with EasyMocap again")
+    if not np.isfinite(value).all():
+        raise InputError(
+            f"{path}: {key}_{tags[0]} holds a number that is not finite; write it with EasyMocap again"
+        )
+    return value.ravel()
+
+
+EASYMOCAP = Format("EasyMocap's intri.yml and extri.yml", recognise_easymocap, read_easymocap)
 MULTIVIEW = Format("OpenCV's multi-view calibration", recognise_multiview, read_multiview)
 ONE_NODE_EACH = Format("OpenCV's FileStorage with a node or file per camera", recognise_nodes, read_nodes)

@@ -5,18 +5,15 @@ from typing import get_args
 
 from shapepose_fg.core.camera import Axis, Rig
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.io.calibration.association import ASSOCIATION
 from shapepose_fg.io.calibration.camera_tables import CAMERA_TABLES
 from shapepose_fg.io.calibration.colmap import COLMAP
 from shapepose_fg.io.calibration.content import Content, load
-from shapepose_fg.io.calibration.easymocap import EASYMOCAP
-from shapepose_fg.io.calibration.opencv_storage import MULTIVIEW, ONE_NODE_EACH
-from shapepose_fg.io.calibration.panoptic import PANOPTIC, VOXELPOSE
-from shapepose_fg.io.calibration.qualisys import QUALISYS
+from shapepose_fg.io.calibration.json_files import ASSOCIATION, PANOPTIC, VOXELPOSE
+from shapepose_fg.io.calibration.opencv_storage import EASYMOCAP, MULTIVIEW, ONE_NODE_EACH
 from shapepose_fg.io.calibration.rig_file import RIG_FILE
 from shapepose_fg.io.calibration.ros import ROS
-from shapepose_fg.io.calibration.vicon import VICON
 from shapepose_fg.io.calibration.written import METRES, Format, Unit, finished
+from shapepose_fg.io.calibration.xml_files import QUALISYS, VICON
 from shapepose_fg.io.validation import describe
 
 FORMATS: tuple[Format, ...] = (
@@ -95,24 +92,20 @@ def read_rig(
 
 def _unknown(content: Content) -> str:
     """What was found instead of a calibration, and what is known."""
-    known = ", ".join(form.name for form in FORMATS)
+    value = content.value
     if content.syntax == "folder":
-        names = [path.name for path in content.value]
+        names = [path.name for path in value]
         listing = " ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
         return (
             f"{content.path}: this is a folder; give the file inside it, or the folder with the files of"
             f" EasyMocap, COLMAP or ROS; here is {listing or 'nothing'}"
         )
-    found = content.syntax if content.syntax == "text" else f"{content.syntax} ({_about(content)})"
+    about = f"<{value.tag}>" if hasattr(value, "tag") else describe(value)
+    if isinstance(value, dict):
+        about = f"with {' '.join(list(map(str, value))[:5]) or 'nothing'}"
+    found = content.syntax if content.syntax == "text" else f"{content.syntax} ({about})"
+    known = ", ".join(form.name for form in FORMATS)
     return (
         f"{content.path}: recognised as {found}, but this is not a calibration that is known here; give one of"
         f" {known} (docs/conventions.md)"
     )
-
-
-def _about(content: Content) -> str:
-    """A few words about what the file holds."""
-    if isinstance(content.value, dict):
-        return f"with {' '.join(list(map(str, content.value))[:5]) or 'nothing'}"
-    tag = getattr(content.value, "tag", None)
-    return f"<{tag}>" if tag is not None else describe(content.value)

@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from shapepose_fg.core.camera import Axis, Lens, Rig
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.storage.files import write_atomically
+from shapepose_fg.core.storage.files import write_content
 from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.calibration.written import (
     Format,
@@ -18,12 +18,9 @@ from shapepose_fg.io.calibration.written import (
     Unit,
     WrittenCamera,
     WrittenRig,
-    check_rotation,
-    nearest_rotation,
     pose,
-    sentence,
 )
-from shapepose_fg.io.validation import describe
+from shapepose_fg.io.validation import describe, validated
 
 RIG_FORMAT = "shapepose-fg rig 1"
 """The tag by which a rig file of our own is known."""
@@ -53,13 +50,10 @@ def write_rig(rig: Rig, path: str | Path) -> None:
         for camera in rig.cameras
     ]
     content = {"format": RIG_FORMAT, "unit": "m", "up": rig.up, "cameras": cameras}
-    text = json.dumps(content, indent=1, allow_nan=False)
-    write_atomically(Path(path), lambda stream: stream.write(text.encode()))
+    write_content(Path(path), json.dumps(content, indent=1, allow_nan=False))
 
 
 class _Camera(BaseModel):
-    """One camera."""
-
     model_config = ConfigDict(strict=True, extra="forbid")
     name: Annotated[str, Field(min_length=1)]
     image_size: ImageSize
@@ -71,8 +65,6 @@ class _Camera(BaseModel):
 
 
 class _Rig(BaseModel):
-    """The whole file."""
-
     model_config = ConfigDict(strict=True, extra="forbid")
     format: Literal["shapepose-fg rig 1"]
     unit: Unit | None = None
@@ -91,10 +83,7 @@ def read(content: Content) -> WrittenRig:
     if content.value["format"] != RIG_FORMAT:
         got = describe(content.value["format"])
         raise InputError(f'{path}: format must be "{RIG_FORMAT}", got {got}; this version reads no other')
-    try:
-        rig = _Rig.model_validate(content.value)
-    except ValidationError as error:
-        raise InputError(sentence(error, str(path), _CURES)) from None
+    rig = validated(_Rig, content.value, path, _CURES)
     cures = {
         "up": 'say which axis points up, "up": "z", or pass --up z',
         "unit": 'say what lengths are in, "unit": "m", or pass --unit m',
@@ -111,8 +100,7 @@ def _camera(camera: _Camera, place: str) -> WrittenCamera:
         wTc = np.array(camera.wTc)
         if np.any(wTc[3] != (0, 0, 0, 1)):
             raise InputError(f"{place}: the last row of wTc must be 0 0 0 1; {_CURES['wTc']}")
-        check_rotation(wTc[:3, :3], "wTc", place)
-        wTc[:3, :3] = nearest_rotation(wTc[:3, :3])
+        wTc = pose(wTc[:3, :3], wTc[:3, 3], "wTc", place, world_from_camera=True)
     else:
         cTw = np.array(camera.cTw)
         wTc = pose(cTw[:, :3], cTw[:, 3], "cTw", place)

@@ -22,13 +22,9 @@ from shapepose_fg.io.calibration.written import (
     rotation_of,
 )
 
-_SUFFIXES = (".yaml", ".yml")
 _LENSES: dict[str, Lens] = {
-    "": "perspective",
-    "plumb_bob": "perspective",
-    "rational_polynomial": "perspective",
-    "equidistant": "fisheye",
-    "fisheye": "fisheye",
+    **dict.fromkeys(("", "plumb_bob", "rational_polynomial"), "perspective"),
+    **dict.fromkeys(("equidistant", "fisheye"), "fisheye"),
 }
 """ROS' distortion models that are lenses of OpenCV."""
 _POSE_CURE = (
@@ -39,7 +35,7 @@ _POSE_CURE = (
 def recognise(content: Content) -> bool:
     """Whether this is a camera_info file, or a folder in which there is one."""
     if content.syntax == "folder":
-        return any(path.suffix in _SUFFIXES and _is_info(_value(path)) for path in content.value if path.is_file())
+        return any(map(_is_info, _values(content).values()))
     return content.syntax == "YAML" and (_is_info(content.value) or _pose_of(content.value) is not None)
 
 
@@ -51,7 +47,7 @@ def read(content: Content) -> WrittenRig:
             f"{content.path}: this is {what} of one camera of ROS; give the folder with <camera>.yaml and"
             " <camera>_pose.yaml of every camera"
         )
-    values = {path: _value(path) for path in content.value if path.suffix in _SUFFIXES and path.is_file()}
+    values = _values(content)
     poses = {path.stem.removesuffix("_pose"): path for path, value in values.items() if not _is_info(value)}
     cameras = []
     for path, value in values.items():
@@ -66,17 +62,17 @@ def read(content: Content) -> WrittenRig:
     return WrittenRig(cameras, "m", "z")
 
 
-def _value(path: Path) -> Any:
-    """What a YAML file holds; nothing where it is of another syntax."""
-    content = load(path)
-    return content.value if content.syntax == "YAML" else None
+def _values(content: Content) -> dict[Path, Any]:
+    """What the YAML files of a folder hold; nothing where one is of another syntax."""
+    files = [path for path in content.value if path.suffix in (".yaml", ".yml") and path.is_file()]
+    found = {path: load(path) for path in files}
+    return {path: each.value if each.syntax == "YAML" else None for path, each in found.items()}
 
 
 def _is_info(value: Any) -> bool:
     """Whether this is what camera_calibration writes, or a CameraInfo message."""
-    if not isinstance(value, dict):
-        return False
-    return "camera_matrix" in value or {"distortion_model", "height", "width"} <= value.keys()
+    known = isinstance(value, dict)
+    return known and ("camera_matrix" in value or {"distortion_model", "height", "width"} <= value.keys())
 
 
 def _camera(name: str, path: Path, value: dict[str, Any], wTc: np.ndarray) -> WrittenCamera:
@@ -120,8 +116,7 @@ def _pose(path: Path, value: Any) -> np.ndarray:
         )
     translation, rotation = message
     try:
-        t = [float(translation[axis]) for axis in "xyz"]
-        q = [float(rotation[axis]) for axis in "xyzw"]
+        t, q = [float(translation[axis]) for axis in "xyz"], [float(rotation[axis]) for axis in "xyzw"]
     except (KeyError, TypeError, ValueError):
         raise InputError(
             f"{path}: translation must have x y z and rotation x y z w, numbers; {_POSE_CURE}"

@@ -8,12 +8,11 @@ from typing import Annotated, Any, Literal
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field, FiniteFloat, ValidationError
+from pydantic import Field, FiniteFloat
 
 from shapepose_fg.core.camera import Axis, Camera, Lens, padded_distortion
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.calibration.content import Content
-from shapepose_fg.io.validation import first_problem, key_text
 
 Unit = Literal["m", "cm", "mm"]
 """The unit of lengths in a calibration file."""
@@ -97,8 +96,21 @@ def pose(
             f" {len(t)}; write both again"
         )
     R = np.asarray(cv2.Rodrigues(R.ravel())[0], dtype=np.float64) if R.size == 3 else R.reshape(3, 3)
-    check_rotation(R, key, place)
-    R = nearest_rotation(R)
+    with np.errstate(over="ignore", invalid="ignore"):  # of numbers like 1e300, which are refused here
+        off = np.abs(R @ R.T - np.eye(3)).max()
+    if not off <= _ROTATION_TOLERANCE:
+        raise InputError(
+            f"{place}: the rotation of {key} is not orthonormal (R Rᵀ is off by {off:.2g});"
+            " give a pure rotation without scale, row by row"
+        )
+    if np.linalg.det(R) < 0:
+        raise InputError(
+            f"{place}: the rotation of {key} mirrors (determinant -1); use a right-handed world and"
+            " OpenCV's camera axes: x right, y down, z forward"
+        )
+    if off >= _EXACT:
+        U, _, Vt = np.linalg.svd(R)
+        R = U @ Vt
     wTc = np.eye(4)
     wTc[:3, :3] = R if world_from_camera else R.T
     wTc[:3, 3] = t if world_from_camera else -R.T @ t
@@ -141,35 +153,3 @@ def finished(written: WrittenCamera, metres: float, image_size: tuple[int, int],
         return Camera(written.name, written.K, wTc, size, distortion, written.lens)
     except ValueError as error:
         raise InputError(f"{path}: {error}; {cure}") from None
-
-
-def check_rotation(R: NDArray[np.float64], key: str, place: str) -> None:
-    """Refuse a rotation that is scaled, sheared or mirrored."""
-    with np.errstate(over="ignore", invalid="ignore"):  # of numbers like 1e300, which are refused here
-        off = np.abs(R @ R.T - np.eye(3)).max()
-    if not off <= _ROTATION_TOLERANCE:
-        raise InputError(
-            f"{place}: the rotation of {key} is not orthonormal (R Rᵀ is off by {off:.2g});"
-            " give a pure rotation without scale, row by row"
-        )
-    if np.linalg.det(R) < 0:
-        raise InputError(
-            f"{place}: the rotation of {key} mirrors (determinant -1); use a right-handed world and"
-            " OpenCV's camera axes: x right, y down, z forward"
-        )
-
-
-def nearest_rotation(R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The orthonormal matrix nearest to `R`, or `R` itself where that is as good as exact."""
-    if np.abs(R @ R.T - np.eye(3)).max() < _EXACT:
-        return R
-    U, _, Vt = np.linalg.svd(R)
-    return U @ Vt
-
-
-def sentence(error: ValidationError, place: str, cures: Mapping[str, str]) -> str:
-    """The first problem of `error` at `place`, with the cure for the innermost key that has one."""
-    keys, problem = first_problem(error)
-    known = [cures[str(key)] for key in reversed(keys) if key in cures]
-    cure = known[0] if known else "see docs/conventions.md for the format"
-    return f"{place}: {key_text(keys)} {problem}; {cure}"

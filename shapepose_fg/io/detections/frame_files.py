@@ -1,6 +1,6 @@
 """A JSON file per frame: OpenPose's, Pose2Sim's (RTMLib's people written in OpenPose's way), MMPose's of pictures.
 
-Pose2Sim leaves `_keypoints` out of the names, writes NaN for people whom it dropped, and `{}` for people whom a
+Pose2Sim leaves `_keypoints` out of the names, writes NaN for people that it dropped, and `{}` for people that a
 camera does not see.
 """
 
@@ -9,21 +9,26 @@ from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, FiniteFloat, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, FiniteFloat, TypeAdapter
 
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import MIDDLE, read_json, read_text
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock
-from shapepose_fg.io.validation import first_problem, key_text
+from shapepose_fg.io.validation import validated, validated_list
 
 _FILE = re.compile(r"(\d+)(_keypoints)?\.json$")
 """How the file of a frame is named."""
+_OPENPOSE, _POSE2SIM, _MMPOSE = "OpenPose's JSON", "Pose2Sim's JSON", "MMPose's JSON of pictures"
 _RERUN = {
-    "OpenPose's JSON": "run OpenPose again with --write_json --keypoint_scale 0",
-    "Pose2Sim's JSON": "run Pose2Sim's pose estimation again",
-    "MMPose's JSON of pictures": "run MMPose again with --pred-out-dir",
+    _OPENPOSE: "run OpenPose again with --write_json --keypoint_scale 0",
+    _POSE2SIM: "run Pose2Sim's pose estimation again",
+    _MMPOSE: "run MMPose again with --pred-out-dir",
 }
+_MOST = 10**12
+"""No frame has a higher number."""
+_LONGEST_GAP = 1000
+"""Frames that may be missing, and as many as there are: more are numbers of something else."""
 
 
 class _Person(BaseModel):
@@ -34,8 +39,6 @@ class _Person(BaseModel):
 
 
 class _Frame(BaseModel):
-    """The file of one frame."""
-
     model_config = ConfigDict(strict=True)
     people: list[_Person]
 
@@ -69,25 +72,58 @@ def frame_number(file: Path) -> int:
 def read_frame_files(folder: Path) -> CameraPeople:
     """The frames that one camera saw; InputError naming file, key and cure.
 
-    A frame's number is in its file's name. Nobody is seen in frames whose files are missing in between (`gaps`).
+    A frame's number is in its file's name. No people are seen in frames whose files are missing in between
+    (`gaps`).
     """
-    program = _program(folder)
-    files = _numbered(folder, program)
-    numbers = list(files) or [0]
+    files = frame_files(folder)
+    if len(files) == 0:
+        lists = sorted(each.name for each in folder.glob("*.json") if not each.name.startswith("."))
+        if len(lists) > 1:
+            names = " ".join(lists[:4])
+            raise InputError(
+                f"{folder}: several JSON files without frame numbers ({names}); leave the one to be read"
+            )
+        raise InputError(
+            f"{folder}: no *_keypoints.json (OpenPose) or *_000000.json (Pose2Sim) in this folder; run OpenPose"
+            " or Pose2Sim's pose estimation into it"
+        )
+    program = _OPENPOSE
+    if not files[0].name.endswith("_keypoints.json"):
+        program = _MMPOSE if read_text(files[0], most=MIDDLE).lstrip()[:1] == "[" else _POSE2SIM
+    numbered = _numbered(folder, files, _RERUN[program])
+    numbers = list(numbered)
     gaps = tuple((one + 1, other - 1) for one, other in pairwise(numbers) if other > one + 1)
-    blocks = _blocks(folder, program, files)
+    blocks = _blocks(folder, program, numbered)
     return CameraPeople(folder, program, blocks, numbers[0], numbers[-1], gaps=gaps, rerun=_RERUN[program])
+
+
+def _numbered(folder: Path, files: list[Path], rerun: str) -> dict[int, Path]:
+    """The frames' files by the frames' numbers, which rise."""
+    numbered = sorted((frame_number(file), file) for file in files)
+    first, last = numbered[0][0], numbered[-1][0]
+    if last >= _MOST:
+        raise InputError(
+            f"{numbered[-1][1]}: no frame has so high a number; number them by the recording's frames"
+        )
+    for (number, file), (following, other) in pairwise(numbered):
+        if following == number:
+            raise InputError(f"{other}: frame {number} is also in {file.name}; keep one recording in a folder")
+    if last - first + 1 > 2 * len(numbered) + _LONGEST_GAP:
+        raise InputError(
+            f"{folder}: {len(numbered)} files are numbered from {first} to {last}; number them"
+            f" by the frames of the recording, or {rerun}"
+        )
+    return dict(numbered)
 
 
 def _blocks(folder: Path, program: str, files: dict[int, Path]) -> Iterator[PeopleBlock]:
     """The people of the files, block by block."""
-    read = _instances if program.startswith("MMPose") else _people
-    counts = set[int]()
-    numbers = list(files)
+    read = _instances if program == _MMPOSE else _people
+    counts, numbers = set[int](), list(files)
     for start in range(0, len(numbers), BLOCK_FRAMES):
-        frames, people = [], []
+        frames, people = list[int](), list[list[float]]()
         for number in numbers[start : start + BLOCK_FRAMES]:
-            found = read(files[number], program)
+            found = read(files[number], _RERUN[program])
             people += found
             frames += [number] * len(found)
         counts |= {len(person) // 3 for person in people}
@@ -99,90 +135,36 @@ def _blocks(folder: Path, program: str, files: dict[int, Path]) -> Iterator[Peop
         yield PeopleBlock.of(frames, people)
 
 
-def _program(folder: Path) -> str:
-    """Whose files these are, by the first one."""
-    files = frame_files(folder)
-    if len(files) == 0:
-        return "OpenPose's JSON"
-    if files[0].name.endswith("_keypoints.json"):
-        return "OpenPose's JSON"
-    begin = read_text(files[0], most=MIDDLE).lstrip()[:1]
-    return "MMPose's JSON of pictures" if begin == "[" else "Pose2Sim's JSON"
-
-
-_MOST = 10**12
-"""No frame has a higher number."""
-_LONGEST_GAP = 1000
-"""Frames that may be missing, and as many as there are: more are numbers of something else."""
-
-
-def _numbered(folder: Path, program: str) -> dict[int, Path]:
-    """The frames' files by the frames' numbers, which rise."""
-    files = frame_files(folder)
-    if len(files) == 0:
-        raise InputError(
-            f"{folder}: no *_keypoints.json (OpenPose) or *_000000.json (Pose2Sim) in this folder; run OpenPose"
-            " or Pose2Sim's pose estimation into it"
-        )
-    numbered = sorted((int(match[1]), file) for file in files if (match := _FILE.search(file.name)) is not None)
-    if numbered[-1][0] >= _MOST:
-        raise InputError(
-            f"{numbered[-1][1]}: no frame has so high a number; number them by the recording's frames"
-        )
-    for (number, file), (following, other) in pairwise(numbered):
-        if following == number:
-            raise InputError(f"{other}: frame {number} is also in {file.name}; keep one recording in a folder")
-    numbers = dict(numbered)
-    missing = numbered[-1][0] - numbered[0][0] + 1 - len(numbered)
-    if missing > len(numbered) + _LONGEST_GAP:
-        raise InputError(
-            f"{folder}: {len(numbered)} files are numbered from {numbered[0][0]} to {numbered[-1][0]}; number them"
-            f" by the frames of the recording, or {_RERUN[program]}"
-        )
-    return numbers
-
-
-def _people(file: Path, program: str) -> list[list[float]]:
-    """Flat keypoints of the people of a frame; empty people are nobody."""
-    try:
-        frame = _Frame.model_validate(read_json(file, most=MIDDLE))
-    except ValidationError as error:
-        place, problem = first_problem(error)
-        raise InputError(f"{file}: {key_text(place)} {problem}; {_RERUN[program]}") from None
+def _people(file: Path, rerun: str) -> list[list[float]]:
+    """Flat keypoints of the people of a frame; people without keypoints are left out."""
     found = []
-    for number, person in enumerate(frame.people):
-        values = person.pose_keypoints_2d
-        place = f"{file}: people[{number}].pose_keypoints_2d"
+    for number, person in enumerate(validated(_Frame, read_json(file, most=MIDDLE), file, rerun).people):
+        values, place = person.pose_keypoints_2d, f"{file}: people[{number}].pose_keypoints_2d"
         if values is None and person.model_extra:
-            raise InputError(f"{place} is missing; {_RERUN[program]}")
+            raise InputError(f"{place} is missing; {rerun}")
         if values is None or len(values) == 0:
             continue
         if len(values) % 3 != 0:
             raise InputError(
-                f"{place} must hold x, y and score of each keypoint, got {len(values)} numbers; {_RERUN[program]}"
+                f"{place} must hold x, y and score of each keypoint, got {len(values)} numbers; {rerun}"
             )
         if any(value in (float("inf"), float("-inf")) for value in values):
-            raise InputError(f"{place} holds Infinity; {_RERUN[program]}")
+            raise InputError(f"{place} holds Infinity; {rerun}")
         found.append(values)
     return found
 
 
-def _instances(file: Path, program: str) -> list[list[float]]:
+def _instances(file: Path, rerun: str) -> list[list[float]]:
     """Flat keypoints of the people of a picture of MMPose."""
-    try:
-        instances = _INSTANCES.validate_python(read_json(file, most=MIDDLE))
-    except ValidationError as error:
-        place, problem = first_problem(error)
-        raise InputError(f"{file}: {key_text(place)} {problem}; {_RERUN[program]}") from None
     found = []
-    for number, person in enumerate(instances):
-        if len(person.keypoints) != len(person.keypoint_scores) or any(
-            len(each) != 2 for each in person.keypoints
-        ):
+    for number, person in enumerate(validated_list(_INSTANCES, read_json(file, most=MIDDLE), file, rerun)):
+        scores = person.keypoint_scores
+        if len(person.keypoints) != len(scores) or any(len(each) != 2 for each in person.keypoints):
             raise InputError(
-                f"{file}: [{number}].keypoints must hold x and y for each of the {len(person.keypoint_scores)}"
-                f" keypoint_scores; {_RERUN[program]}"
+                f"{file}: [{number}].keypoints must hold x and y for each of the {len(scores)}"
+                f" keypoint_scores; {rerun}"
             )
-        pairs = zip(person.keypoints, person.keypoint_scores, strict=True)
-        found.append([value for (x, y), score in pairs for value in (x, y, score)])
+        found.append(
+            [value for (x, y), score in zip(person.keypoints, scores, strict=True) for value in (x, y, score)]
+        )
     return found

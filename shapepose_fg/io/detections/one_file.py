@@ -2,20 +2,19 @@
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
 from itertools import chain, islice
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter
 
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock
 from shapepose_fg.io.json_items import JsonItems
-from shapepose_fg.io.validation import describe, first_problem, key_text
+from shapepose_fg.io.validation import describe, validated_list
 
 _COCO, _ALPHAPOSE, _MMPOSE = "COCO's keypoint results", "AlphaPose's JSON", "MMPose's JSON of a video"
 _RERUN = {
@@ -29,6 +28,10 @@ _LONGEST_NAME = 4096
 """Characters of a picture's path: the search takes the square of them."""
 _FRAME_NUMBER = re.compile(r"(\d+)\D*$")
 """The last number in the name of a picture."""
+_LISTS = ("annotations", "instance_info")
+"""Keys of the list where the file is an object: those of COCO's data sets and of MMPose."""
+_AT_ONCE = 1024
+"""Items that are checked together: as Python's numbers they take several times the memory of an array."""
 
 
 class _Result(BaseModel):
@@ -55,26 +58,29 @@ class _VideoFrame(BaseModel):
     instances: list[_Instance]
 
 
-_RESULTS = TypeAdapter(list[_Result])
-_FRAMES = TypeAdapter(list[_VideoFrame])
-
-
-_LISTS = ("annotations", "instance_info")
-"""Keys of the list where the file is an object: those of COCO's data sets and of MMPose."""
-_AT_ONCE = 1024
-"""Items that are checked together: as Python's numbers they take several times the memory of an array."""
+_RESULTS, _FRAMES = TypeAdapter(list[_Result]), TypeAdapter(list[_VideoFrame])
 
 
 def is_one_file(path: Path) -> bool:
-    """Whether a JSON file of one camera holds all its frames."""
+    """Whether all frames of one camera are in a JSON file, or in the only one of a folder."""
+    if path.is_dir():
+        lists = _lists(path)
+        return len(lists) == 1 and _holds_all(lists[0])
+    return path.is_file()
+
+
+def _lists(folder: Path) -> list[Path]:
+    return [each for each in folder.glob("*.json") if not each.name.startswith(".")]
+
+
+def _holds_all(path: Path) -> bool:
     items = JsonItems(path, _LISTS)
-    if not items.found:
-        return items.key is not None
-    return items.key is not None or _known(next(iter(items), {"image_id": None}))
+    return items.key is not None or (items.found and _known(next(iter(items), {"image_id": None})))
 
 
 def read_one_file(path: Path) -> CameraPeople:
     """Read all frames that one camera saw; InputError naming file, key and cure."""
+    path = _lists(path)[0] if path.is_dir() else path
     items = JsonItems(path, _LISTS)
     if items.key is not None and not items.found:
         raise InputError(f"{path}: the file must be a list, got {describe(items.value)}; {_RERUN[_COCO]}")
@@ -98,50 +104,12 @@ def _known(item: Any) -> bool:
     return isinstance(item, dict) and ("image_id" in item or "instances" in item)
 
 
-@dataclass
-class _People:
-    """People as they are read, in arrays."""
-
-    path: Path
-    program: str
-    keypoints: list[NDArray[np.float64]] = field(default_factory=list)
-    """(n, K, 3), some people at a time."""
-    counts: set[int] = field(default_factory=set)
-    """K of all so far."""
-
-    def add(self, rows: list[list[float]]) -> None:
-        """Take in people with flat keypoints."""
-        self.counts |= {len(row) // 3 for row in rows}
-        if len(self.counts) > 1:
-            raise InputError(
-                f"{self.path}: recognised as {self.program}, with people of"
-                f" {' and '.join(map(str, sorted(self.counts)))} keypoints; give the detections of one model"
-            )
-        if len(rows) > 0:
-            self.keypoints.append(np.array(rows, dtype=np.float64).reshape(len(rows), len(rows[0]) // 3, 3))
-
-    def camera(self, frames: list[int], listed: tuple[int, int]) -> CameraPeople:
-        """All of them, who are in these `frames` (N); `listed` are the first and last that the file knows."""
-        blocks = _in_order(np.array(frames, dtype=np.intp), self.keypoints)
-        first, last = listed
-        return CameraPeople(
-            self.path, self.program, blocks, first, last, every_frame=False, rerun=_RERUN[self.program]
-        )
-
-
-def _in_order(frames: NDArray[np.intp], parts: list[NDArray[np.float64]]) -> Iterator[PeopleBlock]:
-    """People in the order of their frames (N,), some frames at a time; `parts` are their keypoints."""
-    if len(frames) == 0:
-        return
-    order = np.argsort(frames, kind="stable")
-    cuts = np.flatnonzero(np.diff(frames[order] // BLOCK_FRAMES)) + 1
-    starts = np.cumsum([0, *map(len, parts)])
-    for index in np.split(order, cuts):
-        part = np.searchsorted(starts, index, side="right") - 1
-        keypoints = np.empty((len(index), *parts[0].shape[1:]))
-        for n in np.unique(part).tolist():
-            keypoints[part == n] = parts[n][index[part == n] - starts[n]]
-        yield PeopleBlock(frames[index], keypoints)
+def _checked(adapter: Any, items: Iterable[Any], path: Path, program: str) -> Iterator[tuple[int, list[Any]]]:
+    """The items, some at a time, and the index of the first of them."""
+    items, start = iter(items), 0
+    while len(some := list(islice(items, _AT_ONCE))) > 0:
+        yield start, validated_list(adapter, some, path, _RERUN[program], start)
+        start += len(some)
 
 
 def _results(path: Path, program: str, items: Iterable[Any], others: Mapping[str, Any]) -> CameraPeople:
@@ -161,14 +129,19 @@ def _results(path: Path, program: str, items: Iterable[Any], others: Mapping[str
         people.add([person.keypoints for person in results])
     pictures = _pictures(others, path, program)
     frames: dict[int | str, int] = {}
-    for index, image in enumerate(images):
+    known = [(image, f"[{index}].image_id") for index, image in enumerate(images)]
+    known += [(image, f"images[{index}]") for index, image in enumerate(pictures)]
+    for image, place in known:
         if image not in frames:
-            frames[image] = _number(image, pictures, f"{path}: [{index}].image_id", program)
-    for index, image in enumerate(pictures):
-        if image not in frames:
-            frames[image] = _number(image, pictures, f"{path}: images[{index}]", program)
-    _refuse_merged(frames, path, program)
-    listed = (min(frames.values()), max(frames.values())) if frames else (0, -1)
+            frames[image] = _number(image, pictures.get(image), f"{path}: {place}", program)
+    first: dict[int, int | str] = {}
+    for image, frame in frames.items():
+        if first.setdefault(frame, image) != image:
+            raise InputError(
+                f"{path}: the pictures {str(first[frame])[:40]!r} and {str(image)[:40]!r} are both frame {frame};"
+                f" {_RERUN[program]}, of one camera with a number for each picture"
+            )
+    listed = (min(first), max(first)) if first else (0, -1)
     return people.camera([frames[image] for image in images], listed)
 
 
@@ -192,21 +165,6 @@ def _video(path: Path, items: Iterable[Any]) -> CameraPeople:
     return people.camera(frames, (first, last) if last >= 0 else (0, -1))
 
 
-def _checked(
-    adapter: TypeAdapter[list[Any]], items: Iterable[Any], path: Path, program: str
-) -> Iterator[tuple[int, list[Any]]]:
-    """The items, some at a time, and the index of the first of them."""
-    items, start = iter(items), 0
-    while len(some := list(islice(items, _AT_ONCE))) > 0:
-        try:
-            yield start, adapter.validate_python(some)
-        except ValidationError as error:
-            (index, *place), problem = first_problem(error)
-            where = key_text((start + int(index), *place))
-            raise InputError(f"{path}: {where} {problem}; {_RERUN[program]}") from None
-        start += len(some)
-
-
 def _pictures(others: Mapping[str, Any], path: Path, program: str) -> dict[int | str, str | None]:
     """The pictures of a COCO data set by their ids, those without people too: the names of their files."""
     pictures = {}
@@ -219,9 +177,8 @@ def _pictures(others: Mapping[str, Any], path: Path, program: str) -> dict[int |
     return pictures
 
 
-def _number(image: int | str, pictures: Mapping[int | str, str | None], place: str, program: str) -> int:
+def _number(image: int | str, name: str | None, place: str, program: str) -> int:
     """The frame of a picture: the last number in its name, or its id where that is a number and it has no name."""
-    name = pictures.get(image)
     if name is None and isinstance(image, int):
         if 0 <= image < _MOST:
             return image
@@ -233,12 +190,41 @@ def _number(image: int | str, pictures: Mapping[int | str, str | None], place: s
     return int(match[1])
 
 
-def _refuse_merged(frames: Mapping[int | str, int], path: Path, program: str) -> None:
-    """InputError where two pictures would be one frame, by their numbers."""
-    first: dict[int, int | str] = {}
-    for image, frame in frames.items():
-        if first.setdefault(frame, image) != image:
+class _People:
+    """People as they are read, in arrays."""
+
+    def __init__(self, path: Path, program: str) -> None:
+        self._path, self._program = path, program
+        self._keypoints, self._counts = list[NDArray[np.float64]](), set[int]()
+
+    def add(self, rows: list[list[float]]) -> None:
+        """Take in people with flat keypoints."""
+        self._counts |= {len(row) // 3 for row in rows}
+        if len(self._counts) > 1:
             raise InputError(
-                f"{path}: the pictures {str(first[frame])[:40]!r} and {str(image)[:40]!r} are both frame {frame};"
-                f" {_RERUN[program]}, of one camera with a number for each picture"
+                f"{self._path}: recognised as {self._program}, with people of"
+                f" {' and '.join(map(str, sorted(self._counts)))} keypoints; give the detections of one model"
             )
+        if len(rows) > 0:
+            self._keypoints.append(np.array(rows, dtype=np.float64).reshape(len(rows), len(rows[0]) // 3, 3))
+
+    def camera(self, frames: list[int], listed: tuple[int, int]) -> CameraPeople:
+        """All of them, who are in these `frames` (N); `listed` are the first and last that the file knows."""
+        blocks = self._in_order(np.array(frames, dtype=np.intp))
+        rerun = _RERUN[self._program]
+        return CameraPeople(self._path, self._program, blocks, *listed, every_frame=False, rerun=rerun)
+
+    def _in_order(self, frames: NDArray[np.intp]) -> Iterator[PeopleBlock]:
+        """People in the order of their frames (N,), some frames at a time."""
+        parts = self._keypoints
+        if len(frames) == 0:
+            return
+        order = np.argsort(frames, kind="stable")
+        cuts = np.flatnonzero(np.diff(frames[order] // BLOCK_FRAMES)) + 1
+        starts = np.cumsum([0, *map(len, parts)])
+        for index in np.split(order, cuts):
+            part = np.searchsorted(starts, index, side="right") - 1
+            keypoints = np.empty((len(index), *parts[0].shape[1:]))
+            for n in np.unique(part).tolist():
+                keypoints[part == n] = parts[n][index[part == n] - starts[n]]
+            yield PeopleBlock(frames[index], keypoints)

@@ -1,6 +1,8 @@
-"""People of one camera as detectors write them, and taken apart into candidates with affinities."""
+"""People of one camera as detectors write them: kept, given scores from 0 to 1, and taken apart into
+candidates.
+"""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,8 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.core.storage.kept_arrays import KeptArrays
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections.view_streams import ViewCandidates, ViewStream
+
+OVERSHOOT = 1.1
+"""Heat maps that are enlarged overshoot a little: scores up to this are cut at 1 without a word."""
+_RARE = 0.01
+"""Scores are divided by what this share of them exceeds: the highest alone would be decided by one outlier."""
+_MOST_LOOKED_AT = 4_000_000
+"""Of more scores than this every second, third ... is looked at for that."""
+_OCCLUDED = 0.5
+"""The score of a keypoint that an annotator marked though it was hidden: COCO's visibility 1 of 2."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +40,12 @@ class PeopleBlock:
         keypoints = np.array(people, dtype=np.float64).reshape(len(people), count, 3)
         return cls(np.array(frames, dtype=np.intp), keypoints)
 
+    @property
+    def scores(self) -> NDArray[np.float64]:
+        """(S,) of keypoints that were seen."""
+        every = self.keypoints[..., 2].ravel()
+        return every[np.isfinite(every) & (every > 0)]
+
 
 @dataclass(frozen=True)
 class CameraPeople:
@@ -44,32 +62,113 @@ class CameraPeople:
     last: int
     """Number of the last frame."""
     every_frame: bool = True
-    """Whether the files list every frame, those in which nobody is too. Where not, frames may be missing at both
+    """Whether the files list every frame, those without people too. Where not, frames may be missing at both
     ends, and the other cameras tell how long the recording is."""
     gaps: tuple[tuple[int, int], ...] = ()
-    """First and last number of frames in between that are missing from the files: nobody is seen in them."""
+    """First and last number of frames in between that are missing from the files: no people are seen in them."""
     rerun: str = "write the detections again"
     """How the program makes pixels of the calibrated pictures."""
 
 
-def candidates_of(people: CameraPeople, skeleton: Skeleton, first: int, last: int) -> ViewStream:
+class KeptPeople:
+    """All people of one camera, read to the end and kept; and what must be known of all of them."""
+
+    def __init__(self, camera: CameraPeople, kept: KeptArrays, name: str) -> None:
+        """Read them, into `kept` under names that begin with `name`."""
+        self.camera, self._kept, self._names = camera, kept, list[str]()
+        self.keypoint_count: int | None = None
+        """K, None without people."""
+        self.farthest: float | None = None
+        """The largest coordinate of a keypoint that was seen, pixels; None where there is none."""
+        self.score_count, self.top_score, self.visibilities = 0, 0.0, True
+        """How many scores there are, the highest, and whether none is another number than 1 and 2."""
+        for block in camera.blocks:
+            if len(block.frame) == 0:
+                continue
+            self._names.append(f"{name}-{len(self._names):07d}")
+            kept.keep(self._names[-1], {"frame": block.frame, "keypoints": block.keypoints})
+            self.keypoint_count = self.keypoint_count or block.keypoints.shape[1]
+            scores = block.scores
+            self.score_count += len(scores)
+            self.top_score = max(self.top_score, float(scores.max(initial=0.0)))
+            self.visibilities &= bool(np.isin(scores, (1, 2)).all())
+            xy = np.abs(block.keypoints[block.keypoints[..., 2] > 0][:, :2])
+            if not np.isnan(xy).all():
+                self.farthest = max(self.farthest or 0.0, float(np.nanmax(xy)))
+
+    def blocks(self, *, last_time: bool = False) -> Iterator[PeopleBlock]:
+        """The people in the order of their frames; the last time they are not kept any longer."""
+        for name in self._names:
+            block = PeopleBlock(*(self._kept.array(name, key) for key in ("frame", "keypoints")))
+            if last_time:
+                self._kept.drop(name)
+            yield block
+
+
+@dataclass(frozen=True)
+class ScoreRule:
+    """How detectors' scores become probabilities, the same for all cameras.
+
+    - COCO's visibilities (only 0, 1 and 2, and a 2 among them): 2 is 1, and 1, hidden, is 0.5.
+    - Scores that exceed 1.1: divided by the score that 1 in 100 exceeds, if that is above 1, then cut at 1.
+      RTMPose's are heights of two curves and lie mostly under 1; others' are a few units, or per cent.
+    """
+
+    scale: float = 1.0
+    """They are divided by it, then cut at 1."""
+    visibilities: bool = False
+    """They are COCO's instead."""
+    note: str | None = None
+    """What is said of it; None where they were probabilities before."""
+
+    @classmethod
+    def of(cls, people: Sequence[KeptPeople]) -> "ScoreRule":
+        """The rule for the scores of all cameras."""
+        top = max(each.top_score for each in people)
+        if top == 2 and all(each.visibilities for each in people):
+            note = "scores are COCO's visibilities: 2 was read as 1, and 1, a hidden joint, as 0.5"
+            return cls(visibilities=True, note=note)
+        if top <= OVERSHOOT:
+            return cls()
+        step = -(-sum(each.score_count for each in people) // _MOST_LOOKED_AT)
+        looked_at = np.concatenate([block.scores[::step] for each in people for block in each.blocks()])
+        scale = max(1.0, float(np.quantile(looked_at, 1 - _RARE)))
+        divided = f"divided by {scale:.3g}, which 1 in 100 exceeds, and " if scale > 1 else ""
+        return cls(
+            scale, note=f"scores reach {top:.3g}, so they are no probabilities: they were {divided}cut at 1"
+        )
+
+    def applied(self, score: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Scores (...) from 0 to 1."""
+        if self.visibilities:
+            return np.where(score == 1, _OCCLUDED, score / 2)
+        return np.minimum(score / self.scale, 1.0)
+
+
+def candidates_of(people: KeptPeople, rule: ScoreRule, skeleton: Skeleton, first: int, last: int) -> ViewStream:
     """The joints of people as candidates, with affinity 1 between those of one person that a limb joins.
 
     So that grouped and ungrouped detections walk the same way. Frames run from number `first` to `last`. Joints
     that the skeleton makes are the middles of two that were seen, as sure as the less sure of them.
     """
     count = last - first + 1
-    return ViewStream(people.source, count, _blocks(people.blocks, skeleton, first, count), first)
+    return ViewStream(people.camera.source, count, _blocks(people, rule, skeleton, first, count), first)
 
 
-def _blocks(blocks: Iterator[PeopleBlock], skeleton: Skeleton, first: int, count: int) -> Iterator[ViewCandidates]:
+def _blocks(
+    people: KeptPeople, rule: ScoreRule, skeleton: Skeleton, first: int, count: int
+) -> Iterator[ViewCandidates]:
     """Candidates in blocks of `BLOCK_FRAMES` frames, of people in blocks of any length."""
+    blocks = people.blocks(last_time=True)
     waiting = PeopleBlock(np.zeros(0, dtype=np.intp), np.zeros((0, skeleton.keypoint_count, 3)))
     for start in range(0, count, BLOCK_FRAMES):
         end = first + min(start + BLOCK_FRAMES, count)
         parts = [waiting]
         while (len(parts[-1].frame) == 0 or parts[-1].frame[-1] < end) and (part := next(blocks, None)):
-            parts.append(part)
+            score = rule.applied(part.keypoints[..., 2])
+            parts.append(
+                PeopleBlock(part.frame, np.concatenate([part.keypoints[..., :2], score[..., None]], axis=-1))
+            )
         filled = [part for part in parts if len(part.frame) > 0] or parts[:1]
         frame = np.concatenate([part.frame for part in filled])
         keypoints = np.concatenate([part.keypoints for part in filled])
@@ -89,14 +188,8 @@ def _candidates(frame: NDArray[np.intp], keypoints: NDArray[np.float64], skeleto
     # People are in the order of their frames: so are pairs.
     pairs = row[:, np.array(skeleton.limbs)].reshape(-1, 2)
     pairs = pairs[np.all(pairs >= 0, axis=1)]
-    return ViewCandidates(
-        frame=frame[person],
-        joint=joint,
-        xy=joints[person, joint, :2],
-        confidence=joints[person, joint, 2],
-        pairs=pairs,
-        affinity=np.ones(len(pairs)),
-    )
+    xy, score = joints[person, joint, :2], joints[person, joint, 2]
+    return ViewCandidates(frame[person], joint, xy, score, pairs, np.ones(len(pairs)))
 
 
 def _joints(keypoints: NDArray[np.float64], skeleton: Skeleton) -> NDArray[np.float64]:

@@ -1,7 +1,7 @@
 """What one camera saw, block by block, and the blocks of all cameras put together as a table of the recording."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +53,8 @@ class ViewStream:
     """The blocks in order, each read when it is asked for; the last may have fewer frames."""
     first_number: int = 0
     """What the source itself calls its first frame."""
+    skeleton: Skeleton | None = None
+    """Whose joints the candidates are, where the source says it."""
 
 
 def assemble(
@@ -77,19 +79,16 @@ def _refuse_different(views: Sequence[ViewStream]) -> None:
     """InputError where views hold other frames; what is wrong with their files goes first."""
     first = views[0]
     for view in views[1:]:
-        if view.frame_count == first.frame_count and view.first_number == first.first_number:
+        if (view.frame_count, view.first_number) == (first.frame_count, first.first_number):
             continue
         for each in views:
             for _ in each.blocks:
                 pass
-        if view.frame_count != first.frame_count:
-            raise InputError(
-                f"{view.source} holds {view.frame_count} frames, but {first.source} holds"
-                f" {first.frame_count}; give the same frames of every camera"
-            )
+        what = f"holds {view.frame_count} frames", f"holds {first.frame_count}"
+        if view.frame_count == first.frame_count:
+            what = f"starts at frame {view.first_number}", f"starts at frame {first.first_number}"
         raise InputError(
-            f"{view.source} starts at frame {view.first_number}, but {first.source} starts at frame"
-            f" {first.first_number}; give the same frames of every camera"
+            f"{view.source} {what[0]}, but {first.source} {what[1]}; give the same frames of every camera"
         )
 
 
@@ -121,91 +120,69 @@ def _together(
     return candidates, candidate_start, np.searchsorted(pair_frame[pair_order], edges)
 
 
-@dataclass
-class _Left:
+class _LeftOut:
     """Candidates of a camera that were left out for one reason."""
 
-    count: int = 0
-    """How many."""
-    of: int = 0
-    """Of how many."""
-    first: str = ""
-    """Where the first of them is, in words."""
+    def __init__(self, cure: str) -> None:
+        self._cure, self._count, self._of, self._first = cure, 0, 0, ""
 
-    @property
-    def too_many(self) -> bool:
-        """Whether it cannot be by chance."""
-        return self.count > _STRAY * self.of
+    def add(self, out: NDArray[np.bool_], words: Callable[[int], str]) -> None:
+        """Take in which candidates (D,) of a block are left out; `words` say where one of them is."""
+        if self._count == 0 and out.any():
+            self._first = words(int(np.argmax(out)))
+        self._count += int(out.sum())
+        self._of += len(out)
+
+    def note(self, what: str) -> list[str]:
+        """A sentence, if there were some; InputError where there are so many that it cannot be by chance."""
+        if self._count > _STRAY * self._of:
+            raise InputError(f"{self._first}; {self._cure}")
+        return [f"{self._first}; {self._count} {what} of {self._of} were left out"] if self._count > 0 else []
 
 
-@dataclass
 class _Undistorted:
     """One camera's candidates with the pixels of a camera without distortion, and those that were left out."""
 
-    source: Path
-    camera: Camera
-    outside: _Left = field(default_factory=_Left)
-    """Those far outside the picture."""
-    undone: _Left = field(default_factory=_Left)
-    """Those whose distortion cannot be undone."""
+    def __init__(self, source: Path, camera: Camera) -> None:
+        self.source, self.camera = source, camera
+        self._outside = _LeftOut("give detections made on pictures of the calibrated size")
+        self._undone = _LeftOut("check the distortion coefficients in the calibration")
 
     def undistorted(self, view: ViewCandidates) -> ViewCandidates:
         """A block."""
         size = np.array(self.camera.image_size, dtype=np.float64)
         outside = np.any((view.xy < -MARGIN * size) | (view.xy > (1 + MARGIN) * size), axis=1)
-        self.outside.of += len(outside)
-        if outside.any():
-            if self.outside.count == 0:
-                row = int(np.argmax(outside))
-                x, y = view.xy[row]
-                self.outside.first = (
-                    f"{self.source}: frame {view.frame[row]} has a joint at pixel ({x:.0f}, {y:.0f}), far outside"
-                    f" the {self.camera.image_size[0]} x {self.camera.image_size[1]} picture of the calibration"
-                )
-            self.outside.count += int(outside.sum())
-            view = _only(view, ~outside)
+        self._outside.add(
+            outside,
+            lambda row: (
+                f"{self.source}: frame {view.frame[row]} has a joint at pixel ({view.xy[row, 0]:.0f},"
+                f" {view.xy[row, 1]:.0f}), far outside the {self.camera.image_size[0]} x"
+                f" {self.camera.image_size[1]} picture of the calibration"
+            ),
+        )
         certain = view.confidence >= _LEAST_SCORE
-        if not certain.all():
-            view = _only(view, certain)
-        xy = self.camera.undistort(view.xy)
-        undone = np.asarray(np.isfinite(xy).all(axis=1))
-        self.undone.of += len(undone)
-        if not undone.all():
-            if self.undone.count == 0:
-                self.undone.first = (
-                    f"{self.source}: the distortion of camera {self.camera.name} cannot be undone at frame"
-                    f" {view.frame[int(np.argmin(undone))]}"
-                )
-            self.undone.count += int((~undone).sum())
-            view, xy = _only(view, undone), xy[undone]
-        return replace(view, xy=xy)
+        seen = _only(view, ~outside & certain)
+        xy = self.camera.undistort(seen.xy)
+        undone = np.asarray(~np.isfinite(xy).all(axis=1))
+        self._undone.add(
+            undone,
+            lambda row: (
+                f"{self.source}: the distortion of camera {self.camera.name} cannot be undone"
+                f" at frame {seen.frame[row]}"
+            ),
+        )
+        return _only(replace(seen, xy=xy), ~undone)
 
     def notes(self) -> list[str]:
-        """Sentences about candidates that were left out.
-
-        InputError where so many have no place that the calibration must be another's.
-        """
-        notes, outside, undone = [], self.outside, self.undone
-        if outside.count > 0:
-            if outside.too_many:
-                raise InputError(f"{outside.first}; give detections made on pictures of the calibrated size")
-            notes.append(f"{outside.first}; {outside.count} such joints of {outside.of} were left out")
-        if undone.count > 0:
-            if undone.too_many:
-                raise InputError(f"{undone.first}; check the distortion coefficients in the calibration")
-            notes.append(f"{undone.first}; {undone.count} joints of {undone.of} were left out")
-        return notes
+        """Sentences about candidates that were left out; InputError where the calibration must be another's."""
+        return self._outside.note("such joints") + self._undone.note("joints")
 
 
 def _only(view: ViewCandidates, keep: NDArray[np.bool_]) -> ViewCandidates:
     """The candidates of the mask `keep` (D,), and the pairs between them."""
+    if keep.all():
+        return view
     place = np.cumsum(keep) - 1
     both = keep[view.pairs].all(axis=1)
-    return ViewCandidates(
-        frame=view.frame[keep],
-        joint=view.joint[keep],
-        xy=view.xy[keep],
-        confidence=view.confidence[keep],
-        pairs=place[view.pairs[both]],
-        affinity=view.affinity[both],
-    )
+    rows = (view.frame[keep], view.joint[keep], view.xy[keep], view.confidence[keep])
+    return ViewCandidates(*rows, place[view.pairs[both]], view.affinity[both])

@@ -9,30 +9,18 @@ from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS
 from shapepose_fg.core.skeleton import SMPL_24
-from shapepose_fg.core.storage.files import write_atomically
-from shapepose_fg.io.export.axes import y_up
 from shapepose_fg.io.export.job import Job, Written
-from shapepose_fg.io.export.skinned import BONES, RestBody, motion_of
-from shapepose_fg.io.export.stretches import stretches
+from shapepose_fg.io.export.skinned import BONES, RestBody, all_segments
+from shapepose_fg.io.export.take import y_up
 
 
 def write_bvh(job: Job) -> Written:
-    """A file per person and stretch of frames without a long hole, named by its first and last frame."""
-    take, lost = job.take.at_one_rate()
+    """A file per person and segment of frames without a long hole, named by its first and last frame."""
     written = Written()
-    written.note_rate(lost, take.fps)
-    for person, who in enumerate(take.persons.tolist()):
-        motion = motion_of(take, person, job.arrays, y_up(take.up))
-        if motion is None:
-            written.notes.append(f"bvh: person {who} has no body in any frame")
-            continue
-        written.note_shape("bvh", who, motion.spread_m)
-        for stretch in stretches(motion, job.longest_hole(take.fps)):
-            first, last = take.frames[stretch.index[[0, -1]]].tolist()
-            path = job.folder / f"person_{who}_frames_{first}-{last}.bvh"
-            text = bvh_text(motion.rest, stretch.rotations, stretch.pelvis, take.fps)
-            write_atomically(path, lambda stream, text=text: stream.write(text.encode()))
-            written.files.append(path)
+    for who, rest, segment, take in all_segments(job, "bvh", y_up(job.take.up), written):
+        first, last = take.frames[segment.index[[0, -1]]].tolist()
+        path = job.folder / f"person_{who}_frames_{first}-{last}.bvh"
+        written.add(path, bvh_text(rest, segment.rotations, segment.pelvis, take.fps))
     return written
 
 

@@ -7,38 +7,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS, SmplArrays
+from shapepose_fg.core.drawing import colour_of, vertex_normals
 from shapepose_fg.core.skeleton import SMPL_24
-from shapepose_fg.core.storage.files import write_atomically
-from shapepose_fg.io.export.axes import y_up
-from shapepose_fg.io.export.buffers import Buffers
 from shapepose_fg.io.export.job import Job, Written, optional
-from shapepose_fg.io.export.skinned import BONES, Motion, motion_of
-from shapepose_fg.viz.rendering import vertex_normals
-from shapepose_fg.viz.viewer.palette import colour_of
+from shapepose_fg.io.export.skinned import BONES, Motion, everybody
+from shapepose_fg.io.export.take import y_up
 
 _SET = 4
 """Bones in a set of influences. Every program reads the first set, Blender all of them."""
+_ARRAY, _ELEMENTS = 34962, 34963
+"""glTF's targets: what vertices have, and which vertices make triangles."""
+_COMPONENTS = {"uint8": 5121, "uint16": 5123, "uint32": 5125, "float32": 5126}
+_TYPES = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 
 
 def write_glb(job: Job) -> Written:
     """`people.glb`."""
     take, written = job.take, Written()
-    motions = {}
-    for person, who in enumerate(take.persons.tolist()):
-        motion = motion_of(take, person, job.arrays, y_up(take.up))
-        if motion is None:
-            written.notes.append(f"glb: person {who} has no body in any frame")
-        else:
-            written.note_shape("glb", who, motion.spread_m)
-            motions[who] = motion
+    motions = dict(everybody(job, take, "glb", y_up(take.up), written))
     if len(motions) == 0:
         return written
     if job.arrays.pose_blend is not None:
         written.notes.append("glb: the body's pose-dependent corrections of the skin are left out")
-    content = glb_bytes(motions, job.arrays, take.times_s)
-    path = job.folder / "people.glb"
-    write_atomically(path, lambda stream: stream.write(content))
-    written.files.append(path)
+    written.add(job.folder / "people.glb", glb_bytes(motions, job.arrays, take.times_s))
     return written
 
 
@@ -99,7 +90,7 @@ class _Skin:
     influences: dict[str, int]
 
 
-def _add_person(gltf: Any, file: Any, buffers: Buffers, who: int, motion: Motion, skin: "_Skin") -> None:
+def _add_person(gltf: Any, file: Any, buffers: "Buffers", who: int, motion: Motion, skin: "_Skin") -> None:
     """Nodes of a person in the pose of its first frame, with mesh, material and skin."""
     first, rest = len(file.nodes), motion.rest
     name = f"person_{who}"
@@ -143,7 +134,7 @@ def _add_person(gltf: Any, file: Any, buffers: Buffers, who: int, motion: Motion
 
 
 def _animate(
-    gltf: Any, animation: Any, buffers: Buffers, first: int, motion: Motion, times: NDArray[np.float64]
+    gltf: Any, animation: Any, buffers: "Buffers", first: int, motion: Motion, times: NDArray[np.float64]
 ) -> None:
     """The channels of a person whose node is number `first`."""
 
@@ -179,3 +170,52 @@ def _linear(colour: tuple[float, float, float]) -> list[float]:
     """A colour as glTF's factors have it: linear light, from sRGB (IEC 61966-2-1)."""
     srgb = np.array(colour)
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4).tolist()
+
+
+class Buffers:
+    """glTF's binary part: arrays one after the other, each described by an accessor."""
+
+    def __init__(self) -> None:
+        self._gltf = optional("pygltflib", "export")
+        self.accessors: list[Any] = []
+        self.views: list[Any] = []
+        self._parts: list[bytes] = []
+        self._length = 0
+
+    def vertices(self, values: NDArray[Any], *, bounds: bool = False) -> int:
+        """Number of the accessor of a vertex attribute; `bounds` are asked for of positions."""
+        return self._add(values, _ARRAY, bounds)
+
+    def indices(self, values: NDArray[Any]) -> int:
+        """Number of the accessor of triangles' vertices, flat."""
+        return self._add(values, _ELEMENTS, False)
+
+    def values(self, values: NDArray[Any], *, bounds: bool = False) -> int:
+        """Number of the accessor of anything else; `bounds` are asked for of an animation's times."""
+        return self._add(values, None, bounds)
+
+    @property
+    def data(self) -> bytes:
+        """All arrays."""
+        return b"".join(self._parts)
+
+    def _add(self, values: NDArray[Any], target: int | None, bounds: bool) -> int:
+        flat = np.ascontiguousarray(values.mT if values.ndim == 3 else values)  # matrices go column by column
+        content = flat.tobytes()
+        self.views.append(
+            self._gltf.BufferView(buffer=0, byteOffset=self._length, byteLength=len(content), target=target)
+        )
+        limits = {"min": np.atleast_1d(flat.min(0)).tolist(), "max": np.atleast_1d(flat.max(0)).tolist()}
+        self.accessors.append(
+            self._gltf.Accessor(
+                bufferView=len(self.views) - 1,
+                componentType=_COMPONENTS[flat.dtype.name],
+                count=len(flat),
+                type=_TYPES[values.shape[1:]],
+                **(limits if bounds else {}),
+            )
+        )
+        padding = -len(content) % 4  # each array begins at a multiple of 4 bytes
+        self._parts.append(content + bytes(padding))
+        self._length += len(content) + padding
+        return len(self.accessors) - 1

@@ -1,6 +1,7 @@
 """What a writer is given, and what it says it has done."""
 
 from dataclasses import dataclass, field
+from enum import StrEnum
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
@@ -9,11 +10,22 @@ from types import ModuleType
 from shapepose_fg.body.model.smpl_file import SmplArrays
 from shapepose_fg.body.shapes import read_body
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.io.export.markers import MarkerSet
+from shapepose_fg.core.storage.files import write_content
 from shapepose_fg.io.export.take import Take
 
 _VISIBLE_M = 1e-3
-"""Differences below this are nobody's concern."""
+"""Smaller differences are not told of."""
+
+
+class MarkerSet(StrEnum):
+    """Which points are markers, and what they are called."""
+
+    OPENSIM = "opensim"
+    """The joints of the result, named as in the OpenSim models of Pose2Sim."""
+    JOINTS = "joints"
+    """The joints of the result with its own names."""
+    BODY = "body"
+    """The 24 joints of the body: smooth, and there whenever the body is."""
 
 
 @dataclass(frozen=True)
@@ -49,10 +61,6 @@ class Job:
         """The body model where markers need it."""
         return self.arrays if self.markers == MarkerSet.BODY else None
 
-    def longest_hole(self, fps: float) -> int:
-        """Missing frames in a row, at most, that are filled."""
-        return int(self.fill_gaps_s * fps + 1e-6)
-
 
 @dataclass
 class Written:
@@ -63,10 +71,17 @@ class Written:
     notes: list[str] = field(default_factory=list)
     """What was left out or changed, a sentence each."""
 
-    def note_rate(self, lost: int, fps: float) -> None:
-        """Say how many frames have no place at one rate."""
+    def add(self, path: Path, content: str | bytes) -> None:
+        """Write a file, whole or not at all."""
+        write_content(path, content)
+        self.files.append(path)
+
+    def at_one_rate(self, take: Take) -> Take:
+        """The take for formats that know one rate only; frames that have no place at it are noted."""
+        even, lost = take.at_one_rate()
         if lost > 0:
-            self.notes.append(f"{lost} frames left out: at {fps:g} a second others are nearer to their place")
+            self.notes.append(f"{lost} frames left out: at {take.fps:g} a second others are nearer to their place")
+        return even
 
     def note_shape(self, kind: str, who: int, spread_m: float) -> None:
         """Say where a person has several shapes, of which a file can have one."""

@@ -1,27 +1,15 @@
 """Points with names, for files of markers: TRC and C3D."""
 
 from dataclasses import dataclass
-from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.model.smpl_file import SmplArrays
 from shapepose_fg.core.skeleton import MID_HIP, SMPL_24
-from shapepose_fg.io.export.axes import opensim_axes
+from shapepose_fg.io.export.job import MarkerSet
 from shapepose_fg.io.export.skinned import motion_of
-from shapepose_fg.io.export.take import Take
-
-
-class MarkerSet(StrEnum):
-    """Which points are markers, and what they are called."""
-
-    OPENSIM = "opensim"
-    """The joints of the result, named as in the OpenSim models of Pose2Sim."""
-    JOINTS = "joints"
-    """The joints of the result with its own names."""
-    BODY = "body"
-    """The 24 joints of the body: smooth, and there whenever the body is."""
+from shapepose_fg.io.export.take import Take, opensim_axes
 
 
 @dataclass(frozen=True)
@@ -52,12 +40,11 @@ def markers_of(take: Take, person: int, kind: MarkerSet, arrays: SmplArrays | No
     if kind == MarkerSet.BODY:
         if arrays is None:
             raise ValueError("markers on the body need the body model")
-        count = len(take.frames)
-        xyz = np.full((count, len(SMPL_24), 3), np.nan)
+        xyz = np.full((len(take.frames), len(SMPL_24), 3), np.nan)
         motion = motion_of(take, person, arrays, axes)
         if motion is not None:
             xyz[motion.index] = motion.joints()
-        return Markers(SMPL_24, xyz, np.full((count, len(SMPL_24)), np.nan))
+        return Markers(SMPL_24, xyz, np.full(xyz.shape[:2], np.nan))
     names = tuple(take.people.joint_names.tolist())
     xyz = take.column("joints", person) @ axes.T
     sigma = sigma_m(take.column("covariance", person))
@@ -65,10 +52,8 @@ def markers_of(take: Take, person: int, kind: MarkerSet, arrays: SmplArrays | No
 
 
 def opensim_names(joints: tuple[str, ...]) -> tuple[str, ...]:
-    """The names that Pose2Sim's OpenSim models have for joints.
-
-    All but one are the same. The middle of the hips is `Hip` in the model for HALPE_26, which has the top of the
-    head too, and `CHip` in those for BODY_25 and COCO.
+    """The names that Pose2Sim's OpenSim models have for joints: ours, but for the middle of the hips, which is
+    `Hip` in the model for HALPE_26, which has the top of the head too, and `CHip` in those for BODY_25 and COCO.
     """
     hip = "Hip" if "Head" in joints else "CHip"
     return tuple(hip if name == MID_HIP else name for name in joints)

@@ -1,14 +1,15 @@
 """A saved result as what is exported: with its cameras, its up axis and its body model."""
 
 from pathlib import Path
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.core.camera import Axis, Rig
+from shapepose_fg.core.camera import Axis
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import OpenedReconstruction, Reconstruction
-from shapepose_fg.core.result_options import results_folder
+from shapepose_fg.core.result_files import results_folder
 from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.export.take import Take
@@ -32,12 +33,18 @@ def read_take(
     `observations` says whether what they were solved from is read, too.
     """
     cameras = results_folder(path) / CAMERAS
+    if up is not None and up not in get_args(Axis):
+        raise InputError(f"--up {up}: must be one of x -x y -y z -z")
     with Reconstruction.open(path) as opened:
         rig = read_rig(cameras) if cameras.is_file() else None
-        axis = _up(up, rig, cameras)
+        if up is None and rig is None:
+            raise InputError(f"{cameras}: it is not there to say which axis is up; give --up, such as --up z")
         people = opened.rows(chosen_rows(opened, path, frames, persons), observations=observations)
-    if frames is not None:
-        people = people.with_run(frames=_covered(people, frames))
+    if frames is not None:  # of those that were reconstructed the ones that are asked for
+        spans = covered_frames(people.run) or []
+        cut = [[max(span.start, frames.start), min(span.stop, frames.stop)] for span in spans]
+        people = people.with_run(frames=[[start, stop] for start, stop in cut if start < stop])
+    axis: Any = up or (rig.up if rig is not None else None)
     try:
         return Take.of(people, axis, rig=rig, fps=fps, seen_only=seen_only, identities=identities)
     except ValueError as error:
@@ -67,27 +74,9 @@ def chosen_rows(
     return np.flatnonzero(chosen)
 
 
-def _covered(people: Reconstruction, frames: range) -> list[list[int]]:
-    """The part of the frames that were reconstructed that lies in `frames`."""
-    spans = covered_frames(people.run) or []
-    cut = [[max(span.start, frames.start), min(span.stop, frames.stop)] for span in spans]
-    return [[start, stop] for start, stop in cut if start < stop]
-
-
 def body_file(take: Take, given: Path | None) -> Path | None:
     """File of the body model that a result was made with, or the one `given`; None for the one that ships."""
     named = take.people.run.get("body")
     if given is not None or named is None:
         return given
     return Path(str(named))
-
-
-def _up(up: Axis | None, rig: Rig | None, cameras: Path) -> Axis:
-    """The axis of the world that points up, as the user or the cameras say it."""
-    if up is not None:
-        if up not in ("x", "-x", "y", "-y", "z", "-z"):
-            raise InputError(f"--up {up}: must be one of x -x y -y z -z")
-        return up
-    if rig is None:
-        raise InputError(f"{cameras}: it is not there to say which axis is up; give --up, such as --up z")
-    return rig.up

@@ -1,13 +1,15 @@
 """The bodies of a take as bones and a skin, in NumPy: what BVH, glTF, AMASS and marker files are made of."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS, SmplArrays
+from shapepose_fg.io.export.job import Job, Written
 from shapepose_fg.io.export.take import Take
 
 BONES = len(SMPL_PARENTS)
@@ -93,6 +95,61 @@ def motion_of(take: Take, person: int, arrays: SmplArrays, axes: NDArray[np.floa
         return motion
     apart = np.linalg.norm(pose_joints(_offsets(own), quaternions, pelvis) - motion.joints(), axis=-1)
     return Motion(rest, index, quaternions, pelvis, float(apart.max()))
+
+
+def everybody(
+    job: Job, take: Take, kind: str, axes: NDArray[np.float64], written: Written
+) -> Iterator[tuple[int, Motion]]:
+    """Who has a body, and how it moves in the world turned by `axes` (3, 3); who has none is noted in
+    `written`.
+    """
+    for person, who in enumerate(take.persons.tolist()):
+        motion = motion_of(take, person, job.arrays, axes)
+        if motion is None:
+            written.notes.append(f"{kind}: person {who} has no body in any frame")
+        else:
+            written.note_shape(kind, who, motion.spread_m)
+            yield who, motion
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Frames of a motion without a hole."""
+
+    index: NDArray[np.intp]
+    """(F,) frames of the take, one after the other."""
+    rotations: NDArray[np.float64]
+    """(F, 24, 4) as in `Motion`."""
+    pelvis: NDArray[np.float64]
+    """(F, 3) as in `Motion`."""
+    filled: NDArray[np.bool_]
+    """(F,) frames that lie in a hole, between those before and after it."""
+
+
+def segments(motion: Motion, longest_hole: int) -> Iterator[Segment]:
+    """The motion in parts without holes; a hole of up to `longest_hole` frames is interpolated.
+
+    Rotations turn at a constant rate from the one before the hole to the one after it, the pelvis moves on a line.
+    """
+    cuts = np.flatnonzero(np.diff(motion.index) > longest_hole + 1) + 1
+    for part in np.split(np.arange(len(motion.index)), cuts):
+        given, rotations, pelvis = motion.index[part], motion.rotations[part], motion.pelvis[part]
+        index = np.arange(given[0], given[-1] + 1)
+        if len(index) > len(given):
+            turns = [Slerp(given, Rotation.from_quat(bone)) for bone in rotations.swapaxes(0, 1)]
+            rotations = np.stack([turn(index).as_quat() for turn in turns], axis=1)
+            pelvis = np.stack([np.interp(index, given, axis) for axis in pelvis.T], axis=1)
+        yield Segment(index, rotations, pelvis, ~np.isin(index, given))
+
+
+def all_segments(
+    job: Job, kind: str, axes: NDArray[np.float64], written: Written
+) -> Iterator[tuple[int, RestBody, Segment, Take]]:
+    """Everybody's motion at one rate in parts without long holes, with the take that these are frames of."""
+    take = written.at_one_rate(job.take)
+    for who, motion in everybody(job, take, kind, axes, written):
+        for segment in segments(motion, int(job.fill_gaps_s * take.fps + 1e-6)):
+            yield who, motion.rest, segment, take
 
 
 def rest_joints(arrays: SmplArrays, betas: NDArray[np.float64]) -> NDArray[np.float64]:

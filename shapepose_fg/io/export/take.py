@@ -10,9 +10,22 @@ from rich.filesize import decimal
 from shapepose_fg.core.camera import Axis, Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Known, Reconstruction
+from shapepose_fg.core.result_files import free_memory
 from shapepose_fg.core.run_summary import covered_frames
-from shapepose_fg.core.storage.saved_table import free_memory
 
+_TO_Y_UP: dict[Axis, list[list[int]]] = {
+    "y": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    "-y": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
+    "z": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+    "-z": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
+    "x": [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
+    "-x": [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],
+}
+"""The smallest turn that takes each axis to y."""
+_Z_FROM_Y = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+"""(x, y, z) to (x, -z, y): what Blender's importers do with a file whose y is up."""
+_FORWARD_X = np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])
+"""About y: with it a world whose z is up becomes (y, z, x), as Pose2Sim writes it."""
 _LONGEST = 1_000_000
 """Frames of a file with one rate: nine hours at 30 a second. Beyond, times are in another unit or have a hole."""
 _BODY_BYTES = 2_000
@@ -57,7 +70,7 @@ class Take:
 
         `fps` takes the place of the result's own times, which must be known without it. `seen_only` leaves out
         every joint that no view saw in that frame, and the bodies of rows where none was seen. With `identities`
-        off, a result without time is a Take too: a person is then nobody's identity over frames.
+        off, a result without time is a Take too: a person is then a number within the frame.
         """
         if len(people) == 0:
             raise ValueError("nobody was found, so there is nothing to export")
@@ -173,3 +186,21 @@ def _fps_of(people: Reconstruction) -> float:
     if fps is None or not fps > 0:
         raise ValueError("one frame does not say how many there are a second; give --fps")
     return float(fps)
+
+
+def y_up(up: Axis) -> NDArray[np.float64]:
+    """(3, 3) rotation from a world with the axis `up` upwards to y up: BVH and glTF.
+
+    Z up becomes (x, z, -y), which Blender's importers undo: there the numbers are those of the world again.
+    """
+    return np.array(_TO_Y_UP[up], dtype=np.float64)
+
+
+def z_up(up: Axis) -> NDArray[np.float64]:
+    """(3, 3) rotation to z up, as AMASS has it; the identity where z is up."""
+    return _Z_FROM_Y @ y_up(up)
+
+
+def opensim_axes(up: Axis) -> NDArray[np.float64]:
+    """(3, 3) rotation to y up in TRC and C3D: Pose2Sim's, so that the same cameras give the same numbers."""
+    return _FORWARD_X @ y_up(up)

@@ -4,6 +4,7 @@ import os
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -161,26 +162,27 @@ class PictureFiles:
         if len(files) == 0:
             raise InputError(f"{path}: no pictures in this folder; known are {' '.join(sorted(PICTURES))}")
         found = [_LAST_NUMBER.search(each.stem) for each in files]
-        if all(match is None for match in found) and len(files) == 1:
+        if len(files) == 1 and found[0] is None:
             return cls(path, _size(files[0]), tuple(files), np.zeros(1, dtype=np.intp))
-        bare = next((each for each, match in zip(files, found, strict=True) if match is None), None)
-        if bare is not None:
-            raise InputError(f"{bare}: no number in its name says which frame this is; number the pictures")
-        numbers = np.array([int(match[0]) for match in found if match is not None], dtype=object)
-        if max(numbers) > np.iinfo(np.int64).max // 2:
-            raise InputError(
-                f"{path}: a number with {len(str(max(numbers)))} digits is no frame's; number the frames"
-            )
-        order = np.argsort(numbers.astype(np.int64), kind="stable")
-        number = numbers.astype(np.intp)[order]
-        twice = np.flatnonzero(np.diff(number) == 0)
-        files = [files[place] for place in order.tolist()]
-        if len(twice) > 0:
-            one, other = files[int(twice[0])].name, files[int(twice[0]) + 1].name
-            raise InputError(f"{path}: {one} and {other} are both frame {number[twice[0]]}; leave one of them")
-        missing = int(number[-1] - number[0] + 1 - len(number))
-        notes = (f"{path}: {missing} of {number[-1] - number[0] + 1} pictures are missing",) if missing > 0 else ()
-        return cls(path, _size(files[0]), tuple(files), number, notes)
+        numbered = list[tuple[int, Path]]()
+        for each, match in zip(files, found, strict=True):
+            if match is None:
+                raise InputError(f"{each}: no number in its name says which frame this is; number the pictures")
+            numbered.append((int(match[0]), each))
+        numbered.sort()
+        first, last = numbered[0][0], numbered[-1][0]
+        if last > np.iinfo(np.int64).max // 2:
+            raise InputError(f"{path}: a number with {len(str(last))} digits is no frame's; number the frames")
+        for (one, file), (two, other) in pairwise(numbered):
+            if one == two:
+                raise InputError(f"{path}: {file.name} and {other.name} are both frame {one}; leave one of them")
+        count = last - first + 1
+        notes = (f"{path}: {count - len(files)} of {count} pictures are missing",) if count > len(files) else ()
+        number, paths = (
+            np.array([each for each, _ in numbered], dtype=np.intp),
+            tuple(each for _, each in numbered),
+        )
+        return cls(path, _size(paths[0]), paths, number, notes)
 
     def at(self, place: int) -> Picture | None:
         """The picture of frame `place`; None where the file cannot be read, or is of another size."""
@@ -191,7 +193,7 @@ class PictureFiles:
 
 
 def _capture(path: Path) -> Any:
-    """The video at `path`, opened by FFmpeg and by the rules for files that nobody vouches for."""
+    """The video at `path`, opened by FFmpeg under the rules for untrusted files."""
     if not path.is_file():
         raise InputError(f"{path}: there is no such video; check the path")
     before, level = os.environ.get(_READ_OPTIONS), cv2.utils.logging.getLogLevel()
@@ -227,13 +229,9 @@ def _times(path: Path, stamp_s: NDArray[np.float64], fps: float) -> tuple[NDArra
             f"{path}: the frames' times in the file do not rise; its rate of {fps:g} a second was taken instead"
         ]
     time_s = stamp_s - stamp_s[0]
-    if len(time_s) < 3:
-        return time_s, []
-    step = float(np.median(np.diff(time_s)))
-    gaps = np.flatnonzero(np.diff(time_s) > 1.5 * step)
-    if len(gaps) == 0:
-        return time_s, []
-    return time_s, [
+    steps = np.diff(time_s)
+    gaps = np.flatnonzero(steps > 1.5 * np.median(steps)) if len(steps) > 1 else steps
+    return time_s, [] if len(gaps) == 0 else [
         f"{path}: the time from frame to frame varies, {len(gaps)} steps are longer than one and a half frames"
         f" (the first after frame {gaps[0]}); frames were taken by their times"
     ]

@@ -61,17 +61,34 @@ def align(clocks: Sequence[CameraClock], has_clock: bool) -> Lockstep:
     moment = clocks[master].time
     moment = moment[(moment >= first) & (moment <= last)]
     if len(moment) == 0:
-        raise InputError(_apart(clocks, has_clock))
+        late = max(clocks, key=lambda each: each.time[0])
+        early, unit = min(clocks, key=lambda each: each.time[-1]), " s" if has_clock else ""
+        raise InputError(
+            f"camera {early.name} ends at {early.time[-1]:.6g}{unit} and camera {late.name} starts at"
+            f" {late.time[0]:.6g}{unit}: they have no moment in common; check --start"
+        )
     places, off = zip(*(_nearest(each, moment) for each in clocks), strict=True)
     picture = np.column_stack(places)
-    notes = [_left_out(each, picture[:, v], slowest) for v, each in enumerate(clocks)]
-    notes += [_gaps(each, picture[:, v]) for v, each in enumerate(clocks)]
-    notes += [_misfit(each, off[v][picture[:, v] >= 0]) for v, each in enumerate(clocks) if has_clock]
+    notes = [note for v, each in enumerate(clocks) for note in _left_out(each, picture[:, v], slowest)]
+    for v, each in enumerate(clocks):
+        missing = np.flatnonzero(picture[:, v] < 0)
+        if len(missing) > 0:
+            notes.append(
+                f"camera {each.name}: no picture within half a frame of {len(missing)} of {len(moment)} moments"
+                f" (the first is frame {missing[0]}); it sees nobody there"
+            )
+    for v, each in enumerate(clocks if has_clock else ()):
+        misfit = off[v][picture[:, v] >= 0]
+        if misfit.max(initial=0.0) > _MISFIT_S:
+            notes.append(
+                f"camera {each.name}: pictures are up to {1e3 * misfit.max():.1f} ms from the moment they stand"
+                f" for ({1e3 * misfit.mean():.1f} ms in the mean)"
+            )
     time_s = None
     if has_clock:
         taken = [np.where(picture[:, v] >= 0, each.time[picture[:, v]], moment) for v, each in enumerate(clocks)]
         time_s = np.column_stack(taken)
-    return Lockstep(picture, time_s, tuple(note for note in notes if note is not None))
+    return Lockstep(picture, time_s, tuple(notes))
 
 
 def _nearest(clock: CameraClock, moment: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
@@ -85,50 +102,13 @@ def _nearest(clock: CameraClock, moment: NDArray[np.float64]) -> tuple[NDArray[n
     return np.where(off <= clock.period / 2 * (1 + 1e-3) + 1e-9, place, -1), off
 
 
-def _left_out(clock: CameraClock, place: NDArray[np.intp], moment: float) -> str | None:
+def _left_out(clock: CameraClock, place: NDArray[np.intp], moment: float) -> list[str]:
     """What a camera took before and after the moments that all cameras saw; `moment` is from one to the next."""
     used = place[place >= 0]
     if len(used) == 0:
-        return None
+        return []
+    ends = (int(used[0]), "at the start"), (int(len(clock.time) - 1 - used[-1]), "at the end")
     # A faster camera always has frames between the moments.
-    before, after = (
-        int(count) if count * clock.period >= 0.99 * moment else 0
-        for count in (used[0], len(clock.time) - 1 - used[-1])
-    )
-    if before == after == 0:
-        return None
-    where = " and ".join(f"{n} {at}" for n, at in ((before, "at the start"), (after, "at the end")) if n > 0)
-    return f"camera {clock.name}: frames that another camera has no picture for were left out, {where}"
-
-
-def _gaps(clock: CameraClock, place: NDArray[np.intp]) -> str | None:
-    """Moments of which a camera has no picture."""
-    missing = np.flatnonzero(place < 0)
-    if len(missing) == 0:
-        return None
-    return (
-        f"camera {clock.name}: no picture within half a frame of {len(missing)} of {len(place)} moments (the first"
-        f" is frame {missing[0]}); it sees nobody there"
-    )
-
-
-def _misfit(clock: CameraClock, off: NDArray[np.float64]) -> str | None:
-    """How far a camera's pictures are from the moments."""
-    if len(off) == 0 or off.max() <= _MISFIT_S:
-        return None
-    return (
-        f"camera {clock.name}: pictures are up to {1e3 * off.max():.1f} ms from the moment they stand for"
-        f" ({1e3 * off.mean():.1f} ms in the mean)"
-    )
-
-
-def _apart(clocks: Sequence[CameraClock], has_clock: bool) -> str:
-    """Two cameras that have no moment in common."""
-    late = max(clocks, key=lambda each: each.time[0])
-    early = min(clocks, key=lambda each: each.time[-1])
-    unit = "s" if has_clock else ""
-    return (
-        f"camera {early.name} ends at {early.time[-1]:.6g} {unit}".rstrip()
-        + f" and camera {late.name} starts at {late.time[0]:.6g} {unit}".rstrip()
-        + ": they have no moment in common; check --start"
-    )
+    where = " and ".join(f"{n} {at}" for n, at in ends if n > 0 and n * clock.period >= 0.99 * moment)
+    said = f"camera {clock.name}: frames that another camera has no picture for were left out, {where}"
+    return [said] if where else []

@@ -84,8 +84,9 @@ def place(
     bottom; and otherwise the same shape at another size, which was resized. InputError for any other size, unless
     `wanted` says what was done, and where what is wanted is impossible.
     """
+    (width, height), (full_width, full_height) = picture_size, calibrated_size
     sizes = (
-        f"camera {name}: the pictures are {_words(picture_size)}, the calibration is for {_words(calibrated_size)}"
+        f"camera {name}: the pictures are {width} x {height}, the calibration is for {full_width} x {full_height}"
     )
     if wanted is not None:
         if wanted is PlacementKind.SAME and picture_size != calibrated_size:
@@ -93,7 +94,6 @@ def place(
         return Placement.of(wanted, picture_size, calibrated_size), None
     if picture_size == calibrated_size:
         return Placement.of(PlacementKind.SAME, picture_size, calibrated_size), None
-    (width, height), (full_width, full_height) = picture_size, calibrated_size
     if max(abs(width - full_width), abs(height - full_height)) <= _BLOCK:
         cropped = Placement.of(PlacementKind.CROP, picture_size, calibrated_size)
         return cropped, (
@@ -112,7 +112,3 @@ def place(
         f"{sizes}; say what was done to them with --image-placement: letterbox (resized, with bars), scale"
         " (resized), crop or crop-centre (cut)"
     )
-
-
-def _words(size: tuple[int, int]) -> str:
-    return f"{size[0]} x {size[1]}"

@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.storage.files import read_json, write_atomically
+from shapepose_fg.core.storage.files import read_json, write_content
 from shapepose_fg.io.footage.placement import Placement, PlacementKind
-from shapepose_fg.io.validation import first_problem, key_text
+from shapepose_fg.io.validation import validated
 
 FOOTAGE = "footage.json"
 """The file, beside the detections."""
-_FORMAT = "shapepose-fg footage 1"
+_FORMAT, _CURE = "shapepose-fg footage 1", "run shapepose-fg detect again"
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,8 @@ def write_used_footage(file: Path, cameras: Sequence[CameraFootage], about: dict
         }
         for each in cameras
     ]
-    text = json.dumps({"format": _FORMAT, **about, "cameras": entries}, indent=1, allow_nan=False)
-    write_atomically(file, lambda stream: stream.write(text.encode()))
+    content = {"format": _FORMAT, **about, "cameras": entries}
+    write_content(file, json.dumps(content, indent=1, allow_nan=False))
 
 
 class _Camera(BaseModel):
@@ -69,23 +69,14 @@ class _File(BaseModel):
 
 def read_used_footage(file: Path) -> list[CameraFootage]:
     """Read what `write_used_footage` wrote; InputError, one sentence, on anything else."""
-    content = read_json(file)
-    try:
-        parsed = _File.model_validate(content)
-    except ValidationError as error:
-        where, problem = first_problem(error)
-        raise InputError(f"{file}: {key_text(where)} {problem}; run shapepose-fg detect again") from None
+    parsed = validated(_File, read_json(file), file, _CURE)
     if parsed.format != _FORMAT:
-        raise InputError(
-            f"{file}: format must be {_FORMAT!r}, got {parsed.format[:40]!r}; run shapepose-fg detect again"
-        )
+        raise InputError(f"{file}: format must be {_FORMAT!r}, got {parsed.format[:40]!r}; {_CURE}")
     found = []
     for camera in parsed.cameras:
         sizes = camera.picture_size, camera.calibrated_size
         if min(*sizes[0], *sizes[1]) < 1:
-            raise InputError(
-                f"{file}: camera {camera.name}: sizes must be positive; run shapepose-fg detect again"
-            )
+            raise InputError(f"{file}: camera {camera.name}: sizes must be positive; {_CURE}")
         placement = Placement.of(camera.placement, *sizes)
         places = np.array(camera.pictures, dtype=np.intp)
         found.append(CameraFootage(camera.name, Path(camera.path), placement, places))

@@ -1,24 +1,24 @@
 """The result of a run, made of its parts column by column: in memory, or straight into the files."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.body.shapes import SubjectShapes
 from shapepose_fg.core.observation_table import ObservationTable
-from shapepose_fg.core.reconstruction import Reconstruction, count_rows, shared_columns
+from shapepose_fg.core.reconstruction import Reconstruction, count_rows
 from shapepose_fg.core.result_files import write_result
-from shapepose_fg.core.storage.npz_writer import Column
+from shapepose_fg.core.shapes import SubjectShapes
+from shapepose_fg.core.storage.npz import Pieces
+from shapepose_fg.core.storage.schema import Table
 from shapepose_fg.pipeline.bodies_over_time import BodiesOverTime
 from shapepose_fg.pipeline.person_bodies import Person
-from shapepose_fg.pipeline.runs.parts import OBSERVED, Parts
-from shapepose_fg.pipeline.runs.rows_of_people import RowsOfPeople
+from shapepose_fg.pipeline.runs.parts import OBSERVED, Parts, RowsOfPeople
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,8 @@ class Assembly:
     @cached_property
     def persons(self) -> list[NDArray[np.int64]]:
         """For each part (R,) who its rows are."""
-        return [self._named(self.parts.column(n, "person")) for n in range(len(self.parts))]
+        tracks = (self.parts.column(n, "person").tolist() for n in range(len(self.parts)))
+        return [np.array([self.names.get(each, each) for each in track], dtype=np.int64) for track in tracks]
 
     @cached_property
     def people(self) -> RowsOfPeople:
@@ -75,17 +76,14 @@ class Assembly:
         """What run.json says of the rows (`Reconstruction.counts`)."""
         return count_rows(zip(self.pieces("status"), self.pieces("known"), strict=True))
 
-    def columns(self) -> dict[str, Column]:
+    def columns(self) -> dict[str, Pieces]:
         """What people.npz holds."""
-        empty = Reconstruction.empty(self.joint_names)
-        return self._columns(empty.columns(), Reconstruction.ROWS, "") | shared_columns(empty.joint_names)
+        return self._columns(Reconstruction.empty(self.joint_names), "")
 
-    def observation_columns(self) -> dict[str, Column] | None:
+    def observation_columns(self) -> dict[str, Pieces] | None:
         """What observations.npz holds; None where there are no rows."""
-        if len(self) == 0:
-            return None
-        empty = ObservationTable.empty(self.joint_names, self.view_names).columns()
-        return self._columns(empty, ObservationTable.ROWS, OBSERVED)
+        empty = ObservationTable.empty(self.joint_names, self.view_names)
+        return self._columns(empty, OBSERVED) if len(self) > 0 else None
 
     def reconstruction(self, every: int = 1, *, consume: bool = False) -> Reconstruction:
         """In memory, all of it or every so many frames.
@@ -94,14 +92,14 @@ class Assembly:
         can be made of them afterwards.
         """
         chosen = [np.flatnonzero(frame % every == 0) for frame in self.pieces("frame")]
-        people, table = self.columns(), self.observation_columns() or {}
-        tables = (("", people, Reconstruction.ROWS), (OBSERVED, table, ObservationTable.ROWS))
-        rows = {
-            prefix + name: np.empty((sum(map(len, chosen)), *columns[name].shape[1:]), columns[name].dtype)
-            for prefix, columns, names in tables
-            for name in names
-            if name in columns
-        }
+        empty = Reconstruction.empty(self.joint_names)
+        unseen = ObservationTable.empty(self.joint_names, self.view_names) if len(self) > 0 else None
+        columns = {name: each for name, each in self.columns().items() if name in empty.ROWS}
+        if unseen is not None:
+            table = self._columns(unseen, OBSERVED)
+            columns |= {OBSERVED + name: table[name] for name in unseen.ROWS}
+        count = sum(map(len, chosen))
+        rows = {name: np.empty((count, *each.shape[1:]), each.dtype) for name, each in columns.items()}
         before: Counter[int] = Counter()
         stop = 0
         for n, (mine, person) in enumerate(zip(chosen, self.persons, strict=True)):
@@ -111,15 +109,12 @@ class Assembly:
             before.update(person.tolist())
             if consume:
                 self.parts.drop(n)
-        observed = None
-        if len(table) > 0:
-            names = [name for name in table if name != "gate_names"]
-            observed = ObservationTable(**{name: _array(table[name], rows.get(OBSERVED + name)) for name in names})
-        columns = {name: _array(people[name], rows.get(name)) for name in people if name != "known_names"}
-        return Reconstruction(**columns, run=self.run, observations=observed, shapes=self.shapes)
+        if unseen is not None:
+            unseen = replace(unseen, **{name: rows.pop(OBSERVED + name) for name in unseen.ROWS})
+        return replace(empty, **rows, run=self.run, observations=unseen, shapes=self.shapes)
 
     def save(self, folder: Path) -> None:
-        """Write people.npz, observations.npz and run.json as `Reconstruction.save` does, without having it all in
+        """Write people.npz, observations.npz and run.json as `Reconstruction.save` does; it is never all in
         memory.
         """
         write_result(folder, self.columns(), self.observation_columns(), self.run)
@@ -135,22 +130,11 @@ class Assembly:
         values = self.parts.column(n, name)
         return values if self.bodies is None else self.bodies.filled(name, values, self.persons[n], before)
 
-    def _named(self, track: NDArray[np.int64]) -> NDArray[np.int64]:
-        """(R,) what each row's track is called."""
-        return np.array([self.names.get(each, each) for each in track.tolist()], dtype=np.int64)
-
-    def _columns(self, empty: Mapping[str, Column], rows: Sequence[str], prefix: str) -> dict[str, Column]:
-        """`empty` columns with the rows of all parts."""
-
-        def pieces(name: str) -> Callable[[], Iterator[NDArray[Any]]]:
-            return lambda: self.pieces(prefix + name)
-
+    def _columns(self, empty: Table, prefix: str) -> dict[str, Pieces]:
+        """The columns of an `empty` table with the rows of all parts."""
         return {
-            name: Column(each.dtype, (len(self), *each.shape[1:]), pieces(name)) if name in rows else each
-            for name, each in empty.items()
+            name: Pieces(each.dtype, (len(self), *each.shape[1:]), partial(self.pieces, prefix + name))
+            if name in empty.ROWS
+            else each
+            for name, each in empty.columns().items()
         }
-
-
-def _array(column: Column, rows: NDArray[Any] | None) -> NDArray[Any]:
-    """The rows of a column, where it has some."""
-    return column.array() if rows is None else rows

@@ -1,12 +1,14 @@
 """Who is who on both sides of a border between chunks, whose people were followed apart."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.storage.schema import Column, Table
 from shapepose_fg.pipeline.windows import Span
 
 _SAME = 0.5
@@ -16,16 +18,16 @@ _NEAR_M = 0.3
 
 
 @dataclass(frozen=True)
-class Border:
+class Border(Table):
     """Who is where in the frames on both sides of a border: N rows."""
 
-    frame: NDArray[np.intp]
+    frame: Annotated[NDArray[np.intp], Column("N", np.intp)]
     """(N,) frame of each row."""
-    track: NDArray[np.intp]
+    track: Annotated[NDArray[np.intp], Column("N", np.intp)]
     """(N,) whose it is, as one of the chunks has it."""
-    candidate: NDArray[np.intp]
+    candidate: Annotated[NDArray[np.intp], Column("N J V", np.intp)]
     """(N, J, V) its detections; -1 for none."""
-    place: NDArray[np.float64]
+    place: Annotated[NDArray[np.float64], Column("N J 3", unit="m")]
     """(N, J, 3) where its joints were expected, metres; NaN where nothing was."""
 
     @classmethod
@@ -33,10 +35,6 @@ class Border:
         """The rows of a window, and of the frames that it overlaps."""
         rows = Observations.concatenate([rows for _, rows in span.decided])
         return cls(rows.frame, rows.track, rows.candidate, rows.initial)
-
-    def rows(self, index: NDArray[np.intp]) -> "Border":
-        """Some of the rows."""
-        return Border(self.frame[index], self.track[index], self.candidate[index], self.place[index])
 
 
 def same_people(before: Border, after: Border) -> dict[int, int]:
@@ -46,20 +44,18 @@ def same_people(before: Border, after: Border) -> dict[int, int]:
     were expected. One to one.
     """
     shared = np.intersect1d(before.frame, after.frame)
-    before = before.rows(np.flatnonzero(np.isin(before.frame, shared)))
-    after = after.rows(np.flatnonzero(np.isin(after.frame, shared)))
+    before, after = (each.rows(np.isin(each.frame, shared)) for each in (before, after))
     old, new = np.unique(before.track), np.unique(after.track)
     alike = np.zeros((len(old), len(new)))
-    for i, a in enumerate(old.tolist()):
-        mine = before.rows(np.flatnonzero(before.track == a))
-        for k, b in enumerate(new.tolist()):
-            alike[i, k] = _alike(mine, after.rows(np.flatnonzero(after.track == b)))
+    for i, a in enumerate(old):
+        mine = before.rows(before.track == a)
+        alike[i] = [_alike(mine, after.rows(after.track == b)) for b in new]
     rows, columns = linear_sum_assignment(-alike)
     return {int(new[k]): int(old[i]) for i, k in zip(rows, columns, strict=True) if alike[i, k] > 0}
 
 
 def _alike(a: Border, b: Border) -> float:
-    """0 for two people; up to 1 for one whom nobody saw, and up to 2 by how many detections both tracks have."""
+    """0 for two people; up to 1 for one out of sight, and up to 2 by how many detections both tracks have."""
     _, first, second = np.intersect1d(a.frame, b.frame, return_indices=True)
     if len(first) == 0:
         return 0.0

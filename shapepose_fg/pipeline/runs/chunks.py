@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.core.frame_times import stretches
+from shapepose_fg.core.frame_times import segments
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.runs.borders import Border, same_people
 from shapepose_fg.pipeline.windows import Engine, Span
@@ -38,41 +38,41 @@ def cut_in_chunks(
     """Chunks of about `chunk_frames` whose borders are those of windows, so that windows are as without chunks.
 
     `time_s` (T,) are the times of all frames of the recording. What is followed before a chunk is whole windows,
-    at least `WARM_S` of them. A stretch between cuts is cut for itself.
+    at least `WARM_S` of them. Each segment between cuts is cut for itself.
     """
     batch = config.batch_frames
     step = max(1, round(chunk_frames / batch)) * batch
     found = []
-    for stretch in stretches(frames, cuts):
+    for segment in segments(frames, cuts):
         # The last window takes up to half a window more than its own frames (`Engine.follow`).
-        borders = [at for at in stretch[step::step] if at + batch // 2 < stretch.stop]
-        for start, stop in zip((stretch.start, *borders), (*borders, stretch.stop), strict=True):
+        borders = [at for at in segment[step::step] if at + batch // 2 < segment.stop]
+        for start, stop in zip((segment.start, *borders), (*borders, segment.stop), strict=True):
             first = start
-            while first > stretch.start and time_s[start] - time_s[first] < WARM_S:
+            while first > segment.start and time_s[start] - time_s[first] < WARM_S:
                 first -= batch
-            until = _until(stop, stretch, first, time_s, config)
-            found.append(Chunk(range(start, stop), first, until, until == stretch.stop))
+            until = _until(stop, segment, first, time_s, config)
+            found.append(Chunk(range(start, stop), first, until, until == segment.stop))
     return found
 
 
-def _until(stop: int, stretch: range, first: int, time_s: NDArray[np.float64], config: PipelineConfig) -> int:
+def _until(stop: int, segment: range, first: int, time_s: NDArray[np.float64], config: PipelineConfig) -> int:
     """How far people must be followed for the window that ends at `stop`: half a window and the overlap beyond it,
     the block in which that is decided, as far as following looks ahead, and two frames to spare, in whole batches.
 
     `Engine` compares means over the cameras' times, which round differently: a frame more or less, twice.
     """
     beyond = stop + config.batch_frames // 2 + 1
-    while beyond < stretch.stop and time_s[beyond] - time_s[stop] <= config.windows.overlap_s:
+    while beyond < segment.stop and time_s[beyond] - time_s[stop] <= config.windows.overlap_s:
         beyond += 1
-    if beyond >= stretch.stop:
-        return stretch.stop
+    if beyond >= segment.stop:
+        return segment.stop
     newest = beyond
     ahead_s = BLOCK_S + config.following.look_ahead_s
-    while newest < stretch.stop and time_s[newest] - time_s[beyond] < ahead_s:
+    while newest < segment.stop and time_s[newest] - time_s[beyond] < ahead_s:
         newest += 1
     newest += 2
     batches = -(-(newest + 1 - first) // config.batch_frames)
-    return min(first + batches * config.batch_frames, stretch.stop)
+    return min(first + batches * config.batch_frames, segment.stop)
 
 
 def windows_of(engine: Engine, chunk: Chunk, read: Callable[[int], Input]) -> Iterator[Span]:
@@ -102,7 +102,7 @@ class Identities:
         return {} if alone or self.border is None else same_people(self.border, begins)
 
     def name(self, track: int, names: dict[int, int]) -> int:
-        """What a track is called; whoever has no name gets the next."""
+        """What a track is called; a track without a name gets the next."""
         if track not in names:
             names[track] = self.next_id
             self.next_id += 1

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from shapepose_fg.body.shapes import SubjectShapes
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.shapes import SubjectShapes
 from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.core.storage.kept_arrays import KeptArrays
 

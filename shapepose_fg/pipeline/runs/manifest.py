@@ -1,11 +1,19 @@
-"""The folder of a run that is not finished: what the run was begun from, and what it has done so far."""
+"""The folder of a run that is not finished: room for it, what it was begun from, and what it has done so far."""
 
 import json
 import shutil
+from math import prod
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from rich.filesize import decimal
+
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.observation_table import ObservationTable
+from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.run_summary import difference
 from shapepose_fg.core.storage.files import read_json, sweep, write_atomically
 from shapepose_fg.core.storage.kept_arrays import InFolder
@@ -17,6 +25,8 @@ _GONE = ".parts-gone"
 """What that folder is called while it is removed."""
 _MANIFEST = "manifest.json"
 _FORMAT = "shapepose-fg unfinished run 1"
+_LOOKED_AT = 200
+"""Frames, spread over the run, by which people are counted."""
 
 
 def open_run(output: Path, begun: dict[str, Any], *, resume: bool = False, restart: bool = False) -> InFolder:
@@ -73,12 +83,16 @@ def _only_ours(folder: Path) -> bool:
     return folder.is_dir() and all(file.name.startswith(f".{_MANIFEST}.") for file in folder.iterdir())
 
 
+_WORDS = {"program": "version of this program", "cameras": "set of cameras", "skeleton": "skeleton"}
+"""What differs, where a key would not say it."""
+
+
 def _refuse_other(folder: Path, before: Any, now: dict[str, Any]) -> None:
     """InputError where a run was begun from something else."""
-    name = difference(before, now) if isinstance(before, dict) else "all of it"
-    if name is None:
+    found = difference(before, now)
+    if found is None:
         return
-    was, is_now = (_at(values, name) for values in (before, now))
+    name, was, is_now = found
     short = all(len(repr(value)) <= 40 for value in (was, is_now))
     how = f" ({was} then, {is_now} now)" if short else ""
     raise InputError(
@@ -87,17 +101,27 @@ def _refuse_other(folder: Path, before: Any, now: dict[str, Any]) -> None:
     )
 
 
-_WORDS = {"program": "version of this program", "cameras": "set of cameras", "skeleton": "skeleton"}
-"""What differs, where a key would not say it."""
+def expected_bytes(detections: DetectionSequence, rig: Rig, frames: range) -> int:
+    """What a run needs on the disk at the most: its rows twice, as parts and, compressed or not, as results.
+
+    As many people are expected as a view has detections of each joint, in the mean over views, joints and frames.
+    """
+    joints = detections.skeleton.joints
+    if len(frames) == 0:
+        return 0
+    spread = np.unique(np.linspace(frames.start, frames.stop - 1, min(len(frames), _LOOKED_AT)).astype(int))
+    people = np.mean([len(detections[frame]) for frame in spread.tolist()]) / (len(rig) * len(joints))
+    tables = (Reconstruction.empty(joints), ObservationTable.empty(joints, rig.names))
+    columns = [table.columns()[name] for table in tables for name in table.ROWS]
+    row = sum(column.dtype.itemsize * prod(column.shape[1:]) for column in columns)
+    return int(2 * row * people * len(frames))
 
 
-def _at(values: Any, name: str) -> Any:
-    """The value of a dotted name; a key may have dots in it."""
-    if not isinstance(values, dict) or name == "":
-        return values
-    for key, value in values.items():
-        if name == key:
-            return value
-        if name.startswith(f"{key}."):
-            return _at(value, name[len(key) + 1 :])
-    return None
+def check_room(folder: Path, needed: int) -> None:
+    """InputError where the disk of `folder` has less room than that."""
+    free = shutil.disk_usage(folder).free
+    if free < needed:
+        raise InputError(
+            f"{folder}: about {decimal(needed)} are needed here, and {decimal(free)} are free; make room, give"
+            " another --output, or take a part with --frames"
+        )

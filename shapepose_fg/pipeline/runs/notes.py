@@ -35,17 +35,16 @@ class Notes:
     def add(self, other: "Notes") -> None:
         """Take in the notes of what comes next."""
         self.frames += other.frames
-        for name, spent in other.seconds.items():
-            self.seconds[name] = self.seconds.get(name, 0.0) + spent
+        sums: Any = ((self.seconds, other.seconds), (self.probable, other.probable))
+        for mine, more in sums:
+            for name, amount in more.items():
+                mine[name] = mine.get(name, 0) + amount
+        for mine, more in ((self.dropped, other.dropped), (self.thinned_frames, other.thinned_frames)):
+            for name, frames in more.items():
+                mine.setdefault(name, []).extend(frames)
         for track, (evidence, rows) in other.evidence.items():
             before = self.evidence.get(track, [0.0, 0])
             self.evidence[track] = [before[0] + evidence, before[1] + rows]
-        for tenth, count in other.probable.items():
-            self.probable[tenth] = self.probable.get(tenth, 0) + count
-        for reason, frames in other.dropped.items():
-            self.dropped.setdefault(reason, []).extend(frames)
-        for what, frames in other.thinned_frames.items():
-            self.thinned_frames.setdefault(what, []).extend(frames)
         self.problems += other.problems
 
     def as_dict(self) -> dict[str, Any]:

@@ -1,7 +1,8 @@
 """Solved windows, kept one after the other: what a run has done so far, and from where it can go on."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,6 @@ from shapepose_fg.pipeline.runs.checkpoint import Checkpoint, checkpoint_arrays,
 from shapepose_fg.pipeline.runs.notes import Notes
 from shapepose_fg.tracking.hypotheses import Input
 
-_PART, _FOLLOWED = "part", "followed"
 _STATUS = np.array([*map(str, Status)])
 """A status is kept as its place in this list."""
 OBSERVED = "observations."
@@ -39,14 +39,12 @@ class Parts:
     def __init__(self, kept: KeptArrays) -> None:
         """Those that are in `kept`, up to the last from which the run can go on."""
         self.kept = kept
-        self._counts: list[int] = []
-        followed = kept.names(f"{_FOLLOWED}-")
+        followed = kept.names("followed-")
         self._followed = followed[-1] if followed else None
         done = int(followed[-1].split("-")[1]) + 1 if followed else 0
         for name in followed[:-1]:
             kept.drop(name)
-        for n in range(done):
-            self._counts.append(len(kept.array(_name(n), "frame")))
+        self._counts = [len(kept.array(_name(n), "frame")) for n in range(done)]
 
     def __len__(self) -> int:
         return len(self._counts)
@@ -59,24 +57,25 @@ class Parts:
     def append(self, part: Part) -> None:
         """Keep the next window. When this returns, and it has a checkpoint, the run can go on behind it."""
         n, rows, table = len(self), part.rows, part.rows.observations
-        arrays = {name: getattr(rows, name) for name in Reconstruction.ROWS if name != "status"}
-        arrays["status"] = np.argmax(rows.status[:, None] == _STATUS, axis=1).astype(np.uint8)
         if table is None:
             raise ValueError("the rows of a part need their observations")
-        columns = (name for name in ObservationTable.ROWS if name not in ("frame", "person"))
-        arrays |= {OBSERVED + name: getattr(table, name) for name in columns}
+        arrays = {
+            OBSERVED + name: getattr(table, name) for name in table.ROWS[2:]
+        }  # frame and person are those of rows
+        arrays |= {name: getattr(rows, name) for name in rows.ROWS}
+        arrays["status"] = np.argmax(rows.status[:, None] == _STATUS, axis=1).astype(np.uint8)
         self.kept.keep(_name(n), arrays, part.notes.as_dict())
         self._counts.append(len(rows))
         if part.checkpoint is not None and self.kept.lasting:
-            before, self._followed = self._followed, f"{_FOLLOWED}-{n:06d}"
+            before, self._followed = self._followed, f"followed-{n:06d}"
             self.kept.keep(self._followed, checkpoint_arrays(part.checkpoint))
             if before is not None:
                 self.kept.drop(before)
 
     def column(self, n: int, name: str) -> NDArray[Any]:
         """A column of a part, by its name in people.npz, or in observations.npz with `OBSERVED` before it."""
-        name = name.removeprefix(OBSERVED) if name in (f"{OBSERVED}frame", f"{OBSERVED}person") else name
-        values = self.kept.array(_name(n), name)
+        shared = name.removeprefix(OBSERVED)
+        values = self.kept.array(_name(n), shared if shared in ObservationTable.ROWS[:2] else name)
         return _STATUS[values] if name == "status" else values
 
     def drop(self, n: int) -> None:
@@ -99,4 +98,42 @@ class Parts:
 
 
 def _name(n: int) -> str:
-    return f"{_PART}-{n:06d}"
+    return f"part-{n:06d}"
+
+
+@dataclass(frozen=True)
+class RowsOfPeople:
+    """The rows of one person, or track, out of all parts of a run: read when they are asked for."""
+
+    parts: Parts
+    """The solved windows."""
+    whose: Sequence[NDArray[np.integer]]
+    """For each part (R,) whose its rows are."""
+
+    @cached_property
+    def counts(self) -> dict[int, int]:
+        """How many rows everybody has, by number."""
+        return {number: sum(count for _, count in places) for number, places in sorted(self._places.items())}
+
+    def pieces(
+        self, number: int, columns: Sequence[str], rows: slice = slice(None)
+    ) -> Iterator[tuple[NDArray[Any], ...]]:
+        """`columns` of somebody's rows, part by part; `rows` counts among somebody's own."""
+        start, stop, _ = rows.indices(self.counts[number])
+        before = 0
+        for n, count in self._places[number]:
+            first, last = max(start - before, 0), min(stop - before, count)
+            before += count
+            if first < last:
+                mine = np.flatnonzero(self.whose[n] == number)[first:last]
+                yield tuple(self.parts.column(n, name)[mine] for name in columns)
+
+    @cached_property
+    def _places(self) -> dict[int, list[tuple[int, int]]]:
+        """In which parts everybody is, and in how many rows of each."""
+        places: dict[int, list[tuple[int, int]]] = {}
+        for n, whose in enumerate(self.whose):
+            numbers, counts = np.unique(whose, return_counts=True)
+            for number, count in zip(numbers.tolist(), counts.tolist(), strict=True):
+                places.setdefault(number, []).append((n, count))
+        return places

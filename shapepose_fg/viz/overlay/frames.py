@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.drawing import colour_of
 from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import Known, OpenedReconstruction, Reconstruction, Status
 from shapepose_fg.io.footage.footage import Footage, Picture
@@ -23,7 +24,6 @@ from shapepose_fg.viz.overlay.drawing import (
     draw_skeletons,
 )
 from shapepose_fg.viz.overlay.picture_view import PictureView
-from shapepose_fg.viz.viewer.palette import colour_of
 
 if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel

@@ -9,13 +9,11 @@ from numpy.typing import NDArray
 
 from shapepose_fg.body.model.smpl_file import SmplArrays
 from shapepose_fg.core.camera import Camera
+from shapepose_fg.core.drawing import PALETTE, bones_of
 from shapepose_fg.core.reconstruction import Known
-from shapepose_fg.io.export.axes import z_up
-from shapepose_fg.io.export.bones import bones_of
 from shapepose_fg.io.export.markers import sigma_m
-from shapepose_fg.io.export.take import Take
+from shapepose_fg.io.export.take import Take, z_up
 from shapepose_fg.viz.report.skins import ROW_BYTES, TURN, Skins, skins_of
-from shapepose_fg.viz.viewer.palette import PALETTE
 
 _MISSING = -32768
 """In place of a coordinate that is not known."""

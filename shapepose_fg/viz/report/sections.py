@@ -4,13 +4,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from shapepose_fg.core.drawing import PALETTE
 from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import Known, Reconstruction
 from shapepose_fg.tracking.listing import TrackSummary
 from shapepose_fg.viz.report import facts
 from shapepose_fg.viz.report.elements import Child, Element, element, share_bar, table, trend
 from shapepose_fg.viz.report.figures import KINDS, CameraFigures, known_counts
-from shapepose_fg.viz.viewer.palette import PALETTE
 
 KIND_WORDS = {
     Known.SEEN: "seen",

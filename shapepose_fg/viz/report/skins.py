@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS, SmplArrays
-from shapepose_fg.io.export.light_mesh import thinned
+from shapepose_fg.core.drawing import thinned
 from shapepose_fg.io.export.skinned import BONES, RestBody, motion_of
 from shapepose_fg.io.export.take import Take
 

@@ -10,7 +10,7 @@ from shapepose_fg.core.camera import Axis, Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import ASSUMED_FPS
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.core.result_options import results_folder
+from shapepose_fg.core.result_files import results_folder
 from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.export.take import Take

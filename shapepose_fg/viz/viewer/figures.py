@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.drawing import PALETTE, rgb
 from shapepose_fg.core.reconstruction import Reconstruction, Status
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.viz.rendering import look_at, render_depth, zoom
 from shapepose_fg.viz.viewer.floor import Floor
-from shapepose_fg.viz.viewer.palette import PALETTE, rgb
 
 if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel

@@ -1,19 +1,87 @@
-"""`.npz` files, read within bounds: arrays whole, or some of their rows without the others in memory."""
+"""`.npz` files: written piece by piece, and read within bounds, whole or only some of their rows."""
 
 import math
 import os
 import zipfile
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.lib import format as npy
+from numpy.typing import DTypeLike, NDArray
 
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import open_regular
+
+_WRITTEN_BYTES = 1 << 20
+"""What the compressor is given at a time, whatever pieces an array comes in."""
+_SMALL_BYTES = 2**28
+"""Arrays of a small file may be so large together, however well they are packed: columns of NaN pack 1000 to 1."""
+_MOST_PACKED = 50
+"""Those of a larger one this much larger than the file; measured coordinates hardly pack at all."""
+_BLOCK_BYTES, _PASSED_BYTES = 2**22, 2**18
+"""Of rows that are unpacked, and that are passed over, at a time."""
+_HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """An array that comes in pieces of its first axis."""
+
+    dtype: np.dtype[Any]
+    """The type of its values."""
+    shape: tuple[int, ...]
+    """Its whole shape."""
+    pieces: Callable[[], Iterable[NDArray[Any]]]
+    """The pieces in order; can be asked for several times."""
+
+    @classmethod
+    def of(cls, array: NDArray[Any], dtype: DTypeLike | None = None) -> "Pieces":
+        """An array in one piece, as values of `dtype` where that is given."""
+        return cls(np.dtype(array.dtype if dtype is None else dtype), array.shape, lambda: (array,))
+
+    def array(self) -> NDArray[Any]:
+        """All of it."""
+        pieces = [np.asarray(piece, dtype=self.dtype) for piece in self.pieces()]
+        return np.concatenate(pieces) if len(pieces) > 0 else np.zeros(self.shape, dtype=self.dtype)
+
+    def blocks(self) -> Iterator[bytes]:
+        """Its bytes in C order; ValueError where the pieces do not make up the shape."""
+        length, waiting = 0, b""
+        for piece in self.pieces():
+            if piece.shape[1:] != self.shape[1:]:
+                raise ValueError(f"a piece of {self.shape} must not be {piece.shape}")
+            length += len(piece) if piece.ndim > 0 else 1
+            if piece.size > 0:
+                raw = np.ascontiguousarray(piece, dtype=self.dtype).reshape(-1).view(np.uint8)
+                at = 0
+                while len(waiting) + len(raw) - at >= _WRITTEN_BYTES:
+                    stop = at + _WRITTEN_BYTES - len(waiting)
+                    yield waiting + raw[at:stop].tobytes()
+                    at, waiting = stop, b""
+                waiting += raw[at:].tobytes()
+        if length != (self.shape[0] if self.shape else 1):
+            raise ValueError(f"the pieces of {self.shape} make up {length} rows")
+        yield waiting
+
+
+def write_npz(stream: BinaryIO, arrays: Mapping[str, Pieces | NDArray[Any]]) -> None:
+    """Write `arrays` as a compressed `.npz` that NumPy alone reads; the same values give the same bytes.
+
+    They are taken in order, each when the one before it is written, and need not be in memory.
+    """
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, each in arrays.items():
+            array = each if isinstance(each, Pieces) else Pieces.of(np.asarray(each))
+            # A name instead of a file gives every member the same date.
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                header = {"descr": npy.dtype_to_descr(array.dtype), "fortran_order": False, "shape": array.shape}
+                npy.write_array_header_1_0(member, header)
+                for block in array.blocks():
+                    member.write(block)
 
 
 def read_npz(file: Path, names: Collection[str], cure: str) -> dict[str, NDArray[Any]]:
@@ -28,20 +96,23 @@ def read_npz(file: Path, names: Collection[str], cure: str) -> dict[str, NDArray
 
 @dataclass
 class _Member:
-    """An array of a file, and how far it has been read."""
+    """An array of a file: its bytes, where among them the first row begins, and whether rows lie in Fortran's
+    order.
+    """
 
     stream: IO[bytes]
-    """Its bytes."""
     begin: int
-    """Where the first row is among these."""
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     fortran: bool
-    """Whether its rows are not one after the other."""
+
+    @property
+    def row_bytes(self) -> int:
+        return self.dtype.itemsize * math.prod(self.shape[1:])
 
 
 class NpzFile:
-    """An `.npz` file that stays open, until it is closed or the block is left of which it is the context.
+    """An `.npz` file that is open, until it is closed or the block is left of which it is the context.
 
     Rows are packed: those in front of the wanted ones are unpacked and passed over. Who asks for rows in rising
     order, as `rows` of one call after the other, unpacks each once.
@@ -76,19 +147,17 @@ class NpzFile:
     def row_bytes(self, name: str) -> int:
         """What a row of an array takes in memory."""
         with self._telling():
-            member = self._member(name)
-            return member.dtype.itemsize * math.prod(member.shape[1:])
+            return self._member(name).row_bytes
 
     def array(self, name: str) -> NDArray[Any]:
         """All of an array."""
         with self._telling():
             self._member(name)
             with self._archive.open(self._members[name]) as stream:
-                array = np.lib.format.read_array(stream, allow_pickle=False)
-            return _with_letters(name, array)
+                return _with_letters(name, npy.read_array(stream, allow_pickle=False))
 
     def rows(self, name: str, index: NDArray[np.intp]) -> NDArray[Any]:
-        """The rows `index` (R,), rising, of an array; ValueError where it has no so many."""
+        """The rows `index` (R,), rising, of an array."""
         with self._telling():
             member = self._member(name)
             if member.fortran:
@@ -98,15 +167,14 @@ class NpzFile:
                 return array
             if index[-1] >= member.shape[0]:
                 raise ValueError(f"{name} has {member.shape[0]} rows, and row {index[-1]} is asked for")
-            width = member.dtype.itemsize * math.prod(member.shape[1:])
-            step = max(1, _BLOCK_BYTES // max(width, 1))
+            step = max(1, _BLOCK_BYTES // max(member.row_bytes, 1))
             for first in range(int(index[0]), int(index[-1]) + 1, step):
                 count = min(step, int(index[-1]) + 1 - first)
                 begin, end = np.searchsorted(index, (first, first + count))
                 if begin == end:
                     continue
-                _go_to(member.stream, member.begin + first * width)
-                content = member.stream.read(count * width)
+                _go_to(member.stream, member.begin + first * member.row_bytes)
+                content = member.stream.read(count * member.row_bytes)
                 block = np.frombuffer(content, dtype=member.dtype).reshape(count, *member.shape[1:])
                 array[begin:end] = block[index[begin:end] - first]
             return _with_letters(name, array)
@@ -129,7 +197,7 @@ class NpzFile:
         if name not in self._open:
             info = self._members[name]
             stream = self._archive.open(info)
-            version = np.lib.format.read_magic(stream)
+            version = npy.read_magic(stream)
             if version not in _HEADERS:
                 raise ValueError(f"{info.filename} is of NumPy's format {version}, 1.0 and 2.0 are read")
             shape, fortran, dtype = _HEADERS[version](stream)
@@ -154,17 +222,6 @@ class NpzFile:
             ) from None
 
 
-_SMALL_BYTES = 2**28
-"""Arrays of a small file may be so large together, however well they are packed: columns of NaN pack 1000 to 1."""
-_MOST_PACKED = 50
-"""Those of a larger one this much larger than the file; measured coordinates hardly pack at all."""
-_BLOCK_BYTES = 2**22
-"""Of rows that are unpacked at a time."""
-_PASSED_BYTES = 2**18
-"""Of rows that are passed over."""
-_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-
-
 def _go_to(stream: IO[bytes], place: int) -> None:
     """Pass over what is in front of `place`, a little at a time: `seek` would unpack 16 MB at once."""
     if place < stream.tell():
@@ -183,16 +240,15 @@ def _check_members(members: Sequence[zipfile.ZipInfo], size: int) -> None:
             raise ValueError(f"{member.filename} is packed in another way than NumPy does")
     if len({member.filename for member in members}) < len(members):
         raise ValueError("an array is there twice")
-    total, most = sum(member.file_size for member in members), max(_SMALL_BYTES, _MOST_PACKED * size)
-    if total > most:
+    total = sum(member.file_size for member in members)
+    if total > max(_SMALL_BYTES, _MOST_PACKED * size):
         raise ValueError(f"its arrays would be {total >> 20} MiB large, {total // max(size, 1)} times the file")
 
 
 def _with_letters(name: str, array: NDArray[Any]) -> NDArray[Any]:
     """The array, if its text is of letters that there are: Python text of others crashes where it is printed."""
     if array.dtype.kind == "U" and array.size > 0 and array.dtype.itemsize > 0:
-        order = array.dtype.byteorder
-        letters = np.frombuffer(array.tobytes(), dtype=np.dtype(np.uint32).newbyteorder(order))
+        letters = np.frombuffer(array.tobytes(), np.dtype(np.uint32).newbyteorder(array.dtype.byteorder))
         if np.any((letters > 0x10FFFF) | ((letters >= 0xD800) & (letters < 0xE000))):
             raise ValueError(f"{name}.npy holds letters that there are not")
     return array

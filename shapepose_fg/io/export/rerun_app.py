@@ -1,21 +1,29 @@
-"""A take as a rerun recording, for a file and for the viewer alike: what is logged, and how it is laid out."""
+"""A take as a rerun recording: written as RRD or shown in the viewer, how it is laid out, and nothing sent
+unasked.
 
+In the recording's own axes, metres; what is missing is not drawn.
+"""
+
+import json
 import shutil
+import subprocess
 import sysconfig
+import tempfile
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from shapepose_fg.body.model.smpl_file import SmplArrays
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.io.export.job import Job, optional
-from shapepose_fg.io.export.rerun_people import log_people, person_path
-from shapepose_fg.io.export.rerun_views import camera_path, log_cameras, log_observations
+from shapepose_fg.core.storage.files import write_atomically
+from shapepose_fg.io.export.job import Job, Written, optional
+from shapepose_fg.io.export.rerun_log import camera_path, log_cameras, log_observations, log_people, person_path
 from shapepose_fg.io.export.take import Take
 
 APPLICATION = "shapepose-fg"
-_CONNECT_S = 10.0
-"""How long a viewer may take to answer."""
+_CONNECT_S, _PATIENCE_S = 10.0, 30
+"""How long a viewer that runs, and one that is started, may take to answer."""
 _UP = {
     "x": "RIGHT_HAND_X_UP", "-x": "RIGHT_HAND_X_DOWN", "y": "RIGHT_HAND_Y_UP",
     "-y": "RIGHT_HAND_Y_DOWN", "z": "RIGHT_HAND_Z_UP", "-z": "RIGHT_HAND_Z_DOWN",
@@ -77,6 +85,27 @@ def log_take(stream: Any, take: Take, arrays: SmplArrays | None) -> None:
     stream.reset_time()
 
 
+def write_rrd(job: Job) -> Written:
+    """`people.rrd`; without bodies where the body model is not there any more."""
+    written, take = Written(), job.take
+    stream = new_stream()
+    arrays, note = body_if_there(job)
+    written.notes += [] if note is None else [f"rrd: {note}"]
+    if take.rig is None:
+        written.notes.append("rrd: no cameras, for there is no cameras.json")
+    path = job.folder / "people.rrd"
+    with tempfile.TemporaryDirectory() as folder:  # rerun writes to a path only
+        draft = Path(folder) / "people.rrd"
+        stream.save(draft, default_blueprint=layout(take))
+        log_take(stream, take, arrays)
+        stream.flush()
+        stream.disconnect()
+        with draft.open("rb") as source:
+            write_atomically(path, lambda target: shutil.copyfileobj(source, target))
+    written.files.append(path)
+    return written
+
+
 def layout(take: Take) -> Any:
     """The viewer's first layout: the world, every camera with people drawn over what it saw, and two plots."""
     optional("rerun", "view")
@@ -127,3 +156,37 @@ def _eye(rrb: Any, take: Take) -> Any:
     side = np.roll(up, 1) + 0.6 * np.roll(up, 2)
     place = middle + reach * (1.0 * side / np.linalg.norm(side) + 0.45 * up)
     return rrb.EyeControls3D(position=place, look_target=middle, eye_up=up)
+
+
+def switch_off(viewer: str) -> bool:
+    """Switch rerun's statistics of use, which its viewer sends to its makers, off with the program `viewer`.
+
+    For this and all later uses of rerun, as its manual says; True where they were on. InputError where they cannot
+    be: nothing is sent unasked.
+    """
+    try:
+        if not _on(viewer):
+            return False
+        _said_by(viewer, "disable")
+        if not _on(viewer):
+            return True
+        problem = "they are still on"
+    except (OSError, ValueError, AttributeError, subprocess.SubprocessError) as error:
+        problem = " ".join(str(error).split())
+    raise InputError(
+        f"rerun's statistics of use cannot be switched off ({problem}); run `rerun analytics disable`, "
+        "or give --statistics if they may be sent"
+    )
+
+
+def _on(viewer: str) -> bool:
+    """Whether they are sent; where the variable CI is set, rerun has none and prints `null`."""
+    settings = json.loads(_said_by(viewer, "config"))
+    return settings is not None and settings.get("analytics_enabled", True)
+
+
+def _said_by(viewer: str, command: str) -> str:
+    """What `rerun analytics COMMAND` prints."""
+    words = [viewer, "analytics", command]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=_PATIENCE_S, check=True)
+    return done.stdout

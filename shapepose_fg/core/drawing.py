@@ -1,0 +1,70 @@
+"""What all pictures of people share: a colour for each, lines between joints, and light surfaces."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.core.skeleton import BODY_25
+
+PALETTE = ("#3f7fb8", "#e0962f", "#2f9e80", "#c06c9c", "#6cb6dd", "#c8623f", "#7d70b8", "#a8a03c")
+"""After Okabe and Ito's: apart for every kind of colour vision."""
+CELL_M = 0.02
+"""Edge of the cells of which `thinned` keeps one vertex each: a finger's width, too little to be seen across a
+room."""
+
+
+def rgb(text: str) -> tuple[float, float, float]:
+    """Red, green and blue, 0 to 1 in sRGB, of a colour such as `#3f7fb8`."""
+    red, green, blue = (int(text[at : at + 2], 16) / 255 for at in (1, 3, 5))
+    return red, green, blue
+
+
+def colour_of(person: int) -> tuple[float, float, float]:
+    """The colour of an identity, the same in all files of a result."""
+    return rgb(PALETTE[person % len(PALETTE)])
+
+
+def bones_of(joint_names: tuple[str, ...]) -> NDArray[np.intp]:
+    """(B, 2) joints that a line joins: each of BODY_25 and the nearest joint towards the hip that is there."""
+    rows = zip(BODY_25.joints, BODY_25.parents, strict=True)
+    parents = {name: BODY_25.joints[parent] for name, parent in rows if parent >= 0} | {"Head": "Neck"}
+    pairs = []
+    for place, name in enumerate(joint_names):
+        parent = parents.get(name)
+        while parent is not None and parent not in joint_names:
+            parent = parents.get(parent)
+        if parent is not None:
+            pairs.append((joint_names.index(parent), place))
+    return np.array(pairs, dtype=np.intp).reshape(-1, 2)
+
+
+def vertex_normals(vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> NDArray[np.float64]:
+    """Unit normals (N, 3): the mean of the adjacent faces', weighted by their areas."""
+    a, b, c = (np.asarray(vertices, dtype=np.float64)[faces[:, m]] for m in range(3))
+    normal = np.cross(b - a, c - a)
+    total = np.stack(
+        [np.bincount(faces.ravel(), np.repeat(normal[:, axis], 3), minlength=len(vertices)) for axis in range(3)],
+        axis=1,
+    )
+    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
+
+
+def thinned(
+    vertices: NDArray[np.float64], faces: NDArray[np.integer], cell_m: float = CELL_M
+) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
+    """Which vertices (M,) of a mesh stay, and its triangles (F, 3) among these; for a T-pose, metres.
+
+    Of the vertices in a cell of a grid the one nearest to their middle stands for all of them, and triangles that
+    become lines or occur twice go (Rossignac and Borrel 1993).
+    """
+    cells = np.floor(vertices / cell_m).astype(np.int64)
+    _, cell, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    cell = cell.reshape(-1)
+    middle = np.stack([np.bincount(cell, axis) for axis in vertices.T], axis=1) / count[:, None]
+    order = np.lexsort((np.linalg.norm(vertices - middle[cell], axis=1), cell))
+    kept = order[np.r_[0, np.cumsum(count)[:-1]]]
+    merged = cell[faces]
+    whole = (merged != np.roll(merged, 1, axis=1)).all(axis=1)
+    # A triangle is the same whichever vertex comes first.
+    first = np.argmin(merged, axis=1)[:, None]
+    turned = np.take_along_axis(merged, (first + np.arange(3)) % 3, axis=1)
+    return kept, np.unique(turned[whole], axis=0).astype(np.int32)

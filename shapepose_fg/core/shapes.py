@@ -1,0 +1,99 @@
+"""People's body shapes, as far as they are known: means and how sure they are, on which body."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import write_atomically
+from shapepose_fg.core.storage.npz import read_npz, write_npz
+from shapepose_fg.core.storage.schema import Column, Table
+
+_COLUMNS = ("names", "betas", "information", "body")
+_CURE = "give a file that `--shapes` has written"
+
+
+@dataclass(frozen=True)
+class SubjectShapes(Table):
+    """The shapes of G people: a Gaussian each over the betas of one body model."""
+
+    names: Annotated[NDArray[np.str_], Column("N", np.str_)]
+    """(G,) who they are, each once: identities of a recording as text, or names of your own."""
+    betas: Annotated[NDArray[np.float64], Column("N 10")]
+    """(G, 10) mean shape, standard deviations."""
+    information: Annotated[NDArray[np.float64], Column("N 10 10")]
+    """(G, 10, 10) inverse covariance of that shape, the prior over adults included."""
+    body: str
+    """Fingerprint of the body model that the betas are of (`body.fitting.weights.fingerprint`)."""
+
+    def __post_init__(self) -> None:
+        """Check every shape and type; that names differ; that betas are finite and information is definite."""
+        super().__post_init__()
+        names = self.names.tolist()
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise ValueError(f"names must differ, {twice!r} occurs twice")
+        finite = np.isfinite(self.betas).all(axis=1) & np.isfinite(self.information).all(axis=(1, 2))
+        if not finite.all():
+            raise ValueError(
+                f"betas and information must be finite, those of {names[np.argmin(finite)]!r} are not"
+            )
+        largest = float(np.abs(self.information).max(initial=0.0))
+        symmetric = np.allclose(self.information, self.information.mT, rtol=0.0, atol=1e-5 * largest)
+        if not symmetric or (len(self) > 0 and (np.linalg.eigvalsh(self.information) <= 0).any()):
+            raise ValueError("information must be symmetric and positive definite, for each of the people")
+
+    @classmethod
+    def empty(cls, body: str) -> "SubjectShapes":
+        """No people."""
+        return cls(np.zeros(0, dtype="U1"), np.zeros((0, 10)), np.zeros((0, 10, 10)), body)
+
+    @property
+    def covariance(self) -> NDArray[np.float64]:
+        """(G, 10, 10) how uncertain each shape is."""
+        return np.linalg.inv(self.information).astype(np.float64, copy=False)
+
+    def named(self, names: Sequence[str]) -> "SubjectShapes":
+        """The same people with other names."""
+        return replace(self, names=np.array(list(names), dtype=str))
+
+    def updated(self, other: "SubjectShapes") -> "SubjectShapes":
+        """These people and those of `other`, whose shapes take the place of older ones of the same name.
+
+        A shape that was estimated with an older one as its prior holds that already: the two are not added up.
+        ValueError where `other` is of another body.
+        """
+        if other.body != self.body:
+            raise ValueError("shapes must be of the same body model")
+        return SubjectShapes.joined([self.rows(~np.isin(self.names, other.names)), other])
+
+    def save(self, file: str | Path) -> None:
+        """Write the shapes as `.npz`, whole or not at all (docs/conventions.md)."""
+        write_atomically(Path(file), self.write)
+
+    def write(self, stream: BinaryIO) -> None:
+        """Write the contents of that file."""
+        write_npz(stream, {name: np.asarray(getattr(self, name)) for name in _COLUMNS})
+
+    @classmethod
+    def load(cls, file: str | Path, body: str) -> "SubjectShapes":
+        """Read what `save` wrote, of the model with the fingerprint `body`; InputError on anything else."""
+        file = Path(file)
+        columns = read_npz(file, _COLUMNS, _CURE)
+        for name in _COLUMNS:
+            if name not in columns:
+                raise InputError(f"{file}: column {name} is missing; {_CURE}")
+        whose = columns["body"]
+        if whose.shape != () or whose.dtype.kind != "U" or str(whose) != body:
+            raise InputError(
+                f"{file}: these are shapes of another body model, their betas mean something else on this one;"
+                " give --body the model that they were made with, or another file"
+            )
+        try:
+            return cls(columns["names"], columns["betas"], columns["information"], body)
+        except ValueError as error:
+            raise InputError(f"{file}: {error}; {_CURE}") from None

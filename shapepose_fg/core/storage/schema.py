@@ -1,0 +1,172 @@
+"""Tables of arrays: what each column holds is said once, in the type of its field, and checked wherever one is
+made.
+
+class Walk(Table):
+frame: Annotated[NDArray[np.int64], Column("N", np.int64, most=1e9)]
+place: Annotated[NDArray[np.float64], Column("N 3", unit="m", most=1e6)]
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from functools import cache
+from typing import Any, ClassVar, Self, cast, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.core.storage.npz import Pieces
+
+_ALLOWED = {"i": "iu", "u": "iu", "f": "f", "U": "U"}
+"""Kinds of NumPy types that may stand for a column's own kind: whole numbers, real numbers, text."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """What an array of a table holds."""
+
+    axes: str
+    """Its axes, apart by spaces: a letter is a length that is the same in all columns of a table, N counts
+    rows."""
+    dtype: Any = np.float64
+    """The type of its values."""
+    unit: str = ""
+    """The unit of its values, where they have one."""
+    most: float = np.inf
+    """The largest magnitude in a file, beyond which no result goes and products of it are no numbers."""
+    missing: Any = None
+    """What it holds where it is not given, as in files of earlier versions; None where it must be given."""
+    codes: type[IntEnum] | None = None
+    """What its codes mean, counted from 0."""
+    stored: Any = None
+    """The type in files, where that is another."""
+
+    @property
+    def has_rows(self) -> bool:
+        """Whether it has an entry per row."""
+        return self.axes.split()[0] == "N"
+
+    def shape(self, sizes: dict[str, int]) -> tuple[int, ...]:
+        """Its shape where letters have these lengths."""
+        return tuple(int(axis) if axis.isdecimal() else sizes.get(axis, 0) for axis in self.axes.split())
+
+    def checked(self, name: str, value: Any, sizes: dict[str, int]) -> NDArray[Any]:
+        """`value` as an array of the column's shape and type; ValueError naming the column where it is anything
+        else.
+
+        Lengths that are not in `sizes` yet are taken from it. Numbers of another size are converted, but real
+        numbers are not cut to whole ones, and whole numbers that do not fit are refused. Text keeps its own width.
+        """
+        wanted = np.dtype(self.dtype)
+        if value is None and self.missing is not None:
+            value = np.full(self.shape(sizes), self.missing, dtype=wanted)
+        array = np.asarray(value)
+        for axis, length in zip(self.axes.split(), array.shape, strict=False):
+            sizes.setdefault(axis, length)
+        if array.shape != self.shape(sizes):
+            raise ValueError(f"{name} must be {self.shape(sizes)}, got {array.shape}")
+        if array.dtype.kind not in _ALLOWED[wanted.kind] and array.size > 0:
+            raise ValueError(f"{name} must hold {wanted} values, got {array.dtype}")
+        if wanted.kind in "iu" and array.size > 0 and array.dtype != wanted:
+            low, high = np.iinfo(cast(Any, wanted)).min, np.iinfo(cast(Any, wanted)).max
+            if array.min() < low or array.max() > high:
+                raise ValueError(f"{name} must hold {low} to {high}, got {array.min()} to {array.max()}")
+        array = array.astype(str if wanted.kind == "U" else wanted, copy=False)
+        if self.codes is not None and array.size > 0 and array.max() >= len(self.codes):
+            raise ValueError(f"{name} must hold codes below {len(self.codes)}, got {array.max()}")
+        return array
+
+    def check_range(self, name: str, array: NDArray[Any]) -> None:
+        """ValueError where a number is larger than any result has, or a whole one negative."""
+        if array.size == 0 or not np.isfinite(self.most):
+            return
+        if array.dtype.kind == "i" and array.min() < 0:
+            raise ValueError(f"{name} must not be negative, got {array.min()}")
+        largest = max(np.fmax.reduce(array, axis=None), -np.fmin.reduce(array, axis=None))
+        if largest > self.most:
+            raise ValueError(f"{name} must be at most {self.most:g} or unknown (NaN), got {largest:g}")
+
+
+@cache
+def columns_of(kind: type) -> dict[str, Column]:
+    """The columns of a class of tables by the names of its fields, in their order."""
+    hints = get_type_hints(kind, include_extras=True)
+    marks = {name: getattr(hint, "__metadata__", ()) for name, hint in hints.items()}
+    return {name: mark for name, found in marks.items() for mark in found if isinstance(mark, Column)}
+
+
+class Table:
+    """Base of frozen dataclasses whose fields are arrays, each annotated with its `Column`.
+
+    ValueError that names the column where one has another shape or type.
+    """
+
+    ROWS: ClassVar[Sequence[str]] = ()
+    """The columns with an entry per row, in the order in which files have them; by default that of the fields."""
+
+    def __post_init__(self) -> None:
+        sizes: dict[str, int] = {}
+        for name, column in columns_of(type(self)).items():
+            object.__setattr__(self, name, column.checked(name, getattr(self, name), sizes))
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        if len(cls.ROWS) == 0:
+            cls.ROWS = [name for name, column in columns_of(cls).items() if column.has_rows]
+
+    def __len__(self) -> int:
+        return len(getattr(self, self.ROWS[0]))
+
+    @classmethod
+    def shared(cls) -> list[str]:
+        """The columns that all rows share, such as the names of joints."""
+        return [name for name, column in columns_of(cls).items() if not column.has_rows]
+
+    @classmethod
+    def without_rows(cls, **shared: Any) -> Self:
+        """A table without rows; `shared` are the columns that rows share."""
+        sizes: dict[str, int] = {}
+        columns = columns_of(cls)
+        values = {name: columns[name].checked(name, value, sizes) for name, value in shared.items()}
+        sizes["N"] = 0
+        rows = {name: np.zeros(columns[name].shape(sizes), columns[name].dtype) for name in cls.ROWS}
+        return cls(**values, **rows)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self], **others: Any) -> Self:
+        """The rows of parts (one at least), one after the other; what they share, and `others`, as it is.
+
+        ValueError where two parts have not the same shared columns.
+        """
+        for part in parts[1:]:
+            for name in cls.shared():
+                if not np.array_equal(getattr(part, name), getattr(parts[0], name)):
+                    raise ValueError(f"parts must have the same {name}")
+        rows = {name: np.concatenate([getattr(part, name) for part in parts]) for name in cls.ROWS}
+        return replace(cast(Any, parts[0]), **rows, **others)
+
+    def rows(self, index: Any) -> Self:
+        """The rows that `index` picks: a mask (N,) or row numbers."""
+        return replace(cast(Any, self), **{name: getattr(self, name)[index] for name in self.ROWS})
+
+    def check_ranges(self) -> None:
+        """ValueError for what no result gives: negative frames, joints thousands of kilometres away."""
+        for name, column in columns_of(type(self)).items():
+            column.check_range(name, getattr(self, name))
+
+    def columns(self) -> dict[str, Pieces]:
+        """What a file holds: rows, what they share, and what their codes mean."""
+        stored = {name: column.stored for name, column in columns_of(type(self)).items()}
+        own = {name: Pieces.of(getattr(self, name), stored[name]) for name in (*self.ROWS, *self.shared())}
+        return own | {name: Pieces.of(words) for name, words in self.meanings().items()}
+
+    @classmethod
+    def meanings(cls) -> dict[str, NDArray[np.str_]]:
+        """What codes mean, as the arrays that make a file readable: `gate_names` for the column `gate`."""
+        coded = {name: column.codes for name, column in columns_of(cls).items() if column.codes is not None}
+        return {f"{name}_names": code_names(codes) for name, codes in coded.items()}
+
+
+def code_names(kinds: type[IntEnum]) -> NDArray[np.str_]:
+    """(K,) what each code of `kinds` means, in words."""
+    return np.array([kind.name.lower().replace("_", " ") for kind in kinds])

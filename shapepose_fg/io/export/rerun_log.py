@@ -1,0 +1,260 @@
+"""What a rerun recording holds: people and cameras in the world, what cameras saw and took, and how well it
+fits.
+"""
+
+from collections.abc import Callable, Sequence
+from types import ModuleType
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from shapepose_fg.body.model.smpl_file import SmplArrays
+from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.drawing import bones_of, colour_of, thinned, vertex_normals
+from shapepose_fg.core.observation_table import Gate
+from shapepose_fg.core.reconstruction import Known
+from shapepose_fg.io.export.job import optional
+from shapepose_fg.io.export.markers import sigma_m
+from shapepose_fg.io.export.skinned import rest_joints, skin
+from shapepose_fg.io.export.take import Take
+from shapepose_fg.io.footage.footage import Footage
+from shapepose_fg.io.footage.placement import Placement
+from shapepose_fg.io.footage.used import CameraFootage
+
+PEOPLE, CAMERAS = "world/people", "world/cameras"
+"""Where people and cameras are in the recording."""
+_REGION = float(np.sqrt(chi2.ppf(0.95, 3)))
+"""Standard deviations at which an ellipsoid holds 95 % of a Gaussian."""
+_JOINT_M, _GUESSED_M, _BONE_M = 0.016, 0.010, 0.007
+_PALE = 0.6
+"""How much white is in the colour of a joint that no view saw."""
+_CHUNK = 64
+"""Bodies that are posed at once."""
+_GATES = {
+    Gate.TOO_FAR: (213, 43, 43),
+    Gate.CONTRADICTS_BODY: (214, 39, 190),
+    Gate.BEHIND_CAMERA: (90, 90, 90),
+    Gate.NOT_PLACED: (150, 150, 150),
+}
+"""Colours of detections that were not used, by reason; those that were have their person's."""
+_USED_DOT, _UNUSED_DOT = -2.0, -3.0
+"""Radii of dots on the screen, whatever the zoom: that is what rerun takes negative radii for."""
+_QUALITY = 75
+"""Of the JPEGs, of 100: a second of four cameras in full HD is about 30 MB."""
+
+
+def person_path(who: int) -> str:
+    """Where a person is in the recording."""
+    return f"{PEOPLE}/{who}"
+
+
+def camera_path(name: str) -> str:
+    """Where a camera is in the recording, whatever its name."""
+    return f"{CAMERAS}/{_escaped(name)}"
+
+
+def _escaped(name: str) -> str:
+    return optional("rerun", "view").escape_entity_path_part(name)
+
+
+def _set_time(stream: Any, take: Take, index: int) -> None:
+    """What is logged from now on is of this frame."""
+    stream.set_time("frame", sequence=int(take.frames[index]))
+    stream.set_time("time", duration=float(take.times_s[index]))
+
+
+def log_people(rr: ModuleType, stream: Any, take: Take, arrays: SmplArrays | None) -> None:
+    """All people of a take in all its frames; bodies where there is a body model."""
+    bones = bones_of(tuple(take.people.joint_names.tolist()))
+    mesh = None if arrays is None else thinned(arrays.template, arrays.faces)
+    for person, who in enumerate(take.persons.tolist()):
+        colour = np.array(colour_of(who))
+        if mesh is not None:
+            albedo = [*_rgb8(colour).tolist(), round(255 * 0.55)]
+            surface = rr.Mesh3D.from_fields(triangle_indices=mesh[1], albedo_factor=albedo)
+            stream.log(f"{person_path(who)}/body", surface, static=True)
+        line = rr.SeriesLines(colors=_rgb8(colour[None]), names=f"person {who}")
+        stream.log(f"plots/sigma/person_{who}", line, static=True)
+        _log_person(rr, stream, take, person, colour, bones)
+        if arrays is not None and mesh is not None:
+            _log_bodies(rr, stream, take, person, arrays, mesh)
+
+
+def _log_person(
+    rr: ModuleType, stream: Any, take: Take, person: int, colour: NDArray[np.float64], bones: NDArray[np.intp]
+) -> None:
+    """Joints, bones, ellipsoids and sigma of one person, frame by frame; what ends is cleared."""
+    who, people, there_before = int(take.persons[person]), take.people, False
+    path, plot = person_path(who), f"plots/sigma/person_{who}"
+    sigma = 1e3 * sigma_m(people.covariance)
+    for index, row in enumerate(take.rows[person].tolist()):
+        if row < 0 and not there_before:
+            continue
+        _set_time(stream, take, index)
+        there_before = row >= 0
+        if row < 0:
+            for gone in (path, plot):
+                stream.log(gone, rr.Clear(recursive=True))
+            continue
+        joints = people.joints[row]
+        placed = np.flatnonzero(np.isfinite(joints).all(axis=1))
+        seen = people.known[row][placed] == Known.SEEN
+        shades = np.where(seen[:, None], colour, colour + _PALE * (1 - colour))
+        points = rr.Points3D(
+            joints[placed],
+            colors=_rgb8(shades),
+            radii=np.where(seen, _JOINT_M, _GUESSED_M),
+            labels=people.joint_names[placed].tolist(),
+            show_labels=False,
+        )
+        stream.log(f"{path}/joints", points)
+        lines = joints[bones]
+        lines = lines[np.isfinite(lines).all(axis=(1, 2))]
+        stream.log(f"{path}/bones", rr.LineStrips3D(lines, colors=_rgb8(colour[None]), radii=_BONE_M))
+        stream.log(f"{path}/uncertainty", _ellipsoids(rr, joints[placed], people.covariance[row][placed], colour))
+        known = sigma[row][np.isfinite(sigma[row])]
+        if len(known) > 0:
+            stream.log(plot, rr.Scalars(float(np.median(known))))
+
+
+def _ellipsoids(
+    rr: ModuleType, centres: NDArray[np.float64], covariance: NDArray[np.float64], colour: NDArray[np.float64]
+) -> Any:
+    """The 95 % regions of joints."""
+    fine = np.isfinite(covariance).all(axis=(1, 2))
+    variance, axes = np.linalg.eigh(covariance[fine])
+    axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # a rotation, not a mirror
+    return rr.Ellipsoids3D(
+        centers=centres[fine],
+        half_sizes=_REGION * np.sqrt(np.maximum(variance, 0)),
+        quaternions=Rotation.from_matrix(axes).as_quat() if fine.any() else np.zeros((0, 4)),
+        colors=_rgb8(colour[None]),
+        line_radii=0.0008,
+    )
+
+
+def _log_bodies(
+    rr: ModuleType,
+    stream: Any,
+    take: Take,
+    person: int,
+    arrays: SmplArrays,
+    mesh: tuple[NDArray[np.intp], NDArray[np.int32]],
+) -> None:
+    """The body of one person where there is one; of its skin the vertices and triangles `mesh`."""
+    (kept, faces), people, rows = mesh, take.people, take.rows[person]
+    path = f"{person_path(int(take.persons[person]))}/body"
+    parts = [getattr(people, name) for name in ("betas", "global_orient", "body_pose", "transl")]
+    whole = np.all([np.isfinite(part).reshape(len(part), -1).all(axis=1) for part in parts], axis=0)
+    for index in np.flatnonzero((rows >= 0) & ~whole[rows]).tolist():
+        _set_time(stream, take, index)
+        stream.log(path, rr.Clear(recursive=False))
+    index = np.flatnonzero((rows >= 0) & whole[rows])
+    for chunk in (index[start : start + _CHUNK] for start in range(0, len(index), _CHUNK)):
+        betas, orient, pose, transl = (part[rows[chunk]] for part in parts)
+        vectors = np.concatenate([orient[:, None], pose], axis=1).reshape(-1, 3)
+        rotations = Rotation.from_rotvec(vectors).as_quat().reshape(len(chunk), -1, 4)
+        pelvis = rest_joints(arrays, betas)[:, 0] + transl
+        vertices = skin(arrays, betas, rotations, pelvis, kept).astype(np.float32)
+        for place, at in enumerate(chunk.tolist()):
+            _set_time(stream, take, at)
+            normals = vertex_normals(vertices[place], faces).astype(np.float32)
+            stream.log(path, rr.Mesh3D.from_fields(vertex_positions=vertices[place], vertex_normals=normals))
+
+
+def log_cameras(rr: ModuleType, stream: Any, rig: Rig) -> None:
+    """The cameras, which stand still; their pictures are those of cameras without distortion."""
+    for camera in rig.cameras:
+        pose = rr.Transform3D(translation=camera.centre, mat3x3=camera.wTc[:3, :3])
+        lens = rr.Pinhole(
+            image_from_camera=camera.K,
+            resolution=camera.image_size,
+            camera_xyz=rr.ViewCoordinates.RDF,
+            image_plane_distance=0.4,
+        )
+        stream.log(camera_path(camera.name), pose, lens, static=True)
+    reasons = [
+        rr.AnnotationInfo(id=int(gate), label=gate.name.lower().replace("_", " "), color=colour)
+        for gate, colour in _GATES.items()
+    ]
+    stream.log(CAMERAS, rr.AnnotationContext(reasons), static=True)
+
+
+def log_observations(rr: ModuleType, stream: Any, take: Take) -> None:
+    """What each camera saw of the people: used in their colours, not used in that of the reason; and residuals."""
+    table, rig = take.people.observations, take.rig
+    if table is None or rig is None or tuple(table.view_names.tolist()) != rig.names:
+        return
+    row_frame = np.searchsorted(take.frames, take.people.frame)
+    colours = _rgb8(np.array([colour_of(who) for who in take.people.person.tolist()]))
+    used, seen = table.gate == Gate.USED, table.gate != Gate.NOT_SEEN
+    residual = np.where(used, np.linalg.norm(table.residual_px, axis=-1), np.nan)
+    for index in range(len(take.frames)):
+        _set_time(stream, take, index)
+        rows = np.flatnonzero(row_frame == index)
+        for view, name in enumerate(rig.names):
+            path = f"{camera_path(name)}/seen"
+            row, joint = np.nonzero(used[rows, :, view])
+            points = rr.Points2D(
+                table.xy[rows[row], joint, view],
+                colors=colours[rows[row]],
+                radii=_USED_DOT,
+                labels=take.people.joint_names[joint].tolist(),
+                show_labels=False,
+            )
+            stream.log(f"{path}/used", points)
+            row, joint = np.nonzero(seen[rows, :, view] & ~used[rows, :, view])
+            xy, gate = table.xy[rows[row], joint, view], table.gate[rows[row], joint, view]
+            stream.log(f"{path}/not_used", rr.Points2D(xy, class_ids=gate, radii=_UNUSED_DOT))
+            errors = residual[rows, :, view]
+            if np.isfinite(errors).any():
+                stream.log(f"plots/residual/{_escaped(name)}", rr.Scalars(float(np.nanmedian(errors))))
+
+
+def log_pictures(
+    stream: Any,
+    take: Take,
+    pictures: Sequence[tuple[CameraFootage, Footage]],
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """What the cameras took of a take's frames, undistorted, so that people and detections lie on it; a frame
+    without a picture has none.
+    """
+    rr = optional("rerun", "view")
+    if take.rig is None:
+        raise ValueError("pictures need cameras")
+    done, total = 0, len(pictures) * len(take.frames)
+    for used, footage in pictures:
+        camera = take.rig.cameras[take.rig.names.index(used.name)]
+        maps = undistorting(camera, used.placement)
+        path = f"{camera_path(camera.name)}/picture"
+        for index, frame in enumerate(take.frames.tolist()):
+            place = int(used.places[frame]) if frame < len(used.places) else -1
+            picture = footage.at(place) if place >= 0 else None
+            _set_time(stream, take, index)
+            if picture is None:
+                stream.log(path, rr.Clear(recursive=False))
+            else:
+                straight = cv2.remap(picture, *maps, cv2.INTER_LINEAR, borderValue=(90, 90, 90))
+                _, jpeg = cv2.imencode(".jpg", straight, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+                stream.log(path, rr.EncodedImage(contents=jpeg.tobytes(), media_type="image/jpeg"))
+            done += 1
+            if progress is not None:
+                progress(done, total)
+
+
+def undistorting(camera: Camera, placement: Placement) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Where in a picture each pixel of the calibrated picture without distortion is: columns and rows, (H, W)."""
+    width, height = camera.image_size
+    column, row = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+    pixels = np.stack([column.ravel(), row.ravel()], axis=1)
+    there = placement.to_picture(camera.distort(pixels)).reshape(height, width, 2).astype(np.float32)
+    return np.ascontiguousarray(there[..., 0]), np.ascontiguousarray(there[..., 1])
+
+
+def _rgb8(colours: NDArray[np.float64]) -> NDArray[np.uint8]:
+    return np.rint(255 * np.clip(colours, 0, 1)).astype(np.uint8)

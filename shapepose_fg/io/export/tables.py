@@ -1,0 +1,132 @@
+"""Results as tables: CSV, a line per person, frame and joint, for notebooks; Parquet, all columns, for archives.
+
+In the recording's own axes, metres.
+"""
+
+import csv
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.core.reconstruction import Known, OpenedReconstruction
+from shapepose_fg.core.storage.files import write_atomically
+from shapepose_fg.core.storage.schema import code_names
+from shapepose_fg.io.export.job import Job, Written, optional
+from shapepose_fg.io.export.markers import sigma_m
+from shapepose_fg.io.export.take import Take
+
+COLUMNS = (
+    "frame time_s person joint x_m y_m z_m sigma_m sigma_x_m sigma_y_m sigma_z_m vx_m_s vy_m_s vz_m_s"
+    " known confidence"
+).split()
+"""The first line of a CSV file."""
+_GROUP_ROWS = 4096
+"""Rows of a group of Parquet: some 20 MB, of which readers take what they need."""
+_OBSERVED = "observations."
+"""What the names of observations.npz's columns begin with in Parquet."""
+
+
+def write_csv(job: Job) -> Written:
+    """`joints.csv`."""
+    written = Written()
+    written.add(job.folder / "joints.csv", csv_text(job.take))
+    return written
+
+
+def csv_text(take: Take) -> str:
+    """All joints that are placed: a joint that is not known has no line. What else is not known is empty."""
+    people = take.people
+    row, joint = np.nonzero(np.isfinite(people.joints).all(axis=2))
+    order = np.lexsort((joint, people.person[row], people.frame[row]))
+    row, joint = row[order], joint[order]
+    times = take.times_s[np.searchsorted(take.frames, people.frame)]
+    covariance = people.covariance[row, joint]
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    with np.errstate(invalid="ignore"):
+        axes = np.sqrt(np.where(variance >= 0, variance, np.nan))
+    columns = [
+        people.frame[row].tolist(),
+        _words(times[row]),
+        people.person[row].tolist(),
+        people.joint_names[joint].tolist(),
+        *map(_words, people.joints[row, joint].T),
+        _words(sigma_m(covariance)),
+        *map(_words, axes.T),
+        *map(_words, people.velocity[row, joint].T),
+        code_names(Known)[people.known[row, joint]].tolist(),
+        _words(people.confidence[row, joint], "%.4f"),
+    ]
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    writer.writerows(zip(*columns, strict=True))
+    return stream.getvalue()
+
+
+def _words(values: np.ndarray, digits: str = "%.6f") -> list[str]:
+    """Numbers as text; empty where they are not known."""
+    return np.where(np.isfinite(values), np.char.mod(digits, values), "").tolist()
+
+
+def write_parquet(opened: OpenedReconstruction, rows: NDArray[np.intp] | None, folder: Path) -> Written:
+    """`people.parquet`: a row per person and frame, columns as in people.npz and observations.npz.
+
+    `rows` (R,), rising, chooses; None takes all; some are in memory at a time. An array of a row is a flat list in
+    C order, of a length that is the same in all rows; its shape is in the column's metadata, as JSON under
+    `shape`. The file's metadata has `joint_names`, `known_names`, `view_names` and `gate_names`, and `run`, which
+    is run.json.
+    """
+    arrow, parquet = optional("pyarrow", "archive"), optional("pyarrow.parquet", "archive")
+    rows = np.arange(len(opened)) if rows is None else rows
+    path = folder / "people.parquet"
+    # Without a row there are columns too.
+    first, about = _columns(opened, rows[:1])
+    fields = [
+        arrow.field(name, _type(arrow, values), metadata={"shape": json.dumps(values.shape[1:])})
+        for name, values in first.items()
+    ]
+    schema = arrow.schema(fields, metadata={name: json.dumps(value) for name, value in about.items()})
+
+    def write(stream: Any) -> None:
+        with parquet.ParquetWriter(stream, schema, compression="zstd") as writer:
+            for start in range(0, len(rows), _GROUP_ROWS):
+                columns, _ = _columns(opened, rows[start : start + _GROUP_ROWS])
+                pairs = zip(columns.values(), schema, strict=True)
+                arrays = [_array(arrow, values, field.type) for values, field in pairs]
+                writer.write_table(arrow.Table.from_arrays(arrays, schema=schema))
+
+    write_atomically(path, write)
+    return Written([path])
+
+
+def _columns(
+    opened: OpenedReconstruction, rows: NDArray[np.intp]
+) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """All columns in some rows, by their names, and what is said of the whole file."""
+    people = opened.rows(rows)
+    table = people.observations
+    columns = {name: getattr(people, name) for name in people.ROWS}
+    about: dict[str, Any] = {"joint_names": people.joint_names.tolist()}
+    about |= {name: words.tolist() for name, words in people.meanings().items()}
+    if table is not None:
+        columns |= {_OBSERVED + name: getattr(table, name) for name in table.ROWS[2:]}
+        about |= {"view_names": table.view_names.tolist()}
+        about |= {name: words.tolist() for name, words in table.meanings().items()}
+    return columns, about | {"run": opened.run}
+
+
+def _type(arrow: Any, values: NDArray[Any]) -> Any:
+    """The type of a column."""
+    own = arrow.string() if values.dtype.kind == "U" else arrow.from_numpy_dtype(values.dtype)
+    return own if values.ndim == 1 else arrow.list_(own, int(np.prod(values.shape[1:])))
+
+
+def _array(arrow: Any, values: NDArray[Any], kind: Any) -> Any:
+    """A column of some rows."""
+    if values.ndim == 1:
+        return arrow.array(values, type=kind)
+    return arrow.FixedSizeListArray.from_arrays(arrow.array(values.ravel()), type=kind)
