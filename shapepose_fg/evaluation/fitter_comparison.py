@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitter import BodyFit, JointTargets
 from shapepose_fg.body.model.body_model import BodyModel
-from shapepose_fg.body.training.motions import load_motions
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.evaluation.fitting import (
     SETTINGS,
@@ -33,6 +32,7 @@ from shapepose_fg.evaluation.fitting_methods import (
     timed_fit,
 )
 from shapepose_fg.simulation.sequences import DANCERS
+from shapepose_fg.simulation.training.motions import load_motions
 
 BODIES = 2048
 """Half of them dance salsa, half are everybody else of the test subjects."""

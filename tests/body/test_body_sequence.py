@@ -46,8 +46,8 @@ def bodies() -> BodyParameters:
     """People who move as the priors say, PEOPLE * FRAMES rows."""
     rng = np.random.default_rng(0)
     prior = PosePrior.default()
-    factor = np.linalg.cholesky(prior.covariances[0])
-    poses = np.clip(prior.means[0] + 0.7 * smooth(69, rng) @ factor.T, prior.lower, prior.upper)
+    factor = np.linalg.cholesky(prior.covariance)
+    poses = np.clip(prior.mean + 0.7 * smooth(69, rng) @ factor.T, prior.lower, prior.upper)
     upright = Rotation.from_rotvec([np.pi / 2, 0, 0])
     turn = Rotation.from_euler("z", (1.0 * smooth(1, rng) + np.arange(PEOPLE)[:, None, None]).reshape(-1, 1))
     betas = np.repeat(np.clip(rng.normal(size=(PEOPLE, 10)), -2, 2), FRAMES, axis=0)

@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from shapepose_fg.body.model.body_model import BodyModel
-from shapepose_fg.body.training.split import split_of
 from shapepose_fg.evaluation.experiments.body_fitters import FPS, acceleration, longest_recordings, recorded_bodies
 from shapepose_fg.simulation.mocap import Mocap
+from shapepose_fg.simulation.training.split import split_of
 
 
 def test_recordings_are_of_test_subjects_upright_and_where_they_were(shared_data):

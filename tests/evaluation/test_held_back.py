@@ -2,11 +2,11 @@
 
 import pytest
 
-from shapepose_fg.body.training.split import split_of
 from shapepose_fg.evaluation.experiments.held_back import held_back, stretches_of
 from shapepose_fg.evaluation.experiments.over_time import with_mean
 from shapepose_fg.evaluation.experiments.scale import Scale
 from shapepose_fg.simulation.sequences import Sequence
+from shapepose_fg.simulation.training.split import split_of
 
 
 def test_nothing_was_learnt_from_anybody_in_them(shared_data):

@@ -2,7 +2,7 @@
 
     E(Theta) = sum_i rho(|S_i (x_i(Theta) - z_i)|²) + |betas|² - 2 log p(theta) + constant
 
-with S_iᵀ S_i the information of target z_i, rho a robust kernel, p the pose prior, a Gaussian mixture: SMPLify
+with S_iᵀ S_i the information of target z_i, rho a robust kernel, p the pose prior, a Gaussian: SMPLify
 (Bogo et al. 2016) for 3D joints. There is no factor 1/2, so that the inverse of the Hessian below is a covariance.
 """
 
@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from shapepose_fg.body.fitting.pose_energy import PoseEnergy, PosePull
 from shapepose_fg.body.fitting.pose_prior import NUM_ANGLES, PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters, accumulate
 from shapepose_fg.body.model.rotation import exp_so3, log_so3, right_jacobian
@@ -190,6 +189,43 @@ def factored(hessian: Tensor) -> Tensor:
     return torch.linalg.cholesky_ex(hessian + torch.diag(added))[0]
 
 
+@dataclass(frozen=True)
+class PosePull:
+    """The pose prior's energy at the angles of B rows, and how it pulls them."""
+
+    energy: Tensor
+    """(B,) squared Mahalanobis distance."""
+    gradient: Tensor
+    """(B, A) half the gradient."""
+    hessian: Tensor
+    """(B, A, A) half the Hessian."""
+
+
+class PoseEnergy:
+    """-2 log of the prior's marginal density over the visible angles, but for a constant."""
+
+    def __init__(self, prior: PosePrior, angles: np.ndarray, dtype: torch.dtype):
+        """For the visible `angles` (A,), places among the 69, computing in `dtype`."""
+        hidden = np.setdiff1d(np.arange(NUM_ANGLES), angles)
+
+        def tensor(array: np.ndarray) -> Tensor:
+            return torch.from_numpy(np.ascontiguousarray(array)).to(dtype)
+
+        self._mean, self._precision = tensor(prior.mean[angles]), tensor(prior.marginal_precision(angles))
+        gain = prior.regression(angles, hidden)
+        self._gain, self._at_zero = tensor(gain), tensor(prior.mean[hidden] - gain @ prior.mean[angles])
+
+    def pull(self, angles: Tensor, anchor: Tensor | None = None) -> PosePull:
+        """At visible angles (B, A), around `anchor` (B, A) or where the prior expects them."""
+        error = angles - (self._mean if anchor is None else anchor)
+        gradient = error @ self._precision
+        return PosePull((gradient * error).sum(-1), gradient, self._precision.expand(len(angles), -1, -1))
+
+    def hidden(self, angles: Tensor) -> Tensor:
+        """(B, M) what the prior expects of the invisible angles."""
+        return angles @ self._gain.T + self._at_zero
+
+
 class BodyEnergy:
     """Evaluates the energy over the *free* parameters of a row, a vector (P,).
 
@@ -325,8 +361,7 @@ class BodyEnergy:
         """How stiffly betas are held, how far away they are, and what pulls the angles."""
         angles = free[:, self._angle_slice]
         held = Held.by_priors() if held is None else held
-        pose = self._pose(angles) if held.angles is None else self._pose.around(held.angles, angles)
-        return held.stiffness, free[:, :10] - held.betas, pose
+        return held.stiffness, free[:, :10] - held.betas, self._pose.pull(angles, held.angles)
 
 
 def visible_joints(model: BodyModel, prior: PosePrior) -> np.ndarray:

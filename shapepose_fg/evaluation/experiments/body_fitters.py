@@ -19,8 +19,6 @@ from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.body.fitting.learned import LearnedFitter
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.threads import torch_threads
-from shapepose_fg.body.training.motions import load_motions
-from shapepose_fg.body.training.split import TEST_SUBJECTS
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.bodies import TWIST_JUMP, statures, twists
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
@@ -28,6 +26,8 @@ from shapepose_fg.evaluation.experiments.scale import Scale
 from shapepose_fg.evaluation.fitting import SHAPE_LIMIT, true_bodies
 from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.simulation.mocap import Clip, Mocap
+from shapepose_fg.simulation.training.motions import load_motions
+from shapepose_fg.simulation.training.split import TEST_SUBJECTS
 
 Array = NDArray[np.float64]
 Fitter = LearnedFitter | LevenbergMarquardtFitter

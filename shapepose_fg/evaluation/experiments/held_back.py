@@ -9,7 +9,6 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from shapepose_fg.body.training.split import split_of
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
 from shapepose_fg.evaluation.experiments.over_time import COLUMNS, cells, measure, with_mean
 from shapepose_fg.evaluation.experiments.scale import Scale, Stretch
@@ -17,6 +16,7 @@ from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.simulation.mocap import Mocap
 from shapepose_fg.simulation.sequences import SEQUENCES
+from shapepose_fg.simulation.training.split import split_of
 
 SEED = 1001
 """Of the sequences, and of the detector."""

@@ -13,8 +13,8 @@ from shapepose_fg.body.model.body_model import BodyModel, accumulate
 from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.body.model.small_matrices import inverse_3x3
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, TARGET_SKELETONS, slots
-from shapepose_fg.body.training.corruption import CorruptionConfig, corrupt
-from shapepose_fg.body.training.motions import Motions, mirror_joints
+from shapepose_fg.simulation.training.corruption import CorruptionConfig, corrupt
+from shapepose_fg.simulation.training.motions import MIRROR_JOINTS, Motions
 
 _ALL = tuple(range(len(BODY_POINTS)))
 
@@ -72,7 +72,7 @@ class PeopleSource:
         self.config, self.model, self._frame = config, model, frame
         self._poses = torch.from_numpy(motions.poses)
         self._weight = torch.from_numpy(motions.weight).double().cumsum(0)
-        self._mirror = torch.tensor(mirror_joints())
+        self._mirror = torch.tensor(MIRROR_JOINTS)
 
     def draw(self, count: int, generator: torch.Generator) -> People:
         """`count` people."""
@@ -117,7 +117,7 @@ _CHAINS = torch.stack(
 
 
 class Trainer:
-    """One run of training, which can be stopped and continued to the bit (see `checkpoint`)."""
+    """One run of training."""
 
     def __init__(self, source: PeopleSource, frame: PersonFrame, network: UpdateNetwork, config: TrainingConfig):
         self.source, self.frame, self.config = source, frame, config
@@ -136,7 +136,7 @@ class Trainer:
 
     def _iterate(self) -> list[float]:
         config = self.config
-        # Everything that is drawn follows from seed and iteration: a run that was stopped goes on the same.
+        # Everything that is drawn follows from seed and iteration.
         generator = torch.Generator().manual_seed(config.seed * 10_000_019 + self.iteration)
         torch.manual_seed(config.seed * 10_000_019 + self.iteration)  # dropout
         for group in self.optimiser.param_groups:

@@ -12,8 +12,8 @@ from shapepose_fg.body.fitting.learned import LearnedFitter
 from shapepose_fg.body.fitting.weights import FitterWeights
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, MIRROR, TARGET_SKELETONS, slots
-from shapepose_fg.body.training.corruption import corrupt
-from shapepose_fg.body.training.train import PeopleSource
+from shapepose_fg.simulation.training.corruption import corrupt
+from shapepose_fg.simulation.training.train import PeopleSource
 
 INSIDE = 0.9
 """Share of the joints that shall lie inside the ellipsoid of that probability which their prior claims."""
