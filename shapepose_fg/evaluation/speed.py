@@ -11,11 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter
-from shapepose_fg.body.fitting.body_sequence import SequenceFit, Shapes
-from shapepose_fg.body.fitting.fitter import BodyFit, JointTargets
+from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets, SequenceFit, Shapes
 from shapepose_fg.body.fitting.fitters import make_fitter
-from shapepose_fg.body.fitting.learned import LearnedFitter
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.core.camera import Rig
@@ -77,16 +74,16 @@ class Spent:
 
 
 @dataclass(frozen=True)
-class TimedFitter:
+class TimedFitter(BodyFitter):
     """A body fitter that adds up the time it takes."""
 
-    fitter: "LearnedFitter | LevenbergMarquardtFitter"
+    fitter: BodyFitter
     """Does the work."""
     clock: list[float] = field(default_factory=lambda: [0.0])
     """Seconds so far, those of fitters made from this one too."""
 
     @property
-    def model(self) -> BodyModel:
+    def model(self) -> BodyModel | None:
         """The body that is fitted."""
         return self.fitter.model
 

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
 from shapepose_fg.body.fitting.fitters import make_fitter
-from shapepose_fg.body.fitting.learned import LearnedFitter
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.core.camera import Rig
@@ -48,12 +47,12 @@ def solve_alone(
         estimates = estimator.estimate(alone)
         spent = time.process_time() - began
     steps = np.nan
-    if isinstance(fitter, LearnedFitter):
+    if fitter.weights is not None:
         steps = fitter.weights.network.config.steps + fitter.config.polish_steps
     return StageTwo(estimates, spent, steps * counted.rows / max(len(observations), 1))
 
 
-class _Counted:
+class _Counted(BodyFitter):
     """A fitter that counts the rows it fits."""
 
     def __init__(self, fitter: BodyFitter) -> None:

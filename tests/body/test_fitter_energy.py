@@ -3,6 +3,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from shapepose_fg.body.fitting import evidence
 from shapepose_fg.body.fitting.energy import (
     BodyEnergy,
     PoseEnergy,
@@ -11,7 +12,7 @@ from shapepose_fg.body.fitting.energy import (
     robust_weight,
     visible_joints,
 )
-from shapepose_fg.body.fitting.evidence import EvidenceConfig, determine_pose, weigh
+from shapepose_fg.body.fitting.evidence import determine_pose, weigh
 from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.pose_prior import PosePrior
@@ -180,7 +181,7 @@ def test_model_error_is_added_to_covariances_and_rays_stay_rays():
     information = (information + information.swapaxes(-1, -2)) / 2
     information[0, 5] = np.diag([1e4, 1e4, 0.0])
     information[0, 6] = 0
-    root = weigh(JointTargets(rng.normal(size=(1, 25, 3)), information), EvidenceConfig()).root
+    root = weigh(JointTargets(rng.normal(size=(1, 25, 3)), information), 0.02).root
     weighed = root @ root
     full = np.setdiff1d(np.arange(25), [5, 6])
     expected = np.linalg.inv(covariance[0, full] + 0.02**2 * np.eye(3))
@@ -189,7 +190,7 @@ def test_model_error_is_added_to_covariances_and_rays_stay_rays():
     assert not weighed[0, 6].any()
 
 
-def test_joints_on_a_line_do_not_determine_a_pose():
+def test_joints_on_a_line_do_not_determine_a_pose(monkeypatch):
     line = np.arange(-2.0, 3.0)[:, None] * np.array([0.3, 0.4, 0.0])
     side = np.array([0.1, -0.1, 0.0, -0.1, 0.1])[:, None] * np.array([0.0, 0.0, 1.0])
     xyz, used = np.stack([line, line + side, line + side, line + 4]), np.ones((4, 5), dtype=bool)
@@ -197,5 +198,5 @@ def test_joints_on_a_line_do_not_determine_a_pose():
     xyz[2, 1] = 100.0  # is not looked at
     off = 0.1 * np.sqrt(4 / 5)  # root mean square distance from the line of the second
     for least, expected in ((off - 1e-6, [False, True, False, False]), (off + 1e-6, [False] * 4)):
-        found = determine_pose(xyz, used, EvidenceConfig(min_spread_m=least))
-        assert found.tolist() == expected
+        monkeypatch.setattr(evidence, "MIN_SPREAD_M", least)
+        assert determine_pose(xyz, used).tolist() == expected

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shapepose_fg.body.fitting.fitter import BodyFit, FitStatus
+from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
@@ -27,7 +27,7 @@ STAGE_II = EstimatorConfig(
 WRIST = BODY_25.index("RWrist")
 
 
-class Still:
+class Still(BodyFitter):
     """The same body, whatever it is fitted to."""
 
     def __init__(self, joints):

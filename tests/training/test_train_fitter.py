@@ -12,8 +12,9 @@ import torch
 from safetensors import safe_open
 
 from shapepose_fg.body.fitting.fitter import JointTargets
-from shapepose_fg.body.fitting.learned import LearnedFitter, LearnedFitterConfig
+from shapepose_fg.body.fitting.fitters import SmplFitter
 from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.fitting.settings import BodyConfig
 from shapepose_fg.body.fitting.weights import FitterWeights
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.core.errors import InputError
@@ -73,8 +74,8 @@ def test_a_run_writes_weights_that_fit_and_the_same_each_time(script, tmp_path):
     assert str(tmp_path) not in " ".join(card.values())  # nobody's folders
     body = BodyModel.default().keypoints(BodyParameters.zeros(1)).double().numpy()
     information = np.broadcast_to(np.eye(3) / 0.01**2, (1, 25, 3, 3))
-    polished = LearnedFitterConfig(polish_steps=12)  # four iterations teach nothing
-    fit = LearnedFitter(weights=weights, config=polished).fit(JointTargets(body, information))
+    polished = BodyConfig(polish_steps=12)  # four iterations teach nothing
+    fit = SmplFitter(weights=weights, config=polished).fit(JointTargets(body, information))
     assert fit.ok.all() and np.linalg.norm(fit.joints - body, axis=-1).mean() < 0.1
 
 

@@ -5,15 +5,13 @@ from pathlib import Path
 
 from shapepose_fg.evaluation import (
     detector_agreement,
-    fitter_tables,
     scene_tables,
     sequence_difficulty,
     shelf_tables,
     visibility_agreement,
 )
-from shapepose_fg.evaluation.experiments import body_fitters, box, crowd, footage, over_time, who_is_there
+from shapepose_fg.evaluation.experiments import box, crowd, footage, over_time, who_is_there
 from shapepose_fg.evaluation.experiments.ablation import ablation
-from shapepose_fg.evaluation.experiments.detector_joints import detector_joints, detector_joints_shelf
 from shapepose_fg.evaluation.experiments.experiment import Experiment, whole
 from shapepose_fg.evaluation.experiments.foreign_bodies import foreign
 from shapepose_fg.evaluation.experiments.graph_solver import graph_solver
@@ -45,13 +43,6 @@ def experiments(scale: Scale, images: Path | None = None, others: Path | None = 
     for make in (footage.shelf_events, footage.held_out_views, footage.single_person, footage.alone_beside_time):
         yield from _there(make(scale))
     yield from _paper(scale, images, others)
-    yield detector_joints(scale)
-    yield from _there(detector_joints_shelf(scale))
-    if not scale.quick and scale.mocap is not None:
-        for name, table in fitter_tables.tables(scale.mocap, scale.shelf, images).items():
-            yield whole(name, table, "pipeline" if name == "fitter alternation" else "bodies")
-    for make in (body_fitters.left_out, body_fitters.over_time):
-        yield from _there(make(scale))
     if not scale.quick:
         yield from _simulation(scale, images)
 
