@@ -6,8 +6,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 
-from shapepose_fg.setup_check.matching import GATE, distances
+from shapepose_fg.core.camera import Views
+from shapepose_fg.setup_check.adjustment import Q, changed
+from shapepose_fg.setup_check.matching import GATE, distances, same_frame
 from shapepose_fg.setup_check.sightings import MIN_JOINTS, Sightings
 
 Array = NDArray[np.float64]
@@ -20,7 +23,7 @@ _ROUNDS = 6
 _WIDTH = 0.03
 """Width of the Cauchy kernel, as a part of a person's size in the picture."""
 _STEPS = 4
-"""Gauss-Newton steps between matchings."""
+"""Steps between matchings."""
 
 
 @dataclass(frozen=True)
@@ -85,8 +88,6 @@ def possible_matches(first: Index, second: Index) -> int:
 
 def tries(others: Others, seen: Sightings, rng: np.random.Generator) -> Iterator[tuple[Array, Array]]:
     """Joints in the world (N, 3) and in the picture (N, 2) of people and sightings that may be one another."""
-    from shapepose_fg.setup_check.matching import same_frame
-
     person, sighting = same_frame(others.frame, seen.frame)
     both = ~np.isnan(others.points[person][..., 0]) & ~np.isnan(seen.xy[sighting][..., 0])
     enough = np.flatnonzero(both.sum(axis=1) >= MIN_JOINTS + 3)
@@ -177,25 +178,25 @@ def refined(others: Others, seen: Sightings, camera: Pinhole, columns: tuple[int
 
 
 def _solved(points: Array, xy: Array, width_px: Array, camera: Pinhole, columns: list[int]) -> Pinhole:
-    """Robust Gauss-Newton on points (N, 3) seen at xy (N, 2)."""
-    from shapepose_fg.core.camera import Views
-    from shapepose_fg.setup_check.adjustment import Q, camera_derivatives, changed
+    """The camera, fitted robustly (Cauchy) to points (N, 3) seen at xy (N, 2)."""
+    ahead = points @ camera.cTw[2, :3] + camera.cTw[2, 3] > 0
+    if ahead.sum() < 4:
+        return camera
+    points, xy, width_px = points[ahead], xy[ahead], width_px[ahead, None]
 
-    for _ in range(_STEPS):
-        at = points @ camera.cTw[:, :3].T + camera.cTw[:, 3]
-        ahead = at[:, 2] > 0
-        if ahead.sum() < 4:
-            return camera
-        pixels = (at[ahead] @ camera.K.T)[:, :2] / at[ahead][:, 2:]
-        r = pixels - xy[ahead]
-        B = camera_derivatives(at[ahead], camera.K)[..., columns]
-        w = 1 / (width_px[ahead] ** 2 + (r**2).sum(axis=1))
-        H = np.einsum("n,nai,naj->ij", w, B, B)
-        step = np.zeros((1, Q))
-        step[0, columns] = -np.linalg.lstsq(H, np.einsum("n,nai,na->i", w, B, r), rcond=1e-10)[0]
-        new = changed(Views(camera.K[None], camera.cTw[None]), step)
-        camera = Pinhole(new.K[0], new.cTw[0])
-    return camera
+    def moved(step: Array) -> Pinhole:
+        change = np.zeros((1, Q))
+        change[0, columns] = step
+        new = changed(Views(camera.K[None], camera.cTw[None]), change)
+        return Pinhole(new.K[0], new.cTw[0])
+
+    def errors(step: Array) -> Array:
+        new = moved(step)
+        at = (points @ new.cTw[:, :3].T + new.cTw[:, 3]) @ new.K.T
+        return ((at[:, :2] / np.maximum(at[:, 2:], 1e-9) - xy) / width_px).ravel()
+
+    start = np.zeros(len(columns))
+    return moved(least_squares(errors, start, x_scale="jac", loss="cauchy", max_nfev=_STEPS).x)
 
 
 def difference(cTw: Array, other: Array) -> tuple[float, float]:

@@ -14,6 +14,9 @@ _GAIN = 0.25
 """What a change must bring of a camera's score to be named."""
 _EXPLAINED = 0.65
 """Everything fits so well where nothing but detectors err, or little more: no other explanation is sought."""
+_LEAST_FRAMES = 40
+"""In fewer frames people hardly move far enough to tell a small offset in time from chance: in 20 frames of the
+built-in scene a camera that is in time looked 4 frames early."""
 _FEW = 40
 """Frames that are enough for what all cameras share."""
 
@@ -52,7 +55,9 @@ def _judged(look: Look, change: Change) -> float:
 
 
 def lags(look: Look) -> list[Lag]:
-    """Each camera's offset in time against the others."""
+    """Each camera's offset in time against the others; none is told in a short recording that fits as it is."""
+    if len(np.unique(look.evidence.sightings.frame)) < _LEAST_FRAMES:
+        return [Lag(0, 0.0, 0.0)] * look.view_count
     return [lag_of(look, view) for view in range(look.view_count)]
 
 

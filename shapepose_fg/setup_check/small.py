@@ -140,7 +140,7 @@ def other_pose(look: Look) -> OtherPose:
 def _seen(look: Look) -> tuple[Array, Array, Array]:
     """What is observed of people, spread over the frames."""
     groups = look.groups()
-    step = max(1, len(groups) // _MOST_PEOPLE)
+    step = max(1, -(-len(groups) // _MOST_PEOPLE))
     return observed(Groups(groups.frame[::step], groups.member[::step]), look.sightings)
 
 
