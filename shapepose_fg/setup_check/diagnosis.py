@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import DetectionSequence
-from shapepose_fg.setup_check.changes import Change, Kind, lag_of
+from shapepose_fg.setup_check.changes import Change, Kind, gross_mistake, lag_of, lags, latest
 from shapepose_fg.setup_check.duplicates import Duplicate, duplicates
 from shapepose_fg.setup_check.evidence import Evidence, Look, Setup, gather
+from shapepose_fg.setup_check.lag import Lag
 from shapepose_fg.setup_check.people import Build, build_of
-from shapepose_fg.setup_check.search import Lag, gross_mistake, lags, latest
 from shapepose_fg.setup_check.small import SHIFT, SmallErrors, other_pose, small_errors, with_small_errors
 
 Array = NDArray[np.float64]

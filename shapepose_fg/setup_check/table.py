@@ -8,8 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from shapepose_fg.setup_check.camera_use import short
-from shapepose_fg.setup_check.figures import CameraFigures, PairFigures
-from shapepose_fg.setup_check.report import SetupReport
+from shapepose_fg.setup_check.report import CameraFigures, PairFigures, SetupReport
 
 
 def setup_report(report: SetupReport) -> RenderableType:

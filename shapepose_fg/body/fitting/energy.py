@@ -276,30 +276,23 @@ class BodyEnergy:
     def evaluate(
         self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor, held: "Held | None" = None
     ) -> Evaluated:
-        """What `linearise` gives, with keypoints and Jacobian."""
-        xyz, jacobian = self.keypoints_with_jacobian(free)
-        here = self.linearise_at(free, xyz, jacobian, targets, kernel_scale, held)
+        """Bodies, and the energy around them, at free parameters (B, P); the kernel has the scale (B, 1).
+
+        What is `held` stays around there instead of where the priors expect it.
+        """
+        xyz, jacobian, here = self._linearised(free, targets, kernel_scale, held)
         return Evaluated(free, xyz, jacobian, here, factored(here.hessian))
 
     def linearise(
         self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor, held: "Held | None" = None
     ) -> Linearisation:
-        """Energy, gradient and Hessian at free parameters (B, P), with the kernel's scale (B, 1).
+        """The energy alone, see `evaluate`."""
+        return self._linearised(free, targets, kernel_scale, held)[2]
 
-        What is `held` stays around there instead of where the priors expect it.
-        """
-        return self.linearise_at(free, *self.keypoints_with_jacobian(free), targets, kernel_scale, held)
-
-    def linearise_at(
-        self,
-        free: Tensor,
-        xyz: Tensor,
-        jacobian: Tensor,
-        targets: WhitenedTargets,
-        kernel_scale: Tensor,
-        held: "Held | None" = None,
-    ) -> Linearisation:
-        """The same where keypoints `xyz` and their `jacobian` are known already."""
+    def _linearised(
+        self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor, held: "Held | None"
+    ) -> tuple[Tensor, Tensor, Linearisation]:
+        xyz, jacobian = self.keypoints_with_jacobian(free)
         residual = (targets.root @ (xyz - targets.xyz)[..., None]).squeeze(-1)
         squared = residual.square().sum(-1)
         weight = robust_weight(squared, kernel_scale).sqrt()[..., None]
@@ -307,8 +300,13 @@ class BodyEnergy:
         rows = (root @ jacobian.unflatten(1, xyz.shape[1:])).flatten(1, 2)
         gradient = (rows.mT @ (weight * residual).flatten(1)[..., None]).squeeze(-1)
         hessian = rows.mT @ rows
-        prior = self._add_priors(free, gradient, hessian, held)
-        return Linearisation(squared, prior, gradient, hessian)
+        stiffness, away, pose = self._pulls(free, held)
+        gradient[:, :10] += stiffness * away
+        gradient[:, self._angle_slice] += pose.gradient
+        torch.diagonal(hessian, dim1=-2, dim2=-1)[:, :10] += stiffness
+        hessian[:, self._angle_slice, self._angle_slice] += pose.hessian
+        prior = (stiffness * away.square()).sum(-1) + pose.energy
+        return xyz, jacobian, Linearisation(squared, prior, gradient, hessian)
 
     def slope(
         self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor, held: "Held | None" = None
@@ -347,15 +345,6 @@ class BodyEnergy:
         by_angles = turned + pose.gradient
         gradient = torch.cat((by_betas, by_column[:, 10:13], by_angles, by_column[:, -3:]), 1)
         return Slope(xyz, squared, (stiffness * away.square()).sum(-1) + pose.energy, gradient)
-
-    def _add_priors(self, free: Tensor, gradient: Tensor, hessian: Tensor, held: "Held | None") -> Tensor:
-        """Add the gradients and Hessians of shape and pose prior in place; returns their energy (B,)."""
-        stiffness, away, pose = self._pulls(free, held)
-        gradient[:, :10] += stiffness * away
-        gradient[:, self._angle_slice] += pose.gradient
-        torch.diagonal(hessian, dim1=-2, dim2=-1)[:, :10] += stiffness
-        hessian[:, self._angle_slice, self._angle_slice] += pose.hessian
-        return (stiffness * away.square()).sum(-1) + pose.energy
 
     def _pulls(self, free: Tensor, held: "Held | None") -> tuple[Tensor, Tensor, PosePull]:
         """How stiffly betas are held, how far away they are, and what pulls the angles."""

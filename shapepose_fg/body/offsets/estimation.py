@@ -144,9 +144,9 @@ def _eliminate(
 
     Returns Hessian and gradient by (offsets 75, mean of the free parameters P), and the prior's Hessian (P, P).
     """
-    xyz, jacobian = energy.keypoints_with_jacobian(free)
     scale = torch.tensor(kernel_scale, dtype=free.dtype)
-    here = energy.linearise_at(free, xyz, jacobian, targets, scale)
+    body = energy.evaluate(free, targets, scale)
+    xyz, jacobian, here = body.xyz, body.jacobian, body.here
     root = robust_weight(here.squared, scale).sqrt()[..., None, None] * targets.root
     rotations = energy.model.bone_rotations(energy.complete(free))[:, torch.from_numpy(RIDES_ON)]
     by_offset = root @ rotations  # (R, 25, 3, 3), whitened
