@@ -170,6 +170,8 @@ def with_bodies_over_time(
     """
     if len(people) == 0:
         return people
+    if fitter.model is None:
+        raise ValueError(f"{type(fitter).__name__} has no model: it fits no bodies over time")
     known = SubjectShapes.empty(fingerprint(fitter.model)) if known is None else known
     if known.body != fingerprint(fitter.model):
         raise ValueError("shapes must be of the same body model as the fitter's")

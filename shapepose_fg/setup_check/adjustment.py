@@ -53,10 +53,10 @@ def normal_equations(structure: Structure, views: Views) -> Normal:
         R = cTw[:, :3]
         values.insert(pose, gtsam.Pose3(gtsam.Rot3(R.T), -R.T @ cTw[:, 3]))
         values.insert(lens, gtsam.Cal3_S2(M[0, 0], M[1, 1], M[0, 1], M[0, 2], M[1, 2]))
-        # Next to no information: cameras that saw nobody stay in the equations.
+        # Next to no information: cameras without people stay in the equations.
         graph.add(gtsam.PriorFactorPose3(pose, values.atPose3(pose), precision(6, 1e-12)))
         graph.add(gtsam.PriorFactorCal3_S2(lens, values.atCal3_S2(lens), precision(5, 1e-12)))
-    ok, weight = (each.reshape(-1, V)[used] for each in (ok, structure.weight))
+    ok, weight = ok.reshape(-1, V)[used], structure.weight.reshape(-1, V)[used]
     slope = np.square(structure.jacobian.reshape(-1, V, 6)[used]).sum(axis=-1)
     weak = _WEAK * np.where(ok, weight * slope, 0.0).sum(axis=-1)
     for point, xyz, least in zip(points, structure.points.reshape(-1, 3)[used], weak, strict=True):
@@ -75,7 +75,7 @@ def normal_equations(structure: Structure, views: Views) -> Normal:
         rest.push_back(lens)
     _, cameras = graph.linearize(values).eliminatePartialMultifrontal(order)
     H, eta = cameras.hessian(rest)
-    T = block_diag(*map(_tangent, views.K))
+    T: Array = np.asarray(block_diag(*map(_tangent, views.K)))
     return Normal(T.T @ H @ T, -T.T @ eta)
 
 

@@ -91,7 +91,7 @@ def worth(change: Change) -> float:
 
 
 def of_one(look: Look, view: int, rng: np.random.Generator) -> Iterator[Change]:
-    """Changes of one camera that fit it to the people whom the others see, the best of each kind."""
+    """Changes of one camera that fit it to the people that the others see, the best of each kind."""
     others, seen, camera = look.others(view), look.seen_by(view), look.setup.camera(view)
     if len(others) == 0 or len(seen) == 0:
         return
@@ -126,7 +126,7 @@ def lag_of(look: Look, view: int, most: int | None = None) -> Lag:
 
 
 def of_two(look: Look, first: int, second: int) -> Change | None:
-    """Two cameras exchanged, as the people whom all others see say it; None where they see nobody."""
+    """Two cameras exchanged, as the people that all others see say it; None where they see none."""
     others = look.others(first, second)
     setup = look.setup.exchanged(first, second)
     if len(others) == 0:

@@ -28,7 +28,7 @@ _STEPS = 4
 
 @dataclass(frozen=True)
 class Others:
-    """The people whom all cameras but some see."""
+    """The people that all cameras but some see."""
 
     frame: Index
     """(P,) frame of each person."""

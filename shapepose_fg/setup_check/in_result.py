@@ -14,9 +14,9 @@ from shapepose_fg.setup_check.changes import Kind
 from shapepose_fg.setup_check.report import SetupReport, rounded
 
 _MOST_BETA = 5.0
-"""A shape component so many standard deviations from the mean is nobody's."""
+"""A shape component so many standard deviations from the mean is no person's."""
 _SHARE = 0.1
-"""Of so many rows: fewer are single people whom nearly nobody saw."""
+"""Of so many rows: fewer are single people that hardly any camera saw."""
 _WORST = 2.0
 """A camera whose joints are so many times as far from the others' as is usual is said, if nothing else is."""
 _FAR_MM = 60.0
@@ -61,7 +61,7 @@ def result_check(
 
 
 def _shapes(people: Reconstruction) -> list[str]:
-    """Bodies of a shape that nobody has."""
+    """Bodies of a shape that no person has."""
     there = np.isfinite(people.betas).all(axis=1)
     largest = np.abs(people.betas[there]).max(axis=1, initial=0.0)
     far = largest > _MOST_BETA

@@ -29,7 +29,7 @@ class CameraFigures:
     people: int
     """People that it saw in the frames that were looked at."""
     matched: float
-    """Share of them who are somebody whom another camera sees too."""
+    """Share of them that another camera sees too."""
     median_px: float | None
     """Median distance of a projected joint to its detection, all that were matched, pixels."""
     high_px: float | None
@@ -43,7 +43,7 @@ class CameraFigures:
     left_out_mm: float | None
     """The same as a length."""
     left_out_matched: float
-    """Share of the people whom the others see and the camera could match that it does match."""
+    """Share of the people seen by the others that the camera could match and does match."""
     late_frames: int
     """Frames by which it is late against the others; negative: early."""
 
@@ -76,7 +76,7 @@ class SetupReport:
     frames: int
     """Frames that were looked at."""
     stature_m: float | None
-    """How tall the people come out, median; None where nobody does."""
+    """How tall the people come out, median; None without people."""
 
     def as_dict(self) -> dict[str, Any]:
         """What run.json holds under `setup`."""

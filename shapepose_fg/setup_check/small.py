@@ -175,7 +175,7 @@ def _cost(structure: Structure) -> float:
 
 
 def _median_px(structure: Structure) -> Array:
-    """(V,) median distance of projections to detections; NaN for a camera that sees nobody."""
+    """(V,) median distance of projections to detections; NaN for a camera without people."""
     distance = np.linalg.norm(structure.residual, axis=-1)
     distance = np.where(np.isfinite(distance), distance, np.nan)
     return np.array([np.nan if np.isnan(d).all() else np.nanmedian(d) for d in np.moveaxis(distance, 2, 0)])

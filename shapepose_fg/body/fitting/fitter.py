@@ -138,7 +138,7 @@ class Shapes:
     mean: NDArray[np.float64]
     """(G, 10) in standard deviations over adults."""
     information: NDArray[np.float64]
-    """(G, 10, 10) inverse covariances. Those of somebody unknown are the identity around 0."""
+    """(G, 10, 10) inverse covariances. Those of an unknown person are the identity around 0."""
 
     def __post_init__(self) -> None:
         if self.mean.ndim != 2 or self.mean.shape[1] != 10 or self.information.shape != (*self.mean.shape, 10):

@@ -241,7 +241,7 @@ class BodyModel:
 
     @cached_property
     def _mesh(self) -> "_Mesh":
-        """The big arrays, made when somebody first asks for vertices."""
+        """The big arrays, made when vertices are first asked for."""
         arrays = self._arrays
         shapes = arrays.shapes.transpose(2, 0, 1)  # (10, Nv, 3)
         rest, rest_shapes = arrays.joint_regressor @ arrays.template, arrays.joint_regressor @ shapes

@@ -40,7 +40,7 @@ class TrainingConfig:
     shake_rad: float = 0.05
     """Sigma added to recorded angles: bodies and recordings have play."""
     exchange: float = 0.15
-    """Share of people who get an arm or a leg from somebody else."""
+    """Share of people who get an arm or a leg of another person."""
     skeletons: tuple[float, ...] = (0.55, 0.15, 0.15, 0.15)
     """Shares of BODY_25, COCO_17, HALPE_26, SMPL_24."""
     rotation_m: float = 0.05
@@ -57,7 +57,7 @@ class TrainingConfig:
 
 @dataclass(frozen=True)
 class People:
-    """True bodies upright in front of nobody's camera: pelvis at the origin, any heading."""
+    """True bodies, upright, without a camera: pelvis at the origin, any heading."""
 
     state: BodyState
     """Shape and pose."""
