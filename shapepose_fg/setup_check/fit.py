@@ -1,6 +1,6 @@
 """How well one camera fits the people that the others see, and which change of it would fit them."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -122,25 +122,24 @@ def posed_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
 
 def zoomed_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
     """The camera with the focal length by which it sees `points` (N, 3) at `xy` (N, 2)."""
-    at = _ahead(points, camera)
-    if at is None:
-        return None
-    direction, offset = (at - camera.K[:2, 2]), xy - camera.K[:2, 2]
-    factor = float((direction * offset).sum() / (direction**2).sum())
-    if not 0.1 < factor < 10:
-        return None
-    return Pinhole(scaled_focal(camera.K, factor), camera.cTw)
+    return _scaled_to(points, xy, camera, camera.K[:2, 2], scaled_focal)
 
 
 def resized_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
     """The camera of pictures that are larger or smaller, in which `points` (N, 3) lie at `xy` (N, 2)."""
-    at = _ahead(points, camera)
-    if at is None:
+    return _scaled_to(points, xy, camera, np.zeros(2), scaled_picture)
+
+
+def _scaled_to(
+    points: Array, xy: Array, camera: Pinhole, centre: Array, scaled: Callable[[Array, float], Array]
+) -> Pinhole | None:
+    """The camera with its K `scaled` by how much farther from `centre` than it says the points are seen."""
+    at = (points @ camera.cTw[:, :3].T + camera.cTw[:, 3]) @ camera.K.T
+    if not (at[:, 2] > 0).all():
         return None
-    factor = float((at * xy).sum() / (at**2).sum())
-    if not 0.1 < factor < 10:
-        return None
-    return Pinhole(scaled_picture(camera.K, factor), camera.cTw)
+    direction = at[:, :2] / at[:, 2:] - centre
+    factor = float((direction * (xy - centre)).sum() / (direction**2).sum())
+    return Pinhole(scaled(camera.K, factor), camera.cTw) if 0.1 < factor < 10 else None
 
 
 def scaled_focal(K: Array, factor: float) -> Array:
@@ -156,12 +155,6 @@ def scaled_picture(K: Array, factor: float) -> Array:
     new[:2, :2] *= factor
     new[:2, 2] = factor * (K[:2, 2] + 0.5) - 0.5
     return new
-
-
-def _ahead(points: Array, camera: Pinhole) -> Array | None:
-    """Pixels (N, 2) of points, if all are before the camera."""
-    at = (points @ camera.cTw[:, :3].T + camera.cTw[:, 3]) @ camera.K.T
-    return at[:, :2] / at[:, 2:] if (at[:, 2] > 0).all() else None
 
 
 def refined(others: Others, seen: Sightings, camera: Pinhole, columns: tuple[int, ...]) -> Pinhole:
