@@ -332,9 +332,7 @@ class BodyEnergy:
         body, points = self.complete(free), self.model.keypoint_points
         local = exp_so3(torch.cat((body.global_orient[:, None], body.body_pose), 1))
         rotations = accumulate(local)
-        blend = (local[:, 1:] - torch.eye(3, dtype=self.dtype)).flatten(1)
-        feature = None if points.offsets_pose is None else blend
-        xyz, arms = points.positions_with_arms(rotations, body.betas, body.transl, feature)
+        xyz, arms = points.positions_with_arms(rotations, body.betas, body.transl, points.feature(local))
         squared, forces = pull(xyz)
         by_column = points.pull_back(forces, arms, rotations, local)
         angles = free[:, self._angle_slice]

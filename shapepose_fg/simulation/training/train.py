@@ -100,8 +100,7 @@ class PeopleSource:
 def body_points(model: BodyModel, state: BodyState) -> Tensor:
     """(B, K, 3) all `BODY_POINTS` of a state, differentiable."""
     points = model.points
-    feature = None if points.offsets_pose is None else (state.local[:, 1:] - torch.eye(3)).flatten(1)
-    return points.positions(accumulate(state.local), state.betas, state.transl, feature)
+    return points.positions(accumulate(state.local), state.betas, state.transl, points.feature(state.local))
 
 
 def _chain(joints: tuple[int, ...]) -> Tensor:
