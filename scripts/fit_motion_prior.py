@@ -9,16 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from shapepose_fg.body.training.motion import STEP_S, learn_motion_prior
-from shapepose_fg.body.training.motions import frame_weights
-from shapepose_fg.body.training.split import TEST_SUBJECTS, VALIDATION_SUBJECTS, split_of
 from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.simulation.mocap import Mocap
-
-ACKNOWLEDGEMENT = (
-    "The data used in this project was obtained from mocap.cs.cmu.edu. "
-    "The database was created with funding from NSF EIA-0196217."
-)
+from shapepose_fg.simulation.training.motion_prior import STEP_S, learn_motion_prior
+from shapepose_fg.simulation.training.motions import ACKNOWLEDGEMENT, frame_weights
+from shapepose_fg.simulation.training.split import TEST_SUBJECTS, VALIDATION_SUBJECTS, split_of
 
 
 def main() -> None:

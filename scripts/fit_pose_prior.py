@@ -1,9 +1,8 @@
 """Learn the pose prior from motion capture: python scripts/fit_pose_prior.py cmu_smpl24.npz.
 
-Reads recordings (CMU's, or a folder of AMASS files), fits a Gaussian mixture over the 69 joint angles to the
-training subjects and prints how well it does on validation and test subjects; then fits it to training and
-validation subjects and writes shapepose_fg/body/data/pose_prior.npz. With --compare it only prints how other
-numbers of components do on validation subjects.
+Reads recordings (CMU's, or a folder of AMASS files), fits a Gaussian over the 69 joint angles to the training
+subjects and prints how well it does on validation and test subjects; then fits it to training and validation
+subjects and writes shapepose_fg/body/data/pose_prior.npz.
 """
 
 import argparse
@@ -15,25 +14,19 @@ from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.fitting.pose_prior import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel
-from shapepose_fg.body.training.mixture import MixtureConfig
-from shapepose_fg.body.training.motions import Motions, load_motions
-from shapepose_fg.body.training.prior import (
-    PriorConfig,
+from shapepose_fg.core.skeleton import SMPL_24
+from shapepose_fg.simulation.training.motions import ACKNOWLEDGEMENT, Motions, load_motions
+from shapepose_fg.simulation.training.pose_prior import (
+    Gaussian,
     angles_of,
     expected_angles,
     learn_pose_prior,
-    log_likelihood,
+    recorded_angles,
 )
-from shapepose_fg.body.training.split import TEST_SUBJECTS, VALIDATION_SUBJECTS
-from shapepose_fg.core.skeleton import SMPL_24
+from shapepose_fg.simulation.training.split import TEST_SUBJECTS, VALIDATION_SUBJECTS
 
 Array = NDArray[np.float64]
 
-COMPARED = (1, 4, 8, 16, 32)
-ACKNOWLEDGEMENT = (
-    "The data used in this project was obtained from mocap.cs.cmu.edu. "
-    "The database was created with funding from NSF EIA-0196217."
-)
 HIDDEN = {
     "wrist, arm hidden": ("left_wrist", ("left_collar", "left_shoulder", "left_elbow", "left_wrist")),
     "wrist, forearm hidden": ("left_wrist", ("left_elbow", "left_wrist")),
@@ -46,32 +39,26 @@ def main() -> None:
     """Fit, report, write."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("motions", type=Path, help="cmu_smpl24.npz, or a folder of AMASS files")
-    parser.add_argument("--compare", action="store_true", help="print figures for several numbers of components")
     parser.add_argument("--output", type=Path, default=Path("shapepose_fg/body/data/pose_prior.npz"))
     arguments = parser.parse_args()
     motions = load_motions(arguments.motions)
-    train, validation = motions.of("train"), motions.of("validation")
+    train, test = motions.of("train"), motions.of("test")
     print(f"learning from {len(train)} frames and their mirror images")
-    if arguments.compare:
-        for components in COMPARED:
-            prior = learn_pose_prior(train, PriorConfig(MixtureConfig(components)), "")
-            report(f"{components:2d} components, validation", prior, validation)
-        return
-    prior = learn_pose_prior(train, PriorConfig(), "")
-    report("validation", prior, validation)
-    report("test", prior, motions.of("test"))
+    prior = learn_pose_prior(train, "")
+    report("validation", prior, motions.of("validation"))
+    report("test", prior, test)
     # What ships learns from the validation subjects too: they have chosen, and poses are few.
-    both = motions.rows(~np.isin(motions.subject, motions.of("test").subject))
-    prior = learn_pose_prior(both, PriorConfig(), provenance(both, PriorConfig()))
-    report("test, validation subjects learnt from too", prior, motions.of("test"))
+    both = motions.rows(~np.isin(motions.subject, test.subject))
+    prior = learn_pose_prior(both, provenance(both))
+    report("test, validation subjects learnt from too", prior, test)
     prior.save(arguments.output)
     print(f"{arguments.output}: {arguments.output.stat().st_size / 1024:.0f} KiB, {len(both)} frames")
 
 
-def provenance(learnt: Motions, config: PriorConfig) -> str:
+def provenance(learnt: Motions) -> str:
     """What the file says about itself."""
     return (
-        f"{ACKNOWLEDGEMENT} Fitted by scripts/fit_pose_prior.py, {config.mixture.components} component(s), to "
+        f"{ACKNOWLEDGEMENT} Fitted by scripts/fit_pose_prior.py, 1 component(s), to "
         f"{len(learnt)} frames and their mirror images: all subjects but {' '.join(TEST_SUBJECTS)} (test; 60 61: "
         f"salsa), which were not used. Subjects {' '.join(VALIDATION_SUBJECTS)} (validation) chose the settings "
         "and were learnt from in the end. Collars and hands were not recorded: their sigmas are assumed."
@@ -81,7 +68,7 @@ def provenance(learnt: Motions, config: PriorConfig) -> str:
 def report(title: str, prior: PosePrior, motions: Motions) -> None:
     """Print log likelihood and errors at the ends of hidden limbs (weighted means)."""
     motions = motions.rows(np.arange(0, len(motions), 3))
-    likelihood = float(np.average(log_likelihood(prior, motions), weights=motions.weight))
+    density = Gaussian(prior.mean, prior.covariance).log_density(*recorded_angles(motions))
     poses = motions.poses[:, 1:].reshape(len(motions), -1).astype(np.float64)
     parts = []
     for name, (end, chain) in HIDDEN.items():
@@ -90,7 +77,7 @@ def report(title: str, prior: PosePrior, motions: Motions) -> None:
         guess[:, asked] = expected_angles(prior, poses, asked)
         error = np.linalg.norm(limb_end(guess, end) - limb_end(poses, end), axis=1)
         parts.append(f"{name} {100 * np.average(error, weights=motions.weight):.1f} cm")
-    print(f"{title}: {likelihood:.2f} nats a frame; {', '.join(parts)}")
+    print(f"{title}: {np.average(density, weights=motions.weight):.2f} nats a frame; {', '.join(parts)}")
 
 
 def limb_end(poses: Array, end: str) -> Array:

@@ -12,16 +12,15 @@ from pathlib import Path
 
 from shapepose_fg.body.fitting.fitters import BodyConfig, make_fitter
 from shapepose_fg.body.threads import torch_threads
-from shapepose_fg.body.training.foot_speeds import foot_speeds
-from shapepose_fg.body.training.motion_statistics import (
+from shapepose_fg.estimation.motion_model import FORMAT
+from shapepose_fg.simulation.files import cut, named_scene
+from shapepose_fg.simulation.measurement.motion import (
     LastingErrors,
     densities,
     detected,
     lasting_errors,
     recorded_joints,
 )
-from shapepose_fg.estimation.motion_model import FORMAT
-from shapepose_fg.simulation.files import cut, named_scene
 
 SEQUENCES = {"salsa": 0, "crossing": 100}
 """Sequences of `tune`, and the first of the 120 frames that are taken."""
@@ -59,9 +58,6 @@ def main() -> None:
         }
         for lag, value in zip(pairs[0].lags_s, pairs[0].autocorrelation, strict=True):
             print(f"{name}: {lag:.3f} s {value:.2f}")
-    feet = foot_speeds(recorded_joints(arguments.mocap, "train"))  # for estimation/contact.py
-    print(f"feet: {feet.speeds_m_s} m/s, {feet.first}, {feet.lasts_s(30.0)} s, {feet.correlation_s} s")
-    print(feet.turns)
     arguments.output.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
 
 

@@ -1,9 +1,8 @@
-"""Train the learned fitter's update network: python scripts/train_fitter.py cmu_smpl24.npz [--resume].
+"""Train the learned fitter's update network: python scripts/train_fitter.py cmu_smpl24.npz.
 
 Learns from the training subjects of recorded motions (CMU's .npz or a folder of AMASS files), watches the
-validation subjects, never sees the test subjects. Writes a checkpoint every few minutes, from which `--resume`
-goes on to the bit, a log (one JSON line for each validation), and at the end the weights with their card. About
-an hour on one core.
+validation subjects, never sees the test subjects. Writes a log (one JSON line for each validation), and at the end
+the weights with their card. About an hour on one core.
 """
 
 import json
@@ -25,19 +24,14 @@ from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.weights import FitterWeights, fingerprint
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
-from shapepose_fg.body.training.calibration import calibrated
-from shapepose_fg.body.training.checkpoint import load_checkpoint, save_checkpoint
-from shapepose_fg.body.training.motions import Motions, load_motions
-from shapepose_fg.body.training.split import TEST_SUBJECTS, VALIDATION_SUBJECTS
-from shapepose_fg.body.training.train import PeopleSource, Trainer, TrainingConfig, body_points, prepared
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.provenance import versions
+from shapepose_fg.simulation.training.calibration import calibrated
+from shapepose_fg.simulation.training.motions import ACKNOWLEDGEMENT, Motions, load_motions
+from shapepose_fg.simulation.training.split import TEST_SUBJECTS, VALIDATION_SUBJECTS
+from shapepose_fg.simulation.training.train import PeopleSource, Trainer, TrainingConfig, body_points, prepared
 
 VALIDATION_PEOPLE = 2048
-ACKNOWLEDGEMENT = (
-    "The data used in this project was obtained from mocap.cs.cmu.edu. "
-    "The database was created with funding from NSF EIA-0196217."
-)
 
 
 def main(
@@ -49,7 +43,6 @@ def main(
     seed: Annotated[int, typer.Option(help="Of everything that is drawn.")] = 0,
     threads: Annotated[int, typer.Option(min=1, help="CPU threads.")] = 1,
     validate_every: Annotated[int, typer.Option(min=1, help="Iterations between validations.")] = 500,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint beside the output.")] = False,
     calibrate: Annotated[
         bool, typer.Option("--calibrate", help="Only measure the covariances of the weights in the output anew.")
     ] = False,
@@ -72,23 +65,18 @@ def main(
     train = recorded.of("train")
     frame = PersonFrame.of(model, train.poses, train.weight)
     trainer = _trainer(recorded, model, frame, config)
-    checkpoint, log = output.with_suffix(".checkpoint"), output.with_suffix(".log")
-    if resume:
-        load_checkpoint(trainer, checkpoint)
-    elif checkpoint.exists():
-        raise InputError(f"{checkpoint}: there is a run already; go on with --resume, or remove it")
+    log = output.with_suffix(".log")
     validation = _people_to_validate(recorded, model, frame, config)
     columns = (*Progress.get_default_columns()[:-1], TimeRemainingColumn())
     with Progress(*columns) as progress:
-        bar = progress.add_task("training", total=iterations, completed=trainer.iteration)
-        for errors in trainer.run(iterations - trainer.iteration):
+        bar = progress.add_task("training", total=iterations)
+        for errors in trainer.run(iterations):
             progress.update(bar, advance=1, description=f"joints {errors[-1]:.0f} mm")
             if trainer.iteration % validate_every == 0 or trainer.iteration == iterations:
                 line = {"iteration": trainer.iteration, "time": round(time.time())}
                 line |= {"validation_mm": [round(error, 2) for error in validation(trainer.averaged)]}
                 with log.open("a", encoding="utf-8") as file:
                     file.write(json.dumps(line) + "\n")
-                save_checkpoint(trainer, checkpoint)
     card = _card(trainer, recorded, motions, validation(trainer.averaged))
     network = trainer.averaged.requires_grad_(False).eval().cpu()
     weights = FitterWeights(network, frame, fingerprint(model), card=card)
@@ -98,7 +86,7 @@ def main(
 
 def _refuse_unwritable(output: Path) -> None:
     """InputError where the weights could not be written in the end."""
-    for file in (output, output.with_suffix(".checkpoint"), output.with_suffix(".log")):
+    for file in (output, output.with_suffix(".log")):
         if file.is_dir():
             raise InputError(f"{file}: this is a folder; give another --output")
         if file.exists() and not os.access(file, os.W_OK):

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from shapepose_fg.body.fitting.body_sequence import Shapes
-from shapepose_fg.body.fitting.fitters import make_fitter
-from shapepose_fg.body.fitting.learned import LearnedFitter
+from shapepose_fg.body.fitting.fitter import Shapes
+from shapepose_fg.body.fitting.fitters import SmplFitter, make_fitter
 from shapepose_fg.body.fitting.weights import fingerprint
 from shapepose_fg.body.model.body_model import BodyParameters
 from shapepose_fg.body.shapes import SubjectShapes
@@ -44,9 +43,9 @@ def scene() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def fitter() -> LearnedFitter:
+def fitter() -> SmplFitter:
     made = make_fitter()
-    assert isinstance(made, LearnedFitter)
+    assert made.weights is not None
     return made
 
 

@@ -41,7 +41,7 @@ LEVELS = (
     "io pipeline.solving",
     "simulation viz.viewer detection2d",
     "viz.overlay setup_check",
-    "body.training io.export",
+    "io.export",
     "viz.report",
     "evaluation",
     "cli.reconstruct.outcome cli.reconstruct.summary cli.reconstruct.inputs",
@@ -152,7 +152,6 @@ def test_torch_is_imported_for_bodies_only():
     assert users <= {f"body.{name}" for name in ("model", "fitting", "offsets", "threads")} | {
         "evaluation",
         "simulation",
-        "body.training",
     }
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shapepose_fg.body.fitting.fitter import BodyFit, FitStatus
+from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus
 from shapepose_fg.cli.main import main
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.detections import Detections
@@ -25,7 +25,7 @@ STAGE_II = EstimatorConfig(PAPER.observations, PAPER.window_graph, PAPER.refine,
 WRIST, KNEE = BODY_25.index("RWrist"), BODY_25.index("LKnee")
 
 
-class OneBody:
+class OneBody(BodyFitter):
     """Fits the same body to everything: as it is without leaving anything out 5 cm from its priors."""
 
     def __init__(self, joints, sigma_m=0.1):

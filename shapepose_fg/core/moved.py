@@ -17,7 +17,7 @@ _ROOMS = {
     "cli": "options terminal stopping demo batch",
     "viz": "rendering overlay report viewer",
     "io": "export",
-    "body": "training",
+    "simulation": "training",
 }
 """What was in the package's root until 0.1, by where it is now."""
 _MERGED = {

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from annotated_types import Interval
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from shapepose_fg.core.bounds import Settings, Share
 from shapepose_fg.detection2d.networks import NetworkLayout
@@ -144,17 +145,10 @@ def line_integrals(
     part = np.linspace(0.0, 1.0, config.line_samples)
     x = np.clip(start[:, :1] + along[:, :1] * part, 0, width - 1)
     y = np.clip(start[:, 1:] + along[:, 1:] * part, 0, height - 1)
-    # Read the field between cells: the four cells around each place, weighted.
-    left, top = np.minimum(x.astype(np.intp), max(width - 2, 0)), np.minimum(y.astype(np.intp), max(height - 2, 0))
-    fx, fy = x - left, y - top
-    right, bottom = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
     component = np.zeros(x.shape)
     for axis in range(2):
-        flat = fields[axis::2][limb[:, None], top, left] * (1 - fx) * (1 - fy)
-        flat += fields[axis::2][limb[:, None], top, right] * fx * (1 - fy)
-        flat += fields[axis::2][limb[:, None], bottom, left] * (1 - fx) * fy
-        flat += fields[axis::2][limb[:, None], bottom, right] * fx * fy
-        component += flat * direction[:, axis, None]
+        places = np.stack([np.broadcast_to(2.0 * limb[:, None] + axis, x.shape), y, x])
+        component += map_coordinates(fields, places, np.float64, order=1) * direction[:, axis, None]
     supported = (component >= config.min_along).mean(axis=1) >= config.min_supported
     return np.where(supported & (length > 0), np.clip(component.mean(axis=1), 0.0, 1.0), 0.0)
 

@@ -1,4 +1,4 @@
-"""An ONNX file of somebody else, read within bounds and looked through before any library sees it."""
+"""An ONNX file from outside, read within bounds and looked through before any library sees it."""
 
 import os
 from collections.abc import Iterator

@@ -12,7 +12,6 @@ from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.body_step import BodyStep, Tie, disagreement
 from shapepose_fg.estimation.contact import walking
-from shapepose_fg.estimation.draft import WholeFitter
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.linearisation import ViewEvidence, linearise, mean_confidence
 from shapepose_fg.estimation.motion_model import LOST_M
@@ -153,8 +152,7 @@ def final_bodies(
     known = np.isfinite(xyz).all(axis=-1) & np.isfinite(covariance[rows]).all(axis=(2, 3))
     information[known] = np.linalg.inv(covariance[rows][known])
     information = (information + information.swapaxes(2, 3)) / 2
-    whole = fitter.fit_whole if isinstance(fitter, WholeFitter) else fitter.fit
-    fit = whole(JointTargets(np.nan_to_num(xyz), information), solution.fit.rows(rows))
+    fit = fitter.fit_whole(JointTargets(np.nan_to_num(xyz), information), solution.fit.rows(rows))
     return solution.fit.with_rows(rows[fit.ok], fit.rows(np.flatnonzero(fit.ok)))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
-from shapepose_fg.estimation.draft import MODEL_SIGMA_M, WholeFitter
+from shapepose_fg.estimation.draft import MODEL_SIGMA_M
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.linearisation import ViewEvidence
 from shapepose_fg.estimation.window_graph import Message
@@ -50,10 +50,7 @@ class BodyStep:
             last, groups = last.rows(rows), None if groups is None else groups[rows]
         if self.config.refine.leave_one_out:
             return self.fitter.fit(targets, last, groups)
-        if groups is None and isinstance(self.fitter, WholeFitter):
-            fit = self.fitter.fit_whole(targets, last)
-        else:
-            fit = self.fitter.fit(targets, last, groups)
+        fit = self.fitter.fit_whole(targets, last) if groups is None else self.fitter.fit(targets, last, groups)
         return replace(fit, prior_xyz=fit.joints, prior_covariance=fit.covariance + MODEL_SIGMA_M**2 * np.eye(3))
 
     def message(

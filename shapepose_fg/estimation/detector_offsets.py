@@ -1,14 +1,12 @@
 """Which joints of a recording are known well enough to learn the detector's habits from, and who uses them."""
 
 from dataclasses import dataclass, field
-from typing import Annotated, Protocol, Self, runtime_checkable
+from typing import Annotated
 
 import numpy as np
 from annotated_types import Interval
 
-from shapepose_fg.body.fitting.fitter import BodyFitter, JointTargets
-from shapepose_fg.body.model.body_model import BodyModel
-from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
+from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.body.offsets.estimation import OffsetPrior
 from shapepose_fg.core.bounds import Count, Metres, Settings, Share
 from shapepose_fg.core.camera import Rig, Views
@@ -39,18 +37,6 @@ class OffsetConfig(Settings):
         super().__post_init__()
         if self.source == "":
             raise ValueError('source must be "recording", "none" or a file, got nothing')
-
-
-@runtime_checkable
-class AdjustableFitter(BodyFitter, Protocol):
-    """A body fitter that can be told where its detector puts the joints."""
-
-    model: BodyModel
-    """The body that it fits."""
-
-    def with_keypoint_offsets(self, offsets: KeypointOffsets) -> Self:
-        """The same fitter, its joints moved by `offsets`."""
-        ...
 
 
 def spread_frames(length: int, count: int) -> list[int]:

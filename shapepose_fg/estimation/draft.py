@@ -1,7 +1,5 @@
 """Roughly where joints are, without a graph: enough to give the detections out again."""
 
-from typing import Protocol, runtime_checkable
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,15 +19,6 @@ detector's joints lie from the body's, or weighs another share: on Shelf a quart
 
 LIMB_SIGMA_M = 0.03
 """Sigma of an unseen joint from which on it is more the body's than its own."""
-
-
-@runtime_checkable
-class WholeFitter(BodyFitter, Protocol):
-    """A fitter that is faster where nobody needs a joint's prior without its own target."""
-
-    def fit_whole(self, targets: JointTargets, initial: BodyFit | None = None) -> BodyFit:
-        """Bodies of all rows, `prior_xyz` and `prior_covariance` NaN."""
-        ...
 
 
 def changed_targets(before: JointTargets, now: JointTargets) -> NDArray[np.intp]:
@@ -86,7 +75,7 @@ def limb_steps(
     C = np.where(known[rows][..., None, None], covariance[rows], np.eye(3))
     information = np.where(known[rows][..., None, None], np.linalg.inv(C), 0.0)
     targets = JointTargets(np.nan_to_num(joints[rows]), (information + information.swapaxes(2, 3)) / 2)
-    body = fitter.fit_whole(targets) if isinstance(fitter, WholeFitter) else fitter.fit(targets)
+    body = fitter.fit_whole(targets)
     share = C @ np.linalg.inv(C + LIMB_SIGMA_M**2 * np.eye(3))
     step = np.einsum("...ij,...j->...i", share, body.joints - joints[rows])
     steps[rows] = np.where((moved[rows] & np.isfinite(step).all(axis=-1))[..., None], step, 0.0)

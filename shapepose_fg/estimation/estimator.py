@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from factors import make_camera
 from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
-from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter
+from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, check_fitter
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Status
@@ -20,7 +20,6 @@ from shapepose_fg.estimation.contact import feet_of
 from shapepose_fg.estimation.doubt import association_spread, exchange_spread, limbs_to_exchange
 from shapepose_fg.estimation.draft import (
     NARROWING,
-    WholeFitter,
     changed_targets,
     drafted,
     limb_steps,
@@ -114,6 +113,7 @@ class Estimator:
     ) -> None:
         """`joints` are the names of the detector's joints: the motion model goes by them."""
         self.rig = rig
+        check_fitter(fitter)
         self.fitter = fitter
         self.config = EstimatorConfig() if config is None else config
         self.joints = joints
@@ -168,9 +168,8 @@ class Estimator:
         sigmas = observation_sigmas(observations, X, views, config.observations, self.joints)
         evidence = linearise(observations, sigmas, X, views, config.observations)
         enough = (evidence.sigma_m <= config.refine.max_sigma_m).sum(axis=1) >= LEAST_JOINTS
-        whole = self.fitter.fit_whole if isinstance(self.fitter, WholeFitter) else self.fitter.fit
         fitted = joint_targets(evidence, enough)
-        body = whole(fitted)
+        body = self.fitter.fit_whole(fitted)
         for wider in NARROWING if config.refine.draft_reach_m > 0 else ():
             around = np.where(body.ok[:, None, None], body.joints, X)
             reach_m = wider * config.refine.draft_reach_m
@@ -179,7 +178,7 @@ class Estimator:
             rows = changed_targets(fitted, targets)
             if len(rows) == 0:
                 continue
-            again = whole(targets.rows(rows))
+            again = self.fitter.fit_whole(targets.rows(rows))
             fitted = fitted.with_rows(rows, targets.rows(rows))
             placed = np.flatnonzero(again.ok)
             body = body.with_rows(rows[placed], again.rows(placed))

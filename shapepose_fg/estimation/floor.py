@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 LOOK_S = 1.5
-"""A foot that stands for so long is one look at the floor: so long errors last (`SequenceConfig.lasting_s`)."""
+"""A foot that stands for so long is one look at the floor: so long errors are correlated
+(`BodyConfig.correlation_s`)."""
 LEAST_LOOKS = 6
 """Looks that a floor takes: two feet of one person over five seconds, or of three people at a time."""
 AGREE = 0.6

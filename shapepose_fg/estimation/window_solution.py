@@ -75,11 +75,15 @@ class WindowSolution:
         chain over time, unless factors of your own tie joints.
         """
         graph = gtsam.NonlinearFactorGraph(self.window.graph)
-        reported, offsets = self.keys, self._offset_keys
-        known, more = self._known, self._more
-        of = (self.window.keys, offsets, self.joints - self.solved, more)
-        share = self.lasting.white_share
-        factors = lasting_difference_factors(reported[known], *(each[known] for each in of), share)
+        reported, offsets, known = self.keys, self._offset_keys, self._known
+        factors = lasting_difference_factors(
+            reported[known],
+            self.window.keys[known],
+            offsets[known],
+            (self.joints - self.solved)[known],
+            self._more[known],
+            self.lasting.white_share,
+        )
         for joint in np.flatnonzero(known.any(axis=0)).tolist():
             there = known[:, joint]
             factors += offset_factors(

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.body.fitting.body_sequence import Shapes
+from shapepose_fg.body.fitting.fitter import BodyFitter, Shapes
 from shapepose_fg.body.fitting.weights import fingerprint
 from shapepose_fg.body.shapes import SubjectShapes, recognise
 from shapepose_fg.core.reconstruction import Reconstruction, Status
 from shapepose_fg.core.storage.kept_arrays import InMemory, KeptArrays
 from shapepose_fg.estimation.floor import Floor
-from shapepose_fg.pipeline.person_bodies import Person, PersonBodies, SequenceFitting
+from shapepose_fg.pipeline.person_bodies import Person, PersonBodies
 
 STRETCH_ROWS = 4000
 """Rows of a person that are fitted together at the most. The shape of a longer track is what so many of its rows
@@ -159,7 +159,7 @@ def _spread(count: int, most: int, length: int) -> list[range]:
 
 def with_bodies_over_time(
     people: Reconstruction,
-    fitter: SequenceFitting,
+    fitter: BodyFitter,
     known: SubjectShapes | None = None,
     floor: Floor | None = None,
 ) -> Reconstruction:
@@ -170,6 +170,8 @@ def with_bodies_over_time(
     """
     if len(people) == 0:
         return people
+    if fitter.model is None:
+        raise ValueError(f"{type(fitter).__name__} has no model: it fits no bodies over time")
     known = SubjectShapes.empty(fingerprint(fitter.model)) if known is None else known
     if known.body != fingerprint(fitter.model):
         raise ValueError("shapes must be of the same body model as the fitter's")

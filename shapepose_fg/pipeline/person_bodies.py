@@ -1,36 +1,13 @@
 """One person's bodies over time: what they are fitted to, who fits them, and what comes out."""
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.body.fitting.body_sequence import SequenceFit, Shapes
-from shapepose_fg.body.fitting.fitter import BodyFitter, JointTargets
-from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.body.fitting.fitter import BodyFitter, JointTargets, Shapes
 from shapepose_fg.body.model.soles import above_floor
 from shapepose_fg.estimation.floor import Floor
-
-
-@runtime_checkable
-class SequenceFitting(BodyFitter, Protocol):
-    """A fitter that fits bodies over time."""
-
-    model: BodyModel
-    """The body that it fits."""
-
-    def fit_sequence(
-        self,
-        targets: JointTargets,
-        groups: NDArray[np.intp],
-        time_s: NDArray[np.float64],
-        shapes: Shapes | None = None,
-        *,
-        fixed_shapes: bool = False,
-    ) -> SequenceFit:
-        """One shape per group and poses linked over time; see `LearnedFitter.fit_sequence`."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -68,13 +45,13 @@ class Person:
         information = (information + information.swapaxes(-1, -2)) / 2
         return cls(number, JointTargets(np.where(solved[..., None], joints, 0.0), information), time_s)
 
-    def fitted(self, fitter: SequenceFitting) -> "PersonBodies":
+    def fitted(self, fitter: BodyFitter) -> "PersonBodies":
         """The bodies, and the shape that they share."""
         group = np.full(len(self.time_s), self.number)
         found = fitter.fit_sequence(self.targets, group, self.time_s, self.shapes, fixed_shapes=self.fixed_shapes)
         fit = found.fit if self.kept is None else found.fit.rows(np.arange(self.kept.start, self.kept.stop))
         bodies = fit.betas, fit.global_orient, fit.body_pose, fit.transl
-        if self.floor is not None:
+        if self.floor is not None and fitter.model is not None:
             bodies = above_floor(fitter.model, bodies, self.floor.normal, self.floor.height_m)
         return PersonBodies(fit.ok, *bodies, found.shapes)
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from shapepose_fg.body.fitting.fitter import BodyFitter
+from shapepose_fg.body.fitting.fitter import BodyFitter, check_fitter
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.fitting.weights import fingerprint
 from shapepose_fg.body.model.body_model import BodyModel
@@ -25,7 +25,6 @@ from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25, Skeleton
 from shapepose_fg.core.storage.kept_arrays import InMemory, KeptArrays
 from shapepose_fg.estimation.detector_offsets import (
-    AdjustableFitter,
     confident_targets,
     spread_frames,
 )
@@ -36,7 +35,7 @@ from shapepose_fg.pipeline.chunk_work import ChunkJob, solve_chunk
 from shapepose_fg.pipeline.cluster import Cluster
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.engine import Setup, find_people
-from shapepose_fg.pipeline.person_bodies import Person, PersonBodies, SequenceFitting
+from shapepose_fg.pipeline.person_bodies import Person, PersonBodies
 from shapepose_fg.pipeline.runs.assembly import Assembly
 from shapepose_fg.pipeline.runs.checkpoint import Checkpoint
 from shapepose_fg.pipeline.runs.chunks import Chunk, Identities, cut_in_chunks
@@ -84,7 +83,7 @@ def reconstruct(
     across the borders (`runs/chunks.py`); the result may differ by who was in hiding there. `run` of the result
     holds the configuration, versions, seconds per stage (over all processes), how many people were found and
     dropped, with reasons, and where the detector's joints lie on the body. That is learnt from frames spread over
-    the whole recording, whatever `frames` picks; a fitter of your own takes part if it is an `AdjustableFitter`.
+    the whole recording, whatever `frames` picks; a fitter of your own takes part if it has a `model`.
     """
     return reconstruct_parts(
         InMemory(),
@@ -145,9 +144,10 @@ def reconstruct_parts(
     with book.stage("load"):
         if fitter is None:
             fitter = make_fitter(config.body, BodyModel.default().with_keypoints(skeleton.joints))
+    check_fitter(fitter)
     with torch_threads(config.threads):
         offsets = _kept_offsets(kept, detections, rig, config, fitter, book)
-        if isinstance(fitter, AdjustableFitter) and offsets is not None:
+        if offsets is not None:
             fitter = fitter.with_keypoint_offsets(offsets)
         setup = Setup(rig, skeleton, config, fitter, extra_factors)
         parts = Parts(kept)
@@ -173,7 +173,7 @@ def reconstruct_parts(
                     cuts_s = (times.frame_s[list(cuts)] + times.frame_s[[cut - 1 for cut in cuts]]) / 2
                     result = replace(result, names=_names(parts, skeleton, config, cuts_s.tolist()))
             floor: Floor | str = "frames stand alone" if not config.temporal else "not sought"
-            if config.temporal and isinstance(fitter, SequenceFitting) and len(result) > 0:
+            if config.temporal and fitter.model is not None and len(result) > 0:
                 with book.stage("bodies over time"):
                     if config.motion.floor:
                         floor = floor_of(parts, skeleton.joints, fitter.model, rig.up_vector)
@@ -201,7 +201,7 @@ def estimate_offsets(
     rig: Rig,
     config: PipelineConfig | None = None,
     *,
-    fitter: AdjustableFitter | None = None,
+    fitter: BodyFitter | None = None,
 ) -> KeypointOffsets:
     """Where the detector of a recording puts its joints on the body, learnt without any truth.
 
@@ -399,10 +399,7 @@ def _pool(cluster: str | None, workers: int, setup: Setup, sharing: int) -> "Wor
 
 def _bodies(setup: Setup, person: Person) -> PersonBodies:
     """One person's bodies, in whatever process."""
-    fitter = setup.fitter
-    if not isinstance(fitter, SequenceFitting):
-        raise TypeError(f"{type(fitter).__name__} does not fit bodies over time")
-    return person.fitted(fitter)
+    return person.fitted(setup.fitter)
 
 
 def _kept_offsets(
@@ -434,10 +431,10 @@ def _offsets(
     source = config.offsets.source
     if source == "none":
         return None
-    if not isinstance(fitter, AdjustableFitter) or detections.skeleton != BODY_25:
+    if fitter.model is None or detections.skeleton != BODY_25:
         if source == "recording":
             return None
-        raise ValueError(f"offsets of {source} need a fitter with `with_keypoint_offsets` and joints of BODY_25")
+        raise ValueError(f"offsets of {source} need a fitter with a `model`, and joints of BODY_25")
     if source != "recording":
         return KeypointOffsets.load(source)
     with book.stage("offsets"):
@@ -448,7 +445,7 @@ def _offsets(
         if len(people) == 0:
             return KeypointOffsets.identity()
         targets = confident_targets(Observations.concatenate(people), rig, config.observations, config.offsets)
-        return learn_offsets(targets, fitter.model, config=config.body.plain, prior=config.offsets.prior)
+        return learn_offsets(targets, fitter.model, config=config.body, prior=config.offsets.prior)
 
 
 def _rows(solved: Solved, rig: Rig, detections: ThinnedFrames, config: PipelineConfig) -> Reconstruction:

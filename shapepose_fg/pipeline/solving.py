@@ -18,7 +18,6 @@ from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.floor import Floor
 from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.pipeline.bodies_over_time import with_bodies_over_time
-from shapepose_fg.pipeline.person_bodies import SequenceFitting
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.pipeline.solved_rows import result_rows
 from shapepose_fg.pipeline.windows import near_border, window_stop
@@ -44,7 +43,7 @@ def solve_rows(
         solved = result_rows(observations, estimates, part.observations.candidate, rig, names, part.person)
         parts.append(solved.rows(_inside(part.frame, window.own)))
     solved = replace(Reconstruction.concatenate(parts), run=rows.run) if parts else rows
-    if not isinstance(fitter, SequenceFitting):
+    if fitter.model is None:
         return solved
     return with_bodies_over_time(solved, fitter, floor=Floor.from_dict(rows.run.get("floor")))
 

@@ -1,13 +1,17 @@
-"""How a small change of each camera would move its pixels, and what of the residuals it explains.
+"""Bundle adjustment: what of the residuals small changes of the cameras explain, by GTSAM.
 
-The points are not known, so that what a change moves *along with the points* explains nothing: it is taken out
-before (the Schur complement of a bundle adjustment), joint by joint.
+The points are not known, so that what a change moves *along with the points* explains nothing: GTSAM eliminates
+them.
 """
 
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
+from gtsam.symbol_shorthand import C, K, P
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
+from scipy.spatial.transform import Rotation
 
 from shapepose_fg.core.camera import Views
 from shapepose_fg.setup_check.structure import Structure
@@ -19,6 +23,8 @@ PARAMETERS = ("turn x", "turn y", "turn z", "move x", "move y", "move z", "centr
 principal point (px), and the logarithm of the focal length."""
 Q = len(PARAMETERS)
 TURN, CENTRE, FOCAL, POSE = [0, 1, 2], [6, 7], [8], [0, 1, 2, 3, 4, 5]
+_WEAK = 1e-9
+"""The information that a point has without any view, as a part of what it has: two rays may be parallel."""
 
 
 @dataclass(frozen=True)
@@ -30,69 +36,61 @@ class Normal:
     g: Array
     """(V Q,)."""
 
-    def solve(self, columns: NDArray[np.intp], information: Array | float = 0.0) -> Array:
-        """The change (n,) of some parameters that lowers the squares most; `information` (n,) holds it at 0."""
-        H = self.H[np.ix_(columns, columns)] + np.diag(np.broadcast_to(information, len(columns)))
+    def solve(self, columns: NDArray[np.intp]) -> Array:
+        """The change (n,) of some parameters that lowers the squares most."""
+        H = self.H[np.ix_(columns, columns)]
         return np.asarray(-np.linalg.lstsq(H, self.g[columns], rcond=1e-10)[0], dtype=np.float64)
-
-
-def derivatives(structure: Structure, views: Views) -> Array:
-    """(P, J, V, 2, Q) how each camera's parameters move its projections."""
-    at = np.einsum("vab,pjb->pjva", views.cTw[:, :, :3], structure.points) + views.cTw[:, :, 3]
-    return camera_derivatives(at, views.K)
-
-
-def camera_derivatives(at: Array, K: Array) -> Array:
-    """(..., 2, Q) how a camera's parameters move the pixels of points `at` (..., 3) in its frame; NaN behind."""
-    fx, fy = K[..., 0, 0], K[..., 1, 1]
-    X, Y = at[..., 0], at[..., 1]
-    Z = np.where(at[..., 2] > 0, at[..., 2], np.nan)
-    x, y, zero = X / Z, Y / Z, np.zeros_like(X)
-    by_point = np.stack(
-        [np.stack([fx / Z, zero, -fx * x / Z], -1), np.stack([zero, fy / Z, -fy * y / Z], -1)], axis=-2
-    )
-    cross = np.zeros((*X.shape, 3, 3))  # d (w x P) / d w = -[P]x
-    cross[..., 0, 1], cross[..., 0, 2] = Z, -Y
-    cross[..., 1, 0], cross[..., 1, 2] = -Z, X
-    cross[..., 2, 0], cross[..., 2, 1] = Y, -X
-    centre = np.broadcast_to(np.eye(2), (*X.shape, 2, 2))
-    focal = np.stack([fx * x, fy * y], axis=-1)[..., None]
-    return np.concatenate([by_point @ cross, by_point, centre, focal], axis=-1)
 
 
 def normal_equations(structure: Structure, views: Views) -> Normal:
     """The normal equations at a structure that is triangulated (see `triangulate`), with its robust weights."""
     V = len(views)
-    B = derivatives(structure, views)
-    ok = (structure.weight > 0) & np.isfinite(structure.residual[..., 0]) & np.isfinite(B).all(axis=(-1, -2))
-    root = np.where(ok, np.sqrt(structure.weight), 0.0)[..., None]
-    P, J = ok.shape[:2]
-    A = (np.where(ok[..., None, None], structure.jacobian, 0.0) * root[..., None]).reshape(P, J, 2 * V, 3)
-    B = np.where(ok[..., None, None], B, 0.0) * root[..., None]
-    r = np.where(ok[..., None], structure.residual, 0.0) * root
-    At = A.swapaxes(-1, -2)
-    points = At @ A
-    points = points + (1e-9 * np.trace(points, axis1=-2, axis2=-1)[..., None, None] + 1e-300) * np.eye(3)
-    # A camera's rows have its own columns only.
-    coupling = (At.reshape(P, J, 3, V, 2).swapaxes(2, 3) @ B).swapaxes(2, 3).reshape(P, J, 3, V * Q)
-    pull = At @ r.reshape(P, J, 2 * V, 1)
-    solved = np.linalg.solve(points, np.concatenate([coupling, pull], axis=-1)).reshape(-1, V * Q + 1)
-    H = -(coupling.reshape(-1, V * Q).T @ solved[:, :-1])
-    g = -(coupling.reshape(-1, V * Q).T @ solved[:, -1])
-    for view in range(V):
-        block = slice(view * Q, view * Q + Q)
-        own = B[:, :, view].reshape(-1, Q)
-        H[block, block] += own.T @ own
-        g[block] += own.T @ r[:, :, view].ravel()
-    return Normal(H, g)
+    ok = (structure.weight > 0) & np.isfinite(structure.residual[..., 0]) & (structure.depth > 0)
+    used, graph, values = np.flatnonzero(ok.any(axis=-1)), gtsam.NonlinearFactorGraph(), gtsam.Values()
+    precision = gtsam.noiseModel.Isotropic.Precision
+    poses, lenses, points = ([name(index) for index in range(n)] for name, n in ((C, V), (K, V), (P, len(used))))
+    for pose, lens, M, cTw in zip(poses, lenses, views.K, views.cTw, strict=True):
+        R = cTw[:, :3]
+        values.insert(pose, gtsam.Pose3(gtsam.Rot3(R.T), -R.T @ cTw[:, 3]))
+        values.insert(lens, gtsam.Cal3_S2(M[0, 0], M[1, 1], M[0, 1], M[0, 2], M[1, 2]))
+        # Next to no information: cameras without people stay in the equations.
+        graph.add(gtsam.PriorFactorPose3(pose, values.atPose3(pose), precision(6, 1e-12)))
+        graph.add(gtsam.PriorFactorCal3_S2(lens, values.atCal3_S2(lens), precision(5, 1e-12)))
+    ok, weight = ok.reshape(-1, V)[used], structure.weight.reshape(-1, V)[used]
+    slope = np.square(structure.jacobian.reshape(-1, V, 6)[used]).sum(axis=-1)
+    weak = _WEAK * np.where(ok, weight * slope, 0.0).sum(axis=-1)
+    for point, xyz, least in zip(points, structure.points.reshape(-1, 3)[used], weak, strict=True):
+        values.insert(point, xyz)
+        graph.add(gtsam.PriorFactorPoint3(point, xyz, precision(3, least)))
+    row, view = np.nonzero(ok)
+    seen = zip(row.tolist(), view.tolist(), structure.xy.reshape(-1, V, 2)[used][ok], weight[ok], strict=True)
+    for n, v, xy, each in seen:
+        factor = gtsam.GeneralSFMFactor2Cal3_S2(xy, precision(2, each), poses[v], points[n], lenses[v])
+        graph.add(factor)
+    order, rest = gtsam.Ordering(), gtsam.Ordering()
+    for key in points:
+        order.push_back(key)
+    for pose, lens in zip(poses, lenses, strict=True):
+        rest.push_back(pose)
+        rest.push_back(lens)
+    _, cameras = graph.linearize(values).eliminatePartialMultifrontal(order)
+    H, eta = cameras.hessian(rest)
+    T: Array = np.asarray(block_diag(*map(_tangent, views.K)))
+    return Normal(T.T @ H @ T, -T.T @ eta)
+
+
+def _tangent(M: Array) -> Array:
+    """(11, Q) GTSAM's tangents of a camera's pose (world from camera) and calibration by `PARAMETERS`."""
+    tangent = np.zeros((11, Q))
+    tangent[:6, POSE] = -np.eye(6)
+    tangent[6:9, 8] = M[0, 0], M[1, 1], M[0, 1]
+    tangent[9:, CENTRE] = np.eye(2)
+    return tangent
 
 
 def changed(views: Views, change: Array) -> Views:
     """The cameras with `change` (V, Q) made to their parameters."""
-    from scipy.spatial.transform import Rotation
-
-    turn = Rotation.from_rotvec(change[:, 0:3]).as_matrix()
-    cTw = turn @ views.cTw
+    cTw = Rotation.from_rotvec(change[:, 0:3]).as_matrix() @ views.cTw
     cTw[:, :, 3] += change[:, 3:6]
     K = views.K.copy()
     K[:, :2, :2] *= np.exp(change[:, 8])[:, None, None]

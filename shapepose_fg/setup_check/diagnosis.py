@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import DetectionSequence
-from shapepose_fg.setup_check.changes import Change, Kind, lag_of
+from shapepose_fg.setup_check.changes import Change, Kind, gross_mistake, lag_of, lags, latest
 from shapepose_fg.setup_check.duplicates import Duplicate, duplicates
 from shapepose_fg.setup_check.evidence import Evidence, Look, Setup, gather
+from shapepose_fg.setup_check.lag import Lag
 from shapepose_fg.setup_check.people import Build, build_of
-from shapepose_fg.setup_check.search import Lag, gross_mistake, lags, latest
 from shapepose_fg.setup_check.small import SHIFT, SmallErrors, other_pose, small_errors, with_small_errors
 
 Array = NDArray[np.float64]
@@ -43,7 +43,7 @@ _SINGLE = 0.7
 _TURN_DEG = 0.6
 """Less is said of the principal point: of a calibration, and not of a camera that was knocked."""
 _NOBODY = 0.05
-"""With fewer people than this for each sighting, cameras see nobody in common."""
+"""With fewer people than this for each sighting, cameras see no people in common."""
 _LAG_ROUNDS, _LAG_NEAR = 6, 8
 _PLAIN_TURN_DEG = 3.0
 """A camera that is turned by more is called turned, wherever it is."""
@@ -142,7 +142,7 @@ def _twice(look: Look, rig: Rig) -> tuple[list[Finding], Evidence]:
 
 
 def _blind(look: Look) -> list[Finding]:
-    """Cameras that see nobody, where others do; or that nobody sees anybody."""
+    """Cameras without people, where others have some; or that no camera sees any."""
     seen = np.bincount(look.sightings.view, minlength=look.view_count)
     if seen.sum() == 0:
         return _nobody(look)
@@ -151,7 +151,7 @@ def _blind(look: Look) -> list[Finding]:
 
 
 def _nobody(look: Look) -> list[Finding]:
-    """Nobody who could be placed."""
+    """No person could be placed."""
     return [Finding(Kind.NOBODY, (), amount=float(len(look.sightings)))]
 
 
@@ -200,7 +200,7 @@ def _small_findings(look: Look, small: SmallErrors, known: set[int]) -> list[Fin
     off = np.flatnonzero(turned | focal)
     if len(off) == 0:
         return []
-    # Three cameras cannot tell which of their small errors are whose.
+    # Three cameras cannot tell which of their small errors belong to which.
     if len(off) == 1 and look.cameras_used > 3:
         view = int(off[0])
         if view in known:

@@ -148,7 +148,7 @@ class Look:
         return groups, triangulate(*observed(groups, self.sightings), self.setup.views, steps)
 
     def others(self, *without: int) -> Others:
-        """The people whom all cameras but these see."""
+        """The people that all cameras but these see."""
         if without not in self._others:
             groups, structure = self.structure(without, steps=2)
             self._others[without] = Others(groups.frame, structure.points)
@@ -156,7 +156,7 @@ class Look:
 
     @cached_property
     def scores(self) -> Array:
-        """(V,) how well each camera fits the people whom the others see (`Match.score`)."""
+        """(V,) how well each camera fits the people that the others see (`Match.score`)."""
         views = range(self.view_count)
         if self.cameras_used < 3:
             return np.full(self.view_count, self._pair_score)

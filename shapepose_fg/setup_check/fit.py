@@ -1,13 +1,16 @@
 """How well one camera fits the people that the others see, and which change of it would fit them."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 
-from shapepose_fg.setup_check.matching import GATE, distances
+from shapepose_fg.core.camera import Views
+from shapepose_fg.setup_check.adjustment import Q, changed
+from shapepose_fg.setup_check.matching import GATE, distances, same_frame
 from shapepose_fg.setup_check.sightings import MIN_JOINTS, Sightings
 
 Array = NDArray[np.float64]
@@ -20,12 +23,12 @@ _ROUNDS = 6
 _WIDTH = 0.03
 """Width of the Cauchy kernel, as a part of a person's size in the picture."""
 _STEPS = 4
-"""Gauss-Newton steps between matchings."""
+"""Steps between matchings."""
 
 
 @dataclass(frozen=True)
 class Others:
-    """The people whom all cameras but some see."""
+    """The people that all cameras but some see."""
 
     frame: Index
     """(P,) frame of each person."""
@@ -85,8 +88,6 @@ def possible_matches(first: Index, second: Index) -> int:
 
 def tries(others: Others, seen: Sightings, rng: np.random.Generator) -> Iterator[tuple[Array, Array]]:
     """Joints in the world (N, 3) and in the picture (N, 2) of people and sightings that may be one another."""
-    from shapepose_fg.setup_check.matching import same_frame
-
     person, sighting = same_frame(others.frame, seen.frame)
     both = ~np.isnan(others.points[person][..., 0]) & ~np.isnan(seen.xy[sighting][..., 0])
     enough = np.flatnonzero(both.sum(axis=1) >= MIN_JOINTS + 3)
@@ -121,25 +122,24 @@ def posed_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
 
 def zoomed_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
     """The camera with the focal length by which it sees `points` (N, 3) at `xy` (N, 2)."""
-    at = _ahead(points, camera)
-    if at is None:
-        return None
-    direction, offset = (at - camera.K[:2, 2]), xy - camera.K[:2, 2]
-    factor = float((direction * offset).sum() / (direction**2).sum())
-    if not 0.1 < factor < 10:
-        return None
-    return Pinhole(scaled_focal(camera.K, factor), camera.cTw)
+    return _scaled_to(points, xy, camera, camera.K[:2, 2], scaled_focal)
 
 
 def resized_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
     """The camera of pictures that are larger or smaller, in which `points` (N, 3) lie at `xy` (N, 2)."""
-    at = _ahead(points, camera)
-    if at is None:
+    return _scaled_to(points, xy, camera, np.zeros(2), scaled_picture)
+
+
+def _scaled_to(
+    points: Array, xy: Array, camera: Pinhole, centre: Array, scaled: Callable[[Array, float], Array]
+) -> Pinhole | None:
+    """The camera with its K `scaled` by how much farther from `centre` than it says the points are seen."""
+    at = (points @ camera.cTw[:, :3].T + camera.cTw[:, 3]) @ camera.K.T
+    if not (at[:, 2] > 0).all():
         return None
-    factor = float((at * xy).sum() / (at**2).sum())
-    if not 0.1 < factor < 10:
-        return None
-    return Pinhole(scaled_picture(camera.K, factor), camera.cTw)
+    direction = at[:, :2] / at[:, 2:] - centre
+    factor = float((direction * (xy - centre)).sum() / (direction**2).sum())
+    return Pinhole(scaled(camera.K, factor), camera.cTw) if 0.1 < factor < 10 else None
 
 
 def scaled_focal(K: Array, factor: float) -> Array:
@@ -157,12 +157,6 @@ def scaled_picture(K: Array, factor: float) -> Array:
     return new
 
 
-def _ahead(points: Array, camera: Pinhole) -> Array | None:
-    """Pixels (N, 2) of points, if all are before the camera."""
-    at = (points @ camera.cTw[:, :3].T + camera.cTw[:, 3]) @ camera.K.T
-    return at[:, :2] / at[:, 2:] if (at[:, 2] > 0).all() else None
-
-
 def refined(others: Others, seen: Sightings, camera: Pinhole, columns: tuple[int, ...]) -> Pinhole:
     """The camera, some of its parameters (`adjustment.PARAMETERS`) fitted to the people that it matches."""
     for _ in range(_ROUNDS):
@@ -177,25 +171,25 @@ def refined(others: Others, seen: Sightings, camera: Pinhole, columns: tuple[int
 
 
 def _solved(points: Array, xy: Array, width_px: Array, camera: Pinhole, columns: list[int]) -> Pinhole:
-    """Robust Gauss-Newton on points (N, 3) seen at xy (N, 2)."""
-    from shapepose_fg.core.camera import Views
-    from shapepose_fg.setup_check.adjustment import Q, camera_derivatives, changed
+    """The camera, fitted robustly (Cauchy) to points (N, 3) seen at xy (N, 2)."""
+    ahead = points @ camera.cTw[2, :3] + camera.cTw[2, 3] > 0
+    if ahead.sum() < 4:
+        return camera
+    points, xy, width_px = points[ahead], xy[ahead], width_px[ahead, None]
 
-    for _ in range(_STEPS):
-        at = points @ camera.cTw[:, :3].T + camera.cTw[:, 3]
-        ahead = at[:, 2] > 0
-        if ahead.sum() < 4:
-            return camera
-        pixels = (at[ahead] @ camera.K.T)[:, :2] / at[ahead][:, 2:]
-        r = pixels - xy[ahead]
-        B = camera_derivatives(at[ahead], camera.K)[..., columns]
-        w = 1 / (width_px[ahead] ** 2 + (r**2).sum(axis=1))
-        H = np.einsum("n,nai,naj->ij", w, B, B)
-        step = np.zeros((1, Q))
-        step[0, columns] = -np.linalg.lstsq(H, np.einsum("n,nai,na->i", w, B, r), rcond=1e-10)[0]
-        new = changed(Views(camera.K[None], camera.cTw[None]), step)
-        camera = Pinhole(new.K[0], new.cTw[0])
-    return camera
+    def moved(step: Array) -> Pinhole:
+        change = np.zeros((1, Q))
+        change[0, columns] = step
+        new = changed(Views(camera.K[None], camera.cTw[None]), change)
+        return Pinhole(new.K[0], new.cTw[0])
+
+    def errors(step: Array) -> Array:
+        new = moved(step)
+        at = (points @ new.cTw[:, :3].T + new.cTw[:, 3]) @ new.K.T
+        return ((at[:, :2] / np.maximum(at[:, 2:], 1e-9) - xy) / width_px).ravel()
+
+    start = np.zeros(len(columns))
+    return moved(least_squares(errors, start, x_scale="jac", loss="cauchy", max_nfev=_STEPS).x)
 
 
 def difference(cTw: Array, other: Array) -> tuple[float, float]:

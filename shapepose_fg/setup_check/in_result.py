@@ -11,12 +11,12 @@ from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.setup_check.camera_use import CameraUse, camera_use
 from shapepose_fg.setup_check.changes import Kind
-from shapepose_fg.setup_check.report import SetupReport
+from shapepose_fg.setup_check.report import SetupReport, rounded
 
 _MOST_BETA = 5.0
-"""A shape component so many standard deviations from the mean is nobody's."""
+"""A shape component so many standard deviations from the mean is no person's."""
 _SHARE = 0.1
-"""Of so many rows: fewer are single people whom nearly nobody saw."""
+"""Of so many rows: fewer are single people that hardly any camera saw."""
 _WORST = 2.0
 """A camera whose joints are so many times as far from the others' as is usual is said, if nothing else is."""
 _FAR_MM = 60.0
@@ -37,7 +37,7 @@ class ResultCheck:
         """What run.json holds: `setup` and `cameras`."""
         return {
             "setup": {**self.report.as_dict(), "warnings": list(self.warnings)},
-            "cameras": [_rounded(asdict(each)) for each in self.cameras],
+            "cameras": [rounded(asdict(each)) for each in self.cameras],
         }
 
 
@@ -61,7 +61,7 @@ def result_check(
 
 
 def _shapes(people: Reconstruction) -> list[str]:
-    """Bodies of a shape that nobody has."""
+    """Bodies of a shape that no person has."""
     there = np.isfinite(people.betas).all(axis=1)
     largest = np.abs(people.betas[there]).max(axis=1, initial=0.0)
     far = largest > _MOST_BETA
@@ -86,10 +86,3 @@ def _outlier(uses: Sequence[CameraUse]) -> list[str]:
         f"{uses[worst].camera} is {lengths[worst]:.0f} mm from where the other cameras put its joints (median),"
         f" they are {usual:.0f} mm from each other; look at its calibration and its pictures"
     ]
-
-
-def _rounded(value: Any) -> Any:
-    """Floats with four digits, in all objects within."""
-    if isinstance(value, dict):
-        return {key: _rounded(each) for key, each in value.items()}
-    return float(f"{value:.4g}") if isinstance(value, float) else value

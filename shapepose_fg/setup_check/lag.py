@@ -32,7 +32,7 @@ class Lag:
     """By how much the joints' errors fall, as a part of the people's size: mean over all joints."""
     agreement: float
     """The same, over how far the joints move within the offset: near 1 if it is the offset, near -1 if there is
-    none, 0 where nobody moves. Of the half of the frames in which it is less: an offset is in both halves, while
+    none, 0 without motion. Of the half of the frames in which it is less: an offset is in both halves, while
     in one of them people may come by chance to where they were."""
 
 

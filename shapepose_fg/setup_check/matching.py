@@ -20,7 +20,7 @@ GATE = 0.15
 """Two sightings whose joints miss each other by more than this part of the person's size are not one person: a
 detector errs by 3 cm of 170, and a calibration that is worth naming by three times that (docs/setup_checks.md)."""
 _MIN_ANGLE = np.deg2rad(4.0)
-"""Least angle between two rays of a pair that places somebody: below it depth is guessed."""
+"""Least angle between two rays of a pair that places a person: below it depth is guessed."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def _meeting(sightings: Sightings, views: Views, first: Index, second: Index) ->
 
 
 def _others(sightings: Sightings, views: Views, members: Index, points: Array) -> tuple[Index, Array]:
-    """For pairs that place somebody at `points` (M, J, 3), who else saw them: see `Pairs`."""
+    """For pairs that place a person at `points` (M, J, 3), who else saw them: see `Pairs`."""
     frame = sightings.frame[members[:, 0]] if len(members) > 0 else np.zeros(0, np.intp)
     third = np.full((len(members), len(views)), -1, dtype=np.intp)
     third_error = np.full(third.shape, np.inf)
@@ -179,7 +179,7 @@ def group(pairs: Pairs, count: int, views: tuple[int, ...]) -> Groups:
     """
     allowed = np.zeros(pairs.third.shape[1], dtype=bool)
     allowed[list(views)] = True
-    free = np.ones(count + 1, dtype=bool)  # the last stands for "nobody"
+    free = np.ones(count + 1, dtype=bool)  # the last stands for no sighting
     free[count] = False
     V = len(allowed)
     live = np.flatnonzero(allowed[pairs.views].all(axis=1))

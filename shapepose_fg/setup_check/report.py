@@ -1,13 +1,64 @@
 """The check of a set-up as one value: what is wrong in words, and the figures; for run.json and the terminal."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from itertools import combinations
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.setup_check.diagnosis import Diagnosis, Finding, diagnose
-from shapepose_fg.setup_check.figures import CameraFigures, PairFigures, camera_figures, pair_figures, plain
+from shapepose_fg.setup_check.evidence import Look
+from shapepose_fg.setup_check.fit import match, possible_matches
+from shapepose_fg.setup_check.lag import is_offset
+from shapepose_fg.setup_check.matching import GATE, errors_of, group, residuals
 from shapepose_fg.setup_check.words import sentence
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class CameraFigures:
+    """How one camera fits the others. Lengths are at the joints' depth."""
+
+    camera: str
+    """Its name."""
+    people: int
+    """People that it saw in the frames that were looked at."""
+    matched: float
+    """Share of them that another camera sees too."""
+    median_px: float | None
+    """Median distance of a projected joint to its detection, all that were matched, pixels."""
+    high_px: float | None
+    """Nine of ten are nearer."""
+    median_mm: float | None
+    """The same median as a length."""
+    high_mm: float | None
+    """Nine of ten are nearer."""
+    left_out_px: float | None
+    """Median distance to where the other cameras alone put the joint, pixels."""
+    left_out_mm: float | None
+    """The same as a length."""
+    left_out_matched: float
+    """Share of the people seen by the others that the camera could match and does match."""
+    late_frames: int
+    """Frames by which it is late against the others; negative: early."""
+
+
+@dataclass(frozen=True)
+class PairFigures:
+    """How two cameras fit each other."""
+
+    first: str
+    second: str
+    """Their names."""
+    matched: float | None
+    """Share of the people that both could see who fit; None where they never see anybody at once."""
+    miss_px: float | None
+    """Median distance by which the rays to one joint miss each other, pixels of the first camera's picture."""
 
 
 @dataclass(frozen=True)
@@ -25,22 +76,18 @@ class SetupReport:
     frames: int
     """Frames that were looked at."""
     stature_m: float | None
-    """How tall the people come out, median; None where nobody does."""
+    """How tall the people come out, median; None without people."""
 
     def as_dict(self) -> dict[str, Any]:
         """What run.json holds under `setup`."""
-        findings = [
-            {
-                "kind": str(each.kind),
-                "cameras": [self.cameras[view].camera for view in each.cameras],
-                "says": words,
-            }
-            for each, words in zip(self.findings, self.warnings, strict=True)
-        ]
+        names = [each.camera for each in self.cameras]
         return {
-            "findings": findings,
-            "cameras": plain(self.cameras),
-            "pairs": plain(self.pairs),
+            "findings": [
+                {"kind": str(each.kind), "cameras": [names[view] for view in each.cameras], "says": words}
+                for each, words in zip(self.findings, self.warnings, strict=True)
+            ],
+            "cameras": [rounded(asdict(each)) for each in self.cameras],
+            "pairs": [rounded(asdict(each)) for each in self.pairs],
             "frames_looked_at": self.frames,
             "stature_m": None if self.stature_m is None else round(self.stature_m, 4),
         }
@@ -66,3 +113,66 @@ def report_of(diagnosis: Diagnosis, rig: Rig, more: tuple[Finding, ...] = ()) ->
         len(diagnosis.look.evidence.anchors),
         build.stature if build is not None and build.count > 0 else None,
     )
+
+
+def camera_figures(diagnosis: Diagnosis, rig: Rig) -> tuple[CameraFigures, ...]:
+    """One entry for every camera."""
+    look = diagnosis.look
+    groups, structure = look.structure(steps=5)
+    px = np.linalg.norm(structure.residual, axis=-1)
+    mm = 1e3 * px * structure.depth / look.setup.views.focal_px
+    seen = np.bincount(look.sightings.view, minlength=len(rig))
+    left = [lag.frames if is_offset(lag) else 0 for lag in diagnosis.lags] or [0] * len(rig)
+    found = []
+    for view, name in enumerate(rig.names):
+        others, mine, camera = look.others(view), look.seen_by(view), look.setup.camera(view)
+        matched = match(others, mine, camera)
+        points = others.points[matched.person]
+        out_px = np.linalg.norm(residuals(points, mine.xy[matched.sighting], camera.K, camera.cTw), axis=-1)
+        depth = (points @ camera.cTw[:, :3].T + camera.cTw[:, 3])[..., 2]
+        out_mm = 1e3 * np.where(np.isfinite(out_px), out_px, np.nan) * depth / look.setup.views.focal_px[view]
+        figures = CameraFigures(
+            name,
+            int(seen[view]),
+            float((groups.member[:, view] >= 0).sum() / max(seen[view], 1)),
+            _quantile(px[..., view], 0.5),
+            _quantile(px[..., view], 0.9),
+            _quantile(mm[..., view], 0.5),
+            _quantile(mm[..., view], 0.9),
+            _quantile(out_px, 0.5),
+            _quantile(out_mm, 0.5),
+            float(len(matched.person) / max(matched.possible, 1)),
+            int(diagnosis.corrected.setup.lag[view]) + left[view],  # what was found, and what remains
+        )
+        found.append(figures)
+    return tuple(found)
+
+
+def pair_figures(look: Look, names: Sequence[str]) -> tuple[PairFigures, ...]:
+    """One entry for every pair of cameras."""
+    return tuple(_pair_figures(look, names, a, b) for a, b in combinations(range(len(names)), 2))
+
+
+def _pair_figures(look: Look, names: Sequence[str], first: int, second: int) -> PairFigures:
+    groups = group(look.pairs, len(look.sightings), (first, second))
+    seen = look.sightings
+    possible = possible_matches(*(seen.frame[seen.view == view] for view in (first, second)))
+    if possible == 0:
+        return PairFigures(names[first], names[second], None, None)
+    error = errors_of(look.pairs, groups, first, second)
+    miss = error * seen.size_px[groups.member[:, first]]
+    return PairFigures(
+        names[first], names[second], float((error < GATE / 2).sum() / possible), _quantile(miss, 0.5)
+    )
+
+
+def _quantile(values: Array, part: float) -> float | None:
+    values = values[np.isfinite(values)]
+    return float(np.quantile(values, part)) if len(values) > 0 else None
+
+
+def rounded(value: Any) -> Any:
+    """Floats with four digits, which are enough for run.json, in all objects within."""
+    if isinstance(value, dict):
+        return {key: rounded(each) for key, each in value.items()}
+    return float(f"{value:.4g}") if isinstance(value, float) else value

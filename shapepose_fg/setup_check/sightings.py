@@ -15,9 +15,9 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 MIN_JOINTS = 5
-"""A person of whom a camera sees fewer of the core joints says too little about the camera."""
+"""A person with fewer core joints in view says too little about the camera."""
 _STATURE_PER_SPREAD = 3.4
-"""Stature of somebody who stands over the root of the joints' summed variances: 1 / 0.29 if spread evenly."""
+"""Stature of a standing person over the root of the joints' summed variances: 1 / 0.29 if spread evenly."""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,8 @@
 """Small errors of cameras: principal points, a turn, a focal length; as few of them as explain the residuals."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,8 +49,6 @@ class SmallErrors:
     """(V,) the same of the roll."""
     focal_sigma: Array
     """(V,) the same of the focal length, as a part of it."""
-    median_px: tuple[Array, Array]
-    """(V,) median residual before and after, pixels."""
     cost: float
     """What remains of the robust cost of all residuals, as a part of what it was."""
     pose_gain: float
@@ -65,49 +65,71 @@ class OtherPose:
     """By how much it is turned."""
     moved: float
     """How far it is moved, the calibration's unit."""
-    views: Views
-    """The cameras after the change."""
     cost: float
     """What remains of the robust cost of all residuals, as a part of what it was."""
 
 
+@dataclass(frozen=True)
+class _Problem:
+    """The residuals of a recording, to be explained by changes of its cameras."""
+
+    seen: tuple[Array, Array, Array]
+    """See `observed`."""
+    views: Views
+    """The cameras before."""
+    structure: Structure
+    """The people before."""
+    normal: Normal
+    """The normal equations there."""
+
+    @classmethod
+    def of(cls, look: Look) -> "_Problem":
+        """Of people spread over the frames."""
+        groups, views = look.groups(), look.setup.views
+        step = max(1, -(-len(groups) // _MOST_PEOPLE))
+        seen = observed(Groups(groups.frame[::step], groups.member[::step]), look.sightings)
+        structure = triangulate(*seen, views, 5)
+        return cls(seen, views, structure, normal_equations(structure, views))
+
+    def solved(self, step: Callable[[Normal, Structure, Array], Array]) -> tuple[Views, Array, float]:
+        """Cameras after some steps (V Q,), the steps' sum (V, Q), and the part of the robust cost that remains.
+
+        `step` is told the normal equations, the people, and the sum so far.
+        """
+        views, structure, total = self.views, self.structure, np.zeros(len(self.views) * Q)
+        for number in range(_ROUNDS):
+            normal = self.normal if number == 0 else normal_equations(structure, views)
+            change = step(normal, structure, total)
+            total = total + change
+            views = changed(views, change.reshape(-1, Q))
+            structure = triangulate(*self.seen, views, 4)
+        return views, total.reshape(-1, Q), _cost(structure) / max(_cost(self.structure), 1e-12)
+
+    @property
+    def pose_gains(self) -> Array:
+        """(V,) by how much another pose of each camera lowers the weighted squares, at least the robust cost."""
+        blocks = [np.array(POSE) + Q * view for view in range(len(self.views))]
+        return np.array([-self.normal.g[block] @ self.normal.solve(block) for block in blocks])
+
+
 def small_errors(look: Look, parts: Parts = ALL) -> SmallErrors:
     """What small errors of the cameras the residuals look like, with a sparse prior."""
-    views, seen = look.setup.views, _seen(look)
-    total = np.zeros(len(views) * Q)
-    structure = first = triangulate(*seen, views, 5)
-    normal = normal_equations(structure, views)
-    roll_sigma, shift_sigma, focal_sigma = _sigmas(normal, len(views))
-    pose_gain = float(_pose_gains(normal, len(views)).max() / max(_cost(first), 1e-12))
-    for number in range(_ROUNDS):
-        normal = normal if number == 0 else normal_equations(structure, views)
-        step_taken = _sparse_step(normal, structure, total, parts)
-        total = total + step_taken
-        views = changed(views, step_taken.reshape(-1, Q))
-        structure = triangulate(*seen, views, 4)
-    change = total.reshape(-1, Q)
-    cost = _cost(structure) / max(_cost(first), 1e-12)
-    medians = (_median_px(first), _median_px(structure))
-    shift, roll = np.rad2deg(np.hypot(*change[:, CENTRE].T) / views.focal_px), np.rad2deg(change[:, 2])
+    problem = _Problem.of(look)
+    roll_sigma, shift_sigma, focal_sigma = _sigmas(problem.normal, len(problem.views))
+    pose_gain = float(problem.pose_gains.max() / max(_cost(problem.structure), 1e-12))
+    views, change, cost = problem.solved(partial(_sparse_step, parts=parts))
     return SmallErrors(
-        change[:, CENTRE],
-        roll,
-        np.exp(change[:, 8]),
-        views,
-        shift,
-        np.rad2deg(shift_sigma / views.focal_px),
-        np.rad2deg(roll_sigma),
-        focal_sigma,
-        medians,
-        cost,
-        pose_gain,
+        centre_px=change[:, CENTRE],
+        roll_deg=np.rad2deg(change[:, 2]),
+        focal=np.exp(change[:, 8]),
+        views=views,
+        shift_deg=np.rad2deg(np.hypot(*change[:, CENTRE].T) / views.focal_px),
+        shift_sigma_deg=np.rad2deg(shift_sigma / views.focal_px),
+        roll_sigma_deg=np.rad2deg(roll_sigma),
+        focal_sigma=focal_sigma,
+        cost=cost,
+        pose_gain=pose_gain,
     )
-
-
-def _pose_gains(normal: Normal, views: int) -> Array:
-    """(V,) by how much another pose of each camera lowers the weighted squares: the robust cost falls by more."""
-    blocks = [np.array(POSE) + Q * view for view in range(views)]
-    return np.array([-normal.g[block] @ normal.solve(block) for block in blocks])
 
 
 def _sigmas(normal: Normal, views: int) -> tuple[Array, Array, Array]:
@@ -121,27 +143,17 @@ def _sigmas(normal: Normal, views: int) -> tuple[Array, Array, Array]:
 
 def other_pose(look: Look) -> OtherPose:
     """The one camera whose pose, changed, explains most of the residuals."""
-    views, seen = look.setup.views, _seen(look)
-    structure = first = triangulate(*seen, views, 5)
-    normal = normal_equations(structure, views)
-    view = int(np.argmax(_pose_gains(normal, len(views))))
+    problem = _Problem.of(look)
+    view = int(np.argmax(problem.pose_gains))
     columns = np.array(POSE) + Q * view
-    for number in range(_ROUNDS):
-        normal = normal if number == 0 else normal_equations(structure, views)
-        step = np.zeros(len(views) * Q)
-        step[columns] = normal.solve(columns)
-        views = changed(views, step.reshape(-1, Q))
-        structure = triangulate(*seen, views, 4)
-    given = look.setup.views
-    turned, moved = difference(given.cTw[view], views.cTw[view])
-    return OtherPose(view, turned, moved, views, _cost(structure) / max(_cost(first), 1e-12))
 
+    def step(normal: Normal, structure: Structure, total: Array) -> Array:
+        change = np.zeros_like(total)
+        change[columns] = normal.solve(columns)
+        return change
 
-def _seen(look: Look) -> tuple[Array, Array, Array]:
-    """What is observed of people, spread over the frames."""
-    groups = look.groups()
-    step = max(1, len(groups) // _MOST_PEOPLE)
-    return observed(Groups(groups.frame[::step], groups.member[::step]), look.sightings)
+    views, _, cost = problem.solved(step)
+    return OtherPose(view, *difference(problem.views.cTw[view], views.cTw[view]), cost)
 
 
 def _sparse_step(normal: Normal, structure: Structure, total: Array, parts: Parts) -> Array:
@@ -172,13 +184,6 @@ def _cost(structure: Structure) -> float:
     square = (structure.residual**2).sum(axis=-1) / scale
     seen = (structure.weight > 0) & np.isfinite(square)
     return float(np.log1p(square[seen]).sum())
-
-
-def _median_px(structure: Structure) -> Array:
-    """(V,) median distance of projections to detections; NaN for a camera that sees nobody."""
-    distance = np.linalg.norm(structure.residual, axis=-1)
-    distance = np.where(np.isfinite(distance), distance, np.nan)
-    return np.array([np.nan if np.isnan(d).all() else np.nanmedian(d) for d in np.moveaxis(distance, 2, 0)])
 
 
 def with_small_errors(look: Look, found: SmallErrors) -> Look:

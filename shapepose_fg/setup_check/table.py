@@ -1,4 +1,4 @@
-"""The check of a set-up on a terminal: sentences, a row for each camera, and who agrees with whom."""
+"""The check of a set-up on a terminal: sentences, a row for each camera, and how pairs of cameras agree."""
 
 from collections.abc import Sequence
 
@@ -8,8 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from shapepose_fg.setup_check.camera_use import short
-from shapepose_fg.setup_check.figures import CameraFigures, PairFigures
-from shapepose_fg.setup_check.report import SetupReport
+from shapepose_fg.setup_check.report import CameraFigures, PairFigures, SetupReport
 
 
 def setup_report(report: SetupReport) -> RenderableType:
@@ -58,7 +57,7 @@ def _cameras(cameras: Sequence[CameraFigures]) -> RenderableType:
 
 
 def _pairs(cameras: Sequence[CameraFigures], pairs: Sequence[PairFigures]) -> RenderableType:
-    """Who agrees with whom: the share of the people that both see who fit."""
+    """How pairs of cameras agree: the share of the people that both see who fit."""
     of = {(pair.first, pair.second): pair for pair in pairs}
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
     table.add_column("agree")

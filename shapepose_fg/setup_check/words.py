@@ -15,19 +15,37 @@ _UNITS = ((1e-3, "m, and was read as mm"), (1e-2, "m, and was read as cm"), (1e-
 
 def sentence(finding: Finding, rig: Rig) -> str:
     """What was found, as it is printed."""
-    words = _WORDS[finding.kind](finding, rig)
+    who = _names(finding, rig)
+    if finding.kind in _SAID:
+        words = _SAID[finding.kind].format(who=who)
+    else:
+        words = _MADE[finding.kind](finding, rig, who)
     return words if words.startswith(rig.names) else f"{words[0].upper()}{words[1:]}"
+
+
+_SAID = {
+    Kind.EXCHANGED: "{who} look exchanged: each sees what the other should see; exchange their names in the"
+    " calibration, or their detections",
+    Kind.INVERTED: "the extrinsics of {who} look inverted: camera from world was taken for world from camera, or"
+    " the other way round; write the inverse",
+    Kind.TRANSPOSED: "the rotation of {who} looks transposed, with the translation as it is; transpose it",
+    Kind.AXES: "the camera axes of {who} look like those of OpenGL or Blender, y up and z backwards; turn y and z"
+    " round",
+    Kind.UNFIT: "{who} fits the others in nothing that was tried; check that its calibration and its detections"
+    " are its own",
+}
+"""What is said whatever the amount."""
 
 
 def _names(finding: Finding, rig: Rig) -> str:
     names = [rig.names[view] for view in finding.cameras]
     if len(names) == len(rig) > 2:
         return "all cameras"
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+    return " and ".join(part for part in (", ".join(names[:-1]), *names[-1:]) if part)
 
 
-def _turned(finding: Finding, rig: Rig) -> str:
-    who, size = _names(finding, rig), rig.cameras[finding.cameras[0]].image_size
+def _turned(finding: Finding, rig: Rig, who: str) -> str:
+    size = rig.cameras[finding.cameras[0]].image_size
     degrees = f"{finding.amount:.1f}" if finding.amount < 10 else f"{finding.amount:.0f}"
     moved = f" and moved by {_length(finding.moved)}" if finding.moved > 0.1 else ""
     if len(finding.shift_px) == 0:
@@ -41,15 +59,15 @@ def _turned(finding: Finding, rig: Rig) -> str:
     )
 
 
-def _moved(finding: Finding, rig: Rig) -> str:
+def _moved(finding: Finding, rig: Rig, who: str) -> str:
     return (
-        f"{_names(finding, rig)} looks moved by about {_length(finding.moved)} and turned by {finding.amount:.1f}"
+        f"{who} looks moved by about {_length(finding.moved)} and turned by {finding.amount:.1f}"
         " degrees; calibrate its pose again"
     )
 
 
-def _late(finding: Finding, rig: Rig) -> str:
-    who, frames = _names(finding, rig), abs(round(finding.amount))
+def _late(finding: Finding, rig: Rig, who: str) -> str:
+    frames = abs(round(finding.amount))
     count = f"{frames} frame{'s' if frames != 1 else ''}"
     if finding.amount > 0:
         return (
@@ -62,50 +80,25 @@ def _late(finding: Finding, rig: Rig) -> str:
     )
 
 
-def _exchanged(finding: Finding, rig: Rig) -> str:
-    return (
-        f"{_names(finding, rig)} look exchanged: each sees what the other should see; exchange their names in the"
-        " calibration, or their detections"
-    )
-
-
-def _inverted(finding: Finding, rig: Rig) -> str:
-    return (
-        f"the extrinsics of {_names(finding, rig)} look inverted: camera from world was taken for world from"
-        " camera, or the other way round; write the inverse"
-    )
-
-
-def _transposed(finding: Finding, rig: Rig) -> str:
-    return f"the rotation of {_names(finding, rig)} looks transposed, with the translation as it is; transpose it"
-
-
-def _axes(finding: Finding, rig: Rig) -> str:
-    return (
-        f"the camera axes of {_names(finding, rig)} look like those of OpenGL or Blender, y up and z backwards;"
-        " turn y and z round"
-    )
-
-
-def _focal(finding: Finding, rig: Rig) -> str:
+def _focal(finding: Finding, rig: Rig, who: str) -> str:
     what, factor = "long" if finding.amount > 1 else "short", finding.amount
-    who = f"{_names(finding, rig)} has a focal length in the calibration that looks"
+    who = f"{who} has a focal length in the calibration that looks"
     if 0.8 < factor < 1.25:
         return f"{who} {100 * abs(factor - 1):.0f} % too {what}; check its intrinsics"
     return f"{who} {factor:.2g} times what fits, too {what}; check its intrinsics and the size of its pictures"
 
 
-def _resized(finding: Finding, rig: Rig) -> str:
+def _resized(finding: Finding, rig: Rig, who: str) -> str:
     width, height = rig.cameras[finding.cameras[0]].image_size
     small = f"{width * finding.amount:.0f} x {height * finding.amount:.0f}"
     return (
-        f"the detections of {_names(finding, rig)} look as if they were made on pictures {finding.amount:.2g}"
+        f"the detections of {who} look as if they were made on pictures {finding.amount:.2g}"
         f" times the calibrated size ({small} instead of {width} x {height}); give detections on pictures of the"
         " calibrated size, or the calibration of these"
     )
 
 
-def _principal_point(finding: Finding, rig: Rig) -> str:
+def _principal_point(finding: Finding, rig: Rig, who: str) -> str:
     by = ", ".join(
         f"{_shift(x, y)} in {rig.names[view]}"
         for view, (x, y) in zip(finding.cameras, finding.shift_px, strict=True)
@@ -116,7 +109,7 @@ def _principal_point(finding: Finding, rig: Rig) -> str:
     )
 
 
-def _duplicate(finding: Finding, rig: Rig) -> str:
+def _duplicate(finding: Finding, rig: Rig, who: str) -> str:
     first, second = (rig.names[view] for view in finding.cameras)
     pair = finding.duplicate
     if pair is None or (pair.same_pose and pair.same_detections):
@@ -128,7 +121,7 @@ def _duplicate(finding: Finding, rig: Rig) -> str:
     )
 
 
-def _unit(finding: Finding, rig: Rig) -> str:
+def _unit(finding: Finding, rig: Rig, who: str) -> str:
     stature = finding.amount
     factor = stature / _ADULT_M
     size = f"people come out {_length(stature)} tall"
@@ -145,17 +138,17 @@ def _unit(finding: Finding, rig: Rig) -> str:
     )
 
 
-def _up(finding: Finding, rig: Rig) -> str:
+def _up(finding: Finding, rig: Rig, who: str) -> str:
     return (
         f"people stand along {finding.axis}, and the calibration says that {rig.up} is up; give --up"
         f" {finding.axis} unless they lie"
     )
 
 
-def _nobody(finding: Finding, rig: Rig) -> str:
+def _nobody(finding: Finding, rig: Rig, who: str) -> str:
     if len(finding.cameras) > 0:
         sees = "sees" if len(finding.cameras) == 1 else "see"
-        return f"{_names(finding, rig)} {sees} nobody in the frames that were looked at; check the detections"
+        return f"{who} {sees} nobody in the frames that were looked at; check the detections"
     if finding.amount < 1:
         return "no camera sees a person in the frames that were looked at; check the detections"
     return (
@@ -164,14 +157,7 @@ def _nobody(finding: Finding, rig: Rig) -> str:
     )
 
 
-def _unfit(finding: Finding, rig: Rig) -> str:
-    return (
-        f"{_names(finding, rig)} fits the others in nothing that was tried; check that its calibration and its"
-        " detections are its own"
-    )
-
-
-def _sizes(finding: Finding, rig: Rig) -> str:
+def _sizes(finding: Finding, rig: Rig, who: str) -> str:
     view = finding.cameras[0]
     width, height = rig.cameras[view].image_size
     x, y = (round(value) for value in finding.shift_px[0])
@@ -181,23 +167,10 @@ def _sizes(finding: Finding, rig: Rig) -> str:
     )
 
 
-_WORDS: dict[Kind, Callable[[Finding, Rig], str]] = {
-    Kind.TURNED: _turned,
-    Kind.MOVED: _moved,
-    Kind.LATE: _late,
-    Kind.EXCHANGED: _exchanged,
-    Kind.INVERTED: _inverted,
-    Kind.TRANSPOSED: _transposed,
-    Kind.AXES: _axes,
-    Kind.FOCAL: _focal,
-    Kind.RESIZED: _resized,
-    Kind.PRINCIPAL_POINT: _principal_point,
-    Kind.DUPLICATE: _duplicate,
-    Kind.UNIT: _unit,
-    Kind.UP: _up,
-    Kind.NOBODY: _nobody,
-    Kind.UNFIT: _unfit,
-    Kind.PICTURE_SIZE: _sizes,
+_MADE: dict[Kind, Callable[[Finding, Rig, str], str]] = {
+    **{Kind.TURNED: _turned, Kind.MOVED: _moved, Kind.LATE: _late, Kind.FOCAL: _focal, Kind.RESIZED: _resized},
+    **{Kind.PRINCIPAL_POINT: _principal_point, Kind.DUPLICATE: _duplicate, Kind.UNIT: _unit, Kind.UP: _up},
+    **{Kind.NOBODY: _nobody, Kind.PICTURE_SIZE: _sizes},
 }
 
 

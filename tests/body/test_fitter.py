@@ -3,10 +3,11 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter, PlainFitterConfig
-from shapepose_fg.body.fitting.evidence import EvidenceConfig
-from shapepose_fg.body.fitting.fitter import BodyFit, FitStatus, JointTargets
+from shapepose_fg.body.fitting import optimisers
+from shapepose_fg.body.fitting.fitter import BodyFit, FitStatus, JointTargets, check_fitter
+from shapepose_fg.body.fitting.fitters import SmplFitter
 from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.fitting.settings import BodyConfig
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.core.skeleton import BODY_25
 
@@ -42,8 +43,8 @@ def one_thread():
 
 
 @pytest.fixture(scope="module")
-def fitter() -> LevenbergMarquardtFitter:
-    return LevenbergMarquardtFitter()
+def fitter() -> SmplFitter:
+    return SmplFitter()
 
 
 @pytest.fixture(scope="module")
@@ -51,10 +52,10 @@ def joints() -> np.ndarray:
     return draw_joints(48)
 
 
-def test_noiseless_joints_come_back_to_the_millimetre(joints):
+def test_noiseless_joints_come_back_to_the_millimetre(joints, monkeypatch):
     # Targets believed to 1 mm leave the priors no say; a quarter of a millimetre is left of them.
-    config = PlainFitterConfig(evidence=EvidenceConfig(model_sigma_m=1e-3), tolerance=1e-4)
-    fit = LevenbergMarquardtFitter(config=config).fit(make_targets(joints, 1e-3))
+    monkeypatch.setattr(optimisers, "TOLERANCE", 1e-4)
+    fit = SmplFitter(config=BodyConfig(model_sigma_m=1e-3)).fit(make_targets(joints, 1e-3))
     assert fit.ok.all()
     assert np.median(distance_mm(fit.joints, joints)) < 1.0
     assert np.median(fit.residual_m) < 1e-3
@@ -160,9 +161,9 @@ def test_no_rows_is_no_people(fitter):
     assert len(fit) == 0 and fit.joints.shape == (0, 25, 3)
 
 
-def test_unfinished_rows_say_so(joints):
-    config = PlainFitterConfig(max_iterations=1)
-    fit = LevenbergMarquardtFitter(config=config).fit(make_targets(joints, 0.001))
+def test_unfinished_rows_say_so(joints, monkeypatch):
+    monkeypatch.setattr(optimisers, "MAX_ITERATIONS", 1)
+    fit = SmplFitter().fit(make_targets(joints, 0.001))
     stuck = fit.status == FitStatus.NOT_CONVERGED
     assert stuck.mean() > 0.8
     assert np.isnan(fit.joints[stuck]).all() and not fit.body_pose[stuck].any()
@@ -193,15 +194,15 @@ def test_turning_and_moving_the_world_changes_nothing_else(fitter, joints):
 
 
 def test_warm_start_is_quicker_and_ends_at_the_same_place(joints, monkeypatch):
-    fitter, evaluations = LevenbergMarquardtFitter(), []
-    solve, linearise = fitter._solve, fitter._energy.linearise
-    monkeypatch.setattr(fitter, "_solve", lambda *args: evaluations.append(0) or solve(*args))
+    fitter, evaluations = SmplFitter(), []
+    solve, linearise = fitter.optimiser.solve, fitter.energy.linearise
+    monkeypatch.setattr(fitter.optimiser, "solve", lambda *args: evaluations.append(0) or solve(*args))
 
     def counted(free, *rest):
         evaluations[-1] += len(free)
         return linearise(free, *rest)
 
-    monkeypatch.setattr(fitter._energy, "linearise", counted)
+    monkeypatch.setattr(fitter.energy, "linearise", counted)
     rng = np.random.default_rng(4)
     first = fitter.fit(make_targets(joints + rng.normal(0, 0.01, joints.shape), 0.01))
     targets = make_targets(joints + rng.normal(0, 0.01, joints.shape), 0.01)
@@ -241,6 +242,8 @@ def test_misuse_is_told(fitter, joints):
     with pytest.raises(ValueError, match="one row per target"):
         fitter.fit(make_targets(joints, 0.01), initial=fitter.fit(make_targets(joints[:2], 0.01)))
     with pytest.raises(ValueError, match="kernel_scale must be positive"):
-        PlainFitterConfig(kernel_scale=0)
+        BodyConfig(kernel_scale=0)
     with pytest.raises(ValueError, match="model_sigma_m must be positive"):
-        EvidenceConfig(model_sigma_m=-1)
+        BodyConfig(model_sigma_m=-1)
+    with pytest.raises(TypeError, match=r"object must inherit from .*BodyFitter, which makes the other methods"):
+        check_fitter(object())

@@ -10,10 +10,10 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter
 from shapepose_fg.body.fitting.fitter import BodyFit, FitStatus, JointTargets
-from shapepose_fg.body.fitting.learned import LearnedFitter, LearnedFitterConfig
+from shapepose_fg.body.fitting.fitters import SmplFitter
 from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.fitting.settings import BodyConfig
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, TARGET_SKELETONS
@@ -52,8 +52,8 @@ def distance_mm(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def fitter(shipped_weights) -> LearnedFitter:
-    return LearnedFitter(weights=shipped_weights)
+def fitter(shipped_weights) -> SmplFitter:
+    return SmplFitter(weights=shipped_weights)
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +89,7 @@ def test_clean_joints_come_back(fitter, joints):
 def test_clean_joints_of_other_skeletons_come_back(shipped_weights, name):
     model = BodyModel.default().with_keypoints(TARGET_SKELETONS[name])
     truth = model.to(torch.float64).keypoints(draw_bodies(COUNT)).numpy()
-    fit = LearnedFitter(model, weights=shipped_weights).fit(known_to(truth, 0.005))
+    fit = SmplFitter(model, weights=shipped_weights).fit(known_to(truth, 0.005))
     assert fit.ok.all() and fit.joints.shape == truth.shape
     # COCO has neither feet nor neck, SMPL has a spine and hands that no prior bends far: a little more room.
     assert distance_mm(fit.joints, truth).mean() < 12
@@ -103,7 +103,7 @@ def test_noise_is_averaged_out(fitter, joints):
 
 
 def test_the_polish_pays_and_needs_the_network(fitter, shipped_weights, joints):
-    unpolished = LearnedFitter(weights=shipped_weights, config=LearnedFitterConfig(polish_steps=0))
+    unpolished = SmplFitter(weights=shipped_weights, config=BodyConfig(polish_steps=0))
     targets = known_to(joints, 0.005)
     rough = unpolished.fit(targets)
     rough_mm = distance_mm(rough.joints, joints)[rough.ok].mean()
@@ -158,7 +158,7 @@ def test_missing_joints_are_filled_in_and_known_to_be_guesses(fit, joints):
 
 def test_beliefs_about_missing_joints_are_as_wide_as_the_weights_say(shipped_weights, uneven):
     one, four = (replace(shipped_weights, spread=torch.full((len(BODY_POINTS),), s)) for s in (1.0, 4.0))
-    narrow, wide = (LearnedFitter(weights=weights).fit(uneven) for weights in (one, four))
+    narrow, wide = (SmplFitter(weights=weights).fit(uneven) for weights in (one, four))
     hidden = ~uneven.information.any(axis=(-1, -2))
     np.testing.assert_allclose(wide.covariance[hidden], 4 * narrow.covariance[hidden], rtol=1e-9)
     np.testing.assert_array_equal(wide.covariance[~hidden], narrow.covariance[~hidden])
@@ -203,8 +203,8 @@ def test_where_the_network_goes_wild_the_plain_optimiser_fits(shipped_weights, j
     network.load_state_dict(shipped_weights.network.state_dict())
     with torch.no_grad():
         network.leave.bias += 1e30
-    fit = LearnedFitter(weights=replace(shipped_weights, network=network.eval())).fit(known_to(joints[:3], 0.01))
-    plain = LevenbergMarquardtFitter().fit(known_to(joints[:3], 0.01))
+    fit = SmplFitter(weights=replace(shipped_weights, network=network.eval())).fit(known_to(joints[:3], 0.01))
+    plain = SmplFitter().fit(known_to(joints[:3], 0.01))
     assert fit.ok.all()
     np.testing.assert_array_equal(fit.joints, plain.joints)
 
@@ -271,7 +271,7 @@ def test_a_detector_that_puts_joints_elsewhere_is_followed(fitter, shipped_weigh
 
 def test_offsets_of_joints_that_a_skeleton_lacks_change_nothing(shipped_weights):
     model = BodyModel.default().with_keypoints(TARGET_SKELETONS["COCO_17"])
-    plain = LearnedFitter(model, weights=shipped_weights)
+    plain = SmplFitter(model, weights=shipped_weights)
     targets = known_to(model.to(torch.float64).keypoints(draw_bodies(4)).numpy(), 0.01)
     offsets = KeypointOffsets.symmetric({"Neck": (0.0, 0.15, 0.0), "LBigToe": (0.1, 0.0, 0.1)})
     moved = plain.with_keypoint_offsets(offsets).fit(targets)
@@ -282,7 +282,7 @@ def test_misuse_is_refused(fitter, joints):
     with pytest.raises(ValueError, match="the 25 keypoints of the body, got 17"):
         fitter.fit(known_to(joints[:, :17], 0.01))
     with pytest.raises(ValueError, match="polish_steps must not be negative"):
-        LearnedFitterConfig(polish_steps=-1)
+        BodyConfig(polish_steps=-1)
 
 
 def test_a_row_alone_in_its_group_is_as_unsure_as_without_groups(fitter, joints):

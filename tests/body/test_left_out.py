@@ -7,12 +7,10 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter
 from shapepose_fg.body.fitting.energy import BodyEnergy
-from shapepose_fg.body.fitting.evidence import EvidenceConfig, weigh
-from shapepose_fg.body.fitting.fit_rows import _evenly
+from shapepose_fg.body.fitting.evidence import weigh
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
-from shapepose_fg.body.fitting.learned import LearnedFitter
+from shapepose_fg.body.fitting.fitters import SmplFitter, evenly, make_fitter
 from shapepose_fg.body.fitting.left_out import left_out_sets, plan_passes
 from shapepose_fg.body.fitting.pose_prior import PosePrior
 from shapepose_fg.body.fitting.posterior import LIMB_M, joint_covariance
@@ -23,7 +21,7 @@ from shapepose_fg.core.skeleton import BODY_25
 MODEL_SIGMA_M = 0.02
 NOISE_M = 0.01
 COUNT = 160
-FITTERS = {"plain": LevenbergMarquardtFitter, "learned": LearnedFitter}
+FITTERS = {"plain": SmplFitter, "learned": make_fitter}
 """Every fitter that ships."""
 
 
@@ -146,7 +144,7 @@ def test_nothing_jumps_where_information_goes_to_zero(fitter, people):
 
 def test_a_joint_that_no_pass_must_leave_out_is_where_the_body_has_it(fitter, people):
     """Where no joint of a set has a target, the pass with all targets has left them out already."""
-    sets = fitter._rows.sets
+    sets = fitter.sets
     alike = np.flatnonzero(sets == sets[BODY_25.index("LWrist")]).tolist()
     fit = fitter.fit(make_targets(people[1][:40], without=alike))
     np.testing.assert_array_equal(fit.prior_xyz[:, alike], fit.joints[:, alike])
@@ -176,7 +174,7 @@ def test_a_long_window_s_shape_is_agreed_upon_by_rows_spread_over_it(fitter):
     people, rows = 2, 40
     xyz = draw(people, rows) + np.random.default_rng(1).normal(0, NOISE_M, (people * rows, 25, 3))
     groups = np.append(np.repeat([3, 1], rows)[:-1], 7)  # one row is alone
-    voters = _evenly(groups, 24)
+    voters = evenly(groups, 24)
     assert [voters[groups == number].sum() for number in (1, 3, 7)] == [24, 24, 1]
     assert np.diff(np.flatnonzero(voters[groups == 3])).max() == 2
     fit = fitter.fit(make_targets(xyz), groups=groups)
@@ -194,7 +192,7 @@ def test_sets_hold_joints_that_tell_little_of_each_other():
     prior = PosePrior.default()
     for skeleton, names in TARGET_SKELETONS.items():
         model = BodyModel.default().with_keypoints(names)
-        sets = left_out_sets(BodyEnergy(model.to(torch.float32), prior), prior, 6)
+        sets = left_out_sets(BodyEnergy(model.to(torch.float32), prior), prior)
         assert sorted(set(sets)) == list(range(6)), skeleton
         place = {name: sets[row] for row, name in enumerate(names)}
         bones = (
@@ -214,8 +212,7 @@ def test_passes_are_what_rows_need(people):
     targets.information[0, sets == 2] = 0  # row 0 has nothing of set 2
     few = np.setdiff1d(np.arange(25), [*np.flatnonzero(sets == 3)[:3].tolist(), 0, 1])
     targets.information[1, few] = 0  # row 1 would not do without set 3
-    config = EvidenceConfig()
-    passes = plan_passes(weigh(targets, config), sets, np.array([5, 5, 7, 8]), config)
+    passes = plan_passes(weigh(targets, MODEL_SIGMA_M), sets, np.array([5, 5, 7, 8]))
     assert passes.row[:4].tolist() == [0, 1, 2, 3] and not passes.without[:4].any()
     for row in range(4):
         for joint in range(25):
@@ -247,7 +244,7 @@ def test_covariance_is_that_of_a_linear_problem_and_the_sag_of_a_limb():
 
 def test_priors_are_calibrated_on_bodies_from_the_priors(people):
     """Squared Mahalanobis distances are chi-squared with 3 degrees of freedom: mean 3, median 2.37."""
-    fit = LevenbergMarquardtFitter().fit(make_targets(people[1]))
+    fit = SmplFitter().fit(make_targets(people[1]))
     squared = mahalanobis(fit.prior_xyz - people[0], fit.prior_covariance)
     assert 2.3 < squared.mean() < 3.6
     assert 1.9 < np.median(squared) < 2.8

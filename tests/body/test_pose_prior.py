@@ -1,13 +1,16 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
 from shapepose_fg.body.fitting.pose_prior import PosePrior
-from shapepose_fg.body.training.motions import load_motions
-from shapepose_fg.body.training.prior import expected_angles
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import SMPL_24
+from shapepose_fg.simulation.training.motions import load_motions
+from shapepose_fg.simulation.training.pose_prior import expected_angles
 
-ARRAYS = ("weights", "means", "covariances", "lower", "upper")
+ARRAYS = ("mean", "covariance", "lower", "upper")
 
 
 @pytest.fixture(scope="module")
@@ -44,8 +47,7 @@ def test_left_and_right_are_mirror_images(prior):
 def test_every_angle_has_play_and_none_is_free(prior):
     sigma = np.sqrt(np.diag(prior.covariance))
     assert sigma.min() > 0.05 and sigma.max() < 1.2
-    for covariance in prior.covariances:
-        assert np.sqrt(np.linalg.eigvalsh(covariance)[0]) > 0.04 and np.linalg.cond(covariance) < 1e4
+    assert np.sqrt(np.linalg.eigvalsh(prior.covariance)[0]) > 0.04 and np.linalg.cond(prior.covariance) < 1e4
 
 
 def test_samples_have_the_moments_and_obey_the_limits(prior):
@@ -60,39 +62,22 @@ def test_samples_have_the_moments_and_obey_the_limits(prior):
     np.testing.assert_allclose(flat.std(axis=0)[free], sigma[free], rtol=0.1)
 
 
-def test_regressions_and_marginals_are_those_of_each_gaussian(prior):
+def test_regression_and_marginal_are_those_of_the_gaussian(prior):
     given, asked = np.arange(0, 60), np.arange(60, 69)
-    regressions, marginals = prior.regressions(given, asked), prior.marginal_precisions(given)
-    for k, P in enumerate(np.linalg.inv(prior.covariances)):
-        # Rows of the precision give the same regression: -P_aa^-1 P_ag.
-        expected = -np.linalg.solve(P[np.ix_(asked, asked)], P[np.ix_(asked, given)])
-        np.testing.assert_allclose(regressions[k], expected, atol=1e-8)
-        marginal = P[np.ix_(given, given)] + P[np.ix_(given, asked)] @ expected
-        np.testing.assert_allclose(marginals[k], marginal, rtol=1e-6, atol=1e-6)
+    P = np.linalg.inv(prior.covariance)
+    # Rows of the precision give the same regression: -P_aa^-1 P_ag.
+    expected = -np.linalg.solve(P[np.ix_(asked, asked)], P[np.ix_(asked, given)])
+    np.testing.assert_allclose(prior.regression(given, asked), expected, atol=1e-8)
+    marginal = P[np.ix_(given, given)] + P[np.ix_(given, asked)] @ expected
+    np.testing.assert_allclose(prior.marginal_precision(given), marginal, rtol=1e-6, atol=1e-6)
 
 
-def test_log_density_is_the_mixtures(prior):
+def test_log_density_is_the_gaussians(prior):
     poses = prior.sample(np.random.default_rng(1), 5)
-    parts = zip(prior.weights, prior.means, prior.covariances, strict=True)
-    density = sum(w * multivariate_normal(mean, S).pdf(poses.reshape(5, 69)) for w, mean, S in parts)
-    np.testing.assert_allclose(prior.log_density(poses), np.log(density))
-    np.testing.assert_allclose(prior.log_density(poses.reshape(5, 69)), np.log(density))
-
-
-def test_moments_are_those_of_the_mixture():
-    ones = np.ones((69, 1))
-    prior = two_components(0.25, 0.5)  # means 0 and 0.5, sigma 0.1, weights 3/4 and 1/4
-    np.testing.assert_allclose(prior.mean, 0.125)
-    np.testing.assert_allclose(prior.covariance, 0.01 * np.eye(69) + 0.1875 * 0.25 * ones @ ones.T)
-    np.testing.assert_allclose(prior.widened(2.0).covariances, 4 * prior.covariances)
-
-
-def two_components(share: float, apart: float) -> PosePrior:
-    """Two round Gaussians, sigma 0.1, the second with every angle `apart` from the first."""
-    means = np.stack([np.zeros(69), np.full(69, apart)])
-    covariances = np.tile(0.01 * np.eye(69), (2, 1, 1))
-    free = np.full(69, np.inf)
-    return PosePrior(np.array([1 - share, share]), means, covariances, -free, free, "test")
+    expected = multivariate_normal(prior.mean, prior.covariance).logpdf(poses.reshape(5, 69))
+    np.testing.assert_allclose(prior.log_density(poses), expected)
+    np.testing.assert_allclose(prior.log_density(poses.reshape(5, 69)), expected)
+    np.testing.assert_allclose(prior.widened(2.0).covariance, 4 * prior.covariance)
 
 
 def test_round_trip(prior, tmp_path):
@@ -112,25 +97,33 @@ def test_provenance_carries_the_acknowledgement(prior):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"means": np.zeros((2, 72))}, "means must be"),
-        ({"means": np.full((2, 69), np.nan)}, "NaN"),
-        ({"weights": np.array([0.5, 0.4])}, "1 in all"),
-        ({"weights": np.array([1.5, -0.5])}, "positive"),
-        ({"covariances": np.tile(np.triu(np.ones((69, 69))), (2, 1, 1))}, "symmetric"),
-        ({"covariances": np.ones((2, 69, 69))}, "positive definite"),
+        ({"mean": np.zeros(72)}, "mean must be"),
+        ({"mean": np.full(69, np.nan)}, "NaN"),
+        ({"covariance": np.triu(np.ones((69, 69)))}, "symmetric"),
+        ({"covariance": np.ones((69, 69))}, "positive definite"),
         ({"lower": np.zeros(69), "upper": np.zeros(69)}, "below"),
     ],
 )
-def test_bad_priors_are_refused(change, message):
-    fields = {name: getattr(two_components(0.5, 1.0), name) for name in (*ARRAYS, "provenance")}
+def test_bad_priors_are_refused(prior, change, message):
     with pytest.raises(ValueError, match=message):
-        PosePrior(**(fields | change))
+        replace(prior, **change)
 
 
 def test_other_files_are_refused(tmp_path):
     np.savez(tmp_path / "other.npz", means=np.zeros((1, 69)))
     with pytest.raises(ValueError, match="has no weights covariances lower upper provenance"):
         PosePrior.load(tmp_path / "other.npz")
+    np.savez(
+        tmp_path / "two.npz",
+        weights=np.full(2, 0.5),
+        means=np.zeros((2, 69)),
+        covariances=np.tile(np.eye(69), (2, 1, 1)),
+        lower=-np.ones(69),
+        upper=np.ones(69),
+        provenance="",
+    )
+    with pytest.raises(InputError, match="a mixture of 2 Gaussians; fits take one"):
+        PosePrior.load(tmp_path / "two.npz")
 
 
 def test_predicts_hidden_joints_of_people_it_never_saw(prior, shared_data):

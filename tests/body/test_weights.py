@@ -9,9 +9,7 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter
-from shapepose_fg.body.fitting.fitters import BodyConfig, make_fitter
-from shapepose_fg.body.fitting.learned import LearnedFitter
+from shapepose_fg.body.fitting.fitters import BodyConfig, SmplFitter, make_fitter
 from shapepose_fg.body.fitting.network import NetworkConfig, UpdateNetwork
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.pose_prior import PosePrior
@@ -19,6 +17,8 @@ from shapepose_fg.body.fitting.weights import FitterWeights, fingerprint
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.io.config import read_config
+from shapepose_fg.pipeline.config import PipelineConfig
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,6 @@ def test_files_give_back_what_was_written(weights, file):
     inputs = torch.randn(3, UpdateNetwork.num_inputs)
     np.testing.assert_array_equal(again.network(inputs, 1).numpy(), weights.network(inputs, 1).numpy())
     assert not any(weight.requires_grad for weight in again.network.parameters())
-    assert FitterWeights.of(weights) is weights and FitterWeights.of(file).body == weights.body
 
 
 def test_what_is_no_safetensors_file_is_refused(tmp_path, file):
@@ -133,7 +132,7 @@ def test_weights_of_another_version_are_refused(file, damage):
 
 def test_weights_belong_to_one_body(weights, tiny_body, file):
     with pytest.raises(InputError, match=r"trained on another body model: train some on yours .* --body"):
-        LearnedFitter(tiny_body, weights=weights)
+        SmplFitter(tiny_body, weights=weights)
     with pytest.raises(InputError, match="another body model"):
         make_fitter(BodyConfig(method="learned", weights=str(file)), tiny_body)
     assert fingerprint(tiny_body) != fingerprint(BodyModel.default())
@@ -142,14 +141,14 @@ def test_weights_belong_to_one_body(weights, tiny_body, file):
 
 
 def test_the_fitter_is_the_one_that_is_asked_for(weights, file, tiny_body, shipped_weights):
-    assert isinstance(make_fitter(model=tiny_body), LevenbergMarquardtFitter)  # whatever the default: it works
-    assert isinstance(make_fitter(BodyConfig(method="plain"), tiny_body), LevenbergMarquardtFitter)
+    assert make_fitter(model=tiny_body).weights is None  # whatever the default: it works
+    assert make_fitter(BodyConfig(method="plain"), tiny_body).weights is None
     learned = make_fitter(BodyConfig(method="learned"))
-    assert isinstance(learned, LearnedFitter) and learned.weights is shipped_weights
-    assert isinstance(make_fitter(BodyConfig(method="auto")), LearnedFitter)
-    assert isinstance(make_fitter(BodyConfig(method="auto"), tiny_body), LevenbergMarquardtFitter)
+    assert learned.weights is shipped_weights
+    assert make_fitter(BodyConfig(method="auto")).weights is shipped_weights
+    assert make_fitter(BodyConfig(method="auto"), tiny_body).weights is None
     own = make_fitter(BodyConfig(method="auto", weights=str(file)))
-    assert isinstance(own, LearnedFitter) and own.weights.card == weights.card
+    assert own.weights is not None and own.weights.card == weights.card
     with pytest.raises(ValueError, match="method must be one of auto learned plain, got 'best'"):
         BodyConfig(method="best")
     with pytest.raises(InputError, match="nowhere"):
@@ -160,3 +159,10 @@ def test_the_shipped_weights_are_for_the_shipped_body_and_say_where_they_are_fro
     shipped_weights.check(BodyModel.default())
     assert shipped_weights.card
     assert shipped_weights.spread.shape == (len(BODY_POINTS),) and bool((shipped_weights.spread > 0).all())
+
+
+@pytest.mark.parametrize("table", ["learned", "plain"])
+def test_settings_of_before_are_told_what_took_their_place(tmp_path, table):
+    (tmp_path / "settings.toml").write_text(f"[body.{table}]\nkernel_scale = 5.0\n")
+    with pytest.raises(InputError, match=rf"body\.{table} is one with \[body\] now, which has model_sigma_m"):
+        read_config(tmp_path / "settings.toml", PipelineConfig)

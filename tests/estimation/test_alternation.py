@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from shapepose_fg.body.fitting.fitter import BodyFit, FitStatus, JointTargets
+from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus, JointTargets
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.observation_table import Gate
@@ -24,7 +24,7 @@ from shapepose_fg.pipeline.solved_rows import result_rows
 WRIST, ELBOW, KNEE = 4, 3, 13
 
 
-class FakeFitter:
+class FakeFitter(BodyFitter):
     """Gives the same body every time to rows with information, none to others; remembers the questions.
 
     Its priors are wide, 10 cm, so that one 17 cm off pulls and does not count as a contradiction.
@@ -373,7 +373,7 @@ def seen_of(rig: Rig, detections: Detections, truth: NDArray[np.float64], within
 
 def test_the_alternation_helps_on_the_built_in_scene():
     """Joints of low confidence end nearer the truth than triangulated, those of high confidence no farther."""
-    from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter
+    from shapepose_fg.body.fitting.fitters import SmplFitter
     from shapepose_fg.simulation import DetectorConfig, built_in_scene, simulate
 
     scene = built_in_scene(frames=12)
@@ -383,7 +383,7 @@ def test_the_alternation_helps_on_the_built_in_scene():
     )
     truth = scene.keypoints.reshape(-1, 25, 3)
     rows = replace(seen, track=np.arange(len(seen)))
-    result = Estimator(scene.rig, LevenbergMarquardtFitter(), BODY_25.joints).estimate(rows)
+    result = Estimator(scene.rig, SmplFitter(), BODY_25.joints).estimate(rows)
     assert (result.status == Status.OK).all() and np.isfinite(result.joints).all()
     before, after = (np.linalg.norm(X - truth, axis=-1) for X in (seen.initial, result.joints))
     low, both = result.confidence < 0.25, np.isfinite(before)

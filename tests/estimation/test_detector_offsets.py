@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter
-from shapepose_fg.body.fitting.fitter import BodyFit, JointTargets
+from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
+from shapepose_fg.body.fitting.fitters import SmplFitter
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.offsets.estimation import OffsetPrior, learn_offsets
@@ -71,7 +71,7 @@ def exact(scene: Scene) -> JointTargets:
 def left_out_error_mm(model: BodyModel, scene: Scene) -> float:
     """How far from a joint the body puts it that is fitted to all the others: mean, exact targets."""
     targets = exact(scene)
-    fit = LevenbergMarquardtFitter(model).fit(targets)
+    fit = SmplFitter(model).fit(targets)
     assert fit.ok.all()
     return float(1e3 * np.linalg.norm(fit.prior_xyz - targets.xyz, axis=-1).mean())
 
@@ -207,11 +207,11 @@ def test_frames_outside_the_span_are_learnt_from_and_not_counted(scene, odd_reco
     assert part.run["people"]["found"] == len(part) == 8
 
 
-class PlainFitter:
+class PlainFitter(BodyFitter):
     """A fitter of one's own that knows nothing of offsets."""
 
     def __init__(self) -> None:
-        self._fitter = LevenbergMarquardtFitter()
+        self._fitter = SmplFitter()
 
     def fit(
         self, targets: JointTargets, initial: BodyFit | None = None, groups: np.ndarray | None = None
@@ -224,7 +224,7 @@ def test_a_fitter_without_offsets_goes_without(scene, odd_recording, tmp_path):
     assert people.run["keypoint_offsets"] is None
     ODD.save(tmp_path / "odd.json")
     config = PipelineConfig(offsets=OffsetConfig(source=str(tmp_path / "odd.json")))
-    with pytest.raises(ValueError, match="with_keypoint_offsets"):
+    with pytest.raises(ValueError, match="need a fitter with a `model`"):
         reconstruct(odd_recording, scene.rig, config, frames=range(1), fitter=PlainFitter())
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.fitting.fitters import BodyConfig, make_fitter
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
@@ -60,7 +61,7 @@ def test_a_neighbour_s_leg_loses_its_hold_on_the_body(fitter):
         assert after.mean() < 0.2 and np.median(after) < 0.15
 
 
-class Counting:
+class Counting(BodyFitter):
     """A fitter that counts the rows that it is given."""
 
     def __init__(self, fitter) -> None:

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from shapepose_fg.body.fitting.fitter import BodyFit
+from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter
 from shapepose_fg.core.reconstruction import Known
 from shapepose_fg.estimation.draft import drafted, limb_steps, smoothed_in_time
 from shapepose_fg.estimation.limb_lengths import with_lengths
@@ -180,7 +180,7 @@ def test_a_draft_without_a_body_is_the_views_and_without_both_nothing():
     assert np.isnan(at[0, 2]).all() and np.isnan(covariance[0, 2]).all(), "determined to a metre, or not at all"
 
 
-class Beside:
+class Beside(BodyFitter):
     """A fitter whose body has every joint 30 cm higher; remembers what it was given."""
 
     def fit(self, targets, initial=None, groups=None):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from shapepose_fg.body.fitting.fitter import BodyFit, FitStatus
+from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Known, Status
@@ -26,7 +26,7 @@ FRAMES = 30
 WRIST, OTHER_WRIST, NOSE = (BODY_25.index(name) for name in ("RWrist", "LWrist", "Nose"))
 
 
-class BesideFitter:
+class BesideFitter(BodyFitter):
     """Puts each row's body where the seen joints are, moved by `beside` (3,) metres; remembers what it was
     asked."""
 
@@ -52,7 +52,7 @@ class BesideFitter:
         )
 
 
-class NobodyFitter:
+class NobodyFitter(BodyFitter):
     """Fits no body to anybody."""
 
     def fit(self, targets, initial=None, groups=None) -> BodyFit:

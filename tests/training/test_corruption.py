@@ -7,7 +7,7 @@ import torch
 from shapepose_fg.body.fitting.pose_prior import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, MIRROR, TARGET_SKELETONS, slots
-from shapepose_fg.body.training.corruption import CorruptionConfig, corrupt
+from shapepose_fg.simulation.training.corruption import CorruptionConfig, corrupt
 
 COUNT, K = 400, len(BODY_POINTS)
 NOTHING = CorruptionConfig(

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.body.training.motions import SUBJECT_CAP, WALK_CAP, Motions, frame_weights, load_motions
-from shapepose_fg.body.training.split import SPLITS, TEST_SUBJECTS, VALIDATION_SUBJECTS, split_of
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.skeleton import SMPL_24
+from shapepose_fg.simulation.training.motions import SUBJECT_CAP, WALK_CAP, Motions, frame_weights, load_motions
+from shapepose_fg.simulation.training.split import SPLITS, TEST_SUBJECTS, VALIDATION_SUBJECTS, split_of
 
 Z_UP = Rotation.from_rotvec([np.pi / 2, 0.0, 0.0])
 
@@ -87,15 +86,6 @@ def test_poses_of_cmu_are_the_recorded_ones_with_collars_that_follow_the_arms(cm
     assert not cmu.poses[~cmu.observed].reshape(-1, 3)[:, 0].all()
 
 
-def test_a_mirror_swaps_sides_and_a_second_mirror_swaps_them_back(cmu):
-    some = cmu.rows(np.arange(0, len(cmu), 1000))
-    mirrored = some.mirrored()
-    left, right = SMPL_24.index("left_elbow"), SMPL_24.index("right_elbow")
-    np.testing.assert_array_equal(mirrored.poses[:, left], some.poses[:, right] * [1, -1, -1])
-    np.testing.assert_array_equal(mirrored.observed[:, left], some.observed[:, right])
-    np.testing.assert_array_equal(mirrored.mirrored().poses, some.poses)
-
-
 def test_a_folder_of_amass_is_read_thinned_and_turned_upright(tmp_path):
     poses = write_amass(tmp_path / "KIT" / "s1" / "jump_poses.npz", 120, 156, 120.0)
     write_amass(
@@ -103,9 +93,7 @@ def test_a_folder_of_amass_is_read_thinned_and_turned_upright(tmp_path):
     )
     write_amass(tmp_path / "KIT" / "s2" / "shape.npz", poses=None)  # lies beside the motions
     motions = load_motions(tmp_path)
-    assert motions.names == ("s1/jump_poses", "s2/walk_poses")
-    assert motions.fps.tolist() == [30.0, 30.0]
-    assert np.bincount(motions.sequence).tolist() == [30, 10]
+    assert len(motions) == 40
     assert set(motions.subject[:30]) == {"s1"} and set(motions.subject[30:]) == {"s2"}
     np.testing.assert_allclose(motions.poses[:30, 1:22], poses[::4, 3:66].reshape(-1, 21, 3), atol=1e-6)
     assert not motions.poses[:, 22:].any()

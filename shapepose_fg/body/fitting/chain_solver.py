@@ -1,38 +1,31 @@
 """Poses of chains of rows and one shape for each chain: Levenberg-Marquardt with the motion prior, batched."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from shapepose_fg.body.fitting.banded import solve_banded
-from shapepose_fg.body.fitting.chains import Motion, Segment
+from shapepose_fg.body.fitting.chains import Motion, Segment, solve_banded
 from shapepose_fg.body.fitting.energy import BodyEnergy, Held, WhitenedTargets, robust_cost
 from shapepose_fg.body.fitting.motion_prior import MotionPrior
 from shapepose_fg.body.model.rotation import exp_so3, log_so3
 
 Array = NDArray[np.float64]
+T_ = TypeVar("T_", "_State", "_Normal")
 
+MAX_ITERATIONS = 8
+"""Steps of Levenberg-Marquardt, refused ones included."""
+TOLERANCE = 0.05
+"""A chain is done when a step lowers its energy by less than this a row, in squared standard deviations."""
 _CHUNK = 128
 """Rows that are linearised at a time."""
 _BATCH_ROWS = 768
 """Rows that are solved at a time, some 300 kB each."""
 _DAMPING_START, _DAMPING_MIN, _DAMPING_MAX = 1e-4, 1e-8, 1e4
-
-
-@dataclass(frozen=True)
-class ChainRows:
-    """R rows as the energy wants them; all rows of a chain have one origin."""
-
-    targets: WhitenedTargets
-    """(R) where the joints should be."""
-    angles: Tensor | None
-    """(R, A) around where the pose prior holds them; None: where it expects them."""
-    time_s: Array
-    """(R,) when."""
 
 
 @dataclass(frozen=True)
@@ -46,66 +39,8 @@ class ChainShapes:
 
 
 @dataclass(frozen=True)
-class _State:
-    """Bodies of G chains."""
-
-    betas: Tensor
-    """(G, 10)."""
-    root: Tensor
-    """(T, G, 3, 3) rotation."""
-    others: Tensor
-    """(T, G, N - 3) angles and place."""
-
-    def moved(self, shape: Tensor, pose: Tensor) -> "_State":
-        """After a step of the betas (G, 10) and of the rest (T, G, N)."""
-        return _State(self.betas + shape, exp_so3(pose[..., :3]) @ self.root, self.others + pose[..., 3:])
-
-    def where(self, better: Tensor, other: "_State") -> "_State":
-        """The chains that are `better` (G,) in another."""
-        rows = better[:, None]
-        return _State(
-            torch.where(rows, other.betas, self.betas),
-            torch.where(rows[..., None], other.root, self.root),
-            torch.where(rows, other.others, self.others),
-        )
-
-
-@dataclass(frozen=True)
-class _Normal:
-    """The energy of G chains and its normal equations; couplings of rows are those of `MotionTerm`."""
-
-    energy: Tensor
-    """(G,)"""
-    shape_gradient: Tensor
-    """(G, 10)"""
-    shape: Tensor
-    """(G, 10, 10) of the betas."""
-    gradient: Tensor
-    """(T, G, N)"""
-    across: Tensor
-    """(T, G, N, 10) of poses with betas."""
-    diagonal: Tensor
-    """(T, G, N, N) of poses."""
-    next_one: Tensor
-    """(T, G, N)"""
-    next_two: Tensor
-    """(T, G, N)"""
-
-    def where(self, better: Tensor, other: "_Normal") -> "_Normal":
-        """The chains that are `better` (G,) in another."""
-        if bool(better.all()):
-            return other
-        mixed = {}
-        for name, mine in vars(self).items():
-            axis = 0 if name in ("energy", "shape", "shape_gradient") else 1
-            mask = better.view(*(1,) * axis, -1, *(1,) * (mine.ndim - axis - 1))
-            mixed[name] = torch.where(mask, getattr(other, name), mine)
-        return _Normal(**mixed)
-
-
-@dataclass(frozen=True)
-class ChainSolver:
-    """Minimises the energy of rows, the motion prior between them and a Gaussian on each chain's betas."""
+class ChainRows:
+    """R rows whose energies are minimised, with the motion prior between them; rows of a chain have one origin."""
 
     energy: BodyEnergy
     """Of a row."""
@@ -113,13 +48,15 @@ class ChainSolver:
     """Between rows."""
     kernel_scale: float
     """Of the robust kernel."""
-    max_iterations: int
-    """Steps, refused ones included."""
-    tolerance: float
-    """A chain is done when a step lowers its energy by less than this a row."""
+    targets: WhitenedTargets
+    """(R) where the joints should be."""
+    angles: Tensor | None
+    """(R, A) around where the pose prior holds them; None: where it expects them."""
+    time_s: Array
+    """(R,) when."""
 
-    def solve(
-        self, free: Tensor, rows: ChainRows, segments: list[Segment], held: ChainShapes, *, fixed: bool
+    def solved(
+        self, free: Tensor, segments: list[Segment], held: ChainShapes, *, fixed: bool
     ) -> tuple[Tensor, ChainShapes]:
         """Parameters (R, P) of the rows that the `segments` (S) keep, from `free` (R, P) on, and their shapes.
 
@@ -129,21 +66,71 @@ class ChainSolver:
         for batch in _batches(segments):
             chosen = [segments[place] for place in batch]
             part = ChainShapes(held.betas[batch], held.information[batch])
-            problem = _Batch(self, rows, chosen, part, fixed)
-            state, betas[batch], information[batch] = problem.solved(free)
+            problem = _Batch(self, chosen, part, fixed)
+            state, information[batch] = problem.solved(free)
+            betas[batch] = state.betas[0]
             for column, segment in enumerate(chosen):
                 inside = np.flatnonzero(segment.kept)
                 found[segment.rows[inside]] = problem.free(state)[inside, column].to(found.dtype)
         return found, ChainShapes(betas, information)
 
 
+@dataclass(frozen=True)
+class _State:
+    """Bodies of G chains."""
+
+    betas: Tensor
+    """(1, G, 10)."""
+    root: Tensor
+    """(T, G, 3, 3) rotation."""
+    others: Tensor
+    """(T, G, N - 3) angles and place."""
+
+    def moved(self, shape: Tensor, pose: Tensor) -> "_State":
+        """After a step of the betas (G, 10) and of the rest (T, G, N)."""
+        return _State(self.betas + shape, exp_so3(pose[..., :3]) @ self.root, self.others + pose[..., 3:])
+
+
+@dataclass(frozen=True)
+class _Normal:
+    """The energy of G chains and its normal equations; couplings of rows are those of `MotionTerm`."""
+
+    energy: Tensor
+    """(1, G)."""
+    shape_gradient: Tensor
+    """(1, G, 10)."""
+    shape: Tensor
+    """(1, G, 10, 10) of the betas."""
+    gradient: Tensor
+    """(T, G, N)."""
+    across: Tensor
+    """(T, G, N, 10) of poses with betas."""
+    diagonal: Tensor
+    """(T, G, N, N) of poses."""
+    next_one: Tensor
+    """(T, G, N)."""
+    next_two: Tensor
+    """(T, G, N)."""
+
+
+def _mixed(better: Tensor, new: T_, old: T_) -> T_:
+    """The chains that are `better` (G,) from `new`, the rest from `old`."""
+    if bool(better.all()):
+        return new
+    return replace(
+        old,
+        **{
+            name: torch.where(better.view(1, -1, *(1,) * (value.ndim - 2)), getattr(new, name), value)
+            for name, value in vars(old).items()
+        },
+    )
+
+
 class _Batch:
     """G chains that are solved together; shorter ones end early."""
 
-    def __init__(
-        self, solver: ChainSolver, rows: ChainRows, segments: list[Segment], held: ChainShapes, fixed: bool
-    ):
-        self._solver, self._held, self._fixed = solver, held, fixed
+    def __init__(self, rows: ChainRows, segments: list[Segment], held: ChainShapes, fixed: bool):
+        self._rows, self._held, self._fixed = rows, held, fixed
         T, G = max(2, *(len(segment.rows) for segment in segments)), len(segments)
         index, step = np.zeros((T, G), dtype=np.intp), np.full((T - 1, G), np.inf)
         mask = np.zeros((T, G), dtype=bool)
@@ -153,60 +140,54 @@ class _Batch:
             index[count:, column] = segment.rows[-1]
             step[: count - 1, column] = np.diff(rows.time_s[segment.rows])
         self._index, self._mask = torch.from_numpy(index), torch.from_numpy(mask)
-        self._chain = self._mask.nonzero()[:, 1]
         real = self._index[self._mask]
         self._targets = rows.targets[real]
         self._angles = None if rows.angles is None else rows.angles[real]
-        self._motion = Motion(*solver.motion.part(solver.energy.angles), torch.from_numpy(step))
+        self._motion = Motion(*rows.motion.part(rows.energy.angles), torch.from_numpy(step))
 
-    def solved(self, free: Tensor) -> tuple[_State, Tensor, Tensor]:
-        """The bodies, their betas (G, 10), and the information about them in the rows (G, 10, 10)."""
-        start = free[self._index].double()
-        state = _State(
-            self._held.betas if self._fixed else start[0, :, :10], exp_so3(start[..., 10:13]), start[..., 13:]
-        )
-        here, count = self._normal(state), self._mask.sum(0)
-        damping, going = (
-            torch.full((len(count),), _DAMPING_START).double(),
-            torch.ones(len(count), dtype=torch.bool),
-        )
+    def solved(self, free: Tensor) -> tuple[_State, Tensor]:
+        """The bodies, and the information about their betas in the rows (G, 10, 10)."""
+        start, count = free[self._index].double(), self._mask.sum(0)
+        betas = self._held.betas[None] if self._fixed else start[:1, :, :10]
+        state = _State(betas, exp_so3(start[..., 10:13]), start[..., 13:])
+        here = self._normal(state)
+        damping = torch.full((len(count),), _DAMPING_START).double()
+        going = torch.ones(len(count), dtype=torch.bool)
         information = torch.zeros_like(self._held.information)
-        for _ in range(self._solver.max_iterations):
-            shape, pose, said = self._step(here, state, damping)
+        for _ in range(MAX_ITERATIONS):
+            shape, pose, said = self._step(here, damping)
             trial = state.moved(shape * going[:, None], pose * going[:, None])
             there = self._normal(trial)
-            gain = here.energy - there.energy
+            gain = (here.energy - there.energy)[0]
             better = (gain > 0) & going
-            state, here = state.where(better, trial), here.where(better, there)
+            state, here = _mixed(better, trial, state), _mixed(better, there, here)
             information = torch.where(going[:, None, None], said, information)
             damping = torch.where(better, damping / 10, damping * 10).clamp_min(_DAMPING_MIN)
-            going = going & ~(better & (gain < self._solver.tolerance * count)) & (damping < _DAMPING_MAX)
+            going = going & ~(better & (gain < TOLERANCE * count)) & (damping < _DAMPING_MAX)
             if not bool(going.any()):
                 break
-        return state, state.betas, information
+        return state, information
 
     def free(self, state: _State) -> Tensor:
         """(T, G, P) parameters of the energy."""
-        betas = state.betas.expand(len(state.root), -1, -1)
-        return torch.cat((betas, log_so3(state.root), state.others), -1)
+        return torch.cat((state.betas.expand(len(state.root), -1, -1), log_so3(state.root), state.others), -1)
 
     def _normal(self, state: _State) -> _Normal:
         """Energy and normal equations, the root's rotation in tangents of the world."""
-        solver, free = self._solver, self.free(state)[self._mask]
-        turn, scale = state.root[self._mask], torch.tensor(solver.kernel_scale)
+        rows, free = self._rows, self.free(state)[self._mask]
+        turn, scale = state.root[self._mask], torch.tensor(rows.kernel_scale)
         (T, G), N = self._mask.shape, free.shape[1] - 10
         moved = self._motion.at(state.root, state.others)
         diagonal = torch.eye(N).double().repeat(T, G, 1, 1)
         across, gradient = diagonal.new_zeros(T, G, N, 10), diagonal.new_zeros(T, G, N)
-        away = state.betas - self._held.betas
+        away = state.betas[0] - self._held.betas
         pull = (self._held.information @ away[..., None]).squeeze(-1)
         energy, shape = moved.energy + (away * pull).sum(-1), diagonal.new_zeros(G, 10, 10)
-        shape_gradient = diagonal.new_zeros(G, 10)
-        place = self._mask.nonzero()
+        shape_gradient, place = diagonal.new_zeros(G, 10), self._mask.nonzero()
         for at in range(0, len(free), _CHUNK):
             part = slice(at, at + _CHUNK)
             held = Held(torch.zeros(10), torch.zeros(1), None if self._angles is None else self._angles[part])
-            row = solver.energy.linearise(free[part].float(), self._targets[part], scale, held)
+            row = rows.energy.linearise(free[part].float(), self._targets[part], scale, held)
             H, g, R = row.hessian.double(), row.gradient.double(), turn[part]
             H[:, 10:13] = R @ H[:, 10:13]
             H[:, :, 10:13] = H[:, :, 10:13] @ R.mT
@@ -217,22 +198,22 @@ class _Batch:
             shape_gradient.index_add_(0, chain, g[:, :10])
             energy.index_add_(0, chain, (robust_cost(row.squared, scale).sum(-1) + row.prior).double())
         torch.diagonal(diagonal, dim1=-2, dim2=-1).add_(moved.diagonal)
-        return _Normal(energy, shape_gradient + pull, shape, gradient + moved.gradient, across, diagonal,
-                       moved.next_one, moved.next_two)  # fmt: skip
+        return _Normal(energy[None], (shape_gradient + pull)[None], shape[None], gradient + moved.gradient, across,
+                       diagonal, moved.next_one, moved.next_two)  # fmt: skip
 
-    def _step(self, here: _Normal, state: _State, damping: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _step(self, here: _Normal, damping: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Steps of betas (G, 10) and poses (T, G, N), and the rows' information about the betas (G, 10, 10)."""
         diagonal = here.diagonal.clone()
         torch.diagonal(diagonal, dim1=-2, dim2=-1).mul_(1 + damping[:, None])
         right = torch.cat((here.gradient[..., None], here.across), -1)
         X = solve_banded(diagonal, here.next_one, here.next_two, right)
         eliminated = (here.across.mT @ X).sum(0)  # (G, 10, 11)
-        said = here.shape - eliminated[..., 1:]
+        said = here.shape[0] - eliminated[..., 1:]
         if self._fixed:
-            return torch.zeros_like(state.betas), -X[..., 0], said
+            return torch.zeros_like(here.shape_gradient[0]), -X[..., 0], said
         whole = said + self._held.information
         whole = whole + damping[:, None, None] * torch.diag_embed(torch.diagonal(whole, dim1=-2, dim2=-1))
-        shape = -torch.linalg.solve(whole, (here.shape_gradient - eliminated[..., 0])[..., None])
+        shape = -torch.linalg.solve(whole, (here.shape_gradient[0] - eliminated[..., 0])[..., None])
         pose = -X[..., 0] - (X[..., 1:] @ shape).squeeze(-1)
         return shape.squeeze(-1), pose, said
 

@@ -98,7 +98,7 @@ class LearnedDescent:
     def _inputs(self, state: BodyState, targets: DescentTargets, believed: Tensor, trust: Tensor) -> Tensor:
         """(B, `UpdateNetwork.num_inputs`) what the network sees."""
         rotations = accumulate(state.local)
-        feature = (state.local[:, 1:] - torch.eye(3)).flatten(1) if self.points.offsets_pose is not None else None
+        feature = self.points.feature(state.local)
         xyz, arms = self.points.positions_with_arms(rotations, state.betas, state.transl, feature)
         residual = targets.xyz - xyz
         pull = (targets.information @ residual[..., None]).squeeze(-1)
@@ -144,8 +144,8 @@ def _believed(information: Tensor) -> tuple[Tensor, Tensor]:
 def gradient_scale(points: SkinnedPoints, slots: tuple[int, ...]) -> Tensor:
     """(P,) what turns a gradient into about a step: the inverse of the Hessian's diagonal in T-pose."""
     eye = torch.eye(3).expand(1, 24, 3, 3)
-    feature = None if points.offsets_pose is None else torch.zeros(1, 207)
-    _, jacobian = points.positions_with_jacobian(eye, torch.zeros(1, 10), torch.zeros(1, 3), eye, feature)
+    still = torch.zeros(1, 10), torch.zeros(1, 3)
+    _, jacobian = points.positions_with_jacobian(eye, *still, eye, points.feature(eye))
     slope = jacobian[0, list(slots)].flatten(0, 1).square().sum(0)[_TANGENT] / _SEEN_M**2
     prior = torch.cat((torch.ones(10), torch.full((3 * NUM_ROTATIONS,), _TURN_RAD**-2), torch.zeros(3)))
     return 1 / (slope + prior)

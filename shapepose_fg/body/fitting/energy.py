@@ -2,7 +2,7 @@
 
     E(Theta) = sum_i rho(|S_i (x_i(Theta) - z_i)|²) + |betas|² - 2 log p(theta) + constant
 
-with S_iᵀ S_i the information of target z_i, rho a robust kernel, p the pose prior, a Gaussian mixture: SMPLify
+with S_iᵀ S_i the information of target z_i, rho a robust kernel, p the pose prior, a Gaussian: SMPLify
 (Bogo et al. 2016) for 3D joints. There is no factor 1/2, so that the inverse of the Hessian below is a covariance.
 """
 
@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from shapepose_fg.body.fitting.pose_energy import PoseEnergy, PosePull
 from shapepose_fg.body.fitting.pose_prior import NUM_ANGLES, PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters, accumulate
 from shapepose_fg.body.model.rotation import exp_so3, log_so3, right_jacobian
@@ -190,6 +189,43 @@ def factored(hessian: Tensor) -> Tensor:
     return torch.linalg.cholesky_ex(hessian + torch.diag(added))[0]
 
 
+@dataclass(frozen=True)
+class PosePull:
+    """The pose prior's energy at the angles of B rows, and how it pulls them."""
+
+    energy: Tensor
+    """(B,) squared Mahalanobis distance."""
+    gradient: Tensor
+    """(B, A) half the gradient."""
+    hessian: Tensor
+    """(B, A, A) half the Hessian."""
+
+
+class PoseEnergy:
+    """-2 log of the prior's marginal density over the visible angles, but for a constant."""
+
+    def __init__(self, prior: PosePrior, angles: np.ndarray, dtype: torch.dtype):
+        """For the visible `angles` (A,), places among the 69, computing in `dtype`."""
+        hidden = np.setdiff1d(np.arange(NUM_ANGLES), angles)
+
+        def tensor(array: np.ndarray) -> Tensor:
+            return torch.from_numpy(np.ascontiguousarray(array)).to(dtype)
+
+        self._mean, self._precision = tensor(prior.mean[angles]), tensor(prior.marginal_precision(angles))
+        gain = prior.regression(angles, hidden)
+        self._gain, self._at_zero = tensor(gain), tensor(prior.mean[hidden] - gain @ prior.mean[angles])
+
+    def pull(self, angles: Tensor, anchor: Tensor | None = None) -> PosePull:
+        """At visible angles (B, A), around `anchor` (B, A) or where the prior expects them."""
+        error = angles - (self._mean if anchor is None else anchor)
+        gradient = error @ self._precision
+        return PosePull((gradient * error).sum(-1), gradient, self._precision.expand(len(angles), -1, -1))
+
+    def hidden(self, angles: Tensor) -> Tensor:
+        """(B, M) what the prior expects of the invisible angles."""
+        return angles @ self._gain.T + self._at_zero
+
+
 class BodyEnergy:
     """Evaluates the energy over the *free* parameters of a row, a vector (P,).
 
@@ -240,30 +276,23 @@ class BodyEnergy:
     def evaluate(
         self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor, held: "Held | None" = None
     ) -> Evaluated:
-        """What `linearise` gives, with keypoints and Jacobian."""
-        xyz, jacobian = self.keypoints_with_jacobian(free)
-        here = self.linearise_at(free, xyz, jacobian, targets, kernel_scale, held)
+        """Bodies, and the energy around them, at free parameters (B, P); the kernel has the scale (B, 1).
+
+        What is `held` stays around there instead of where the priors expect it.
+        """
+        xyz, jacobian, here = self._linearised(free, targets, kernel_scale, held)
         return Evaluated(free, xyz, jacobian, here, factored(here.hessian))
 
     def linearise(
         self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor, held: "Held | None" = None
     ) -> Linearisation:
-        """Energy, gradient and Hessian at free parameters (B, P), with the kernel's scale (B, 1).
+        """The energy alone, see `evaluate`."""
+        return self._linearised(free, targets, kernel_scale, held)[2]
 
-        What is `held` stays around there instead of where the priors expect it.
-        """
-        return self.linearise_at(free, *self.keypoints_with_jacobian(free), targets, kernel_scale, held)
-
-    def linearise_at(
-        self,
-        free: Tensor,
-        xyz: Tensor,
-        jacobian: Tensor,
-        targets: WhitenedTargets,
-        kernel_scale: Tensor,
-        held: "Held | None" = None,
-    ) -> Linearisation:
-        """The same where keypoints `xyz` and their `jacobian` are known already."""
+    def _linearised(
+        self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor, held: "Held | None"
+    ) -> tuple[Tensor, Tensor, Linearisation]:
+        xyz, jacobian = self.keypoints_with_jacobian(free)
         residual = (targets.root @ (xyz - targets.xyz)[..., None]).squeeze(-1)
         squared = residual.square().sum(-1)
         weight = robust_weight(squared, kernel_scale).sqrt()[..., None]
@@ -271,8 +300,13 @@ class BodyEnergy:
         rows = (root @ jacobian.unflatten(1, xyz.shape[1:])).flatten(1, 2)
         gradient = (rows.mT @ (weight * residual).flatten(1)[..., None]).squeeze(-1)
         hessian = rows.mT @ rows
-        prior = self._add_priors(free, gradient, hessian, held)
-        return Linearisation(squared, prior, gradient, hessian)
+        stiffness, away, pose = self._pulls(free, held)
+        gradient[:, :10] += stiffness * away
+        gradient[:, self._angle_slice] += pose.gradient
+        torch.diagonal(hessian, dim1=-2, dim2=-1)[:, :10] += stiffness
+        hessian[:, self._angle_slice, self._angle_slice] += pose.hessian
+        prior = (stiffness * away.square()).sum(-1) + pose.energy
+        return xyz, jacobian, Linearisation(squared, prior, gradient, hessian)
 
     def slope(
         self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor, held: "Held | None" = None
@@ -298,9 +332,7 @@ class BodyEnergy:
         body, points = self.complete(free), self.model.keypoint_points
         local = exp_so3(torch.cat((body.global_orient[:, None], body.body_pose), 1))
         rotations = accumulate(local)
-        blend = (local[:, 1:] - torch.eye(3, dtype=self.dtype)).flatten(1)
-        feature = None if points.offsets_pose is None else blend
-        xyz, arms = points.positions_with_arms(rotations, body.betas, body.transl, feature)
+        xyz, arms = points.positions_with_arms(rotations, body.betas, body.transl, points.feature(local))
         squared, forces = pull(xyz)
         by_column = points.pull_back(forces, arms, rotations, local)
         angles = free[:, self._angle_slice]
@@ -312,21 +344,11 @@ class BodyEnergy:
         gradient = torch.cat((by_betas, by_column[:, 10:13], by_angles, by_column[:, -3:]), 1)
         return Slope(xyz, squared, (stiffness * away.square()).sum(-1) + pose.energy, gradient)
 
-    def _add_priors(self, free: Tensor, gradient: Tensor, hessian: Tensor, held: "Held | None") -> Tensor:
-        """Add the gradients and Hessians of shape and pose prior in place; returns their energy (B,)."""
-        stiffness, away, pose = self._pulls(free, held)
-        gradient[:, :10] += stiffness * away
-        gradient[:, self._angle_slice] += pose.gradient
-        torch.diagonal(hessian, dim1=-2, dim2=-1)[:, :10] += stiffness
-        hessian[:, self._angle_slice, self._angle_slice] += pose.hessian
-        return (stiffness * away.square()).sum(-1) + pose.energy
-
     def _pulls(self, free: Tensor, held: "Held | None") -> tuple[Tensor, Tensor, PosePull]:
         """How stiffly betas are held, how far away they are, and what pulls the angles."""
         angles = free[:, self._angle_slice]
         held = Held.by_priors() if held is None else held
-        pose = self._pose(angles) if held.angles is None else self._pose.around(held.angles, angles)
-        return held.stiffness, free[:, :10] - held.betas, pose
+        return held.stiffness, free[:, :10] - held.betas, self._pose.pull(angles, held.angles)
 
 
 def visible_joints(model: BodyModel, prior: PosePrior) -> np.ndarray:

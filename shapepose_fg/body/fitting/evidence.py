@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitter import STATUS_TYPE, FitStatus, JointTargets
-from shapepose_fg.core.bounds import Metres, Settings
 
 Array = NDArray[np.float64]
 
@@ -16,17 +15,9 @@ LEAST_JOINTS = 4
 """Joints with full information that a fit needs: three place a body in space, one more says whether they agree."""
 _SEEN_SIGMA_M = 0.3
 """A joint's information is full when its target's sigma is under this along every axis, metres."""
-
-
-@dataclass(frozen=True)
-class EvidenceConfig(Settings):
-    """When a row of targets is enough for a body, and how far detector and body differ."""
-
-    model_sigma_m: Metres = 0.02
-    """How far the detector's joints lie from the body's, metres: added to every target's covariance."""
-    min_spread_m: Metres = 0.03
-    """Joints with full information must lie this far off a common line (root mean square), metres: the body could
-    spin about it."""
+MIN_SPREAD_M = 0.03
+"""Joints with full information must lie this far off a common line (root mean square), metres: the body could spin
+about it."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +40,8 @@ class Evidence:
         return Evidence(*(value[index] for value in vars(self).values()))
 
 
-def weigh(targets: JointTargets, config: EvidenceConfig) -> Evidence:
-    """Judge the rows, and add the model's error to every target.
+def weigh(targets: JointTargets, model_sigma_m: float) -> Evidence:
+    """Judge the rows, and add the model's error, a sigma in metres, to every target.
 
     An eigenvalue l of the information becomes l / (1 + l sigma²), which is the inverse of 1 / l + sigma² and
     holds for l = 0 too: a direction in which nothing was measured.
@@ -65,15 +56,15 @@ def weigh(targets: JointTargets, config: EvidenceConfig) -> Evidence:
     count = full.sum(axis=1)
     centre = np.where(full[..., None], xyz, 0.0).sum(axis=1) / np.maximum(count, 1)[:, None]
     status = np.full(len(xyz), FitStatus.OK, dtype=STATUS_TYPE)
-    status[~determine_pose(xyz, full, config)] = FitStatus.TOO_FEW_JOINTS
+    status[~determine_pose(xyz, full)] = FitStatus.TOO_FEW_JOINTS
     status[~valid] = FitStatus.INVALID_TARGETS
-    half = np.sqrt(values / (1 + values * config.model_sigma_m**2))
+    half = np.sqrt(values / (1 + values * model_sigma_m**2))
     root = (vectors * half[..., None, :]) @ vectors.swapaxes(-1, -2)
-    variance = (1 / np.where(full[..., None], values, 1.0)).mean(axis=-1) + config.model_sigma_m**2
+    variance = (1 / np.where(full[..., None], values, 1.0)).mean(axis=-1) + model_sigma_m**2
     return Evidence(status, xyz, root, np.where(full, variance, np.inf), centre)
 
 
-def determine_pose(xyz: Array, used: NDArray[np.bool_], config: EvidenceConfig) -> NDArray[np.bool_]:
+def determine_pose(xyz: Array, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """(...) whether the joints `used` (..., K) of `xyz` (..., K, 3) are enough, and do not lie on a line."""
     count = used.sum(axis=-1)
     points = np.where(used[..., None], xyz, 0.0)
@@ -82,13 +73,13 @@ def determine_pose(xyz: Array, used: NDArray[np.bool_], config: EvidenceConfig) 
     scatter = points.swapaxes(-1, -2) @ points / np.maximum(count, 1)[..., None, None]
     # How far they lie off their best line, squared, is what the largest eigenvalue leaves of the trace.
     off = np.maximum(np.linalg.eigvalsh(scatter)[..., :2].sum(axis=-1), 0.0)
-    return (count >= LEAST_JOINTS) & (off >= config.min_spread_m**2)
+    return (count >= LEAST_JOINTS) & (off >= MIN_SPREAD_M**2)
 
 
 def _refuse_nonsense(targets: JointTargets) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Targets and information with rows that are not finite set to zero, and which rows (B,) were finite.
 
-    The place of a joint without information may be anything, NaN too: nobody looks at it.
+    The place of a joint without information may be anything, NaN too: it is not used.
     """
     known = np.any(targets.information != 0, axis=(2, 3))  # NaN differs from 0
     finite = np.isfinite(targets.information).all(axis=(1, 2, 3))

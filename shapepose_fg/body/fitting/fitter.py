@@ -1,11 +1,16 @@
 """From 3D joints to bodies: what a fitter is given, what it gives back, and what it may be replaced by."""
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
 from enum import StrEnum
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from shapepose_fg.body.model.body_model import BodyModel
+    from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 
 
 class FitStatus(StrEnum):
@@ -126,9 +131,47 @@ class BodyFit:
         )
 
 
-class BodyFitter(Protocol):
-    """Anything that turns joints into bodies: plain optimisation here, a learned fitter elsewhere."""
+@dataclass(frozen=True)
+class Shapes:
+    """What is known of the shapes of G people: a Gaussian over the betas of each."""
 
+    mean: NDArray[np.float64]
+    """(G, 10) in standard deviations over adults."""
+    information: NDArray[np.float64]
+    """(G, 10, 10) inverse covariances. Those of an unknown person are the identity around 0."""
+
+    def __post_init__(self) -> None:
+        if self.mean.ndim != 2 or self.mean.shape[1] != 10 or self.information.shape != (*self.mean.shape, 10):
+            shapes = f"{self.mean.shape} and {self.information.shape}"
+            raise ValueError(f"mean and information must be (G, 10) and (G, 10, 10), got {shapes}")
+
+    @classmethod
+    def unknown(cls, count: int) -> "Shapes":
+        """Shapes of `count` people who were never seen: adults."""
+        return cls(np.zeros((count, 10)), np.tile(np.eye(10), (count, 1, 1)))
+
+
+@dataclass(frozen=True)
+class SequenceFit:
+    """Bodies of B rows, and what is known of their shapes."""
+
+    fit: BodyFit
+    """The bodies. `covariance` is what a row's own targets say at the shape of its group: correlated errors are
+    not averaged out. `prior_xyz` and `prior_covariance` are NaN: they are `fit`'s."""
+    groups: NDArray[np.intp]
+    """(G,) the groups, in order."""
+    shapes: Shapes
+    """(G) their shapes given everything, what was known before included: the prior of their next recording."""
+
+
+class BodyFitter(ABC):
+    """Anything that turns joints into bodies. Your own inherits from this and has `fit`, the rest is optional."""
+
+    model: "BodyModel | None" = None
+    """The body that it fits. A fitter that has one has `with_keypoint_offsets` and `fit_sequence`, too; without,
+    the detector's offsets are not learnt, and there is no one body for each person over time."""
+
+    @abstractmethod
     def fit(
         self, targets: JointTargets, initial: BodyFit | None = None, groups: NDArray[np.intp] | None = None
     ) -> BodyFit:
@@ -137,4 +180,43 @@ class BodyFitter(Protocol):
         `initial` has one row per target; its OK rows are where the fit may start. `groups` (B,) are whole numbers:
         rows with the same number are one person and get one shape. Otherwise rows do not influence each other.
         """
-        ...
+
+    def fit_whole(self, targets: JointTargets, initial: BodyFit | None = None) -> BodyFit:
+        """The same bodies where `prior_xyz` and `prior_covariance` are not needed, which may be NaN: faster."""
+        return self.fit(targets, initial)
+
+    def with_keypoint_offsets(self, offsets: "KeypointOffsets") -> "BodyFitter":
+        """The same fitter for a detector that puts its joints so far from the body's."""
+        raise NotImplementedError(f"{type(self).__name__} has a model and no with_keypoint_offsets")
+
+    def fit_sequence(
+        self,
+        targets: JointTargets,
+        groups: NDArray[np.intp],
+        time_s: NDArray[np.float64],
+        shapes: Shapes | None = None,
+        *,
+        fixed_shapes: bool = False,
+    ) -> SequenceFit:
+        """One shape per group and poses that move as people do, over time.
+
+        Parameters
+        ----------
+        targets: of B rows: where a person's joints are, and how surely, in one frame each.
+        groups: (B,) whole numbers: who.
+        time_s: (B,) when, seconds. Rows of a group more than `gap_s` apart are not linked.
+        shapes: what is known of the shape of each group, in the order of `np.unique(groups)`; None: nothing.
+        fixed_shapes: keep the means of `shapes`.
+
+        Rows with too few joints follow those before and after; ValueError where a group has two rows at one time.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has a model and no fit_sequence")
+
+
+def check_fitter(fitter: object) -> None:
+    """TypeError where `fitter` is no `BodyFitter`."""
+    if not isinstance(fitter, BodyFitter):
+        raise TypeError(
+            f"{type(fitter).__name__} must inherit from shapepose_fg.body.fitting.fitter.BodyFitter, which makes"
+            " the other methods of a fitter from `fit`"
+        )

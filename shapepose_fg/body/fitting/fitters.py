@@ -1,53 +1,288 @@
-"""Which body fitter a pipeline runs with."""
+"""The body fitter: judge targets, plan passes, fit them, share shapes, fit again; with the network on or off."""
 
-from dataclasses import dataclass, field
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal, get_args
 
-from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter, PlainFitterConfig
-from shapepose_fg.body.fitting.learned import LearnedFitter, LearnedFitterConfig
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from shapepose_fg.body.fitting.body_sequence import SequenceFitter
+from shapepose_fg.body.fitting.energy import BodyEnergy, Held, WhitenedTargets
+from shapepose_fg.body.fitting.evidence import Evidence, weigh
+from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus, JointTargets, SequenceFit, Shapes
+from shapepose_fg.body.fitting.left_out import Passes, left_out_sets, plan_passes
+from shapepose_fg.body.fitting.motion_prior import MotionPrior
+from shapepose_fg.body.fitting.optimisers import LevenbergMarquardt, NetworkDescent
+from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.fitting.posterior import JointPosterior, left_out_places
+from shapepose_fg.body.fitting.settings import BodyConfig
+from shapepose_fg.body.fitting.shared_shape import check_groups, pooled_betas, shape_precision, shared
 from shapepose_fg.body.fitting.weights import FitterWeights, fingerprint
 from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 
-Method = Literal["auto", "learned", "plain"]
+Array = NDArray[np.float64]
 
-
-@dataclass(frozen=True)
-class BodyConfig:
-    """How bodies are fitted."""
-
-    method: str = "auto"
-    """"learned": learned gradient descent; "plain": Levenberg-Marquardt; "auto": learned where the weights are for
-    the body at hand, plain on any other body."""
-    weights: str = ""
-    """File of the learned fitter's weights (scripts/train_fitter.py); empty: those that come with the package."""
-    learned: LearnedFitterConfig = field(default_factory=LearnedFitterConfig)
-    """Settings of the learned fitter."""
-    plain: PlainFitterConfig = field(default_factory=PlainFitterConfig)
-    """Settings of the plain one."""
-
-    @classmethod
-    def paper(cls) -> "BodyConfig":
-        """As written in Eq. 6: the network's steps, and nothing after them."""
-        return cls(learned=LearnedFitterConfig(polish_steps=0, unfinished=1e6))
-
-    def __post_init__(self) -> None:
-        if self.method not in get_args(Method):
-            raise ValueError(f"method must be one of {' '.join(get_args(Method))}, got {self.method!r}")
+_CHUNK = 128
+"""Passes that are fitted at a time: their Hessians stay in the cache, and memory does not grow with the batch."""
+_VOTERS = 24
+"""Rows of a group that agree upon its shape. In a window of some seconds errors are correlated: more tell no
+more."""
+_CONVERGED = 9.0
+"""Without a network, rows whose energy a Newton step would still lower by more (3 sigma of the posterior) are
+NOT_CONVERGED; with one, `BodyConfig.unfinished` says so after the plain optimiser has tried."""
+_SPREAD = {"RWrist": 2.0, "LWrist": 2.0}
+"""Multiplies the variance of joints without their own target. Elbows bend farther from their mean than a Gaussian
+says: without it, 85 % of the wrists of the validation subjects (training.split) lay in their 90 % ellipsoids."""
 
 
-def make_fitter(
-    config: BodyConfig | None = None, model: BodyModel | None = None
-) -> "LearnedFitter | LevenbergMarquardtFitter":
+def make_fitter(config: BodyConfig | None = None, model: BodyModel | None = None) -> "SmplFitter":
     """The fitter that `config` asks for, on `model` or the shipped body.
 
-    InputError where the learned one is asked for and its weights are missing, or for another body.
+    InputError where the network is asked for and its weights are missing, or for another body.
     """
     config = BodyConfig() if config is None else config
     model = BodyModel.default() if model is None else model
     if config.method == "plain":
-        return LevenbergMarquardtFitter(model, config=config.plain)
+        return SmplFitter(model, config=config)
     weights = FitterWeights.load(Path(config.weights)) if config.weights else FitterWeights.default()
     if config.method == "auto" and not config.weights and fingerprint(model) != weights.body:
-        return LevenbergMarquardtFitter(model, config=config.plain)
-    return LearnedFitter(model, config=config.learned, weights=weights)
+        return SmplFitter(model, config=config)
+    return SmplFitter(model, config=config, weights=weights)
+
+
+class SmplFitter(BodyFitter):
+    """Fits a body to 3D joints by learned gradient descent, or without `weights` by Levenberg-Marquardt.
+
+    Rows are independent, but for the shape of rows in one group; one that the network and a short polish do not
+    settle is fitted by Levenberg-Marquardt instead, with a shape of its own. The body and its derivatives are
+    computed in single precision around each row's centre, covariances in double: within 1e-4 of all-double ones,
+    at half the cost.
+    """
+
+    model: BodyModel
+
+    def __init__(
+        self,
+        model: BodyModel | None = None,
+        pose_prior: PosePrior | None = None,
+        config: BodyConfig | None = None,
+        weights: FitterWeights | None = None,
+    ):
+        self.model = BodyModel.default() if model is None else model
+        self.prior = PosePrior.default() if pose_prior is None else pose_prior
+        self.config = config = BodyConfig() if config is None else config
+        self.weights = weights
+        """Of the network; None: it is off."""
+        self.energy = BodyEnergy(self.model.to(torch.float32), self.prior)
+        self.sets = left_out_sets(self.energy, self.prior)
+        """(J,) which joints are left out together."""
+        plain = LevenbergMarquardt(self.energy, self.prior, config.kernel_scale)
+        names = self.model.keypoint_names
+        if weights is None:
+            self.optimiser, self._fallback, self._unfinished = plain, None, _CONVERGED
+            self._spread = np.array([_SPREAD.get(name, 1.0) for name in names])
+        else:
+            weights.check(self.model)
+            self.optimiser = NetworkDescent(self.energy, weights, config.kernel_scale, config.polish_steps)
+            self._fallback, self._unfinished, self._spread = plain, config.unfinished, weights.spread_of(names)
+
+    def with_keypoint_offsets(self, offsets: KeypointOffsets) -> "SmplFitter":
+        """The same fitter for a detector that puts its joints so far from the body's."""
+        return SmplFitter(self.model.with_keypoint_offsets(offsets), self.prior, self.config, self.weights)
+
+    @torch.inference_mode()
+    def fit(
+        self, targets: JointTargets, initial: BodyFit | None = None, groups: NDArray[np.intp] | None = None
+    ) -> BodyFit:
+        """Fit a body to every row of `targets`; see `BodyFit` for what comes back.
+
+        OK rows of `initial` are warm starts of Levenberg-Marquardt: no closed form, no annealing; passes that
+        leave targets out start cold. The network needs none: two fits to the same targets are the same fit.
+        """
+        return self._fit(targets, initial, groups, leave_out=True)
+
+    @torch.inference_mode()
+    def fit_whole(self, targets: JointTargets, initial: BodyFit | None = None) -> BodyFit:
+        """The same bodies in a fraction of the time, without `prior_xyz` and `prior_covariance`, which are NaN."""
+        fit = self._fit(targets, initial, None, leave_out=False)
+        fit.prior_xyz[:], fit.prior_covariance[:] = np.nan, np.nan
+        return fit
+
+    @torch.inference_mode()
+    def fit_sequence(
+        self,
+        targets: JointTargets,
+        groups: NDArray[np.intp],
+        time_s: Array,
+        shapes: Shapes | None = None,
+        *,
+        fixed_shapes: bool = False,
+    ) -> SequenceFit:
+        """See `BodyFitter`."""
+        sequence = SequenceFitter(self.energy, self._starts, MotionPrior.default(), self.config)
+        return sequence.fit(targets, groups, time_s, shapes, fixed_shapes=fixed_shapes)
+
+    def _fit(
+        self, targets: JointTargets, initial: BodyFit | None, groups: NDArray[np.intp] | None, *, leave_out: bool
+    ) -> BodyFit:
+        """A body for every row."""
+        count = len(self.sets)
+        if targets.xyz.shape[1] != count:
+            raise ValueError(f"targets must be the {count} keypoints of the body, got {targets.xyz.shape[1]}")
+        if initial is not None and len(initial) != len(targets):
+            raise ValueError(f"initial must have one row per target: {len(targets)}, got {len(initial)}")
+        groups = np.arange(len(targets)) if groups is None else check_groups(groups, len(targets))
+        evidence = weigh(targets, self.config.model_sigma_m)
+        fit = BodyFit.failed(evidence.status, count)
+        rows = np.flatnonzero(evidence.status == FitStatus.OK)
+        if len(rows) > 0:
+            start = None if initial is None else self._start(initial.rows(rows), evidence.centre[rows])
+            usable, groups = evidence.rows(rows), groups[rows]
+            passes = plan_passes(usable, self.sets, groups) if leave_out else Passes.whole(groups, count)
+            passes = replace(passes, votes=passes.votes & evenly(groups, _VOTERS)[passes.row])
+            self._fill(fit, rows, passes, self._posteriors(usable, passes, start), usable)
+        return fit
+
+    def _posteriors(self, evidence: Evidence, passes: Passes, start: Tensor | None) -> list[JointPosterior]:
+        """What all passes say: those with all targets, then those without some, if any."""
+        # Single precision is a micrometre off at 10 m from the origin: each row gets its own origin.
+        inside = evidence.xyz - evidence.centre[:, None]
+        together = bool(shared(passes.pool, passes.votes).any())
+        free, held = self._shapes(inside, evidence, passes, start) if together else (None, Held.by_priors())
+        parts: list[JointPosterior] = []
+        for index in (np.arange(passes.num_rows), np.arange(passes.num_rows, len(passes))):
+            found: list[JointPosterior] = []
+            for chunk in _chunks(index):
+                targets = passes.targets(inside, evidence.root, chunk)
+                if free is None:
+                    variance = passes.variance(evidence.variance_m2, chunk)
+                    body, _ = self.optimiser.first(targets, variance, _part(start, chunk))
+                else:
+                    body = self.optimiser.again(free[chunk], targets, held[torch.from_numpy(chunk)])
+                found.append(JointPosterior.of(body, passes.asked(chunk)))
+            if len(found) == 0:
+                continue
+            part = JointPosterior.concatenated(found)
+            # Each pass by itself: what a target does to another pass must not decide which optimiser this one has.
+            unsettled = np.flatnonzero(~(part.left < self._unfinished))  # NaN is unsettled
+            if self._fallback is not None and len(unsettled) > 0:
+                chunk = index[unsettled]
+                targets = passes.targets(inside, evidence.root, chunk)
+                body, _ = self._fallback.first(targets, passes.variance(evidence.variance_m2, chunk), None)
+                part.put(unsettled, JointPosterior.of(body, passes.asked(chunk)))
+            parts.append(part)
+        return parts
+
+    def _shapes(
+        self, inside: Array, evidence: Evidence, passes: Passes, start: Tensor | None
+    ) -> tuple[Tensor, Held]:
+        """Where all passes start with the shapes at which those of each pool agree: (M, P), and what holds them.
+
+        The shapes are agreed upon by the passes that vote, each of which is fitted by itself first.
+        """
+        bodies, holds, places, precisions, settled = [], [], [], [], []
+        for index in (np.arange(passes.num_rows), np.arange(passes.num_rows, len(passes))):
+            for chunk in _chunks(index):
+                targets = passes.targets(inside, evidence.root, chunk)
+                variance = passes.variance(evidence.variance_m2, chunk)
+                free, held = self.optimiser.arrive(targets, variance, _part(start, chunk))
+                held = held.for_rows(len(free))
+                voting = torch.from_numpy(np.flatnonzero(passes.votes[chunk]))
+                if len(voting) > 0:
+                    body = self.optimiser.again(free[voting], targets[voting], held[voting])
+                    free[voting] = body.free
+                    places.append(chunk[voting.numpy()])
+                    precisions.append(shape_precision(body.factor))
+                    settled.append(body.left < self._unfinished)
+                bodies.append(free)
+                holds.append(held)
+        free, held = torch.cat(bodies), Held.concatenated(holds)
+        place = np.concatenate(places)
+        precision, votes = free.new_zeros(len(free), 10, 10), np.zeros(len(free), dtype=bool)
+        precision[torch.from_numpy(place)], votes[place] = torch.cat(precisions), torch.cat(settled).numpy()
+        betas = pooled_betas(free[:, :10], precision, passes.pool, votes, held)
+        return torch.cat((betas, free[:, 10:]), 1), held.at_shape(betas, shared(passes.pool, votes))
+
+    def _fill(
+        self,
+        fit: BodyFit,
+        rows: NDArray[np.intp],
+        passes: Passes,
+        parts: list[JointPosterior],
+        evidence: Evidence,
+    ) -> None:
+        """Fill `fit`'s `rows` (R,) with what the passes found; `evidence` is that of the rows.
+
+        Rows whose energy a Newton step would still lower, or that are not finite, become NOT_CONVERGED.
+        """
+        wider, found = self._spread[:, None, None], parts[0]
+        unseen = np.all(evidence.root == 0, axis=(-1, -2))[..., None, None]
+        prior_xyz, prior_covariance = left_out_places(passes, *parts)
+        information = np.square(evidence.root).sum(axis=(1, 2, 3)) / 3
+        done = found.left < self._unfinished  # NaN is not
+        done &= np.isfinite(prior_xyz).all(axis=(1, 2)) & np.isfinite(prior_covariance).all(axis=(1, 2, 3))
+        whole = self.energy.complete(torch.from_numpy(found.free[done]).to(self.energy.dtype))
+        fit.status[rows[~done]] = FitStatus.NOT_CONVERGED
+        rows, origin = rows[done], evidence.centre[done]
+        for name in ("betas", "global_orient", "body_pose"):
+            getattr(fit, name)[rows] = getattr(whole, name).double().numpy()
+        fit.transl[rows] = whole.transl.double().numpy() + origin
+        fit.joints[rows] = found.xyz[done] + origin[:, None]
+        fit.covariance[rows] = np.where(unseen, wider * found.covariance, found.covariance)[done]
+        fit.prior_xyz[rows] = prior_xyz[done] + origin[:, None]
+        fit.prior_covariance[rows] = wider * prior_covariance[done] + self.config.model_sigma_m**2 * np.eye(3)
+        fit.residual_m[rows] = np.sqrt(found.squared.sum(axis=1) / information)[done]
+
+    def _starts(self, evidence: Evidence) -> tuple[Tensor, Held, NDArray[np.bool_]]:
+        """Bodies of rows (R) with all their targets, nothing left out, each with a shape of its own.
+
+        Returns their parameters (R, P) around `evidence.centre`, what holds them, and which (R,) are finished.
+        """
+        inside = torch.from_numpy(evidence.xyz - evidence.centre[:, None]).float()
+        targets, found, holds = WhitenedTargets(inside, torch.from_numpy(evidence.root).float()), [], []
+        for at in range(0, len(inside), _CHUNK):
+            part = slice(at, at + _CHUNK)
+            body, held = self.optimiser.first(targets[part], evidence.variance_m2[part], None)
+            found.append(torch.cat((body.free, (body.left < self._unfinished)[:, None]), 1))
+            holds.append(held.for_rows(len(body.free)))
+        free, held = torch.cat(found), Held.concatenated(holds)
+        free, done = free[:, :-1], free[:, -1].bool().numpy()
+        unsettled = np.flatnonzero(~done)
+        if self._fallback is not None and len(unsettled) > 0:
+            seen = targets[torch.from_numpy(unsettled)]
+            body, _ = self._fallback.first(seen, evidence.variance_m2[unsettled], None)
+            free[unsettled], done[unsettled] = body.free, (body.left < self._unfinished).numpy()
+            held.betas[unsettled] = body.free[:, :10]
+            if held.angles is not None:
+                held.angles[unsettled] = body.free[:, 13:-3]
+        return free, held, done
+
+    def _start(self, initial: BodyFit, centre: Array) -> Tensor:
+        """Free parameters (R, P) of bodies around their origins (R, 3); NaN where there is none."""
+        angles = initial.body_pose.reshape(len(initial), -1)[:, self.energy.angles]
+        parts = (initial.betas, initial.global_orient, angles, initial.transl - centre)
+        start = np.where(initial.ok[:, None], np.concatenate(parts, axis=1), np.nan)
+        return torch.from_numpy(start).float()
+
+
+def _chunks(index: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+    return [index[at : at + _CHUNK] for at in range(0, len(index), _CHUNK)]
+
+
+def evenly(groups: NDArray[np.intp], count: int) -> NDArray[np.bool_]:
+    """(R,) at most `count` rows of each group (R,), evenly spread over its rows."""
+    order = np.argsort(groups, kind="stable")
+    _, first, size = np.unique(groups[order], return_index=True, return_counts=True)
+    rank = np.arange(len(order)) - np.repeat(first, size)
+    number = rank * count // np.maximum(np.repeat(size, size), count)
+    chosen = np.zeros(len(order), dtype=bool)
+    chosen[order] = (rank == 0) | (np.diff(number, prepend=0) != 0)
+    return chosen
+
+
+def _part(start: Tensor | None, chunk: NDArray[np.intp]) -> Tensor | None:
+    """The starts of a chunk: passes that leave targets out have none, an earlier body has seen them."""
+    return None if start is None or chunk[0] >= len(start) else start[chunk]

@@ -1,6 +1,5 @@
 """Leave-one-out: which targets are taken out together, and the passes of a fit that never see them."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,8 +7,9 @@ import torch
 from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.energy import BodyEnergy, Held, WhitenedTargets
-from shapepose_fg.body.fitting.evidence import Evidence, EvidenceConfig, determine_pose
+from shapepose_fg.body.fitting.evidence import Evidence, determine_pose
 from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.fitting.settings import BodyConfig
 
 Array = NDArray[np.float64]
 
@@ -56,11 +56,6 @@ class Passes:
         """Count of rows, R."""
         return len(self.source)
 
-    def chunks(self, size: int) -> Iterator[NDArray[np.intp]]:
-        """Indices of all passes, at most `size` at a time: those with all targets, then those without some."""
-        for start, stop in ((0, self.num_rows), (self.num_rows, len(self))):
-            yield from (np.arange(at, min(at + size, stop)) for at in range(start, stop, size))
-
     def asked(self, index: NDArray[np.intp]) -> NDArray[np.intp]:
         """(B, N) joints that some passes are for: all, or those left out, of some sets others too."""
         without = self.without[index]
@@ -79,9 +74,7 @@ class Passes:
         return np.where(self.without[index], np.inf, variance[self.row[index]])
 
 
-def plan_passes(
-    evidence: Evidence, sets: NDArray[np.intp], groups: NDArray[np.intp], config: EvidenceConfig
-) -> Passes:
+def plan_passes(evidence: Evidence, sets: NDArray[np.intp], groups: NDArray[np.intp]) -> Passes:
     """One pass with all targets for each row (R), one more for every set of joints (J,) to leave out.
 
     A set without a target in any row of a group (R,) needs no pass. Where what is left would not determine the
@@ -93,7 +86,7 @@ def plan_passes(
     _, group = np.unique(groups, return_inverse=True)
     asked = np.zeros((group.max() + 1, S), dtype=bool)
     np.logical_or.at(asked, group, seen @ member.T)
-    determined = determine_pose(evidence.xyz[:, None], full[:, None] & ~member, config)  # (R, S)
+    determined = determine_pose(evidence.xyz[:, None], full[:, None] & ~member)  # (R, S)
     together = np.argwhere(asked[group] & determined)
     singly = np.argwhere((asked[group] & ~determined)[:, sets])
     source = np.repeat(np.arange(R)[:, None], S, axis=1)
@@ -109,8 +102,8 @@ def plan_passes(
     return Passes(row, without, group[row] * (S + 1) + of_set + 1, votes, source)
 
 
-def left_out_sets(energy: BodyEnergy, prior: PosePrior, count: int = SETS) -> NDArray[np.intp]:
-    """Which of `count` sets each joint (J,) is left out with: joints that tell little of each other.
+def left_out_sets(energy: BodyEnergy, prior: PosePrior) -> NDArray[np.intp]:
+    """Which of `SETS` sets each joint (J,) is left out with: joints that tell little of each other.
 
     The cost of a pair is how much less certain each of the two is when the other is missing too (`_coupling`); the
     sum over all pairs in one set is made small by placing joint by joint, then moving and exchanging them.
@@ -118,9 +111,9 @@ def left_out_sets(energy: BodyEnergy, prior: PosePrior, count: int = SETS) -> ND
     cost = _coupling(energy, prior)
     sets = np.full(len(cost), -1)
     for joint in np.argsort(-cost.sum(axis=1), kind="stable"):
-        sets[joint] = np.argmin([cost[joint, sets == each].sum() for each in range(count)])
+        sets[joint] = np.argmin([cost[joint, sets == each].sum() for each in range(SETS)])
     while True:
-        by_set = cost @ (sets[:, None] == np.arange(count))  # (J, S) cost of each joint in each set
+        by_set = cost @ (sets[:, None] == np.arange(SETS))  # (J, S) cost of each joint in each set
         own = by_set[np.arange(len(sets)), sets]
         moved = by_set - own[:, None]
         swapped = moved[:, sets] + moved[:, sets].T - 2 * cost
@@ -150,7 +143,7 @@ def _coupling(energy: BodyEnergy, prior: PosePrior) -> Array:
     H, J = body.here.hessian.double().numpy(), body.jacobian.double().numpy()
     root = [10, 11, 12, -3, -2, -1]
     H[:, root, root] += _ROOT_INFORMATION
-    covariance = J @ np.linalg.solve(H, J.swapaxes(1, 2)) + EvidenceConfig.model_sigma_m**2 * np.eye(3 * count)
+    covariance = J @ np.linalg.solve(H, J.swapaxes(1, 2)) + BodyConfig.model_sigma_m**2 * np.eye(3 * count)
     K = np.linalg.inv(covariance).reshape(_POSES, count, 3, count, 3).swapaxes(2, 3)  # (N, J, J, 3, 3)
     own = K[:, np.arange(count), np.arange(count)]
     # The Schur complement: K_aa - K_ab K_bb^-1 K_ba is a's information when b is missing too.

@@ -58,9 +58,8 @@ class PersonFrame:
         zero = torch.zeros(1, 3, dtype=torch.float64)
         pelvis = model.joints(BodyParameters(torch.zeros(1, 10, dtype=torch.float64), zero, pose, zero))[0, 0]
         local = exp_so3(torch.cat((zero[:, None], pose), 1))
-        feature = None if model.points.offsets_pose is None else (local[:, 1:] - torch.eye(3)).flatten(1)
         xyz, jacobian = model.points.positions_with_jacobian(
-            accumulate(local), torch.zeros(1, 10, dtype=torch.float64), zero, local, feature
+            accumulate(local), torch.zeros(1, 10, dtype=torch.float64), zero, local, model.points.feature(local)
         )
         by_shape, by_pose = jacobian[0, ..., :10], jacobian[0, ..., 13:-3]
         spread = by_pose @ torch.from_numpy(covariance)

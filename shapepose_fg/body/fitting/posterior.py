@@ -7,9 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from shapepose_fg.body.fitting.energy import BodyEnergy, Evaluated, factored
-from shapepose_fg.body.fitting.evidence import Evidence
-from shapepose_fg.body.fitting.fitter import BodyFit, FitStatus
+from shapepose_fg.body.fitting.energy import Evaluated, factored
 from shapepose_fg.body.fitting.left_out import Passes
 
 Array = NDArray[np.float64]
@@ -77,48 +75,7 @@ def joint_covariance(factor: Tensor, jacobian: Tensor) -> Tensor:
     return A + sag.square()[..., None, None] * torch.eye(3, dtype=A.dtype)
 
 
-def fill(
-    fit: BodyFit,
-    rows: NDArray[np.intp],
-    passes: Passes,
-    energy: BodyEnergy,
-    parts: list[JointPosterior],
-    evidence: Evidence,
-    spread: Array,
-    *,
-    model_sigma_m: float,
-    unfinished: float,
-) -> None:
-    """Fill `fit`'s `rows` (R,) with what the passes found: those with all targets, and those without some, if any.
-
-    `evidence` is that of the rows. Rows whose energy a Newton step would lower by more than `unfinished`, or that
-    are not finite, become NOT_CONVERGED. `spread` (J,) multiplies the variance of what is said of a joint without
-    its own target.
-    """
-    root, centre = evidence.root, evidence.centre
-    wider = spread[:, None, None]
-    unseen = np.all(root == 0, axis=(-1, -2))[..., None, None]
-    found = parts[0]
-    prior_xyz, prior_covariance = _left_out(passes, *parts)
-    information = np.square(root).sum(axis=(1, 2, 3)) / 3
-    done = found.left < unfinished  # NaN is not
-    done &= np.isfinite(prior_xyz).all(axis=(1, 2)) & np.isfinite(prior_covariance).all(axis=(1, 2, 3))
-    whole = energy.complete(torch.from_numpy(found.free[done]).to(energy.dtype))
-
-    fit.status[rows[~done]] = FitStatus.NOT_CONVERGED
-    rows, origin = rows[done], centre[done]
-    fit.betas[rows] = whole.betas.double().numpy()
-    fit.global_orient[rows] = whole.global_orient.double().numpy()
-    fit.body_pose[rows] = whole.body_pose.double().numpy()
-    fit.transl[rows] = whole.transl.double().numpy() + origin
-    fit.joints[rows] = found.xyz[done] + origin[:, None]
-    fit.covariance[rows] = np.where(unseen, wider * found.covariance, found.covariance)[done]
-    fit.prior_xyz[rows] = prior_xyz[done] + origin[:, None]
-    fit.prior_covariance[rows] = wider * prior_covariance[done] + model_sigma_m**2 * np.eye(3)
-    fit.residual_m[rows] = np.sqrt(found.squared.sum(axis=1) / information)[done]
-
-
-def _left_out(
+def left_out_places(
     passes: Passes, found: JointPosterior, left_out: JointPosterior | None = None
 ) -> tuple[Array, Array]:
     """Place (R, J, 3) and covariance (R, J, 3, 3) of each joint in the pass that never saw its targets."""

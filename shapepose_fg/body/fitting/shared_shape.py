@@ -9,7 +9,7 @@ from shapepose_fg.body.fitting.energy import Held
 
 
 def shape_precision(factor: Tensor) -> Tensor:
-    """(B, 10, 10) what each row alone knows of its betas, from the Cholesky factor (B, P, P) of its Hessian.
+    """(B, 10, 10) what each row by itself knows of its betas, from the Cholesky factor (B, P, P) of its Hessian.
 
     The Schur complement: the inverse of the betas' block of the Hessian's inverse.
     """

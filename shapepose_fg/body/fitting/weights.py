@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
@@ -15,7 +16,7 @@ from torch import Tensor
 from shapepose_fg.body.fitting.network import NetworkConfig, UpdateNetwork
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.model.body_model import BodyModel
-from shapepose_fg.body.model.target_skeletons import BODY_POINTS
+from shapepose_fg.body.model.target_skeletons import BODY_POINTS, slots
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import open_regular
 
@@ -50,10 +51,9 @@ class FitterWeights:
         """The weights that ship with the package (read once)."""
         return _load_default()
 
-    @classmethod
-    def of(cls, source: "FitterWeights | Path") -> "FitterWeights":
-        """`source` itself, or read from a path."""
-        return source if isinstance(source, FitterWeights) else cls.load(source)
+    def spread_of(self, names: tuple[str, ...]) -> NDArray[np.float64]:
+        """(J,) `spread` of the keypoints with these names."""
+        return self.spread[list(slots(names))].double().numpy()
 
     @classmethod
     def load(cls, path: Path) -> "FitterWeights":

@@ -154,10 +154,11 @@ class BodyModel:
         The only thing here whose cost grows with the mesh. ValueError where `only` has other than one axis.
         """
         mesh = self._mesh if only is None else self._part_of_mesh(np.ascontiguousarray(only, dtype=np.intp))
-        _, rotations = self._rotations(parameters)
+        local, rotations = self._rotations(parameters)
         shaped = mesh.template + (parameters.betas @ mesh.shapes).unflatten(-1, (-1, 3))
         if mesh.pose_blend is not None:
-            shaped = shaped + (self._pose_feature(parameters) @ mesh.pose_blend).unflatten(-1, (-1, 3))
+            bent = (local[:, 1:] - torch.eye(3, dtype=self.dtype)).flatten(1)
+            shaped = shaped + (bent @ mesh.pose_blend).unflatten(-1, (-1, 3))
         rest = mesh.rest_joints + (parameters.betas @ mesh.rest_joint_shapes).unflatten(-1, (-1, 3))
         posed = self._joints.positions(rotations, parameters.betas, parameters.transl, None)
         shift = posed - (rotations @ rest[..., None]).squeeze(-1)
@@ -173,8 +174,8 @@ class BodyModel:
     def keypoints(self, parameters: BodyParameters) -> Tensor:
         """(B, K, 3) keypoints, metres: keypoint regressor x vertices, without the mesh."""
         local, rotations = self._rotations(parameters)
-        feature = self._blend_feature(local)
-        return self.keypoint_points.positions(rotations, parameters.betas, parameters.transl, feature)
+        points = self.keypoint_points
+        return points.positions(rotations, parameters.betas, parameters.transl, points.feature(local))
 
     @torch.no_grad()
     def keypoints_with_jacobian(
@@ -188,7 +189,7 @@ class BodyModel:
         """
         local, rotations = self._rotations(parameters)
         return self.keypoint_points.positions_with_jacobian(
-            rotations, parameters.betas, parameters.transl, local, self._blend_feature(local), tangents
+            rotations, parameters.betas, parameters.transl, local, self.keypoint_points.feature(local), tangents
         )
 
     @property
@@ -221,15 +222,6 @@ class BodyModel:
         local = exp_so3(torch.cat((parameters.global_orient[:, None], parameters.body_pose), 1))
         return local, accumulate(local)
 
-    def _blend_feature(self, local: Tensor) -> Tensor | None:
-        """(B, 207) R - I of the joints but the pelvis; None for a model that has no use for it."""
-        if self.keypoint_points.offsets_pose is None:
-            return None
-        return (local[:, 1:] - torch.eye(3, dtype=local.dtype)).flatten(1)
-
-    def _pose_feature(self, parameters: BodyParameters) -> Tensor:
-        return (exp_so3(parameters.body_pose) - torch.eye(3, dtype=self.dtype)).flatten(1)
-
     def _part_of_mesh(self, only: NDArray[np.intp]) -> "_Mesh":
         """What some of the vertices need; the last part is kept, for it is asked for frame after frame."""
         if only.ndim != 1:
@@ -241,7 +233,7 @@ class BodyModel:
 
     @cached_property
     def _mesh(self) -> "_Mesh":
-        """The big arrays, made when somebody first asks for vertices."""
+        """The big arrays, made when vertices are first asked for."""
         arrays = self._arrays
         shapes = arrays.shapes.transpose(2, 0, 1)  # (10, Nv, 3)
         rest, rest_shapes = arrays.joint_regressor @ arrays.template, arrays.joint_regressor @ shapes

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 
 _HEIGHT_M = (0.4, 3.0)
-"""From a newborn to nobody: a template in centimetres or millimetres is far outside."""
+"""From a newborn to more than any adult: a template in centimetres or millimetres is far outside."""
 _SUM_TOLERANCE = 0.02
 """Regressors are weighted means, printed with a few digits."""
 _BELONGS = {

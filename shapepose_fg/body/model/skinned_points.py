@@ -78,6 +78,12 @@ class SkinnedPoints:
             translation=torch.cat((self.translation, other.translation)),
         )
 
+    def feature(self, local: Tensor) -> Tensor | None:
+        """(B, 207) R - I of the joints but the pelvis (B, 24, 3, 3); None where pose blend shapes move nothing."""
+        if self.offsets_pose is None:
+            return None
+        return (local[:, 1:] - torch.eye(3, dtype=local.dtype)).flatten(1)
+
     def positions(self, rotations: Tensor, betas: Tensor, transl: Tensor, pose_feature: Tensor | None) -> Tensor:
         """(B, K, 3) world positions from world rotations (B, 24, 3, 3), betas (B, 10) and transl (B, 3)."""
         terms = self._terms(rotations, self._offsets(betas, pose_feature))

@@ -19,11 +19,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter, PlainFitterConfig
 from shapepose_fg.body.fitting.energy import BodyEnergy, WhitenedTargets, robust_weight
 from shapepose_fg.body.fitting.evidence import Evidence, weigh
 from shapepose_fg.body.fitting.fitter import BodyFit, JointTargets
+from shapepose_fg.body.fitting.fitters import SmplFitter
 from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.fitting.settings import BodyConfig
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import LARGEST_M, RIDES_ON, KeypointOffsets
 from shapepose_fg.core.bounds import Metres, Repeats, Settings
@@ -57,7 +58,7 @@ def learn_offsets(
     targets: JointTargets,
     model: BodyModel,
     pose_prior: PosePrior | None = None,
-    config: PlainFitterConfig | None = None,
+    config: BodyConfig | None = None,
     prior: OffsetPrior | None = None,
 ) -> KeypointOffsets:
     """The offsets of the detector that gave `targets` (BODY_25), rows with too few joints left out.
@@ -68,15 +69,15 @@ def learn_offsets(
     pose_prior = PosePrior.default() if pose_prior is None else pose_prior
     prior = OffsetPrior() if prior is None else prior
     wide = pose_prior.widened(_POSE_WIDENING)
-    config = PlainFitterConfig() if config is None else config
+    config = BodyConfig() if config is None else config
     precision = np.linalg.inv(_prior_covariance(prior))
     model, fit = model.with_keypoint_offsets(_made(np.zeros(75), precision, np.zeros(25))), None
     for _ in range(prior.rounds):
-        fit = LevenbergMarquardtFitter(model, wide, config).fit_whole(targets, fit)
+        fit = SmplFitter(model, wide, config).fit_whole(targets, fit)
         if not fit.ok.any():
             break
         energy = BodyEnergy(model.to(torch.float64), wide)
-        sums = _summed(energy, fit, weigh(targets, config.evidence), config.kernel_scale)
+        sums = _summed(energy, fit, weigh(targets, config.model_sigma_m), config.kernel_scale)
         model = model.with_keypoint_offsets(_solve(sums, model.keypoint_offsets, precision, prior))
     return model.keypoint_offsets
 
@@ -143,9 +144,9 @@ def _eliminate(
 
     Returns Hessian and gradient by (offsets 75, mean of the free parameters P), and the prior's Hessian (P, P).
     """
-    xyz, jacobian = energy.keypoints_with_jacobian(free)
     scale = torch.tensor(kernel_scale, dtype=free.dtype)
-    here = energy.linearise_at(free, xyz, jacobian, targets, scale)
+    body = energy.evaluate(free, targets, scale)
+    xyz, jacobian, here = body.xyz, body.jacobian, body.here
     root = robust_weight(here.squared, scale).sqrt()[..., None, None] * targets.root
     rotations = energy.model.bone_rotations(energy.complete(free))[:, torch.from_numpy(RIDES_ON)]
     by_offset = root @ rotations  # (R, 25, 3, 3), whitened

@@ -56,7 +56,7 @@ SWITCHES: dict[str, tuple[str, ...]] = {
         "refine.body_from_views",
     ),
     "3 alternations, until settled": ("refine.alternations", "refine.settled_m"),
-    "a Gauss-Newton step after the network": ("body.learned.polish_steps", "body.learned.unfinished"),
+    "a Gauss-Newton step after the network": ("body.polish_steps", "body.unfinished"),
     "views that contradict the body": ("refine.disagreement",),
     "offsets of the detector's joints": ("offsets.source",),
 }

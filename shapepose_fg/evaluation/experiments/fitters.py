@@ -15,23 +15,22 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter
 from shapepose_fg.body.fitting.fitter import BodyFitter, JointTargets
-from shapepose_fg.body.fitting.learned import LearnedFitter
+from shapepose_fg.body.fitting.fitters import SmplFitter, make_fitter
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.threads import torch_threads
-from shapepose_fg.body.training.motions import load_motions
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.experiments.experiment import Case, Column, Experiment, Figures
 from shapepose_fg.evaluation.experiments.stretches import Scale
 from shapepose_fg.evaluation.metrics import covariance_calibration
 from shapepose_fg.simulation.sequences import DANCERS
+from shapepose_fg.simulation.training.motions import load_motions
 
 Array = NDArray[np.float64]
 
 FITTERS: dict[str, Callable[[], BodyFitter]] = {
-    "Levenberg-Marquardt": LevenbergMarquardtFitter,
-    "learned": LearnedFitter,
+    "Levenberg-Marquardt": SmplFitter,
+    "learned": make_fitter,
 }
 TARGETS = {"clean": (0.0, 0.0), "10 mm": (0.01, 0.0), "20 mm, 30 % missing": (0.02, 0.3)}
 """Noise along each axis, metres, and the expected share of joints without a target."""

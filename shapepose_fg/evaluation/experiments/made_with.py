@@ -19,6 +19,15 @@ MadeWith = dict[str, str]
 _PACKAGE = Path(__file__).parents[2]
 _DATA = {"pipeline": ("body", "estimation", "simulation"), "bodies": ("body",)}
 """Folders whose data decide: bodies, weights and priors; motion and scatter of joints; the simulated detector."""
+_OLD_NAMES = {
+    "model_sigma_m": "learned.evidence.model_sigma_m",
+    "kernel_scale": "learned.kernel_scale",
+    "polish_steps": "learned.polish_steps",
+    "unfinished": "learned.unfinished",
+    "gap_s": "learned.sequence.gap_s",
+    "correlation_s": "learned.sequence.lasting_s",
+}
+"""Settings of `BodyConfig`, and what they were called before."""
 _FILES = ("*.npz", "*.json", "*.safetensors")
 
 
@@ -35,7 +44,9 @@ def made_with(basis: Basis = "pipeline") -> MadeWith:
 
 def changes(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
     """What is not as it was, a few words each. A setting that is gone is a constant now, and does not count."""
-    found = []
+    found, before = [], dict(before)
+    for name, old in _OLD_NAMES.items():
+        before |= {prefix + name: before[prefix + old] for prefix in ("", "body.") if prefix + old in before}
     for name, value in now.items():
         if name not in before:
             found.append(f"{name} is new")

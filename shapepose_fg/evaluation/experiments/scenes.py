@@ -6,7 +6,6 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from shapepose_fg.body.training.split import split_of
 from shapepose_fg.evaluation.experiments.experiment import Case, Column, Experiment, Figures
 from shapepose_fg.evaluation.experiments.stretches import QUICK_FRAMES, Scale, Stretch
 from shapepose_fg.evaluation.tracking import score_tracks
@@ -14,6 +13,7 @@ from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.simulation.foreign import PEOPLE
 from shapepose_fg.simulation.mocap import Mocap
 from shapepose_fg.simulation.sequences import SEQUENCES
+from shapepose_fg.simulation.training.split import split_of
 
 OVER_TIME = PipelineConfig()
 FRAME_BY_FRAME = replace(OVER_TIME, temporal=False)

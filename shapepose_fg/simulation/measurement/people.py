@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.body.fitting.baseline import LevenbergMarquardtFitter
 from shapepose_fg.body.fitting.fitter import BodyFit
+from shapepose_fg.body.fitting.fitters import SmplFitter
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
@@ -72,7 +72,7 @@ def find(detections: DetectionSequence, rig: Rig, config: PipelineConfig) -> Peo
     """Everybody in the recording, with bodies, every frame by itself."""
     parts, frames, joints, fits = [], [], [], []
     settings = EstimatorConfig(config.observations, config.window_graph, config.refine, config.motion)
-    fitter = LevenbergMarquardtFitter(config=config.body.plain)
+    fitter = SmplFitter(config=config.body)
     estimator = Estimator(rig, fitter, BODY_25.joints, settings)
     for start in range(0, len(detections), BATCH):
         numbers = range(start, min(start + BATCH, len(detections)))

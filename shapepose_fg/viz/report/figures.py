@@ -114,7 +114,7 @@ def _stretches(table: ObservationTable) -> NDArray[np.intp]:
         return np.zeros(0, dtype=np.intp)
     first, last = int(table.frame.min()), int(table.frame.max())
     bins = min(_BINS, last - first + 1)
-    return (table.frame - first) * bins // (last - first + 1)
+    return np.asarray((table.frame - first) * bins // (last - first + 1), dtype=np.intp)
 
 
 def _told_cameras(run: Mapping[str, Any]) -> dict[str, dict[str, Any]]:

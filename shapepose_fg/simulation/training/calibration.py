@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from shapepose_fg.body.fitting.fitter import JointTargets
-from shapepose_fg.body.fitting.learned import LearnedFitter
+from shapepose_fg.body.fitting.fitters import SmplFitter
 from shapepose_fg.body.fitting.weights import FitterWeights
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, MIRROR, TARGET_SKELETONS, slots
-from shapepose_fg.body.training.corruption import corrupt
-from shapepose_fg.body.training.train import PeopleSource
+from shapepose_fg.simulation.training.corruption import corrupt
+from shapepose_fg.simulation.training.train import PeopleSource
 
 INSIDE = 0.9
 """Share of the joints that shall lie inside the ellipsoid of that probability which their prior claims."""
@@ -53,12 +53,12 @@ def left_out_squared(
 ) -> dict[int, NDArray[np.float64]]:
     """By point: squared Mahalanobis distances of true joints to where the body puts them without their target."""
     names = tuple(BODY_POINTS[place] for place in places)
-    fitter = LearnedFitter(model.with_keypoints(names), weights=weights)
+    fitter = SmplFitter(model.with_keypoints(names), weights=weights)
     people = source.draw(count, generator)
     target, information = corrupt(people.points, torch.ones(count, len(BODY_POINTS)), generator)
     chosen = list(places)
     fit = fitter.fit(JointTargets(target[:, chosen].double().numpy(), information[:, chosen].double().numpy()))
     error = (fit.prior_xyz - people.points[:, chosen].double().numpy())[fit.ok]
-    covariance = fit.prior_covariance[fit.ok] - fitter.config.evidence.model_sigma_m**2 * np.eye(3)
+    covariance = fit.prior_covariance[fit.ok] - fitter.config.model_sigma_m**2 * np.eye(3)
     squared = np.einsum("nji,njik,njk->nj", error, np.linalg.inv(covariance), error)
     return {place: squared[:, row] for row, place in enumerate(places)}

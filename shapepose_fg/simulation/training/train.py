@@ -13,8 +13,8 @@ from shapepose_fg.body.model.body_model import BodyModel, accumulate
 from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.body.model.small_matrices import inverse_3x3
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, TARGET_SKELETONS, slots
-from shapepose_fg.body.training.corruption import CorruptionConfig, corrupt
-from shapepose_fg.body.training.motions import Motions, mirror_joints
+from shapepose_fg.simulation.training.corruption import CorruptionConfig, corrupt
+from shapepose_fg.simulation.training.motions import MIRROR_JOINTS, Motions
 
 _ALL = tuple(range(len(BODY_POINTS)))
 
@@ -40,7 +40,7 @@ class TrainingConfig:
     shake_rad: float = 0.05
     """Sigma added to recorded angles: bodies and recordings have play."""
     exchange: float = 0.15
-    """Share of people who get an arm or a leg from somebody else."""
+    """Share of people who get an arm or a leg of another person."""
     skeletons: tuple[float, ...] = (0.55, 0.15, 0.15, 0.15)
     """Shares of BODY_25, COCO_17, HALPE_26, SMPL_24."""
     rotation_m: float = 0.05
@@ -57,7 +57,7 @@ class TrainingConfig:
 
 @dataclass(frozen=True)
 class People:
-    """True bodies upright in front of nobody's camera: pelvis at the origin, any heading."""
+    """True bodies, upright, without a camera: pelvis at the origin, any heading."""
 
     state: BodyState
     """Shape and pose."""
@@ -72,7 +72,7 @@ class PeopleSource:
         self.config, self.model, self._frame = config, model, frame
         self._poses = torch.from_numpy(motions.poses)
         self._weight = torch.from_numpy(motions.weight).double().cumsum(0)
-        self._mirror = torch.tensor(mirror_joints())
+        self._mirror = torch.tensor(MIRROR_JOINTS)
 
     def draw(self, count: int, generator: torch.Generator) -> People:
         """`count` people."""
@@ -100,8 +100,7 @@ class PeopleSource:
 def body_points(model: BodyModel, state: BodyState) -> Tensor:
     """(B, K, 3) all `BODY_POINTS` of a state, differentiable."""
     points = model.points
-    feature = None if points.offsets_pose is None else (state.local[:, 1:] - torch.eye(3)).flatten(1)
-    return points.positions(accumulate(state.local), state.betas, state.transl, feature)
+    return points.positions(accumulate(state.local), state.betas, state.transl, points.feature(state.local))
 
 
 def _chain(joints: tuple[int, ...]) -> Tensor:
@@ -117,7 +116,7 @@ _CHAINS = torch.stack(
 
 
 class Trainer:
-    """One run of training, which can be stopped and continued to the bit (see `checkpoint`)."""
+    """One run of training."""
 
     def __init__(self, source: PeopleSource, frame: PersonFrame, network: UpdateNetwork, config: TrainingConfig):
         self.source, self.frame, self.config = source, frame, config
@@ -136,7 +135,7 @@ class Trainer:
 
     def _iterate(self) -> list[float]:
         config = self.config
-        # Everything that is drawn follows from seed and iteration: a run that was stopped goes on the same.
+        # Everything that is drawn follows from seed and iteration.
         generator = torch.Generator().manual_seed(config.seed * 10_000_019 + self.iteration)
         torch.manual_seed(config.seed * 10_000_019 + self.iteration)  # dropout
         for group in self.optimiser.param_groups:

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.fitting.motion_prior import NUM_MOVING, MotionPrior
-from shapepose_fg.body.training.motions import mirror_joints
 from shapepose_fg.simulation.mocap import Clip
 from shapepose_fg.simulation.shoulder import shoulder_rhythm
+from shapepose_fg.simulation.training.motions import MIRROR_JOINTS
 
 Array = NDArray[np.float64]
 
@@ -81,7 +81,7 @@ def _symmetric(density: Array) -> Array:
     angles = density[:, 3:-3].reshape(2, 23, 3).copy()
     for hand, wrist in zip(_HANDS, _WRISTS, strict=True):
         angles[:, hand - 1] = angles[:, wrist - 1]
-    mirror = np.array(mirror_joints())[1:] - 1
+    mirror = np.array(MIRROR_JOINTS)[1:] - 1
     angles = (angles + angles[:, mirror]) / 2
     root, place = (
         density[:, part].mean(axis=1, keepdims=True).repeat(3, axis=1) for part in (slice(3), slice(-3, None))

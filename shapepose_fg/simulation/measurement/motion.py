@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
-from shapepose_fg.body.training.split import Split, split_of
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.observations import Observations
@@ -23,6 +22,7 @@ from shapepose_fg.estimation.window_graph import speeds, symmetric_roots
 from shapepose_fg.simulation import Scene, simulate
 from shapepose_fg.simulation.mocap import Clip, Mocap
 from shapepose_fg.simulation.shoulder import shoulder_rhythm
+from shapepose_fg.simulation.training.split import Split, split_of
 
 Array = NDArray[np.float64]
 

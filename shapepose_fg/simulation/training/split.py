@@ -1,4 +1,4 @@
-"""Who is learnt from, who decides between settings, and whom the figures are reported on: by subject, for good."""
+"""Which recorded subjects train, which choose settings, and on which figures are reported: fixed for good."""
 
 import hashlib
 from typing import Literal, get_args
@@ -12,9 +12,9 @@ TEST_SUBJECTS = ("60", "61", "02", "08", "16", "43", "94", "139")
 """CMU subjects for reported figures only: salsa (both partners), sports and chores, walks, runs and jumps, a bar,
 Indian dance, getting up."""
 VALIDATION_SUBJECTS = ("06", "12", "127", "140")
-"""CMU subjects by whom settings are chosen: basketball, walks, runs and ducks, getting up from the floor."""
+"""CMU subjects on which settings are chosen: basketball, walks, runs and ducks, getting up from the floor."""
 UNKNOWN_SUBJECT = "?"
-"""A recording that does not say whose it is: to be learnt from, never a part of what is reported."""
+"""A recording without a subject: used for training, never for what is reported."""
 
 _CMU_LAST_SUBJECT = 144
 _TENTHS: tuple[Split, ...] = ("train",) * 8 + ("validation", "test")

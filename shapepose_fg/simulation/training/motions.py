@@ -1,18 +1,26 @@
 """Poses of recorded people, frame by frame: from CMU's .npz or a folder of AMASS files, split by subject."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.body.training.split import SPLITS, Split, split_of
+from shapepose_fg.body.model.target_skeletons import BODY_POINTS, MIRROR
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.core.storage.npz import read_npz
 from shapepose_fg.simulation.mocap import Clip, Mocap
 from shapepose_fg.simulation.shoulder import COLLARS, shoulder_rhythm
+from shapepose_fg.simulation.training.split import SPLITS, Split, split_of
+
+ACKNOWLEDGEMENT = (
+    "The data used in this project was obtained from mocap.cs.cmu.edu. "
+    "The database was created with funding from NSF EIA-0196217."
+)
+MIRROR_JOINTS = tuple(place - BODY_POINTS.index(SMPL_24[0]) for place in MIRROR[-len(SMPL_24) :])
+"""(24,) index of each SMPL joint's partner on the other side of the body; its own for joints in the middle."""
 
 SEGMENT_CAP = 300
 """Frames' worth of weight that one recording may have (10 s)."""
@@ -50,17 +58,11 @@ class Motions:
     their split."""
     subject: NDArray[np.str_]
     """(N,) who was recorded."""
-    sequence: NDArray[np.intp]
-    """(N,) recording, an index into `names`; frames of one recording follow each other."""
-    names: tuple[str, ...]
-    """(S,) names of the recordings."""
-    fps: NDArray[np.float64]
-    """(S,) frames a second of each recording."""
 
     def __post_init__(self) -> None:
         N = len(self.poses)
-        expected = {"poses": (N, 24, 3), "observed": (N, 24), "weight": (N,), "subject": (N,), "sequence": (N,)}
-        for name, shape in (expected | {"fps": (len(self.names),)}).items():
+        expected = {"poses": (N, 24, 3), "observed": (N, 24), "weight": (N,), "subject": (N,)}
+        for name, shape in expected.items():
             if getattr(self, name).shape != shape:
                 raise ValueError(f"{name} must be {shape}, got {getattr(self, name).shape}")
         if not np.isfinite(self.poses).all():
@@ -71,9 +73,8 @@ class Motions:
         return len(self.poses)
 
     def rows(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> "Motions":
-        """The frames `index`, indices or a mask; names and rates of all recordings stay."""
-        kept = {name: getattr(self, name)[index] for name in _FRAME_FIELDS}
-        return replace(self, **kept)
+        """The frames `index`, indices or a mask."""
+        return Motions(*(value[index] for value in vars(self).values()))
 
     def of(self, split: Split) -> "Motions":
         """The frames of the subjects of one part."""
@@ -82,35 +83,15 @@ class Motions:
         subjects, place = np.unique(self.subject, return_inverse=True)
         return self.rows(np.array([split_of(str(name)) == split for name in subjects], dtype=bool)[place])
 
-    def mirrored(self) -> "Motions":
-        """The same recordings seen in a mirror: left and right change sides, the world's x its sign."""
-        order, sign = np.array(mirror_joints()), np.array([1, -1, -1], dtype=np.float32)
-        return replace(self, poses=self.poses[:, order] * sign, observed=self.observed[:, order])
-
-
-_FRAME_FIELDS = ("poses", "observed", "weight", "subject", "sequence")
-
 
 @dataclass(frozen=True)
 class _Recording:
     """One recording as it is read."""
 
-    name: str
     subject: str
     walking: bool
-    fps: float
     poses: NDArray[np.float32]
     observed: NDArray[np.bool_]
-
-
-def mirror_joints() -> tuple[int, ...]:
-    """Index of each SMPL joint's partner on the other side of the body; its own for joints in the middle."""
-    swap = {"left": "right", "right": "left"}
-    parts = [name.partition("_") for name in SMPL_24]
-    return tuple(
-        SMPL_24.index(f"{swap[side]}_{part}" if side in swap else name)
-        for name, (side, _, part) in zip(SMPL_24, parts, strict=True)
-    )
 
 
 def load_motions(path: str | Path) -> Motions:
@@ -130,9 +111,6 @@ def load_motions(path: str | Path) -> Motions:
         observed=np.repeat(np.stack([recording.observed for recording in recordings]), length, axis=0),
         weight=np.repeat(frame_weights(length, subject, walking), length),
         subject=np.repeat(subject, length),
-        sequence=np.repeat(np.arange(len(recordings)), length),
-        names=tuple(recording.name for recording in recordings),
-        fps=np.array([recording.fps for recording in recordings]),
     )
 
 
@@ -170,8 +148,7 @@ def _of_clip(clip: Clip) -> _Recording:
     rotations = shoulder_rhythm(clip.rotations)
     vectors = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_rotvec().reshape(-1, 24, 3)
     vectors[:, 1:][:, ~observed[1:] & ~np.isin(np.arange(1, 24), COLLARS)] = 0.0
-    walking = "walk" in clip.action.lower()
-    return _Recording(clip.name, clip.subject, walking, clip.fps, vectors.astype(np.float32), observed)
+    return _Recording(clip.subject, "walk" in clip.action.lower(), vectors.astype(np.float32), observed)
 
 
 def _read_amass_folder(folder: Path) -> list[_Recording]:
@@ -189,9 +166,8 @@ def _read_amass(path: Path) -> _Recording:
     kept = np.zeros((len(poses[::step]), 24, 3))
     kept[:, :22] = poses[::step, :_BODY_COLUMNS].reshape(-1, 22, 3)
     kept[:, 0] = (_Y_UP * Rotation.from_rotvec(kept[:, 0])).as_rotvec()
-    observed = np.arange(24) < 22
-    walking, subject = "walk" in path.stem.lower(), path.parent.name
-    return _Recording(f"{subject}/{path.stem}", subject, walking, fps / step, kept.astype(np.float32), observed)
+    walking = "walk" in path.stem.lower()
+    return _Recording(path.parent.name, walking, kept.astype(np.float32), np.arange(24) < 22)
 
 
 def _amass_arrays(path: Path) -> tuple[NDArray[np.float64], float]:
