@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from shapepose_fg.evaluation import (
-    detector_agreement,
     fitter_tables,
     scene_tables,
     sequence_difficulty,
@@ -53,7 +52,7 @@ def experiments(scale: Scale, images: Path | None = None, others: Path | None = 
     for make in (body_fitters.left_out, body_fitters.over_time):
         yield from _there(make(scale))
     if not scale.quick:
-        yield from _simulation(scale, images)
+        yield from _simulation(scale)
 
 
 def _paper(scale: Scale, images: Path | None, others: Path | None) -> Iterator[Experiment]:
@@ -93,11 +92,9 @@ def _scenes(scale: Scale) -> Iterator[Experiment]:
     yield whole("cameras", lambda: scene_tables.camera_table(trials[1]))
 
 
-def _simulation(scale: Scale, images: Path | None) -> Iterator[Experiment]:
+def _simulation(scale: Scale) -> Iterator[Experiment]:
     """The simulator itself."""
-    shelf, mocap = scale.shelf, scale.mocap
-    if shelf is not None:
-        yield whole("detector", lambda: detector_agreement.table(shelf, images))
+    mocap = scale.mocap
     if mocap is not None:
         yield whole("difficulty", lambda: sequence_difficulty.table(mocap, ("tune", "report"), 20))
     yield whole("visibility", visibility_agreement.table, "detector")
