@@ -1,6 +1,6 @@
 """Ways through a room full of moving people: somebody who looks ahead and walks around the others."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +18,7 @@ _PACES = np.array([0.15, 0.45, 0.75, 1.0])
 """Speeds that are weighed, as shares of the walker's own."""
 
 
-@dataclass(frozen=True)
-class Way:
+class Way(NamedTuple):
     """Where somebody walks."""
 
     xy: Array
@@ -48,7 +47,7 @@ def way_through(
 
 
 def _worth(way: Way, others: Array, distance_m: Array) -> float:
-    """How good a way is: first that nobody is bumped into, then that it is close."""
+    """How good a way is: first that no one is bumped into, then that it is close."""
     if others.shape[1] == 0 or len(way.xy) == 0:
         return 0.0
     room = (np.linalg.norm(others - way.xy[:, None], axis=-1) - distance_m).min(axis=1)

@@ -34,6 +34,22 @@ class Motion:
     transl: Array
     """(T, P, 3) metres."""
 
+    @classmethod
+    def still(cls, betas: Array, frames: int = 1) -> "Motion":
+        """People of shapes `betas` (P, 10) in the T-pose, not shifted."""
+        people = len(betas)
+        return cls(betas, *(np.zeros((frames, people, *shape)) for shape in ((3,), (23, 3), (3,))))
+
+    @classmethod
+    def joined(cls, parts: "list[Motion]") -> "Motion":
+        """Motions of the same people one after the other."""
+        names = ("global_orient", "body_pose", "transl")
+        return cls(parts[0].betas, *(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+    def __getitem__(self, frames: slice) -> "Motion":
+        """Some consecutive frames."""
+        return Motion(self.betas, self.global_orient[frames], self.body_pose[frames], self.transl[frames])
+
     def __post_init__(self) -> None:
         frames, people = self.transl.shape[:2]
         shapes = {"betas": (people, 10), "global_orient": (frames, people, 3)}

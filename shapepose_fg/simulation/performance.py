@@ -25,18 +25,6 @@ _Z_UP = Rotation.from_rotvec([np.pi / 2, 0.0, 0.0]).as_matrix()
 
 
 @dataclass(frozen=True)
-class Placement:
-    """Where in the room a recording is put."""
-
-    xy: tuple[float, float] = (0.0, 0.0)
-    """Metres; the recording's own `origin` comes to lie here."""
-    turn_rad: float = 0.0
-    """Turn about the vertical; without one, who faced +z in the recording faces -y."""
-    origin: tuple[float, float] = (0.0, 0.0)
-    """Point (x, z) of the recording's floor, in its own metres."""
-
-
-@dataclass(frozen=True)
 class Performance:
     """One person's motion in the room, z up, metres."""
 
@@ -95,35 +83,23 @@ class Figure:
         return (heights + joints[:, list(_FEET), 2] @ self._weights.T).min(axis=1)
 
 
-def perform(
-    body: BodyModel,
-    betas: Array,
-    clip: Clip,
-    placement: Placement = Placement(),
-    *,
-    fps: float | None = None,
-    scale: float | None = None,
-) -> Performance:
-    """`clip` as a body of shape `betas` (10,) does it: on the floor z = 0 of a room with z up.
+def perform(body: BodyModel, betas: Array, clip: Clip, *, scale: float | None = None) -> Performance:
+    """`clip` as a body of shape `betas` (10,) does it: on the floor z = 0 of a room with z up; +z becomes -y.
 
     Steps are longer in the measure of the legs (`scale` overrides it, for who must stay together); collars
     follow the arms, hands hang loosely, and the soles are on the floor, but for what is jumped.
     """
-    clip = clip if fps is None else clip.resampled(fps)
     figure = Figure(body, np.asarray(betas, dtype=np.float64))
     ratio = figure.leg_m / clip.leg_m
-    turn = about_z(np.array([placement.turn_rad]))[0] @ _Z_UP
     rotations = shoulder_rhythm(clip.rotations)
     if not clip.wrist_valid:
         rotations[:, 20:22] = np.eye(3)
     for hand, sign in ((22, -1.0), (23, 1.0)):
         rotations[:, hand] = Rotation.from_rotvec([0.0, 0.0, sign * _RELAXED_HAND]).as_matrix()
-    rotations[:, 0] = turn @ rotations[:, 0]
-    x, z = placement.origin
-    pelvis = (clip.pelvis - (x, clip.floor_y, z)) * (ratio if scale is None else scale)
+    rotations[:, 0] = _Z_UP @ rotations[:, 0]
+    pelvis = clip.pelvis * (ratio if scale is None else scale)
     pelvis[:, 1] = (clip.pelvis[:, 1] - clip.floor_y) * ratio
-    pelvis = pelvis @ turn.T + np.array([*placement.xy, 0.0])
-    return grounded(figure, rotations, pelvis, clip.fps, bend_toes=not clip.toe_valid)
+    return grounded(figure, rotations, pelvis @ _Z_UP.T, clip.fps, bend_toes=not clip.toe_valid)
 
 
 def grounded(figure: Figure, rotations: Array, pelvis: Array, fps: float, *, bend_toes: bool) -> Performance:
@@ -139,12 +115,7 @@ def grounded(figure: Figure, rotations: Array, pelvis: Array, fps: float, *, ben
 
 def together(betas: Array, performances: list[Performance], frames: int) -> Motion:
     """SMPL's parameters of P people, `betas` (P, 10), in `frames` frames (needed where P is 0)."""
-    motion = Motion(
-        np.asarray(betas, dtype=np.float64).reshape(len(performances), 10),
-        np.zeros((frames, len(performances), 3)),
-        np.zeros((frames, len(performances), 23, 3)),
-        np.zeros((frames, len(performances), 3)),
-    )
+    motion = Motion.still(np.asarray(betas, dtype=np.float64).reshape(len(performances), 10), frames)
     for person, performed in enumerate(performances):
         vectors = Rotation.from_matrix(performed.rotations.reshape(-1, 3, 3)).as_rotvec().reshape(-1, 24, 3)
         motion.global_orient[:, person] = vectors[:, 0]
