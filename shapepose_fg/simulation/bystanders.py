@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.simulation.gait import left_of
 from shapepose_fg.simulation.mocap import Clip, Mocap, blend
 from shapepose_fg.simulation.performance import Figure, Performance, about_z, grounded, perform
 
@@ -29,23 +30,20 @@ _STILL_M, _WALK_M = 0.75, 2.5
 
 def standing_clips(mocap: Mocap, *, without: frozenset[str]) -> list[int]:
     """Clips of people who stand and gesture, of subjects other than `without`."""
-    found = []
-    for index, action in enumerate(mocap.actions):
-        if mocap.subjects[index] in without or mocap.lengths[index] < 90:
-            continue
-        stays = np.ptp(_floor_plan(mocap, index), axis=0).max() < _STILL_M
-        if stays and any(word in action.lower() for word in _STILL):
-            found.append(index)
-    return found
+    return [
+        index
+        for index in _long_enough(mocap, 90, without)
+        if any(word in mocap.actions[index].lower() for word in _STILL)
+        and np.ptp(_floor_plan(mocap, index), axis=0).max() < _STILL_M
+    ]
 
 
 def walking_clips(mocap: Mocap, *, without: frozenset[str]) -> list[int]:
     """Clips of people who walk straight on, of subjects other than `without`."""
     found = []
-    for index, action in enumerate(mocap.actions):
-        if mocap.subjects[index] in without or "walk" not in action.lower() or "uneven" in action.lower():
-            continue
-        if mocap.tiers[index] > 0 or mocap.lengths[index] < 60:
+    for index in _long_enough(mocap, 60, without):
+        action = mocap.actions[index].lower()
+        if "walk" not in action or "uneven" in action or mocap.tiers[index] > 0:
             continue
         plan = _floor_plan(mocap, index)
         way = np.linalg.norm(plan[-1] - plan[0])
@@ -53,6 +51,11 @@ def walking_clips(mocap: Mocap, *, without: frozenset[str]) -> list[int]:
         if way > _WALK_M and way > 0.95 * np.linalg.norm(np.diff(plan, axis=0), axis=1).sum() and speed < 1.6:
             found.append(index)
     return found
+
+
+def _long_enough(mocap: Mocap, frames: int, without: frozenset[str]) -> list[int]:
+    there = [subject not in without for subject in mocap.subjects]
+    return np.flatnonzero(np.array(there, dtype=bool) & (mocap.lengths >= frames)).tolist()
 
 
 def endless(clip: Clip, frames: int, start: int = 0) -> Clip:
@@ -98,8 +101,7 @@ def walk_along(
     rotations = blend(cycle.rotations[low], cycle.rotations[high], share)
     rotations[:, 0] = turn @ rotations[:, 0]
     side = cycle.joints[low, 0, 1:] + share[:, None] * (cycle.joints[high, 0, 1:] - cycle.joints[low, 0, 1:])
-    left = np.stack([-np.sin(heading), np.cos(heading)], axis=1)
-    pelvis = np.concatenate([path + left * side[:, :1], side[:, 1:]], axis=1)
+    pelvis = np.concatenate([path + left_of(heading) * side[:, :1], side[:, 1:]], axis=1)
     return grounded(Figure(body, betas), rotations, pelvis, fps, bend_toes=False)
 
 

@@ -6,8 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
+from shapepose_fg.simulation.gait import along
+
 Array = NDArray[np.float64]
 
+_TRIES = 4
 _DECISION_S = 0.1
 """How often a walker looks up."""
 _HORIZON_S = np.linspace(0.2, 2.0, 10)
@@ -36,13 +39,12 @@ def way_through(
     speed_mps: float,
     distance_m: Array,
     half_room_m: float,
-    tries: int = 4,
 ) -> Way:
     """A way from wall to wall and back, past points `others` (T, K, 2) at `distance_m` (K,) or a little more.
 
     Of several tries the one that keeps its distance best, then the one that comes closest.
     """
-    ways = [_walk(others, frames, rng, fps, speed_mps, distance_m, half_room_m) for _ in range(tries)]
+    ways = [_walk(others, frames, rng, fps, speed_mps, distance_m, half_room_m) for _ in range(_TRIES)]
     return max(ways, key=lambda way: _worth(way, others, distance_m))
 
 
@@ -79,7 +81,7 @@ def _walk(
         for later in range(frame, min(frame + hold, frames)):
             places[later], headings[later] = xy, heading
             heading += rate / fps
-            xy = xy + pace * speed / fps * np.array([np.cos(heading), np.sin(heading)])
+            xy = xy + pace * speed / fps * along(np.array(heading))
     sigma = 0.12 * fps
     return Way(
         gaussian_filter1d(places, sigma, axis=0, mode="nearest"),
@@ -91,8 +93,7 @@ def _arcs(xy: Array, heading: float, turns: Array, speeds: Array) -> Array:
     """Where (C, H, 2) each of C turns and speeds leads along the horizon; turns last for at most 0.8 s."""
     step = np.diff(_HORIZON_S, prepend=0.0)
     angle = heading + turns[:, None] * np.minimum(_HORIZON_S - step / 2, 0.8)
-    move = np.stack([np.cos(angle), np.sin(angle)], axis=-1) * (speeds[:, None] * step)[..., None]
-    return xy + np.cumsum(move, axis=1)
+    return xy + np.cumsum(along(angle) * (speeds[:, None] * step)[..., None], axis=1)
 
 
 def _start(others: Array, rng: np.random.Generator, half: float) -> tuple[Array, float, float]:
@@ -108,4 +109,4 @@ def _start(others: Array, rng: np.random.Generator, half: float) -> tuple[Array,
 def _goal(xy: Array, rng: np.random.Generator, half: float) -> Array:
     """A place near the wall across the room."""
     angle = np.arctan2(-xy[1], -xy[0]) + rng.uniform(-0.9, 0.9)
-    return rng.uniform(0.75, 0.95) * half * np.array([np.cos(angle), np.sin(angle)])
+    return rng.uniform(0.75, 0.95) * half * along(angle)

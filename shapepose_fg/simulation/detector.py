@@ -76,11 +76,11 @@ class DetectorConfig:
 
     def __post_init__(self) -> None:
         for name in _KNOBS:
-            if not 0 <= getattr(self, name) < np.inf:
-                raise ValueError(f"{name} must be 0 (none), 1 (as measured) or more, got {getattr(self, name)}")
-        for name in ("doubt", "captures", "wrong_affinities"):
-            if getattr(self, name) > 1:
-                raise ValueError(f"{name} must not be more than 1 (as measured), got {getattr(self, name)}")
+            value = getattr(self, name)
+            if not 0 <= value < np.inf:
+                raise ValueError(f"{name} must be 0 (none), 1 (as measured) or more, got {value}")
+            if value > 1 and name in ("doubt", "captures", "wrong_affinities"):
+                raise ValueError(f"{name} must not be more than 1 (as measured), got {value}")
 
     @classmethod
     def perfect(cls) -> "DetectorConfig":
@@ -236,11 +236,7 @@ def _report(
 
 
 def _duplicates(
-    found: _Found,
-    swap_rank: Array,
-    px_a_metre: Array,
-    config: DetectorConfig,
-    rng: np.random.Generator,
+    found: _Found, swap_rank: Array, px_a_metre: Array, config: DetectorConfig, rng: np.random.Generator
 ) -> _Found:
     """False candidates under the mirror's name of joints that are found under their own."""
     table = config.statistics
@@ -325,13 +321,7 @@ def _capture(
     return captors
 
 
-def _invent(
-    rig: Rig,
-    false: FalseCandidates,
-    true_xy: Array,
-    depth: Array,
-    config: DetectorConfig,
-) -> _Found:
+def _invent(rig: Rig, false: FalseCandidates, true_xy: Array, depth: Array, config: DetectorConfig) -> _Found:
     """The false candidates of this frame, where they are now."""
     table = config.statistics
     near = false.person >= 0

@@ -124,12 +124,15 @@ class DetectorStatistics:
     def read(cls, path: Path) -> "DetectorStatistics":
         """From a file like the shipped one: what is `drawn` takes the place of what was `measured`."""
         content = json.loads(path.read_text(encoding="utf-8"))
+        measured = content["measured"]
 
         def value(name: str) -> Any:
             if name in content["drawn"]:
                 return content["drawn"][name]
-            group, _, key = _KEYS.get(name, name).rpartition(".")
-            return (content["measured"][group] if group else content["measured"])[key]
+            if name in measured and name not in _KEYS:
+                return measured[name]
+            group, key = _KEYS.get(name, name.replace("_", ".", 1)).split(".")
+            return measured[group][key]
 
         values: dict[str, Any] = {}
         for name in [each.name for each in fields(cls) if each.name != "provenance"]:
@@ -173,25 +176,11 @@ _KEYS = {
     "double": "swap.besides",
     "double_m": "swap.double_m",
     "double_confidence": "swap.double_confidence",
-    "capture_gap_m": "capture.gap_m",
     "capture": "capture.share",
     "merge_px": "merge.half_px",
-    "merge_width_px": "merge.width_px",
     "merge_height_px": "merge.image_height_px",
     "false_near": "false.others_per_person",
     "false_far": "false.far_per_view",
-    "false_near_m": "false.near_m",
-    "false_joints": "false.joints",
-    "false_near_confidence": "false.near_confidence",
-    "false_far_confidence": "false.far_confidence",
-    "false_memory": "false.memory",
-    "affinity_right": "affinity.right",
-    "affinity_right_confidence": "affinity.right_confidence",
-    "affinity_correlation": "affinity.correlation",
     "detours": "affinity.detours",
-    "affinity_wrong_share": "affinity.wrong_share",
-    "affinity_wrong": "affinity.wrong",
-    "affinity_nobody_share": "affinity.nobody_share",
-    "affinity_nobody": "affinity.nobody",
 }
-"""Where fields stand under `measured` of the file, if not under their own name."""
+"""Where fields stand in the file, if not under their own name or like `merge_width_px` in `merge.width_px`."""

@@ -1,5 +1,6 @@
 """Feet that stand where they are put: footsteps for any path over the floor."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,21 +12,19 @@ _STANCE = 0.6
 """Share of a stride in which a foot stands."""
 
 
-@dataclass(frozen=True)
-class Path:
-    """How a pelvis moves over the floor, as functions of time."""
+Path = Callable[[Array], tuple[Array, Array]]
+"""Where a pelvis is over the floor at times (...,), seconds: positions (..., 2), metres; headings (...,), radians
+without jumps of a whole turn."""
 
-    time_s: Array
-    """(M,) increasing times; it must reach a stride beyond the frames on both sides."""
-    xy: Array
-    """(M, 2) metres."""
-    heading: Array
-    """(M,) radians, without jumps of a whole turn."""
 
-    def at(self, time_s: Array) -> tuple[Array, Array]:
-        """Position (..., 2) and heading (...,) at `time_s` (...,)."""
-        xy = np.stack([np.interp(time_s, self.time_s, self.xy[:, axis]) for axis in (0, 1)], axis=-1)
-        return xy, np.interp(time_s, self.time_s, self.heading)
+def along(angle: Array) -> Array:
+    """Unit vectors (..., 2) in directions `angle` (...,), from the x axis towards the y axis."""
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def left_of(angle: Array) -> Array:
+    """Unit vectors (..., 2) to the left of directions `angle` (...,)."""
+    return np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -66,15 +65,13 @@ def footsteps(path: Path, time_s: Array, stride_s: float, width_m: float, phase:
     push = np.clip((part - 0.45) / 0.2, 0.0, 1.0) * np.clip((0.85 - part) / 0.2, 0.0, 1.0)
     strike = np.clip((part - 0.85) / 0.12, 0.0, 1.0)
     heading = here_heading + eased * (there_heading - here_heading)
-    centre, facing = path.at(time_s)
-    ahead = np.stack([np.cos(facing), np.sin(facing)], axis=-1)
-    swing = ((xy - centre[:, None]) * ahead[:, None]).sum(axis=-1)
+    centre, facing = path(time_s)
+    swing = ((xy - centre[:, None]) * along(facing)[:, None]).sum(axis=-1)
     return Steps(xy, lift + 0.05 * push * effort, heading, (0.55 * push - 0.2 * strike) * effort, swing)
 
 
 def _plant(path: Path, number: Array, offset: Array, stride_s: float, width_m: float) -> tuple[Array, Array]:
     """Place (T, 2, 2) and heading (T, 2) of the feet in stance `number` (T, 2)."""
-    xy, heading = path.at((number + _STANCE / 2 - offset) * stride_s)
-    left = np.stack([-np.sin(heading), np.cos(heading)], axis=-1)
+    xy, heading = path((number + _STANCE / 2 - offset) * stride_s)
     side = np.array([0.5, -0.5]) * width_m
-    return xy + left * side[:, None], heading + np.array([0.12, -0.12])
+    return xy + left_of(heading) * side[:, None], heading + np.array([0.12, -0.12])

@@ -4,13 +4,12 @@ No recorded motion is needed: each role says where pelvis, hands and eyes go (a 
 turns that into SMPL's parameters. World z up, floor at z = 0, metres, radians.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.simulation.gait import Path, footsteps
+from shapepose_fg.simulation.gait import Path, along, footsteps, left_of
 from shapepose_fg.simulation.limbs import LEGS, Puppet, pose
 
 Array = NDArray[np.float64]
@@ -129,27 +128,27 @@ def dance(pair: list[Build], time: Array, centre: Array, rng: np.random.Generato
 
     def middle(t: Array) -> Array:
         sway = 0.06 * np.sin(2 * np.pi * t / (2 * beat))
-        return centre + np.stack([-np.sin(angle(t)), np.cos(angle(t))], axis=-1) * sway[:, None]
+        return centre + left_of(angle(t)) * sway[:, None]
 
     def half_distance(t: Array) -> Array:
         return 0.29 + 0.04 * np.sin(2 * np.pi * t / (3 * beat) + start)
 
-    def path_of(sign: float) -> Callable[[Array], tuple[Array, Array]]:
+    def path_of(sign: float) -> Path:
         def path(t: Array) -> tuple[Array, Array]:
-            away = np.stack([np.cos(angle(t)), np.sin(angle(t))], axis=-1) * sign
+            away = along(angle(t)) * sign
             facing = angle(t) + (np.pi if sign > 0 else 0.0)
             return middle(t) + away * half_distance(t)[:, None], facing + 0.15 * np.sin(np.pi * t / beat)
 
         return path
 
     shoulder = np.mean([build.shoulder_m for build in pair])
-    across = np.stack([-np.sin(angle(time)), np.cos(angle(time))], axis=-1)
+    across = left_of(angle(time))
     up = _bump(time, 0.5, 1.4, period=2.4)
     held = []
     for side, lift in ((1.0, up), (-1.0, np.zeros_like(up))):
         xy = middle(time) + side * across * (0.34 - 0.16 * lift)[:, None]
         z = shoulder - 0.32 + 0.72 * lift + 0.03 * np.sin(2 * np.pi * time / beat)
-        held.append(np.concatenate([xy, z[:, None]], axis=1))
+        held.append(_at(xy, z))
     puppets = []
     for sign, build, other in ((1.0, pair[0], pair[1]), (-1.0, pair[1], pair[0])):
         away = np.stack([np.cos(angle(time)), np.sin(angle(time)), np.zeros_like(time)], axis=1) * sign
@@ -157,7 +156,7 @@ def dance(pair: list[Build], time: Array, centre: Array, rng: np.random.Generato
         hands = held if sign < 0 else held[::-1]
         wrists = np.stack([hand + 0.07 * away for hand in hands], axis=1)
         xy, _ = path_of(-sign)(time)
-        gaze = np.concatenate([xy, np.full((len(time), 1), other.shoulder_m + 0.12)], axis=1)
+        gaze = _at(xy, other.shoulder_m + 0.12)
         puppets.append(
             _puppet(
                 build,
@@ -187,7 +186,7 @@ def walk(build: Build, time: Array, centre: Array, rng: np.random.Generator) -> 
         return xy, np.unwrap(np.arctan2(half_axes[1] * np.cos(phi), half_axes[0] * np.sin(phi)))
 
     xy, heading = path(time)
-    ahead = xy + 2.0 * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+    ahead = xy + 2.0 * along(heading)
     twist = 0.12 * np.sin(2 * np.pi * time / 1.05)
     return _puppet(
         build,
@@ -199,7 +198,7 @@ def walk(build: Build, time: Array, centre: Array, rng: np.random.Generator) -> 
         lean=np.stack([np.full_like(time, 0.06), twist, np.zeros_like(time)], axis=1),
         wrists=np.zeros((len(time), 2, 3)),
         reach=np.zeros((len(time), 2)),
-        gaze=np.concatenate([ahead, np.full((len(time), 1), 1.3)], axis=1),
+        gaze=_at(ahead, 1.3),
     )
 
 
@@ -210,19 +209,14 @@ def wave(build: Build, time: Array, spot: Array, heading: float, rng: np.random.
 
     def path(t: Array) -> tuple[Array, Array]:
         shift = 0.04 * np.sin(2 * np.pi * t / 2.8)
-        left = np.array([-np.sin(heading), np.cos(heading)])
-        return spot + shift[:, None] * left, heading + 0.25 * np.sin(2 * np.pi * t / 2.8)
+        return spot + shift[:, None] * left_of(np.array(heading)), heading + 0.25 * np.sin(2 * np.pi * t / 2.8)
 
     xy, facing = path(time)
-    forward = np.stack([np.cos(facing), np.sin(facing)], axis=-1)
-    left = np.stack([-forward[:, 1], forward[:, 0]], axis=-1)
+    forward = along(facing)
+    left = left_of(facing)
     beat = 0.13 * np.sin(2 * np.pi * time / 0.62)
     hello = xy + 0.2 * forward - (0.38 + beat)[:, None] * left
-    hello = np.concatenate([hello, np.full((len(time), 1), build.shoulder_m + 0.32)], axis=1)
     floor = xy + 0.42 * forward + 0.1 * left
-    floor = np.concatenate([floor, np.full((len(time), 1), 0.42)], axis=1)
-    reach = np.stack([crouching, waving], axis=1)
-    gaze = np.concatenate([xy + 1.2 * forward, (1.45 - 1.1 * crouching)[:, None]], axis=1)
     return _puppet(
         build,
         time,
@@ -231,16 +225,16 @@ def wave(build: Build, time: Array, spot: Array, heading: float, rng: np.random.
         phase=rng.uniform(),
         dip=0.02 + 0.3 * crouching,
         lean=np.stack([0.03 + 0.75 * crouching, 0.2 * np.sin(2 * np.pi * time / 2.8), -0.06 * waving], axis=1),
-        wrists=np.stack([floor, hello], axis=1),
-        reach=reach,
-        gaze=gaze,
+        wrists=np.stack([_at(floor, 0.42), _at(hello, build.shoulder_m + 0.32)], axis=1),
+        reach=np.stack([crouching, waving], axis=1),
+        gaze=_at(xy + 1.2 * forward, 1.45 - 1.1 * crouching),
     )
 
 
 def _puppet(
     build: Build,
     time: Array,
-    path: Callable[[Array], tuple[Array, Array]],
+    path: Path,
     *,
     stride_s: float,
     phase: float,
@@ -253,7 +247,7 @@ def _puppet(
     """Put a body on the footsteps of `path`, its pelvis `dip` (T,) metres lower than upright."""
     end = (time[-1] if len(time) else 0.0) + _PADDING_S
     known = np.arange(-_PADDING_S, end, 0.02)
-    steps = footsteps(Path(known, *path(known)), time, stride_s, width_m=0.19, phase=phase)
+    steps = footsteps(_tabulated(path, known), time, stride_s, width_m=0.19, phase=phase)
     xy, heading = path(time)
     ankles = np.concatenate([steps.xy, (build.ankle_m + steps.lift)[..., None]], axis=-1)
     # Nobody walks on stretched legs: the pelvis is low enough for both feet, softly.
@@ -262,9 +256,9 @@ def _puppet(
     allowed = (ankles[..., 2] + drop).min(axis=1) + (build.pelvis_m - build.rest[1, 1] + build.floor)
     height = _soften(np.minimum(build.pelvis_m - dip, allowed))
     lean_back = -0.22 * np.maximum(dip - 0.05, 0.0)  # the hips go back over the heels in a crouch
-    xy = xy + lean_back[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+    xy = xy + lean_back[:, None] * along(heading)
     return Puppet(
-        pelvis=np.concatenate([xy, height[:, None]], axis=1),
+        pelvis=_at(xy, height),
         heading=heading,
         lean=lean,
         ankles=ankles,
@@ -275,6 +269,22 @@ def _puppet(
         swing=np.clip(0.55 * steps.swing[:, ::-1], -0.25, 0.3),
         gaze=gaze,
     )
+
+
+def _tabulated(path: Path, time_s: Array) -> Path:
+    """`path`, linear between increasing times (M,)."""
+    places, headings = path(time_s)
+
+    def at(t: Array) -> tuple[Array, Array]:
+        xy = np.stack([np.interp(t, time_s, places[:, axis]) for axis in (0, 1)], axis=-1)
+        return xy, np.interp(t, time_s, headings)
+
+    return at
+
+
+def _at(xy: Array, z: Array | float) -> Array:
+    """Points (T, 3) over `xy` (T, 2) at height `z`."""
+    return np.concatenate([xy, np.broadcast_to(z, len(xy))[:, None]], axis=1)
 
 
 def _bump(time: Array, start: float, length: float, *, period: float) -> Array:

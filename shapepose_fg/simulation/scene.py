@@ -66,16 +66,6 @@ class Scene:
         with torch.no_grad():
             return self.body.vertices(parameters, only).numpy()
 
-    @cached_property
-    def standing(self) -> NDArray[np.float32]:
-        """(Nv, 3) the mean body in its T-pose, y up."""
-        import torch
-
-        from shapepose_fg.body.model.body_model import BodyParameters
-
-        with torch.no_grad():
-            return self.body.vertices(BodyParameters.zeros(1, self.body.dtype))[0].numpy()
-
 
 def built_in_scene(
     seed: int = 0,

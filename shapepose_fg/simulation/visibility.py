@@ -95,11 +95,7 @@ class Skin:
 
 
 def see(
-    rig: Rig,
-    joints: NDArray[np.float64],
-    surfaces: NDArray[np.floating],
-    skin: Skin,
-    config: VisibilityConfig,
+    rig: Rig, joints: NDArray[np.float64], surfaces: NDArray[np.floating], skin: Skin, config: VisibilityConfig
 ) -> Visibility:
     """See BODY_25 `joints` (P, 25, 3) of people whose `surfaces` are (P, M, 3), the vertices of `skin`.
 

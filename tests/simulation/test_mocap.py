@@ -226,7 +226,7 @@ def test_hands_that_are_near_are_brought_together(body: BodyModel):
     for shoulder, elbow, sign in ((16, 18, 1.0), (17, 19, -1.0)):
         poses[:, shoulder] = Rotation.from_rotvec([0, -0.8 * sign, 0]).as_matrix()
         poses[:, elbow] = Rotation.from_rotvec([0, -0.75 * sign, 0]).as_matrix()
-    clip = Clip("a", "a", "", 0, poses, np.tile([0.0, 0.95, 0.0], (60, 1)), 30.0, 0.8, 0.0, True, True)
+    clip = Clip("a", "a", "", poses, np.tile([0.0, 0.95, 0.0], (60, 1)), 30.0, 0.8, 0.0, True, True)
     lead = perform(body, np.zeros(10), clip)
     reach = abs(lead.joints[0, 22, 1] - lead.joints[0, 0, 1])
     for spare in (0.08, 0.13):
