@@ -7,11 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.model.body_model import BodyModel
-from shapepose_fg.simulation.bystanders import stand, walk_along
-from shapepose_fg.simulation.crossing import way_through
-from shapepose_fg.simulation.holding import hold_hands
+from shapepose_fg.simulation.bystanders import stand, walk_along, way_through
 from shapepose_fg.simulation.mocap import Clip
-from shapepose_fg.simulation.performance import Figure, Performance, about_z, perform
+from shapepose_fg.simulation.performance import Figure, Performance, about_z, hold_hands, perform
 
 Array = NDArray[np.float64]
 

@@ -11,9 +11,8 @@ from scipy.spatial.transform import Rotation
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.simulation.bystanders import endless, stand, walk_along
-from shapepose_fg.simulation.holding import hold_hands
 from shapepose_fg.simulation.mocap import Clip, Mocap
-from shapepose_fg.simulation.performance import Figure, Performance, perform, together
+from shapepose_fg.simulation.performance import Figure, Performance, hold_hands, perform, together
 from shapepose_fg.simulation.scene import Scene, keypoints_of, parameters_of, ring_of_cameras
 from shapepose_fg.simulation.shoulder import shoulder_rhythm
 
