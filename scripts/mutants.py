@@ -74,8 +74,8 @@ def changes(node: ast.AST) -> Iterator[ast.AST]:
             yield node.operand
         case ast.Constant(value=bool()):
             yield ast.Constant(not node.value)
-        case ast.Constant(value=int() | float()):
-            yield from (ast.Constant(value) for value in {node.value + 1, 0} - {node.value})
+        case ast.Constant(value=int() | float() as number):
+            yield from (ast.Constant(value) for value in {number + 1, 0} - {number})
         case ast.IfExp():
             yield from (node.body, node.orelse)
         case ast.If() if "TYPE_CHECKING" not in ast.dump(node.test):
@@ -96,8 +96,8 @@ def slots(node: ast.AST, line: int = 1) -> Iterator[tuple[int, Any, Any]]:
     for field, value in ast.iter_fields(node):
         if field in ("annotation", "returns", "decorator_list", "bases"):
             continue
-        container, keys = (value, range(len(value))) if isinstance(value, list) else (vars(node), [field])
-        for key in keys:
+        container: Any = value if isinstance(value, list) else vars(node)
+        for key in range(len(value)) if isinstance(value, list) else [field]:
             each = container[key]
             if isinstance(each, ast.AST) and not (isinstance(each, ast.keyword) and each.arg == "strict"):
                 line = each.lineno if isinstance(each, ast.stmt) else line
