@@ -24,6 +24,7 @@ from shapepose_fg.evaluation.spoiled_setups import spoiled
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.setup_check.diagnosis import diagnose
+from shapepose_fg.setup_check.words import sentence
 from shapepose_fg.simulation import built_in_scene, simulate
 
 ROOT = Path(__file__).parents[1]
@@ -43,6 +44,7 @@ def main() -> None:
     )
     parser.add_argument("--recordings", type=int, default=6, help="simulated recordings; ten times as many clean")
     parser.add_argument("--seed", type=int, default=0, help="fixes the axes of turns, and the simulated people")
+    parser.add_argument("--verbose", action="store_true", help="print what was said of mistakes not named")
     arguments = parser.parse_args()
     if not set(arguments.parts) <= set(PARTS):
         parser.error(f"parts are {' '.join(PARTS)}")
@@ -50,7 +52,7 @@ def main() -> None:
         if part == "clean":
             clean(10 * arguments.recordings, arguments.seed)
         else:
-            confusion(part, recordings(part, arguments), arguments.seed)
+            confusion(part, recordings(part, arguments), arguments.seed, arguments.verbose)
 
 
 def recordings(part: str, arguments: argparse.Namespace) -> Iterator[tuple[DetectionSequence, Rig]]:
@@ -73,10 +75,10 @@ def simulated(seed: int) -> tuple[DetectionSequence, Rig]:
     return simulate(scene, seed=seed), scene.rig
 
 
-def confusion(name: str, given: Iterator[tuple[DetectionSequence, Rig]], seed: int) -> None:
+def confusion(name: str, given: Iterator[tuple[DetectionSequence, Rig]], seed: int, verbose: bool) -> None:
     """How often each mistake was named, and as what otherwise."""
     named, count, said = Counter[str](), Counter[str](), defaultdict(Counter[str])
-    only, seconds = Counter[str](), list[float]()
+    alone, seconds = Counter[str](), list[float]()
     for detections, rig in given:
         before = {(each.kind, each.cameras) for each in diagnose(detections, rig).findings}
         for each in spoiled(detections, rig, seed):
@@ -86,15 +88,18 @@ def confusion(name: str, given: Iterator[tuple[DetectionSequence, Rig]], seed: i
             right = each.named_by(findings)
             count[each.what] += 1
             named[each.what] += right
-            only[each.what] += right and all(
+            alone[each.what] += right and all(
                 finding.kind == each.kind or finding.kind in {kind for kind, _ in before} for finding in findings
             )
             if not right:
                 said[each.what]["; ".join(str(finding.kind) for finding in findings) or "nothing"] += 1
-    print(f"\n{name}{'mistake':>20}{'named':>12}{'only':>10}   instead")
+                if verbose:
+                    words = "; ".join(sentence(finding, each.rig) for finding in findings) or "nothing"
+                    print(f"  {each.what}, camera {each.cameras}: {words}")
+    print(f"\n{name}{'mistake':>20}{'named':>12}{'alone':>10}   instead")
     for what in count:
         instead = ", ".join(f"{words} ({times})" for words, times in said[what].items())
-        print(f"{what:<26}{f'{named[what]} of {count[what]}':>12}{only[what]:>8}   {instead}")
+        print(f"{what:<26}{f'{named[what]} of {count[what]}':>12}{alone[what]:>8}   {instead}")
     total, right = sum(count.values()), sum(named.values())
     print(f"{'all':<26}{f'{right} of {total}':>12}   {100 * right / total:.1f} %")
     print(f"{np.median(seconds):.1f} s of processor a check, {max(seconds):.1f} s at most")
