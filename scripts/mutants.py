@@ -1,226 +1,244 @@
-"""Change the code at random places; do the tests notice? python scripts/mutants.py --sample 60 [--minutes 30].
+"""Change the code at random places and see whether the tests notice: python scripts/mutants.py FOLDER --sample 60.
 
-Changes are Cosmic Ray's (pip install -e ".[mutants]"): another operator or comparison, a number one more or less,
-a condition the other way round, a loop that is not gone through, an exception that is not caught. A place of the
-code is drawn, each as likely, then one of its changes. Left out by rule: words for people, types, decorators,
-`strict=`, `==` for `is`, and changes that no float or mask could take. For every change the tests that reach its
-line are run, those of its own package and the quickest first, until one fails or `--seconds` are full. Noticed is
-what fails, or does not end.
+Places are drawn, each as likely, and changed one at a time: comparisons, arithmetic, logic, numbers, conditions,
+calls left out; words for people, types and decorators are not. Of the tests that reach the changed statement (by
+coverage, measured once, as long as the whole suite) those of its package come first, until one fails. Results are
+kept in FOLDER; a run that is started again goes on. What two sets of tests are worth is compared on one draw:
 
-Results are kept in .mutants, and a run that is stopped goes on there. `--again` tries the survivors anew, with the
-tests of today, and with more `--seconds` if need be. scripts/equivalent_mutants.txt lists survivors that no test
-can notice, with the reason.
+    python scripts/mutants.py /tmp/mutants --sample 200
+    python scripts/mutants.py /tmp/mutants --sample 200 --only "not slow"      # an expression of pytest's -m
+
+Needs coverage (pip install -e ".[mutants]").
 """
 
 import argparse
-import hashlib
+import ast
+import copy
+import importlib
 import json
 import os
+import random
+import shutil
+import subprocess
+import sys
 import time
-from collections import Counter
-from dataclasses import astuple
-from itertools import islice
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-os.environ["OMP_NUM_THREADS"] = "1"  # before torch is loaded: forks must not share its threads
-
-from mutant_places import Mutant, Source, sample
-from mutant_tests import ROOT, Reached, Tree
 from scipy.stats import binomtest
 
-PACKAGES = {
-    "stage I": ("shapepose_fg/proposal/*.py",),
-    "estimation": ("shapepose_fg/estimation/*.py",),
-    "tracking": ("shapepose_fg/tracking/*.py",),
-    "readers": (
-        "shapepose_fg/io/**/*.py",
-        "shapepose_fg/core/storage/files.py",
-        "shapepose_fg/body/model/smpl_*.py",
-        "shapepose_fg/body/model/pickle_records.py",
-    ),
-}
-TESTS = (
-    "tests/proposal/test_*.py",
-    "tests/tracking/test_*.py",
-    "tests/estimation/test_*.py",
-    "tests/io/test_*.py",
-    "tests/body/test_smpl_*.py",
-    "tests/test_*.py",
-)
-NOT_FOR_THIS = {
-    "tests/test_documents.py",
-    "tests/test_imports.py",
-    "tests/test_licences.py",
-    "tests/test_cluster.py",
-}
-"""Tests of documents and packages, not of what the code does; and such as start a cluster."""
-EQUIVALENT = Path(__file__).with_name("equivalent_mutants.txt")
+ROOT = Path(__file__).parents[1]
+WORDS = {"InputError", "ValueError", "RuntimeError", "AssertionError", "print", "isinstance", "TypeVar"}
+"""What is called with words for people, or with types."""
+OTHER: dict[type, tuple[type, ...]] = {
+    ast.Lt: (ast.LtE, ast.Gt), ast.LtE: (ast.Lt, ast.Gt), ast.Gt: (ast.GtE, ast.Lt), ast.GtE: (ast.Gt, ast.Lt),
+    ast.Eq: (ast.NotEq,), ast.NotEq: (ast.Eq,), ast.Is: (ast.IsNot,), ast.IsNot: (ast.Is,),
+    ast.In: (ast.NotIn,), ast.NotIn: (ast.In,), ast.And: (ast.Or,), ast.Or: (ast.And,),
+    ast.Add: (ast.Sub,), ast.Sub: (ast.Add,), ast.Mult: (ast.Div,), ast.Div: (ast.Mult,), ast.Pow: (ast.Mult,),
+    ast.FloorDiv: (ast.Div,), ast.Mod: (ast.FloorDiv,), ast.BitAnd: (ast.BitOr,), ast.BitOr: (ast.BitAnd,),
+}  # fmt: skip
+"""Operators that take each other's place."""
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One change of one file."""
+
+    path: str
+    """The file, relative to the repository."""
+    line: int
+    """Line of the statement, from 1."""
+    name: str
+    """Where it is, what is changed, and what that becomes."""
+    code: str
+    """The whole file with the change."""
+
+
+def changes(node: ast.AST) -> Iterator[ast.AST]:
+    """What may stand in the place of a node."""
+    match node:
+        case ast.Compare(ops=[operator]):
+            for other in OTHER[type(operator)]:
+                yield ast.Compare(node.left, [other()], node.comparators)
+        case ast.BoolOp():
+            yield ast.BoolOp(OTHER[type(node.op)][0](), node.values)
+            yield from node.values
+        case ast.BinOp() if type(node.op) in OTHER:
+            yield ast.BinOp(node.left, OTHER[type(node.op)][0](), node.right)
+        case ast.AugAssign() if type(node.op) in OTHER:
+            yield ast.AugAssign(node.target, OTHER[type(node.op)][0](), node.value)
+        case ast.UnaryOp():
+            yield node.operand
+        case ast.Constant(value=bool()):
+            yield ast.Constant(not node.value)
+        case ast.Constant(value=int() | float() as number):
+            yield from (ast.Constant(value) for value in {number + 1, 0} - {number})
+        case ast.IfExp():
+            yield from (node.body, node.orelse)
+        case ast.If() if "TYPE_CHECKING" not in ast.dump(node.test):
+            yield from (ast.If(ast.Constant(value), node.body, node.orelse) for value in (True, False))
+        case ast.Expr(value=ast.Call()):
+            yield ast.Pass()
+        case ast.Break():
+            yield ast.Continue()
+        case ast.Continue():
+            yield ast.Break()
+
+
+def slots(node: ast.AST, line: int = 1) -> Iterator[tuple[int, Any, Any]]:
+    """Where below `node` something may be changed: the statement's line, and `[container][key]`."""
+    called = getattr(node, "func", None)
+    if isinstance(node, ast.JoinedStr) or getattr(called, "id", getattr(called, "attr", "")) in WORDS:
+        return
+    for field, value in ast.iter_fields(node):
+        if field in ("annotation", "returns", "decorator_list", "bases"):
+            continue
+        container: Any = value if isinstance(value, list) else vars(node)
+        for key in range(len(value)) if isinstance(value, list) else [field]:
+            each = container[key]
+            if isinstance(each, ast.AST) and not (isinstance(each, ast.keyword) and each.arg == "strict"):
+                line = each.lineno if isinstance(each, ast.stmt) else line
+                yield line, container, key
+                yield from slots(each, line)
+
+
+def drawn(paths: list[str], seed: int) -> Iterator[Mutant]:
+    """Mutants in random order, one a place; a seed gives the same ones as long as the files are the same."""
+    rng = random.Random(seed)
+    trees = {path: ast.parse((ROOT / path).read_text(encoding="utf-8")) for path in paths}
+    found = [(path, *slot) for path, tree in trees.items() for slot in slots(tree)]
+    rng.shuffle(found)
+    for path, line, container, key in found:
+        node = container[key]
+        options = list(changes(node))
+        if options:
+            other = copy.copy(rng.choice(options))
+            container[key] = ast.fix_missing_locations(ast.copy_location(other, node))
+            code = ast.unparse(trees[path])
+            container[key] = node
+            before, after = (ast.unparse(each).split("\n")[0] for each in (node, other))
+            yield Mutant(path, line, f"{path}:{line} {before} -> {after}", code)
+
+
+def listed(*words: str) -> list[str]:
+    """Files of the repository."""
+    command = ["git", "ls-files", "-z", *words]
+    names = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.split("\0")
+    return [name for name in names if (ROOT / name).is_file()]
+
+
+class Recorder:
+    """Pytest's plugin that writes down which lines each test reaches, and how long it takes."""
+
+    def __init__(self, file: Path) -> None:
+        """Results go into `file`."""
+        coverage: Any = importlib.import_module("coverage")
+        self.file, self.seconds = file, defaultdict[str, float](float)
+        self.coverage = coverage.Coverage(data_file=None, source=["shapepose_fg", "factors"], config_file=False)
+        self.coverage.start()  # before tests are imported: what that reaches is no test's
+
+    def pytest_runtest_logstart(self, nodeid: str) -> None:
+        """A test begins, with its fixtures."""
+        self.coverage.switch_context(nodeid)
+
+    def pytest_runtest_logreport(self, report: Any) -> None:
+        """Its time."""
+        self.seconds[report.nodeid] += report.duration
+
+    def pytest_sessionfinish(self) -> None:
+        """Write it down: of each file and line the tests."""
+        self.coverage.stop()
+        data, lines = self.coverage.get_data(), {}
+        for file in data.measured_files():
+            contexts = data.contexts_by_lineno(file)
+            lines[os.path.relpath(file)] = {line: sorted(filter(None, names)) for line, names in contexts.items()}
+        self.file.write_text(json.dumps({"seconds": self.seconds, "lines": lines}))
+
+
+class Copy:
+    """A copy of the repository, in which one file at a time is changed."""
+
+    def __init__(self, folder: Path, only: str) -> None:
+        """Copy it, and find out which tests reach which lines; `only` chooses tests by their marks."""
+        self.tree = folder / "tree"
+        shutil.rmtree(self.tree, ignore_errors=True)
+        for name in listed("--cached", "--others", "--exclude-standard"):
+            (self.tree / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(ROOT / name, self.tree / name)
+        reached = folder / f"reached {only}.json"
+        if not reached.exists():
+            self._python([__file__, str(reached), "--only", only, "--record"], None)
+        self.reached = json.loads(reached.read_text())
+
+    def _python(self, words: list[str], most_s: float | None) -> int | None:
+        """The exit code of Python in the copy; None where it takes longer."""
+        paths = os.pathsep.join([str(self.tree), os.environ.get("PYTHONPATH", "")])
+        env = os.environ | {"PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": "1"}
+        command, said = [sys.executable, *words], None if most_s is None else subprocess.DEVNULL
+        try:
+            return subprocess.run(
+                command, cwd=self.tree, env=env, stdout=said, timeout=most_s, check=False
+            ).returncode
+        except subprocess.TimeoutExpired:
+            return None
+
+    def outcome(self, mutant: Mutant, most_s: float) -> str:
+        """What tests of `most_s` seconds in all, and at least one, say of a change."""
+        lines = self.reached["lines"].get(mutant.path, {})
+        tests = lines.get(str(mutant.line)) or sorted({name for names in lines.values() for name in names})
+        own, seconds = f"tests/{Path(mutant.path).parts[1]}/", self.reached["seconds"]
+        chosen, total = [], 0.0
+        for test in sorted(tests, key=lambda name: (not name.startswith(own), seconds[name])):
+            total += seconds[test]
+            if chosen and total > most_s:
+                break
+            chosen.append(test)
+        if len(chosen) == 0:
+            return "not reached"
+        file = self.tree / mutant.path
+        before = file.read_bytes()
+        file.write_text(mutant.code, encoding="utf-8")
+        try:
+            code = self._python(["-m", "pytest", "-x", "-q", "-p", "no:xdist", *chosen], 60 + 5 * most_s)
+        finally:
+            file.write_bytes(before)
+        return "survived" if code == 0 else "noticed"
 
 
 def main() -> None:
-    """Draw, try, count."""
+    """Try mutants, and say what survives."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sample", type=int, default=60, help="changes in each package")
-    parser.add_argument(
-        "--package", choices=[*PACKAGES], action="append", help="of one package; of all by default"
-    )
-    parser.add_argument("--seed", type=int, default=0, help="of the sample")
-    parser.add_argument("--minutes", type=float, default=1e9, help="stop after so long")
-    parser.add_argument("--again", action="store_true", help="try the survivors anew")
-    parser.add_argument("--seconds", type=float, default=8.0, help="of tests for each change")
-    parser.add_argument("--survivors", action="store_true", help="only print them, and the counts")
-    parser.add_argument("--state", type=Path, default=ROOT / ".mutants", help="where results are kept")
+    parser.add_argument("folder", type=Path, help="where results are kept, and the copy of the repository")
+    parser.add_argument("--paths", nargs="+", default=["shapepose_fg", "factors"], help="folders to change")
+    parser.add_argument("--sample", type=int, default=60, help="how many changes")
+    parser.add_argument("--seed", type=int, default=1, help="of the draw")
+    parser.add_argument("--seconds", type=float, default=20.0, help="of tests, for each change")
+    parser.add_argument("--only", default="", help="tests with these marks, as pytest's -m says it")
+    parser.add_argument("--record", action="store_true", help=argparse.SUPPRESS)
     given = parser.parse_args()
-    names = given.package or list(PACKAGES)
-    sources = {name: [Source(ROOT, path) for path in _files(PACKAGES[name])] for name in names}
-    drawn = {name: _drawn(sources[name], given.seed, given.sample, given.state) for name in names}
-    campaign = Campaign(given.state)
-    if not given.survivors:
-        # A change of each package in turn: what is stopped has tried some of all.
-        turns = [mutant for turn in zip(*_filled(list(drawn.values())), strict=True) for mutant in turn if mutant]
-        by_path = {source.path: source for each in sources.values() for source in each}
-        until = time.monotonic() + 60 * given.minutes
-        campaign.run(turns, by_path, again=given.again, most_s=given.seconds, until=until)
-    campaign.show(drawn)
-
-
-def _files(patterns: tuple[str, ...]) -> list[str]:
-    return sorted({str(file.relative_to(ROOT)) for each in patterns for file in ROOT.glob(each)})
-
-
-def _drawn(sources: list[Source], seed: int, count: int, folder: Path) -> list[Mutant]:
-    """The first mutants of a sample; drawing takes its time, so they are kept."""
-    code = "".join(f"{seed} {source.path}\n{source.code}" for source in sources)
-    kept = folder / "drawn" / f"{hashlib.sha256(code.encode()).hexdigest()[:16]}.json"
-    known = [Mutant(*each) for each in json.loads(kept.read_text())] if kept.exists() else []
-    if len(known) < count:
-        known = list(islice(sample(sources, seed), count))
-        kept.parent.mkdir(parents=True, exist_ok=True)
-        kept.write_text(json.dumps([astuple(each) for each in known]))
-    return known[:count]
-
-
-def _filled(lists: list[list[Mutant]]) -> list[list[Mutant | None]]:
-    longest = max(map(len, lists))
-    return [[*each, *[None] * (longest - len(each))] for each in lists]
-
-
-class Campaign:
-    """What was tried, and what came of it."""
-
-    def __init__(self, folder: Path) -> None:
-        """Go on with what is kept in `folder`."""
-        self.folder = folder
-        self.results: dict[str, str] = {}
-        """By the change's line before and after: survived, noticed, too long, or not reached."""
-        if (folder / "results.jsonl").exists():
-            for line in (folder / "results.jsonl").read_text().splitlines():
-                entry = json.loads(line)
-                self.results[entry["id"]] = entry["outcome"]
-
-    def run(
-        self, mutants: list[Mutant], sources: dict[str, Source], *, again: bool, most_s: float, until: float
-    ) -> None:
-        """Try those that have no result yet, with `most_s` seconds of tests; with `again` survivors, too."""
-        left = [each for each in mutants if self._open(each, again)]
-        if len(left) == 0:
-            return
-        self.folder.mkdir(parents=True, exist_ok=True)
-        tree = Tree(self.folder / "tree")
-        tests = [file for file in _files(TESTS) if file not in NOT_FOR_THIS]
-        reached = Reached(tree, self.folder / "reached", tests)
-        everything = {str(file.relative_to(ROOT)): file.read_text() for file in ROOT.glob("shapepose_fg/**/*.py")}
-        for n, mutant in enumerate(left):
-            if time.monotonic() > until:
-                print(f"{len(left) - n} are left for another run")
-                return
-            began = time.monotonic()
-            outcome, count = self._tried(mutant, sources[mutant.path], tree, reached, everything, most_s)
-            self.results[mutant.identity] = outcome
-            seconds = time.monotonic() - began
-            with (self.folder / "results.jsonl").open("a") as stream:
-                entry = {"id": mutant.identity, "outcome": outcome, "tests": count, "seconds": round(seconds, 1)}
-                stream.write(json.dumps(entry) + "\n")
-            print(
-                f"{outcome:<11} {count:3d} tests {seconds:5.1f} s  {mutant.path}:{mutant.line} {mutant.operator}",
-                flush=True,
-            )
-
-    def _open(self, mutant: Mutant, again: bool) -> bool:
-        outcome = self.results.get(mutant.identity)
-        return outcome is None or (again and outcome in ("survived", "not reached"))
-
-    def _tried(
-        self,
-        mutant: Mutant,
-        source: Source,
-        tree: Tree,
-        reached: Reached,
-        everything: dict[str, str],
-        most_s: float,
-    ) -> tuple[str, int]:
-        """What came of a change, and of how many tests."""
-        lines, names, inside = source.statement(mutant.line)
-        tests = reached.tests(mutant.path, lines)
-        if not inside:  # run when the file is loaded: who uses it?
-            tests = set().union(*(reached.users(name, everything) for name in names)) or reached.of_file(
-                mutant.path
-            )
-        chosen, seconds = reached.in_order(tests, mutant.path, most_s)
-        changed = mutant.applied(source.code)
-        if len(chosen) == 0 or changed is None:
-            return "not reached", 0
-        code = tree.test_changed(mutant.path, changed, chosen, most_s + 1.5 * seconds, self.folder / "said")
-        return ("too long" if code is None else "survived" if code == 0 else "noticed"), len(chosen)
-
-    def show(self, drawn: dict[str, list[Mutant]]) -> None:
-        """Survivors, and the share that is noticed."""
-        known = _equivalent()
-        for name, mutants in drawn.items():
-            for mutant in mutants:
-                outcome = self.results.get(mutant.identity)
-                if outcome in ("survived", "not reached") and mutant.identity not in known:
-                    print(f"\n{name}: {mutant.path}:{mutant.line} {outcome}\n- {mutant.before}\n+ {mutant.after}")
-        heads = (
-            ("tried", 7),
-            ("noticed", 9),
-            ("share", 8),
-            ("95 %", 16),
-            ("equivalent", 12),
-            ("share of others", 17),
-        )
-        print(f"\n{'package':<12}" + "".join(f"{head:>{width}}" for head, width in heads))
-        total: Counter[str] = Counter()
-        for name, mutants in drawn.items():
-            counts: Counter[str] = Counter()
-            for mutant in mutants:
-                outcome = self.results.get(mutant.identity)
-                counts["tried"] += outcome is not None
-                counts["noticed"] += outcome in ("noticed", "too long")
-                counts["equivalent"] += outcome in ("survived", "not reached") and mutant.identity in known
-            _print(name, counts)
-            total += counts
-        _print("all", total)
-
-
-def _print(name: str, counts: Counter[str]) -> None:
-    tried, noticed, equivalent = (counts[each] for each in ("tried", "noticed", "equivalent"))
-    if tried == 0:
+    if given.record:
+        words = ["-q", "-p", "no:xdist", "-m", given.only]
+        importlib.import_module("pytest").main(words, plugins=[Recorder(given.folder)])
         return
-    between = binomtest(noticed, tried).proportion_ci(method="wilson")
-    interval = f"{100 * between.low:.0f} to {100 * between.high:.0f} %"
-    print(
-        f"{name:<12}{tried:>7}{noticed:>9}{100 * noticed / tried:>6.1f} %{interval:>16}{equivalent:>12}"
-        f"{100 * noticed / max(tried - equivalent, 1):>15.1f} %"
-    )
-
-
-def _equivalent() -> dict[str, str]:
-    """Changes that no test can notice, with the reason: four columns with | between them."""
-    if not EQUIVALENT.exists():
-        return {}
-    lines = [line for line in EQUIVALENT.read_text().splitlines() if line and not line.startswith("#")]
-    return {identity.strip(): reason.strip() for identity, reason in (line.rsplit(" | ", 1) for line in lines)}
+    folder, here, counts = given.folder.resolve(), None, Counter[str]()
+    folder.mkdir(parents=True, exist_ok=True)
+    results = folder / f"results {given.only}.jsonl"
+    known = dict(json.loads(line) for line in results.read_text().splitlines()) if results.exists() else {}
+    files = listed("--", *(f"{path}/**.py" for path in given.paths))
+    for _, mutant in zip(range(given.sample), drawn(files, given.seed), strict=False):
+        if mutant.name not in known:
+            here, began = here or Copy(folder, given.only), time.monotonic()
+            known[mutant.name] = here.outcome(mutant, given.seconds)
+            with results.open("a") as stream:
+                stream.write(json.dumps([mutant.name, known[mutant.name]]) + "\n")
+            print(f"{known[mutant.name]:<11} {time.monotonic() - began:4.0f} s  {mutant.name}", flush=True)
+        counts[known[mutant.name]] += 1
+    total = counts.total()
+    between = binomtest(counts["noticed"], total).proportion_ci(method="wilson")
+    print(f"{dict(counts)}: noticed {counts['noticed'] / total:.1%} ({between.low:.0%} to {between.high:.0%})")
 
 
 if __name__ == "__main__":

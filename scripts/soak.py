@@ -4,9 +4,7 @@ A minute of the built-in scene is simulated and played forwards and backwards, o
 goes on. `shapepose-fg reconstruct` is run on it and looked at from outside: memory of all its processes, and their
 processor time, for each round of the minute. Neither may grow by more than 5 % to the last; the first has the
 loading in it and is left out, as many as there are processes that solve. Then come bodies over time, check, report
-and the files, of which the peak is printed. With `--solve WINDOWS` the run is stopped after so many; what is kept
-of them is copied up to the end, since the recording repeats, and the run goes on from there: the end of a day
-without the day. Linux only (it reads /proc). Exit code 1 where memory or time grows by more.
+and the files, of which the peak is printed. Linux only (it reads /proc). Exit code 1 where memory or time grows.
 """
 
 import argparse
@@ -21,9 +19,6 @@ from pathlib import Path
 
 import numpy as np
 
-from shapepose_fg.core.camera import Rig
-from shapepose_fg.core.detections import DetectionSequence
-from shapepose_fg.core.storage.kept_arrays import InFolder, KeptArrays
 from shapepose_fg.evaluation.speed import BackAndForth
 from shapepose_fg.io.write_detections import write_association
 from shapepose_fg.pipeline.runs.manifest import PARTS
@@ -33,8 +28,6 @@ _FPS = 25.0
 _EVERY_S = 0.2
 _LOOKING = 0.02
 """Share of the time in which a run is looked at: the system walks through all its pages for that."""
-_SAID_WINDOWS = 20
-"""Of a run that takes hours something is said in between."""
 _MEGABYTE = 1e6
 
 
@@ -73,72 +66,21 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--cameras", type=int, default=4)
     parser.add_argument("--workers", type=int, default=1, help="processes that solve")
     parser.add_argument("--batch-frames", type=int, default=96, help="frames of a window")
-    parser.add_argument("--solve", type=int, metavar="WINDOWS", help="solve so many only, copy the rest")
     parser.add_argument("--tolerance", type=float, default=0.05, help="change that is let pass, as a share")
     parser.add_argument("--folder", type=Path, help="where the files go, and stay; by default they are removed")
     given = parser.parse_args(words)
-    windows, period = given.frames // given.batch_frames, 2 * given.loop
-    solved = windows if given.solve is None else given.solve
-    if solved < windows and (given.frames % given.batch_frames or solved * given.batch_frames % period):
-        parser.error(
-            f"--frames must be whole windows, and those of --solve {period} frames, there and back, or more"
-        )
     with tempfile.TemporaryDirectory(prefix="soak-") as name:
         folder = Path(name) if given.folder is None else given.folder
         scene = built_in_scene(0, people=given.people, cameras=given.cameras, frames=given.loop, fps=_FPS)
-        write_recording(simulate(scene, seed=0), scene.rig, given.frames, folder)
-        size = sum(file.stat().st_size for file in (folder / "recording").rglob("*.txt"))
+        recording = folder / "recording"
+        write_association(BackAndForth(simulate(scene, seed=0), given.frames), scene.rig, recording)
+        size = sum(file.stat().st_size for file in recording.rglob("*.txt"))
         print(f"{given.frames} frames of {given.people} people and {given.cameras} cameras, {size / 1e6:.0f} MB")
-        command, parts = _command(folder, given.workers, given.batch_frames), folder / "out" / PARTS
-        if solved < windows:
-            samples = _watched(command, parts, solved)
-            copy_windows(InFolder(parts), solved, windows, given.batch_frames)
-            ending = _watched([*command, "--resume"], parts)
-        else:
-            samples = _watched(command, parts)
-            ending = [each for each in samples if each.parts == max(each.parts for each in samples)]
-    rounds = rounds_of(samples, given.batch_frames, period, solved * given.batch_frames)
-    _print([each for each in samples if each.parts == 0], rounds, ending)
+        samples = _watched(_command(folder, given.workers, given.batch_frames), folder / "out" / PARTS)
+    rounds = rounds_of(samples, given.batch_frames, 2 * given.loop, given.frames)
+    most = max(each.parts for each in samples)
+    _print([each for each in samples if each.parts == 0], rounds, [each for each in samples if each.parts == most])
     return judged(rounds[given.workers :], given.tolerance)
-
-
-def copy_windows(kept: KeptArrays, solved: int, windows: int, batch_frames: int) -> None:
-    """Of a run that was stopped keep as many windows as were `solved`, and copies of them up to `windows`."""
-    (followed,) = kept.names("followed-")
-    next_id = kept.array(followed, "at")[1]
-    kept.drop(followed)
-    for n in range(solved, windows):
-        source, later = _part(n % solved), (n - n % solved) * batch_frames
-        arrays = {key: kept.array(source, key) for key in kept.keys(source)}
-        arrays["frame"], arrays["time_s"] = arrays["frame"] + later, arrays["time_s"] + later / _FPS
-        kept.keep(_part(n), arrays, kept.about(source))
-    kept.keep(f"followed-{windows - 1:06d}", {"at": np.array([windows * batch_frames, next_id])})
-
-
-def _part(n: int) -> str:
-    return f"part-{n:06d}"
-
-
-def write_recording(loop: DetectionSequence, rig: Rig, frames: int, folder: Path) -> None:
-    """Write `folder`/recording, so many frames of a loop that is played back and forth, as 4D Association's text.
-
-    Once there and back is written, and what is left of it at the end; the rest is copies of that text.
-    """
-    period = 2 * len(loop)
-    times, rest = divmod(frames, period)
-    write_association(BackAndForth(loop, min(frames, period)), rig, folder / "recording")
-    if frames <= period:
-        return
-    if rest > 0:
-        write_association(BackAndForth(loop, rest), rig, folder / "rest")
-    for file in (folder / "recording" / "detection").iterdir():
-        head, body = file.read_bytes().split(b"\n", 1)
-        end = (folder / "rest" / "detection" / file.name).read_bytes().split(b"\n", 1)[1] if rest > 0 else b""
-        with file.open("wb") as stream:
-            stream.write(b"%s %d\n" % (head.split()[0], frames))
-            for _ in range(times):
-                stream.write(body)
-            stream.write(end)
 
 
 def rounds_of(samples: Sequence[Sample], batch_frames: int, length: int, frames: int) -> list[Round]:
@@ -203,26 +145,19 @@ def _command(folder: Path, workers: int, batch_frames: int) -> list[str]:
     return [sys.executable, "-m", "shapepose_fg", "reconstruct", *words]
 
 
-def _watched(command: Sequence[str], parts: Path, stop: int | None = None) -> list[Sample]:
-    """Looks at a run until it ends, or has kept `stop` windows and is stopped; RuntimeError where it fails."""
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=environment)
-    samples = []
+def _watched(command: Sequence[str], parts: Path) -> list[Sample]:
+    """Looks at a run until it ends; RuntimeError where it fails."""
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=os.environ | {"OMP_NUM_THREADS": "1"})
+    samples: list[Sample] = []
     while process.poll() is None:
         kept = samples[-1].parts if samples else 0  # at its end they are removed
-        while (parts / f"{_part(kept)}.safetensors").exists():
+        while (parts / f"part-{kept:06d}.safetensors").exists():
             kept += 1
         start = time.perf_counter()
         memory, whole, cpu = (sum(column) for column in zip(*map(_process, _tree(process.pid)), strict=True))
-        if kept // _SAID_WINDOWS > (samples[-1].parts if samples else 0) // _SAID_WINDOWS:
-            print(f"{kept} windows: {memory / _MEGABYTE:.0f} MB, {cpu:.0f} s", file=sys.stderr)
         samples.append(Sample(kept, int(memory), int(whole), cpu))
-        if stop is not None and kept >= stop:
-            process.terminate()
-            process.wait()
-            break
         time.sleep(max(_EVERY_S, (time.perf_counter() - start) / _LOOKING))
-    if process.returncode != 0 and stop is None:
+    if process.returncode != 0:
         raise RuntimeError(f"the run ended with exit code {process.returncode}")
     return [each for each in samples if each.memory_bytes > 0]
 

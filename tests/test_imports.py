@@ -160,7 +160,7 @@ LIGHT = {
     "readers": "from shapepose_fg import InputError, Reconstruction, read_detections, read_rig, write_rig",
     "stage I": "import shapepose_fg.proposal.association",
     "stage II": "import shapepose_fg.estimation.alternation",
-    "processes that look": "import shapepose_fg.simulation.lookout",
+    "processes that look": "import shapepose_fg.simulation.visibility",
     "help": (
         "from shapepose_fg.cli.main import main\n"
         "sys.argv = ['shapepose-fg', '--help']\n"

@@ -8,11 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.evaluation.speed import BackAndForth
-from shapepose_fg.io.write_detections import write_association
-from shapepose_fg.simulation import built_in_scene, simulate
-
 _FILE = Path(__file__).parents[1] / "scripts" / "soak.py"
 _SPEC = importlib.util.spec_from_file_location("soak", _FILE)
 assert _SPEC is not None and _SPEC.loader is not None
@@ -70,36 +65,3 @@ def test_a_short_run(tmp_path, capsys):
         for stage in ("reading", "ending")
     )
     assert (tmp_path / "out" / "people.npz").is_file()
-
-
-@pytest.mark.parametrize("frames", [3, 8, 21, 24])
-def test_the_recording_is_the_loop_back_and_forth(tmp_path, frames):
-    """Copied text is what writing every frame gives, whether the length is a multiple of the loop or not."""
-    scene = built_in_scene(people=1, cameras=2, frames=4)
-    loop = simulate(scene)
-    soak.write_recording(loop, scene.rig, frames, tmp_path / "copied")
-    write_association(BackAndForth(loop, frames), scene.rig, tmp_path / "written")
-    for camera in scene.rig.names:
-        copied, written = (
-            tmp_path / folder / "detection" / f"{camera}.txt" for folder in ("copied/recording", "written")
-        )
-        assert copied.read_bytes() == written.read_bytes()
-
-
-@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="looks at processes as Linux shows them")
-def test_the_end_of_a_recording_of_which_the_beginning_was_solved(tmp_path, capsys):
-    """96 frames are solved, four times there and back; the result is of 240, at their times, with one shape."""
-    words = "--frames 240 --loop 12 --people 1 --cameras 2 --batch-frames 24 --tolerance 100 --solve 4 --folder"
-    soak.main([*words.split(), str(tmp_path)])
-    assert "ending: up to " in capsys.readouterr().out
-    people = Reconstruction.load(tmp_path / "out")
-    (number,) = np.unique(people.person)
-    mine = people.rows(people.person == number)
-    assert mine.frame.tolist() == [*range(240)] and mine.time_s == pytest.approx(mine.frame / 25)
-    np.testing.assert_array_equal(mine.joints[96:192], mine.joints[:96])
-    assert np.ptp(mine.betas, axis=0).max() == 0
-
-
-def test_windows_that_do_not_repeat_are_not_copied():
-    with pytest.raises(SystemExit):
-        soak.main("--frames 240 --loop 12 --batch-frames 36 --solve 3".split())

@@ -155,7 +155,7 @@ def simulate(
     from shapepose_fg.simulation import DetectorConfig
     from shapepose_fg.simulation import simulate as run_detector
     from shapepose_fg.simulation.files import check_output, cut, cuts_of, named_scene, write_simulated
-    from shapepose_fg.simulation.lookout import FRAMES_WORTH_A_WORKER
+    from shapepose_fg.simulation.visibility import FRAMES_WORTH_A_WORKER
 
     last = re.search(r":\s*(\d{1,6})\s*$", frames or "")
     scene = named_scene(

@@ -30,7 +30,7 @@ def affinities(
 ) -> tuple[NDArray[np.intp], Array]:
     """Pairs (E, 2) of D candidates and their affinities (E,), those above 0.
 
-    `owner` (D, P) says whose joint a candidate is (nobody's: a false one), `true_xy` (V, P, 25, 2) where joints
+    `owner` (D, P) says whose joint a candidate is (none's: a false one), `true_xy` (V, P, 25, 2) where joints
     truly are, `captors` (2, V, P, 25) who stands before a missed joint and has, or has not, captured it.
     A right pair's affinity goes with the lower of its confidences. A wrong pair's goes with the detour: the
     distance of its wrong end from the right one, in limb lengths. `doubt` and `wrong` are the knobs of
@@ -48,16 +48,16 @@ def affinities(
     affinity[right] = 1.0 + doubt * (drawn - 1.0)
     a, b = first[~right], second[~right]
     detour = _detour(view[a], joint[a], joint[b], xy[a], xy[b], owner[a], owner[b], true_xy)
-    nobody = ~np.logical_and(owner[a].any(axis=1), owner[b].any(axis=1))
+    false = ~np.logical_and(owner[a].any(axis=1), owner[b].any(axis=1))
     kind = np.clip(np.searchsorted(statistics.detours, detour, side="right") - 1, 0, len(statistics.detours) - 1)
-    share = np.where(nobody, statistics.affinity_nobody_share[kind], statistics.affinity_wrong_share[kind])
-    table = np.where(nobody[:, None], statistics.affinity_nobody[kind], statistics.affinity_wrong[kind])
+    share = np.where(false, statistics.affinity_nobody_share[kind], statistics.affinity_wrong_share[kind])
+    table = np.where(false[:, None], statistics.affinity_nobody[kind], statistics.affinity_wrong[kind])
     listed = rng.random(len(a)) < share * wrong
     if owner.shape[1] > 0:
         p, q = owner[a].argmax(axis=1), owner[b].argmax(axis=1)
         by_q, by_p = captors[:, view[a], p, joint[b]] == q, captors[:, view[a], q, joint[a]] == p
         captured, refused = np.logical_or(by_q, by_p)
-        listed = np.where(nobody, listed, (listed & ~refused) | captured)
+        listed = np.where(false, listed, (listed & ~refused) | captured)
     affinity[~right] = np.where(listed, statistics.quantile(table, rng.random(len(a))), 0.0)
     used = affinity > 0
     return np.stack([first, second], axis=1)[used], affinity[used]

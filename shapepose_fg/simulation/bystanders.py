@@ -1,12 +1,15 @@
-"""People around those whom a scene is about: recorded walks along any path, recorded gestures without end."""
+"""People around those whom a scene is about: recorded gestures without end, recorded walks past all the others."""
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
 
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.simulation.mocap import Clip, Mocap, blend
+from shapepose_fg.simulation.motion import along, left_of
 from shapepose_fg.simulation.performance import Figure, Performance, about_z, grounded, perform
 
 Array = NDArray[np.float64]
@@ -25,27 +28,34 @@ _STILL = (
 """What people do who stay where they are, as the recordings name it."""
 _STILL_M, _WALK_M = 0.75, 2.5
 """Who stays keeps within this; who walks goes farther."""
+_TRIES = 4
+"""Ways that are tried, of which the best is walked."""
+_DECISION_S = 0.1
+"""How often a walker looks up."""
+_HORIZON_S = np.linspace(0.2, 2.0, 10)
+"""How far ahead a walker sees what the others will do."""
+_TURNS = np.linspace(-1.9, 1.9, 15)
+"""Turns that are weighed, rad/s."""
+_PACES = np.array([0.15, 0.45, 0.75, 1.0])
+"""Speeds that are weighed, as shares of the walker's own."""
 
 
 def standing_clips(mocap: Mocap, *, without: frozenset[str]) -> list[int]:
     """Clips of people who stand and gesture, of subjects other than `without`."""
-    found = []
-    for index, action in enumerate(mocap.actions):
-        if mocap.subjects[index] in without or mocap.lengths[index] < 90:
-            continue
-        stays = np.ptp(_floor_plan(mocap, index), axis=0).max() < _STILL_M
-        if stays and any(word in action.lower() for word in _STILL):
-            found.append(index)
-    return found
+    return [
+        index
+        for index in _long_enough(mocap, 90, without)
+        if any(word in mocap.actions[index].lower() for word in _STILL)
+        and np.ptp(_floor_plan(mocap, index), axis=0).max() < _STILL_M
+    ]
 
 
 def walking_clips(mocap: Mocap, *, without: frozenset[str]) -> list[int]:
     """Clips of people who walk straight on, of subjects other than `without`."""
     found = []
-    for index, action in enumerate(mocap.actions):
-        if mocap.subjects[index] in without or "walk" not in action.lower() or "uneven" in action.lower():
-            continue
-        if mocap.tiers[index] > 0 or mocap.lengths[index] < 60:
+    for index in _long_enough(mocap, 60, without):
+        action = mocap.actions[index].lower()
+        if "walk" not in action or "uneven" in action or mocap.tiers[index] > 0:
             continue
         plan = _floor_plan(mocap, index)
         way = np.linalg.norm(plan[-1] - plan[0])
@@ -53,6 +63,11 @@ def walking_clips(mocap: Mocap, *, without: frozenset[str]) -> list[int]:
         if way > _WALK_M and way > 0.95 * np.linalg.norm(np.diff(plan, axis=0), axis=1).sum() and speed < 1.6:
             found.append(index)
     return found
+
+
+def _long_enough(mocap: Mocap, frames: int, without: frozenset[str]) -> list[int]:
+    there = [subject not in without for subject in mocap.subjects]
+    return np.flatnonzero(np.array(there, dtype=bool) & (mocap.lengths >= frames)).tolist()
 
 
 def endless(clip: Clip, frames: int, start: int = 0) -> Clip:
@@ -98,8 +113,7 @@ def walk_along(
     rotations = blend(cycle.rotations[low], cycle.rotations[high], share)
     rotations[:, 0] = turn @ rotations[:, 0]
     side = cycle.joints[low, 0, 1:] + share[:, None] * (cycle.joints[high, 0, 1:] - cycle.joints[low, 0, 1:])
-    left = np.stack([-np.sin(heading), np.cos(heading)], axis=1)
-    pelvis = np.concatenate([path + left * side[:, :1], side[:, 1:]], axis=1)
+    pelvis = np.concatenate([path + left_of(heading) * side[:, :1], side[:, 1:]], axis=1)
     return grounded(Figure(body, betas), rotations, pelvis, fps, bend_toes=False)
 
 
@@ -134,3 +148,94 @@ def _cycle(walk: Performance) -> tuple[Performance, float]:
     places[:, 1] -= places[:, 1].mean()
     places[:, 0] = 0.0
     return Performance(rotations, joints - joints[:, :1] + places[:, None], walk.rest), length
+
+
+class Way(NamedTuple):
+    """Where somebody walks."""
+
+    xy: Array
+    """(T, 2) metres."""
+    heading: Array
+    """(T,) radians, from the x axis towards the y axis, without whole turns."""
+
+
+def way_through(
+    others: Array,
+    frames: int,
+    rng: np.random.Generator,
+    *,
+    fps: float,
+    speed_mps: float,
+    distance_m: Array,
+    half_room_m: float,
+) -> Way:
+    """A way from wall to wall and back, past points `others` (T, K, 2) at `distance_m` (K,) or a little more.
+
+    Of several tries the one that keeps its distance best, then the one that comes closest.
+    """
+    ways = [_walk(others, frames, rng, fps, speed_mps, distance_m, half_room_m) for _ in range(_TRIES)]
+    return max(ways, key=lambda way: _way_worth(way, others, distance_m))
+
+
+def _way_worth(way: Way, others: Array, distance_m: Array) -> float:
+    """How good a way is: first that no one is bumped into, then that it is close."""
+    if others.shape[1] == 0 or len(way.xy) == 0:
+        return 0.0
+    room = (np.linalg.norm(others - way.xy[:, None], axis=-1) - distance_m).min(axis=1)
+    return 30.0 * float(np.minimum(room, 0.0).mean()) + min(float(room.min()), 0.0) + float((room < 0.4).mean())
+
+
+def _walk(
+    others: Array, frames: int, rng: np.random.Generator, fps: float, speed: float, distance: Array, half: float
+) -> Way:
+    """One try: at each decision the turn and pace whose next two seconds are best (dynamic window)."""
+    hold = max(1, round(_DECISION_S * fps))
+    xy, heading, pace = _way_start(others, rng, half)
+    goal = _way_goal(xy, rng, half)
+    turns, paces = (grid.ravel() for grid in np.meshgrid(_TURNS, _PACES))
+    rate, places, headings = 0.0, np.empty((frames, 2)), np.empty(frames)
+    for frame in range(0, frames, hold):
+        if np.linalg.norm(goal - xy) < 0.5:
+            goal = _way_goal(xy, rng, half)
+        ahead = np.minimum(frame + np.round(_HORIZON_S * fps).astype(int), frames - 1)
+        options = _arcs(xy, heading, turns, paces * speed)
+        cost = 0.35 * np.abs(turns - rate) + 0.15 * np.abs(turns) + 1.2 * (1 - paces) + 1.5 * np.abs(paces - pace)
+        cost += 2.0 * np.linalg.norm(options[:, -1] - goal, axis=-1)
+        cost += 60.0 * np.maximum(np.abs(options) - half, 0.0).sum(axis=(1, 2))
+        apart_x, apart_y = (options[..., None, axis] - others[ahead, :, axis] for axis in (0, 1))
+        gaps = np.sqrt(apart_x**2 + apart_y**2)  # most of the time goes here: five times as fast as norm
+        cost += 200.0 * (np.maximum(distance + 0.08 - gaps, 0.0) ** 2).sum(axis=(1, 2))
+        best = int(np.argmin(cost))
+        rate, pace = float(turns[best]), float(paces[best])
+        for later in range(frame, min(frame + hold, frames)):
+            places[later], headings[later] = xy, heading
+            heading += rate / fps
+            xy = xy + pace * speed / fps * along(np.array(heading))
+    sigma = 0.12 * fps
+    return Way(
+        gaussian_filter1d(places, sigma, axis=0, mode="nearest"),
+        gaussian_filter1d(headings, sigma, mode="nearest"),
+    )
+
+
+def _arcs(xy: Array, heading: float, turns: Array, speeds: Array) -> Array:
+    """Where (C, H, 2) each of C turns and speeds leads along the horizon; turns last for at most 0.8 s."""
+    step = np.diff(_HORIZON_S, prepend=0.0)
+    angle = heading + turns[:, None] * np.minimum(_HORIZON_S - step / 2, 0.8)
+    return xy + np.cumsum(along(angle) * (speeds[:, None] * step)[..., None], axis=1)
+
+
+def _way_start(others: Array, rng: np.random.Generator, half: float) -> tuple[Array, float, float]:
+    """A place that is free, facing the middle, and the first pace."""
+    spots = rng.uniform(-0.95 * half, 0.95 * half, (64, 2))
+    if others.size > 0:
+        early = others[: max(1, min(len(others), 20)) : 4]
+        free = np.linalg.norm(spots[:, None, None] - early, axis=-1).min(axis=(1, 2))
+        spots = spots[[int(np.argmax(np.minimum(free, 0.9)))]]
+    return spots[0], float(np.arctan2(-spots[0][1], -spots[0][0]) + rng.uniform(-0.5, 0.5)), 0.75
+
+
+def _way_goal(xy: Array, rng: np.random.Generator, half: float) -> Array:
+    """A place near the wall across the room."""
+    angle = np.arctan2(-xy[1], -xy[0]) + rng.uniform(-0.9, 0.9)
+    return rng.uniform(0.75, 0.95) * half * along(angle)

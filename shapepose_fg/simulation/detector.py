@@ -1,13 +1,13 @@
 """A detector that errs as a real one does: from where people truly are to 2D joint candidates and part affinities.
 
-What it draws from was measured on real detections (`detector_statistics.py`, `scripts/measure_detector.py`,
-docs/simulation.md). A joint has a lasting quality: at the low end it is missed, above that its quality is its
-confidence, and its error has the size that errors of this confidence have.
+What it draws from was measured on real detections (`detector_statistics.py`, docs/simulation.md). A joint has a
+quality that is correlated over time: at the low end it is missed, above that its quality is its confidence, and
+its error has the size that errors of this confidence have.
 """
 
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -21,11 +21,17 @@ from shapepose_fg.core.detections import Detections, Recording
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.simulation.affinities import affinities
 from shapepose_fg.simulation.detector_statistics import JOINT_GROUP, DetectorStatistics, measured
-from shapepose_fg.simulation.facing import seen_from_the_front
-from shapepose_fg.simulation.lookout import Lookout
-from shapepose_fg.simulation.memory import FalseCandidates, Ghosts, LastingNoise
+from shapepose_fg.simulation.memory import FalseCandidateProcess, FalseCandidates, NoiseProcess, Table
 from shapepose_fg.simulation.scene import Scene
-from shapepose_fg.simulation.visibility import Skin, Visibility, VisibilityConfig
+from shapepose_fg.simulation.visibility import (
+    Skin,
+    Visibility,
+    VisibilityConfig,
+    VisibilityWorker,
+    seen_from_the_front,
+)
+
+Array = NDArray[np.float64]
 
 _MIRROR = np.array(BODY_25.mirror)
 _MIRROR_APART_M = 0.12
@@ -52,7 +58,7 @@ class DetectorConfig:
     doubt: float = 1.0
     """How far confidences, and affinities of right pairs, are below 1."""
     false_candidates: float = 1.0
-    """Number of candidates that are nobody's."""
+    """Number of false candidates."""
     swaps: float = 1.0
     """Share of the joints that are called by their mirror's name."""
     captures: float = 1.0
@@ -70,11 +76,11 @@ class DetectorConfig:
 
     def __post_init__(self) -> None:
         for name in _KNOBS:
-            if not 0 <= getattr(self, name) < np.inf:
-                raise ValueError(f"{name} must be 0 (none), 1 (as measured) or more, got {getattr(self, name)}")
-        for name in ("doubt", "captures", "wrong_affinities"):
-            if getattr(self, name) > 1:
-                raise ValueError(f"{name} must not be more than 1 (as measured), got {getattr(self, name)}")
+            value = getattr(self, name)
+            if not 0 <= value < np.inf:
+                raise ValueError(f"{name} must be 0 (none), 1 (as measured) or more, got {value}")
+            if value > 1 and name in ("doubt", "captures", "wrong_affinities"):
+                raise ValueError(f"{name} must not be more than 1 (as measured), got {value}")
 
     @classmethod
     def perfect(cls) -> "DetectorConfig":
@@ -115,7 +121,8 @@ def simulate(
     detector = Detector(scene.rig, scene.people, scene.fps, config, seed)
     people = ((scene.truth_at(frame), scene.vertices_at(frame, skin.vertices)) for frame in frames)
     found = []
-    watched = Lookout(scene.rig, skin, config.visibility).watch(people, min(workers, max(len(frames), 1)))
+    worker = VisibilityWorker(scene.rig, skin, config.visibility)
+    watched = worker.all(people, min(workers, max(len(frames), 1)))
     with torch_threads(1), closing(watched):
         for frame, seen in zip(frames, watched, strict=True):
             detector.skip_to(frame)
@@ -126,23 +133,17 @@ def simulate(
 
 
 @dataclass(frozen=True)
-class _Found:
+class _Found(Table):
     """Candidates while they are made: D of them."""
 
     view: NDArray[np.intp]
     joint: NDArray[np.intp]
-    xy: NDArray[np.float64]
-    confidence: NDArray[np.float64]
+    xy: Array
+    confidence: Array
     owner: NDArray[np.bool_]
-    """(D, P) whose joint a candidate is; nobody's where it is false, two people's where two are one."""
-    reach_px: NDArray[np.float64]
+    """(D, P) whose joint a candidate is; none's where it is false, two people's where two are one."""
+    reach_px: Array
     """(D,) nearer than this to a better candidate of the same joint it is not seen as one of its own."""
-
-    def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> "_Found":
-        return _Found(**{name: value[index] for name, value in vars(self).items()})
-
-    def join(self, other: "_Found") -> "_Found":
-        return _Found(**{name: np.concatenate([value, vars(other)[name]]) for name, value in vars(self).items()})
 
 
 class Detector:
@@ -151,8 +152,10 @@ class Detector:
     def __init__(self, rig: Rig, people: int, fps: float, config: DetectorConfig, seed: int = 0) -> None:
         """Look at `people` people with the cameras of `rig`, `fps` frames a second."""
         self._rig, self._config, self._seed = rig, config, seed
-        self._noise = LastingNoise(len(rig), people, fps, config.statistics, seed)
-        self._false = FalseCandidates(len(rig), people, fps, config.statistics, config.false_candidates, seed)
+        self._noise = NoiseProcess(len(rig), people, fps, config.statistics, seed)
+        self._false = FalseCandidateProcess(
+            len(rig), people, fps, config.statistics, config.false_candidates, seed
+        )
         self._frame = 0
 
     def skip_to(self, frame: int) -> None:
@@ -164,15 +167,15 @@ class Detector:
             self._false.next(self._frame)
             self._frame += 1
 
-    def detect(self, joints: NDArray[np.float64], visibility: Visibility) -> Detections:
+    def detect(self, joints: Array, visibility: Visibility) -> Detections:
         """The candidates of the next frame: BODY_25 `joints` (P, 25, 3), of which `visibility` is known."""
         config, rig = self._config, self._rig
-        noise, ghosts = self._noise.next(self._frame), self._false.next(self._frame)
+        noise, false = self._noise.next(self._frame), self._false.next(self._frame)
         rng = np.random.default_rng([self._seed, self._frame, 2])
         self._frame += 1
         true_xy, depth = rig.project(joints)
         found, captors = _report(rig, joints, true_xy, depth, visibility, config, noise, rng)
-        found = _merge(found.join(_invent(rig, ghosts, true_xy, depth, config)))
+        found = _merge(found.join(_invent(rig, false, true_xy, depth, config)))
         found = found.take(rng.permutation(len(found.view)))
         pairs, affinity = affinities(
             found.view, found.joint, found.xy, found.confidence, found.owner, true_xy, captors, config.statistics,
@@ -183,12 +186,12 @@ class Detector:
 
 def _report(
     rig: Rig,
-    joints: NDArray[np.float64],
-    true_xy: NDArray[np.float64],
-    depth: NDArray[np.float64],
+    joints: Array,
+    true_xy: Array,
+    depth: Array,
     visibility: Visibility,
     config: DetectorConfig,
-    noise: NDArray[np.float64],
+    noise: Array,
     rng: np.random.Generator,
 ) -> tuple[_Found, NDArray[np.intp]]:
     """The joints of people that are reported, each with its error; and who captured the others (`_capture`)."""
@@ -197,7 +200,7 @@ def _report(
     seen = np.clip((seen - _HIDDEN) / (_SEEN - _HIDDEN), 0.0, 1.0)
     hidden_as = np.where(visibility.hidden_by >= 0, 2, 1)
     worse = _worse(visibility, seen, table, noise)
-    quality = ndtr(noise[LastingNoise.CONFIDENCE] - worse)
+    quality = ndtr(noise[NoiseProcess.CONFIDENCE] - worse)
     miss = ndtri(_between(table.miss[JOINT_GROUP, hidden_as], table.miss[JOINT_GROUP, 0], seen))
     miss = ndtr(ndtri(np.minimum(config.misses * ndtr(miss + worse), 1.0)) - worse)
     reported = visibility.in_image & (quality >= miss) & (miss < 1)
@@ -215,7 +218,7 @@ def _report(
     captors = _capture(reported, true_xy, depth / rig.focal_px[:, None, None], visibility, config, noise)
     gap_px = np.linalg.norm(true_xy[view, person, joint] - true_xy[view, person, _MIRROR[joint]], axis=-1)
     apart = gap_px > _MIRROR_APART_M * px_a_metre
-    swap_rank = np.where(apart, ndtr(noise[LastingNoise.SWAP, reported]), 1.0)
+    swap_rank = np.where(apart, ndtr(noise[NoiseProcess.SWAP, reported]), 1.0)
     swapped = swap_rank < config.swaps * table.swap
     owner[swapped] = False
     found = _Found(
@@ -224,20 +227,16 @@ def _report(
         xy=true_xy[reported] + error,
         confidence=1.0 - config.doubt * (1.0 - confidence),
         owner=owner,
-        reach_px=_reach_px(ndtr(noise[LastingNoise.SCALE, reported]), rig.image_sizes[view, 1], config),
+        reach_px=_reach_px(ndtr(noise[NoiseProcess.SCALE, reported]), rig.image_sizes[view, 1], config),
     )
-    in_sight = np.where(seen >= 0.5, swap_rank, 1.0)  # of which the share of doubles was measured
-    found = found.join(_doubles(found, in_sight, px_a_metre, config, rng))
+    in_sight = np.where(seen >= 0.5, swap_rank, 1.0)  # of which the share of duplicates was measured
+    found = found.join(_duplicates(found, in_sight, px_a_metre, config, rng))
     inside = np.all((found.xy >= 0) & (found.xy <= rig.image_sizes[found.view] - 1), axis=1)
     return found.take(inside), captors
 
 
-def _doubles(
-    found: _Found,
-    swap_rank: NDArray[np.float64],
-    px_a_metre: NDArray[np.float64],
-    config: DetectorConfig,
-    rng: np.random.Generator,
+def _duplicates(
+    found: _Found, swap_rank: Array, px_a_metre: Array, config: DetectorConfig, rng: np.random.Generator
 ) -> _Found:
     """False candidates under the mirror's name of joints that are found under their own."""
     table = config.statistics
@@ -250,15 +249,13 @@ def _doubles(
         view=first.view,
         joint=_MIRROR[first.joint],
         xy=first.xy + shift_px,
-        confidence=table.quantile(np.broadcast_to(table.double_confidence, (len(rank), len(table.levels))), rank),
+        confidence=table.quantile(table.double_confidence, rank),
         owner=np.zeros_like(first.owner),
         reach_px=np.zeros(len(rank)),
     )
 
 
-def _worse(
-    visibility: Visibility, seen: NDArray[np.float64], table: DetectorStatistics, noise: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _worse(visibility: Visibility, seen: Array, table: DetectorStatistics, noise: Array) -> Array:
     """How much worse than others (V, P, 25) joints are found, of people who are buried behind others, or lost.
 
     As a standard normal (probit). What its own body hides is no worse off when others hide the rest.
@@ -270,20 +267,20 @@ def _worse(
         return buried
     half, wholly = -ndtri(table.lost)
     slope = (_WHOLLY_LOST - _HALF_LOST) / (wholly - half)
-    return buried + np.maximum(_HALF_LOST + slope * (noise[LastingNoise.LOST] - half), 0.0)
+    return buried + np.maximum(_HALF_LOST + slope * (noise[NoiseProcess.LOST] - half), 0.0)
 
 
 def _errors(
-    confidence: NDArray[np.float64],
-    seen: NDArray[np.float64],
+    confidence: Array,
+    seen: Array,
     hidden_as: NDArray[np.intp],
     group: NDArray[np.intp],
-    px_a_metre: NDArray[np.float64],
+    px_a_metre: Array,
     config: DetectorConfig,
-    normal: NDArray[np.float64],
-    scale: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Errors (D, 2) px of reported joints, from lasting normal draws `normal` (2, D) and `scale` (D,)."""
+    normal: Array,
+    scale: Array,
+) -> Array:
+    """Errors (D, 2) px of reported joints, from correlated normal draws `normal` (2, D) and `scale` (D,)."""
     table = config.statistics
     floor_m = table.floor_px / table.size_px_a_metre
     # What the grid adds is part of the measured sigma; people of other sizes get it anew.
@@ -301,11 +298,11 @@ def _errors(
 
 def _capture(
     reported: NDArray[np.bool_],
-    true_xy: NDArray[np.float64],
-    metres_a_px: NDArray[np.float64],
+    true_xy: Array,
+    metres_a_px: Array,
     visibility: Visibility,
     config: DetectorConfig,
-    noise: NDArray[np.float64],
+    noise: Array,
 ) -> NDArray[np.intp]:
     """Whose candidate stands for a joint that is missed behind another person: (2, V, P, 25).
 
@@ -318,42 +315,38 @@ def _capture(
     gap_px = np.linalg.norm(true_xy[view, person, joint] - true_xy[view, front, joint], axis=-1)
     gap_m = np.nan_to_num(gap_px, nan=np.inf) * metres_a_px[view, person, joint]
     kind = np.searchsorted(table.capture_gap_m, gap_m, side="right") - 1
-    taken = ndtr(noise[LastingNoise.CAPTURE, view, person, joint]) < config.captures * table.capture[kind]
+    taken = ndtr(noise[NoiseProcess.CAPTURE, view, person, joint]) < config.captures * table.capture[kind]
     captors = np.full((2, *reported.shape), -1)
     captors[np.where(taken, 0, 1), view, person, joint] = front
     return captors
 
 
-def _invent(
-    rig: Rig, ghosts: Ghosts, true_xy: NDArray[np.float64], depth: NDArray[np.float64], config: DetectorConfig
-) -> _Found:
-    """False candidates, where they are now."""
+def _invent(rig: Rig, false: FalseCandidates, true_xy: Array, depth: Array, config: DetectorConfig) -> _Found:
+    """The false candidates of this frame, where they are now."""
     table = config.statistics
-    near = ghosts.person >= 0
-    size = rig.image_sizes[ghosts.view]
-    xy = ghosts.offset * (size - 1)
-    at = ghosts.view[near], ghosts.person[near], ghosts.anchor[near]
-    xy[near] = true_xy[at] + ghosts.offset[near] * (rig.focal_px[at[0]] / depth[at])[:, None]
+    near = false.person >= 0
+    size = rig.image_sizes[false.view]
+    xy = false.offset * (size - 1)
+    at = false.view[near], false.person[near], false.anchor[near]
+    xy[near] = true_xy[at] + false.offset[near] * (rig.focal_px[at[0]] / depth[at])[:, None]
     there = np.all((xy >= 0) & (xy <= size - 1), axis=1)  # NaN behind a camera compares false
     # The others stay in the background: a person before it covers them.
-    gap_px = np.linalg.norm(true_xy[ghosts.view] - xy[:, None, None], axis=-1)
-    gap_m = (gap_px * depth[ghosts.view]).min(axis=(1, 2), initial=np.inf, where=np.isfinite(gap_px))
-    there &= near | (gap_m > _NEAR_M * rig.focal_px[ghosts.view])
+    gap_px = np.linalg.norm(true_xy[false.view] - xy[:, None, None], axis=-1)
+    gap_m = (gap_px * depth[false.view]).min(axis=(1, 2), initial=np.inf, where=np.isfinite(gap_px))
+    there &= near | (gap_m > _NEAR_M * rig.focal_px[false.view])
     quantiles = np.where(near[:, None], table.false_near_confidence, table.false_far_confidence)
     found = _Found(
-        view=ghosts.view,
-        joint=ghosts.joint,
+        view=false.view,
+        joint=false.joint,
         xy=xy,
-        confidence=table.quantile(quantiles, ghosts.rank),
+        confidence=table.quantile(quantiles, false.rank),
         owner=np.zeros((len(xy), true_xy.shape[1]), dtype=bool),
-        reach_px=_reach_px(ghosts.rank, size[:, 1], config),
+        reach_px=_reach_px(false.rank, size[:, 1], config),
     )
     return found.take(there)
 
 
-def _reach_px(
-    probability: NDArray[np.float64], height_px: NDArray[np.float64], config: DetectorConfig
-) -> NDArray[np.float64]:
+def _reach_px(probability: Array, height_px: Array, config: DetectorConfig) -> Array:
     """How near (D,) to a better one of its joint a candidate is lost: logistic, in proportion to the image."""
     table = config.statistics
     drawn = np.clip(probability, 1e-6, 1 - 1e-6)
@@ -379,11 +372,9 @@ def _merge(found: _Found) -> _Found:
     owner = found.owner.copy()
     for index in np.flatnonzero(lost)[::-1]:  # few; the worst first, so that theirs is handed up
         owner[winner[index]] |= owner[index]
-    return _Found(**{**vars(found), "owner": owner}).take(~lost)
+    return replace(found, owner=owner).take(~lost)
 
 
-def _between(
-    hidden: NDArray[np.float64], visible: NDArray[np.float64], seen: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _between(hidden: Array, visible: Array, seen: Array) -> Array:
     """From the value of a hidden joint to that of a visible one, by the share that is seen."""
     return hidden + (visible - hidden) * seen

@@ -1,7 +1,10 @@
-"""How a real detector errs, as tables: what `scripts/measure_detector.py` found on the Shelf recording."""
+"""How a real detector errs, as tables measured on the Shelf recording (docs/simulation.md).
+
+The shipped file was written at commit 059d6f0; the code that measures is `simulation/measurement` of 77ab725.
+"""
 
 import json
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -37,7 +40,7 @@ class DetectorStatistics:
     buried: Array
     """(B,) what they add to a miss and take from a confidence, as a standard normal (probit)."""
     lost: Array
-    """(2,) share of the people in a view of whom half, or four fifths, is missed though nobody hides them."""
+    """(2,) share of the people in a view half, or four fifths, of whom is missed though no other hides them."""
     lost_memory: Array
     """(2, 2) as `error_memory`: how long that lasts."""
     lost_correlation: Array
@@ -119,25 +122,27 @@ class DetectorStatistics:
 
     @classmethod
     def read(cls, path: Path) -> "DetectorStatistics":
-        """From the file that `scripts/measure_detector.py --update` writes."""
+        """From a file like the shipped one: what is `drawn` takes the place of what was `measured`."""
         content = json.loads(path.read_text(encoding="utf-8"))
-        found = cls.of(content["measured"], content["drawn"])
-        return replace(found, provenance=content["provenance"]["recording"])
+        measured = content["measured"]
 
-    @classmethod
-    def of(cls, measured: dict[str, Any], drawn: dict[str, Any]) -> "DetectorStatistics":
-        """From what was measured, and what is drawn instead so that the same is measured in a simulation."""
-        flat = _flat(measured)
-        names = [field.name for field in fields(cls) if field.name != "provenance"]
-        values: dict[str, Any] = {
-            name: drawn[name] if name in drawn else flat[_KEYS.get(name, name)] for name in names
-        }
-        for name, value in values.items():
-            values[name] = np.array(value, dtype=np.float64) if isinstance(value, list) else float(value)
-        return cls(**values)
+        def value(name: str) -> Any:
+            if name in content["drawn"]:
+                return content["drawn"][name]
+            if name in measured and name not in _KEYS:
+                return measured[name]
+            group, key = _KEYS.get(name, name.replace("_", ".", 1)).split(".")
+            return measured[group][key]
+
+        values: dict[str, Any] = {}
+        for name in [each.name for each in fields(cls) if each.name != "provenance"]:
+            found = value(name)
+            values[name] = np.array(found, dtype=np.float64) if isinstance(found, list) else float(found)
+        return cls(**values, provenance=content["provenance"]["recording"])
 
     def quantile(self, table: Array, probability: Array) -> Array:
-        """Values (...,) at `probability` (...,) of quantile tables (..., K)."""
+        """Values (...,) at `probability` (...,) of quantile tables (..., K), or of one table (K,)."""
+        table = np.broadcast_to(table, (*probability.shape, len(self.levels)))
         at = np.clip(np.searchsorted(self.levels, probability, side="right") - 1, 0, len(self.levels) - 2)
         low, high = self.levels[at], self.levels[at + 1]
         part = np.clip((probability - low) / (high - low), 0.0, 1.0)
@@ -171,33 +176,11 @@ _KEYS = {
     "double": "swap.besides",
     "double_m": "swap.double_m",
     "double_confidence": "swap.double_confidence",
-    "capture_gap_m": "capture.gap_m",
     "capture": "capture.share",
     "merge_px": "merge.half_px",
-    "merge_width_px": "merge.width_px",
     "merge_height_px": "merge.image_height_px",
     "false_near": "false.others_per_person",
     "false_far": "false.far_per_view",
-    "false_near_m": "false.near_m",
-    "false_joints": "false.joints",
-    "false_near_confidence": "false.near_confidence",
-    "false_far_confidence": "false.far_confidence",
-    "false_memory": "false.memory",
-    "affinity_right": "affinity.right",
-    "affinity_right_confidence": "affinity.right_confidence",
-    "affinity_correlation": "affinity.correlation",
     "detours": "affinity.detours",
-    "affinity_wrong_share": "affinity.wrong_share",
-    "affinity_wrong": "affinity.wrong",
-    "affinity_nobody_share": "affinity.nobody_share",
-    "affinity_nobody": "affinity.nobody",
 }
-"""Where fields stand in the file, if not under their own name."""
-
-
-def _flat(value: dict[str, Any]) -> dict[str, Any]:
-    """Nested keys joined by dots."""
-    inner = {
-        f"{key}.{name}": v for key, part in value.items() if isinstance(part, dict) for name, v in part.items()
-    }
-    return value | inner
+"""Where fields stand in the file, if not under their own name or like `merge_width_px` in `merge.width_px`."""

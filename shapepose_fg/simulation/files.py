@@ -12,7 +12,6 @@ from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.write_detections import refuse_leftovers, write_association, write_openpose
 from shapepose_fg.simulation import Scene, built_in_scene
 from shapepose_fg.simulation.mocap import Mocap
-from shapepose_fg.simulation.motion import Motion
 from shapepose_fg.simulation.room import SequenceConfig
 from shapepose_fg.simulation.sequences import SEQUENCES, Sequence, Split, sequence
 from shapepose_fg.simulation.truth import truth_of
@@ -70,10 +69,9 @@ def named_scene(
 
 def cut(scene: Scene, span: range) -> Scene:
     """Some consecutive frames of `scene`."""
-    motion, frames = scene.motion, slice(span.start, span.stop)
-    part = Motion(motion.betas, motion.global_orient[frames], motion.body_pose[frames], motion.transl[frames])
+    part = scene.motion[span.start : span.stop]
     if not isinstance(scene, Sequence):
-        return Scene(scene.rig, scene.body, part, scene.fps)
+        return replace(scene, motion=part)
     # Segments that reach into the span, each from its cut (the first from frame 0) to the next.
     segments = zip((0, *scene.cuts), (*scene.cuts, len(scene)), scene.clips, strict=False)
     clips = tuple(names for start, stop, names in segments if start < span.stop and stop > span.start)

@@ -1,10 +1,11 @@
-"""Errors that last: what a detector gets wrong in one frame it gets wrong in the next.
+"""Errors that are correlated over time: what a detector gets wrong in one frame it gets wrong in the next.
 
 Everything here is stationary and runs frame by frame from the first one; each frame has its own generator, made of
 the seed and the frame's number, so that skipping frames leaves the later ones as they are.
 """
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from shapepose_fg.simulation.detector_statistics import JOINT_GROUP, DetectorSta
 Array = NDArray[np.float64]
 
 
-class LastingNoise:
+class NoiseProcess:
     """Seven standard normal processes for every view, person and joint.
 
     Each is the sum of a fast and a slow AR(1) process and of white noise.
@@ -32,12 +33,8 @@ class LastingNoise:
         self._keep = np.exp(-1.0 / (fps * seconds))[..., None, None, None]
         self._amplitude = np.sqrt(share)[..., None, None, None]
         self._white = np.sqrt(np.maximum(1.0 - share.sum(axis=1), 0.0))[:, None, None, None]
-        self._mix = [
-            _root(c)
-            for c in (
-                statistics.error_correlation, statistics.confidence_correlation, statistics.lost_correlation
-            )
-        ]  # fmt: skip
+        correlations = statistics.error_correlation, statistics.confidence_correlation, statistics.lost_correlation
+        self._mix = [_root(each) for each in correlations]
         self._state: Array | None = None
 
     def next(self, frame: int) -> Array:
@@ -55,12 +52,26 @@ class LastingNoise:
 
 
 @dataclass(frozen=True)
-class Ghosts:
+class Table:
+    """Columns of one length."""
+
+    def take(self, index: NDArray) -> Self:
+        """The rows at `index`, or where it holds."""
+        return type(self)(**{name: value[index] for name, value in vars(self).items()})
+
+    def join(self, other: Self) -> Self:
+        """The rows of both."""
+        both = {name: np.concatenate([value, vars(other)[name]]) for name, value in vars(self).items()}
+        return type(self)(**both)
+
+
+@dataclass(frozen=True)
+class FalseCandidates(Table):
     """False candidates that are there now: F of them."""
 
     view: NDArray[np.intp]
     person: NDArray[np.intp]
-    """Whom it goes with, or -1."""
+    """The person that it goes with, or -1."""
     anchor: NDArray[np.intp]
     """The joint that it keeps its distance to."""
     joint: NDArray[np.intp]
@@ -72,15 +83,9 @@ class Ghosts:
     stays: Array
     """(F,) probability to be there in the next frame."""
 
-    def take(self, index: NDArray) -> "Ghosts":
-        return Ghosts(**{name: value[index] for name, value in vars(self).items()})
 
-    def join(self, other: "Ghosts") -> "Ghosts":
-        return Ghosts(**{name: np.concatenate([value, vars(other)[name]]) for name, value in vars(self).items()})
-
-
-class FalseCandidates:
-    """Candidates of nobody: some go along with a person, some stay where they are; some flicker, some last."""
+class FalseCandidateProcess:
+    """False candidates: some go along with a person, some stay where they are; some flicker, some last."""
 
     def __init__(
         self, views: int, people: int, fps: float, statistics: DetectorStatistics, rate: float, seed: int
@@ -91,30 +96,27 @@ class FalseCandidates:
         self._stays = np.append(np.exp(-1.0 / (fps * seconds)), 0.0)
         # Of those that are there at any time: born as often as they go.
         self._present = np.append(share, max(1.0 - share.sum(), 0.0))[:, None] * np.array([near, far])
-        self._ghosts: Ghosts | None = None
+        self._present_now: FalseCandidates | None = None
 
-    def next(self, frame: int) -> Ghosts:
+    def next(self, frame: int) -> FalseCandidates:
         """Those of `frame`; to be called for every frame, in order."""
         rng = np.random.default_rng([self._seed, frame, 1])
-        if self._ghosts is None:
-            self._ghosts = self._born(rng, self._present)
+        if self._present_now is None:
+            self._present_now = self._born(rng, self._present)
         else:
-            staying = self._ghosts.take(rng.random(len(self._ghosts.view)) < self._ghosts.stays)
-            self._ghosts = staying.join(self._born(rng, self._present * (1.0 - self._stays)[:, None]))
-        return self._ghosts
+            staying = self._present_now.take(rng.random(len(self._present_now.view)) < self._present_now.stays)
+            self._present_now = staying.join(self._born(rng, self._present * (1.0 - self._stays)[:, None]))
+        return self._present_now
 
-    def _born(self, rng: np.random.Generator, rate: Array) -> Ghosts:
+    def _born(self, rng: np.random.Generator, rate: Array) -> FalseCandidates:
         """Poisson counts of `rate` (3, 2): by how long they stay, near people and far from them."""
         kind = np.repeat(np.arange(6), rng.poisson(rate).ravel())
         stays, far = self._stays[kind // 2], kind % 2 == 1
         count = len(kind)
-        distance = self._statistics.quantile(
-            np.broadcast_to(self._statistics.false_near_m, (count, len(self._statistics.levels))),
-            rng.random(count),
-        )
+        distance = self._statistics.quantile(self._statistics.false_near_m, rng.random(count))
         angle = rng.uniform(0.0, 2 * np.pi, count)
         around = distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        return Ghosts(
+        return FalseCandidates(
             view=rng.integers(0, self._views, count),
             person=np.where(far, -1, rng.integers(0, max(self._people, 1), count)),
             anchor=rng.integers(0, 25, count),

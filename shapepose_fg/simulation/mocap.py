@@ -36,8 +36,6 @@ class Clip:
     """Who was recorded."""
     action: str
     """What is done, in words."""
-    tier: int
-    """How near to the recording: 0 its own skeleton, 1 and 2 retargeted."""
     rotations: Array
     """(T, 24, 3, 3) local rotations in SMPL's structure, y up."""
     pelvis: Array
@@ -86,7 +84,7 @@ class Mocap:
     lengths: NDArray[np.int64]
     """(S,) frames of each."""
     tiers: NDArray[np.int64]
-    """(S,) how near to the recording."""
+    """(S,) how near to the recording: 0 its own skeleton, 1 and 2 retargeted."""
     pairs: tuple[tuple[int, int], ...]
     """Clips of two people together: same frames, common origin."""
     arrays: dict[str, NDArray]
@@ -122,7 +120,6 @@ class Mocap:
             name=self.names[index],
             subject=self.subjects[index],
             action=self.actions[index],
-            tier=int(self.tiers[index]),
             rotations=rotations,
             pelvis=pelvis,
             fps=fps,

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.simulation.gait import Path, footsteps
 from shapepose_fg.simulation.limbs import LEGS, Puppet, pose
 
 Array = NDArray[np.float64]
@@ -19,6 +18,11 @@ COUPLE, LOOP, WAVER = np.array([[-0.15, 0.0], [1.05, 0.0], [0.92, -0.1]])
 """Where in a group the middle of the couple, of the walker's loop, and who waves are, metres."""
 _PADDING_S = 3.0
 """Paths are known this long before the first and after the last frame, for the steps to come."""
+_STANCE = 0.6
+"""Share of a stride in which a foot stands."""
+Path = Callable[[Array], tuple[Array, Array]]
+"""Where a pelvis is over the floor at times (...,), seconds: positions (..., 2), metres; headings (...,), radians
+without jumps of a whole turn."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +37,22 @@ class Motion:
     """(T, P, 23, 3) axis-angle."""
     transl: Array
     """(T, P, 3) metres."""
+
+    @classmethod
+    def still(cls, betas: Array, frames: int = 1) -> "Motion":
+        """People of shapes `betas` (P, 10) in the T-pose, not shifted."""
+        people = len(betas)
+        return cls(betas, *(np.zeros((frames, people, *shape)) for shape in ((3,), (23, 3), (3,))))
+
+    @classmethod
+    def joined(cls, parts: "list[Motion]") -> "Motion":
+        """Motions of the same people one after the other."""
+        names = ("global_orient", "body_pose", "transl")
+        return cls(parts[0].betas, *(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+    def __getitem__(self, frames: slice) -> "Motion":
+        """Some consecutive frames."""
+        return Motion(self.betas, self.global_orient[frames], self.body_pose[frames], self.transl[frames])
 
     def __post_init__(self) -> None:
         frames, people = self.transl.shape[:2]
@@ -113,27 +133,27 @@ def dance(pair: list[Build], time: Array, centre: Array, rng: np.random.Generato
 
     def middle(t: Array) -> Array:
         sway = 0.06 * np.sin(2 * np.pi * t / (2 * beat))
-        return centre + np.stack([-np.sin(angle(t)), np.cos(angle(t))], axis=-1) * sway[:, None]
+        return centre + left_of(angle(t)) * sway[:, None]
 
     def half_distance(t: Array) -> Array:
         return 0.29 + 0.04 * np.sin(2 * np.pi * t / (3 * beat) + start)
 
-    def path_of(sign: float) -> Callable[[Array], tuple[Array, Array]]:
+    def path_of(sign: float) -> Path:
         def path(t: Array) -> tuple[Array, Array]:
-            away = np.stack([np.cos(angle(t)), np.sin(angle(t))], axis=-1) * sign
+            away = along(angle(t)) * sign
             facing = angle(t) + (np.pi if sign > 0 else 0.0)
             return middle(t) + away * half_distance(t)[:, None], facing + 0.15 * np.sin(np.pi * t / beat)
 
         return path
 
     shoulder = np.mean([build.shoulder_m for build in pair])
-    across = np.stack([-np.sin(angle(time)), np.cos(angle(time))], axis=-1)
+    across = left_of(angle(time))
     up = _bump(time, 0.5, 1.4, period=2.4)
     held = []
     for side, lift in ((1.0, up), (-1.0, np.zeros_like(up))):
         xy = middle(time) + side * across * (0.34 - 0.16 * lift)[:, None]
         z = shoulder - 0.32 + 0.72 * lift + 0.03 * np.sin(2 * np.pi * time / beat)
-        held.append(np.concatenate([xy, z[:, None]], axis=1))
+        held.append(_at(xy, z))
     puppets = []
     for sign, build, other in ((1.0, pair[0], pair[1]), (-1.0, pair[1], pair[0])):
         away = np.stack([np.cos(angle(time)), np.sin(angle(time)), np.zeros_like(time)], axis=1) * sign
@@ -141,7 +161,7 @@ def dance(pair: list[Build], time: Array, centre: Array, rng: np.random.Generato
         hands = held if sign < 0 else held[::-1]
         wrists = np.stack([hand + 0.07 * away for hand in hands], axis=1)
         xy, _ = path_of(-sign)(time)
-        gaze = np.concatenate([xy, np.full((len(time), 1), other.shoulder_m + 0.12)], axis=1)
+        gaze = _at(xy, other.shoulder_m + 0.12)
         puppets.append(
             _puppet(
                 build,
@@ -171,7 +191,7 @@ def walk(build: Build, time: Array, centre: Array, rng: np.random.Generator) -> 
         return xy, np.unwrap(np.arctan2(half_axes[1] * np.cos(phi), half_axes[0] * np.sin(phi)))
 
     xy, heading = path(time)
-    ahead = xy + 2.0 * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+    ahead = xy + 2.0 * along(heading)
     twist = 0.12 * np.sin(2 * np.pi * time / 1.05)
     return _puppet(
         build,
@@ -183,7 +203,7 @@ def walk(build: Build, time: Array, centre: Array, rng: np.random.Generator) -> 
         lean=np.stack([np.full_like(time, 0.06), twist, np.zeros_like(time)], axis=1),
         wrists=np.zeros((len(time), 2, 3)),
         reach=np.zeros((len(time), 2)),
-        gaze=np.concatenate([ahead, np.full((len(time), 1), 1.3)], axis=1),
+        gaze=_at(ahead, 1.3),
     )
 
 
@@ -194,19 +214,14 @@ def wave(build: Build, time: Array, spot: Array, heading: float, rng: np.random.
 
     def path(t: Array) -> tuple[Array, Array]:
         shift = 0.04 * np.sin(2 * np.pi * t / 2.8)
-        left = np.array([-np.sin(heading), np.cos(heading)])
-        return spot + shift[:, None] * left, heading + 0.25 * np.sin(2 * np.pi * t / 2.8)
+        return spot + shift[:, None] * left_of(np.array(heading)), heading + 0.25 * np.sin(2 * np.pi * t / 2.8)
 
     xy, facing = path(time)
-    forward = np.stack([np.cos(facing), np.sin(facing)], axis=-1)
-    left = np.stack([-forward[:, 1], forward[:, 0]], axis=-1)
+    forward = along(facing)
+    left = left_of(facing)
     beat = 0.13 * np.sin(2 * np.pi * time / 0.62)
     hello = xy + 0.2 * forward - (0.38 + beat)[:, None] * left
-    hello = np.concatenate([hello, np.full((len(time), 1), build.shoulder_m + 0.32)], axis=1)
     floor = xy + 0.42 * forward + 0.1 * left
-    floor = np.concatenate([floor, np.full((len(time), 1), 0.42)], axis=1)
-    reach = np.stack([crouching, waving], axis=1)
-    gaze = np.concatenate([xy + 1.2 * forward, (1.45 - 1.1 * crouching)[:, None]], axis=1)
     return _puppet(
         build,
         time,
@@ -215,16 +230,16 @@ def wave(build: Build, time: Array, spot: Array, heading: float, rng: np.random.
         phase=rng.uniform(),
         dip=0.02 + 0.3 * crouching,
         lean=np.stack([0.03 + 0.75 * crouching, 0.2 * np.sin(2 * np.pi * time / 2.8), -0.06 * waving], axis=1),
-        wrists=np.stack([floor, hello], axis=1),
-        reach=reach,
-        gaze=gaze,
+        wrists=np.stack([_at(floor, 0.42), _at(hello, build.shoulder_m + 0.32)], axis=1),
+        reach=np.stack([crouching, waving], axis=1),
+        gaze=_at(xy + 1.2 * forward, 1.45 - 1.1 * crouching),
     )
 
 
 def _puppet(
     build: Build,
     time: Array,
-    path: Callable[[Array], tuple[Array, Array]],
+    path: Path,
     *,
     stride_s: float,
     phase: float,
@@ -237,7 +252,7 @@ def _puppet(
     """Put a body on the footsteps of `path`, its pelvis `dip` (T,) metres lower than upright."""
     end = (time[-1] if len(time) else 0.0) + _PADDING_S
     known = np.arange(-_PADDING_S, end, 0.02)
-    steps = footsteps(Path(known, *path(known)), time, stride_s, width_m=0.19, phase=phase)
+    steps = footsteps(_tabulated(path, known), time, stride_s, width_m=0.19, phase=phase)
     xy, heading = path(time)
     ankles = np.concatenate([steps.xy, (build.ankle_m + steps.lift)[..., None]], axis=-1)
     # Nobody walks on stretched legs: the pelvis is low enough for both feet, softly.
@@ -246,9 +261,9 @@ def _puppet(
     allowed = (ankles[..., 2] + drop).min(axis=1) + (build.pelvis_m - build.rest[1, 1] + build.floor)
     height = _soften(np.minimum(build.pelvis_m - dip, allowed))
     lean_back = -0.22 * np.maximum(dip - 0.05, 0.0)  # the hips go back over the heels in a crouch
-    xy = xy + lean_back[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+    xy = xy + lean_back[:, None] * along(heading)
     return Puppet(
-        pelvis=np.concatenate([xy, height[:, None]], axis=1),
+        pelvis=_at(xy, height),
         heading=heading,
         lean=lean,
         ankles=ankles,
@@ -259,6 +274,72 @@ def _puppet(
         swing=np.clip(0.55 * steps.swing[:, ::-1], -0.25, 0.3),
         gaze=gaze,
     )
+
+
+@dataclass(frozen=True)
+class Steps:
+    """The feet of a walk in T frames, left and right."""
+
+    xy: Array
+    """(T, 2, 2) where the ankles are over the floor, metres."""
+    lift: Array
+    """(T, 2) how high they are above standing, metres."""
+    heading: Array
+    """(T, 2) where the feet point, radians."""
+    pitch: Array
+    """(T, 2) heel above toes, radians."""
+    swing: Array
+    """(T, 2) how far a foot is ahead of the pelvis, metres: arms swing against it."""
+
+
+def footsteps(path: Path, time_s: Array, stride_s: float, width_m: float, phase: float = 0.0) -> Steps:
+    """Steps under `path` at the T times: each foot stands `_STANCE` of a stride, then swings to its next place.
+
+    A foot stands where the hip is in the middle of its stance, `width_m` beside the other; the two are half
+    a stride apart. Who stays in place does not lift the feet.
+    """
+    sides = np.array([0.0, 0.5])
+    cycle = time_s[:, None] / stride_s + phase + sides
+    number, part = np.floor(cycle), np.mod(cycle, 1.0)
+    here, here_heading = _plant(path, number, sides + phase, stride_s, width_m)
+    there, there_heading = _plant(path, number + 1, sides + phase, stride_s, width_m)
+    progress = np.clip((part - _STANCE) / (1 - _STANCE), 0.0, 1.0)
+    eased = progress**2 * (3 - 2 * progress)
+    xy = here + eased[..., None] * (there - here)
+    length = np.linalg.norm(there - here, axis=-1)
+    turn = np.abs(there_heading - here_heading)
+    effort = np.clip(length / 0.6 + turn / 1.5, 0.0, 1.0)
+    lift = 0.09 * effort * np.sin(np.pi * progress)
+    # The heel leaves the floor before the toes, and lands before them.
+    push = np.clip((part - 0.45) / 0.2, 0.0, 1.0) * np.clip((0.85 - part) / 0.2, 0.0, 1.0)
+    strike = np.clip((part - 0.85) / 0.12, 0.0, 1.0)
+    heading = here_heading + eased * (there_heading - here_heading)
+    centre, facing = path(time_s)
+    swing = ((xy - centre[:, None]) * along(facing)[:, None]).sum(axis=-1)
+    return Steps(xy, lift + 0.05 * push * effort, heading, (0.55 * push - 0.2 * strike) * effort, swing)
+
+
+def _plant(path: Path, number: Array, offset: Array, stride_s: float, width_m: float) -> tuple[Array, Array]:
+    """Place (T, 2, 2) and heading (T, 2) of the feet in stance `number` (T, 2)."""
+    xy, heading = path((number + _STANCE / 2 - offset) * stride_s)
+    side = np.array([0.5, -0.5]) * width_m
+    return xy + left_of(heading) * side[:, None], heading + np.array([0.12, -0.12])
+
+
+def _tabulated(path: Path, time_s: Array) -> Path:
+    """`path`, linear between increasing times (M,)."""
+    places, headings = path(time_s)
+
+    def at(t: Array) -> tuple[Array, Array]:
+        xy = np.stack([np.interp(t, time_s, places[:, axis]) for axis in (0, 1)], axis=-1)
+        return xy, np.interp(t, time_s, headings)
+
+    return at
+
+
+def _at(xy: Array, z: Array | float) -> Array:
+    """Points (T, 3) over `xy` (T, 2) at height `z`."""
+    return np.concatenate([xy, np.broadcast_to(z, len(xy))[:, None]], axis=1)
 
 
 def _bump(time: Array, start: float, length: float, *, period: float) -> Array:
@@ -273,3 +354,13 @@ def _soften(height: Array) -> Array:
         return height
     padded = np.concatenate([np.repeat(height[:1], 2), height, np.repeat(height[-1:], 2)])
     return np.convolve(padded, np.full(5, 0.2), mode="valid")
+
+
+def along(angle: Array) -> Array:
+    """Unit vectors (..., 2) in directions `angle` (...,), from the x axis towards the y axis."""
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def left_of(angle: Array) -> Array:
+    """Unit vectors (..., 2) to the left of directions `angle` (...,)."""
+    return np.stack([-np.sin(angle), np.cos(angle)], axis=-1)

@@ -1,4 +1,4 @@
-"""Recorded motions performed by bodies of any shape, on the floor of a room with z up."""
+"""Recorded motions performed by bodies of any shape, on the floor of a room with z up; hands held stay held."""
 
 from dataclasses import dataclass, replace
 
@@ -22,18 +22,15 @@ _RELAXED_HAND = 0.25
 _JUMP_M = 0.12
 """Who rises this far above the floor around it has jumped; less is how recordings err."""
 _Z_UP = Rotation.from_rotvec([np.pi / 2, 0.0, 0.0]).as_matrix()
-
-
-@dataclass(frozen=True)
-class Placement:
-    """Where in the room a recording is put."""
-
-    xy: tuple[float, float] = (0.0, 0.0)
-    """Metres; the recording's own `origin` comes to lie here."""
-    turn_rad: float = 0.0
-    """Turn about the vertical; without one, who faced +z in the recording faces -y."""
-    origin: tuple[float, float] = (0.0, 0.0)
-    """Point (x, z) of the recording's floor, in its own metres."""
+_ARMS = ((13, 16, 18, 20, 22), (14, 17, 19, 21, 23))
+"""Collar, shoulder, elbow, wrist, hand: left, right."""
+_HELD_M, _FREE_M = 0.17, 0.27
+"""Hands nearer than the first are held, farther than the second they are not: the recordings' limbs and those of
+drawn bodies leave 10 to 20 cm between hands that touched."""
+_TOUCH_M = 0.07
+"""Distance between the knuckles of two hands that hold each other."""
+_STRETCH = 0.995
+"""An arm is never quite straight."""
 
 
 @dataclass(frozen=True)
@@ -95,35 +92,23 @@ class Figure:
         return (heights + joints[:, list(_FEET), 2] @ self._weights.T).min(axis=1)
 
 
-def perform(
-    body: BodyModel,
-    betas: Array,
-    clip: Clip,
-    placement: Placement = Placement(),
-    *,
-    fps: float | None = None,
-    scale: float | None = None,
-) -> Performance:
-    """`clip` as a body of shape `betas` (10,) does it: on the floor z = 0 of a room with z up.
+def perform(body: BodyModel, betas: Array, clip: Clip, *, scale: float | None = None) -> Performance:
+    """`clip` as a body of shape `betas` (10,) does it: on the floor z = 0 of a room with z up; +z becomes -y.
 
     Steps are longer in the measure of the legs (`scale` overrides it, for who must stay together); collars
     follow the arms, hands hang loosely, and the soles are on the floor, but for what is jumped.
     """
-    clip = clip if fps is None else clip.resampled(fps)
     figure = Figure(body, np.asarray(betas, dtype=np.float64))
     ratio = figure.leg_m / clip.leg_m
-    turn = about_z(np.array([placement.turn_rad]))[0] @ _Z_UP
     rotations = shoulder_rhythm(clip.rotations)
     if not clip.wrist_valid:
         rotations[:, 20:22] = np.eye(3)
     for hand, sign in ((22, -1.0), (23, 1.0)):
         rotations[:, hand] = Rotation.from_rotvec([0.0, 0.0, sign * _RELAXED_HAND]).as_matrix()
-    rotations[:, 0] = turn @ rotations[:, 0]
-    x, z = placement.origin
-    pelvis = (clip.pelvis - (x, clip.floor_y, z)) * (ratio if scale is None else scale)
+    rotations[:, 0] = _Z_UP @ rotations[:, 0]
+    pelvis = clip.pelvis * (ratio if scale is None else scale)
     pelvis[:, 1] = (clip.pelvis[:, 1] - clip.floor_y) * ratio
-    pelvis = pelvis @ turn.T + np.array([*placement.xy, 0.0])
-    return grounded(figure, rotations, pelvis, clip.fps, bend_toes=not clip.toe_valid)
+    return grounded(figure, rotations, pelvis @ _Z_UP.T, clip.fps, bend_toes=not clip.toe_valid)
 
 
 def grounded(figure: Figure, rotations: Array, pelvis: Array, fps: float, *, bend_toes: bool) -> Performance:
@@ -139,12 +124,7 @@ def grounded(figure: Figure, rotations: Array, pelvis: Array, fps: float, *, ben
 
 def together(betas: Array, performances: list[Performance], frames: int) -> Motion:
     """SMPL's parameters of P people, `betas` (P, 10), in `frames` frames (needed where P is 0)."""
-    motion = Motion(
-        np.asarray(betas, dtype=np.float64).reshape(len(performances), 10),
-        np.zeros((frames, len(performances), 3)),
-        np.zeros((frames, len(performances), 23, 3)),
-        np.zeros((frames, len(performances), 3)),
-    )
+    motion = Motion.still(np.asarray(betas, dtype=np.float64).reshape(len(performances), 10), frames)
     for person, performed in enumerate(performances):
         vectors = Rotation.from_matrix(performed.rotations.reshape(-1, 3, 3)).as_rotvec().reshape(-1, 24, 3)
         motion.global_orient[:, person] = vectors[:, 0]
@@ -181,3 +161,79 @@ def _toes_on_the_floor(rotations: Array, joints: Array, world: Array, lowest: Ar
         angle = -np.clip(pitch, 0.0, 0.7) * near
         bent[:, ball] = Rotation.from_rotvec(np.array([1.0, 0.0, 0.0]) * angle[:, None]).as_matrix()
     return bent
+
+
+def hold_hands(lead: Performance, follow: Performance, fps: float) -> tuple[Performance, Performance]:
+    """Bring together hands of two people that are nearly together and stay so for a while, each half of the way.
+
+    Only shoulders and elbows turn: the elbow bends by the law of cosines, the shoulder turns the arm along the
+    shortest arc. Each hand goes to the other's nearest one.
+    """
+    if len(lead) == 0:
+        return lead, follow
+    pull = _pull(lead, follow, fps)
+    for _ in range(2):  # the hand's own length turns with the arm: the second pass takes up what is left
+        hands = [person.joints[:, [22, 23]] for person in (lead, follow)]
+        apart = hands[1][:, None] - hands[0][:, :, None]  # (T, 2, 2, 3) from the lead's hands to the follow's
+        gap = np.linalg.norm(apart, axis=-1)
+        step = (pull * np.maximum(1.0 - _TOUCH_M / np.maximum(gap, 1e-6), 0.0) / 2)[..., None] * apart
+        lead = _reach(lead, step.sum(axis=2))
+        follow = _reach(follow, -step.sum(axis=1))
+    return lead, follow
+
+
+def _pull(lead: Performance, follow: Performance, fps: float) -> Array:
+    """(T, 2, 2) how firmly each hand of the lead holds each of the follow's, 0 to 1, smooth in time."""
+    gap = np.linalg.norm(lead.joints[:, [22, 23], None] - follow.joints[:, None, [22, 23]], axis=-1)
+    near = np.clip((_FREE_M - gap) / (_FREE_M - _HELD_M), 0.0, 1.0)
+    nearest = np.exp(-gap / 0.02)
+    # A hand that is near to both of the other's hands holds the nearer one.
+    share = nearest / np.maximum(
+        np.maximum(nearest.sum(axis=1, keepdims=True), nearest.sum(axis=2, keepdims=True)), 1e-300
+    )
+    return gaussian_filter1d(near * share, 0.12 * fps, axis=0, mode="nearest")
+
+
+def _reach(person: Performance, steps: Array) -> Performance:
+    """Move the hands by `steps` (T, 2, 3) metres, left and right, as far as the arms go."""
+    rotations, joints = person.rotations.copy(), person.joints.copy()
+    world = rotations[:, 0]
+    for joint in (3, 6, 9):
+        world = world @ rotations[:, joint]
+    for side, (collar, shoulder, elbow, wrist, hand) in enumerate(_ARMS):
+        girdle = world @ rotations[:, collar]
+        upper = girdle @ rotations[:, shoulder]
+        fore = upper @ rotations[:, elbow]
+        root, middle, end = (joints[:, joint] for joint in (shoulder, elbow, wrist))
+        target = end + steps[:, side]
+        bend = _bend(middle - root, end - middle, np.linalg.norm(target - root, axis=1))
+        swing = _shortest(middle - root + np.einsum("tij,tj->ti", bend, end - middle), target - root)
+        upper, fore = swing @ upper, swing @ bend @ fore
+        rotations[:, shoulder] = np.swapaxes(girdle, -1, -2) @ upper
+        rotations[:, elbow] = np.swapaxes(upper, -1, -2) @ fore
+        bones = ((shoulder, elbow, upper), (elbow, wrist, fore), (wrist, hand, fore @ rotations[:, wrist]))
+        for parent, joint, turned in bones:
+            joints[:, joint] = joints[:, parent] + turned @ (person.rest[joint] - person.rest[parent])
+    return replace(person, rotations=rotations, joints=joints)
+
+
+def _bend(upper: Array, lower: Array, distance: Array) -> Array:
+    """Rotation (T, 3, 3) of the forearm `lower` (T, 3) after which the arm is `distance` (T,) long."""
+    a, b = np.linalg.norm(upper, axis=1), np.linalg.norm(lower, axis=1)
+    axis = np.cross(upper, lower)
+    size = np.linalg.norm(axis, axis=1)
+    now = np.arctan2(size, (upper * lower).sum(axis=1))
+    length = np.clip(distance, np.abs(a - b) + 0.12, _STRETCH * (a + b))
+    then = np.arccos(np.clip((length**2 - a**2 - b**2) / (2 * a * b), -1.0, 1.0))
+    # The axis of an arm that is straight is not known: such an arm does not bend.
+    weight = np.clip(size / (a * b) / 0.05, 0.0, 1.0)
+    change = (weight * (then - now) / np.maximum(size, 1e-9))[:, None] * axis
+    return Rotation.from_rotvec(change).as_matrix()
+
+
+def _shortest(before: Array, after: Array) -> Array:
+    """Rotation (T, 3, 3) along the shortest arc from direction `before` to `after`, (T, 3) each."""
+    axis = np.cross(before, after)
+    size = np.linalg.norm(axis, axis=1)
+    angle = np.arctan2(size, (before * after).sum(axis=1))
+    return Rotation.from_rotvec((angle / np.maximum(size, 1e-12))[:, None] * axis).as_matrix()

@@ -7,16 +7,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.model.body_model import BodyModel
-from shapepose_fg.simulation.bystanders import stand, walk_along
-from shapepose_fg.simulation.crossing import way_through
-from shapepose_fg.simulation.holding import hold_hands
+from shapepose_fg.simulation.bystanders import stand, walk_along, way_through
 from shapepose_fg.simulation.mocap import Clip
-from shapepose_fg.simulation.performance import Figure, Performance, about_z, perform
+from shapepose_fg.simulation.performance import Figure, Performance, about_z, hold_hands, perform
 
 Array = NDArray[np.float64]
 
 _TORSO = (0, 6, 9, 12)
-"""Pelvis, spine and neck: what nobody else may come into."""
+"""Pelvis, spine and neck: what no one else may come into."""
+_HALF_ROOM_M = 1.75
+"""Pelvises stay within this of the middle of the room, in x and in y."""
+_LIMBS_M = 0.12
+"""No joint of who stands comes nearer than this to a joint of anybody else, where there is room for it."""
 _TORSO_M = 0.2
 """How near to these another's joint may come."""
 _MIDDLES, _LIMBS = (0, 9), (18, 19, 20, 21, 22, 23, 4, 5)
@@ -24,7 +26,7 @@ _MIDDLES, _LIMBS = (0, 9), (18, 19, 20, 21, 22, 23, 4, 5)
 _SPOTS, _PAIR_OPTIONS, _TRIED = 150, 60, 30
 """Places that are drawn for who stands and for a pair, and how many of them are looked at closely."""
 _PACE_MPS = 1.35
-"""Nobody walks faster through a room full of people."""
+"""People walk no faster through a room full of others."""
 _ARM_M = 0.3
 """Who walks keeps this far from others' limbs."""
 
@@ -41,26 +43,16 @@ class SequenceConfig:
     """People who walk through, between and around."""
     close_m: float = 0.45
     """Pelvises of people who do not dance together stay this far apart, or a little farther."""
-    limbs_m: float = 0.12
-    """No joint of who stands comes nearer than this to a joint of anybody else, where there is room for it."""
-    apart_m: float = 1.3
-    """A take is used from where the dancers come nearer than this to where they part."""
-    half_room_m: float = 1.75
-    """Pelvises stay within this of the middle of the room, in x and in y."""
     segment_frames: int = 600
-    """Longest stretch without a cut, at 30 frames a second."""
+    """Longest segment without a cut, at 30 frames a second."""
     frames: int = 3000
     """Length of the sequence."""
-    shape_spread: float = 0.8
-    """Standard deviation of the betas over people; a pair's two differ by less."""
     camera_distance_m: tuple[float, float] = (3.1, 3.6)
     """Range of the cameras' distances from the middle."""
     camera_height_m: tuple[float, float] = (2.0, 2.5)
     """Range of the cameras' heights; every second one is 0.3 m lower."""
     focal_px: tuple[float, float] = (860.0, 940.0)
     """Range of the cameras' focal lengths."""
-    image_size: tuple[int, int] = (1280, 720)
-    """Pixels."""
     seed: int = 0
     """Fixes everything that is drawn."""
     without: frozenset[str] = frozenset()
@@ -69,10 +61,8 @@ class SequenceConfig:
     def __post_init__(self) -> None:
         if not (0 <= self.pairs <= 2 and self.standing >= 0 and self.walking >= 0):
             raise ValueError(f"pairs must be 0, 1 or 2, standing and walking at least 0; got {self}")
-        if not (self.close_m > 0 and self.half_room_m > 0 and self.segment_frames > 0 and self.frames >= 0):
-            raise ValueError(
-                f"close_m, half_room_m, segment_frames must be positive, frames at least 0; got {self}"
-            )
+        if not (self.close_m > 0 and self.segment_frames > 0 and self.frames >= 0):
+            raise ValueError(f"close_m, segment_frames must be positive, frames at least 0; got {self}")
 
     @property
     def people(self) -> int:
@@ -115,7 +105,7 @@ class Room:
         """One who stays at a free spot close to the others, turned towards them."""
         one = stand(self.body, betas, clip, self.frames, self.fps, start=int(self.rng.integers(10_000)))
         faces = one.rotations[:, 0, :2, 2].mean(axis=0)
-        spots = self.rng.uniform(-self.config.half_room_m, self.config.half_room_m, (_SPOTS, 2))
+        spots = self.rng.uniform(-_HALF_ROOM_M, _HALF_ROOM_M, (_SPOTS, 2))
         noise = self.rng.normal(0.0, 0.5, _SPOTS)
         others = self.points(_MIDDLES)
         if others.shape[1] > 0:
@@ -140,7 +130,7 @@ class Room:
             fps=self.fps,
             speed_mps=min(speed, _PACE_MPS),
             distance_m=np.repeat([self.config.close_m, _ARM_M], [middles.shape[1], limbs.shape[1]]),
-            half_room_m=self.config.half_room_m,
+            half_room_m=_HALF_ROOM_M,
         )
         start = self.rng.uniform()
         walk = walk_along(self.body, betas, clip, way.xy, way.heading, fps=self.fps, start=start)
@@ -171,7 +161,7 @@ class Room:
         """How well a pair is placed: inside the room, close to others, but not closer than allowed."""
         steps = np.concatenate([one.joints[::3, list(_MIDDLES), :2] for one in two], axis=1)
         steps = steps @ about_z(np.array([turn]))[0, :2, :2].T + shift
-        outside = float(np.maximum(np.abs(steps) - self.config.half_room_m, 0.0).max())
+        outside = float(np.maximum(np.abs(steps) - _HALF_ROOM_M, 0.0).max())
         gaps = np.linalg.norm(steps[:, :, None] - self.points(_MIDDLES)[::3, None], axis=-1)
         spare = float(gaps.min()) - self.config.close_m if gaps.size > 0 else 0.0
         return 20.0 * min(spare, 0.0) - max(spare, 0.0) - 10.0 * outside
@@ -182,7 +172,7 @@ class Room:
         for placed in options:
             reach = max(np.abs(one.joints[:, 0, :2]).max() for one in placed)
             free = min((self._gap(one, other) for one in placed for other in self.performed), default=0.0)
-            free = min(free, self.config.half_room_m - float(reach))
+            free = min(free, _HALF_ROOM_M - float(reach))
             if free > most:
                 best, most = placed, free
             if free >= 0.0:
@@ -192,7 +182,7 @@ class Room:
     def _gap(self, one: Performance, other: Performance) -> float:
         """How much more room two people leave each other than is asked for, metres; negative: less."""
         a, b = one.joints[::5], other.joints[::5]
-        limbs = np.linalg.norm(a[:, :, None] - b[:, None], axis=-1).min() - self.config.limbs_m
+        limbs = np.linalg.norm(a[:, :, None] - b[:, None], axis=-1).min() - _LIMBS_M
         trunks = clearance_m(a, b).min() - _TORSO_M
         hips = np.linalg.norm((a - b)[:, 0, :2], axis=-1).min() - self.config.close_m
         return float(min(limbs, trunks, hips))

@@ -62,19 +62,9 @@ class Scene:
             return np.zeros((0, count, 3), dtype=np.float32)
         import torch
 
-        parameters = _parameters(self.body, self.motion, slice(frame, frame + 1))
+        parameters = parameters_of(self.body, self.motion[frame : frame + 1])
         with torch.no_grad():
             return self.body.vertices(parameters, only).numpy()
-
-    @cached_property
-    def standing(self) -> NDArray[np.float32]:
-        """(Nv, 3) the mean body in its T-pose, y up."""
-        import torch
-
-        from shapepose_fg.body.model.body_model import BodyParameters
-
-        with torch.no_grad():
-            return self.body.vertices(BodyParameters.zeros(1, self.body.dtype))[0].numpy()
 
 
 def built_in_scene(
@@ -109,7 +99,6 @@ def ring_of_cameras(
     count: int,
     rng: np.random.Generator,
     *,
-    image_size: tuple[int, int] = (1280, 720),
     distance_m: tuple[float, float] = (3.1, 3.6),
     height_m: tuple[float, float] = (2.0, 2.5),
     focal_px: tuple[float, float] = (860.0, 940.0),
@@ -119,7 +108,7 @@ def ring_of_cameras(
     `distance_m`, `height_m` and `focal_px` are what they are drawn from; every second one is 0.3 m lower.
     1280 x 720 px and a focal length near 900 px by default: a field of view of 71 by 44 degrees.
     """
-    cameras = []
+    image_size, cameras = (1280, 720), []
     angles = 2 * np.pi * (np.arange(count) + rng.uniform(-0.18, 0.18, count)) / count + 0.35
     for index, angle in enumerate(angles):
         distance, height = rng.uniform(*distance_m), rng.uniform(*height_m) + (0.2, -0.1)[index % 2]
@@ -138,8 +127,7 @@ def builds_of(body: "BodyModel", betas: NDArray[np.float64]) -> list[Build]:
         return []
     import torch
 
-    standing = Motion(betas, *(np.zeros((1, len(betas), *shape)) for shape in ((3,), (23, 3), (3,))))
-    parameters = _parameters(body, standing, slice(0, 1))
+    parameters = parameters_of(body, Motion.still(betas))
     with torch.no_grad():
         joints = body.joints(parameters).numpy().astype(np.float64)
         floors = body.vertices(parameters).numpy()[..., 1].min(axis=1)
@@ -154,7 +142,7 @@ def keypoints_of(body: "BodyModel", motion: Motion) -> NDArray[np.float64]:
     import torch
 
     with torch.no_grad():
-        points = body.keypoints(_parameters(body, motion, slice(0, frames))).numpy()
+        points = body.keypoints(parameters_of(body, motion)).numpy()
     return points.astype(np.float64).reshape(frames, people, -1, 3)
 
 
@@ -163,25 +151,23 @@ def _on_the_floor(body: "BodyModel", motion: Motion, builds: list[Build]) -> Mot
     frames, people = motion.transl.shape[:2]
     if frames * people == 0:
         return motion
-    standing = Motion(motion.betas, *(np.zeros((1, people, *shape)) for shape in ((3,), (23, 3), (3,))))
     floors = np.array([build.floor for build in builds])
-    soles = keypoints_of(body, standing)[0][:, _FEET, 1].min(axis=1) - floors
+    soles = keypoints_of(body, Motion.still(motion.betas))[0][:, _FEET, 1].min(axis=1) - floors
     transl = motion.transl.copy()
     transl[..., 2] += soles - keypoints_of(body, motion)[:, :, _FEET, 2].min(axis=2)
-    return Motion(motion.betas, motion.global_orient, motion.body_pose, transl)
+    return replace(motion, transl=transl)
 
 
-def _parameters(body: "BodyModel", motion: Motion, frames: slice) -> "BodyParameters":
-    """The bodies of some frames, frame by frame, as one batch."""
+def parameters_of(body: "BodyModel", motion: Motion) -> "BodyParameters":
+    """The bodies of all frames, frame by frame, as one batch."""
     import torch
 
     from shapepose_fg.body.model.body_model import BodyParameters
 
-    count = len(range(*frames.indices(len(motion.transl))))
     tensors = {
-        "betas": np.tile(motion.betas, (count, 1)),
-        "global_orient": motion.global_orient[frames].reshape(-1, 3),
-        "body_pose": motion.body_pose[frames].reshape(-1, 23, 3),
-        "transl": motion.transl[frames].reshape(-1, 3),
+        "betas": np.tile(motion.betas, (len(motion.transl), 1)),
+        "global_orient": motion.global_orient.reshape(-1, 3),
+        "body_pose": motion.body_pose.reshape(-1, 23, 3),
+        "transl": motion.transl.reshape(-1, 3),
     }
     return BodyParameters(**{name: torch.from_numpy(value).to(body.dtype) for name, value in tensors.items()})

@@ -1,11 +1,12 @@
-"""Named interaction sequences around real two-person salsa takes, and random scenes of recorded motions.
+"""Named interaction sequences around real two-person salsa takes.
 
 Takes 60/61_01 to _07 are for choosing settings ("tune"), _09 to _15 for reporting ("report"); whoever else is
 in the room comes from other subjects. Room of 4 x 4 m, world z up, floor at z = 0.
 """
 
 import re
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -24,9 +25,13 @@ Array = NDArray[np.float64]
 Split = Literal["tune", "report"]
 
 DANCERS = frozenset({"60", "61"})
-"""Subjects of the salsa takes: nobody trains on them."""
+"""Subjects of the salsa takes: no network trains on them."""
 TAKES: dict[str, range] = {"tune": range(1, 8), "report": range(9, 16)}
 """Numbers of the takes of each split."""
+_APART_M = 1.3
+"""A take is used from where the dancers come nearer than this to where they part."""
+_SHAPE_SPREAD = 0.8
+"""Standard deviation of the betas over people; a pair's two differ by less."""
 _IMAGE_PX_A_M = 259.0
 """Everybody is as large in the image, whatever the cameras' distance."""
 
@@ -55,13 +60,13 @@ SEQUENCES: dict[str, SequenceConfig] = {
 class Sequence(Scene):
     """A scene made of recorded motions, and what it is made of."""
 
-    name: str = "random"
+    name: str = ""
     """Which of `SEQUENCES`."""
     split: str = ""
-    """"tune" or "report"; empty where no salsa take is used."""
+    """"tune" or "report"."""
     cuts: tuple[int, ...] = ()
     """First frames of what follows a cut: there everybody may be somewhere else."""
-    clips: tuple[tuple[str, ...], ...] = field(default=())
+    clips: tuple[tuple[str, ...], ...] = ()
     """For each segment the name of the recording that each person performs."""
 
 
@@ -92,28 +97,24 @@ def sequence(
     if len(takes) == 0:
         raise ValueError(f"these recordings hold no salsa take of split {split!r}: give the whole file")
     rng = np.random.default_rng([config.seed, list(TAKES).index(split)])
-    return _compose(mocap, takes, config, rng, body, cameras, frames, fps, (name, split), until)
-
-
-def random_scene(
-    mocap: Mocap,
-    *,
-    people: int,
-    cameras: int,
-    frames: int,
-    seed: int,
-    body: BodyModel | None = None,
-    fps: float = 30.0,
-    config: SequenceConfig | None = None,
-) -> Sequence:
-    """0 to 12 people who stand and walk close together before 2 to 12 cameras; subjects 60 and 61 are not used."""
-    if not (0 <= people <= 12 and 2 <= cameras <= 12 and frames >= 0):
-        raise ValueError(f"need 0 to 12 people, 2 to 12 cameras, frames >= 0; got {people}, {cameras}, {frames}")
-    base = SequenceConfig() if config is None else config
-    rng = np.random.default_rng([base.seed, seed, 7])
-    walking = int(rng.binomial(people, 0.4)) if people < 7 else people // 4
-    base = replace(base, pairs=0, standing=people - walking, walking=walking)
-    return _compose(mocap, [], base, rng, body, cameras, frames, fps, ("random", ""))
+    body = BodyModel.default() if body is None else body
+    frames = config.frames if frames is None else frames
+    rig = ring_of_cameras(
+        cameras,
+        rng,
+        distance_m=config.camera_distance_m,
+        height_m=config.camera_height_m,
+        focal_px=config.focal_px,
+    )
+    betas = _shapes(config, rng)
+    dances = _dances(mocap, takes, config, fps, rng)
+    parts, clips, starts = [Motion.still(betas, 0)], [], [0]
+    while starts[-1] < (frames if until is None else min(until, frames)):
+        room = _segment(mocap, body, betas, config, rng, fps, frames - starts[-1], dances)
+        parts.append(together(betas, room.performed, room.frames))
+        clips.append(tuple(room.names))
+        starts.append(starts[-1] + room.frames)
+    return Sequence(rig, body, Motion.joined(parts), fps, name, split, tuple(starts[1:-1]), tuple(clips))
 
 
 def salsa_takes(mocap: Mocap, split: Split) -> list[tuple[int, int]]:
@@ -121,68 +122,25 @@ def salsa_takes(mocap: Mocap, split: Split) -> list[tuple[int, int]]:
     return [pair for pair in mocap.pairs if _take(mocap.names[pair[0]]) in TAKES[split]]
 
 
-def _compose(
-    mocap: Mocap,
-    takes: list[tuple[int, int]],
-    config: SequenceConfig,
-    rng: np.random.Generator,
-    body: BodyModel | None,
-    cameras: int,
-    frames: int | None,
-    fps: float,
-    label: tuple[str, str],
-    until: int | None = None,
-) -> Sequence:
-    """Segments one after the other until there are frames enough."""
-    body = BodyModel.default() if body is None else body
-    frames = config.frames if frames is None else frames
-    rig = ring_of_cameras(
-        cameras,
-        rng,
-        image_size=config.image_size,
-        distance_m=config.camera_distance_m,
-        height_m=config.camera_height_m,
-        focal_px=config.focal_px,
-    )
-    betas = _shapes(config, rng)
-    stretches = _Stretches(mocap, takes, config, fps, rng)
-    parts: list[Motion] = []
-    clips: list[tuple[str, ...]] = []
-    cuts: list[int] = []
-    done = 0
-    while done < (frames if until is None else min(until, frames)):
-        room = _segment(mocap, body, betas, config, rng, fps, frames - done, stretches)
-        parts.append(together(betas, room.performed, room.frames))
-        clips.append(tuple(room.names))
-        done += room.frames
-        cuts.append(done)
-    motion = _joined(parts) if len(parts) > 0 else together(np.zeros((0, 10)), [], 0)
-    if len(parts) == 0 and config.people > 0:
-        motion = Motion(betas, *(np.zeros((0, config.people, *shape)) for shape in ((3,), (23, 3), (3,))))
-    return Sequence(rig, body, motion, fps, *label, tuple(cuts[:-1]), tuple(clips))
-
-
-class _Stretches:
-    """Endless stretches of takes in a drawn order, each at most a segment long."""
-
-    def __init__(self, mocap: Mocap, takes, config: SequenceConfig, fps: float, rng: np.random.Generator):
-        self.mocap, self.config, self.fps, self.rng = mocap, config, fps, rng
-        self.takes, self.queue = takes, []
-
-    def __call__(self) -> tuple[Clip, Clip]:
-        if len(self.queue) == 0:
-            for pair in (self.takes[index] for index in self.rng.permutation(len(self.takes))):
-                self.queue += _together_in(self.mocap, pair, self.config, self.fps)
-        return self.queue.pop(0)
+def _dances(
+    mocap: Mocap, takes: list[tuple[int, int]], config: SequenceConfig, fps: float, rng: np.random.Generator
+) -> Iterator[tuple[Clip, Clip]]:
+    """Segments of takes in a drawn order without end, each as long as may be without a cut at the most."""
+    while True:
+        drawn = [takes[index] for index in rng.permutation(len(takes))]
+        segments = [segment for pair in drawn for segment in _together_in(mocap, pair, config, fps)]
+        if len(segments) == 0:
+            raise ValueError("in none of these salsa takes the two dance together: give the whole file")
+        yield from segments
 
 
 def _together_in(
     mocap: Mocap, pair: tuple[int, int], config: SequenceConfig, fps: float
 ) -> list[tuple[Clip, Clip]]:
-    """The stretches of a take in which the two are together."""
+    """The segments of a take in which the two are together."""
     lead, follow = (mocap.clip(index).resampled(fps) for index in pair)
     gap = np.linalg.norm((lead.pelvis - follow.pelvis)[:, [0, 2]], axis=1)
-    near = np.flatnonzero(gap < config.apart_m)
+    near = np.flatnonzero(gap < _APART_M)
     if len(near) < fps:
         return []
     first, last = int(near[0]), int(near[-1]) + 1
@@ -199,10 +157,10 @@ def _segment(
     rng: np.random.Generator,
     fps: float,
     most: int,
-    stretches: _Stretches,
+    dances: Iterator[tuple[Clip, Clip]],
 ) -> Room:
     """Everybody from one cut to the next: first the pairs, then who stands, then who walks around them."""
-    dancing = [stretches() for _ in range(config.pairs)]
+    dancing = [next(dances) for _ in range(config.pairs)]
     longest = max(1, round(config.segment_frames * fps / 30.0))
     frames = min([most, longest, *(len(lead) for lead, _ in dancing)])
     room = Room(body, config, frames, fps, rng)
@@ -217,7 +175,7 @@ def _segment(
 
 def _shapes(config: SequenceConfig, rng: np.random.Generator) -> Array:
     """(P, 10) betas: those of a pair are near each other, so that their hands still meet."""
-    betas = rng.normal(0.0, config.shape_spread, (config.people, 10))
+    betas = rng.normal(0.0, _SHAPE_SPREAD, (config.people, 10))
     for lead in range(0, 2 * config.pairs, 2):
         betas[lead : lead + 2] = 0.6 * betas[lead] + rng.normal(0.0, 0.25, (2, 10))
     return np.clip(betas, -1.8, 1.8)
@@ -226,17 +184,9 @@ def _shapes(config: SequenceConfig, rng: np.random.Generator) -> Array:
 def _drawn(clips: list[int], count: int, rng: np.random.Generator) -> list[int]:
     """`count` clips, none twice before all were drawn once."""
     if count > 0 and len(clips) == 0:
-        raise ValueError(
-            "these recordings hold nobody who stands or walks, other than the dancers: give the whole file"
-        )
+        raise ValueError("no one but the dancers stands or walks in these recordings: give the whole file")
     rounds = -(-count // max(len(clips), 1))
     return [clips[index] for _ in range(rounds) for index in rng.permutation(len(clips))][:count]
-
-
-def _joined(parts: list[Motion]) -> Motion:
-    """Motions of the same people one after the other."""
-    names = ("global_orient", "body_pose", "transl")
-    return Motion(parts[0].betas, *(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 def _take(name: str) -> int:

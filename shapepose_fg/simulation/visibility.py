@@ -1,5 +1,6 @@
 """Which joints a camera sees: the first of the posed surfaces on the rays to each joint, and whose skin it is."""
 
+from collections.abc import Generator, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -8,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.camera import Rig
-from shapepose_fg.core.skeleton import SMPL_24
+from shapepose_fg.core.skeleton import BODY_25, SMPL_24
+from shapepose_fg.pipeline.workers import Workers
 from shapepose_fg.viz.rendering import first_surface_at, scaled
 
 if TYPE_CHECKING:
@@ -24,11 +26,18 @@ _BONES = (
 ).split()
 """The own bones of each joint of BODY_25: SMPL's that begin there; face, toes and heels have their nearest. A
 collar has next to no skin: it counts as the shoulder's own, so that the chest is adjacent to the shoulder."""
-_FACE = [0, 15, 16, 17, 18]
-"""Nose, eyes and ears in BODY_25: they lie on the skin, not inside a limb."""
+FACE = tuple(BODY_25.index(name) for name in ("Nose", "REye", "LEye", "REar", "LEar"))
+"""They lie on the skin, not inside a limb."""
 
 _RAYS = np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (0.7, 0.7), (-0.7, 0.7), (0.7, -0.7), (-0.7, -0.7)])
 """Where rays go around a joint, in units of the probe's radius."""
+
+FramePeople = tuple[NDArray[np.float64], NDArray[np.float32]]
+"""One frame: BODY_25 joints (P, 25, 3) and surfaces (P, M, 3) of everybody, metres."""
+AHEAD = 4
+"""Frames a worker that are under way: they are short work."""
+FRAMES_WORTH_A_WORKER = 100
+"""A recording must have this many for each worker, or starting them takes longer than it saves."""
 
 
 @dataclass(frozen=True)
@@ -86,11 +95,7 @@ class Skin:
 
 
 def see(
-    rig: Rig,
-    joints: NDArray[np.float64],
-    surfaces: NDArray[np.floating],
-    skin: Skin,
-    config: VisibilityConfig,
+    rig: Rig, joints: NDArray[np.float64], surfaces: NDArray[np.floating], skin: Skin, config: VisibilityConfig
 ) -> Visibility:
     """See BODY_25 `joints` (P, 25, 3) of people whose `surfaces` are (P, M, 3), the vertices of `skin`.
 
@@ -118,13 +123,63 @@ def see(
     shows = skin._shows_or_none[np.where(owner == own, place, -1), np.arange(joints.shape[1])[:, None]]
     gap = depth[..., None] - met_depth  # -inf where nothing is met
     deep = np.full((joints.shape[1], 1), np.inf)
-    deep[_FACE] = config.face_depth_m
+    deep[list(FACE)] = config.face_depth_m
     stopped = (gap > config.front_m) & (~shows | (gap > deep))
     seen = np.where(in_image, 1.0 - stopped.mean(axis=-1), 0.0)
     hidden_by = np.where(in_image, NOBODY, BORDER)
     hidden = in_image & (seen < 0.5)
     hidden_by[hidden] = _commonest(np.where(owner == own, ITSELF, owner)[hidden], stopped[hidden])
     return Visibility(seen, in_image, hidden_by)
+
+
+@dataclass(frozen=True)
+class VisibilityWorker:
+    """Finds what the cameras see of many frames: the same for all frames of a recording."""
+
+    rig: Rig
+    """The cameras."""
+    skin: Skin
+    """The surface that is drawn."""
+    config: VisibilityConfig
+    """How it is drawn and read."""
+
+    def one(self, people: FramePeople) -> Visibility:
+        """What the cameras see of one frame."""
+        return see(self.rig, *people, self.skin, self.config)
+
+    def all(self, frames: Iterable[FramePeople], workers: int = 1) -> Generator[Visibility, None, None]:
+        """What the cameras see, frame after frame; in `workers` processes, or here if that is 1.
+
+        Frames are taken from `frames` as they are needed. Close the iterator (`contextlib.closing`) to end the
+        processes early. RuntimeError where one of them dies.
+        """
+        with Workers(workers, self, AHEAD) as pool:
+            yield from pool.map(VisibilityWorker.one, frames)
+
+
+def facing(joints: NDArray[np.float64], centres: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Cosine (V, P, 5) between a face joint's way out of the head and the way to the camera: 1 seen frontally.
+
+    `joints` (P, 25, 3) BODY_25, `centres` (V, 3) of the cameras; the head's middle is that of the ears.
+    """
+    face = joints[:, FACE]
+    outward = face - joints[:, FACE[3:]].mean(axis=1, keepdims=True)
+    to_camera = centres[:, None, None] - face
+    length = np.linalg.norm(outward, axis=-1) * np.linalg.norm(to_camera, axis=-1)
+    return (outward * to_camera).sum(axis=-1) / np.maximum(length, 1e-9)
+
+
+def seen_from_the_front(
+    seen: NDArray[np.float64], joints: NDArray[np.float64], centres: NDArray[np.float64], ramp: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """`seen` (V, P, 25) where a face joint's share is less the more it faces away, whatever the depth buffer says.
+
+    `ramp` (5, 2) holds the cosines at which a face joint is wholly lost and wholly there.
+    """
+    low, high = ramp.T
+    result = seen.copy()
+    result[..., FACE] *= np.clip((facing(joints, centres) - low) / (high - low), 0.0, 1.0)
+    return result
 
 
 def _commonest(who: NDArray[np.intp], counts: NDArray[np.bool_]) -> NDArray[np.intp]:

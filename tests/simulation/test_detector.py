@@ -15,8 +15,7 @@ from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.simulation import DetectorConfig, Scene, built_in_scene, detector_statistics, simulate
 from shapepose_fg.simulation.detector import Detector
 from shapepose_fg.simulation.detector_statistics import JOINT_GROUP, LIMB_GROUP, DetectorStatistics, measured
-from shapepose_fg.simulation.facing import FACE, facing
-from shapepose_fg.simulation.visibility import Visibility
+from shapepose_fg.simulation.visibility import FACE, Visibility, facing
 from shapepose_fg.viz.rendering import look_at
 
 LIMBS = np.array(BODY_25.limbs)
@@ -424,13 +423,11 @@ def test_the_shipped_statistics_are_whole():
     np.testing.assert_allclose(table.probability(rows, table.quantile(rows, probability)), probability, atol=1e-9)
 
 
-def test_what_is_drawn_takes_the_place_of_what_was_measured():
+def test_what_is_drawn_takes_the_place_of_what_was_measured(tmp_path: Path):
     content = json.loads((Path(detector_statistics.__file__).parent / "data" / "detector.json").read_text())
-    drawn = DetectorStatistics.of(content["measured"], {"swap": 0.5, "miss": np.full((14, 3), 0.25).tolist()})
-    assert drawn.swap == 0.5 and (drawn.miss == 0.25).all()
-    plain = DetectorStatistics.of(content["measured"], {})
-    assert plain.swap == content["measured"]["swap"]["instead"] and plain.floor_px == measured().floor_px
-    names = {field.name for field in fields(measured())}
-    assert set(content["drawn"]) <= names
-    for name, value in content["drawn"].items():
-        np.testing.assert_array_equal(getattr(measured(), name), value)
+    content["drawn"] = {"swap": 0.5, "miss": np.full((14, 3), 0.25).tolist(), "double": 0.125}
+    (tmp_path / "other.json").write_text(json.dumps(content))
+    other = DetectorStatistics.read(tmp_path / "other.json")
+    assert other.swap == 0.5 and (other.miss == 0.25).all() and other.double == 0.125
+    assert other.false_far == content["measured"]["false"]["far_per_view"] != measured().false_far
+    assert other.floor_px == measured().floor_px

@@ -9,8 +9,7 @@ from shapepose_fg.body.model.smpl_file import SMPL_PARENTS
 from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 from shapepose_fg.evaluation.bodies import statures
 from shapepose_fg.simulation import built_in_scene
-from shapepose_fg.simulation.foreign import PEOPLE, people_of, recast
-from shapepose_fg.simulation.proportions import Proportions, reshaped
+from shapepose_fg.simulation.foreign import PEOPLE, Proportions, people_of, recast, reshaped
 
 BODY = BodyModel.default()
 LIMBS = [

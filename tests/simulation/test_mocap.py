@@ -11,10 +11,9 @@ from scipy.spatial.transform import Rotation
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.simulation.bystanders import endless, stand, walk_along
-from shapepose_fg.simulation.holding import hold_hands
 from shapepose_fg.simulation.mocap import Clip, Mocap
-from shapepose_fg.simulation.performance import Figure, Performance, Placement, perform, together
-from shapepose_fg.simulation.scene import Scene, _parameters, keypoints_of, ring_of_cameras
+from shapepose_fg.simulation.performance import Figure, Performance, hold_hands, perform, together
+from shapepose_fg.simulation.scene import Scene, keypoints_of, parameters_of, ring_of_cameras
 from shapepose_fg.simulation.shoulder import shoulder_rhythm
 
 SHAPES = np.clip(np.random.default_rng(0).normal(0.0, 0.8, (4, 10)), -1.8, 1.8)
@@ -114,7 +113,7 @@ def test_collars_rise_with_the_arm_after_the_first_thirty_degrees():
 
 def test_arms_point_in_the_room_as_they_did_in_the_recording(tiny_mocap: Mocap, body: BodyModel):
     clip = tiny_mocap.clip(5)
-    performed = perform(body, SHAPES[0], clip, Placement(turn_rad=0.7))
+    performed = perform(body, SHAPES[0], clip).moved(np.zeros(2), 0.7)
     turn = Rotation.from_rotvec([0, 0, 0.7]).as_matrix() @ Z_UP
     for chain in UPPER_ARMS:
         np.testing.assert_allclose(
@@ -130,23 +129,22 @@ def test_arms_point_in_the_room_as_they_did_in_the_recording(tiny_mocap: Mocap, 
 def test_parameters_pose_the_body_that_was_planned(tiny_mocap: Mocap, body: BodyModel):
     """SMPL's `transl` is not the pelvis: the joints of the parameters are those of the performance."""
     double = BodyModel(body.arrays, dtype=torch.float64)
-    performed = perform(double, SHAPES[1], tiny_mocap.clip(0), Placement((0.4, -0.3), 1.1, (0.1, 0.2)))
+    performed = perform(double, SHAPES[1], tiny_mocap.clip(0)).moved(np.array([0.4, -0.3]), 1.1)
     motion = together(SHAPES[1:2], [performed], len(performed))
-    joints = double.joints(_parameters(double, motion, slice(0, len(performed)))).numpy()
+    joints = double.joints(parameters_of(double, motion)).numpy()
     np.testing.assert_allclose(joints, performed.joints, atol=1e-9)
 
 
-def test_a_placement_puts_the_recordings_origin_there(tiny_mocap: Mocap, body: BodyModel):
+def test_ways_are_longer_by_the_ratio_of_the_legs(tiny_mocap: Mocap, body: BodyModel):
     clip = tiny_mocap.clip(4)
-    x, _, z = clip.pelvis[10]
-    performed = perform(body, SHAPES[0], clip, Placement((0.5, -1.0), 0.0, (float(x), float(z))))
-    np.testing.assert_allclose(performed.joints[10, 0, :2], [0.5, -1.0], atol=1e-12)
-    # +z of the recording is -y of the room; steps are longer by the ratio of the legs.
+    performed = perform(body, SHAPES[0], clip)
+    # +z of the recording is -y of the room.
     way = performed.joints[40, 0, :2] - performed.joints[10, 0, :2]
     ratio = Figure(body, SHAPES[0]).leg_m / clip.leg_m
     np.testing.assert_allclose(way, [0.0, -1.3 * ratio], atol=1e-5)
-    turned = perform(body, SHAPES[0], clip, Placement((0.5, -1.0), np.pi / 2, (float(x), float(z))))
-    np.testing.assert_allclose(turned.joints[40, 0, :2], [0.5 + 1.3 * ratio, -1.0], atol=1e-5)
+    turned = performed.moved(np.array([0.5, -1.0]), np.pi / 2)
+    way = turned.joints[40, 0, :2] - turned.joints[10, 0, :2]
+    np.testing.assert_allclose(way, [1.3 * ratio, 0.0], atol=1e-5)
 
 
 @pytest.mark.parametrize("shape", [0, 1, 2])
@@ -227,7 +225,7 @@ def test_hands_that_are_near_are_brought_together(body: BodyModel):
     for shoulder, elbow, sign in ((16, 18, 1.0), (17, 19, -1.0)):
         poses[:, shoulder] = Rotation.from_rotvec([0, -0.8 * sign, 0]).as_matrix()
         poses[:, elbow] = Rotation.from_rotvec([0, -0.75 * sign, 0]).as_matrix()
-    clip = Clip("a", "a", "", 0, poses, np.tile([0.0, 0.95, 0.0], (60, 1)), 30.0, 0.8, 0.0, True, True)
+    clip = Clip("a", "a", "", poses, np.tile([0.0, 0.95, 0.0], (60, 1)), 30.0, 0.8, 0.0, True, True)
     lead = perform(body, np.zeros(10), clip)
     reach = abs(lead.joints[0, 22, 1] - lead.joints[0, 0, 1])
     for spare in (0.08, 0.13):

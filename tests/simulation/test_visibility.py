@@ -42,7 +42,10 @@ def look(rig: Rig, joints: NDArray, meshes: NDArray, scene: Scene, config: Visib
 def standing(scene: Scene) -> tuple[NDArray, NDArray]:
     """Joints (25, 3) and mesh (Nv, 3) of the mean body in its T-pose: z up, facing -y, left is +x."""
     turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-    return scene.body.arrays.keypoint_regressor @ scene.standing @ turn, scene.standing @ turn
+    return (
+        scene.body.arrays.keypoint_regressor @ scene.body.arrays.template @ turn,
+        scene.body.arrays.template @ turn,
+    )
 
 
 def first_met(origin: NDArray, target: NDArray, mesh: NDArray, faces: NDArray) -> tuple[float, int]:

@@ -6,7 +6,7 @@ import pytest
 from factors import motion_covariance
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.motion_model import MotionModel
-from shapepose_fg.simulation.measurement.motion import _lasting, densities
+from shapepose_fg.simulation.training.motion_statistics import _lasting, densities
 
 FPS = 30.0
 

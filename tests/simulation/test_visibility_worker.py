@@ -1,4 +1,4 @@
-"""Worker processes that look: the same bytes, in order, a bounded way ahead, and nobody left behind."""
+"""Worker processes that find what is visible: same bytes, in order, a bounded way ahead, none left behind."""
 
 import multiprocessing
 import os
@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 from shapepose_fg.simulation import DetectorConfig, Scene, built_in_scene, simulate
-from shapepose_fg.simulation.lookout import AHEAD, Lookout, People
-from shapepose_fg.simulation.visibility import Skin
+from shapepose_fg.simulation.visibility import AHEAD, FramePeople, Skin, VisibilityWorker
 
 CONFIG = DetectorConfig().visibility
 
@@ -26,13 +25,13 @@ def scene() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def lookout(scene: Scene) -> Lookout:
-    return Lookout(scene.rig, Skin.of(scene.body, CONFIG.cell_m), CONFIG)
+def worker(scene: Scene) -> VisibilityWorker:
+    return VisibilityWorker(scene.rig, Skin.of(scene.body, CONFIG.cell_m), CONFIG)
 
 
 @pytest.fixture(scope="module")
-def people(scene: Scene, lookout: Lookout) -> list[People]:
-    return [(scene.truth_at(frame), scene.vertices_at(frame, lookout.skin.vertices)) for frame in range(9)]
+def people(scene: Scene, worker: VisibilityWorker) -> list[FramePeople]:
+    return [(scene.truth_at(frame), scene.vertices_at(frame, worker.skin.vertices)) for frame in range(9)]
 
 
 def same_bytes(one: object, two: object) -> bool:
@@ -58,7 +57,7 @@ def test_scenes_with_nobody_and_without_frames_need_no_special_care():
 
 
 def test_frames_are_taken_as_they_are_needed_and_closing_ends_the_processes(
-    lookout: Lookout, people: list[People]
+    worker: VisibilityWorker, people: list[FramePeople]
 ):
     taken = []
 
@@ -67,23 +66,23 @@ def test_frames_are_taken_as_they_are_needed_and_closing_ends_the_processes(
             taken.append(len(taken))
             yield people[len(taken) % 9]
 
-    with closing(lookout.watch(endless(), 2)) as seen:
+    with closing(worker.all(endless(), 2)) as seen:
         first, second = next(seen), next(seen)
         assert len(multiprocessing.active_children()) == 2
-        assert same_bytes(first, lookout.look(people[1])) and same_bytes(second, lookout.look(people[2]))
+        assert same_bytes(first, worker.one(people[1])) and same_bytes(second, worker.one(people[2]))
         assert len(taken) == 2 * AHEAD + 1
     assert multiprocessing.active_children() == []
 
 
-def test_an_error_in_a_worker_is_raised_here(lookout: Lookout, people: list[People]):
+def test_an_error_in_a_worker_is_raised_here(worker: VisibilityWorker, people: list[FramePeople]):
     joints, surfaces = people[0]
-    with pytest.raises(ValueError), closing(lookout.watch([(joints[:, :, :2], surfaces)], 2)) as seen:
+    with pytest.raises(ValueError), closing(worker.all([(joints[:, :, :2], surfaces)], 2)) as seen:
         next(seen)
     assert multiprocessing.active_children() == []
 
 
-def test_a_worker_that_dies_is_no_endless_wait(lookout: Lookout, people: list[People]):
-    with closing(lookout.watch(people * 9, 2)) as seen:
+def test_a_worker_that_dies_is_no_endless_wait(worker: VisibilityWorker, people: list[FramePeople]):
+    with closing(worker.all(people * 9, 2)) as seen:
         next(seen)
         multiprocessing.active_children()[0].kill()
         with pytest.raises(RuntimeError, match="worker process ended"):
@@ -91,9 +90,9 @@ def test_a_worker_that_dies_is_no_endless_wait(lookout: Lookout, people: list[Pe
 
 
 @pytest.mark.parametrize("workers", [0, -1])
-def test_no_workers_are_refused(lookout: Lookout, scene: Scene, workers: int):
+def test_no_workers_are_refused(worker: VisibilityWorker, scene: Scene, workers: int):
     with pytest.raises(ValueError, match="workers must be 1"):
-        list(lookout.watch([], workers))
+        list(worker.all([], workers))
     with pytest.raises(ValueError, match="workers must be 1"):
         simulate(scene, workers=workers)
 
@@ -148,8 +147,8 @@ def alive(process: int) -> bool:
     return state.rsplit(")", 1)[1].split()[0] != "Z"
 
 
-def test_a_lookout_looks_as_it_is_told(lookout: Lookout, people: list[People]):
-    strict = Lookout(lookout.rig, lookout.skin, replace(CONFIG, probe_m=0.0))
-    (rays,), (ray,) = lookout.watch(people[:1]), strict.watch(people[:1])
+def test_a_worker_uses_the_settings_that_it_is_given(worker: VisibilityWorker, people: list[FramePeople]):
+    strict = VisibilityWorker(worker.rig, worker.skin, replace(CONFIG, probe_m=0.0))
+    (rays,), (ray,) = worker.all(people[:1]), strict.all(people[:1])
     assert set(np.unique(ray.seen)) <= {0.0, 1.0}  # one ray arrives or not
     assert len(np.unique(rays.seen)) > 2
