@@ -13,8 +13,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import shapepose_fg.cli.reconstruct.run  # noqa: F401
 from shapepose_fg.cli.main import main
-from shapepose_fg.cli.reconstruct.run import run_job  # noqa: F401
 from shapepose_fg.pipeline.pipeline import reconstruct_parts  # noqa: F401  what a run loads, torch too, is loaded before the fork
 from shapepose_fg.pipeline.runs.manifest import PARTS
 from shapepose_fg.simulation import built_in_scene, simulate

@@ -1,5 +1,6 @@
 """The whole way: what goes in as 2D candidates comes out as people."""
 
+import inspect
 from dataclasses import replace
 
 import gtsam
@@ -17,6 +18,7 @@ from shapepose_fg.evaluation.metrics import joint_metrics
 from shapepose_fg.evaluation.shelf import evaluate_shelf, read_shelf_ground_truth
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
+from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people, reconstruct
 from shapepose_fg.proposal.proposals import ProposalConfig
 from shapepose_fg.simulation import built_in_scene, simulate
@@ -104,7 +106,8 @@ def test_workers_change_no_byte(scene, recording):
     config = PipelineConfig(batch_frames=8)
     counts = list[int]()
     alone = reconstruct(recording, scene.rig, config)
-    helped = reconstruct(recording, scene.rig, config, workers=2, progress=lambda done, _: counts.append(done))
+    execution = Execution(workers=2, progress=lambda done, _: counts.append(done))
+    helped = reconstruct(recording, scene.rig, config, execution=execution)
     assert counts == [8, 16]
     for name in Reconstruction.ROWS:
         assert getattr(alone, name).tobytes() == getattr(helped, name).tobytes(), name
@@ -117,7 +120,14 @@ def test_workers_change_no_byte(scene, recording):
 
 def test_factors_that_cannot_be_sent_to_workers_are_refused(scene, recording):
     with pytest.raises(ValueError, match="at the top of a module, or use workers=1"):
-        reconstruct(recording, scene.rig, workers=2, extra_factors=lambda window, keys: ())
+        reconstruct(recording, scene.rig, extra_factors=lambda window, keys: (), execution=Execution(workers=2))
+
+
+def test_arguments_that_went_into_execution_are_named(scene, recording):
+    for name in ("workers", "cluster", "chunk_frames", "progress"):
+        with pytest.raises(TypeError, match=rf"give execution=Execution\({name}=\.\.\.\)"):
+            reconstruct(recording, scene.rig, **{name: None})
+    assert len(inspect.signature(reconstruct).parameters) <= 10
 
 
 def test_progress_counts_frames_and_torch_gets_its_threads_back(scene, recording):
@@ -127,7 +137,7 @@ def test_progress_counts_frames_and_torch_gets_its_threads_back(scene, recording
         scene.rig,
         PipelineConfig(batch_frames=4),
         frames=range(10),
-        progress=lambda *done: seen.append(done),
+        execution=Execution(progress=lambda *done: seen.append(done)),
     )
     assert seen == [(4, 10), (10, 10)], "two frames are no window of their own"
     assert torch.get_num_threads() == before

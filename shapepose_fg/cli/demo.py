@@ -20,6 +20,7 @@ from shapepose_fg.evaluation.matching import Matches, match_people
 from shapepose_fg.evaluation.metrics import CORRECT_M, covariance_calibration, joint_metrics
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.solved_setup import CAMERAS
+from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.simulation import Scene, built_in_scene, simulate
 from shapepose_fg.viz.report.writing import REPORT, write_report
@@ -117,7 +118,7 @@ def run_demo(progress: Callable[[int, int], None] | None = None, scene: Scene | 
     config = PipelineConfig()
     before = before_refinement(detections, scene.rig, config)
     times = FrameTimes.from_fps(scene.fps, len(scene))
-    people = reconstruct(detections, scene.rig, config, times=times, progress=progress)
+    people = reconstruct(detections, scene.rig, config, times=times, execution=Execution(progress=progress))
     return Demo(scene, detections, people, alternation_errors(before, people, scene.keypoints))
 
 

@@ -22,6 +22,7 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections, DetectionSequence
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 
 STAGES = (
@@ -157,9 +158,8 @@ def spend(
     """
     fitter = TimedFitter(make_fitter(config.body, BodyModel.default().with_keypoints(recording.skeleton.joints)))
     before, start = os.times(), time.perf_counter()
-    people = reconstruct(
-        recording, rig, config, frames=frames, fitter=fitter, workers=workers, chunk_frames=chunk_frames
-    )
+    execution = Execution(workers=workers, chunk_frames=chunk_frames)
+    people = reconstruct(recording, rig, config, frames=frames, fitter=fitter, execution=execution)
     wall_s, after = time.perf_counter() - start, os.times()
     seconds = dict(people.run["seconds"])
     return Spent(

@@ -15,9 +15,8 @@ from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.estimation.estimator import Estimator, ExtraFactors
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.floor import Floor
-from shapepose_fg.pipeline.bodies_over_time import with_bodies_over_time
-from shapepose_fg.pipeline.person_bodies import SequenceFitting
-from shapepose_fg.pipeline.pipeline import PipelineConfig
+from shapepose_fg.pipeline.bodies_over_time import SequenceFitting, with_bodies_over_time
+from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.solved_rows import result_rows
 from shapepose_fg.pipeline.windows import near_border, window_stop
 

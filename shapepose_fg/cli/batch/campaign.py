@@ -10,7 +10,7 @@ from typing import Protocol
 from shapepose_fg.cli.batch.leader import Assignment, Leader
 from shapepose_fg.cli.batch.standing import Standing, Standings
 from shapepose_fg.cli.batch.table import Entry
-from shapepose_fg.cli.reconstruct.outcome import Ended
+from shapepose_fg.cli.reconstruct.request import Ended
 from shapepose_fg.pipeline.runs.manifest import PARTS
 
 ATTEMPTS = 2

@@ -15,8 +15,7 @@ from shapepose_fg.core.observation_table import ObservationTable
 from shapepose_fg.core.reconstruction import Reconstruction, count_rows, shared_columns
 from shapepose_fg.core.result_files import write_result
 from shapepose_fg.core.storage.npz_writer import Column
-from shapepose_fg.pipeline.bodies_over_time import BodiesOverTime
-from shapepose_fg.pipeline.person_bodies import Person
+from shapepose_fg.pipeline.bodies_over_time import BodiesOverTime, Person
 from shapepose_fg.pipeline.runs.parts import OBSERVED, Parts
 from shapepose_fg.pipeline.runs.rows_of_people import RowsOfPeople
 
