@@ -306,7 +306,7 @@ def test_help_names_the_commands(capsys):
 def test_config_prints_every_table_with_units(capsys):
     assert run("config") == 0
     printed = capsys.readouterr().out
-    assert "[candidates]" in printed
+    assert "[people]" in printed
     assert "gate_m = " in printed
 
 

@@ -18,9 +18,9 @@ from shapepose_fg.evaluation.metrics import joint_metrics
 from shapepose_fg.evaluation.shelf import evaluate_shelf, read_shelf_ground_truth
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
+from shapepose_fg.pipeline.config import PeopleConfig
 from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people, reconstruct
-from shapepose_fg.proposal.proposals import ProposalConfig
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.scene import Scene
 
@@ -78,7 +78,7 @@ def test_the_run_says_how_it_came_about(recording, people):
     run = people.run
     assert run["frames"] == [0, 16]
     assert run["people"]["found"] == len(people) == run["people"]["status"]["ok"]
-    assert run["configuration"]["window_graph"]["rho_3d"] == PipelineConfig().window_graph.rho_3d
+    assert run["configuration"]["people"]["gate_m"] == PipelineConfig().people.gate_m
     assert set(run["seconds"]) >= {"triangulate", "propose", "follow", "solve"}
     assert run["versions"]["gtsam"].startswith("4.")
     assert [each["person"] for each in run["probability"]] == np.unique(people.person).tolist()
@@ -231,7 +231,7 @@ def test_without_time_problems_and_phantoms_are_those_of_the_frames(scene, recor
 
 
 def test_settings_reach_their_steps(scene, recording):
-    strict = PipelineConfig(proposals=ProposalConfig(min_probability=1.0))
+    strict = PipelineConfig(people=PeopleConfig(min_probability=1.0))
     assert len(find_people(recording[0], scene.rig, BODY_25, strict)) == 0
     with pytest.raises(ValueError, match="batch_frames must be at least 1"):
         replace(strict, batch_frames=0)

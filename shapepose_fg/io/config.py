@@ -60,6 +60,9 @@ def _build(kind: type[T], table: dict[str, Any], path: Path, prefix: str = "", c
     known = [field.name for field in fields(cast(Any, kind)) if field.init]
     values = {}
     for key, value in table.items():
+        replaced: dict[str, str] = getattr(kind, "replaced", {})
+        if key in replaced:
+            raise InputError(f"{path}: {prefix}{key} {replaced[key]}; {cure}")
         if key not in known:
             near = get_close_matches(key, known, n=1, cutoff=0)[0]
             meant = cure if cure == ANOTHER_VERSION else f"did you mean {prefix}{near}?"

@@ -13,7 +13,7 @@ from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.core.storage.kept_arrays import KeptArrays
 from shapepose_fg.estimation.detector_offsets import AdjustableFitter, confident_targets, spread_frames
 from shapepose_fg.pipeline.config import PipelineConfig
-from shapepose_fg.pipeline.engine import Setup, find_people
+from shapepose_fg.pipeline.engine import Setup, StageOne
 from shapepose_fg.pipeline.runs.notes import Notebook
 from shapepose_fg.proposal.thinning import ThinnedFrames
 
@@ -74,9 +74,9 @@ def offsets_of(setup: Setup, detections: ThinnedFrames, book: Notebook) -> Keypo
     with book.stage("offsets"):
         spread = spread_frames(len(detections), config.offsets.frames)
         # Joints that three views see well are wanted: people whose hips they see are enough, and found faster.
-        hips = replace(config, proposals=replace(config.proposals, evidence=False))
-        people = [find_people(detections[t], rig, setup.skeleton, hips) for t in spread]
+        hips = StageOne.of(config).by_hips()
+        people = [hips.people(detections[t], rig, setup.skeleton, Notebook()) for t in spread]
         if len(people) == 0:
             return KeypointOffsets.identity()
-        targets = confident_targets(Observations.concatenate(people), rig, config.observations, config.offsets)
-        return learn_offsets(targets, fitter.model, config=config.body.plain, prior=config.offsets.prior)
+        targets = confident_targets(Observations.concatenate(people), rig, config.observations)
+        return learn_offsets(targets, fitter.model, config=config.body.plain)

@@ -13,7 +13,6 @@ from shapepose_fg.core.frame_times import stretches
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.estimation.estimator import Estimator, ExtraFactors
-from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.floor import Floor
 from shapepose_fg.pipeline.bodies_over_time import SequenceFitting, with_bodies_over_time
 from shapepose_fg.pipeline.config import PipelineConfig
@@ -36,9 +35,8 @@ def solve_rows(
     """
     if rows.observations is None:
         raise ValueError("rows without observations cannot be solved anew; reconstruct the recording again")
-    settings = EstimatorConfig(config.observations, config.window_graph, config.refine, config.motion)
     joint_names = tuple(rows.joint_names.tolist())
-    estimator = Estimator(rig, fitter, joint_names, settings)
+    estimator = Estimator(rig, fitter, joint_names, config.estimator)
     parts = []
     with torch_threads(config.threads):
         for window in _windows(rows, config):

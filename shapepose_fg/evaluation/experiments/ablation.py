@@ -10,14 +10,15 @@ from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Fig
 from shapepose_fg.evaluation.experiments.scale import Scale, Stretch, shorter
 from shapepose_fg.evaluation.experiments.scene_scores import mean_of, solve_and_score
 from shapepose_fg.evaluation.markdown import rule
+from shapepose_fg.evaluation.varied import varied
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 
 FRAMES = 30
 """Of each stretch."""
 
-OURS = replace(PipelineConfig(), temporal=False)
+OURS = varied(replace(PipelineConfig(), temporal=False))
 """What each is taken from: time stands in a row of its own."""
-PAPER = PipelineConfig.paper()
+PAPER = varied(PipelineConfig.paper())
 """What each is added to."""
 
 SWITCHES: dict[str, tuple[str, ...]] = {

@@ -17,6 +17,7 @@ from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.shelf import evaluate_shelf, match_actors, read_shelf_ground_truth
 from shapepose_fg.evaluation.shelf_events import identity_switches, lost_limbs, pcp_interval
 from shapepose_fg.evaluation.single_person import man_of, measure_single_person
+from shapepose_fg.evaluation.varied import varied
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 
 QUICK = range(20)
@@ -169,7 +170,7 @@ def _beside(scale: Scale, name: str) -> Figures:
     wrists = [footage.detections.skeleton.joints.index(joint) for joint in ("RWrist", "LWrist")]
     for reach_m in _REACHES_M:
         refine = replace(default.refine, draft_reach_m=reach_m)
-        found = beside(solve(config=replace(default, temporal=False, refine=refine)), timed)
+        found = beside(solve(config=replace(varied(default), temporal=False, refine=refine)), timed)
         figures[f"{reach_m:g}"] = {
             "share": 100 * found.share,
             "wrists": 100 * float(found.apart[wrists].sum() / max(found.seen[wrists].sum(), 1)),

@@ -16,7 +16,6 @@ from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.estimator import Estimator
-from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.linearisation import linearise, observation_sigmas, triangulate
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
@@ -71,7 +70,7 @@ def shelf_people(folder: Path) -> tuple[DetectionSequence, Rig, People]:
 def find(detections: DetectionSequence, rig: Rig, config: PipelineConfig) -> People:
     """Everybody in the recording, with bodies, every frame by itself."""
     parts, frames, joints, fits = [], [], [], []
-    settings = EstimatorConfig(config.observations, config.window_graph, config.refine, config.motion)
+    settings = config.estimator
     fitter = LevenbergMarquardtFitter(config=config.body.plain)
     estimator = Estimator(rig, fitter, BODY_25.joints, settings)
     for start in range(0, len(detections), BATCH):
