@@ -346,7 +346,6 @@ def short_scene(monkeypatch):
 
 
 def test_demo_compares_with_the_truth_and_leaves_a_picture(short_scene, tmp_path, monkeypatch, capsys):
-    pytest.importorskip("matplotlib")
     monkeypatch.chdir(tmp_path)
     assert run("demo") == 0
     printed = capsys.readouterr()
@@ -376,19 +375,6 @@ def test_a_report_is_left_or_taken_away(recording, pipeline, capsys):
     assert page.read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
     assert run(*recording, "--no-report") == 0
     assert not page.exists() and "to look at" not in capsys.readouterr().out
-
-
-def test_demo_without_matplotlib_says_what_to_install(short_scene, tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    assert run("demo", "--output", str(tmp_path / "out")) == 0
-    assert "no picture: the picture needs matplotlib: pip install shapepose-fg[viewer]" in capsys.readouterr().out
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
-        "cameras.json",
-        "observations.npz",
-        "people.npz",
-        "report.html",
-        "run.json",
-    ]
 
 
 def test_the_scene_is_what_the_demo_says_it_is():

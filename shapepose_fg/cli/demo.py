@@ -12,7 +12,6 @@ from rich.table import Table
 from rich.text import Text
 
 from shapepose_fg.core.detections import Recording
-from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.evaluation.alternation import JointErrors, alternation_errors, before_refinement
@@ -24,6 +23,7 @@ from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.simulation import Scene, built_in_scene, simulate
 from shapepose_fg.viz.report.writing import REPORT, write_report
+from shapepose_fg.viz.viewer import demo_picture
 
 _STAGES = {
     "triangulate": "pairs of views to 3D points",
@@ -76,18 +76,10 @@ class Demo:
         return Group(*(Padding(part, (1, 0, 0, 2)) for part in parts))
 
     def draw(self, path: Path) -> None:
-        """Write the picture of a typical frame; InputError where matplotlib is missing."""
-        from shapepose_fg.viz.viewer import demo_picture
-
+        """Write the picture of a typical frame."""
         frame = self.typical_frame
-        demo_picture(
-            path,
-            self.scene.rig,
-            self.people,
-            frame,
-            detections=self.detections[frame],
-            truth=self.scene.vertices_at(frame),
-        )
+        seen, truth = self.detections[frame], self.scene.vertices_at(frame)
+        demo_picture(path, self.scene.rig, self.people, frame, seen, truth)
 
     def save(self, folder: Path, *, report: bool = True) -> list[str]:
         """Write people.npz and what belongs to it, the report and the picture; returns what to tell the user."""
@@ -104,10 +96,7 @@ class Demo:
         else:
             (folder / REPORT).unlink(missing_ok=True)
         picture = folder / "picture.png"
-        try:
-            self.draw(picture)
-        except InputError as hint:
-            return [*told, f"no picture: {hint}"]
+        self.draw(picture)
         return [*told, f"{picture}  frame {self.typical_frame}, one of middling error; grey: the truth"]
 
 

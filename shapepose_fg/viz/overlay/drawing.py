@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.skeleton import BODY_25, SKELETONS
 from shapepose_fg.io.footage.footage import Picture
+from shapepose_fg.viz.bodies import joined
 from shapepose_fg.viz.overlay.picture_view import PictureView
 from shapepose_fg.viz.rendering import rasterise
 
@@ -51,11 +52,9 @@ def draw_bodies(
     colours: Sequence[Colour],
 ) -> Picture:
     """The surfaces `vertices` (P, Nv, 3), metres, half transparent in a colour each, lit from the camera."""
-    people, count = vertices.shape[:2]
-    if people == 0:
+    if len(vertices) == 0:
         return picture
-    points = vertices.reshape(-1, 3).astype(np.float64)
-    corners = (faces[None] + count * np.arange(people)[:, None, None]).reshape(-1, 3)
+    points, corners = joined(vertices, faces)
     xy, depth = view.project(points)
     surface = rasterise(xy, depth, corners, view.size, cull_back=True)
     row, column = np.nonzero(surface.face >= 0)

@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.observation_table import Gate
-from shapepose_fg.core.reconstruction import Known, OpenedReconstruction, Reconstruction, Status
+from shapepose_fg.core.reconstruction import Known, OpenedReconstruction, Reconstruction
 from shapepose_fg.io.footage.footage import Footage, Picture
 from shapepose_fg.io.footage.used import CameraFootage
+from shapepose_fg.viz.bodies import surfaces
 from shapepose_fg.viz.overlay.drawing import (
     Colour,
     Skeletons,
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel
 
 _INK: Colour = (45, 45, 45)
-_BODY = ("betas", "global_orient", "body_pose", "transl")
 
 
 @dataclass(frozen=True)
@@ -66,15 +65,16 @@ class Overlay:
         """
         people = self.people.at(frame)
         people = people.rows(np.argsort(people.person, kind="stable"))
-        vertices, whose = self._bodies(people)
+        body = self.body if self.content.bodies else None
+        vertices, rows = (np.zeros((0, 0, 3)), ()) if body is None else surfaces(people, body)
         drawn = []
         for (used, footage), size in zip(self.cameras, sizes, strict=True):
             camera = self.rig.cameras[self.rig.names.index(used.name)]
             view = PictureView(camera, used.placement, size)
             picture = _picture(used, footage, frame, size)
-            if self.content.bodies and len(vertices) > 0 and self.body is not None:
-                colours = [self.colour(person) for person in whose.tolist()]
-                picture = draw_bodies(picture, view, vertices, self.body.faces, colours)
+            if body is not None and len(vertices) > 0:
+                colours = [self.colour(person) for person in people.person[list(rows)].tolist()]
+                picture = draw_bodies(picture, view, vertices, body.faces, colours)
             if self.content.detections:
                 self._draw_detections(picture, view, people)
             if self.content.skeletons:
@@ -96,24 +96,6 @@ class Overlay:
             colours=[self.colour(person) for person in people.person.tolist()],
             labels=[f"person {person}" for person in people.person.tolist()],
         )
-
-    def _bodies(self, people: Reconstruction) -> tuple[NDArray[np.float64], NDArray[np.integer]]:
-        """Surfaces (P, Nv, 3) of those who have a body, and who they are (P,)."""
-        if not self.content.bodies or self.body is None:
-            return np.zeros((0, 0, 3)), people.person[:0]
-        import torch
-
-        from shapepose_fg.body.model.body_model import BodyParameters
-
-        there = people.status == str(Status.OK)
-        for name in _BODY:
-            there = there & np.isfinite(getattr(people, name)).reshape(len(people), -1).all(axis=1)
-        if not there.any():
-            return np.zeros((0, 0, 3)), people.person[:0]
-        parts = (torch.from_numpy(getattr(people, name)[there]).to(self.body.dtype) for name in _BODY)
-        with torch.no_grad():
-            vertices = self.body.vertices(BodyParameters(*parts)).numpy().astype(np.float64)
-        return vertices, people.person[there]
 
     def _draw_detections(self, picture: Picture, view: PictureView, people: Reconstruction) -> None:
         """What this camera saw of the people of one frame."""

@@ -87,7 +87,8 @@ class VideoFile:
 
 def write_picture(path: Path, picture: Picture) -> None:
     """Write a picture; the ending, .png or .jpg, says how."""
-    done, content = cv2.imencode(path.suffix, picture, [cv2.IMWRITE_JPEG_QUALITY, 90])
+    quality = [cv2.IMWRITE_JPEG_QUALITY, 90] if path.suffix == ".jpg" else []
+    done, content = cv2.imencode(path.suffix, picture, quality)
     if not done:
         raise InputError(f"{path}: the picture cannot be written in this format; use .png or .jpg")
     write_atomically(path, lambda stream: stream.write(content.tobytes()))
