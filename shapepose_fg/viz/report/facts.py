@@ -4,17 +4,24 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from typing import Any
 
-from shapepose_fg.pipeline.pipeline import PipelineConfig
+from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.viz.report.figures import number
 
 Run = Mapping[str, Any]
 
 
 def changed_settings(run: Run) -> list[tuple[str, str, str]]:
-    """Settings that are not the default: dotted name, value, default; a dash where there is none any more."""
+    """Settings that are not the default: dotted name, value, default; a dash where there is none any more.
+
+    Tables of an older program, of which everything was written down, are left out.
+    """
     usual = dict(_flat(asdict(PipelineConfig())))
     given = {name: (_text(value), _text(usual.get(name, "–"))) for name, value in _flat(run.get("configuration"))}
-    return [(name, value, default) for name, (value, default) in given.items() if value != default]
+    return [
+        (name, value, default)
+        for name, (value, default) in given.items()
+        if value != default and name.split(".")[0] not in PipelineConfig.replaced
+    ]
 
 
 def dropped(run: Run) -> list[tuple[str, int, str]]:
