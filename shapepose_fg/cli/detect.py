@@ -146,7 +146,9 @@ def detect(
             raise
     for name, failed in zip(rig.names, report.unreadable, strict=True):
         if failed > 0:
-            note(f"camera {name}: {failed} of {report.moments} pictures cannot be read; it sees nobody there")
+            note(
+                f"camera {name}: {failed} of {report.moments} pictures cannot be read; it has no detections there"
+            )
     show(_summary(run, report, time.perf_counter() - begin))
     print(_next_command(run, cameras))
 

@@ -22,7 +22,8 @@ INPUT, TIME, RESULT, RUN, DRAW = "Input", "Time", "Result", "Run", "What is draw
 
 def option(group: str, text: str, *names: str, **more: Any) -> Any:
     """An option under a heading, with its help."""
-    return typer.Option(*names, help=text, rich_help_panel=group, **({"show_default": False} | more))
+    how: dict[str, Any] = {"show_default": False} | more
+    return typer.Option(*names, help=text, rich_help_panel=group, **how)
 
 
 def grouped(command: Callable[..., Any]) -> Callable[..., Any]:

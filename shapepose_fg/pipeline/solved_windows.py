@@ -137,8 +137,8 @@ class SolvedWindows:
                 for each in problems
             ]
         notes = Notes(solved.frames, dict(solved.seconds), problems=problems)
-        if len(solved.nobody) > 0:
-            notes.dropped[_FALSE_POSITIVE] = list(solved.nobody)
+        if len(solved.false_positives) > 0:
+            notes.dropped[_FALSE_POSITIVE] = list(solved.false_positives)
         said = np.isfinite(rows.evidence)
         if temporal:
             for track in np.unique(rows.track[said]).tolist():

@@ -67,7 +67,7 @@ class _Window:
         """Rows in its own frames, and in those within `overlap_s` of its borders, none beyond a cut."""
         frame, time_s = rows.frame, rows.time_s
         known, first = np.unique(frame, return_index=True)
-        # Where nobody of `rows` is in the frame at a border, its time is between those of the frames around it.
+        # Where no row is in the frame at a border, its time is between those of the frames around it.
         begin_s, end_s = np.interp([self.own.start, self.own.stop], known, time_s[first])
         own = _inside(frame, self.own)
         before = near_border(time_s, begin_s, overlap_s) & (frame < self.own.start)

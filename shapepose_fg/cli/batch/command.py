@@ -47,7 +47,7 @@ def batch(
 
 
 def _run(table: Path, entries: "list[Entry]", output: Path, running: RunOptions, at_once: int | None) -> None:
-    """The batch in a folder where nobody else writes."""
+    """The batch, in a folder that no other process writes to."""
     from shapepose_fg.cli.batch.campaign import Campaign
     from shapepose_fg.cli.batch.check import look_at_all
     from shapepose_fg.cli.batch.standing import BATCH, Standings

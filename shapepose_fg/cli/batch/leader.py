@@ -1,6 +1,6 @@
 """One recording, led by a process of its own: it reads, hands out work to the cluster, and writes the results.
 
-A process and not a thread, so that one recording's error, memory or crash is no other's, and nobody waits for
+A process and not a thread, so that one recording's error, memory or crash is no other's, and none waits for
 Python's lock.
 """
 

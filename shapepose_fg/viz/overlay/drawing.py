@@ -12,6 +12,7 @@ from shapepose_fg.io.footage.footage import Picture
 from shapepose_fg.viz.bodies import joined
 from shapepose_fg.viz.overlay.picture_view import PictureView
 from shapepose_fg.viz.rendering import rasterise
+from shapepose_fg.viz.viewer.palette import colour_of
 
 Colour = tuple[int, int, int]
 """Blue, green, red, 0 to 255."""
@@ -28,6 +29,12 @@ _FINE = 8
 """Bits of a pixel's fraction in OpenCV's drawing."""
 _NOT_BONES = {("RShoulder", "REar"), ("LShoulder", "LEar")}
 """Links of detectors that are no bones."""
+
+
+def blue_green_red(person: int) -> Colour:
+    """The colour of an identity: the same in all that draws the result."""
+    red, green, blue = (round(255 * part) for part in colour_of(person))
+    return blue, green, red
 
 
 def bones_of(joint_names: Sequence[str]) -> NDArray[np.intp]:
@@ -104,7 +111,7 @@ def draw_skeletons(picture: Picture, view: PictureView, people: Skeletons) -> No
             cv2.circle(picture, centre, radius, _WHITE if filled else _DARK, -1, cv2.LINE_AA, _FINE)
             cv2.circle(picture, centre, radius, colour, max(1, stroke // 2), cv2.LINE_AA, _FINE)
         tops.append(_top(xy[known], view.size))
-    # Names last: nobody's limbs cross them.
+    # Names last: no limbs cross them.
     for top, colour, label in zip(tops, people.colours, people.labels, strict=True):
         if top is not None:
             draw_label(picture, label, (top[0], top[1] - 5 * stroke), colour)

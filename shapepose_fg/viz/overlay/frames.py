@@ -16,6 +16,7 @@ from shapepose_fg.viz.bodies import surfaces
 from shapepose_fg.viz.overlay.drawing import (
     Colour,
     Skeletons,
+    blue_green_red,
     bones_of,
     draw_bodies,
     draw_detections,
@@ -23,7 +24,6 @@ from shapepose_fg.viz.overlay.drawing import (
     draw_skeletons,
 )
 from shapepose_fg.viz.overlay.picture_view import PictureView
-from shapepose_fg.viz.viewer.palette import colour_of
 
 if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel
@@ -73,7 +73,7 @@ class Overlay:
             view = PictureView(camera, used.placement, size)
             picture = _picture(used, footage, frame, size)
             if body is not None and len(vertices) > 0:
-                colours = [self.colour(person) for person in people.person[list(rows)].tolist()]
+                colours = [blue_green_red(person) for person in people.person[list(rows)].tolist()]
                 picture = draw_bodies(picture, view, vertices, body.faces, colours)
             if self.content.detections:
                 self._draw_detections(picture, view, people)
@@ -83,17 +83,12 @@ class Overlay:
             drawn.append(picture)
         return drawn
 
-    def colour(self, person: int) -> Colour:
-        """The colour of an identity, blue, green, red: the same in all that draws the result."""
-        red, green, blue = (round(255 * part) for part in colour_of(person))
-        return blue, green, red
-
     def _skeletons(self, people: Reconstruction) -> Skeletons:
         return Skeletons(
             joints=people.joints,
             seen=np.isin(people.known, (Known.SEEN, Known.UNKNOWN)),
             bones=bones_of(people.joint_names.tolist()),
-            colours=[self.colour(person) for person in people.person.tolist()],
+            colours=[blue_green_red(person) for person in people.person.tolist()],
             labels=[f"person {person}" for person in people.person.tolist()],
         )
 
@@ -106,7 +101,7 @@ class Overlay:
         gate = table.gate[..., v]
         row, joint = np.nonzero(gate != Gate.NOT_SEEN)
         xy = view.through_lens(table.xy[row, joint, v])
-        colours = np.array([self.colour(person) for person in table.person[row].tolist()]).reshape(-1, 3)
+        colours = np.array([blue_green_red(person) for person in table.person[row].tolist()]).reshape(-1, 3)
         draw_detections(picture, xy, gate[row, joint] == Gate.USED, colours)
 
 

@@ -37,7 +37,7 @@ def dropped(run: Run) -> list[tuple[str, int, str]]:
 
 
 def probabilities(run: Run) -> dict[int, float]:
-    """How probable it is that each person was there, by number; nobody where every frame stands alone."""
+    """How probable it is that each person was there, by number; empty frame by frame."""
     listed = run.get("probability")
     entries = [_object(each) for each in (listed if isinstance(listed, list) else [])]
     found = {number(each.get("person")): number(each.get("probability")) for each in entries}
@@ -45,7 +45,7 @@ def probabilities(run: Run) -> dict[int, float]:
 
 
 def problems(run: Run) -> list[str]:
-    """Whom the solver could not solve: person, frame, joint and reason."""
+    """What could not be solved: person, frame, joint and reason."""
     listed = _object(run.get("people")).get("problems")
     entries = listed if isinstance(listed, list) else []
     return [", ".join(f"{key} {value}" for key, value in _object(each).items()) for each in entries]

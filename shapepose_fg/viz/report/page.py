@@ -32,7 +32,7 @@ class Content:
     cameras: Sequence[CameraFigures]
     """What became of each camera's detections; none where that is not recorded."""
     scene: Scene | None
-    """What is drawn; None where nobody was found."""
+    """What is drawn; None where there are no people."""
     remarks: Sequence[str] = ()
     """What the page lacks, a sentence each."""
 

@@ -62,7 +62,7 @@ def people_section(people: Reconstruction, tracks: Sequence[TrackSummary], over_
     words = (
         "A person is the same number and colour everywhere. Height is that of the fitted body standing upright."
         if over_time
-        else "Every frame stands alone here (--no-temporal): a number is nobody's over time."
+        else "Every frame was solved by itself (--no-temporal): a number is no identity."
     )
     return section(
         "people",
@@ -105,7 +105,7 @@ def cameras_section(cameras: Sequence[CameraFigures]) -> Element:
         "“All” counts every detection that was given to somebody, before gates. ",
         "Left out: the median distance to where the other cameras alone put the joint. " if left_out else "",
         f"Lines over time go from 0 to {most:.0f} px. A camera whose error stands out is calibrated badly, ",
-        "late, or sees people whom the others do not see.",
+        "late, or sees people that the others do not see.",
     ]
     numbers = set(range(1, len(head) - 1))
     return section(

@@ -14,7 +14,7 @@ from shapepose_fg.core.reconstruction import Known, Reconstruction
 from shapepose_fg.io.footage.footage import Picture
 from shapepose_fg.io.footage.placement import Placement, PlacementKind
 from shapepose_fg.viz.bodies import joined, surfaces
-from shapepose_fg.viz.overlay.drawing import Skeletons, bones_of, draw_label, draw_skeletons
+from shapepose_fg.viz.overlay.drawing import Skeletons, blue_green_red, bones_of, draw_label, draw_skeletons
 from shapepose_fg.viz.overlay.output import write_picture
 from shapepose_fg.viz.overlay.picture_view import PictureView
 from shapepose_fg.viz.rendering import look_at, render_depth, render_shaded, zoom
@@ -125,7 +125,7 @@ def _draw_people(panel: Picture, camera: Camera, people: Reconstruction, rows: N
         joints=some.joints,
         seen=np.isin(some.known, (Known.SEEN, Known.UNKNOWN)),
         bones=bones_of(some.joint_names.tolist()),
-        colours=[tuple(round(255 * part) for part in colour_of(each)[::-1]) for each in numbers],
+        colours=[blue_green_red(each) for each in numbers],
         labels=[f"person {each}" for each in numbers],
     )
     draw_skeletons(panel, view, drawn)
