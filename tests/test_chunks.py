@@ -13,12 +13,11 @@ from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.core.storage.kept_arrays import InFolder
 from shapepose_fg.pipeline.engine import Setup
 from shapepose_fg.pipeline.execution import Execution
-from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct, reconstruct_parts
+from shapepose_fg.pipeline.pipeline import PipelineConfig, Task, reconstruct, reconstruct_parts
 from shapepose_fg.pipeline.runs import chunks
 from shapepose_fg.pipeline.runs.borders import Border, same_people
 from shapepose_fg.pipeline.runs.chunks import Chunk, cut_in_chunks, windows_of
 from shapepose_fg.pipeline.solved_windows import ChunkJob, solve_chunk
-from shapepose_fg.pipeline.task import Task
 from shapepose_fg.pipeline.windows import Engine, WindowConfig
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.tracking.following import FollowingConfig

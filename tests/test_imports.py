@@ -34,7 +34,7 @@ LEVELS = (
     "pipeline.config pipeline.cluster",
     "pipeline.runs",
     "pipeline.engine",
-    "pipeline.execution pipeline.task pipeline.offsets pipeline.solved_windows",
+    "pipeline.execution pipeline.offsets pipeline.solved_windows",
     "pipeline.pipeline",
     "io pipeline.solving",
     "simulation viz.viewer.palette viz.bodies detection2d",

@@ -25,11 +25,10 @@ from shapepose_fg.core.storage.output_folder import only_run_in
 from shapepose_fg.estimation.detector_offsets import OffsetConfig
 from shapepose_fg.io.config import toml_text
 from shapepose_fg.pipeline.execution import Execution
-from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct, reconstruct_parts
+from shapepose_fg.pipeline.pipeline import PipelineConfig, Task, reconstruct, reconstruct_parts
 from shapepose_fg.pipeline.runs.known_people import checksum_at_start, people_at_start, write_people
 from shapepose_fg.pipeline.runs.manifest import end_run, open_run
 from shapepose_fg.pipeline.runs.room import check_room, expected_bytes
-from shapepose_fg.pipeline.task import Task
 from shapepose_fg.pipeline.windows import WindowConfig
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.files import write_simulated

@@ -1,8 +1,9 @@
 """The whole way: triangulate, vote, propose, associate; follow, solve in windows, put bodies on; rows out."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
 
 from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.fitting.fitters import make_fitter
@@ -12,7 +13,7 @@ from shapepose_fg.body.shapes import SubjectShapes
 from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import DetectionSequence
-from shapepose_fg.core.frame_times import FrameTimes, spans_of
+from shapepose_fg.core.frame_times import FrameTimes, check_cuts, spans_of
 from shapepose_fg.core.provenance import versions
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import Skeleton
@@ -33,10 +34,24 @@ from shapepose_fg.pipeline.runs.parts import Parts
 from shapepose_fg.pipeline.runs.rows_of_people import RowsOfPeople
 from shapepose_fg.pipeline.runs.standing import floor_of
 from shapepose_fg.pipeline.solved_windows import SolvedWindows
-from shapepose_fg.pipeline.task import Task, moved_into_execution
 from shapepose_fg.proposal.thinning import ThinnedFrames
 from shapepose_fg.tracking.evidence import probability
 from shapepose_fg.tracking.stitching import Ends, Trace, stitch
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def moved_into_execution(function: Callable[P, R]) -> Callable[P, R]:
+    """`function`, which names `Execution` where it is given an argument that went there."""
+
+    @wraps(function)
+    def called(*arguments: P.args, **options: P.kwargs) -> R:
+        for name in {"workers", "cluster", "chunk_frames", "progress"} & options.keys():
+            raise TypeError(f"{name} is a part of what runs it now: give execution=Execution({name}=...)")
+        return function(*arguments, **options)
+
+    return called
 
 
 @moved_into_execution
@@ -70,6 +85,31 @@ def reconstruct(
     config = PipelineConfig() if config is None else config
     task = Task(detections, rig, config, frames, times, cuts, shapes, fitter, extra_factors)
     return reconstruct_parts(InMemory(), task, execution).reconstruction(consume=True)
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is to be reconstructed: the arguments of `reconstruct`, which describes them."""
+
+    detections: DetectionSequence
+    rig: Rig
+    config: PipelineConfig = field(default_factory=PipelineConfig)
+    frames: range | None = None
+    times: FrameTimes | None = None
+    cuts: Sequence[int] = ()
+    shapes: SubjectShapes | None = None
+    fitter: BodyFitter | None = None
+    extra_factors: ExtraFactors | None = None
+
+    def whole(self) -> tuple[range, FrameTimes, list[int]]:
+        """Frames, times and cuts, those that are not given filled in; ValueError where they do not fit."""
+        count = len(self.detections)
+        frames = range(count) if self.frames is None else self.frames
+        if frames.step != 1 or not 0 <= frames.start <= frames.stop <= count:
+            raise ValueError(f"frames must be a range of step 1 within 0:{count}, got {frames}")
+        times = FrameTimes.assumed(count) if self.times is None else self.times
+        times.check(count, len(self.rig))
+        return frames, times, list(check_cuts(self.cuts, count))
 
 
 def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None = None) -> Assembly:

@@ -12,7 +12,7 @@ import pytest
 
 from shapepose_fg.cli.batch.table import read_table
 from shapepose_fg.cli.main import main
-from shapepose_fg.cli.reconstruct.carry_out import carry_out
+from shapepose_fg.cli.reconstruct.command import carry_out
 from shapepose_fg.cli.stopping import Stopped
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes

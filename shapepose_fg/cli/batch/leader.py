@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from shapepose_fg.cli.batch.check import LOG
-from shapepose_fg.cli.reconstruct.carry_out import carry_out
+from shapepose_fg.cli.reconstruct.command import carry_out
 from shapepose_fg.cli.reconstruct.request import Ended, Request
 from shapepose_fg.cli.stopping import Stopped, stoppable
 from shapepose_fg.cli.terminal import use_any_streams

@@ -11,8 +11,8 @@ from shapepose_fg.cli.terminal import note, show, warn
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import rate_words
 from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.pipeline.pipeline import Task
 from shapepose_fg.pipeline.runs.assembly import Assembly
-from shapepose_fg.pipeline.task import Task
 from shapepose_fg.setup_check.camera_use import use_table
 from shapepose_fg.setup_check.diagnosis import diagnose
 from shapepose_fg.setup_check.in_result import ResultCheck, result_check

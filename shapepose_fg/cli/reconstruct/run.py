@@ -29,12 +29,11 @@ from shapepose_fg.io.export.pose2sim_files import write_pose2sim_files
 from shapepose_fg.io.solved_setup import CAMERAS
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.execution import Execution
-from shapepose_fg.pipeline.pipeline import reconstruct_parts
+from shapepose_fg.pipeline.pipeline import Task, reconstruct_parts
 from shapepose_fg.pipeline.runs.assembly import Assembly
 from shapepose_fg.pipeline.runs.known_people import checksum_at_start, people_at_start, write_people
 from shapepose_fg.pipeline.runs.manifest import PARTS, end_run, frames_done, open_run
 from shapepose_fg.pipeline.runs.room import check_room, expected_bytes
-from shapepose_fg.pipeline.task import Task
 from shapepose_fg.viz.report.writing import MOST_ROWS, REPORT, th, write_report
 
 
