@@ -259,6 +259,7 @@ def test_errors_are_one_sentence_and_exit_code_2(recording, pipeline, capsys, op
     [
         (["reconstruct"], "--calibration, --detections and --output: missing; give them, or --project"),
         (["rebuild"], "No such command 'rebuild'"),
+        (["evaluate", "shelf", "--people", "x"], "No such option: --people; give the result"),
         (
             ["evaluate", "shelf", "/nothing", "--ground-truth", "/gt.txt"],
             "/nothing: there is no such file",
@@ -308,6 +309,21 @@ def test_config_prints_every_table_with_units(capsys):
     printed = capsys.readouterr().out
     assert "[people]" in printed
     assert "gate_m = " in printed
+
+
+def test_help_groups_the_options(capsys):
+    """The same words for the same things, under the same headings."""
+    for command, groups in (
+        ("reconstruct", ("Input", "Time", "Result", "Run")),
+        ("overlay", ("Input", "What is drawn", "Time", "Result")),
+        ("detect", ("Input", "Network", "Time", "Result")),
+    ):
+        assert run(command, "--help") == 0
+        printed = capsys.readouterr().out
+        assert all(f"─ {group} ─" in printed for group in groups)
+    assert run("--help") == 0
+    printed = capsys.readouterr().out
+    assert all(words in printed for words in ("From a recording to a result", "With a result", "To try"))
 
 
 def test_evaluate_shelf(shared_data, tmp_path, capsys):

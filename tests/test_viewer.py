@@ -96,6 +96,11 @@ def test_two_cameras_are_enough(tmp_path: Path, scene: Scene, found: Reconstruct
     assert picture(tmp_path / "two.png").shape[1] == 1800
 
 
+def test_there_are_no_surfaces_of_no_rows(scene: Scene):
+    bodies, rows = surfaces(Reconstruction.empty(), scene.body)
+    assert bodies.shape == (0, scene.body.num_vertices, 3) and len(rows) == 0
+
+
 def test_surfaces_are_those_of_rows_with_a_body_and_lie_under_skeletons(scene: Scene, found: Reconstruction):
     people = without_body(found, 0).at(0)
     bodies, rows = surfaces(people, scene.body)
