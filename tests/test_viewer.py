@@ -13,9 +13,8 @@ from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.simulation import DetectorConfig, Scene, built_in_scene, simulate
 from shapepose_fg.viz.bodies import joined, surfaces
 from shapepose_fg.viz.rendering import look_at, render_depth
-from shapepose_fg.viz.viewer import demo_picture
 from shapepose_fg.viz.viewer.floor import Floor, floor_picture
-from shapepose_fg.viz.viewer.picture import floor_under, framed, free_viewpoint, two_views
+from shapepose_fg.viz.viewer.picture import demo_picture, floor_under, framed, free_viewpoint, two_views
 
 UP = np.array([0.0, 0.0, 1.0])
 

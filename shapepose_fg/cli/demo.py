@@ -22,7 +22,7 @@ from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.simulation import Scene, built_in_scene, simulate
 from shapepose_fg.viz.report.writing import REPORT, write_report
-from shapepose_fg.viz.viewer import demo_picture
+from shapepose_fg.viz.viewer.picture import demo_picture
 
 _STAGES = {
     "triangulate": "pairs of views to 3D points",

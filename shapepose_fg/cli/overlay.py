@@ -74,7 +74,7 @@ def overlay(
         rig, run = read_rig(folder / CAMERAS), people.run
         names = pictures.named(rig) if drawn.cameras is None else _cameras(drawn.cameras, rig)
         shown = pictures.of_result(run, rig, names, detections)
-        content = OverlayContent(skeletons=drawn.skeletons, bodies=drawn.bodies, detections=drawn.points)
+        content = OverlayContent(skeletons=drawn.skeletons, detections=drawn.points)
         if drawn.points and not people.observed:
             note(f"{folder}: there is no observations.npz, so no detections are drawn")
         over = Overlay(people, rig, shown, content, _body(run) if drawn.bodies else None)

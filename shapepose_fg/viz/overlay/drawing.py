@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.reconstruction import Known, Reconstruction
 from shapepose_fg.core.skeleton import BODY_25, SKELETONS
 from shapepose_fg.io.footage.footage import Picture
 from shapepose_fg.viz.bodies import joined
@@ -90,6 +91,18 @@ class Skeletons:
     """(P,) one for each person."""
     labels: Sequence[str]
     """(P,) what is written above each person."""
+
+    @classmethod
+    def of(cls, people: Reconstruction) -> "Skeletons":
+        """Of the rows of one frame."""
+        numbers = people.person.tolist()
+        return cls(
+            joints=people.joints,
+            seen=np.isin(people.known, (Known.SEEN, Known.UNKNOWN)),
+            bones=bones_of(people.joint_names.tolist()),
+            colours=[blue_green_red(each) for each in numbers],
+            labels=[f"person {each}" for each in numbers],
+        )
 
 
 def draw_skeletons(picture: Picture, view: PictureView, people: Skeletons) -> None:

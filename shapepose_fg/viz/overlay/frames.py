@@ -9,7 +9,7 @@ import numpy as np
 
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.observation_table import Gate
-from shapepose_fg.core.reconstruction import Known, OpenedReconstruction, Reconstruction
+from shapepose_fg.core.reconstruction import OpenedReconstruction, Reconstruction
 from shapepose_fg.io.footage.footage import Footage, Picture
 from shapepose_fg.io.footage.used import CameraFootage
 from shapepose_fg.viz.bodies import surfaces
@@ -17,7 +17,6 @@ from shapepose_fg.viz.overlay.drawing import (
     Colour,
     Skeletons,
     blue_green_red,
-    bones_of,
     draw_bodies,
     draw_detections,
     draw_label,
@@ -37,8 +36,6 @@ class OverlayContent:
 
     skeletons: bool = True
     """Bones and joints, with the person's number."""
-    bodies: bool = False
-    """The bodies' surfaces."""
     detections: bool = True
     """2D detections that were used, and in another colour those that were not."""
 
@@ -56,7 +53,7 @@ class Overlay:
     content: OverlayContent = OverlayContent()
     """What is drawn."""
     body: "BodyModel | None" = None
-    """The model of the bodies; needed where they are drawn."""
+    """The model of the bodies; None where they are not drawn."""
 
     def draw(self, frame: int, sizes: Sequence[tuple[int, int]]) -> list[Picture]:
         """Each camera's picture of `frame`, drawn on, at a size (width, height) of its own.
@@ -65,32 +62,23 @@ class Overlay:
         """
         people = self.people.at(frame)
         people = people.rows(np.argsort(people.person, kind="stable"))
-        body = self.body if self.content.bodies else None
+        body = self.body
         vertices, rows = (np.zeros((0, 0, 3)), ()) if body is None else surfaces(people, body)
         drawn = []
         for (used, footage), size in zip(self.cameras, sizes, strict=True):
             camera = self.rig.cameras[self.rig.names.index(used.name)]
             view = PictureView(camera, used.placement, size)
             picture = _picture(used, footage, frame, size)
-            if body is not None and len(vertices) > 0:
+            if body is not None:
                 colours = [blue_green_red(person) for person in people.person[list(rows)].tolist()]
                 picture = draw_bodies(picture, view, vertices, body.faces, colours)
             if self.content.detections:
                 self._draw_detections(picture, view, people)
             if self.content.skeletons:
-                draw_skeletons(picture, view, self._skeletons(people))
+                draw_skeletons(picture, view, Skeletons.of(people))
             draw_label(picture, f"camera {used.name}, frame {frame}", (0, 0), _INK, centred=False)
             drawn.append(picture)
         return drawn
-
-    def _skeletons(self, people: Reconstruction) -> Skeletons:
-        return Skeletons(
-            joints=people.joints,
-            seen=np.isin(people.known, (Known.SEEN, Known.UNKNOWN)),
-            bones=bones_of(people.joint_names.tolist()),
-            colours=[blue_green_red(person) for person in people.person.tolist()],
-            labels=[f"person {person}" for person in people.person.tolist()],
-        )
 
     def _draw_detections(self, picture: Picture, view: PictureView, people: Reconstruction) -> None:
         """What this camera saw of the people of one frame."""

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.detections import Detections
-from shapepose_fg.core.reconstruction import Known, Reconstruction
+from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.io.footage.footage import Picture
 from shapepose_fg.io.footage.placement import Placement, PlacementKind
 from shapepose_fg.viz.bodies import joined, surfaces
-from shapepose_fg.viz.overlay.drawing import Skeletons, blue_green_red, bones_of, draw_label, draw_skeletons
+from shapepose_fg.viz.overlay.drawing import Skeletons, draw_label, draw_skeletons
 from shapepose_fg.viz.overlay.output import write_picture
 from shapepose_fg.viz.overlay.picture_view import PictureView
 from shapepose_fg.viz.rendering import look_at, render_depth, render_shaded, zoom
@@ -119,16 +119,7 @@ def _draw_people(panel: Picture, camera: Camera, people: Reconstruction, rows: N
     """The skeletons of some rows, with who they are."""
     placement = Placement.of(PlacementKind.SAME, camera.image_size, camera.image_size)
     view = PictureView(camera, placement, camera.image_size)
-    some = people.rows(rows)
-    numbers = some.person.tolist()
-    drawn = Skeletons(
-        joints=some.joints,
-        seen=np.isin(some.known, (Known.SEEN, Known.UNKNOWN)),
-        bones=bones_of(some.joint_names.tolist()),
-        colours=[blue_green_red(each) for each in numbers],
-        labels=[f"person {each}" for each in numbers],
-    )
-    draw_skeletons(panel, view, drawn)
+    draw_skeletons(panel, view, Skeletons.of(people.rows(rows)))
 
 
 def _draw_dots(panel: Picture, window: Camera, camera: Camera, xy: Array) -> None:
