@@ -2,7 +2,7 @@
 
     python scripts/run_pose2sim.py --venv /tmp/pose2sim --output others                  # Shelf and six stretches
     python scripts/run_pose2sim.py --venv /tmp/pose2sim --output others --only shelf
-    shapepose-fg evaluate shelf others/shelf/pose2sim --ground-truth shelf/gt_dev.txt
+    shapepose-fg evaluate shelf --people others/shelf/pose2sim --ground-truth shelf/gt_dev.txt
 
 Makes the environment DIR where there is none, and installs Pose2Sim from PyPI into it; nothing of it is among our
 dependencies. For every recording it writes a project as Pose2Sim wants it (cameras in TOML; people of each view,

@@ -11,7 +11,6 @@ from shapepose_fg.evaluation.alternation import BeforeRefinement, alternation_er
 from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.matching import match_people
 from shapepose_fg.evaluation.metrics import JointMetrics, covariance_calibration, joint_metrics
-from shapepose_fg.evaluation.varied import varied
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.simulation import built_in_scene, simulate
 
@@ -21,7 +20,7 @@ DEMO = 0
 """The scene of `shapepose-fg demo`."""
 CAMERAS = (2, 3, 4, 6, 8, 10)
 """Numbers of cameras that are compared."""
-CONFIG = varied(replace(PipelineConfig(), temporal=False))
+CONFIG = replace(PipelineConfig(), temporal=False)
 """Every frame by itself."""
 DOUBTFUL = 0.25
 """A joint whose mean confidence over all views is less is seen badly (the paper's rho_3D)."""

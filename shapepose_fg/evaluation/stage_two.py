@@ -15,6 +15,7 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.estimator import Estimates, Estimator
+from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 
 
@@ -39,7 +40,7 @@ def solve_alone(
     if offsets is not None:
         fitter = fitter.with_keypoint_offsets(offsets)
     counted = _Counted(fitter)
-    settings = config.estimator
+    settings = EstimatorConfig(config.observations, config.window_graph, config.refine, config.motion)
     estimator = Estimator(rig, counted, BODY_25.joints, settings)
     alone = replace(observations, track=np.arange(len(observations)))  # no two rows are one person's
     with torch_threads(config.threads):

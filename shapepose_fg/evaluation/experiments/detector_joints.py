@@ -143,7 +143,7 @@ def _targets(shelf: Footage, start: int, length: int) -> JointTargets:
     frames = [start + frame for frame in spread_frames(length - _APART, FRAMES)]
     detections = shelf.detections
     rows = [find_people(detections[t], shelf.rig, detections.skeleton, config) for t in frames]
-    return confident_targets(Observations.concatenate(rows), shelf.rig, config.observations)
+    return confident_targets(Observations.concatenate(rows), shelf.rig, config.observations, config.offsets)
 
 
 def _mean_and_median(errors: NDArray[np.float64]) -> list[float]:

@@ -11,6 +11,7 @@ from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
+from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.linearisation import observation_sigmas
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
 from shapepose_fg.evaluation.experiments.scale import Scale, Stretch, shorter
@@ -67,7 +68,7 @@ def _measure(stretch: Stretch, *, quick: bool) -> Figures:
     found = [find_people(detections[t], scene.rig, detections.skeleton, config) for t in range(len(detections))]
     frame = np.repeat(np.arange(len(found)), [len(people) for people in found])
     rows, views = Observations.concatenate(found), Views.of(scene.rig)
-    settings = config.estimator
+    settings = EstimatorConfig(config.observations, config.window_graph, config.refine, config.motion)
     joints = detections.skeleton.joints
     sigmas = observation_sigmas(rows, rows.initial, views, config.observations, joints)
     matches = match_people(frame, rows.initial, scene.keypoints)

@@ -11,7 +11,6 @@ from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Fig
 from shapepose_fg.evaluation.experiments.scale import Scale, Stretch, shorter
 from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.metrics import joint_metrics
-from shapepose_fg.evaluation.varied import varied
 from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people
 
 FRAMES = 30
@@ -96,4 +95,4 @@ def _measure(stretch: Stretch, config: PipelineConfig, count: int) -> Figures:
         found = [find_people(seen[t], rig, seen.skeleton, config).initial for t in range(len(seen))]
         return joint_metrics(found, truth).as_dict()
     refine = replace(config.refine, alternations=count, settled_m=0.0)
-    return joint_metrics(stretch.reconstruct(replace(varied(config), refine=refine)), truth).as_dict()
+    return joint_metrics(stretch.reconstruct(replace(config, refine=refine)), truth).as_dict()

@@ -14,11 +14,11 @@ from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.estimator import Estimator
+from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures
 from shapepose_fg.evaluation.experiments.scale import Scale, Stretch, shorter
 from shapepose_fg.evaluation.markdown import rule
 from shapepose_fg.evaluation.matching import match_people
-from shapepose_fg.evaluation.varied import varied
 from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people, reconstruct
 from shapepose_fg.simulation import DetectorConfig, Scene, simulate
 from shapepose_fg.simulation.foreign import DETECTOR_S_OWN, people_of, recast
@@ -192,7 +192,7 @@ def _of_paper(scene: Scene, detections: DetectionSequence, truth: NDArray[np.flo
     rows = Observations.concatenate(found)
     rows = replace(rows, track=np.arange(len(rows)), frame=frame)
     refine = replace(config.refine, alternations=1)
-    settings = replace(config.estimator, refine=refine)
+    settings = EstimatorConfig(config.observations, config.window_graph, refine, config.motion)
     with torch_threads(config.threads):
         estimator = Estimator(scene.rig, make_fitter(config.body), detections.skeleton.joints, settings)
         bodies = estimator.estimate(rows).fit.joints
@@ -204,7 +204,7 @@ def _of_paper(scene: Scene, detections: DetectionSequence, truth: NDArray[np.flo
 def _of_ours(scene: Scene, detections: DetectionSequence, truth: NDArray[np.float64]) -> Curve:
     """Frame by frame: what the views say, with the body only where they leave a joint open; and both fused."""
     ours = replace(PipelineConfig(), temporal=False)
-    alone = replace(varied(ours), window_graph=replace(ours.window_graph, rho_3d=0.0))
+    alone = replace(ours, window_graph=replace(ours.window_graph, rho_3d=0.0))
     views, fused = (reconstruct(detections, scene.rig, config) for config in (alone, ours))
     if not np.array_equal(views.frame, fused.frame):
         raise RuntimeError("the body's prior changed who is there: rows cannot be compared")
