@@ -19,10 +19,12 @@ if TYPE_CHECKING:
     from shapepose_fg.io.calibration import write_rig as write_rig
     from shapepose_fg.io.config import read_config as read_config
     from shapepose_fg.io.detections import read_detections as read_detections
+    from shapepose_fg.pipeline.execution import Execution as Execution
     from shapepose_fg.pipeline.pipeline import PipelineConfig as PipelineConfig
     from shapepose_fg.pipeline.pipeline import reconstruct as reconstruct
 
 _HOMES = {
+    "Execution": "shapepose_fg.pipeline.execution",
     "InputError": "shapepose_fg.core.errors",
     "PipelineConfig": "shapepose_fg.pipeline.pipeline",
     "Reconstruction": "shapepose_fg.core.reconstruction",

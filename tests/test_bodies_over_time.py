@@ -17,10 +17,10 @@ from shapepose_fg.core.storage.kept_arrays import InMemory
 from shapepose_fg.pipeline.bodies_over_time import (
     STRETCH_ROWS,
     BodiesOverTime,
+    Person,
     fit_everybody,
     with_bodies_over_time,
 )
-from shapepose_fg.pipeline.person_bodies import Person
 from shapepose_fg.simulation import Scene, built_in_scene
 from shapepose_fg.simulation.truth import truth_of
 
@@ -89,8 +89,8 @@ def test_a_long_track_is_fitted_in_stretches_that_fit_together(fitter):
     def fitted(stretch_rows: int) -> tuple[BodiesOverTime, BodyParameters]:
         nobody = SubjectShapes.empty(fingerprint(fitter.model))
         bodies = fit_everybody(
-            {0: 240}, person, lambda jobs: (job.fitted(fitter) for job in jobs), InMemory(), nobody, stretch_rows,
-            piece_rows=20,
+            {0: 240}, person, lambda jobs: (job.fitted(fitter) for job in jobs), InMemory(), nobody,
+            (stretch_rows, 20),
         )  # fmt: skip
         columns = ("betas", "global_orient", "body_pose", "transl")
         parts = [bodies.filled(name, getattr(people, name), people.person, {}) for name in columns]
@@ -117,7 +117,7 @@ def test_a_long_track_is_fitted_in_stretches_that_fit_together(fitter):
     # With that shape it is the uncut track's bodies, and nothing jumps at a border.
     known = Shapes(cut.shapes.betas, cut.shapes.information)
     uncut = replace(person(0, [range(240)]), shapes=known, fixed_shapes=True).fitted(fitter)
-    pose = (uncut.betas, uncut.global_orient, uncut.body_pose, uncut.transl)
+    pose = (uncut[name] for name in ("betas", "global_orient", "body_pose", "transl"))
     same = fitter.model.keypoints(BodyParameters(*(torch.from_numpy(part).float() for part in pose))).numpy()
     assert 1e3 * np.linalg.norm(joints - same, axis=-1).max() < 0.3
     apart_mm = 1e3 * np.linalg.norm(np.diff(joints, axis=0) - np.diff(same, axis=0), axis=-1)
@@ -142,7 +142,7 @@ def test_a_long_track_of_somebody_known(fitter):
         everybody = dict.fromkeys(numbers.tolist(), 48)
         jobs = InMemory()
         return fit_everybody(
-            everybody, person, lambda jobs: (job.fitted(fitter) for job in jobs), jobs, known, 24, piece_rows=8
+            everybody, person, lambda jobs: (job.fitted(fitter) for job in jobs), jobs, known, (24, 8)
         ).shapes
 
     alone, again = fitted(SubjectShapes.empty(known.body)), fitted(known)

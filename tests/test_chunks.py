@@ -11,12 +11,13 @@ from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.core.storage.kept_arrays import InFolder
-from shapepose_fg.pipeline.chunk_work import ChunkJob, solve_chunk
 from shapepose_fg.pipeline.engine import Setup
-from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct, reconstruct_parts
+from shapepose_fg.pipeline.execution import Execution
+from shapepose_fg.pipeline.pipeline import PipelineConfig, Task, reconstruct, reconstruct_parts
 from shapepose_fg.pipeline.runs import chunks
 from shapepose_fg.pipeline.runs.borders import Border, same_people
 from shapepose_fg.pipeline.runs.chunks import Chunk, cut_in_chunks, windows_of
+from shapepose_fg.pipeline.solved_windows import ChunkJob, solve_chunk
 from shapepose_fg.pipeline.windows import Engine, WindowConfig
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.tracking.following import FollowingConfig
@@ -54,7 +55,7 @@ def whole(scene, recording):
 
 @pytest.fixture(scope="module")
 def in_chunks(scene, recording):
-    return reconstruct(recording, scene.rig, CONFIG, cuts=CUTS, chunk_frames=12)
+    return reconstruct(recording, scene.rig, CONFIG, cuts=CUTS, execution=Execution(chunk_frames=12))
 
 
 def test_chunks_change_neither_people_nor_names(whole, in_chunks):
@@ -72,7 +73,7 @@ def test_chunks_change_neither_people_nor_names(whole, in_chunks):
 
 
 def test_processes_change_no_byte_of_it(scene, recording, in_chunks):
-    found = reconstruct(recording, scene.rig, CONFIG, cuts=CUTS, chunk_frames=12, workers=2)
+    found = reconstruct(recording, scene.rig, CONFIG, cuts=CUTS, execution=Execution(chunk_frames=12, workers=2))
     for name in found.ROWS:
         equal_nan = name != "status"
         assert np.array_equal(getattr(found, name), getattr(in_chunks, name), equal_nan=equal_nan), name
@@ -80,7 +81,8 @@ def test_processes_change_no_byte_of_it(scene, recording, in_chunks):
 
 def test_a_dask_cluster_changes_no_byte_of_it(scene, recording, in_chunks):
     pytest.importorskip("distributed", reason="Dask is an extra")
-    found = reconstruct(recording, scene.rig, CONFIG, cuts=CUTS, chunk_frames=12, workers=2, cluster="local")
+    execution = Execution(chunk_frames=12, workers=2, cluster="local")
+    found = reconstruct(recording, scene.rig, CONFIG, cuts=CUTS, execution=execution)
     for name in ("joints", "covariance", "person", "body_pose"):
         assert np.array_equal(getattr(found, name), getattr(in_chunks, name), equal_nan=name != "person"), name
 
@@ -90,13 +92,12 @@ def test_a_run_in_chunks_that_was_stopped_goes_on(scene, recording, in_chunks, t
         if done >= 20:
             raise Stopped(15)
 
-    arguments = {"cuts": CUTS, "chunk_frames": 12}
+    task = Task(recording, scene.rig, CONFIG, cuts=CUTS)
     with pytest.raises(Stopped):
-        reconstruct_parts(InFolder(tmp_path), recording, scene.rig, CONFIG, progress=stop, **arguments)
+        reconstruct_parts(InFolder(tmp_path), task, Execution(chunk_frames=12, progress=stop))
     done: list[int] = []
-    found = reconstruct_parts(
-        InFolder(tmp_path), recording, scene.rig, CONFIG, progress=lambda n, _: done.append(n), **arguments
-    ).reconstruction()
+    execution = Execution(chunk_frames=12, progress=lambda n, _: done.append(n))
+    found = reconstruct_parts(InFolder(tmp_path), task, execution).reconstruction()
     assert done[0] > 20
     for name in ("joints", "covariance", "person", "body_pose", "frame"):
         equal_nan = name not in ("person", "frame")
@@ -185,4 +186,4 @@ def test_who_is_who_by_detections_and_out_of_sight_by_place():
 
 def test_chunks_shorter_than_a_window_are_refused(scene, recording):
     with pytest.raises(ValueError, match="chunk_frames must be at least batch_frames"):
-        reconstruct(recording, scene.rig, CONFIG, chunk_frames=3)
+        reconstruct(recording, scene.rig, CONFIG, execution=Execution(chunk_frames=3))

@@ -277,7 +277,7 @@ def test_weights_that_lie(tmp_path):
     [
         "threads = 100000",
         "[body]\npolish_steps = 100000",
-        "[candidates]\nvote_radius_m = 1e308",
+        "[people]\ngate_m = 1e308",
         "batch_frames = 0",
     ],
 )

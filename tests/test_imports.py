@@ -19,7 +19,7 @@ LEVELS = (
     "core.storage.npz",
     "core.storage.schema",
     "core.storage.output_folder core.storage.kept_arrays core.shapes core.provenance"
-    " core.run_summary viz.rendering pipeline.workers body.threads cli.options cli.terminal cli.stopping",
+    " core.run_summary viz.rendering pipeline.workers body.threads cli.terminal cli.stopping",
     "core.result_files",
     "body.model",
     "body.fitting body.shapes",
@@ -31,25 +31,24 @@ LEVELS = (
     "proposal",
     "estimation",
     "tracking",
-    "pipeline.person_bodies",
     "pipeline.windows pipeline.bodies_over_time pipeline.solved_rows",
     "pipeline.config pipeline.cluster",
     "pipeline.runs",
     "pipeline.engine",
-    "pipeline.chunk_work",
+    "pipeline.execution pipeline.offsets pipeline.solved_windows",
     "pipeline.pipeline",
     "io pipeline.solving",
-    "simulation viz.viewer detection2d",
+    "simulation viz.bodies detection2d",
     "viz.overlay setup_check",
+    "viz.viewer",
     "io.export",
     "viz.report",
     "evaluation",
-    "cli.reconstruct.outcome cli.reconstruct.summary cli.reconstruct.inputs",
-    "cli.reconstruct.ending",
-    "cli.reconstruct.run",
-    "cli.reconstruct.request",
+    "cli.options",
+    "cli.pictures",
+    "cli.reconstruct",
     "cli.batch",
-    "cli.demo cli.tracks cli.detect cli.overlay cli.export cli.report cli.view cli.setup cli.reconstruct.command"
+    "cli.demo cli.tracks cli.detect cli.overlay cli.export cli.report cli.view cli.setup cli.simulate"
     " cli.batch.command",
     "cli.main",
     "__main__",
@@ -112,7 +111,7 @@ def ours(names: set[str]) -> set[str]:
     return {name for name in names if name.split(".")[0] in ("factors", "shapepose_fg")}
 
 
-FOLDERS = {f"shapepose_fg{name}" for name in ("", ".body", ".cli", ".cli.reconstruct", ".core", ".core.storage")}
+FOLDERS = {f"shapepose_fg{name}" for name in ("", ".body", ".cli", ".core", ".core.storage")}
 FOLDERS |= {"shapepose_fg.pipeline", "shapepose_fg.viz"}
 LIBRARY = {name: tree for name, tree in modules("shapepose_fg") if name not in FOLDERS}
 """All modules but folders whose files have levels of their own."""

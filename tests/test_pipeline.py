@@ -1,5 +1,6 @@
 """The whole way: what goes in as 2D candidates comes out as people."""
 
+import inspect
 from dataclasses import replace
 
 import gtsam
@@ -17,8 +18,9 @@ from shapepose_fg.evaluation.metrics import joint_metrics
 from shapepose_fg.evaluation.shelf import evaluate_shelf, read_shelf_ground_truth
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
+from shapepose_fg.pipeline.config import PeopleConfig
+from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people, reconstruct
-from shapepose_fg.proposal.proposals import ProposalConfig
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.scene import Scene
 
@@ -76,7 +78,7 @@ def test_the_run_says_how_it_came_about(recording, people):
     run = people.run
     assert run["frames"] == [0, 16]
     assert run["people"]["found"] == len(people) == run["people"]["status"]["ok"]
-    assert run["configuration"]["window_graph"]["rho_3d"] == PipelineConfig().window_graph.rho_3d
+    assert run["configuration"]["people"]["gate_m"] == PipelineConfig().people.gate_m
     assert set(run["seconds"]) >= {"triangulate", "propose", "follow", "solve"}
     assert run["versions"]["gtsam"].startswith("4.")
     assert [each["person"] for each in run["probability"]] == np.unique(people.person).tolist()
@@ -104,7 +106,8 @@ def test_workers_change_no_byte(scene, recording):
     config = PipelineConfig(batch_frames=8)
     counts = list[int]()
     alone = reconstruct(recording, scene.rig, config)
-    helped = reconstruct(recording, scene.rig, config, workers=2, progress=lambda done, _: counts.append(done))
+    execution = Execution(workers=2, progress=lambda done, _: counts.append(done))
+    helped = reconstruct(recording, scene.rig, config, execution=execution)
     assert counts == [8, 16]
     for name in Reconstruction.ROWS:
         assert getattr(alone, name).tobytes() == getattr(helped, name).tobytes(), name
@@ -117,7 +120,14 @@ def test_workers_change_no_byte(scene, recording):
 
 def test_factors_that_cannot_be_sent_to_workers_are_refused(scene, recording):
     with pytest.raises(ValueError, match="at the top of a module, or use workers=1"):
-        reconstruct(recording, scene.rig, workers=2, extra_factors=lambda window, keys: ())
+        reconstruct(recording, scene.rig, extra_factors=lambda window, keys: (), execution=Execution(workers=2))
+
+
+def test_arguments_that_went_into_execution_are_named(scene, recording):
+    for name in ("workers", "cluster", "chunk_frames", "progress"):
+        with pytest.raises(TypeError, match=rf"give execution=Execution\({name}=\.\.\.\)"):
+            reconstruct(recording, scene.rig, **{name: None})
+    assert len(inspect.signature(reconstruct).parameters) <= 10
 
 
 def test_progress_counts_frames_and_torch_gets_its_threads_back(scene, recording):
@@ -127,7 +137,7 @@ def test_progress_counts_frames_and_torch_gets_its_threads_back(scene, recording
         scene.rig,
         PipelineConfig(batch_frames=4),
         frames=range(10),
-        progress=lambda *done: seen.append(done),
+        execution=Execution(progress=lambda *done: seen.append(done)),
     )
     assert seen == [(4, 10), (10, 10)], "two frames are no window of their own"
     assert torch.get_num_threads() == before
@@ -221,7 +231,7 @@ def test_without_time_problems_and_phantoms_are_those_of_the_frames(scene, recor
 
 
 def test_settings_reach_their_steps(scene, recording):
-    strict = PipelineConfig(proposals=ProposalConfig(min_probability=1.0))
+    strict = PipelineConfig(people=PeopleConfig(min_probability=1.0))
     assert len(find_people(recording[0], scene.rig, BODY_25, strict)) == 0
     with pytest.raises(ValueError, match="batch_frames must be at least 1"):
         replace(strict, batch_frames=0)

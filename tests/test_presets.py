@@ -21,7 +21,7 @@ from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people
 from shapepose_fg.proposal.candidates import triangulate_pairs, vote
 
 PAPER = PipelineConfig.paper()
-STAGE_II = EstimatorConfig(PAPER.observations, PAPER.window_graph, PAPER.refine, PAPER.motion)
+STAGE_II = PAPER.estimator
 WRIST, KNEE = BODY_25.index("RWrist"), BODY_25.index("LKnee")
 
 

@@ -24,7 +24,8 @@ from shapepose_fg.core.storage.kept_arrays import InFolder
 from shapepose_fg.core.storage.output_folder import only_run_in
 from shapepose_fg.estimation.detector_offsets import OffsetConfig
 from shapepose_fg.io.config import toml_text
-from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct, reconstruct_parts
+from shapepose_fg.pipeline.execution import Execution
+from shapepose_fg.pipeline.pipeline import PipelineConfig, Task, reconstruct, reconstruct_parts
 from shapepose_fg.pipeline.runs.known_people import checksum_at_start, people_at_start, write_people
 from shapepose_fg.pipeline.runs.manifest import check_room, end_run, expected_bytes, open_run
 from shapepose_fg.pipeline.windows import WindowConfig
@@ -100,7 +101,7 @@ def test_a_run_that_is_stopped_again_and_again_ends_the_same(scene, recording, w
     while result is None:
         kept = Interrupted(tmp_path / "parts", 3 + stops % 2, behind=stops % 3 == 1)
         try:
-            result = reconstruct_parts(kept, recording, scene.rig, CONFIG, cuts=CUTS)
+            result = reconstruct_parts(kept, Task(recording, scene.rig, CONFIG, cuts=CUTS))
         except Stopped:
             stops += 1
             assert stops < 12, "the run must come to an end"
@@ -122,16 +123,11 @@ def test_without_time_it_goes_on_too(scene, recording, tmp_path):
     frames = range(4, 16)
     kept = Interrupted(tmp_path / "parts", 3, behind=False)
     with pytest.raises(Stopped):
-        reconstruct_parts(kept, recording, scene.rig, config, frames=frames)
+        reconstruct_parts(kept, Task(recording, scene.rig, config, frames))
     counts = []
-    result = reconstruct_parts(
-        InFolder(tmp_path / "parts"),
-        recording,
-        scene.rig,
-        config,
-        frames=frames,
-        progress=lambda done, _: counts.append(done),
-    )
+    execution = Execution(progress=lambda done, _: counts.append(done))
+    task = Task(recording, scene.rig, config, frames)
+    result = reconstruct_parts(InFolder(tmp_path / "parts"), task, execution)
     assert counts == [8, 12], "the first window is not solved again"
     result.save(tmp_path)
     reconstruct(recording, scene.rig, config, frames=frames).save(tmp_path / "whole")
@@ -338,12 +334,12 @@ def test_a_folder_of_somebody_else_is_left_alone(tmp_path):
 def test_a_damaged_part_is_named(scene, recording, tmp_path):
     kept = Interrupted(tmp_path / "parts", 3, behind=False)
     with pytest.raises(Stopped):
-        reconstruct_parts(kept, recording, scene.rig, CONFIG, cuts=CUTS)
+        reconstruct_parts(kept, Task(recording, scene.rig, CONFIG, cuts=CUTS))
     assert kept.names("followed") == ["followed-000000"]
     part = tmp_path / "parts" / "part-000000.safetensors"
     part.write_bytes(part.read_bytes()[:-100])
     with pytest.raises(InputError, match=r"part-000000\.safetensors: a part of an unfinished run cannot be read"):
-        reconstruct_parts(InFolder(tmp_path / "parts"), recording, scene.rig, CONFIG, cuts=CUTS)
+        reconstruct_parts(InFolder(tmp_path / "parts"), Task(recording, scene.rig, CONFIG, cuts=CUTS))
 
 
 def test_one_run_at_a_time_and_its_leftovers_are_swept(tmp_path):

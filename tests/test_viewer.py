@@ -1,6 +1,5 @@
 """The picture of a frame: made for whoever is there, and bodies where their skeletons are."""
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,16 +8,14 @@ import numpy as np
 import pytest
 
 from shapepose_fg.core.camera import Rig
-from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.simulation import DetectorConfig, Scene, built_in_scene, simulate
+from shapepose_fg.viz.bodies import joined, surfaces
 from shapepose_fg.viz.rendering import look_at, render_depth
-from shapepose_fg.viz.viewer import demo_picture
-from shapepose_fg.viz.viewer.figures import Figures, Mesh, floor_under, framed, free_viewpoint, two_views
 from shapepose_fg.viz.viewer.floor import Floor, floor_picture
+from shapepose_fg.viz.viewer.picture import demo_picture, floor_under, framed, free_viewpoint, two_views
 
-pytest.importorskip("matplotlib")
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -71,19 +68,19 @@ def picture(path: Path) -> np.ndarray:
 def test_the_picture_is_written_with_everything(tmp_path: Path, scene: Scene, found: Reconstruction):
     detections = simulate(scene, DetectorConfig())[1]
     path = tmp_path / "people.png"
-    demo_picture(path, scene.rig, found, 1, detections=detections, truth=scene.vertices_at(1), width_px=900)
+    demo_picture(path, scene.rig, found, 1, detections=detections, truth=scene.vertices_at(1))
     image = picture(path)
-    assert image.shape[1] == 900 and 450 < image.shape[0] < 700
+    assert image.shape[1] == 1800 and 900 < image.shape[0] < 1100
     # Somebody of each colour is drawn, besides paper and floor: colourful pixels of at least four hues.
     hsv = cv2.cvtColor(image, cv2.COLOR_BGR2HSV)
     hues = np.bincount(hsv[hsv[..., 1] > 100][:, 0] // 15, minlength=12)
-    assert (hues > 300).sum() >= 4
+    assert (hues > 1200).sum() >= 4
 
 
 def test_a_person_without_body_and_an_empty_frame_are_drawn(tmp_path: Path, scene: Scene, found: Reconstruction):
     partial = without_body(found, 3)  # the blue one: the most saturated
     for name, people in (("partial", partial), ("full", found), ("nobody", Reconstruction.empty())):
-        demo_picture(tmp_path / f"{name}.png", scene.rig, people, 0, views=(0, 1), width_px=700)
+        demo_picture(tmp_path / f"{name}.png", scene.rig, people, 0)
     partly, full, empty = (picture(tmp_path / f"{name}.png") for name in ("partial", "full", "nobody"))
 
     def inked(image: np.ndarray) -> int:
@@ -94,47 +91,51 @@ def test_a_person_without_body_and_an_empty_frame_are_drawn(tmp_path: Path, scen
 
 
 def test_two_cameras_are_enough(tmp_path: Path, scene: Scene, found: Reconstruction):
-    demo_picture(tmp_path / "two.png", Rig(scene.rig.cameras[:2], up="z"), found, 0, width_px=500)
-    assert picture(tmp_path / "two.png").shape[1] == 500
+    demo_picture(tmp_path / "two.png", Rig(scene.rig.cameras[:2], up="z"), found, 0)
+    assert picture(tmp_path / "two.png").shape[1] == 1800
 
 
-def test_figures_come_by_identity_and_bodies_lie_under_skeletons(scene: Scene, found: Reconstruction):
-    figures = Figures.of(without_body(found, 0).at(0), scene.body)
-    assert figures.labels == ("person 0", "person 1", "person 2", "person 3")
-    # Identities run against the rows, so the row without a body is the last identity.
-    np.testing.assert_array_equal(figures.has_body, [True, True, True, False])
-    bodies = figures.mesh.vertices.reshape(3, -1, 3)
-    np.testing.assert_allclose(bodies, scene.vertices_at(0)[[3, 2, 1]], atol=1e-5)
-    assert len(np.unique(figures.mesh.colours, axis=0)) == 3
+def test_there_are_no_surfaces_of_no_rows(scene: Scene):
+    bodies, rows = surfaces(Reconstruction.empty(), scene.body)
+    assert bodies.shape == (0, scene.body.num_vertices, 3) and len(rows) == 0
+
+
+def test_surfaces_are_those_of_rows_with_a_body_and_lie_under_skeletons(scene: Scene, found: Reconstruction):
+    people = without_body(found, 0).at(0)
+    bodies, rows = surfaces(people, scene.body)
+    np.testing.assert_array_equal(rows, [1, 2, 3])
+    np.testing.assert_allclose(bodies, scene.vertices_at(0)[1:], atol=1e-5)
+    vertices, faces = joined(bodies, scene.body.faces)
     # In a view, every joint's pixel is covered by a body or next to one: joints lie inside the silhouette.
-    camera = framed(scene.rig.cameras[0], figures.points, (800, 450))
-    surface = render_depth(figures.mesh.vertices, figures.mesh.faces, camera)
-    xy, _ = camera.project(figures.joints[:3].reshape(-1, 3))
+    camera = framed(scene.rig.cameras[0], vertices, (800, 450))
+    surface = render_depth(vertices, faces, camera)
+    xy, _ = camera.project(people.joints[rows].reshape(-1, 3))
     column, row = np.clip(np.rint(xy), 0, (799, 449)).astype(int).T
     assert (surface.face[row, column] >= 0).mean() > 0.95
 
 
 def test_views_and_frames_are_well_chosen(scene: Scene, found: Reconstruction):
-    figures = Figures.of(found.at(0), scene.body)
-    first, second = two_views(scene.rig, figures.mesh)
+    joints, none = found.at(0).joints, np.zeros((0, 3, 3))
+    vertices, faces = joined(scene.vertices_at(0), scene.body.faces)
+    points = np.concatenate([joints.reshape(-1, 3), vertices])
+    first, second = two_views(scene.rig, vertices, faces)
     assert first != second
     axes = scene.rig.cTw[:, 2, :3]
     assert abs(axes[first] @ axes[second]) < 0.8
     for camera in scene.rig.cameras:
-        window = framed(camera, figures.points, (640, 360))
+        window = framed(camera, points, (640, 360))
         assert window.image_size == (640, 360)
-        inside = camera.project(figures.points)[0]
+        inside = camera.project(points)[0]
         seen = ((inside >= 0) & (inside <= np.array(camera.image_size) - 1)).all(axis=1)
-        xy, _ = window.project(figures.points[seen])
+        xy, _ = window.project(points[seen])
         assert (xy > -1).all() and (xy < (640, 360)).all()
-    floor = floor_under(scene.rig, figures, Mesh.clay(None, scene.body.faces))
+    floor = floor_under(scene.rig, joints, none, points)
     assert abs(floor.height(np.zeros(3))) < 0.01  # the floor of the built-in scene is at 0
-    sunk = replace(figures, joints=figures.joints - np.array([0.5, 0, 0, 0])[:, None, None] * UP)
-    assert abs(floor_under(scene.rig, sunk, Mesh.clay(None, scene.body.faces)).height(np.zeros(3))) < 0.02
-    truth = Mesh.clay(scene.vertices_at(0), scene.body.faces)
-    assert abs(floor_under(scene.rig, sunk, truth).height(np.zeros(3))) < 0.01
-    free = free_viewpoint(scene.rig, figures.points, floor, (900, 800))
-    xy, _ = free.project(figures.points)
+    sunk = joints - np.array([0.5, 0, 0, 0])[:, None, None] * UP
+    assert abs(floor_under(scene.rig, sunk, none, points).height(np.zeros(3))) < 0.02
+    assert abs(floor_under(scene.rig, sunk, scene.vertices_at(0), points).height(np.zeros(3))) < 0.01
+    free = free_viewpoint(scene.rig, points, floor, (900, 800))
+    xy, _ = free.project(points)
     assert (xy > 0).all() and (xy < (900, 800)).all()
 
 
@@ -168,11 +169,3 @@ def test_the_floor_has_lines_below_the_horizon_and_a_shadow_under_a_body(scene: 
     darker = nobody.mean(axis=-1) - shaded.mean(axis=-1)
     assert darker[row - 2, column + 5] > 0.2  # in the middle of the square
     assert darker[:40].max() == 0 and darker.min() > -1e-9
-
-
-def test_without_matplotlib_the_cure_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scene: Scene, found: Reconstruction
-):
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(InputError, match=r"pip install shapepose-fg\[viewer\]"):
-        demo_picture(tmp_path / "none.png", scene.rig, found, 0)

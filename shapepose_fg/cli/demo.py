@@ -1,6 +1,6 @@
 """The demo: the built-in scene reconstructed, compared with the truth, and drawn."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -9,10 +9,8 @@ import numpy as np
 from rich.console import Group, RenderableType
 from rich.padding import Padding
 from rich.table import Table
-from rich.text import Text
 
 from shapepose_fg.core.detections import Recording
-from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.evaluation.alternation import JointErrors, alternation_errors, before_refinement
@@ -20,9 +18,11 @@ from shapepose_fg.evaluation.matching import Matches, match_people
 from shapepose_fg.evaluation.metrics import CORRECT_M, covariance_calibration, joint_metrics
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.solved_setup import CAMERAS
+from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.simulation import Scene, built_in_scene, simulate
 from shapepose_fg.viz.report.writing import REPORT, write_report
+from shapepose_fg.viz.viewer.picture import demo_picture
 
 _STAGES = {
     "triangulate": "pairs of views to 3D points",
@@ -30,7 +30,7 @@ _STAGES = {
     "propose": "candidates to new people",
     "associate": "new people to their 2D observations",
     "follow": "people from frame to frame",
-    "associate again": "detections given out anew",
+    "associate again": "detections reassociated",
     "offsets": "where the detector puts joints on the body",
     "solve": "bodies and factor graphs, covariances",
     "bodies over time": "one shape a person, poses linked in time",
@@ -75,18 +75,10 @@ class Demo:
         return Group(*(Padding(part, (1, 0, 0, 2)) for part in parts))
 
     def draw(self, path: Path) -> None:
-        """Write the picture of a typical frame; InputError where matplotlib is missing."""
-        from shapepose_fg.viz.viewer import demo_picture
-
+        """Write the picture of a typical frame."""
         frame = self.typical_frame
-        demo_picture(
-            path,
-            self.scene.rig,
-            self.people,
-            frame,
-            detections=self.detections[frame],
-            truth=self.scene.vertices_at(frame),
-        )
+        seen, truth = self.detections[frame], self.scene.vertices_at(frame)
+        demo_picture(path, self.scene.rig, self.people, frame, seen, truth)
 
     def save(self, folder: Path, *, report: bool = True) -> list[str]:
         """Write people.npz and what belongs to it, the report and the picture; returns what to tell the user."""
@@ -103,10 +95,7 @@ class Demo:
         else:
             (folder / REPORT).unlink(missing_ok=True)
         picture = folder / "picture.png"
-        try:
-            self.draw(picture)
-        except InputError as hint:
-            return [*told, f"no picture: {hint}"]
+        self.draw(picture)
         return [*told, f"{picture}  frame {self.typical_frame}, one of middling error; grey: the truth"]
 
 
@@ -117,7 +106,7 @@ def run_demo(progress: Callable[[int, int], None] | None = None, scene: Scene | 
     config = PipelineConfig()
     before = before_refinement(detections, scene.rig, config)
     times = FrameTimes.from_fps(scene.fps, len(scene))
-    people = reconstruct(detections, scene.rig, config, times=times, progress=progress)
+    people = reconstruct(detections, scene.rig, config, times=times, execution=Execution(progress=progress))
     return Demo(scene, detections, people, alternation_errors(before, people, scene.keypoints))
 
 
@@ -125,36 +114,28 @@ def _accuracy(demo: Demo) -> Table:
     """How many people and joints are right."""
     metrics = joint_metrics(demo.people, demo.scene.keypoints)
     median_mm = float(np.nanmedian(demo.errors.after_mm)) if demo.errors.after_mm.size else float("nan")
-    table = _table("Against the truth")
-    table.add_row("people found", f"{metrics.people_found} of {metrics.people_true}", "in all frames together")
-    table.add_row("found twice", str(metrics.people_duplicated))
-    table.add_row("invented", str(metrics.people_invented))
-    table.add_row("precision", _percent(metrics.precision), f"joints within {CORRECT_M} m, of those placed")
-    table.add_row("recall", _percent(metrics.recall), f"joints within {CORRECT_M} m, of all true ones")
-    table.add_row("F1", _percent(metrics.f1))
-    table.add_row("MPJPE", f"{metrics.mpjpe_mm:.1f} mm", "mean distance of a joint to the true one")
-    table.add_row("median", f"{median_mm:.1f} mm", "half of the joints are nearer than this")
-    return table
+    rows = (
+        ("people found", f"{metrics.people_found} of {metrics.people_true}", "in all frames together"),
+        ("found twice", str(metrics.people_duplicated), ""),
+        ("invented", str(metrics.people_invented), ""),
+        ("precision", _percent(metrics.precision), f"joints within {CORRECT_M} m, of those placed"),
+        ("recall", _percent(metrics.recall), f"joints within {CORRECT_M} m, of all true ones"),
+        ("F1", _percent(metrics.f1), ""),
+        ("MPJPE", f"{metrics.mpjpe_mm:.1f} mm", "mean distance of a joint to the true one"),
+        ("median", f"{median_mm:.1f} mm", "half of the joints are nearer than this"),
+    )
+    return _table("Against the truth", rows)
 
 
 def _alternation(demo: Demo) -> Table:
     """What the factor graphs and the body make of what the views alone say."""
-    rho = SEEN_BADLY
-    table = Table(
-        title="What comes after stage I: mean distance to the truth",
-        title_justify="left",
-        title_style="bold",
-        box=None,
-        padding=(0, 2, 0, 0),
-    )
-    for heading in ("joints", "count", "before", "after"):
-        table.add_column(heading, justify="left" if heading == "joints" else "right", header_style="dim")
-    table.add_column("")
-    notes = (f"mean confidence {rho:g} or more", "less: body and motion help", "the body fills them in")
-    for (name, mask), note in zip(demo.errors.groups(rho).items(), notes, strict=True):
-        cells = (_mm(demo.errors.before_mm[mask]), _mm(demo.errors.after_mm[mask]))
-        table.add_row(name, str(int(mask.sum())), *cells, Text(note, style="dim"))
-    return table
+    notes = (f"mean confidence {SEEN_BADLY:g} or more", "less: body and motion help", "the body fills them in")
+    rows = [
+        (name, str(int(mask.sum())), _mm(demo.errors.before_mm[mask]), _mm(demo.errors.after_mm[mask]), note)
+        for (name, mask), note in zip(demo.errors.groups(SEEN_BADLY).items(), notes, strict=True)
+    ]
+    title = "What comes after stage I: mean distance to the truth"
+    return _table(title, rows, ("joints", "count", "before", "after", ""))
 
 
 def _covariances(demo: Demo) -> Table:
@@ -162,36 +143,42 @@ def _covariances(demo: Demo) -> Table:
     matches, people = demo.matches, demo.people
     error = people.joints[matches.row] - demo.scene.keypoints[matches.frame, matches.person]
     calibration = covariance_calibration(error, people.covariance[matches.row])
-    table = _table("Is the truth where the covariances say?")
-    for level, share in calibration.coverage.items():
-        table.add_row(
+    rows = [
+        (
             f"inside the {100 * level:.0f} % ellipsoid",
             _percent(share),
             f"should be {100 * level:.0f} %; more is cautious",
         )
-    table.add_row("mean NEES", f"{calibration.mean_nees:.2f}", "should be 3; more is too sure")
-    return table
+        for level, share in calibration.coverage.items()
+    ]
+    rows.append(("mean NEES", f"{calibration.mean_nees:.2f}", "should be 3; more is too sure"))
+    return _table("Is the truth where the covariances say?", rows)
 
 
 def _time(demo: Demo) -> Table:
     """Milliseconds a frame, stage by stage."""
     seconds, frames = demo.people.run["seconds"], max(len(demo.scene), 1)
-    table = _table("Time, milliseconds a frame")
-    for stage, what in _STAGES.items():
-        table.add_row(stage, f"{1e3 * seconds.get(stage, 0.0) / frames:.1f}", what)
     total = sum(spent for stage, spent in seconds.items() if stage != "load")
-    table.add_row("all", f"{1e3 * total / frames:.1f}", "bodies are cheaper in longer recordings", style="bold")
-    return table
+    stages = [(stage, f"{1e3 * seconds.get(stage, 0.0) / frames:.1f}", what) for stage, what in _STAGES.items()]
+    whole = ("all", f"{1e3 * total / frames:.1f}", "bodies are cheaper in longer recordings")
+    return _table("Time, milliseconds a frame", [*stages, whole])
 
 
-def _table(title: str) -> Table:
-    """A table of figures: name, value, what it means."""
-    table = Table(
-        title=title, title_justify="left", title_style="bold", show_header=False, box=None, padding=(0, 2, 0, 0)
-    )
-    table.add_column()
-    table.add_column(justify="right")
-    table.add_column(style="dim")
+def _table(title: str, rows: Iterable[tuple[str, ...]], heads: Sequence[str] = ("", "", "")) -> Table:
+    """Names, figures, and in the last column what they mean."""
+    table = Table(title=title, title_justify="left", title_style="bold", box=None, padding=(0, 2, 0, 0))
+    table.show_header = any(heads)
+    for n, head in enumerate(heads):
+        inner = 0 < n < len(heads) - 1
+        table.add_column(
+            head,
+            "",
+            justify="right" if inner else "left",
+            header_style="dim",
+            style="dim" if n + 1 == len(heads) else "",
+        )
+    for row in rows:
+        table.add_row(*row)
     return table
 
 

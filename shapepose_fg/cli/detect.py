@@ -2,125 +2,135 @@
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
-import typer
-
-from shapepose_fg.cli.options import ImageSizeOption, UnitOption, UpOption, frame_range, image_size_of
+from shapepose_fg.cli.options import (
+    RESULT,
+    RUN,
+    TIME,
+    CameraOptions,
+    FramesOption,
+    frame_range,
+    grouped,
+    option,
+)
+from shapepose_fg.cli.pictures import PictureOptions
 from shapepose_fg.cli.terminal import note, progress, show
 from shapepose_fg.core.errors import InputError
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from shapepose_fg.core.camera import Axis, Rig
     from shapepose_fg.detection2d.detector import CameraDetector
-    from shapepose_fg.detection2d.network import Backend
+    from shapepose_fg.detection2d.network import Backend, HeatMapNetwork
     from shapepose_fg.detection2d.recording import DetectionReport, DetectionRun
-    from shapepose_fg.io.calibration import Unit
-    from shapepose_fg.io.footage.footage import Footage
     from shapepose_fg.io.footage.lockstep import Lockstep
+
+_NETWORK = "Network"
 
 # Everything else is imported inside the command: `--help` must not wait for it.
 
 
-def detect(
-    calibration: Annotated[Path, typer.Option(help="Cameras: a file, or a folder, of one of the formats known.")],
-    videos: Annotated[
-        list[str],
-        typer.Option(
-            "--videos",
-            "--images",
-            metavar="FOLDER|CAMERA=PATH",
-            help="Folder with a video, a picture, or a folder of pictures named after each camera; or each one's"
-            " own, given once for each camera.",
-        ),
-    ],
+@dataclass(frozen=True, kw_only=True)
+class NetworkOptions:
+    """The network that detects, and how it is run."""
+
     network: Annotated[
-        str, typer.Option(metavar="FILE|NAME", help="ONNX file of a network of OpenPose's kind, or a named one.")
-    ],
-    output: Annotated[Path, typer.Option(help="Folder for the detections; made if it is not there.")],
+        str, option(_NETWORK, "ONNX file of a network of OpenPose's kind, or a named one.", metavar="FILE|NAME")
+    ]
     layout: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="How to read the network: tf-pose, openpose-coco, openpose-body25."),
-    ] = None,
-    download: Annotated[
-        bool, typer.Option("--download", help="Fetch a named network that is not here yet.")
-    ] = False,
+        option(_NETWORK, "How to read it: tf-pose, openpose-coco, openpose-body25.", metavar="NAME"),
+    ] = None
+    download: Annotated[bool, option(_NETWORK, "Fetch a named network that is not here yet.", "--download")] = (
+        False
+    )
     network_address: Annotated[
-        str | None, typer.Option(metavar="URL", help="Where to fetch it from; its checksum decides.")
-    ] = None,
+        str | None, option(_NETWORK, "Where to fetch it from; its checksum decides.", metavar="URL")
+    ] = None
+    long_side: Annotated[
+        int,
+        option(_NETWORK, "Longer side of what it is shown, pixels: more finds smaller people.", show_default=True),
+    ] = 656
+    backend: Annotated[
+        str, option(RUN, "What runs the network: opencv or onnxruntime.", metavar="NAME", show_default=True)
+    ] = "opencv"
+
+    def check(self) -> None:
+        """Refuse what makes no sense."""
+        if self.backend not in ("opencv", "onnxruntime"):
+            raise InputError(f"--backend {self.backend}: must be opencv or onnxruntime")
+        if not 128 <= self.long_side <= 4096:
+            raise InputError(f"--long-side {self.long_side}: must be 128 to 4096 pixels")
+
+    def load(self) -> "HeatMapNetwork":
+        """The network, fetched if need be."""
+        from shapepose_fg.detection2d.download import find_network
+        from shapepose_fg.detection2d.network import HeatMapNetwork
+
+        with progress("fetching the network", "bytes") as fetched:
+            file = find_network(
+                self.network, download=self.download, address=self.network_address, progress=fetched
+            )
+        return HeatMapNetwork.load(file, self.layout, cast("Backend", self.backend))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClockOptions:
+    """When pictures were taken."""
+
     fps: Annotated[
         list[str] | None,
-        typer.Option(metavar="RATE|CAMERA=RATE", help="Frames a second, where the files are silent or wrong."),
-    ] = None,
+        option(TIME, "Frames a second, where the files are silent or wrong.", metavar="RATE|CAMERA=RATE"),
+    ] = None
     start: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="CAMERA=TIME", help="When its first frame was taken: 0.2s, or 12f (its own frames); else 0."
+        option(
+            TIME,
+            "When its first frame was taken: 0.2s, or 12f (its own frames); else 0.",
+            metavar="CAMERA=TIME",
         ),
-    ] = None,
-    image_placement: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="KIND|CAMERA=KIND",
-            help="How pictures of another size than the calibration's came about: scale, letterbox, crop,"
-            " crop-centre.",
-        ),
-    ] = None,
-    frames: Annotated[
-        str | None, typer.Option(metavar="A:B", help="Moments A to B-1 only; either may be left out.")
-    ] = None,
-    long_side: Annotated[
-        int, typer.Option(help="Longer side of what the network is shown, pixels: more finds smaller people.")
-    ] = 656,
-    backend: Annotated[
-        str, typer.Option(metavar="NAME", help="What runs the network: opencv or onnxruntime.")
-    ] = "opencv",
-    up: UpOption = None,
-    unit: UnitOption = None,
-    image_size: ImageSizeOption = None,
+    ] = None
+    frames: FramesOption = None
+
+
+@grouped
+def detect(
+    cameras: CameraOptions,
+    pictures: PictureOptions,
+    network: NetworkOptions,
+    clock: ClockOptions,
+    output: Annotated[Path, option(RESULT, "Folder for the detections; made if it is not there.")],
 ) -> None:
     """Detect people's joints in videos or pictures, for `reconstruct`: candidates with part affinities.
 
     Pictures of rolled cameras are turned upright first; the calibration knows how. A run that is stopped goes on
     where it was when it is started again.
     """
-    if backend not in ("opencv", "onnxruntime"):
-        raise InputError(f"--backend {backend}: must be opencv or onnxruntime")
-    if not 128 <= long_side <= 4096:
-        raise InputError(f"--long-side {long_side}: must be 128 to 4096 pixels")
+    network.check()
+    if pictures.videos is None:
+        raise InputError("--videos: missing; give the cameras' videos or pictures")
     from shapepose_fg.detection2d.detector import CameraDetector, DetectionConfig
-    from shapepose_fg.detection2d.download import find_network
-    from shapepose_fg.detection2d.network import HeatMapNetwork
     from shapepose_fg.detection2d.recording import DetectionRun, run_detection
-    from shapepose_fg.io.calibration import read_rig
     from shapepose_fg.io.footage.given import clocks_of, per_camera, placements_of
     from shapepose_fg.io.footage.lockstep import align
 
-    rig = read_rig(
-        calibration,
-        up=cast("Axis | None", up),
-        unit=cast("Unit | None", unit),
-        image_size=image_size_of(image_size),
-    )
-    with progress("fetching the network", "bytes") as fetched:
-        file = find_network(network, download=download, address=network_address, progress=fetched)
-    loaded = HeatMapNetwork.load(file, layout, cast("Backend", backend))
-    footage = _open(videos, rig)
+    rig = cameras.rig()
+    loaded = network.load()
+    footage = pictures.opened(rig)
     sizes = {name: each.size for name, each in zip(rig.names, footage, strict=True)}
-    placements, concluded = placements_of(image_placement or [], sizes, rig)
+    placements, concluded = placements_of(pictures.image_placement or [], sizes, rig)
     for each in concluded:
         note(each)
-    rates = per_camera("--fps", fps or [], rig, one_for_all=True)
-    starts = per_camera("--start", start or [], rig, one_for_all=False)
-    clocks, has_clock = clocks_of(footage, rates, starts, rig)
-    moments = align(clocks, has_clock)
-    moments = _part(moments, frame_range(frames, len(moments)))
+    rates = per_camera("--fps", clock.fps or [], rig, one_for_all=True)
+    starts = per_camera("--start", clock.start or [], rig, one_for_all=False)
+    moments = align(*clocks_of(footage, rates, starts, rig))
+    moments = _part(moments, frame_range(clock.frames, len(moments)))
     for each in moments.notes:
         note(each)
-    config = DetectionConfig(long_side=long_side)
+    config = DetectionConfig(long_side=network.long_side)
     detectors = [
         CameraDetector.of(camera, rig.up_vector, placements[camera.name], loaded, config) for camera in rig.cameras
     ]
@@ -136,26 +146,11 @@ def detect(
             raise
     for name, failed in zip(rig.names, report.unreadable, strict=True):
         if failed > 0:
-            note(f"camera {name}: {failed} of {report.moments} pictures cannot be read; it sees nobody there")
+            note(
+                f"camera {name}: {failed} of {report.moments} pictures cannot be read; it has no detections there"
+            )
     show(_summary(run, report, time.perf_counter() - begin))
-    print(_next_command(run, calibration, up, unit, image_size))
-
-
-def _open(videos: Sequence[str], rig: "Rig") -> "list[Footage]":
-    """The footage of every camera, looked through."""
-    from shapepose_fg.io.footage.footage import open_footage
-    from shapepose_fg.io.footage.places import find_footage
-
-    places = find_footage(videos, rig.names)
-    for each in places.notes:
-        note(each)
-    footage = []
-    for name, path in zip(rig.names, places.paths, strict=True):
-        with progress(f"looking through {name}") as done:
-            footage.append(open_footage(path, done))
-        for each in footage[-1].notes:
-            note(each)
-    return footage
+    print(_next_command(run, cameras))
 
 
 def _shown_small(detectors: "Sequence[CameraDetector]", size: tuple[int, int]) -> str:
@@ -201,14 +196,12 @@ def _summary(run: "DetectionRun", report: "DetectionReport", seconds: float) -> 
     return table
 
 
-def _next_command(
-    run: "DetectionRun", calibration: Path, up: str | None, unit: str | None, size: str | None
-) -> str:
+def _next_command(run: "DetectionRun", cameras: CameraOptions) -> str:
     """How to go on, as a line to copy."""
     import shlex
 
-    options = {"--calibration": calibration, "--detections": run.output, "--up": up, "--unit": unit}
-    options |= {"--image-size": size}
+    options = {"--calibration": cameras.calibration, "--detections": run.output, "--up": cameras.up}
+    options |= {"--unit": cameras.unit, "--image-size": cameras.image_size}
     if run.moments.time_s is not None and len(run.moments) > 1:
         options["--timestamps"] = run.output / "times.csv"
     options["--output"] = "results"

@@ -2,24 +2,23 @@
 
 import json
 import os
-import re
 import sys
-import time
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import Annotated, Any, cast
 
 import typer
 
 from shapepose_fg.cli.batch.command import batch
 from shapepose_fg.cli.detect import detect
 from shapepose_fg.cli.export import export
-from shapepose_fg.cli.options import FramesOption, check_workers, frame_range
+from shapepose_fg.cli.options import INPUT, RESULT, JsonOption, option
 from shapepose_fg.cli.overlay import overlay
 from shapepose_fg.cli.reconstruct.command import reconstruct
-from shapepose_fg.cli.report import report as report_command
+from shapepose_fg.cli.report import report
 from shapepose_fg.cli.setup import check_calibration
+from shapepose_fg.cli.simulate import simulate
 from shapepose_fg.cli.stopping import Stopped, stoppable
 from shapepose_fg.cli.terminal import progress as progress_bar
 from shapepose_fg.cli.terminal import show, use_any_streams
@@ -27,9 +26,6 @@ from shapepose_fg.cli.tracks import tracks
 from shapepose_fg.cli.view import view
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.output_folder import prepare_output
-
-if TYPE_CHECKING:
-    from shapepose_fg.simulation.files import Format
 
 # Everything else is imported inside the commands: `--help` must not wait for torch.
 
@@ -40,17 +36,22 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 evaluate = typer.Typer(help="Score a reconstruction against an annotation.")
-app.add_typer(evaluate, name="evaluate")
-app.add_typer(tracks, name="tracks")
-app.command()(reconstruct)
-app.command()(batch)
-app.command()(detect)
-app.command("check-calibration")(check_calibration)
-app.command()(overlay)
-app.command()(export)
-app.command("report")(report_command)
-app.command()(view)
+_RECORDING, _RESULT, _TRY = "From a recording to a result", "With a result", "To try, and to compare"
+app.command(rich_help_panel=_RECORDING)(detect)
+app.command("check-calibration", rich_help_panel=_RECORDING)(check_calibration)
+app.command(rich_help_panel=_RECORDING)(reconstruct)
+app.command(rich_help_panel=_RECORDING)(batch)
+app.command("report", rich_help_panel=_RESULT)(report)
+app.command(rich_help_panel=_RESULT)(overlay)
+app.command(rich_help_panel=_RESULT)(view)
+app.command(rich_help_panel=_RESULT)(export)
+app.add_typer(tracks, name="tracks", rich_help_panel=_RESULT)
+app.add_typer(evaluate, name="evaluate", rich_help_panel=_TRY)
 
+_MOVED = {
+    "--people": "give the result as the first argument: shapepose-fg evaluate shelf RESULTS --ground-truth FILE"
+}
+"""Options that there were, and what took their place."""
 _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
 """What typer raises for a wrong command line; older and newer versions keep the class in different places."""
 
@@ -64,7 +65,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             code = app(arguments or ["--help"], standalone_mode=False)
             sys.stdout.flush()
     except _UsageProblem as error:
-        code = _fail(f"{cast(Any, error).format_message().rstrip('.')}; see shapepose-fg --help")
+        cure = _MOVED.get(getattr(error, "option_name", ""), "see shapepose-fg --help")
+        code = _fail(f"{cast(Any, error).format_message().rstrip('.')}; {cure}")
     except InputError as error:
         code = _fail(str(error))
     except BrokenPipeError:  # the reader of our output, such as `head`, has had enough
@@ -84,17 +86,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 @evaluate.command("shelf")
 def evaluate_shelf_command(
-    people: Annotated[
-        Path, typer.Option(help="people.npz, or its folder; 4D Association's text; TRC, or a folder of it.")
+    results: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RESULTS",
+            help="Folder of a reconstruction, or its people.npz; 4D Association's text; TRC, or a folder of it.",
+        ),
     ],
-    ground_truth: Annotated[Path, typer.Option(help="Annotation of the Shelf recording, as text.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
+    ground_truth: Annotated[Path, option(INPUT, "Annotation of the Shelf recording, as text.")],
+    as_json: JsonOption = False,
 ) -> None:
     """PCP per limb and actor, MPJPE and recall on the Shelf recording."""
     from shapepose_fg.evaluation.other_results.reading import read_people
     from shapepose_fg.evaluation.shelf import evaluate_shelf, read_shelf_ground_truth
 
-    score = evaluate_shelf(read_people(people), read_shelf_ground_truth(ground_truth))
+    score = evaluate_shelf(read_people(results), read_shelf_ground_truth(ground_truth))
     if as_json:
         print(json.dumps(score.as_dict(), indent=2, allow_nan=False))
     else:
@@ -107,11 +113,13 @@ detector sees them with noise, misses, false candidates and occlusion; from what
 it saw the people are reconstructed, over time."""
 
 
-@app.command()
+@app.command(rich_help_panel=_TRY)
 def demo(
-    output: Annotated[Path, typer.Option(help="Folder for the result and the picture.")] = Path("demo"),
+    output: Annotated[Path, option(RESULT, "Folder for the result and the picture.", show_default=True)] = Path(
+        "demo"
+    ),
     report: Annotated[
-        bool, typer.Option("--report/--no-report", help="Leave report.html, the result as a page to look at.")
+        bool, option(RESULT, "Leave report.html, the result as a page to look at.", "--report/--no-report")
     ] = True,
 ) -> None:
     """Reconstruct a built-in scene of four people, compare it with the truth, and draw it."""
@@ -127,68 +135,7 @@ def demo(
         print(line)
 
 
-@app.command()
-def simulate(
-    name: Annotated[str, typer.Argument(help="demo, or an interaction sequence: salsa, crossing or crowd.")],
-    output: Annotated[Path, typer.Option(help="Folder for cameras, detections and truth.")],
-    split: Annotated[str, typer.Option(help="Takes of a sequence: tune, to choose settings by; report.")] = "tune",
-    frames: FramesOption = None,
-    cameras: Annotated[int, typer.Option(help="Cameras around the room, 2 to 12.")] = 6,
-    people: Annotated[int | None, typer.Option(help="People in demo, 0 to 12; a sequence has its own.")] = None,
-    seed: Annotated[int, typer.Option(help="Fixes the detector's errors, and the people of demo.")] = 0,
-    mocap: Annotated[Path | None, typer.Option(help="Recorded motions (.npz) that sequences are made of.")] = None,
-    format: Annotated[str, typer.Option(help="Detections as association (4D Association) or openpose.")] = (
-        "association"
-    ),
-    workers: Annotated[
-        int | None, typer.Option(help="Processes that look at the frames; by default one a core. No byte changes.")
-    ] = None,
-) -> None:
-    """Simulate a recording with known truth: cameras, 2D detections, and people.npz to compare with."""
-    if format not in ("association", "openpose"):
-        raise InputError(f"--format {format}: must be association or openpose")
-    if seed < 0:
-        raise InputError(f"--seed {seed}: must be 0 or more")
-    check_workers(workers)
-    prepare_output(output)
-    from shapepose_fg.pipeline.workers import suitable_workers
-    from shapepose_fg.simulation import DetectorConfig
-    from shapepose_fg.simulation import simulate as run_detector
-    from shapepose_fg.simulation.files import check_output, cut, cuts_of, named_scene, write_simulated
-    from shapepose_fg.simulation.visibility import FRAMES_WORTH_A_WORKER
-
-    last = re.search(r":\s*(\d{1,6})\s*$", frames or "")
-    scene = named_scene(
-        name,
-        split=split,
-        cameras=cameras,
-        people=people,
-        frames=int(last[1]) if last is not None else 0,
-        seed=seed,
-        mocap=mocap,
-    )
-    span = frame_range(frames, len(scene))
-    part = cut(scene, span)
-    check_output(part, output, cast("Format", format))
-    workers = suitable_workers(len(span), FRAMES_WORTH_A_WORKER) if workers is None else workers
-    start = time.perf_counter()
-    with progress_bar("simulating") as progress:
-        detections = run_detector(part, DetectorConfig(), seed, workers=workers, progress=progress)
-    seconds = time.perf_counter() - start
-    about = {"name": name, "seed": seed, "first_frame": span.start, "detector": DetectorConfig().as_dict()}
-    about |= {} if name == "demo" else {"split": split}
-    written = write_simulated(part, detections, output, cast("Format", format), **about)
-    print(
-        f"{len(span)} frames of {scene.people} people before {cameras} cameras,"
-        f" {1e3 * seconds / len(span):.0f} ms a frame"
-    )
-    for what, path in written.items():
-        print(f"{what:<12}{path}")
-    timing = f"--fps {part.fps:g}" + (f" --cuts {','.join(map(str, cuts_of(part)))}" if cuts_of(part) else "")
-    print(
-        f"try: shapepose-fg reconstruct --calibration {written['cameras']} --detections {written['detections']}"
-        f" {timing} --output {output / 'results'}"
-    )
+app.command(rich_help_panel=_TRY)(simulate)
 
 
 class Preset(StrEnum):
@@ -198,7 +145,7 @@ class Preset(StrEnum):
     PAPER = "paper"
 
 
-@app.command("config")
+@app.command("config", rich_help_panel=_RECORDING)
 def print_config(
     preset: Annotated[
         Preset,
@@ -212,7 +159,7 @@ def print_config(
     print(toml_text(PipelineConfig.paper() if preset is Preset.PAPER else PipelineConfig()), end="")
 
 
-@app.command()
+@app.command(rich_help_panel=_TRY)
 def version() -> None:
     """Print the versions of this program and of what it stands on."""
     from shapepose_fg.core.provenance import versions

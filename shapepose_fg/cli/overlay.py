@@ -1,14 +1,15 @@
 """The command `overlay`: a result drawn over the videos or pictures that it was made from."""
 
 import re
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from shapepose_fg.cli.options import FramesOption, frame_range
+from shapepose_fg.cli.options import DRAW, INPUT, RESULT, FramesOption, frame_range, grouped, option
+from shapepose_fg.cli.pictures import PictureOptions
 from shapepose_fg.cli.terminal import note, progress
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import ASSUMED_FPS
@@ -17,92 +18,82 @@ from shapepose_fg.core.result_files import results_folder
 if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel
     from shapepose_fg.core.camera import Rig
-    from shapepose_fg.viz.overlay.frames import Overlay
-
-# Everything else is imported inside the command: `--help` must not wait for it.
-
-_GRID = "grid"
-"""What the file with all cameras is called."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Drawn:
+    """What is drawn, and how large."""
+
+    cameras: Annotated[str | None, option(DRAW, "Only these cameras.", metavar="A,B")] = None
+    stills: Annotated[
+        str | None, option(DRAW, "Still pictures of these frames instead of a video.", metavar="A,B")
+    ] = None
+    each: Annotated[
+        bool, option(DRAW, "A file for each camera at its own size, or all in one.", "--each/--grid")
+    ] = False
+    bodies: Annotated[bool, option(DRAW, "Draw the bodies' surfaces.", "--bodies/--no-bodies")] = False
+    skeletons: Annotated[bool, option(DRAW, "Draw joints and bones.", "--skeletons/--no-skeletons")] = True
+    points: Annotated[
+        bool, option(DRAW, "Draw the 2D detections; red crosses were not used.", "--points/--no-points")
+    ] = True
+    width: Annotated[int, option(DRAW, "Width of the grid, pixels.", show_default=True)] = 1920
+
+
+@grouped
 def overlay(
     results: Annotated[Path, typer.Argument(metavar="RESULTS", help="Folder of a reconstruction.")],
-    output: Annotated[
-        Path | None, typer.Option(help="Folder for videos and pictures; by default RESULTS/overlay.")
-    ] = None,
-    videos: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--videos",
-            "--images",
-            metavar="FOLDER|CAMERA=PATH",
-            help="The cameras' videos or pictures, as for `detect`; by default those that were detected in.",
-        ),
-    ] = None,
+    pictures: PictureOptions,
+    drawn: Drawn,
     detections: Annotated[
         Path | None,
-        typer.Option(help="Folder that `detect` wrote: it says which picture belongs to which frame."),
+        option(INPUT, "Folder that `detect` wrote: it says which picture belongs to which frame."),
     ] = None,
-    cameras: Annotated[str | None, typer.Option(metavar="A,B", help="Only these cameras.")] = None,
     frames: FramesOption = None,
-    stills: Annotated[
-        str | None, typer.Option(metavar="A,B", help="Still pictures of these frames instead of a video.")
-    ] = None,
-    each: Annotated[
-        bool, typer.Option("--each/--grid", help="A file for each camera at its own size, or all in one.")
-    ] = False,
-    bodies: Annotated[bool, typer.Option("--bodies/--no-bodies", help="Draw the bodies' surfaces.")] = False,
-    skeletons: Annotated[bool, typer.Option("--skeletons/--no-skeletons", help="Draw joints and bones.")] = True,
-    points: Annotated[
-        bool, typer.Option("--points/--no-points", help="Draw the 2D detections; red crosses were not used.")
-    ] = True,
-    width: Annotated[int, typer.Option(help="Width of the grid, pixels.")] = 1920,
-    image_placement: Annotated[
-        list[str] | None,
-        typer.Option(metavar="KIND|CAMERA=KIND", help="As for `detect`, where pictures have another size."),
+    output: Annotated[
+        Path | None, option(RESULT, "Folder for videos and pictures; by default RESULTS/overlay.")
     ] = None,
 ) -> None:
     """Draw a result over the videos or pictures that it was made from: mp4, or still pictures.
 
     Everybody has a colour. Dots are joints that were seen, dark rings joints that were inferred; squares are 2D
-    detections that were used, red crosses those that were not.
+    detections that were used, red crosses those that were not. Without --videos, those are drawn on that were
+    detected in.
     """
-    if not 160 <= width <= 7680:
-        raise InputError(f"--width {width}: must be 160 to 7680 pixels")
+    if not 160 <= drawn.width <= 7680:
+        raise InputError(f"--width {drawn.width}: must be 160 to 7680 pixels")
+    if drawn.stills is not None and frames is not None:
+        raise InputError("--stills and --frames: both say which frames; give one of them")
     from shapepose_fg.core.reconstruction import Reconstruction
     from shapepose_fg.io.calibration import read_rig
     from shapepose_fg.io.solved_setup import CAMERAS
     from shapepose_fg.viz.overlay.frames import Overlay, OverlayContent
-    from shapepose_fg.viz.overlay.result_pictures import pictures_of
+    from shapepose_fg.viz.overlay.output import write_overlay
 
     folder = results_folder(results)
-    if stills is not None and frames is not None:
-        raise InputError("--stills and --frames: both say which frames; give one of them")
     with Reconstruction.open(folder) as people:
-        rig = read_rig(folder / CAMERAS)
-        drawn = _drawn_cameras(cameras, videos, rig)
-        pictures = pictures_of(people.run, rig, drawn, videos, detections, image_placement or [])
-        content = OverlayContent(skeletons=skeletons, bodies=bodies, detections=points)
-        if points and not people.observed:
+        rig, run = read_rig(folder / CAMERAS), people.run
+        names = pictures.named(rig) if drawn.cameras is None else _cameras(drawn.cameras, rig)
+        shown = pictures.of_result(run, rig, names, detections)
+        content = OverlayContent(skeletons=drawn.skeletons, detections=drawn.points)
+        if drawn.points and not people.observed:
             note(f"{folder}: there is no observations.npz, so no detections are drawn")
-        over = Overlay(people, rig, pictures, content, _body(people.run) if bodies else None)
-        length = max(len(used.places) for used, _ in pictures)
-        if stills is not None:
-            chosen, fps = _stills(stills, length), None
+        over = Overlay(people, rig, shown, content, _body(run) if drawn.bodies else None)
+        length = max(len(used.places) for used, _ in shown)
+        if drawn.stills is not None:
+            chosen, fps = _stills(drawn.stills, length), None
         else:
-            chosen = _recorded(people.run, length) if frames is None else frame_range(frames, length)
-            fps = _fps(people.run)
+            chosen, fps = _recorded(run, length) if frames is None else frame_range(frames, length), _fps(run)
         if len(chosen) == 0:
             raise InputError(f"{folder}: none of its frames has a picture; give the videos that it was made from")
-        for path in _write(over, chosen, output or folder / "overlay", each, width, fps):
+        with progress("drawing") as done:
+            width = None if drawn.each else drawn.width
+            written = write_overlay(over, chosen, output or folder / "overlay", width, fps, done)
+        for path in written:
             print(f"written  {path}")
 
 
-def _drawn_cameras(text: str | None, videos: Sequence[str] | None, rig: "Rig") -> list[str]:
-    """The cameras that are drawn: those that are asked for, or else those whose videos are given one by one."""
-    if text is None:
-        named = {each.partition("=")[0].strip() for each in videos or [] if "=" in each}
-        return [name for name in rig.names if name in named] or list(rig.names)
+def _cameras(text: str, rig: "Rig") -> list[str]:
+    """The cameras that are asked for."""
     names = [name.strip() for name in text.split(",") if name.strip()]
     for name in names:
         if name not in rig.names:
@@ -141,35 +132,3 @@ def _stills(text: str, length: int) -> list[int]:
     if not all(re.fullmatch(r"\d{1,9}", word) and int(word) < length for word in words):
         raise InputError(f"--stills {text}: must be frames 0 to {length - 1}, such as 0,50")
     return [int(word) for word in words]
-
-
-def _write(
-    over: "Overlay", frames: Sequence[int], place: Path, each: bool, width: int, video_fps: float | None
-) -> list[Path]:
-    """Draw `frames` and write them: a video where a rate is given, else still pictures."""
-    from shapepose_fg.viz.overlay.frames import grid, grid_shape
-    from shapepose_fg.viz.overlay.output import VideoFile, even, write_picture
-
-    own = [even(footage.size) for _, footage in over.cameras]
-    columns, cells = grid_shape(own, width)
-    names = [used.name for used, _ in over.cameras] if each else [_GRID]
-    sizes = own if each else cells
-    paths: list[Path] = []
-    videos: list[VideoFile] = []
-    with ExitStack() as stack, progress("drawing") as done:
-        for at, frame in enumerate(frames):
-            drawn = over.draw(frame, sizes)
-            pictures = drawn if each else [grid(drawn, columns)]
-            if video_fps is not None and len(videos) == 0:
-                paths = [place / f"{name}.mp4" for name in names]
-                shapes = [(picture.shape[1], picture.shape[0]) for picture in pictures]
-                files = zip(paths, shapes, strict=True)
-                videos = [stack.enter_context(VideoFile(path, shape, video_fps)) for path, shape in files]
-            for index, picture in enumerate(pictures):
-                if video_fps is not None:
-                    videos[index].add(picture)
-                else:
-                    paths.append(place / f"{names[index]}_{frame:06d}.jpg")
-                    write_picture(paths[-1], picture)
-            done(at + 1, len(frames))
-    return paths

@@ -11,7 +11,7 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Stopped(BaseException):
-    """The user, or the system, wants the program to end; nobody's error, so that nothing catches it by chance."""
+    """The user, or the system, wants the program to end; no `Exception`, so that nothing catches it."""
 
     def __init__(self, number: int, message: str = "") -> None:
         super().__init__(message)

@@ -89,7 +89,7 @@ def rename_person(context: typer.Context, person: Person, other: Other) -> None:
 
 @tracks.command("drop")
 def drop_person(context: typer.Context, person: Person) -> None:
-    """A is nobody: A's rows are taken out."""
+    """A is a false positive: A's rows are taken out."""
     _correct(context, "drop", person)
 
 
@@ -141,7 +141,7 @@ def _tracks_table(results: Path) -> "RenderableType":
         )
     lines = [f"{len(listed)} people, {rows} rows{rate_words(run)}"]
     if not run.get("configuration", {}).get("temporal", True):
-        lines.append("every frame stands alone here: a number is nobody's over time")
+        lines.append("every frame was solved by itself: a number is no identity")
     edits = read_corrections(results_folder(results))
     if len(edits) > 0:
         lines.append(f"corrected: {'; '.join(map(str, edits))}")

@@ -12,8 +12,7 @@ _ROOMS = {
     "core": "errors camera skeleton detections observations observation_table frame_times bounds"
     " reconstruction provenance run_summary result_files",
     "core.storage": "files kept_arrays output_folder",
-    "pipeline": "engine windows workers cluster chunk_work solving person_bodies bodies_over_time solved_rows"
-    " runs",
+    "pipeline": "engine windows workers cluster solving bodies_over_time solved_rows runs",
     "cli": "options terminal stopping demo batch",
     "viz": "rendering overlay report viewer",
     "io": "export",
@@ -39,12 +38,13 @@ _MERGED = {
 """Modules that are others now, under whichever name."""
 _RENAMED = {
     "pipeline_config": "pipeline.config",
+    "chunk_work": "pipeline.solved_windows",
+    "person_bodies": "pipeline.bodies_over_time",
     "batch_command": "cli.batch.command",
     **{f"{name}_command": f"cli.{name}" for name in "tracks detect overlay export report view setup".split()},
-    **{
-        f"reconstruct_{name}": f"cli.reconstruct.{name}"
-        for name in "command ending inputs outcome request run summary".split()
-    },
+    **{f"reconstruct_{name}": f"cli.reconstruct.{name}" for name in "command ending request run".split()},
+    **{f"reconstruct_{name}": "cli.reconstruct.request" for name in ("inputs", "outcome")},
+    "reconstruct_summary": "cli.reconstruct.ending",
     **{old: new for new, names in _MERGED.items() for old in names.split()},
 }
 MOVED = {name: f"{room}.{name}" for room, names in _ROOMS.items() for name in names.split()} | _RENAMED

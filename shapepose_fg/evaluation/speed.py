@@ -9,6 +9,7 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections, DetectionSequence
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 
 STAGES = (
@@ -82,7 +83,7 @@ def spend(
 ) -> Spent:
     """Reconstruct, and look at the clocks before and after."""
     before, start = os.times(), time.perf_counter()
-    people = reconstruct(recording, rig, config, frames=frames, workers=workers)
+    people = reconstruct(recording, rig, config, frames=frames, execution=Execution(workers=workers))
     wall_s, after = time.perf_counter() - start, os.times()
     return Spent(len(frames), sum(after[:4]) - sum(before[:4]), wall_s, people)
 

@@ -105,7 +105,9 @@ def _lines(config: Any, table: str = "") -> list[str]:
             name = f"{table}.{field.name}" if table else field.name
             tables += ["", *_comment(comments.get(field.name)), f"[{name}]", *_lines(value, name)]
         else:
-            settings += _comment(comments.get(field.name)) + _comment(range_of(type(config), field.name))
+            bounds = range_of(type(config), field.name)
+            words = [comments.get(field.name), None if bounds is None else f"({bounds})"]
+            settings += _comment(" ".join(filter(None, words)) or None)
             settings.append(f"# {field.name} is not set" if value is None else f"{field.name} = {_toml(value)}")
     return settings + tables
 

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.body.fitting.fitter import BodyFitter, Shapes
+from shapepose_fg.body.fitting.fitter import BodyFitter, JointTargets, Shapes
 from shapepose_fg.body.fitting.weights import fingerprint
+from shapepose_fg.body.model.soles import above_floor
 from shapepose_fg.body.shapes import SubjectShapes, recognise
 from shapepose_fg.core.reconstruction import Reconstruction, Status
 from shapepose_fg.core.storage.kept_arrays import InMemory, KeptArrays
 from shapepose_fg.estimation.floor import Floor
-from shapepose_fg.pipeline.person_bodies import Person, PersonBodies
 
 STRETCH_ROWS = 4000
 """Rows of a person that are fitted together at the most. The shape of a longer track is what so many of its rows
@@ -27,10 +27,60 @@ _OVERLAP_ROWS = 32
 """Rows that a stretch has of its neighbours, on either side, when poses are fitted."""
 
 
-Fits = Callable[[Iterable[Person]], Iterable[PersonBodies]]
-"""Fits the bodies of people, in order."""
-
 _COLUMNS = ("betas", "global_orient", "body_pose", "transl")
+
+
+@dataclass(frozen=True)
+class Person:
+    """What one person's bodies are fitted to, N rows; plain data, which can be sent to another process."""
+
+    number: int
+    """Who it is."""
+    targets: JointTargets
+    """The joints as they were solved."""
+    time_s: NDArray[np.float64]
+    """(N,) seconds."""
+    shapes: Shapes | None = None
+    """What is known of the shape, (1)."""
+    fixed_shapes: bool = False
+    """Whether the shape is known and stays."""
+    kept: range | None = None
+    """The rows whose bodies are wanted, None for all. Others overlap with what is before and after, or tell of the
+    shape only."""
+    floor: Floor | None = None
+    """What bodies do not sink into, where it was found."""
+
+    @classmethod
+    def of(
+        cls,
+        number: int,
+        joints: NDArray[np.float64],
+        covariance: NDArray[np.float64],
+        time_s: NDArray[np.float64],
+    ) -> "Person":
+        """From the solved rows of one person: `joints` (N, J, 3), `covariance` (N, J, 3, 3), `time_s` (N,)."""
+        solved = np.isfinite(joints.sum(axis=-1)) & np.isfinite(covariance.sum(axis=(-1, -2)))
+        information = np.zeros_like(covariance)
+        information[solved] = np.linalg.inv(covariance[solved])
+        information = (information + information.swapaxes(-1, -2)) / 2
+        return cls(number, JointTargets(np.where(solved[..., None], joints, 0.0), information), time_s)
+
+    def fitted(self, fitter: BodyFitter) -> dict[str, NDArray[Any]]:
+        """The bodies as arrays: `ok` (N,) which rows have one, `betas` to `transl` as in `Reconstruction`; and the
+        shape that they share, `mean` (1, 10) and `information` (1, 10, 10) by what all rows say of it.
+        """
+        group = np.full(len(self.time_s), self.number)
+        found = fitter.fit_sequence(self.targets, group, self.time_s, self.shapes, fixed_shapes=self.fixed_shapes)
+        fit = found.fit if self.kept is None else found.fit.rows(np.arange(self.kept.start, self.kept.stop))
+        bodies = fit.betas, fit.global_orient, fit.body_pose, fit.transl
+        if self.floor is not None and fitter.model is not None:
+            bodies = above_floor(fitter.model, bodies, self.floor.normal, self.floor.height_m)
+        shape = {"mean": found.shapes.mean, "information": found.shapes.information}
+        return {"ok": fit.ok, **dict(zip(_COLUMNS, bodies, strict=True)), **shape}
+
+
+Fits = Callable[[Iterable[Person]], Iterable[dict[str, NDArray[Any]]]]
+"""Fits the bodies of people (`Person.fitted`), in order."""
 
 
 @dataclass(frozen=True)
@@ -83,15 +133,16 @@ def fit_everybody(
     fits: Fits,
     kept: KeptArrays,
     known: SubjectShapes,
-    stretch_rows: int = STRETCH_ROWS,
-    piece_rows: int = PIECE_ROWS,
+    lengths: tuple[int, int] = (STRETCH_ROWS, PIECE_ROWS),
 ) -> BodiesOverTime:
     """Fit one body per person to the joints as they were solved; what is kept already is not fitted again.
 
     `counts` is how many rows everybody has; `person` gives what somebody's bodies are fitted to in some of these,
     one range after the other, and `fits` fits people, side by side if it likes. `known` are people from other
-    recordings: who is recognised by shape (`recognise`) is fitted again with that as the prior.
+    recordings: who is recognised by shape (`recognise`) is fitted again with that as the prior. `lengths` are rows
+    of a segment and of a piece.
     """
+    stretch_rows, piece_rows = lengths
     long = [number for number, count in counts.items() if count > stretch_rows]
 
     def fitted(jobs: Mapping[str, Callable[[], Person]]) -> None:
@@ -99,8 +150,7 @@ def fit_everybody(
         there = set(kept.names(""))
         missing = [name for name in jobs if name not in there]
         for name, bodies in zip(missing, fits(jobs[name]() for name in missing), strict=True):
-            arrays = {column: getattr(bodies, column) for column in ("ok", *_COLUMNS)}
-            kept.keep(name, arrays | {"mean": bodies.shape.mean, "information": bodies.shape.information})
+            kept.keep(name, bodies)
 
     def found(kind: str, prior: Mapping[int, Shapes | None]) -> dict[int, Shapes]:
         """Some people's shapes, and their bodies where the track is short."""

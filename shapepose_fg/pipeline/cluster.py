@@ -114,7 +114,7 @@ class Scheduler:
 
 @contextmanager
 def local_cluster(count: int, *, dashboard: bool = False) -> Iterator[Scheduler]:
-    """`count` processes of this machine, which nobody reaches from another, while the block runs.
+    """`count` processes of this machine, out of reach of others, while the block runs.
 
     InputError where Dask is not installed. With `dashboard`, and bokeh installed, the scheduler has one.
     """

@@ -1,14 +1,14 @@
-"""The settings of the whole way, and the paper's."""
+"""The settings of the whole way, and the paper's; what else the steps are made of stands beside them."""
 
-from dataclasses import dataclass, field
-from typing import Annotated
+from dataclasses import dataclass, field, replace
+from typing import Annotated, ClassVar, Literal
 
 from annotated_types import Interval
 
 from shapepose_fg.body.fitting.fitters import BodyConfig
-from shapepose_fg.core.bounds import Settings
+from shapepose_fg.core.bounds import Count, Factor, Metres, Repeats, Seconds, Settings, Share
 from shapepose_fg.estimation.detector_offsets import OffsetConfig
-from shapepose_fg.estimation.estimator_config import RefineConfig
+from shapepose_fg.estimation.estimator_config import EstimatorConfig, RefineConfig
 from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.estimation.motion_model import MotionConfig
 from shapepose_fg.estimation.window_graph import WindowGraphConfig
@@ -22,56 +22,138 @@ from shapepose_fg.tracking.tracker import TrackingConfig
 
 
 @dataclass(frozen=True)
+class PeopleConfig(Settings):
+    """Who is found, and for how long somebody is followed without being seen."""
+
+    gate_m: Metres = 0.07
+    """Largest reprojection error of a point of two views, as a length at its depth: over three times the 2 cm that
+    a detector's error leaves. More where the cameras are calibrated worse than to a pixel or two."""
+    most_pairs: Annotated[int, Interval(ge=1000, le=1_000_000)] = 150_000
+    """Pairs of detections of one joint in a frame: of more, each view keeps its most confident ones (18 a view of
+    30 cameras, 47 of 12, 122 of 5). More for denser crowds, fewer for detectors that see people everywhere: time
+    and memory grow with it."""
+    min_probability: Share = 0.3
+    """Least probability of a new person. Less finds people of whom little is seen, more leaves out more false
+    positives; over time, 0.5 and 0.3 gave F1 95.2 and 95.7 before three and four cameras."""
+    min_new_joints: Count = 4
+    """Core joints (trunk, arms, legs) that two views must see for a new person over time: less where furniture
+    hides people. Frame by frame three are enough: evidence decides there."""
+    patience_s: Seconds = 0.5
+    """Somebody without evidence for longer has gone. More for people who are often hidden; whoever comes back
+    later is recognised by `stitching`."""
+
+
+@dataclass(frozen=True)
+class SolvingConfig(Settings):
+    """How bodies and joints alternate (Algorithm 1), and how far the body is believed."""
+
+    alternations: Repeats = 3
+    """N of Algorithm 1 frame by frame: how often the body is fitted and the joints are solved, at the most. Most
+    frames are settled after one or two; the paper has 10."""
+    window_alternations: Repeats = 1
+    """The same over time, where a window starts from drafts: a second round takes twice the time and changed the
+    mean error by 0.1 to 0.2 mm. Windows with factors of your own take `alternations`."""
+    weight_shape: Factor = 1.0
+    """w_shape of Eq. 5, multiplies the squared distances to the body model: less for people whom it does not fit,
+    in wide clothes or with a load."""
+
+
+_CONSTANT = "is no table any more: its settings are constants beside the steps that use them"
+
+
+@dataclass(frozen=True)
 class PipelineConfig(Settings):
     """The settings of every step, and how the work is cut."""
 
-    candidates: CandidateConfig = field(default_factory=CandidateConfig)
-    """Stage I (b, c): pairs of views to 3D joint candidates."""
-    proposals: ProposalConfig = field(default_factory=ProposalConfig)
-    """Stage I (d): candidates to people."""
-    association: AssociationConfig = field(default_factory=AssociationConfig)
-    """Stage I (e): people to their 2D observations."""
+    method: Literal["default", "paper"] = "default"
+    """"paper": the steps as section 3 of the paper has them. `PipelineConfig.paper()` and `config --preset paper`
+    set its numbers, too."""
+    people: PeopleConfig = field(default_factory=PeopleConfig)
+    """Stage I, and people over time: who is there."""
     observations: ObservationConfig = field(default_factory=ObservationConfig)
-    """How far a 2D observation is trusted."""
-    tracking: TrackingConfig = field(default_factory=TrackingConfig)
-    """People over time: how they are followed from frame to frame."""
+    """How far a 2D observation is trusted: for detectors other than OpenPose, `scripts/measure_detector.py`."""
     following: FollowingConfig = field(default_factory=FollowingConfig)
     """People over time: what becomes of tracks."""
     stitching: StitchingConfig = field(default_factory=StitchingConfig)
     """People over time: who comes back after a longer time out of sight."""
     windows: WindowConfig = field(default_factory=WindowConfig)
-    """People over time: how frames are cut into windows, and how often detections are given out again."""
-    window_graph: WindowGraphConfig = field(default_factory=WindowGraphConfig)
-    """Stage II: the factor graph of a person."""
+    """How frames are cut into windows, and how often detections are reassociated."""
+    solving: SolvingConfig = field(default_factory=SolvingConfig)
+    """Stage II: bodies and joints."""
     motion: MotionConfig = field(default_factory=MotionConfig)
     """Stage II: how frames hang together."""
     body: BodyConfig = field(default_factory=BodyConfig)
     """Stage II: how bodies are fitted."""
     offsets: OffsetConfig = field(default_factory=OffsetConfig)
     """Stage II: where the detector puts its joints on the body."""
-    refine: RefineConfig = field(default_factory=RefineConfig)
-    """Stage II: the alternation."""
     temporal: bool = True
     """People over time: identities, motion, one shape a person. Without it every frame stands alone."""
     batch_frames: Annotated[int, Interval(ge=1, le=10000)] = 96
-    """Frames that are solved together and returned: bodies are fitted fastest by the hundred."""
+    """Frames that are solved together and returned: bodies are fitted fastest by the hundred. Fewer need less
+    memory."""
     threads: Annotated[int, Interval(ge=1, le=256)] = 1
     """Threads of torch while bodies are fitted: the matrices are small, and where cores are busy a second thread
     costs more than it brings."""
+
+    replaced: ClassVar[dict[str, str]] = {
+        "candidates": f"{_CONSTANT}; gate_m and most_pairs are in [people]",
+        "proposals": f"{_CONSTANT}; min_probability is in [people], and method chooses between evidence and hips",
+        "association": _CONSTANT,
+        "tracking": f"{_CONSTANT}; min_new_joints and patience_s are in [people]",
+        "window_graph": f"{_CONSTANT}; weight_shape is in [solving]",
+        "refine": f"{_CONSTANT}; alternations and window_alternations are in [solving]",
+    }
+    """Tables that there were, and what took their place."""
 
     @classmethod
     def paper(cls) -> "PipelineConfig":
         """The method as the paper has it written in section 3, without what we settled differently."""
         return cls(
-            candidates=CandidateConfig.paper(),
-            proposals=ProposalConfig.paper(),
-            association=AssociationConfig.paper(),
+            method="paper",
+            people=PeopleConfig(gate_m=CandidateConfig.paper().gate_m, min_new_joints=1),
             observations=ObservationConfig.paper(),
-            tracking=TrackingConfig(min_new_joints=1),
             windows=WindowConfig(again_alone=0),
-            window_graph=WindowGraphConfig.paper(),
+            solving=SolvingConfig(alternations=RefineConfig.paper().alternations),
             body=BodyConfig.paper(),
             offsets=OffsetConfig(source="none"),
-            refine=RefineConfig.paper(),
             temporal=False,
         )
+
+    @property
+    def candidates(self) -> CandidateConfig:
+        """Stage I (b, c): pairs of views to 3D joint candidates."""
+        rules = CandidateConfig.paper() if self.method == "paper" else CandidateConfig()
+        return replace(rules, gate_m=self.people.gate_m, most_pairs=self.people.most_pairs)
+
+    @property
+    def proposals(self) -> ProposalConfig:
+        """Stage I (d): candidates to people."""
+        rules = ProposalConfig.paper() if self.method == "paper" else ProposalConfig()
+        return replace(rules, min_probability=self.people.min_probability)
+
+    @property
+    def association(self) -> AssociationConfig:
+        """Stage I (e): people to their 2D observations."""
+        return AssociationConfig.paper() if self.method == "paper" else AssociationConfig()
+
+    @property
+    def tracking(self) -> TrackingConfig:
+        """People over time: how they are followed from frame to frame."""
+        return TrackingConfig(min_new_joints=self.people.min_new_joints, patience_s=self.people.patience_s)
+
+    @property
+    def window_graph(self) -> WindowGraphConfig:
+        """Stage II: the factor graph of a person."""
+        rules = WindowGraphConfig.paper() if self.method == "paper" else WindowGraphConfig()
+        return replace(rules, weight_shape=self.solving.weight_shape)
+
+    @property
+    def refine(self) -> RefineConfig:
+        """Stage II: the alternation."""
+        rules, own = RefineConfig.paper() if self.method == "paper" else RefineConfig(), self.solving
+        return replace(rules, alternations=own.alternations, window_alternations=own.window_alternations)
+
+    @property
+    def estimator(self) -> EstimatorConfig:
+        """Stage II."""
+        return EstimatorConfig(self.observations, self.window_graph, self.refine, self.motion)

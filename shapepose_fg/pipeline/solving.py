@@ -14,11 +14,10 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.estimation.estimator import Estimates, Estimator, ExtraFactors
-from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.floor import Floor
 from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.pipeline.bodies_over_time import with_bodies_over_time
-from shapepose_fg.pipeline.pipeline import PipelineConfig
+from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.solved_rows import result_rows
 from shapepose_fg.pipeline.windows import near_border, window_stop
 
@@ -74,8 +73,7 @@ def _solved(
     """Each window of the recording: its rows and those around it, solved."""
     if rows.observations is None:
         raise ValueError("rows without observations cannot be solved anew; reconstruct the recording again")
-    settings = EstimatorConfig(config.observations, config.window_graph, config.refine, config.motion)
-    estimator = Estimator(rig, fitter, tuple(rows.joint_names.tolist()), settings)
+    estimator = Estimator(rig, fitter, tuple(rows.joint_names.tolist()), config.estimator)
     with torch_threads(config.threads):
         for window in _windows(rows, config):
             part = rows.rows(window.rows(rows, config.windows.overlap_s))
@@ -99,7 +97,7 @@ class _Window:
         """Rows in its own frames, and in those within `overlap_s` of its borders, none beyond a cut."""
         frame, time_s = rows.frame, rows.time_s
         known, first = np.unique(frame, return_index=True)
-        # Where nobody of `rows` is in the frame at a border, its time is between those of the frames around it.
+        # Where no row is in the frame at a border, its time is between those of the frames around it.
         begin_s, end_s = np.interp([self.own.start, self.own.stop], known, time_s[first])
         own = _inside(frame, self.own)
         before = near_border(time_s, begin_s, overlap_s) & (frame < self.own.start)

@@ -34,10 +34,10 @@ class WindowConfig(Settings):
     """What a window takes of the frames before and after its own, and does not return: smoothing reaches a few
     frames. Windows of other lengths move joints by under 2 mm in the median (tests/test_windows.py)."""
     again_over_time: RepeatsOrNone = 3
-    """How often detections are given out again around a draft of a window."""
+    """How often detections are reassociated around a draft of a window: fewer rounds are faster."""
     again_alone: RepeatsOrNone = 5
-    """The same for frames that stand alone. From time to time more is asked of who stays (`Survival`): whoever
-    goes leaves detections to others, so the least goes first."""
+    """The same frame by frame; 0: never, as in the paper. From round to round more is asked of who stays
+    (`Survival`): who goes leaves detections to others, so the least sure goes first. Fewer rounds are faster."""
 
 
 def window_stop(start: int, end: int, frames: int) -> int:
@@ -80,8 +80,8 @@ class Solved:
     """How many frames they are of."""
     seconds: dict[str, float]
     """What it took, by stage."""
-    nobody: tuple[int, ...] = ()
-    """The frame of each row that was nobody when detections were given out again: a phantom, or a double."""
+    false_positives: tuple[int, ...] = ()
+    """The frame of each row that was left with no detections of its own when they were reassociated."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class WindowSolver:
     skeleton: Skeleton
     """The detector's joints."""
     assignment: AssignmentConfig
-    """How detections are given out."""
+    """How detections are associated."""
     windows: WindowConfig
     """How often they are."""
     extra_factors: ExtraFactors | None = None
@@ -121,7 +121,7 @@ class WindowSolver:
             replace(estimates.rows(index), problems=problems),
             frames=span.stop - span.start,
             seconds={"associate again": associated - began, "solve": time.perf_counter() - associated},
-            nobody=tuple(sorted(frame for frame in left.elements() if frame in own)),
+            false_positives=tuple(sorted(frame for frame in left.elements() if frame in own)),
         )
 
 

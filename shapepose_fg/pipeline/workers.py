@@ -72,7 +72,7 @@ class Workers(Generic[Shared]):
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if self._pool is not None:
             if kind is not None and self._lifeline is not None:
-                self._lifeline.close()  # nobody waits for what they are at
+                self._lifeline.close()  # what they are at is not wanted any more
             self._pool.shutdown(cancel_futures=True)
             self._pool = None
         if self._lifeline is not None:
@@ -135,7 +135,7 @@ def cores() -> int:
 
 @contextmanager
 def what_workers_inherit() -> Iterator[None]:
-    """Processes that start now have one thread each for linear algebra, and are deaf to ctrl-C.
+    """Processes that start now have one thread each for linear algebra, and ignore Ctrl-C.
 
     The terminal sends it to all of them; it is this process that ends them.
     """
@@ -176,7 +176,7 @@ def _begin(content: bytes, lifeline: Any) -> None:
 def end_with(lifeline: Any) -> None:
     """End this process, whatever it is at, when the one that started it lets go of the other end, or is killed.
 
-    A pipe and no event: whoever is killed while it waits for an event leaves its lock to nobody.
+    A pipe and no event: a process that is killed while it waits for an event keeps the lock for ever.
     """
     try:
         lifeline.recv_bytes()

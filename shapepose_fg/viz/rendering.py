@@ -4,7 +4,6 @@ Pixels follow OpenCV: the centre of the first pixel is (0, 0). A surface nearer 
 """
 
 import threading
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -26,8 +25,13 @@ _FLAT = (
     .setShadingType(cv2.RASTERIZE_SHADING_FLAT)
     .setCullingMode(cv2.RASTERIZE_CULLING_CW)
 )
-_CHUNK_PIXELS = 2_000_000
-"""Pixels tested at once: bounds the memory that large triangles take."""
+_BOTH_SIDES = (
+    cv2.TriangleRasterizeSettings()
+    .setShadingType(cv2.RASTERIZE_SHADING_FLAT)
+    .setCullingMode(cv2.RASTERIZE_CULLING_NONE)
+)
+_AMBIENT = 0.45
+"""Light that reaches every part of a shaded mesh."""
 
 
 @dataclass(frozen=True)
@@ -163,105 +167,32 @@ def rasterise(
     *,
     cull_back: bool = False,
 ) -> Surface:
-    """Draw triangles with corners at pixels `xy` (N, 2) and `depth` (N,) into an image of `size` (W, H).
+    """Draw triangles with corners at pixels `xy` (N, 2) and `depth` (N,) into an image of `size` (W, H), by
+    OpenCV.
 
-    1/depth is linear in the image, so that depth is exact inside a face. Corners that are NaN, or nearer
-    than `NEAR_M`, drop their faces.
+    1/depth is linear in the image, so that depth is exact inside a face. Corners that are NaN, or nearer than
+    `NEAR_M`, drop their faces. At most 2**20 faces are drawn.
     """
     width, height = size
-    x, y = np.ascontiguousarray(xy, dtype=np.float64).T.copy()
-    nearness = np.where(depth > NEAR_M, 1.0 / np.maximum(depth, NEAR_M), np.nan).astype(np.float64)
-    x[~np.isfinite(nearness)] = np.nan
-    index, first_row, rows, room = _rows(x, y, faces, size, cull_back)
-    a, b, c = _planes(x, y, nearness, faces[index])
-    buffer = np.zeros(width * height, dtype=np.uint64)
-    for part in _chunks(room):
-        which, row = _ranges(first_row[part], rows[part])
-        which += part.start
-        first, count = _spans(a[:3, which], b[:3, which] * row + c[:3, which], width)
-        span, column = _ranges(first, count)
-        which, row = which[span], row[span]
-        near = a[3, which] * column + b[3, which] * row + c[3, which]
-        # Nearness in the high bits, face in the low ones: the maximum of one integer keeps both.
-        bits = near.astype(np.float32).view(np.uint32).astype(np.uint64) << np.uint64(32)
-        np.maximum.at(buffer, row * width + column, bits | index[which].astype(np.uint64))
-    hit = buffer > 0
-    near = (buffer >> np.uint64(32)).astype(np.uint32).view(np.float32)
-    met = np.full(width * height, np.inf, dtype=np.float32)
-    np.divide(np.float32(1.0), near, out=met, where=hit)
-    face = np.where(hit, (buffer & np.uint64(0xFFFFFFFF)).astype(np.int64), -1).astype(np.int32)
-    return Surface(met.reshape(height, width), face.reshape(height, width))
-
-
-def _rows(
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    faces: NDArray[np.integer],
-    size: tuple[int, int],
-    cull_back: bool,
-) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """Faces with a pixel centre in their box: index, first row, count of rows, pixels of the box, each (G,)."""
-    i, j, k = faces.T
-    xs, ys = (x[i], x[j], x[k]), (y[i], y[j], y[k])
-    area = (xs[1] - xs[0]) * (ys[2] - ys[0]) - (xs[2] - xs[0]) * (ys[1] - ys[0])
-    keep = area < -1e-12 if cull_back else np.abs(area) > 1e-12  # NaN compares false: such faces go
-    low_x = np.maximum(np.ceil(np.minimum(np.minimum(*xs[:2]), xs[2])), 0)
-    high_x = np.minimum(np.floor(np.maximum(np.maximum(*xs[:2]), xs[2])), size[0] - 1)
-    low_y = np.maximum(np.ceil(np.minimum(np.minimum(*ys[:2]), ys[2])), 0)
-    high_y = np.minimum(np.floor(np.maximum(np.maximum(*ys[:2]), ys[2])), size[1] - 1)
-    index = np.flatnonzero(keep & (high_x >= low_x) & (high_y >= low_y))
-    rows = (high_y - low_y)[index].astype(np.intp) + 1
-    return index, low_y[index].astype(np.intp), rows, rows * ((high_x - low_x)[index].astype(np.intp) + 1)
-
-
-def _spans(
-    a: NDArray[np.float64], rest: NDArray[np.float64], width: int
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """First column and count (S,) of the pixels of a row where all three a x + rest (3, S) are at least 0."""
-    low, high = np.full(rest.shape[1], -np.inf), np.full(rest.shape[1], np.inf)
-    outside = np.zeros(rest.shape[1], dtype=bool)
-    for slope, value in zip(a, rest, strict=True):
-        with np.errstate(divide="ignore", invalid="ignore"):
-            edge = -value / slope
-        # The margin lets neighbours both draw a pixel centre on their common edge: no gaps.
-        low = np.where(slope > 0, np.maximum(low, edge - 1e-7), low)
-        high = np.where(slope < 0, np.minimum(high, edge + 1e-7), high)
-        outside |= (slope == 0) & (value < -1e-9)
-    first = np.ceil(np.clip(low, 0, width)).astype(np.intp)
-    last = np.floor(np.clip(high, -1, width - 1)).astype(np.intp)
-    return first, np.where(outside, 0, np.maximum(last - first + 1, 0))
-
-
-def _ranges(first: NDArray[np.intp], count: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Members of ranges that begin at `first` (G,) and have `count` (G,): whose each is, and the number."""
-    which = np.repeat(np.arange(len(count)), count)
-    return which, np.arange(len(which)) + (first - np.cumsum(count) + count)[which]
-
-
-def _planes(
-    x: NDArray[np.float64], y: NDArray[np.float64], nearness: NDArray[np.float64], faces: NDArray[np.integer]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Coefficients a, b, c, each (4, G), of a x + b y + c: three barycentric coordinates and 1/depth."""
-    px, py = x[faces.T], y[faces.T]
-    nx, ny = np.roll(px, -1, axis=0), np.roll(py, -1, axis=0)
-    lx, ly = np.roll(px, 1, axis=0), np.roll(py, 1, axis=0)
-    # Coordinate m vanishes on the edge from the next corner to the last one and is 1 at corner m.
-    a, b = ny - ly, lx - nx
-    c = nx * ly - lx * ny
-    area = (a * px + b * py + c)[0]
-    a, b, c = a / area, b / area, c / area
-    corner = nearness[faces.T]
-    return tuple(np.concatenate([q, (q * corner).sum(axis=0, keepdims=True)]) for q in (a, b, c))  # type: ignore[return-value]
-
-
-def _chunks(counts: NDArray[np.intp]) -> Iterator[slice]:
-    """Ranges of faces with about `_CHUNK_PIXELS` pixels in their boxes."""
-    if len(counts) == 0:
-        return
-    group = np.cumsum(counts) // _CHUNK_PIXELS
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(group)) + 1, [len(counts)]])
-    for start, stop in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        yield slice(start, stop)
+    drawable = np.isfinite(xy).all(axis=1) & (depth > NEAR_M)
+    index = np.flatnonzero(drawable[faces].all(axis=1))
+    if len(index) == 0:
+        nothing = np.full((height, width), np.inf, dtype=np.float32)
+        return Surface(nothing, np.full((height, width), -1, dtype=np.int32))
+    # As in `_as_opengl`, for pixels: x / z and y / z are what OpenCV scales by its own focal length.
+    focal = height / 2 / np.tan(0.5)
+    middle = np.array([width / 2, height / 2]) - 0.5
+    flat = (xy - middle) * depth[:, None] / focal * (1.0, -1.0)
+    corners = np.column_stack([flat, -depth])[faces[index]].reshape(-1, 3).astype(np.float32)
+    number = np.repeat(_numbers(len(index)), 3, axis=0)
+    colour = np.full((height, width, 3), -1.0, dtype=np.float32)
+    met = np.full((height, width), _FAR_M, dtype=np.float32)
+    each = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
+    style = _FLAT if cull_back else _BOTH_SIDES
+    cv2.triangleRasterize(corners, each, number, colour, met, np.eye(4), 1.0, NEAR_M, _FAR_M, style)
+    hit = colour[..., 0] >= 0
+    face = np.where(hit, index[np.where(hit, np.rint(colour[..., 0] / _NUMBER), 0).astype(np.intp)], -1)
+    return Surface(np.where(hit, met, np.float32(np.inf)), face.astype(np.int32))
 
 
 def render_shaded(
@@ -269,9 +200,7 @@ def render_shaded(
     faces: NDArray[np.integer],
     colours: NDArray[np.floating],
     camera: Camera,
-    *,
     light: NDArray[np.float64],
-    ambient: float = 0.45,
     samples: int = 3,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Picture of shaded meshes: colour (H, W, 3) in 0..1, multiplied by coverage, and coverage (H, W).
@@ -291,7 +220,7 @@ def render_shaded(
     lit = 0.5 + 0.5 * normal @ (light / np.linalg.norm(light))
     # A grazing surface darkens a little: limbs of one colour stay apart.
     rim = 0.75 + 0.25 * np.clip(normal @ toward_eye, 0.0, 1.0) ** 0.5
-    shade = (ambient + (1.0 - ambient) * lit) * rim
+    shade = (_AMBIENT + (1.0 - _AMBIENT) * lit) * rim
     base = (np.asarray(colours, dtype=np.float64)[corners] * weight[..., None]).sum(axis=1)
     picture = np.zeros((*surface.face.shape, 4), dtype=np.float32)
     picture[row, column, :3] = np.clip(base * shade[:, None], 0.0, 1.0)

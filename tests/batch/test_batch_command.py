@@ -6,14 +6,13 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 
 from shapepose_fg.cli.batch.table import read_table
 from shapepose_fg.cli.main import main
-from shapepose_fg.cli.reconstruct.request import carry_out
+from shapepose_fg.cli.reconstruct.command import carry_out
 from shapepose_fg.cli.stopping import Stopped
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
@@ -21,6 +20,7 @@ from shapepose_fg.estimation.detector_offsets import OffsetConfig
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.config import toml_text
 from shapepose_fg.io.detections import read_detections
+from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.pipeline.runs.manifest import frames_done
 from shapepose_fg.pipeline.windows import WindowConfig
@@ -87,7 +87,7 @@ def stopped_behind_a_chunk(archive: Path, folder: Path) -> None:
             raise Stopped(signal.SIGTERM)
 
     with pytest.raises(Stopped):
-        carry_out(asked, folder, workers=1, restart=True, watched=lambda: nullcontext(stop))
+        carry_out(asked, folder, Execution(progress=stop), restart=True)
     assert frames_done(folder) == 12
 
 
@@ -125,11 +125,12 @@ def test_an_archive_is_interrupted_goes_on_and_is_what_each_recording_alone_give
     assert "the file ends too early" in broken["reasons"][0]
     assert f"broken: {broken['reasons'][0]}"[:60] in " ".join(said.err.split()) and "2 done, 1 failed" in said.out
     assert "parts" not in {file.name for file in (tmp_path / "long").iterdir()}
-    for name, more in (("long", {"cuts": (18,), "chunk_frames": 12}), ("short", {})):
+    for name, more in (("long", {"cuts": (18,)}), ("short", {})):
         rig = read_rig(archive / name / "rig.json")
         seen = read_detections(archive / name / "openpose", rig)
         times = FrameTimes.from_fps(25.0, len(seen)) if name == "long" else None
-        reconstruct(seen, rig, CONFIG, times=times, **more).save(tmp_path / "alone" / name)
+        execution = Execution(chunk_frames=12 if name == "long" else None)
+        reconstruct(seen, rig, CONFIG, times=times, execution=execution, **more).save(tmp_path / "alone" / name)
         for file in ("people.npz", "observations.npz"):
             assert (tmp_path / name / file).read_bytes() == (tmp_path / "alone" / name / file).read_bytes(), file
 

@@ -12,8 +12,7 @@ from shapepose_fg.cli.batch.command import _standings
 from shapepose_fg.cli.batch.leader import Assignment, Failed, Leader
 from shapepose_fg.cli.batch.standing import Standing, Standings, read_standings
 from shapepose_fg.cli.batch.table import Entry
-from shapepose_fg.cli.reconstruct.outcome import Ended
-from shapepose_fg.cli.reconstruct.request import Request
+from shapepose_fg.cli.reconstruct.request import Ended, Request
 from shapepose_fg.cli.stopping import Stopped
 from shapepose_fg.core.errors import InputError
 

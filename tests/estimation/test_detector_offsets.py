@@ -17,8 +17,8 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.detector_offsets import OffsetConfig, confident_targets, spread_frames
 from shapepose_fg.estimation.linearisation import ObservationConfig
+from shapepose_fg.pipeline.config import PeopleConfig
 from shapepose_fg.pipeline.pipeline import PipelineConfig, estimate_offsets, reconstruct
-from shapepose_fg.proposal.candidates import CandidateConfig
 from shapepose_fg.proposal.thinning import ThinnedFrames
 from shapepose_fg.simulation import DetectorConfig, built_in_scene, simulate
 from shapepose_fg.simulation.scene import Scene
@@ -111,7 +111,7 @@ def test_no_offsets_are_found_where_there_are_none(scene):
 
 def test_offsets_are_learnt_from_frames_that_are_thinned_as_in_a_run(scene):
     """Every detection is there four times, 2 px aside; eight of a joint stay in a view, of four people."""
-    config = PipelineConfig(candidates=CandidateConfig(most_pairs=1000))
+    config = PipelineConfig(people=PeopleConfig(most_pairs=1000))
     rng, frames = np.random.default_rng(0), []
     for seen in simulate(scene, seed=0, frames=range(3)):
         xy = np.tile(seen.xy, (4, 1)) + rng.normal(0, 2, (4 * len(seen), 2))
@@ -172,7 +172,7 @@ def seen_by(views: int, confidence: float, scene: Scene) -> Observations:
 @pytest.mark.parametrize(("views", "confidence", "used"), [(6, 0.8, True), (2, 0.8, False), (6, 0.3, False)])
 def test_only_what_three_views_see_well_is_learnt_from(scene, views, confidence, used):
     observations = seen_by(views, confidence, scene)
-    targets = confident_targets(observations, scene.rig, ObservationConfig(), OffsetConfig())
+    targets = confident_targets(observations, scene.rig, ObservationConfig())
     assert (np.abs(targets.information).max(axis=(2, 3)) > 0).all() == used
     assert (np.abs(targets.information).max(axis=(2, 3)) > 0).any() == used
     np.testing.assert_allclose(targets.xyz, scene.truth_at(0), atol=1e-6)

@@ -69,12 +69,12 @@ def test_fifteen_joints_are_told_apart_and_a_perfect_result_scores_100(tmp_path,
     result.write_text(truth.read_text())
     assert tuple(read_people(result).joint_names) == SHELF_JOINTS
     with pytest.raises(SystemExit):
-        main(["evaluate", "shelf", "--people", str(result), "--ground-truth", str(truth), "--json"])
+        main(["evaluate", "shelf", str(result), "--ground-truth", str(truth), "--json"])
     assert '"pcp_average": 100.0' in capsys.readouterr().out
     # The same person in 19 joints: the protocol's mapping makes neck and head, exactly.
     result.write_text(skeleton_text({0: {0: with_confidence(named(SKEL_19))}}, 1, 19))
     with pytest.raises(SystemExit):
-        main(["evaluate", "shelf", "--people", str(result), "--ground-truth", str(truth), "--json"])
+        main(["evaluate", "shelf", str(result), "--ground-truth", str(truth), "--json"])
     assert '"pcp_average": 100.0' in capsys.readouterr().out
 
 
@@ -193,5 +193,5 @@ def test_people_are_not_read_twice(tmp_path):
 def test_shelf_s_annotation_is_a_perfect_result(shared_data, capsys):
     path = str(shared_data / "shelf" / "gt_dev.txt")
     with pytest.raises(SystemExit):
-        main(["evaluate", "shelf", "--people", path, "--ground-truth", path, "--json"])
+        main(["evaluate", "shelf", path, "--ground-truth", path, "--json"])
     assert '"mpjpe_mm": 0.0' in capsys.readouterr().out

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from shapepose_fg.cli.main import main
+from shapepose_fg.cli.pictures import opened
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.calibration import write_rig
@@ -14,7 +15,7 @@ from shapepose_fg.io.export.reading import read_take
 from shapepose_fg.io.export.rerun_app import new_stream
 from shapepose_fg.io.export.rerun_log import log_pictures, undistorting
 from shapepose_fg.io.footage.placement import Placement, PlacementKind
-from shapepose_fg.viz.overlay.result_pictures import pictures_of
+from shapepose_fg.viz.overlay.result_pictures import Wanted, pictures_of
 
 from .conftest import FIRST
 
@@ -79,7 +80,7 @@ def test_pictures_are_logged_in_their_frames(filmed, result, tmp_path, capsys):
     rerun = pytest.importorskip("rerun")
     take = read_take(filmed, frames=range(FIRST, FIRST + 3))
     assert take.rig is not None
-    pictures = pictures_of(take.people.run, take.rig, ["cam0"], [f"cam0={filmed / 'cam0'}"], None, [])
+    pictures = pictures_of(take.people.run, take.rig, Wanted(["cam0"], [f"cam0={filmed / 'cam0'}"]), opened)
     stream, told = new_stream(), []
     stream.save(tmp_path / "pictures.rrd")
     log_pictures(stream, take, pictures, lambda done, total: told.append((done, total)))
@@ -109,7 +110,7 @@ def test_pictures_whose_numbers_are_no_frames_are_refused(filmed):
     with pytest.raises(
         InputError, match="pictures are numbered from 0 to 20261122061055; number them by the frames"
     ):
-        pictures_of({}, take.rig, ["cam0"], [f"cam0={filmed / 'cam0'}"], None, [])
+        pictures_of({}, take.rig, Wanted(["cam0"], [f"cam0={filmed / 'cam0'}"]))
 
 
 @pytest.mark.parametrize(

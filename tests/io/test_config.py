@@ -1,6 +1,6 @@
 """Settings: TOML tables onto nested dataclasses, and the printed defaults back."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, is_dataclass
 from enum import StrEnum
 from pathlib import Path
 
@@ -9,6 +9,7 @@ import pytest
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.config import read_config, toml_text
 from shapepose_fg.io.validation import describe
+from shapepose_fg.pipeline.config import PeopleConfig
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 
 
@@ -114,11 +115,30 @@ def test_the_pipelines_own_settings(tmp_path):
     path = tmp_path / "settings.toml"
     path.write_text(toml_text(PipelineConfig()))
     assert read_config(path, PipelineConfig) == PipelineConfig()
-    path.write_text("batch_frames = 7\n[candidates]\ngate_m = 0.2\n")
+    path.write_text("batch_frames = 7\n[people]\ngate_m = 0.2\n")
     config = read_config(path, PipelineConfig)
-    assert config == replace(
-        PipelineConfig(), batch_frames=7, candidates=replace(PipelineConfig().candidates, gate_m=0.2)
-    )
+    assert config == PipelineConfig(batch_frames=7, people=PeopleConfig(gate_m=0.2))
+    assert config.candidates.gate_m == 0.2
+
+
+@pytest.mark.parametrize("old", ["candidates", "proposals", "association", "tracking", "window_graph", "refine"])
+def test_what_took_the_place_of_old_settings_is_said(tmp_path, old):
+    (tmp_path / "old.toml").write_text(f"[{old}]\ngate_m = 0.2\n")
+    with pytest.raises(
+        InputError, match=f"{old} is no table any more: .*; `shapepose-fg config` shows the defaults"
+    ):
+        read_config(tmp_path / "old.toml", PipelineConfig)
+
+
+def test_there_are_few_settings():
+    """What a user has no reason to turn is a constant."""
+
+    def count(config) -> int:
+        values = [getattr(config, each.name) for each in fields(config)]
+        return sum(count(value) if is_dataclass(value) else 1 for value in values)
+
+    body = count(PipelineConfig().body)
+    assert count(PipelineConfig()) - body <= 35
 
 
 def test_values_are_described_in_a_word_or_two():

@@ -9,6 +9,7 @@ import pytest
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections, Recording
 from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.pipeline.config import PeopleConfig
 from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people, reconstruct
 from shapepose_fg.proposal.candidates import (
     CandidateConfig,
@@ -152,7 +153,7 @@ def among_strangers(people: Detections, strangers: Detections) -> Detections:
 
 def test_what_was_left_out_is_said(five_cameras, two_people, seen_exactly):
     rig, seen = five_cameras, seen_exactly(five_cameras, two_people)
-    config = PipelineConfig(candidates=CandidateConfig(most_pairs=1000), batch_frames=2)
+    config = PipelineConfig(people=PeopleConfig(most_pairs=1000), batch_frames=2)
     config = replace(config, offsets=replace(config.offsets, source="none"))
     frames = [among_strangers(seen, crowd(rig, count, seed)) for seed, count in enumerate((16, 1, 16))]
     people = reconstruct(Recording(BODY_25, frames), rig, config)

@@ -184,9 +184,10 @@ def test_entries_of_run_json_that_make_no_sense_say_nothing(result, scene, tmp_p
     assert_closed(Page(write_report(tmp_path, result.with_run(**run), scene.rig)))
 
 
-def test_a_long_recording_is_thinned_and_says_so(result, scene, tmp_path):
+def test_a_long_recording_is_thinned_and_says_so(result, scene, tmp_path, monkeypatch):
     whole = write_report(tmp_path, result, scene.rig).stat().st_size
-    thin = Page(write_report(tmp_path, result, scene.rig, scene_bytes=8000))
+    monkeypatch.setattr("shapepose_fg.viz.report.writing.SCENE_BYTES", 8000)
+    thin = Page(write_report(tmp_path, result, scene.rig))
     assert len(thin.source) < whole - 8000
     every = int(np.ceil(whole / 8000)) and re.search(r"one frame in (\d+) \((\d+) of 24\)", thin.text)
     assert every is not None

@@ -6,6 +6,7 @@ import pytest
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.pipeline.config import PeopleConfig
 from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people
 from shapepose_fg.tracking.following import FollowingConfig, FollowState, finish, follow
 from shapepose_fg.tracking.hypotheses import Input
@@ -17,13 +18,10 @@ FPS = 30.0
 @pytest.fixture(scope="session")
 def tracker() -> Tracker:
     """Stage I as the pipeline makes it, bones of 0.7 m at most."""
-    config = PipelineConfig()
+    config, likely = PipelineConfig(), PipelineConfig(people=PeopleConfig(min_probability=0.15))
 
     def find(detections, rig, weak):
-        from dataclasses import replace
-
-        sure = replace(config.proposals, min_probability=0.15 if weak else config.proposals.min_probability)
-        return find_people(detections, rig, BODY_25, replace(config, proposals=sure))
+        return find_people(detections, rig, BODY_25, likely if weak else config)
 
     scale = BodyScale(np.full(25, 0.7), np.full(25, 10.0))
     return Tracker(BODY_25, scale, find, TrackingConfig(), config.observations)

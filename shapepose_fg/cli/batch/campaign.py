@@ -5,32 +5,16 @@ from dataclasses import dataclass, replace
 from multiprocessing.connection import wait
 from pathlib import Path
 from time import monotonic
-from typing import Protocol
 
 from shapepose_fg.cli.batch.leader import Assignment, Leader
 from shapepose_fg.cli.batch.standing import Standing, Standings
+from shapepose_fg.cli.batch.summary import Bars
 from shapepose_fg.cli.batch.table import Entry
-from shapepose_fg.cli.reconstruct.outcome import Ended
+from shapepose_fg.cli.reconstruct.request import Ended
 from shapepose_fg.pipeline.runs.manifest import PARTS
 
 ATTEMPTS = 2
 """A recording that has failed so often is left, and the others go on."""
-
-
-class Watcher(Protocol):
-    """Who is told how it goes."""
-
-    def began(self, name: str) -> None:
-        """A recording is being read."""
-        ...
-
-    def frames(self, name: str, done: int, count: int) -> None:
-        """So many of its frames are done."""
-        ...
-
-    def ended(self, name: str, *, failed: str | None, again: bool) -> None:
-        """It is done, or has `failed` for a reason; `again` if it will be tried again."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -48,7 +32,7 @@ class Campaign:
     at_once: int
     """So many recordings are led at a time."""
 
-    def run(self, standings: Standings, watcher: Watcher) -> None:
+    def run(self, standings: Standings, watcher: Bars) -> None:
         """Do what is not done; `standings` has how each ended.
 
         The largest come first, so that none is alone at the end; whoever failed comes again after all others.
@@ -97,7 +81,7 @@ class Campaign:
         resume = not restart and (folder / PARTS).exists()
         return Assignment(entry.name, entry.request, folder, self.cluster, self.at_once, resume, restart)
 
-    def _heard(self, leader: Leader, standings: Standings, watcher: Watcher) -> bool:
+    def _heard(self, leader: Leader, standings: Standings, watcher: Bars) -> bool:
         """Take in what a leader tells; whether it has ended."""
         name, told = leader.assignment.name, leader.next()
         if isinstance(told, tuple):

@@ -55,14 +55,13 @@ def look_at_all(table: Path, entries: Sequence[Entry], output: Path, *, begun: b
 
 def _look_at(entry: Entry, folder: Path, begun: bool) -> int:
     """Bytes of a recording's detections."""
-    asked = entry.request
-    known = prepare(asked, folder, tell=lambda _: None)
-    rig = known.rig()
-    places = find_places(known.detections, rig)
+    known = prepare(entry.request, folder, tell=lambda _: None)
+    asked = known.request
+    places = find_places(known.detections, asked.rig())
     find_skeleton(asked.skeleton)
     settings = known.settings()
     source = settings.offsets.source
-    files = [asked.body, known.timestamps, Path(source) if source not in ("recording", "none") else None]
+    files = [asked.body, asked.timestamps, Path(source) if source not in ("recording", "none") else None]
     for file in files:
         if file is not None:
             open_regular(file).close()

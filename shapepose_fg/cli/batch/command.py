@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from shapepose_fg.cli.options import check_workers
+from shapepose_fg.cli.options import RESULT, RUN, RunOptions, grouped, option
 from shapepose_fg.cli.stopping import Stopped
 from shapepose_fg.cli.terminal import note, show, warn
 from shapepose_fg.core.errors import InputError
@@ -21,29 +21,14 @@ if TYPE_CHECKING:
 # Everything else is imported inside the command: `--help` must not wait for torch.
 
 
+@grouped
 def batch(
     table: Annotated[Path, typer.Argument(metavar="RECORDINGS.TOML", help="The recordings: see docs/batch.md.")],
-    output: Annotated[
-        Path, typer.Option(help="Folder for a folder of results of each recording, and batch.json.")
-    ],
-    cluster: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ADDRESS", help="Dask scheduler (tcp://host:8786) whose processes solve; else this machine's."
-        ),
-    ] = None,
-    workers: Annotated[
-        int | None, typer.Option(help="Processes of this machine that solve; by default one a core.")
-    ] = None,
+    running: RunOptions,
+    output: Annotated[Path, option(RESULT, "Folder for a folder of results of each recording, and batch.json.")],
     at_once: Annotated[
-        int | None, typer.Option(help="Recordings under way at a time; by default as many as keep all busy.")
+        int | None, option(RUN, "Recordings under way at a time; by default as many as keep all busy.")
     ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with what is not done in --output; who failed is tried again.")
-    ] = False,
-    restart: Annotated[
-        bool, typer.Option("--restart", help="Begin all recordings anew, whatever is in --output.")
-    ] = False,
 ) -> None:
     """Reconstruct all recordings of a table: each as `reconstruct` would, to the byte, in one queue of work.
 
@@ -51,34 +36,18 @@ def batch(
     """
     from shapepose_fg.cli.batch.table import read_table
 
-    check_workers(workers)
-    if cluster is not None and workers is not None:
-        raise InputError(
-            "--cluster and --workers: these are processes of the cluster, or of this machine; give one"
-        )
+    running.check()
     if at_once is not None and not 1 <= at_once <= 64:
         raise InputError(f"--at-once {at_once}: must be 1 to 64; leave it out for as many as keep all busy")
-    if resume and restart:
-        raise InputError("--resume and --restart: a batch goes on or begins anew; give one of them")
     entries = read_table(table)
     from shapepose_fg.cli.batch.standing import BATCH
 
     with only_run_in(output, [BATCH]):
-        _run(table, entries, output, cluster, workers, at_once, resume=resume, restart=restart)
+        _run(table, entries, output, running, at_once)
 
 
-def _run(
-    table: Path,
-    entries: "list[Entry]",
-    output: Path,
-    address: str | None,
-    workers: int | None,
-    at_once: int | None,
-    *,
-    resume: bool,
-    restart: bool,
-) -> None:
-    """The batch in a folder where nobody else writes."""
+def _run(table: Path, entries: "list[Entry]", output: Path, running: RunOptions, at_once: int | None) -> None:
+    """The batch, in a folder that no other process writes to."""
     from shapepose_fg.cli.batch.campaign import Campaign
     from shapepose_fg.cli.batch.check import look_at_all
     from shapepose_fg.cli.batch.standing import BATCH, Standings
@@ -88,13 +57,14 @@ def _run(
 
     begin = time.monotonic()
     standings = Standings(output / BATCH, str(table))
-    standings.of = _standings(entries, output, resume=resume, restart=restart)
+    standings.of = _standings(entries, output, resume=running.resume, restart=running.restart)
     todo = [entry for entry in entries if standings.of[entry.name].status == "waiting"]
-    sizes = look_at_all(table, todo, output, begun=resume or restart)
+    sizes = look_at_all(table, todo, output, begun=running.resume or running.restart)
     if len(todo) > 0:
         with ExitStack() as opened:
+            address = None if running.cluster == "local" else running.cluster
             if address is None:
-                scheduler = opened.enter_context(local_cluster(workers or cores(), dashboard=True))
+                scheduler = opened.enter_context(local_cluster(running.workers or cores(), dashboard=True))
             else:
                 scheduler = look_at(address)
             count = min(at_once or _at_once(scheduler.processes, cores()), len(todo))

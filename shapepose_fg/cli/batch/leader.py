@@ -1,6 +1,6 @@
 """One recording, led by a process of its own: it reads, hands out work to the cluster, and writes the results.
 
-A process and not a thread, so that one recording's error, memory or crash is no other's, and nobody waits for
+A process and not a thread, so that one recording's error, memory or crash is no other's, and none waits for
 Python's lock.
 """
 
@@ -10,19 +10,19 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 from shapepose_fg.cli.batch.check import LOG
-from shapepose_fg.cli.reconstruct.outcome import Ended
-from shapepose_fg.cli.reconstruct.request import Request, carry_out
+from shapepose_fg.cli.reconstruct.command import carry_out
+from shapepose_fg.cli.reconstruct.request import Ended, Request
 from shapepose_fg.cli.stopping import Stopped, stoppable
 from shapepose_fg.cli.terminal import use_any_streams
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.workers import end_with, processes, what_workers_inherit
 
 _CARRIED_OUT_BY = "shapepose_fg.cli.reconstruct.run"
@@ -124,20 +124,13 @@ def _lead(assignment: Assignment, tell: Connection, lifeline: Connection) -> Non
 
 def _carried_out(assignment: Assignment, tell: Callable[[int, int], None]) -> Ended | Failed:
     """The recording, reconstructed, or why it is not."""
-
-    @contextmanager
-    def watched() -> Iterator[Callable[[int, int], None]]:
-        yield tell
-
     try:
         return carry_out(
             assignment.request,
             assignment.folder,
-            cluster=assignment.cluster,
-            sharing=assignment.sharing,
+            Execution(None, assignment.cluster, assignment.sharing, progress=tell),
             resume=assignment.resume,
             restart=assignment.restart,
-            watched=watched,
         )
     except InputError as error:
         print(f"error: {error}", flush=True)

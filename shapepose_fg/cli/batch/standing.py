@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from shapepose_fg.cli.reconstruct.outcome import Ended
+from shapepose_fg.cli.reconstruct.request import Ended
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.provenance import versions
 from shapepose_fg.core.storage.files import read_json, write_atomically

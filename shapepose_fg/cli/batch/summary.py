@@ -21,15 +21,15 @@ class Bars:
         self._count()
 
     def began(self, name: str) -> None:
-        """See `Watcher`."""
+        """A recording is being read."""
         self._tasks[name] = self._bars.add_task(name, total=None)
 
     def frames(self, name: str, done: int, count: int) -> None:
-        """See `Watcher`."""
+        """So many of its frames are done."""
         self._bars.update(self._tasks[name], completed=done, total=count)
 
     def ended(self, name: str, *, failed: str | None, again: bool) -> None:
-        """See `Watcher`."""
+        """It is done, or has `failed` for a reason; `again` if it will be tried again."""
         self._bars.remove_task(self._tasks.pop(name))
         self._count()
         how, style = ("done", "green") if failed is None else ("failed", "bold red")

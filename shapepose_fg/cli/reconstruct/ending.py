@@ -1,83 +1,119 @@
-"""What `shapepose-fg reconstruct` makes of a finished run beside its results: check, report, TRC and C3D."""
+"""What `shapepose-fg reconstruct` says at its end: who was found, how well it went, and what looks wrong."""
 
-from dataclasses import dataclass
-from pathlib import Path
+from typing import Any
 
+import numpy as np
 from rich.table import Table
+from rich.text import Text
 
-from shapepose_fg.cli.reconstruct.summary import summary_table
-from shapepose_fg.cli.terminal import note
-from shapepose_fg.core.camera import Rig
+from shapepose_fg.cli.reconstruct.request import Prepared
+from shapepose_fg.cli.terminal import note, show, warn
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.frame_times import rate_words
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.io.detection_table import DetectionTable
-from shapepose_fg.io.export.marker_files import write_pose2sim_files
-from shapepose_fg.io.pose2sim_project import Pose2SimProject
+from shapepose_fg.pipeline.pipeline import Task
 from shapepose_fg.pipeline.runs.assembly import Assembly
+from shapepose_fg.setup_check.camera_use import use_table
 from shapepose_fg.setup_check.diagnosis import diagnose
 from shapepose_fg.setup_check.in_result import ResultCheck, result_check
 from shapepose_fg.setup_check.pictures import other_sizes
 from shapepose_fg.setup_check.report import report_of
-from shapepose_fg.viz.report.writing import MOST_ROWS, REPORT, th, write_report
+
+_SURE = 0.9
+"""Whoever is less probable is named."""
+_KNOWN_WORDS = {
+    "seen": "seen by two views",
+    "weak": "seen by one or weakly",
+    "body": "inferred from the body",
+    "motion": "carried by motion",
+    "unknown": "unknown",
+}
 
 
-@dataclass(frozen=True)
-class Ending:
-    """What is wanted of a run beside its results."""
-
-    calibration: Path
-    """The file of the cameras."""
-    project: Pose2SimProject | None
-    """Where TRC and C3D go."""
-    videos: Path | None
-    """Folder of videos whose sizes are compared with the calibration's."""
-    report: bool
-    """Whether report.html is."""
-    check: bool
-    """Whether the set-up is checked."""
-
-    def looked_at(self, result: Assembly) -> Reconstruction:
-        """The rows that fit in memory beside everything else."""
-        every = _every(result)
-        if every > 1:
-            note(f"check and report are made of every {th(every)} frame: the result has {len(result)} rows")
-        return result.reconstruction(every=every)
-
-    def checked(
-        self, recording: DetectionTable, rig: Rig, frames: range, people: Reconstruction
-    ) -> ResultCheck | None:
-        """Whether cameras, detections and, where there are any, videos fit."""
-        if not self.check:
-            return None
-        sizes = ()
-        if self.videos is not None and self.videos.is_dir():
-            try:
-                sizes = other_sizes([str(self.videos)], rig)
-            except InputError as error:  # the result does not need them
-                note(f"{error}; their sizes are not checked")
-        report = report_of(diagnose(recording, rig, frames), rig, sizes)
-        return result_check(report, people, recording, rig, frames)
-
-    def written(
-        self, result: Assembly, people: Reconstruction, rig: Rig, frames: range, seconds: float, output: Path
-    ) -> Table:
-        """Leave report and files for other programs; returns what is to be said of the run."""
-        summary = summary_table(result, people, frames, len(rig), seconds, output)
-        if self.report:
-            page = write_report(output, people, rig, every=_every(result))
-            summary.add_row("", f"{page}  to look at, in a browser")
-        else:  # that of an earlier result would say what is no longer true
-            (output / REPORT).unlink(missing_ok=True)
-        if self.project is not None:
-            whole = people if len(people) == len(result) else result.reconstruction()
-            written = write_pose2sim_files(whole, rig.up, self.project)
-            for path in written.files:
-                summary.add_row("", str(path))
-            for each in written.notes:
-                note(each)
-        return summary
+def check_setup(known: Prepared, task: Task, people: Reconstruction) -> ResultCheck:
+    """Whether cameras, detections and, of a project, videos fit; `people` were reconstructed."""
+    frames, sizes = task.whole()[0], ()
+    # Of its own detections `detect` knows which pictures they are of.
+    if known.project is not None and not (known.detections / "footage.json").is_file():
+        videos = known.project.folder / "videos"
+        try:
+            sizes = other_sizes([str(videos)], task.rig) if videos.is_dir() else ()
+        except InputError as error:  # the result does not need them
+            note(f"{error}; their sizes are not checked")
+    report = report_of(diagnose(task.detections, task.rig, frames), task.rig, sizes)
+    return result_check(report, people, task.detections, task.rig, frames)
 
 
-def _every(result: Assembly) -> int:
-    """Which frames check and report look at: every so many."""
-    return max(1, -(-len(result) // MOST_ROWS))
+def summary_table(result: Assembly, people: Reconstruction, span: range, cameras: int, seconds: float) -> Table:
+    """What was reconstructed, how well it went, and how long it took.
+
+    `people` are rows of the `result` that say how sure the joints are.
+    """
+    frame, run, counts = result.columns()["frame"].array(), result.run, result.counts()
+    per_frame = np.bincount(frame - span.start, minlength=len(span))
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    table.add_column(style="bold")
+    table.add_column(overflow="fold")
+    table.add_row("frames", f"{len(span)} ({span.start}:{span.stop}) of {cameras} cameras{rate_words(run)}")
+    over_time = run.get("configuration", {}).get("temporal", False)
+    count = f"{len(result.people.counts)} people over time" if over_time else "no identities"
+    table.add_row("people", f"{count}, {per_frame.mean():.1f} a frame ({per_frame.min()} to {per_frame.max()})")
+    table.add_row("rows", f"{len(result)} in all")
+    for status, count in sorted(counts["status"].items()):
+        table.add_row("", f"{count} {status}", style="green" if status == "ok" else "yellow")
+    if len(doubtful := _doubtful(run)) > 0:
+        table.add_row("", doubtful, style="yellow")
+    for reason, count in run.get("people", {}).get("dropped", {}).items():
+        where = _frames_words(run.get("dropped_frames", {}).get(reason, []))
+        table.add_row("", f"{count} dropped: {reason}{where}", style="dim")
+    for what, spans in run.get("thinned_frames", {}).items():
+        table.add_row("", f"too many {what}, the surest were taken{_frames_words(spans)}", style="yellow")
+    if len(people) > 0:
+        table.add_row("joints", _joints(counts["joints"], people))
+    # Loading torch and the body takes a second or two, once; it says nothing about the time of a frame.
+    stages = {name: spent for name, spent in run.get("seconds", {}).items() if name != "load"}
+    per_stage = "  ".join(f"{name} {1e3 * spent / len(span):.1f}" for name, spent in stages.items())
+    table.add_row("time", f"{1e3 * sum(stages.values()) / len(span):.1f} ms a frame, {seconds:.1f} s in all")
+    table.add_row("", per_stage, style="dim")
+    return table
+
+
+def _doubtful(run: dict[str, Any]) -> str:
+    """Who is less probable than `_SURE`; without identities how many rows; empty where all are."""
+    said = run.get("probability", [])
+    if isinstance(said, dict):
+        count = sum(rows for tenth, rows in said.items() if float(tenth) < _SURE)
+        return f"{count} are less probable than {_SURE}" if count > 0 else ""
+    few = [f"{each['person']} ({each['probability']:.2f})" for each in said if each["probability"] < _SURE]
+    return f"less probable than {_SURE}: person {', '.join(few[:8])}{' ...' * (len(few) > 8)}" if few else ""
+
+
+def _frames_words(spans: list[list[int]]) -> str:
+    """In which frames, as far as there is room: run.json has all."""
+    told = [f"{start}" if stop == start + 1 else f"{start}-{stop - 1}" for start, stop in spans[:4]]
+    more = " ..." if len(spans) > len(told) else ""
+    return f" (frames {' '.join(told)}{more})" if told else ""
+
+
+def _joints(count: dict[str, int], people: Reconstruction) -> str:
+    """How the joints are known, as shares, and how sure they are, as words."""
+    total = max(sum(count.values()), 1)
+    shares = [f"{100 * count[how] / total:.1f} % {word}" for how, word in _KNOWN_WORDS.items() if count[how] > 0]
+    variance = np.trace(people.covariance, axis1=-2, axis2=-1) / 3
+    variance = variance[np.isfinite(variance) & (variance >= 0)]
+    sigma = f"; median sigma {1e3 * np.sqrt(np.median(variance)):.0f} mm" if len(variance) > 0 else ""
+    return ", ".join(shares) + sigma
+
+
+def show_check(checked: ResultCheck) -> None:
+    """How far each camera is from the result, and on stderr what looks wrong."""
+    if len(checked.cameras) > 0:
+        print()
+        show(use_table(checked.cameras))
+        meaning = (
+            "error: median / 90 % of all detections given to people, before gates; used: after;\n"
+            "left out: median, from where the other cameras alone put the joint"
+        )
+        show(Text(meaning, style="dim"))
+    for each in checked.warnings:
+        warn(each)

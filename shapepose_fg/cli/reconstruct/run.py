@@ -3,196 +3,189 @@
 import hashlib
 import json
 import time
-from collections.abc import Callable
-from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from shapepose_fg.body.fitting.fitter import BodyFitter
+from shapepose_fg.body.fitting.fitters import make_fitter
+from shapepose_fg.body.fitting.weights import fingerprint
+from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.shapes import SubjectShapes
-from shapepose_fg.cli.reconstruct.ending import Ending
-from shapepose_fg.cli.reconstruct.inputs import known_shapes
-from shapepose_fg.cli.reconstruct.outcome import Ended
-from shapepose_fg.cli.reconstruct.summary import show_check
+from shapepose_fg.cli.reconstruct.ending import check_setup, show_check, summary_table
+from shapepose_fg.cli.reconstruct.request import Ended, Prepared
 from shapepose_fg.cli.stopping import Stopped
-from shapepose_fg.cli.terminal import note, show
-from shapepose_fg.core.camera import Rig
+from shapepose_fg.cli.terminal import note, progress, show
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.provenance import program_digest, versions
+from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.storage.kept_arrays import KeptArrays
+from shapepose_fg.core.storage.output_folder import prepare_output
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.detection_table import DetectionTable
+from shapepose_fg.io.export.marker_files import write_pose2sim_files
 from shapepose_fg.io.solved_setup import CAMERAS
-from shapepose_fg.pipeline.pipeline import PipelineConfig, Progress, reconstruct_parts
+from shapepose_fg.pipeline.config import PipelineConfig
+from shapepose_fg.pipeline.execution import Execution
+from shapepose_fg.pipeline.pipeline import Task, reconstruct_parts
+from shapepose_fg.pipeline.runs.assembly import Assembly
 from shapepose_fg.pipeline.runs.known_people import checksum_at_start, people_at_start, write_people
 from shapepose_fg.pipeline.runs.manifest import PARTS, check_room, end_run, expected_bytes, frames_done, open_run
+from shapepose_fg.viz.report.writing import MOST_ROWS, REPORT, th, write_report
 
 
 @dataclass(frozen=True)
-class Job:
-    """What is to be reconstructed, read and checked."""
+class Run:
+    """A reconstruction into a folder, whose input is read and checked."""
 
-    rig: Rig
-    """The cameras."""
+    task: Task
+    """What is to be reconstructed."""
     recording: DetectionTable
-    """What they saw."""
-    settings: PipelineConfig
-    """How."""
-    frames: range
-    """Which frames."""
-    times: FrameTimes | None
-    """When they were taken, where that is said."""
-    cuts: tuple[int, ...]
-    """First frames of what follows a cut."""
-    body: Path | None
-    """File of the body model; None for the one that ships."""
-    fitter: BodyFitter | None
-    """The fitter with that model; None for the pipeline's own."""
-    shapes: Path | None
-    """File of people's shapes."""
+    """The detections of it, as they were read."""
+    known: Prepared
+    """What was asked for."""
     inputs: dict[str, str]
     """Checksums of the files that were read."""
-    chunk_frames: int | None = None
-    """Into chunks of how many frames the recording is cut; None for one."""
-    sharing: int = 1
-    """How many runs share the cluster."""
+    execution: Execution
+    """What runs it; without `progress` a bar is shown."""
+
+    @property
+    def frames(self) -> range:
+        """Those that are reconstructed."""
+        return self.task.whole()[0]
 
     def begun(self) -> dict[str, Any]:
         """All that the result depends on, as plain values: equal for a run that goes on."""
-        times = FrameTimes.assumed(len(self.recording)) if self.times is None else self.times
-        skeleton = {"name": self.recording.skeleton.name, "sha256": _digest(asdict(self.recording.skeleton))}
+        task, asked = self.task, self.known.request
+        times = FrameTimes.assumed(len(self.recording)) if task.times is None else task.times
+        skeleton = self.recording.skeleton
         cameras = [
             (
                 camera.name,
                 camera.image_size,
                 camera.lens,
-                *map(_numbers, (camera.K, camera.distortion, camera.wTc)),
+                *(array.tolist() for array in (camera.K, camera.distortion, camera.wTc)),
             )
-            for camera in self.rig.cameras
+            for camera in task.rig.cameras
         ]
         return {
             "inputs": self.inputs,
-            "configuration": asdict(self.settings),
+            "configuration": asdict(task.config),
             "frames": [self.frames.start, self.frames.stop],
-            "time": {**times.as_dict(), "sha256": _digest(_numbers(times.time_s))},
-            "cuts": list(self.cuts),
-            "chunk_frames": self.chunk_frames,
-            "body": None if self.body is None else str(self.body),
-            "shapes": None if self.shapes is None else str(self.shapes),
-            "skeleton": skeleton,
-            "cameras": _digest([self.rig.up, cameras]),
+            "time": {**times.as_dict(), "sha256": _digest(times.time_s.tolist())},
+            "cuts": list(task.cuts),
+            "chunk_frames": self.execution.chunk_frames,
+            "body": None if asked.body is None else str(asked.body),
+            "shapes": None if asked.shapes is None else str(asked.shapes),
+            "skeleton": {"name": skeleton.name, "sha256": _digest(asdict(skeleton))},
+            "cameras": _digest([task.rig.up, cameras]),
             "versions": versions(),
             "program": program_digest(),
         }
 
+    def carried_out(self, *, resume: bool, restart: bool) -> Ended:
+        """Reconstruct, and leave the results in the folder, where the caller is the only one.
 
-def run_job(
-    job: Job,
-    output: Path,
-    ending: Ending,
-    *,
-    workers: int,
-    cluster: str | None,
-    resume: bool,
-    restart: bool,
-    watched: Callable[[], AbstractContextManager[Progress]],
-) -> Ended:
-    """Reconstruct, and leave the results in `output`, where the caller is the only one.
+        Whatever stops it, what is done is kept there, and the next call with `resume` goes on. InputError where
+        that cannot be, or the disk is full; `Stopped`, with where it stands, on Ctrl-C or a request to end.
+        """
+        output = self.known.output
+        if not (output / PARTS).is_dir():
+            check_room(output, expected_bytes(self.recording, self.task.rig, self.frames))
+            if resume:
+                note(f"{output}: no run was stopped here; this one begins anew")
+        kept = open_run(output, self.begun(), resume=resume, restart=restart)
+        try:
+            return self._finished(kept)
+        except Stopped as stop:
+            raise Stopped(stop.number, self._standing()) from None
+        except OSError as error:
+            place = f"{error.filename}: " if error.filename is not None else ""
+            raise InputError(f"{place}{error.strerror or error}; {self._standing()}") from None
 
-    `watched` gives what is told how many frames are done.
+    def _finished(self, kept: KeptArrays) -> Ended:
+        """The reconstruction, its files, and what is said of it."""
+        asked, output, rig = self.known.request, self.known.output, self.task.rig
+        file, inputs = asked.shapes, dict(self.inputs)
+        known = None if file is None else people_at_start(kept, file, lambda: _known_people(file, asked.body))
+        start = time.perf_counter()
+        told = self.execution.progress
+        task = replace(self.task, shapes=known)
+        with progress("reconstructing") if told is None else nullcontext(told) as told:
+            result = reconstruct_parts(kept, task, replace(self.execution, progress=told))
+        seconds = time.perf_counter() - start
+        if file is not None and known is not None and len(known) > 0:
+            inputs[str(file)] = checksum_at_start(kept)
+        result = result.with_run(inputs=inputs, notes=list(self.recording.notes), body=asked.body)
+        every = max(1, -(-len(result) // MOST_ROWS))
+        if every > 1:
+            note(f"check and report are made of every {th(every)} frame: the result has {len(result)} rows")
+        people = result.reconstruction(every=every)
+        checked = check_setup(self.known, self.task, people) if asked.check else None
+        result = result if checked is None else result.with_run(**checked.as_run())
+        people = people.with_run(**result.run)
+        result.save(output)
+        # What the observations were seen with: to solve or draw them anew.
+        if not (output / CAMERAS).exists() or not (output / CAMERAS).samefile(self.known.calibration):
+            write_rig(rig, output / CAMERAS)
+        summary = summary_table(result, people, self.frames, len(rig), seconds)
+        for n, written in enumerate(self._written(result, people, every)):
+            summary.add_row("" if n > 0 else "written", written)
+        if file is not None and known is not None and result.shapes is not None:
+            write_people(kept, file, known.updated(result.shapes))
+            summary.add_row("", f"{file}  shapes of {len(result.shapes)} people")
+        end_run(output)
+        show(summary)
+        if checked is not None:
+            show_check(checked)
+        count = len(result.people.counts) if self.task.config.temporal else None
+        return Ended(len(self.frames), len(result), count, () if checked is None else tuple(checked.warnings))
 
-    Whatever stops it, what is done is kept there, and the next call with `resume` goes on. InputError where that
-    cannot be, or the disk is full; `Stopped`, with where it stands, on Ctrl-C or a request to end.
-    """
-    begun = job.begun()
-    if not (output / PARTS).is_dir():
-        check_room(output, expected_bytes(job.recording, job.rig, job.frames))
-        if resume:
-            note(f"{output}: no run was stopped here; this one begins anew")
-    kept = open_run(output, begun, resume=resume, restart=restart)
-    try:
-        return _run(job, output, ending, kept, workers, cluster, watched)
-    except Stopped as stop:
-        raise Stopped(stop.number, _standing(job, output)) from None
-    except OSError as error:
-        place = f"{error.filename}: " if error.filename is not None else ""
-        raise InputError(f"{place}{error.strerror or error}; {_standing(job, output)}") from None
+    def _written(self, result: Assembly, people: Reconstruction, every: int) -> list[str]:
+        """Report and files for other programs are left; what there is now."""
+        output, project = self.known.output, self.known.project
+        files = ["people.npz", "run.json", *(["observations.npz"] if len(result) > 0 else []), CAMERAS]
+        written = [str(output / name) for name in files]
+        if self.known.request.report:
+            written.append(f"{write_report(output, people, self.task.rig, every=every)}  to look at, in a browser")
+        else:  # that of an earlier result would say what is no longer true
+            (output / REPORT).unlink(missing_ok=True)
+        if project is not None:
+            whole = people if len(people) == len(result) else result.reconstruction()
+            made = write_pose2sim_files(whole, self.task.rig.up, project)
+            written += map(str, made.files)
+            for each in made.notes:
+                note(each)
+        return written
 
-
-def _run(
-    job: Job,
-    output: Path,
-    ending: Ending,
-    kept: KeptArrays,
-    workers: int,
-    cluster: str | None,
-    watched: Callable[[], AbstractContextManager[Progress]],
-) -> Ended:
-    """The reconstruction, its files, and what is said of it."""
-    file = job.shapes
-    known: SubjectShapes | None = None
-    if file is not None:
-        known = people_at_start(kept, file, lambda: known_shapes(file, job.body))
-    start = time.perf_counter()
-    with watched() as progress:
-        result = reconstruct_parts(
-            kept,
-            job.recording,
-            job.rig,
-            job.settings,
-            frames=job.frames,
-            fitter=job.fitter,
-            times=job.times,
-            cuts=job.cuts,
-            shapes=known,
-            progress=progress,
-            workers=workers,
-            cluster=cluster,
-            chunk_frames=job.chunk_frames,
-            sharing=job.sharing,
-        )
-    seconds = time.perf_counter() - start
-    inputs = dict(job.inputs)
-    if file is not None and known is not None and len(known) > 0:
-        inputs[str(file)] = checksum_at_start(kept)
-    result = result.with_run(inputs=inputs, notes=list(job.recording.notes), body=job.body)
-    people = ending.looked_at(result)
-    checked = ending.checked(job.recording, job.rig, job.frames, people)
-    result = result if checked is None else result.with_run(**checked.as_run())
-    people = people.with_run(**result.run)
-    result.save(output)
-    # What the observations were seen with: to solve or draw them anew.
-    if not (output / CAMERAS).exists() or not (output / CAMERAS).samefile(ending.calibration):
-        write_rig(job.rig, output / CAMERAS)
-    if file is not None and known is not None and result.shapes is not None:
-        write_people(kept, file, known.updated(result.shapes))
-    summary = ending.written(result, people, job.rig, job.frames, seconds, output)
-    if file is not None and result.shapes is not None:
-        summary.add_row("", f"{file}  shapes of {len(result.shapes)} people")
-    end_run(output)
-    show(summary)
-    if checked is not None:
-        show_check(checked)
-    warnings = () if checked is None else tuple(checked.warnings)
-    count = len(result.people.counts) if job.settings.temporal else None
-    return Ended(len(job.frames), len(result), count, warnings)
+    def _standing(self) -> str:
+        """How far a run that was stopped has come, and how to go on."""
+        output = self.known.output
+        try:
+            done = frames_done(output)
+        except InputError as error:
+            return str(error)
+        if done == 0:
+            return "nothing is kept: no frame was done"
+        return f"{done} of {len(self.frames)} frames are kept in {output / PARTS}; go on with --resume"
 
 
-def _standing(job: Job, output: Path) -> str:
-    """How far a run that was stopped has come, and how to go on."""
-    try:
-        done = frames_done(output)
-    except InputError as error:
-        return str(error)
-    if done == 0:
-        return "nothing is kept: no frame was done"
-    return f"{done} of {len(job.frames)} frames are kept in {output / PARTS}; go on with --resume"
+def fitter_of(body: Path | None, settings: PipelineConfig, joints: tuple[str, ...]) -> BodyFitter | None:
+    """The body fitter with the model of the file `body`; without one, the pipeline takes its own."""
+    if body is None:
+        return None
+    return make_fitter(settings.body, BodyModel.load(body).with_keypoints(joints))
 
 
-def _numbers(array: Any) -> list[Any]:
-    return array.tolist()
+def _known_people(file: Path, body: Path | None) -> SubjectShapes:
+    """The people that `file` knows, on the body in use; none where there is no such file yet."""
+    model = fingerprint(BodyModel.default() if body is None else BodyModel.load(body))
+    if file.exists():
+        return SubjectShapes.load(file, model)
+    prepare_output(file.parent)
+    return SubjectShapes.empty(model)
 
 
 def _digest(value: Any) -> str:

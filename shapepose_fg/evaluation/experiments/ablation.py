@@ -8,11 +8,12 @@ from typing import Any
 from shapepose_fg.evaluation.experiments.experiment import Column, Experiment
 from shapepose_fg.evaluation.experiments.scenes import FRAME_BY_FRAME, OVER_TIME, case
 from shapepose_fg.evaluation.experiments.stretches import Scale
+from shapepose_fg.evaluation.varied import varied
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 
 FRAMES = 30
 """Of each stretch."""
-PAPER = PipelineConfig.paper()
+PAPER = varied(PipelineConfig.paper())
 """What each is added to; what each is taken from is ours frame by frame, as time stands in a row of its own."""
 COLUMNS = (
     *(Column("F1, %", "f1"), Column("MPJPE, mm", "mpjpe_mm")),

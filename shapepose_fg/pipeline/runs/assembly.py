@@ -16,8 +16,7 @@ from shapepose_fg.core.result_files import write_result
 from shapepose_fg.core.shapes import SubjectShapes
 from shapepose_fg.core.storage.npz import Pieces
 from shapepose_fg.core.storage.schema import Table
-from shapepose_fg.pipeline.bodies_over_time import BodiesOverTime
-from shapepose_fg.pipeline.person_bodies import Person
+from shapepose_fg.pipeline.bodies_over_time import BodiesOverTime, Person
 from shapepose_fg.pipeline.runs.parts import OBSERVED, Parts, RowsOfPeople
 
 

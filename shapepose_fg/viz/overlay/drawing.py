@@ -7,8 +7,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.drawing import colour_of
+from shapepose_fg.core.reconstruction import Known, Reconstruction
 from shapepose_fg.core.skeleton import BODY_25, SKELETONS
 from shapepose_fg.io.footage.footage import Picture
+from shapepose_fg.viz.bodies import joined
 from shapepose_fg.viz.overlay.picture_view import PictureView
 from shapepose_fg.viz.rendering import rasterise
 
@@ -27,6 +30,12 @@ _FINE = 8
 """Bits of a pixel's fraction in OpenCV's drawing."""
 _NOT_BONES = {("RShoulder", "REar"), ("LShoulder", "LEar")}
 """Links of detectors that are no bones."""
+
+
+def blue_green_red(person: int) -> Colour:
+    """The colour of an identity: the same in all that draws the result."""
+    red, green, blue = (round(255 * part) for part in colour_of(person))
+    return blue, green, red
 
 
 def bones_of(joint_names: Sequence[str]) -> NDArray[np.intp]:
@@ -51,11 +60,9 @@ def draw_bodies(
     colours: Sequence[Colour],
 ) -> Picture:
     """The surfaces `vertices` (P, Nv, 3), metres, half transparent in a colour each, lit from the camera."""
-    people, count = vertices.shape[:2]
-    if people == 0:
+    if len(vertices) == 0:
         return picture
-    points = vertices.reshape(-1, 3).astype(np.float64)
-    corners = (faces[None] + count * np.arange(people)[:, None, None]).reshape(-1, 3)
+    points, corners = joined(vertices, faces)
     xy, depth = view.project(points)
     surface = rasterise(xy, depth, corners, view.size, cull_back=True)
     row, column = np.nonzero(surface.face >= 0)
@@ -85,6 +92,18 @@ class Skeletons:
     labels: Sequence[str]
     """(P,) what is written above each person."""
 
+    @classmethod
+    def of(cls, people: Reconstruction) -> "Skeletons":
+        """Of the rows of one frame."""
+        numbers = people.person.tolist()
+        return cls(
+            joints=people.joints,
+            seen=np.isin(people.known, (Known.SEEN, Known.UNKNOWN)),
+            bones=bones_of(people.joint_names.tolist()),
+            colours=[blue_green_red(each) for each in numbers],
+            labels=[f"person {each}" for each in numbers],
+        )
+
 
 def draw_skeletons(picture: Picture, view: PictureView, people: Skeletons) -> None:
     """Draw bones, joints (rings where they are inferred) and labels on `picture`."""
@@ -105,7 +124,7 @@ def draw_skeletons(picture: Picture, view: PictureView, people: Skeletons) -> No
             cv2.circle(picture, centre, radius, _WHITE if filled else _DARK, -1, cv2.LINE_AA, _FINE)
             cv2.circle(picture, centre, radius, colour, max(1, stroke // 2), cv2.LINE_AA, _FINE)
         tops.append(_top(xy[known], view.size))
-    # Names last: nobody's limbs cross them.
+    # Names last: no limbs cross them.
     for top, colour, label in zip(tops, people.colours, people.labels, strict=True):
         if top is not None:
             draw_label(picture, label, (top[0], top[1] - 5 * stroke), colour)

@@ -6,18 +6,17 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from shapepose_fg.core.camera import Rig
-from shapepose_fg.core.drawing import colour_of
 from shapepose_fg.core.observation_table import Gate
-from shapepose_fg.core.reconstruction import Known, OpenedReconstruction, Reconstruction, Status
+from shapepose_fg.core.reconstruction import OpenedReconstruction, Reconstruction
 from shapepose_fg.io.footage.footage import Footage, Picture
 from shapepose_fg.io.footage.used import CameraFootage
+from shapepose_fg.viz.bodies import surfaces
 from shapepose_fg.viz.overlay.drawing import (
     Colour,
     Skeletons,
-    bones_of,
+    blue_green_red,
     draw_bodies,
     draw_detections,
     draw_label,
@@ -29,7 +28,6 @@ if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel
 
 _INK: Colour = (45, 45, 45)
-_BODY = ("betas", "global_orient", "body_pose", "transl")
 
 
 @dataclass(frozen=True)
@@ -38,8 +36,6 @@ class OverlayContent:
 
     skeletons: bool = True
     """Bones and joints, with the person's number."""
-    bodies: bool = False
-    """The bodies' surfaces."""
     detections: bool = True
     """2D detections that were used, and in another colour those that were not."""
 
@@ -57,7 +53,7 @@ class Overlay:
     content: OverlayContent = OverlayContent()
     """What is drawn."""
     body: "BodyModel | None" = None
-    """The model of the bodies; needed where they are drawn."""
+    """The model of the bodies; None where they are not drawn."""
 
     def draw(self, frame: int, sizes: Sequence[tuple[int, int]]) -> list[Picture]:
         """Each camera's picture of `frame`, drawn on, at a size (width, height) of its own.
@@ -66,54 +62,23 @@ class Overlay:
         """
         people = self.people.at(frame)
         people = people.rows(np.argsort(people.person, kind="stable"))
-        vertices, whose = self._bodies(people)
+        body = self.body
+        vertices, rows = (np.zeros((0, 0, 3)), ()) if body is None else surfaces(people, body)
         drawn = []
         for (used, footage), size in zip(self.cameras, sizes, strict=True):
             camera = self.rig.cameras[self.rig.names.index(used.name)]
             view = PictureView(camera, used.placement, size)
             picture = _picture(used, footage, frame, size)
-            if self.content.bodies and len(vertices) > 0 and self.body is not None:
-                colours = [self.colour(person) for person in whose.tolist()]
-                picture = draw_bodies(picture, view, vertices, self.body.faces, colours)
+            if body is not None:
+                colours = [blue_green_red(person) for person in people.person[list(rows)].tolist()]
+                picture = draw_bodies(picture, view, vertices, body.faces, colours)
             if self.content.detections:
                 self._draw_detections(picture, view, people)
             if self.content.skeletons:
-                draw_skeletons(picture, view, self._skeletons(people))
+                draw_skeletons(picture, view, Skeletons.of(people))
             draw_label(picture, f"camera {used.name}, frame {frame}", (0, 0), _INK, centred=False)
             drawn.append(picture)
         return drawn
-
-    def colour(self, person: int) -> Colour:
-        """The colour of an identity, blue, green, red: the same in all that draws the result."""
-        red, green, blue = (round(255 * part) for part in colour_of(person))
-        return blue, green, red
-
-    def _skeletons(self, people: Reconstruction) -> Skeletons:
-        return Skeletons(
-            joints=people.joints,
-            seen=np.isin(people.known, (Known.SEEN, Known.UNKNOWN)),
-            bones=bones_of(people.joint_names.tolist()),
-            colours=[self.colour(person) for person in people.person.tolist()],
-            labels=[f"person {person}" for person in people.person.tolist()],
-        )
-
-    def _bodies(self, people: Reconstruction) -> tuple[NDArray[np.float64], NDArray[np.integer]]:
-        """Surfaces (P, Nv, 3) of those who have a body, and who they are (P,)."""
-        if not self.content.bodies or self.body is None:
-            return np.zeros((0, 0, 3)), people.person[:0]
-        import torch
-
-        from shapepose_fg.body.model.body_model import BodyParameters
-
-        there = people.status == str(Status.OK)
-        for name in _BODY:
-            there = there & np.isfinite(getattr(people, name)).reshape(len(people), -1).all(axis=1)
-        if not there.any():
-            return np.zeros((0, 0, 3)), people.person[:0]
-        parts = (torch.from_numpy(getattr(people, name)[there]).to(self.body.dtype) for name in _BODY)
-        with torch.no_grad():
-            vertices = self.body.vertices(BodyParameters(*parts)).numpy().astype(np.float64)
-        return vertices, people.person[there]
 
     def _draw_detections(self, picture: Picture, view: PictureView, people: Reconstruction) -> None:
         """What this camera saw of the people of one frame."""
@@ -124,7 +89,7 @@ class Overlay:
         gate = table.gate[..., v]
         row, joint = np.nonzero(gate != Gate.NOT_SEEN)
         xy = view.through_lens(table.xy[row, joint, v])
-        colours = np.array([self.colour(person) for person in table.person[row].tolist()]).reshape(-1, 3)
+        colours = np.array([blue_green_red(person) for person in table.person[row].tolist()]).reshape(-1, 3)
         draw_detections(picture, xy, gate[row, joint] == Gate.USED, colours)
 
 

@@ -1,13 +1,13 @@
 """Where the pictures of a result are, and which of them belongs to which of its frames."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.cli.terminal import note, progress
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.footage.footage import Footage, open_footage
@@ -17,26 +17,39 @@ from shapepose_fg.io.footage.places import find_footage
 from shapepose_fg.io.footage.used import FOOTAGE, CameraFootage, read_used_footage
 
 
+@dataclass(frozen=True)
+class Wanted:
+    """Which pictures are wanted."""
+
+    drawn: Sequence[str]
+    """Of which cameras."""
+    videos: Sequence[str] | None = None
+    """Where they are, as `find_footage` takes it; None for those that `detect` says it read."""
+    detections: Path | None = None
+    """The folder where it says so; None for that beside the detections that the result was made from."""
+    image_placement: Sequence[str] = ()
+    """How those of another size than the calibration's came about, as `placements_of` takes it."""
+
+
 def pictures_of(
     run: Mapping[str, Any],
     rig: Rig,
-    drawn: Sequence[str],
-    videos: Sequence[str] | None,
-    detections: Path | None,
-    image_placement: Sequence[str],
+    wanted: Wanted,
+    open_one: Callable[[str, Path], Footage] = lambda _, path: open_footage(path),
+    tell: Callable[[str], None] = print,
 ) -> list[tuple[CameraFootage, Footage]]:
-    """The pictures of the cameras `drawn`, and which belongs to which frame.
+    """The pictures that are wanted, and which belongs to which frame; InputError where they are missing.
 
-    `run` is what the result's run.json says. They are those of `videos`, as the command line gives them, or else
-    those that `detect` says it read: in its folder `detections`, or beside the detections that the result was made
-    from. InputError where they are missing.
+    `run` is what the result's run.json says. `open_one` opens the pictures of a camera, by its name; `tell` is
+    given what was taken to be what.
     """
-    used = {each.name: each for each in _used_footage(run, detections)}
-    if videos is not None:
-        places = find_footage(videos, drawn)
+    drawn = wanted.drawn
+    used = {each.name: each for each in _used_footage(run, wanted.detections)}
+    if wanted.videos is not None:
+        places = find_footage(wanted.videos, drawn)
         paths = dict(zip(drawn, places.paths, strict=True))
         for text in places.notes:
-            note(text)
+            tell(text)
     else:
         missing = next((name for name in drawn if name not in used), None)
         if missing is not None:
@@ -49,25 +62,22 @@ def pictures_of(
     for name, path in paths.items():
         if not path.exists():
             raise InputError(f"{path}: the pictures of camera {name} are not there any more; give --videos")
-        with progress(f"looking through {name}") as done:
-            opened[name] = open_footage(path, done)
-        for text in opened[name].notes:
-            note(text)
+        opened[name] = open_one(name, path)
     # What detect was told of the pictures holds as long as they have the same size.
     alike = {
         name: used[name].placement
         for name, each in opened.items()
-        if name in used and used[name].placement.picture_size == each.size and not image_placement
+        if name in used and used[name].placement.picture_size == each.size and not wanted.image_placement
     }
     sizes = {name: each.size for name, each in opened.items() if name not in alike}
     for name, placement in alike.items():
         _refuse_other_calibration(name, placement, rig)
-    placements, notes = placements_of(image_placement, sizes, rig)
+    placements, notes = placements_of(wanted.image_placement, sizes, rig)
     counted = [name for name in drawn if name not in used]
     if len(counted) > 0:
         notes.append(f"frame 0 of the result is taken to be the first picture of {' '.join(counted)}, and so on")
     for text in notes:
-        note(text)
+        tell(text)
     placements |= alike
     pairs = []
     for name, footage in opened.items():

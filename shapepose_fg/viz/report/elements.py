@@ -1,5 +1,7 @@
 """HTML as a tree of elements: every text and attribute is escaped when it is written."""
 
+from collections.abc import Sequence
+from importlib.resources import files
 from xml.etree import ElementTree
 
 Element = ElementTree.Element
@@ -15,26 +17,55 @@ def element(tag: str, *children: Child, **attributes: str | None) -> Element:
     for name, value in attributes.items():
         if value is not None:
             made.set(name.rstrip("_").replace("_", "-"), value)
-    append(made, *children)
-    return made
-
-
-def append(parent: Element, *children: Child) -> None:
-    """Add texts and elements at the end of an element."""
     for child in children:
         if child is None:
             continue
         if not isinstance(child, str):
-            parent.append(child)
-        elif len(parent) == 0:
-            parent.text = (parent.text or "") + child
+            made.append(child)
+        elif len(made) == 0:
+            made.text = (made.text or "") + child
         else:
-            parent[-1].tail = (parent[-1].tail or "") + child
+            made[-1].tail = (made[-1].tail or "") + child
+    return made
 
 
 def html(root: Element) -> str:
     """The text of an element and all within. What is inside `script` and `style` is written as it is."""
     return ElementTree.tostring(root, encoding="unicode", method="html")
+
+
+def asset(name: str) -> str:
+    """Text of a file that ships beside this one."""
+    return (files("shapepose_fg.viz.report") / "data" / name).read_text(encoding="utf-8")
+
+
+def asset_element(name: str) -> Element:
+    """The element that a file of well-formed HTML holds, without the blanks between its elements."""
+    root = ElementTree.fromstring(asset(name))
+    for each in root.iter():
+        each.text = each.text if each.text and each.text.strip() else None
+        each.tail = each.tail.strip() if each.tail and each.tail.strip() else None
+    return root
+
+
+def listing(texts: Sequence[Child], **attributes: str | None) -> Element:
+    """A list with an item for each text."""
+    return element("ul", *(element("li", each) for each in texts), **attributes)
+
+
+def definitions(pairs: Sequence[tuple[Child, Child]], **attributes: str | None) -> Element:
+    """A list of names and what they mean."""
+    return element(
+        "dl",
+        *(part for name, value in pairs for part in (element("dt", name), element("dd", value))),
+        **attributes,
+    )
+
+
+def section(name: str, title: str, *children: Child) -> Element:
+    """A part of the page with its heading."""
+    heading = element("h2", title, id=f"{name}-title")
+    return element("section", heading, *children, id=name, aria_labelledby=f"{name}-title")
 
 
 def table(head: list[Child], rows: list[list[Child]], *, numbers: set[int], label: str) -> Element:

@@ -4,17 +4,24 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from typing import Any
 
-from shapepose_fg.pipeline.pipeline import PipelineConfig
+from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.viz.report.figures import number
 
 Run = Mapping[str, Any]
 
 
 def changed_settings(run: Run) -> list[tuple[str, str, str]]:
-    """Settings that are not the default: dotted name, value, default; a dash where there is none any more."""
+    """Settings that are not the default: dotted name, value, default; a dash where there is none any more.
+
+    Tables of an older program, of which everything was written down, are left out.
+    """
     usual = dict(_flat(asdict(PipelineConfig())))
     given = {name: (_text(value), _text(usual.get(name, "–"))) for name, value in _flat(run.get("configuration"))}
-    return [(name, value, default) for name, (value, default) in given.items() if value != default]
+    return [
+        (name, value, default)
+        for name, (value, default) in given.items()
+        if value != default and name.split(".")[0] not in PipelineConfig.replaced
+    ]
 
 
 def dropped(run: Run) -> list[tuple[str, int, str]]:
@@ -30,7 +37,7 @@ def dropped(run: Run) -> list[tuple[str, int, str]]:
 
 
 def probabilities(run: Run) -> dict[int, float]:
-    """How probable it is that each person was there, by number; nobody where every frame stands alone."""
+    """How probable it is that each person was there, by number; empty frame by frame."""
     listed = run.get("probability")
     entries = [_object(each) for each in (listed if isinstance(listed, list) else [])]
     found = {number(each.get("person")): number(each.get("probability")) for each in entries}
@@ -38,7 +45,7 @@ def probabilities(run: Run) -> dict[int, float]:
 
 
 def problems(run: Run) -> list[str]:
-    """Whom the solver could not solve: person, frame, joint and reason."""
+    """What could not be solved: person, frame, joint and reason."""
     listed = _object(run.get("people")).get("problems")
     entries = listed if isinstance(listed, list) else []
     return [", ".join(f"{key} {value}" for key, value in _object(each).items()) for each in entries]

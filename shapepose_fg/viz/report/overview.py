@@ -8,24 +8,23 @@ from shapepose_fg.core.reconstruction import Known, Reconstruction
 from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.io.export.markers import sigma_m
 from shapepose_fg.viz.report import facts
-from shapepose_fg.viz.report.elements import Element, element
+from shapepose_fg.viz.report.elements import Element, element, listing
 from shapepose_fg.viz.report.figures import Residual
 from shapepose_fg.viz.report.sections import or_dash
+
+_PARTS = {
+    "scene": "Scene",
+    "people": "People",
+    "cameras": "Cameras",
+    "joints": "Joints",
+    "unused": "Not used",
+    "run": "Run",
+}
 
 
 def header(title: str, people: Reconstruction, cameras: int) -> Element:
     """What this is a report of, in a sentence."""
-    links = [
-        element("a", words, href=f"#{name}")
-        for name, words in (
-            ("scene", "Scene"),
-            ("people", "People"),
-            ("cameras", "Cameras"),
-            ("joints", "Joints"),
-            ("unused", "Not used"),
-            ("run", "Run"),
-        )
-    ]
+    links = [element("a", words, href=f"#{name}") for name, words in _PARTS.items()]
     return element(
         "header",
         element("p", "shapepose-fg report", class_="kicker"),
@@ -58,7 +57,7 @@ def warnings(people: Reconstruction) -> Element | None:
     return element(
         "aside",
         element("h2", "Look at this first"),
-        element("ul", *(element("li", each) for each in said)),
+        listing(said),
         class_="warnings",
         role="note",
     )

@@ -5,18 +5,15 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.tracking.listing import TrackSummary
-from shapepose_fg.viz.report.elements import element, html
+from shapepose_fg.viz.report.elements import Element, asset, asset_element, element, html
 from shapepose_fg.viz.report.figures import CameraFigures
 from shapepose_fg.viz.report.overview import header, key_figures, over_time, warnings
 from shapepose_fg.viz.report.run_section import run_section
 from shapepose_fg.viz.report.scene import Scene
-from shapepose_fg.viz.report.scene_section import scene_section
-from shapepose_fg.viz.report.sections import cameras_section, joints_section, people_section
-from shapepose_fg.viz.report.unused_section import unused_section
+from shapepose_fg.viz.report.sections import cameras_section, joints_section, people_section, unused_section
 
 _SCRIPTS = ("geometry.js", "skin.js", "drawing.js", "page.js")
 """In the order in which they are loaded."""
@@ -35,7 +32,7 @@ class Content:
     cameras: Sequence[CameraFigures]
     """What became of each camera's detections; none where that is not recorded."""
     scene: Scene | None
-    """What is drawn; None where nobody was found."""
+    """What is drawn; None where there are no people."""
     remarks: Sequence[str] = ()
     """What the page lacks, a sentence each."""
 
@@ -45,7 +42,7 @@ def page_text(content: Content) -> str:
 
     Texts of the input are escaped, and the page's own policy forbids every script but those that are part of it.
     """
-    scripts = [_asset(name) for name in _SCRIPTS] if content.scene is not None else []
+    scripts = [asset(name) for name in _SCRIPTS] if content.scene is not None else []
     hashes = " ".join(f"'sha256-{_sha256(text)}'" for text in scripts) or "'none'"
     policy = f"default-src 'none'; style-src 'unsafe-inline'; script-src {hashes}; img-src data:"
     head = element(
@@ -56,13 +53,13 @@ def page_text(content: Content) -> str:
         element("meta", name="color-scheme", content="light dark"),
         element("meta", name="referrer", content="no-referrer"),
         element("title", f"{content.title} – shapepose-fg report"),
-        element("style", _asset("report.css")),
+        element("style", asset("report.css")),
     )
     main = element(
         "main",
         warnings(content.people),
         key_figures(content.people),
-        None if content.scene is None else scene_section(content.scene),
+        None if content.scene is None else _scene_section(content.scene),
         people_section(content.people, content.tracks, over_time(content.people)),
         cameras_section(content.cameras),
         joints_section(content.people),
@@ -77,9 +74,28 @@ def page_text(content: Content) -> str:
     return "<!DOCTYPE html>\n" + html(element("html", head, body, lang="en")) + "\n"
 
 
-def _asset(name: str) -> str:
-    """Text of a file that ships beside this one."""
-    return (files("shapepose_fg.viz.report") / "data" / name).read_text(encoding="utf-8")
+def _scene_section(scene: Scene) -> Element:
+    """The canvas with what moves it, as the page's script fills it."""
+    root = asset_element("scene.html")
+    tools = next(each for each in root if each.get("class") == "tools")
+    cameras = scene.data["cameras"]
+    absent = {"show-bodies": "mesh" not in scene.data, "show-cameras": len(cameras) == 0, "through": not cameras}
+    for each in [*tools]:
+        name = each.get("id") or next((within.get("id") for within in each), None)
+        if name is not None and absent.get(name):
+            tools.remove(each)
+    for menu in tools.findall("select"):
+        menu.extend(
+            element("option", f"camera {camera['name']}", value=str(n)) for n, camera in enumerate(cameras)
+        )
+    root.find(".//input[@id='frame']").set("max", str(max(scene.kept - 1, 0)))  # type: ignore[union-attr]
+    if scene.every > 1:
+        words = (
+            f"Drawn here is one frame in {scene.every} ({scene.kept} of {scene.frames}), so that the page stays"
+            " small; all figures below are of every frame."
+        )
+        root.append(element("p", words, class_="lead"))
+    return root
 
 
 def _sha256(script: str) -> str:

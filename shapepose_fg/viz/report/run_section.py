@@ -1,12 +1,12 @@
 """The part of a report that says how a result came about."""
 
+from collections import Counter
 from collections.abc import Sequence
 
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.viz.report import facts
-from shapepose_fg.viz.report.elements import Child, Element, element, table
-from shapepose_fg.viz.report.sections import section
+from shapepose_fg.viz.report.elements import Child, Element, definitions, element, listing, section, table
 
 _SOURCES = {
     "assumed": "assumed: nothing says how many frames there are a second (--fps)",
@@ -21,8 +21,8 @@ def run_section(people: Reconstruction, remarks: Sequence[str]) -> Element:
     parts: list[Child] = []
     said = [*remarks, *facts.notes(run)]
     if len(said) > 0:
-        parts += [element("h3", "Notes"), element("ul", *(element("li", each) for each in said))]
-    parts += [element("h3", "Facts"), element("dl", *_facts(people), class_="facts")]
+        parts += [element("h3", "Notes"), listing(said)]
+    parts += [element("h3", "Facts"), definitions(_facts(people), class_="facts")]
     parts.append(element("h3", "Settings that are not the default"))
     changed = facts.changed_settings(run)
     if len(changed) == 0:
@@ -34,18 +34,16 @@ def run_section(people: Reconstruction, remarks: Sequence[str]) -> Element:
     for key, title in (("versions", "Versions"), ("inputs", "Inputs, with their sha256")):
         told = facts.pairs(run, key)
         if len(told) > 0:
-            items = [part for name, value in told for part in (element("dt", name), element("dd", value))]
-            listing = element("dl", *items, class_=f"facts {key}")
-            parts.append(element("details", element("summary", title), listing))
+            parts.append(element("details", element("summary", title), definitions(told, class_=f"facts {key}")))
     return section("run", "Run", *parts)
 
 
-def _facts(people: Reconstruction) -> list[Element]:
-    """Names and values, as the parts of a list of definitions."""
+def _facts(people: Reconstruction) -> list[tuple[Child, Child]]:
+    """Names and values."""
     run = people.run
     fps, source = facts.rate(run)
     spans = [f"{span.start}–{span.stop - 1}" for span in covered_frames(run) or [] if len(span) > 0]
-    entries = [
+    entries: list[tuple[Child, Child]] = [
         ("frames", ", ".join(spans) or "not said"),
         ("frames a second", f"{fps:.4g}" if fps is not None else "not said"),
         ("times", _SOURCES.get(source, source) or "not said"),
@@ -53,9 +51,7 @@ def _facts(people: Reconstruction) -> list[Element]:
         ("body model", str(run.get("body") or "the open body that ships")),
         ("skeleton", f"{len(people.joint_names)} joints"),
     ]
-    status = {}
-    for each in people.status.tolist():
-        status[each] = status.get(each, 0) + 1
+    status = Counter(people.status.tolist())
     entries.append(("rows", ", ".join(f"{count} {name}" for name, count in status.items()) or "none"))
     spent = facts.stages(run)
     if len(spent) > 0:
@@ -63,4 +59,4 @@ def _facts(people: Reconstruction) -> list[Element]:
         longest = sorted((each for each in spent if each[1] >= 0.05), key=lambda each: -each[1])
         listed = ", ".join(f"{name} {seconds:.1f}" for name, seconds in longest)
         entries.append(("time", f"{total:.1f} s of processors: {listed}"))
-    return [part for name, value in entries for part in (element("dt", name), element("dd", value))]
+    return entries

@@ -9,8 +9,8 @@ from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import Known, Reconstruction
 from shapepose_fg.tracking.listing import TrackSummary
 from shapepose_fg.viz.report import facts
-from shapepose_fg.viz.report.elements import Child, Element, element, share_bar, table, trend
-from shapepose_fg.viz.report.figures import KINDS, CameraFigures, known_counts
+from shapepose_fg.viz.report.elements import Child, Element, element, listing, section, share_bar, table, trend
+from shapepose_fg.viz.report.figures import KINDS, REASONS, CameraFigures, known_counts
 
 KIND_WORDS = {
     Known.SEEN: "seen",
@@ -27,13 +27,13 @@ _MEANING = {
     Known.MOTION: "no detection was used; the frames before and after place it",
     Known.UNKNOWN: "not placed",
 }
+_REASON_WORDS = {
+    Gate.TOO_FAR: ("too far", "farther from the projected joint than the gate (observations.rho_2d_m) allows"),
+    Gate.CONTRADICTS_BODY: ("against the body", "too far from where the rest of the body puts the joint"),
+    Gate.BEHIND_CAMERA: ("behind camera", "the joint lies behind this camera"),
+    Gate.NOT_PLACED: ("joint not placed", "there is no place to compare the detection with"),
+}
 _DASH = "–"
-
-
-def section(name: str, title: str, *children: Child) -> Element:
-    """A part of the page with its heading."""
-    heading = element("h2", title, id=f"{name}-title")
-    return element("section", heading, *children, id=name, aria_labelledby=f"{name}-title")
 
 
 def people_section(people: Reconstruction, tracks: Sequence[TrackSummary], over_time: bool) -> Element:
@@ -42,17 +42,8 @@ def people_section(people: Reconstruction, tracks: Sequence[TrackSummary], over_
         return section("people", "People", element("p", "Nobody was found."))
     persons = np.array([each.person for each in tracks])
     counts = known_counts(people, np.searchsorted(persons, people.person))
-    head: list[Child] = [
-        "person",
-        "from – to",
-        "frames",
-        "gaps",
-        "height",
-        "walked",
-        "confidence",
-        "probability",
-        "how joints are known",
-    ]
+    head: list[Child] = ["person", "from – to", "frames", "gaps", "height", "walked", "confidence", "probability"]
+    head.append("how joints are known")
     sure = facts.probabilities(people.run)
     rows: list[list[Child]] = [
         [
@@ -71,7 +62,7 @@ def people_section(people: Reconstruction, tracks: Sequence[TrackSummary], over_
     words = (
         "A person is the same number and colour everywhere. Height is that of the fitted body standing upright."
         if over_time
-        else "Every frame stands alone here (--no-temporal): a number is nobody's over time."
+        else "Every frame was solved by itself (--no-temporal): a number is no identity."
     )
     return section(
         "people",
@@ -101,8 +92,8 @@ def cameras_section(cameras: Sequence[CameraFigures]) -> Element:
     rows: list[list[Child]] = []
     for each in cameras:
         row: list[Child] = [each.name]
-        row += [count_words(each.offered)] if offered else []
-        row += [count_words(each.given), percent(each.gates[Gate.USED], each.given), _error(each, longest)]
+        row += [_count_words(each.offered)] if offered else []
+        row += [_count_words(each.given), _percent(each.gates[Gate.USED], each.given), _error(each, longest)]
         row += [f"{or_dash(each.used.median_px, '{:.1f}')} / {or_dash(each.used.high_px, '{:.1f}')} px"]
         if left_out:
             mm = or_dash(each.left_out_mm, "{:.0f} mm")
@@ -114,7 +105,7 @@ def cameras_section(cameras: Sequence[CameraFigures]) -> Element:
         "“All” counts every detection that was given to somebody, before gates. ",
         "Left out: the median distance to where the other cameras alone put the joint. " if left_out else "",
         f"Lines over time go from 0 to {most:.0f} px. A camera whose error stands out is calibrated badly, ",
-        "late, or sees people whom the others do not see.",
+        "late, or sees people that the others do not see.",
     ]
     numbers = set(range(1, len(head) - 1))
     return section(
@@ -151,6 +142,54 @@ def joints_section(people: Reconstruction) -> Element:
         for name, count in zip(people.joint_names.tolist(), counts, strict=True)
     ]
     return section("joints", title, legend, element("ol", *items, class_="bars"))
+
+
+def unused_section(people: Reconstruction, cameras: Sequence[CameraFigures]) -> Element:
+    """What was not used, of detections and of people, and why."""
+    parts: list[Child] = []
+    reasons = [gate for gate in REASONS if any(each.gates[gate] > 0 for each in cameras)]
+    if len(reasons) > 0:
+        given = sum(each.given for each in cameras)
+        unused = sum(each.given - each.gates[Gate.USED] for each in cameras)
+        parts.append(element("h3", "Detections"))
+        parts.append(
+            element(
+                "p",
+                f"{_count_words(unused)} of the {_count_words(given)} detections that were given to people",
+                f" ({_percent(unused, given)}) were not used.",
+            )
+        )
+        head: list[Child] = ["camera", *(_REASON_WORDS[gate][0] for gate in reasons), "share of given"]
+        rows: list[list[Child]] = [
+            [
+                each.name,
+                *(_count_words(each.gates[gate]) for gate in reasons),
+                _percent(each.given - each.gates[Gate.USED], each.given),
+            ]
+            for each in cameras
+        ]
+        parts.append(table(head, rows, numbers=set(range(1, len(head))), label="Detections that were not used"))
+        meanings = [
+            element("li", element("b", _REASON_WORDS[gate][0]), f": {_REASON_WORDS[gate][1]}") for gate in reasons
+        ]
+        parts.append(element("ul", *meanings, class_="legend"))
+    elif len(cameras) > 0:
+        parts.append(element("p", "Every detection that was given to somebody was used."))
+    lost = facts.dropped(people.run)
+    if len(lost) > 0:
+        rows = [[reason, _count_words(count), frames or "–"] for reason, count, frames in lost]
+        parts += [
+            element("h3", "People who were not kept"),
+            element("p", "Candidates of which too little fits together to be somebody, counted frame by frame."),
+            table(["reason", "count", "frames"], rows, numbers={1}, label="People who were not kept"),
+        ]
+    unsolved = facts.problems(people.run)
+    if len(unsolved) > 0:
+        more = f"and {len(unsolved) - 50} more, in run.json" if len(unsolved) > 50 else None
+        parts += [element("h3", "What could not be solved"), listing(unsolved[:50]), element("p", more or "")]
+    if len(parts) == 0:
+        parts.append(element("p", "Nothing is recorded about this result."))
+    return section("unused", "What was not used, and why", *parts)
 
 
 def swatch(person: int) -> Element:
@@ -201,10 +240,10 @@ def _share(count: int, total: int) -> str:
     return "under 0.1 %" if percent < 0.05 else f"{min(percent, 99.9):.1f} %"
 
 
-def percent(count: int, total: int) -> str:
+def _percent(count: int, total: int) -> str:
     return _DASH if total == 0 else _share(count, total)
 
 
-def count_words(value: float | None) -> str:
+def _count_words(value: float | None) -> str:
     """Whole numbers with a thin space between thousands."""
     return _DASH if value is None else f"{value:,.0f}".replace(",", "\u202f")

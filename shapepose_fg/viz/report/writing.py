@@ -24,35 +24,32 @@ MOST_ROWS = 40_000
 """Rows that check and report look at, about 400 MB: of longer results every second, third ... frame."""
 REPORT = "report.html"
 """The report of a result, beside its people.npz."""
-_SCENE_BYTES = 8_000_000
+SCENE_BYTES = 8_000_000
 """What people and bodies may take: a page of 10 MB opens at once and still fits in a mail."""
 
 
 def write_report(
     folder: Path,
     people: Reconstruction,
-    rig: Rig | None,
+    rig: Rig | Axis | None,
     *,
-    up: Axis | None = None,
     fps: float | None = None,
     body: Path | None = None,
-    scene_bytes: int = _SCENE_BYTES,
     every: int = 1,
 ) -> Path:
     """Write report.html of `people` into `folder`, whole or not at all; returns its path.
 
-    `rig` are the cameras, None where they are not known. `up` is the axis that is up where they are not, by
-    default the one along which people stand. `fps` takes the place of the result's times. `body` is the body
-    model's file where it is no longer where run.json says. `scene_bytes` is what the scene may take; of longer
-    recordings every second, third ... frame is drawn. `people` are those of every frame of the result, or of
-    `every` so many. Where people cannot be put on one timeline, the page has no
-    scene and says why.
+    `rig` are the cameras; where they are not known the axis that is up, or None for the one along which people
+    stand. `fps` takes the place of the result's times. `body` is the body model's file where it is no longer where
+    run.json says. `people` are those of every frame of the result, or of `every` so many; of longer recordings the
+    scene has every second, third ... frame. Where people cannot be put on one timeline, the page has no scene and
+    says why.
     """
     arrays, remarks = _body(people, body)
     if every > 1:
         remarks.append(f"the result is long: all on this page is of every {th(every)} frame")
-    if rig is None:
-        up = up or _standing(people)
+    if rig is None or isinstance(rig, str):
+        up, rig = rig or _standing(people), None
         remarks.append(f"{CAMERAS} is not there: no cameras are drawn, and {up} is taken to be up")
     else:
         up = rig.up
@@ -62,7 +59,7 @@ def write_report(
             fps = ASSUMED_FPS
             remarks.append(f"nothing says when the frames were taken: the scene plays {fps:g} a second (--fps)")
         try:
-            scene = scene_of(Take.of(people, up, rig=rig, fps=fps, identities=False), arrays, scene_bytes)
+            scene = scene_of(Take.of(people, up, rig=rig, fps=fps, identities=False), arrays, SCENE_BYTES)
         except ValueError as error:
             remarks.append(f"there is no scene: {error}")
     title = folder.resolve().name or str(folder)
@@ -84,8 +81,8 @@ def report_of(
     if up is not None and up not in ("x", "-x", "y", "-y", "z", "-z"):
         raise InputError(f"--up {up}: must be one of x -x y -y z -z")
     cameras = folder / CAMERAS
-    rig = read_rig(cameras) if cameras.is_file() else None
-    return write_report(folder, people, rig, up=up, fps=fps, body=body, every=every)
+    rig = read_rig(cameras) if cameras.is_file() else up
+    return write_report(folder, people, rig, fps=fps, body=body, every=every)
 
 
 def th(number: int) -> str:

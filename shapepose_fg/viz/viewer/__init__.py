@@ -1,5 +1,1 @@
-"""Pictures of a reconstruction."""
-
-from shapepose_fg.viz.viewer.picture import demo_picture
-
-__all__ = ["demo_picture"]
+"""The picture of one frame of a result."""

@@ -1,0 +1,73 @@
+"""The options by which a user says where the cameras' videos or pictures are, and what is made of them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from shapepose_fg.cli.options import INPUT, option
+from shapepose_fg.cli.terminal import note, progress
+
+if TYPE_CHECKING:
+    from shapepose_fg.core.camera import Rig
+    from shapepose_fg.io.footage.footage import Footage
+    from shapepose_fg.io.footage.used import CameraFootage
+
+
+@dataclass(frozen=True, kw_only=True)
+class PictureOptions:
+    """The cameras' videos or pictures."""
+
+    videos: Annotated[
+        list[str] | None,
+        option(
+            INPUT,
+            "Folder with a video, a picture, or a folder of pictures named after each camera; or each one's own,"
+            " given once for each camera.",
+            "--videos",
+            "--images",
+            metavar="FOLDER|CAMERA=PATH",
+        ),
+    ] = None
+    image_placement: Annotated[
+        list[str] | None,
+        option(
+            INPUT,
+            "How pictures of another size than the calibration's came about: scale, letterbox, crop, crop-centre.",
+            metavar="KIND|CAMERA=KIND",
+        ),
+    ] = None
+
+    def named(self, rig: "Rig") -> list[str]:
+        """The cameras whose videos are given one by one; all where none is."""
+        names = {each.partition("=")[0].strip() for each in self.videos or [] if "=" in each}
+        return [name for name in rig.names if name in names] or list(rig.names)
+
+    def opened(self, rig: "Rig") -> "list[Footage]":
+        """The videos or pictures of every camera, looked through."""
+        from shapepose_fg.io.footage.places import find_footage
+
+        places = find_footage(self.videos or [], rig.names)
+        for each in places.notes:
+            note(each)
+        return [opened(name, path) for name, path in zip(rig.names, places.paths, strict=True)]
+
+    def of_result(
+        self, run: Mapping[str, Any], rig: "Rig", drawn: Sequence[str], detections: Path | None = None
+    ) -> "list[tuple[CameraFootage, Footage]]":
+        """Those of a result, whose run.json says `run`, for the cameras `drawn`; see `pictures_of`."""
+        from shapepose_fg.viz.overlay.result_pictures import Wanted, pictures_of
+
+        wanted = Wanted(drawn, self.videos, detections, tuple(self.image_placement or ()))
+        return pictures_of(run, rig, wanted, opened, note)
+
+
+def opened(name: str, path: Path) -> "Footage":
+    """A camera's video or pictures, looked through with a progress bar; what is odd is said."""
+    from shapepose_fg.io.footage.footage import open_footage
+
+    with progress(f"looking through {name}") as done:
+        footage = open_footage(path, done)
+    for each in footage.notes:
+        note(each)
+    return footage

@@ -1,0 +1,101 @@
+"""The command `simulate`: a recording with known truth, as files."""
+
+import re
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, cast
+
+import typer
+
+from shapepose_fg.cli.options import (
+    INPUT,
+    RESULT,
+    FramesOption,
+    WorkersOption,
+    check_workers,
+    frame_range,
+    grouped,
+    option,
+)
+from shapepose_fg.cli.terminal import progress as progress_bar
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.output_folder import prepare_output
+
+if TYPE_CHECKING:
+    from shapepose_fg.simulation.files import Format
+
+# Everything else is imported inside the command: `--help` must not wait for it.
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneOptions:
+    """What is simulated."""
+
+    name: Annotated[str, typer.Argument(help="demo, or an interaction sequence: salsa, crossing or crowd.")]
+    split: Annotated[
+        str, option(INPUT, "Takes of a sequence: tune, to choose settings by; report.", show_default=True)
+    ] = "tune"
+    cameras: Annotated[int, option(INPUT, "Cameras around the room, 2 to 12.", show_default=True)] = 6
+    people: Annotated[int | None, option(INPUT, "People in demo, 0 to 12; a sequence has its own.")] = None
+    seed: Annotated[
+        int, option(INPUT, "Fixes the detector's errors, and the people of demo.", show_default=True)
+    ] = 0
+    mocap: Annotated[Path | None, option(INPUT, "Recorded motions (.npz) that sequences are made of.")] = None
+
+
+@grouped
+def simulate(
+    scene: SceneOptions,
+    output: Annotated[Path, option(RESULT, "Folder for cameras, detections and truth.")],
+    frames: FramesOption = None,
+    format: Annotated[
+        str, option(RESULT, "Detections as association (4D Association) or openpose.", show_default=True)
+    ] = "association",
+    workers: WorkersOption = None,
+) -> None:
+    """Simulate a recording with known truth: cameras, 2D detections, and people.npz to compare with."""
+    if format not in ("association", "openpose"):
+        raise InputError(f"--format {format}: must be association or openpose")
+    if scene.seed < 0:
+        raise InputError(f"--seed {scene.seed}: must be 0 or more")
+    check_workers(workers)
+    prepare_output(output)
+    from shapepose_fg.pipeline.workers import suitable_workers
+    from shapepose_fg.simulation import DetectorConfig
+    from shapepose_fg.simulation import simulate as run_detector
+    from shapepose_fg.simulation.files import check_output, cut, cuts_of, named_scene, write_simulated
+    from shapepose_fg.simulation.visibility import FRAMES_WORTH_A_WORKER
+
+    last = re.search(r":\s*(\d{1,6})\s*$", frames or "")
+    made = named_scene(
+        scene.name,
+        split=scene.split,
+        cameras=scene.cameras,
+        people=scene.people,
+        frames=int(last[1]) if last is not None else 0,
+        seed=scene.seed,
+        mocap=scene.mocap,
+    )
+    span = frame_range(frames, len(made))
+    part = cut(made, span)
+    check_output(part, output, cast("Format", format))
+    workers = suitable_workers(len(span), FRAMES_WORTH_A_WORKER) if workers is None else workers
+    start = time.perf_counter()
+    with progress_bar("simulating") as progress:
+        detections = run_detector(part, DetectorConfig(), scene.seed, workers=workers, progress=progress)
+    seconds = time.perf_counter() - start
+    about = {"name": scene.name, "seed": scene.seed, "first_frame": span.start}
+    about |= {"detector": DetectorConfig().as_dict()} | ({} if scene.name == "demo" else {"split": scene.split})
+    written = write_simulated(part, detections, output, cast("Format", format), **about)
+    print(
+        f"{len(span)} frames of {made.people} people before {scene.cameras} cameras,"
+        f" {1e3 * seconds / len(span):.0f} ms a frame"
+    )
+    for what, path in written.items():
+        print(f"{what:<12}{path}")
+    timing = f"--fps {part.fps:g}" + (f" --cuts {','.join(map(str, cuts_of(part)))}" if cuts_of(part) else "")
+    print(
+        f"try: shapepose-fg reconstruct --calibration {written['cameras']} --detections {written['detections']}"
+        f" {timing} --output {output / 'results'}"
+    )

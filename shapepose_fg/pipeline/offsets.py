@@ -1,0 +1,83 @@
+"""Where the detector of a recording puts its joints on the body: learnt from frames spread over it."""
+
+from dataclasses import fields, replace
+
+from shapepose_fg.body.fitting.fitter import BodyFitter
+from shapepose_fg.body.fitting.fitters import make_fitter
+from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
+from shapepose_fg.body.offsets.estimation import learn_offsets
+from shapepose_fg.body.threads import torch_threads
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import DetectionSequence
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.core.storage.kept_arrays import KeptArrays
+from shapepose_fg.estimation.detector_offsets import confident_targets, spread_frames
+from shapepose_fg.pipeline.config import PipelineConfig
+from shapepose_fg.pipeline.engine import Setup, StageOne
+from shapepose_fg.pipeline.runs.notes import Notebook
+from shapepose_fg.proposal.thinning import ThinnedFrames
+
+_OFFSETS = "keypoint-offsets"
+"""The name under which a run keeps them."""
+
+
+def estimate_offsets(
+    detections: DetectionSequence,
+    rig: Rig,
+    config: PipelineConfig | None = None,
+    *,
+    fitter: BodyFitter | None = None,
+) -> KeypointOffsets:
+    """Where the detector of a recording puts its joints on the body, learnt without any truth.
+
+    From frames spread over the recording and joints that at least three views see well; what `reconstruct` does
+    by itself. `fitter` says on which body, by default the shipped one. `config.offsets.source` is not looked at.
+    """
+    config = PipelineConfig() if config is None else config
+    fitter = make_fitter(config.body) if fitter is None else fitter
+    config = replace(config, offsets=replace(config.offsets, source="recording"))
+    with torch_threads(config.threads):
+        thinned = ThinnedFrames(detections, len(rig), config.candidates)
+        offsets = offsets_of(Setup(rig, thinned.skeleton, config, fitter), thinned, Notebook())
+    if offsets is None:
+        raise ValueError(
+            f"offsets are known for {BODY_25.name} only, these are joints of {detections.skeleton.name}"
+        )
+    return offsets
+
+
+def kept_offsets(
+    kept: KeptArrays, setup: Setup, detections: ThinnedFrames, book: Notebook
+) -> KeypointOffsets | None:
+    """`offsets_of`; what a run began with it goes on with."""
+    columns = [each.name for each in fields(KeypointOffsets)]
+    if len(kept.names(_OFFSETS)) > 0:
+        return KeypointOffsets(**{name: kept.array(_OFFSETS, name) for name in columns})
+    offsets = offsets_of(setup, detections, book)
+    if offsets is not None:
+        kept.keep(_OFFSETS, {name: getattr(offsets, name) for name in columns})
+    return offsets
+
+
+def offsets_of(setup: Setup, detections: ThinnedFrames, book: Notebook) -> KeypointOffsets | None:
+    """Where the detector puts its joints; None where nothing says it. ValueError where a file is of no use."""
+    config, rig, fitter = setup.config, setup.rig, setup.fitter
+    source = config.offsets.source
+    if source == "none":
+        return None
+    if fitter.model is None or setup.skeleton != BODY_25:
+        if source == "recording":
+            return None
+        raise ValueError(f"offsets of {source} need a fitter with a `model`, and joints of BODY_25")
+    if source != "recording":
+        return KeypointOffsets.load(source)
+    with book.stage("offsets"):
+        spread = spread_frames(len(detections), config.offsets.frames)
+        # Joints that three views see well are wanted: people whose hips they see are enough, and found faster.
+        hips = StageOne.of(config).by_hips()
+        people = [hips.people(detections[t], rig, setup.skeleton, Notebook()) for t in spread]
+        if len(people) == 0:
+            return KeypointOffsets.identity()
+        targets = confident_targets(Observations.concatenate(people), rig, config.observations)
+        return learn_offsets(targets, fitter.model, config=config.body)

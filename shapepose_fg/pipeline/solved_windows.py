@@ -1,0 +1,209 @@
+"""The windows of a recording, solved, in order: its people are followed here, or chunk by chunk in any process."""
+
+from collections import Counter, deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.core.frame_times import FrameTimes, stretches
+from shapepose_fg.core.observation_table import place_in_view
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.pipeline.engine import Setup
+from shapepose_fg.pipeline.runs.borders import Border
+from shapepose_fg.pipeline.runs.checkpoint import Checkpoint
+from shapepose_fg.pipeline.runs.chunks import Chunk, Identities, cut_in_chunks, windows_of
+from shapepose_fg.pipeline.runs.notes import Notebook, Notes
+from shapepose_fg.pipeline.runs.parts import Part
+from shapepose_fg.pipeline.solved_rows import result_rows
+from shapepose_fg.pipeline.windows import Solved, Span
+from shapepose_fg.pipeline.workers import Pool
+from shapepose_fg.proposal.thinning import ThinnedFrames
+from shapepose_fg.tracking.hypotheses import Input
+
+_FALSE_POSITIVE = "next to no detections of their own, or in somebody else's place"
+"""Why people are dropped when detections are reassociated."""
+
+
+@dataclass(frozen=True)
+class SolvedWindows:
+    """The windows of a recording: where they come from, and who solves them."""
+
+    setup: Setup
+    """What all processes share."""
+    detections: ThinnedFrames
+    """What the cameras saw."""
+    times: FrameTimes
+    """When."""
+    frames: range
+    """The frames that are wanted."""
+    cuts: Sequence[int]
+    """First frames of what follows a cut."""
+    book: Notebook
+    """Where this process takes its notes."""
+
+    @cached_property
+    def _time_s(self) -> NDArray[np.float64]:
+        """(T, V) when each view took each frame."""
+        return self.times.of_views(len(self.setup.rig))
+
+    def read(self, frame: int) -> Input:
+        """What the cameras give of a frame."""
+        with self.book.stage("read"):
+            self.book.thin("detections", self.detections.is_thinned(frame), frame)
+            return Input(frame, self._time_s[frame], self.detections[frame], self.setup.rig)
+
+    def after(self, begin: Checkpoint | None, pool: Pool[Setup], chunk_frames: int | None) -> Iterator[Part]:
+        """The windows from `begin` on, in order; in chunks of about `chunk_frames`, where that is given."""
+        begin = Checkpoint(self.frames.start) if begin is None else begin
+        return (
+            self._one_by_one(begin, pool) if chunk_frames is None else self._by_chunks(begin, pool, chunk_frames)
+        )
+
+    def _one_by_one(self, begin: Checkpoint, pool: Pool[Setup]) -> Iterator[Part]:
+        waiting: deque[tuple[Notes, Checkpoint | None]] = deque()
+
+        def spans() -> Iterator[Span]:
+            for span, behind in self._followed(begin):
+                waiting.append((self.book.torn_off(), behind))
+                yield span
+
+        for solved in pool.map(_solve, spans()):
+            followed, behind = waiting.popleft()
+            notes = self._notes(solved)
+            notes.add(followed)
+            yield Part(self._rows(solved), notes, behind)
+
+    def _followed(self, begin: Checkpoint) -> Iterator[tuple[Span, Checkpoint | None]]:
+        """The windows as far as their people have been followed, and from where following goes on behind some."""
+        config, engine = self.setup.config, self.setup.engine(self.book)
+        next_id = begin.next_id
+        for stretch in stretches(self.frames, self.cuts):
+            if stretch.stop <= begin.frame:
+                continue
+            carries_on = begin.state is not None and begin.frame > stretch.start
+            state = begin.state if carries_on and begin.state is not None else engine.start(next_id)
+            for start in range(max(stretch.start, begin.frame), stretch.stop, config.batch_frames):
+                batch = range(start, min(start + config.batch_frames, stretch.stop))
+                given, last = [self.read(frame) for frame in batch], batch.stop == stretch.stop
+                with self.book.stage("follow"):
+                    if config.temporal:
+                        spans, state = engine.follow(state, given, last=last)
+                        next_id = state.follow.next_id
+                    else:
+                        spans = [engine.alone(self.book.watched(given))]
+                behind = Checkpoint(batch.stop, next_id, state if config.temporal and not last else None)
+                for n, span in enumerate(spans, start=1):
+                    yield span, behind if n == len(spans) else None
+
+    def _by_chunks(self, begin: Checkpoint, pool: Pool[Setup], chunk_frames: int) -> Iterator[Part]:
+        chunks = cut_in_chunks(self.frames, self.cuts, self.times.frame_s, self.setup.config, chunk_frames)
+        waiting: deque[tuple[Chunk, Notes]] = deque()
+
+        def jobs() -> Iterator[ChunkJob]:
+            for chunk in chunks:
+                if chunk.own.start >= begin.frame:
+                    given = tuple(self.read(frame) for frame in range(chunk.first, chunk.until))
+                    waiting.append((chunk, self.book.torn_off()))
+                    yield ChunkJob(chunk, given)
+
+        identities = Identities(begin.next_id, begin.border)
+        for found in pool.map(solve_chunk, jobs()):
+            chunk, read = waiting.popleft()
+            names = identities.names(found.begins, alone=chunk.first == chunk.own.start)
+            identities.remember(found.ends, names)
+            for solved in found.solved:
+                notes, last = self._notes(solved), solved is found.solved[-1]
+                notes.problems = [
+                    replace(each, track=identities.name(each.track, names)) for each in notes.problems
+                ]
+                notes.evidence = {identities.name(of, names): each for of, each in notes.evidence.items()}
+                track = [identities.name(each, names) for each in solved.observations.track.tolist()]
+                if last:
+                    notes.add(read)
+                    notes.add(found.notes)
+                rows = replace(solved.observations, track=np.array(track, dtype=np.intp))
+                behind = Checkpoint(chunk.own.stop, identities.next_id, border=identities.border)
+                yield Part(self._rows(replace(solved, observations=rows)), notes, behind if last else None)
+
+    def _notes(self, solved: Solved) -> Notes:
+        """What is to be said about a window; people are tracks, or frame by frame numbers within the frame."""
+        temporal, rows, problems = self.setup.config.temporal, solved.observations, list(solved.estimates.problems)
+        if not temporal:
+            problems = [
+                replace(each, track=int(((rows.frame == each.frame) & (rows.track < each.track)).sum()))
+                for each in problems
+            ]
+        notes = Notes(solved.frames, dict(solved.seconds), problems=problems)
+        if len(solved.false_positives) > 0:
+            notes.dropped[_FALSE_POSITIVE] = list(solved.false_positives)
+        said = np.isfinite(rows.evidence)
+        if temporal:
+            for track in np.unique(rows.track[said]).tolist():
+                own = rows.evidence[said & (rows.track == track)]
+                notes.evidence[track] = [float(own.sum()), len(own)]
+        else:
+            notes.probable = dict(Counter(f"{tenth / 10:.1f}" for tenth in np.floor(10 * rows.evidence[said])))
+        return notes
+
+    def _rows(self, solved: Solved) -> Reconstruction:
+        """Solved rows as rows of the result, by frame and person; bodies that were not fitted are NaN there."""
+        order = np.lexsort((solved.observations.track, solved.observations.frame))
+        rows, estimates = solved.observations.rows(order), solved.estimates.rows(order)
+        number_in_frame = np.arange(len(rows)) - np.searchsorted(rows.frame, rows.frame)
+        person = rows.track if self.setup.config.temporal else number_in_frame
+        place = np.full(rows.candidate.shape, -1, dtype=np.int32)
+        for frame in np.unique(rows.frame).tolist():
+            of_frame = rows.frame == frame
+            own = self.detections.in_recording(frame, rows.candidate[of_frame])
+            place[of_frame] = place_in_view(own, self.detections.frames[frame].view)
+        return result_rows(rows, estimates, place, self.setup.rig, self.setup.skeleton.joints, person)
+
+
+def _solve(setup: Setup, span: Span) -> Solved:
+    """One window, in whatever process."""
+    return setup.solver.solve(span)
+
+
+@dataclass(frozen=True)
+class ChunkJob:
+    """A chunk that waits; plain data, which can be sent to another process."""
+
+    chunk: Chunk
+    """Which frames."""
+    given: tuple[Input, ...]
+    """What the cameras gave, from `chunk.first` on."""
+
+
+@dataclass(frozen=True)
+class SolvedChunk:
+    """A chunk that is done; its tracks count from 0."""
+
+    solved: tuple[Solved, ...]
+    """Its windows."""
+    notes: Notes
+    """What is to be said about following its people."""
+    begins: Border
+    """Who is where at its beginning."""
+    ends: Border
+    """And at its end."""
+
+
+def solve_chunk(setup: Setup, job: ChunkJob) -> SolvedChunk:
+    """Follow people through a chunk and solve its windows, in whatever process.
+
+    RuntimeError where these are not the frames of the chunk, each once.
+    """
+    book = Notebook()
+    engine = setup.engine(book)
+    with book.stage("follow"):
+        spans = list(windows_of(engine, job.chunk, lambda frame: job.given[frame - job.chunk.first]))
+    frames = [given.frame for span in spans for given, _ in span.decided[span.start : span.stop]]
+    if frames != list(job.chunk.own):
+        raise RuntimeError(f"windows of {len(frames)} frames were found for a chunk of {job.chunk.own}")
+    solved = tuple(setup.solver.solve(span) for span in spans)
+    notes = book.torn_off()
+    notes.dropped = {why: [each for each in of if each in job.chunk.own] for why, of in notes.dropped.items()}
+    return SolvedChunk(solved, notes, Border.of(spans[0]), Border.of(spans[-1]))
