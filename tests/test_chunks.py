@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.cli.stopping import Stopped
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.frame_times import FrameTimes
@@ -163,7 +164,7 @@ def test_every_chunk_gives_its_own_frames_and_whole_windows(fps, views, batch):
 
 
 def test_a_chunk_without_its_frames_is_an_error_and_no_gap(scene, recording):
-    setup = Setup(scene.rig, recording.skeleton, CONFIG, SimpleNamespace())  # type: ignore[arg-type]
+    setup = Setup(scene.rig, recording.skeleton, CONFIG, make_fitter(CONFIG.body))
     given = tuple(Input(n, np.full(4, n / 25), Detections.empty(), scene.rig) for n in range(16))
     short = Chunk(range(0, 12), 0, 16, ended=False)  # half a window and 0.3 s more are needed
     with pytest.raises(RuntimeError, match=r"windows of 0 frames were found for a chunk of range\(0, 12\)"):

@@ -18,7 +18,7 @@ from shapepose_fg.estimation.estimator import Estimator
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.solved_setup import CAMERAS, read_setup
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
-from shapepose_fg.pipeline.solving import solve_rows
+from shapepose_fg.pipeline.solving import Solver, solve_rows
 from shapepose_fg.pipeline.windows import WindowConfig
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.scene import Scene
@@ -42,7 +42,7 @@ def people(scene) -> Reconstruction:
 def solve(rows: Reconstruction, scene: Scene, config: PipelineConfig = CONFIG) -> Reconstruction:
     offsets = KeypointOffsets.from_dict(rows.run["keypoint_offsets"])
     fitter = make_fitter(config.body, BodyModel.default()).with_keypoint_offsets(offsets)
-    return solve_rows(rows, scene.rig, config, fitter)
+    return solve_rows(rows, Solver(scene.rig, config, fitter))
 
 
 def moved_mm(one: Reconstruction, other: Reconstruction) -> np.ndarray:

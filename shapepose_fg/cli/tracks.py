@@ -214,18 +214,11 @@ def _solver(folder: Path) -> "Solve | None":
         return None
 
     def solve(rows: "Reconstruction") -> "Reconstruction":
-        from shapepose_fg.body.fitting.fitters import make_fitter
-        from shapepose_fg.body.model.body_model import BodyModel
         from shapepose_fg.io.solved_setup import read_setup
-        from shapepose_fg.pipeline.pipeline import PipelineConfig
-        from shapepose_fg.pipeline.solving import solve_rows
+        from shapepose_fg.pipeline.config import PipelineConfig
+        from shapepose_fg.pipeline.solving import Solver, solve_rows
 
-        setup = read_setup(folder, rows, PipelineConfig)
-        model = BodyModel.default() if setup.body is None else BodyModel.load(setup.body)
-        fitter = make_fitter(setup.settings.body, model.with_keypoints(tuple(rows.joint_names.tolist())))
-        if setup.offsets is not None:
-            fitter = fitter.with_keypoint_offsets(setup.offsets)
-        return solve_rows(rows, setup.rig, setup.settings, fitter)
+        return solve_rows(rows, Solver.of(read_setup(folder, rows, PipelineConfig), rows.joint_names))
 
     return solve
 

@@ -35,15 +35,27 @@ def read_setup(folder: Path, people: Reconstruction, kind: type[Settings]) -> So
 
     InputError, one sentence, where a file is missing or damaged, or the settings are another version's.
     """
-    run_file, run, table = folder / "run.json", people.run, people.observations
     rig = read_rig(folder / CAMERAS)
+    table = people.observations
     if table is not None and tuple(table.view_names.tolist()) != tuple(rig.names):
         raise InputError(
             f"{folder / CAMERAS}: the cameras are not those of observations.npz; reconstruct the recording again"
         )
-    configuration: Any = run.get("configuration")
+    return setup_of(people, rig, kind, folder / "run.json")
+
+
+def setup_of(
+    people: Reconstruction, rig: Rig, kind: type[Settings], run_file: Path = Path("run.json")
+) -> SolvedSetup[Settings]:
+    """The same of a result whose cameras are known; `run_file` is where its `run` stands, for errors."""
+    configuration: Any = people.run.get("configuration")
     if not isinstance(configuration, dict):
         raise InputError(f"{run_file}: configuration is missing; reconstruct the recording again")
     settings = config_from(configuration, kind, run_file, cure=ANOTHER_VERSION)
-    offsets = KeypointOffsets.load(run_file) if run.get("keypoint_offsets") is not None else None
-    return SolvedSetup(rig, settings, offsets, None if run.get("body") is None else Path(str(run["body"])))
+    offsets, body = people.run.get("keypoint_offsets"), people.run.get("body")
+    return SolvedSetup(
+        rig=rig,
+        settings=settings,
+        offsets=None if offsets is None else KeypointOffsets.read(offsets, run_file),
+        body=None if body is None else Path(str(body)),
+    )

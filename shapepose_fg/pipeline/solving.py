@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitter import BodyFitter
+from shapepose_fg.body.fitting.fitters import make_fitter
+from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.frame_times import stretches
@@ -16,64 +18,79 @@ from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.estimation.estimator import Estimates, Estimator, ExtraFactors
 from shapepose_fg.estimation.floor import Floor
 from shapepose_fg.estimation.window_solution import WindowSolution
+from shapepose_fg.io.solved_setup import SolvedSetup, setup_of
 from shapepose_fg.pipeline.bodies_over_time import with_bodies_over_time
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.solved_rows import result_rows
 from shapepose_fg.pipeline.windows import near_border, window_stop
 
 
+@dataclass(frozen=True)
+class Solver:
+    """What rows of a result are solved anew with."""
+
+    rig: Rig
+    """The cameras, in the order of the observations' views."""
+    config: PipelineConfig
+    """The settings."""
+    fitter: BodyFitter
+    """Fits bodies; it knows where the detector puts its joints (`run["keypoint_offsets"]`)."""
+
+    @classmethod
+    def of(cls, setup: SolvedSetup[PipelineConfig], joint_names: NDArray[np.str_]) -> "Solver":
+        """What a result with these joints was solved with."""
+        model = BodyModel.default() if setup.body is None else BodyModel.load(setup.body)
+        fitter = make_fitter(setup.settings.body, model.with_keypoints(tuple(joint_names.tolist())))
+        if setup.offsets is not None:
+            fitter = fitter.with_keypoint_offsets(setup.offsets)
+        return cls(setup.rig, setup.settings, fitter)
+
+
 def solve_rows(
-    rows: Reconstruction,
-    rig: Rig,
-    config: PipelineConfig,
-    fitter: BodyFitter,
-    *,
-    extra_factors: ExtraFactors | None = None,
+    rows: Reconstruction, solver: Solver, *, extra_factors: ExtraFactors | None = None
 ) -> Reconstruction:
     """Some people of a result solved anew, each over all of their rows, in the windows of the whole recording.
 
-    Detections stay with whom they were given; gates are decided anew. `fitter` knows where the detector puts its
-    joints (`run["keypoint_offsets"]`). ValueError where `rows` do not say what they were solved from.
+    Detections stay with whom they were given; gates are decided anew. ValueError where `rows` do not say what
+    they were solved from.
     """
     parts = []
-    for window, part, estimates, observations, _ in _solved(rows, rig, config, fitter, extra_factors):
+    for window, part, estimates, observations, _ in _solved(rows, solver, extra_factors):
         assert part.observations is not None
         names = tuple(part.joint_names.tolist())
-        solved = result_rows(observations, estimates, part.observations.candidate, rig, names, part.person)
+        solved = result_rows(observations, estimates, part.observations.candidate, solver.rig, names, part.person)
         parts.append(solved.rows(_inside(part.frame, window.own)))
     solved = replace(Reconstruction.concatenate(parts), run=rows.run) if parts else rows
-    if fitter.model is None:
+    if solver.fitter.model is None:
         return solved
-    return with_bodies_over_time(solved, fitter, floor=Floor.from_dict(rows.run.get("floor")))
+    return with_bodies_over_time(solved, solver.fitter, floor=Floor.from_dict(rows.run.get("floor")))
 
 
 def window_solutions(
-    rows: Reconstruction,
-    rig: Rig,
-    config: PipelineConfig,
-    fitter: BodyFitter,
-    *,
-    extra_factors: ExtraFactors | None = None,
+    people: Reconstruction, rig: Rig, *, extra_factors: ExtraFactors | None = None
 ) -> Iterator[WindowSolution]:
     """Every person of every window of a result as one graph, whose values and marginals are the result's.
 
-    Joints and covariances are those of `rows`; the graph below is solved anew from their observations. Without
-    `extra_factors`: with them the solution says something else, and its own joints are kept. Windows overlap:
-    frames near a border are in two. ValueError as `solve_rows`.
+    Joints and covariances are those of `people`; the graph below is solved anew from their observations, before
+    the cameras `rig`, in the order of the views. With `extra_factors` it says something else, and what it says
+    are joints and covariances. Windows overlap: frames near a border are in two. InputError where `people.run`
+    does not say the settings, ValueError where there are no observations.
     """
-    for _, part, _, _, solutions in _solved(rows, rig, config, fitter, extra_factors):
+    solver = Solver.of(setup_of(people, rig, PipelineConfig), people.joint_names)
+    for _, part, _, _, solutions in _solved(people, solver, extra_factors):
         for solution in solutions:
             as_reported = {"joints": part.joints[solution.rows], "covariance": part.covariance[solution.rows]}
             yield solution if extra_factors is not None else replace(solution, **as_reported)
 
 
 def _solved(
-    rows: Reconstruction, rig: Rig, config: PipelineConfig, fitter: BodyFitter, extra_factors: ExtraFactors | None
+    rows: Reconstruction, solver: Solver, extra_factors: ExtraFactors | None
 ) -> Iterator[tuple["_Window", Reconstruction, Estimates, Observations, list[WindowSolution]]]:
     """Each window of the recording: its rows and those around it, solved."""
     if rows.observations is None:
         raise ValueError("rows without observations cannot be solved anew; reconstruct the recording again")
-    estimator = Estimator(rig, fitter, tuple(rows.joint_names.tolist()), config.estimator)
+    config, names = solver.config, tuple(rows.joint_names.tolist())
+    estimator = Estimator(solver.rig, solver.fitter, names, config.estimator)
     with torch_threads(config.threads):
         for window in _windows(rows, config):
             part = rows.rows(window.rows(rows, config.windows.overlap_s))

@@ -5,11 +5,9 @@ import numpy as np
 import pytest
 
 from factors import isotropic
-from shapepose_fg.body.fitting.fitters import make_fitter
-from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.window_solution import WindowSolution
-from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
+from shapepose_fg.pipeline.pipeline import reconstruct
 from shapepose_fg.pipeline.solving import window_solutions
 from shapepose_fg.simulation import built_in_scene, simulate
 
@@ -27,9 +25,7 @@ def people(scene):
 
 
 def solutions(people, scene, extra_factors=None) -> list[WindowSolution]:
-    config = PipelineConfig()
-    fitter = make_fitter(config.body, BodyModel.default())
-    return list(window_solutions(people, scene.rig, config, fitter, extra_factors=extra_factors))
+    return list(window_solutions(people, scene.rig, extra_factors=extra_factors))
 
 
 def ratios(solution: WindowSolution) -> np.ndarray:

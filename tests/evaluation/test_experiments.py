@@ -18,6 +18,7 @@ from shapepose_fg.evaluation.experiments.made_with import changes, fingerprint, 
 from shapepose_fg.evaluation.experiments.registry import experiments
 from shapepose_fg.evaluation.experiments.runner import Kept, measured
 from shapepose_fg.evaluation.experiments.stretches import Scale, Stretch
+from shapepose_fg.evaluation.varied import varied
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.simulation.sequences import Sequence
 from shapepose_fg.simulation.training.split import split_of
@@ -159,14 +160,14 @@ def test_cases_are_asked_for_by_their_words(monkeypatch, tmp_path, capsys):
 
 def test_every_setting_that_differs_from_the_paper_has_its_switch():
     switched = {name for names in ablation.SWITCHES.values() for name in names}
-    assert switched | {"temporal"} == set(ablation.differing(PipelineConfig.paper(), PipelineConfig()))
+    assert switched | {"temporal"} == set(ablation.differing(ablation.PAPER, varied(PipelineConfig())))
 
 
 def test_all_switches_together_lead_from_one_to_the_other():
     everything = [name for names in ablation.SWITCHES.values() for name in names]
-    assert ablation.with_settings_of(ablation.PAPER, scenes.FRAME_BY_FRAME, everything) == scenes.FRAME_BY_FRAME
-    one = ablation.with_settings_of(scenes.FRAME_BY_FRAME, ablation.PAPER, everything[:1])
-    assert ablation.differing(one, scenes.FRAME_BY_FRAME) == everything[:1]
+    assert ablation.with_settings_of(ablation.PAPER, ablation.OURS, everything) == ablation.OURS
+    one = ablation.with_settings_of(ablation.OURS, ablation.PAPER, everything[:1])
+    assert ablation.differing(one, ablation.OURS) == everything[:1]
 
 
 def test_nothing_was_learnt_from_anybody_who_is_held_back(shared_data):

@@ -100,7 +100,7 @@ def test_no_workers_are_refused(worker: VisibilityWorker, scene: Scene, workers:
 INTERRUPTED = """
 from contextlib import contextmanager
 import multiprocessing, signal, sys
-from shapepose_fg.cli import main as cli
+from shapepose_fg.cli import main, simulate
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # whoever runs the tests may ignore it
 signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
@@ -109,8 +109,8 @@ signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 def tell(what):
     yield lambda done, total: print(done, *(child.pid for child in multiprocessing.active_children()), flush=True)
 
-cli.progress_bar = tell
-cli.main(["simulate", "demo", "--people", "2", "--cameras", "2", "--frames", ":2000", "--workers", "2",
+simulate.progress_bar = tell
+main.main(["simulate", "demo", "--people", "2", "--cameras", "2", "--frames", ":2000", "--workers", "2",
           "--output", sys.argv[1]])
 """
 

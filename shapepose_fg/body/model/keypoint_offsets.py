@@ -127,6 +127,11 @@ class KeypointOffsets:
         content = read_json(path)
         if isinstance(content, dict) and isinstance(content.get("keypoint_offsets"), dict):
             content = content["keypoint_offsets"]
+        return cls.read(content, path)
+
+    @classmethod
+    def read(cls, content: Any, path: Path) -> "KeypointOffsets":
+        """The offsets that a file at `path` has as `content`; InputError on anything else."""
         if not isinstance(content, dict) or content.get("format") != _FORMAT:
             raise InputError(
                 f"{path}: holds no keypoint offsets; give a run.json that does, or what KeypointOffsets.save wrote"

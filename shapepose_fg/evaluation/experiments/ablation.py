@@ -13,6 +13,7 @@ from shapepose_fg.pipeline.pipeline import PipelineConfig
 
 FRAMES = 30
 """Of each stretch."""
+OURS = varied(FRAME_BY_FRAME)
 PAPER = varied(PipelineConfig.paper())
 """What each is added to; what each is taken from is ours frame by frame, as time stands in a row of its own."""
 COLUMNS = (
@@ -80,11 +81,11 @@ def configurations(switches: Sequence[str]) -> Iterator[tuple[str, PipelineConfi
     yield "the paper", PAPER
     yield "the paper + time", replace(PAPER, temporal=True)
     for name in switches:
-        yield f"the paper + {name}", with_settings_of(PAPER, FRAME_BY_FRAME, SWITCHES[name])
+        yield f"the paper + {name}", with_settings_of(PAPER, OURS, SWITCHES[name])
     yield "ours, frame by frame", FRAME_BY_FRAME
     yield "ours, over time", OVER_TIME
     for name in switches:
-        yield f"ours - {name}", with_settings_of(FRAME_BY_FRAME, PAPER, SWITCHES[name])
+        yield f"ours - {name}", with_settings_of(OURS, PAPER, SWITCHES[name])
     without_limbs = replace(OVER_TIME, motion=replace(OVER_TIME.motion, keep_limbs=False))
     yield "ours, over time - limbs are kept", without_limbs
 

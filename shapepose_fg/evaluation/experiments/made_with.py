@@ -10,6 +10,7 @@ from typing import Any
 
 from shapepose_fg.body.fitting.fitters import BodyConfig
 from shapepose_fg.evaluation.experiments.experiment import Basis
+from shapepose_fg.evaluation.varied import varied
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.simulation import DetectorConfig
 
@@ -37,7 +38,7 @@ def made_with(basis: Basis = "pipeline") -> MadeWith:
     found = (
         _values(BodyConfig())
         if bodies_only
-        else _values(PipelineConfig()) | _values(DetectorConfig(), "detector.")
+        else _values(varied(PipelineConfig())) | _values(DetectorConfig(), "detector.")
     )
     return found | {name: digest for folder in _DATA[basis] for name, digest in _checksums(folder).items()}
 
