@@ -13,9 +13,11 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.body_step import BodyStep, Tie, disagreement
 from shapepose_fg.estimation.contact import walking
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
+from shapepose_fg.estimation.in_time import interpolated
 from shapepose_fg.estimation.linearisation import ViewEvidence, linearise, mean_confidence
+from shapepose_fg.estimation.message import Message
 from shapepose_fg.estimation.motion_model import LOST_M
-from shapepose_fg.estimation.window_graph import Message, WindowGraph
+from shapepose_fg.estimation.window_graph import WindowGraph
 
 
 @dataclass(frozen=True)
@@ -205,14 +207,3 @@ def _solve(
         problem = inlier, views, body.rows(np.arange(part.start, part.stop))
         X[part] = window.graph.solve(*problem, initial, lost, walking(window.graph, problem, initial, lost))
     return X
-
-
-def interpolated(points: NDArray[np.float64], times_s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points (T, J, 3) with gaps closed in a straight line, and the ends held; joints never known stay NaN."""
-    known = np.asarray(np.isfinite(points).all(axis=2))
-    result = points.copy()
-    for joint in np.flatnonzero(known.any(axis=0) & ~known.all(axis=0)).tolist():
-        there = known[:, joint]
-        for axis in range(3):
-            result[:, joint, axis] = np.interp(times_s, times_s[there], points[there, joint, axis])
-    return result

@@ -10,7 +10,7 @@ from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
 from shapepose_fg.estimation.draft import MODEL_SIGMA_M
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.linearisation import ViewEvidence
-from shapepose_fg.estimation.window_graph import Message
+from shapepose_fg.estimation.message import Message
 
 JOINT_SIGMA_M = 0.03
 """Sigma of every joint where the body is fitted to X, all joints alike, metres."""

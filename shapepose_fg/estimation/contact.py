@@ -5,8 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.estimation.in_time import near_in_time
+from shapepose_fg.estimation.message import Message
 from shapepose_fg.estimation.state_covariances import state_covariances
-from shapepose_fg.estimation.window_graph import Message, WindowGraph, near_in_time
+from shapepose_fg.estimation.window_graph import WindowGraph
 
 FEET = ("Ankle", "Heel", "BigToe", "SmallToe")
 """Joints that may stand, on either side, each by itself: toes stand while the heel rises."""

@@ -7,7 +7,7 @@ from factors import kernel_weight
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.linearisation import LEAST_PROBABILITY, ObservationConfig, ViewEvidence
-from shapepose_fg.estimation.window_graph import Message
+from shapepose_fg.estimation.message import Message
 
 Array = NDArray[np.float64]
 

@@ -80,12 +80,3 @@ def limb_steps(
     step = np.einsum("...ij,...j->...i", share, body.joints - joints[rows])
     steps[rows] = np.where((moved[rows] & np.isfinite(step).all(axis=-1))[..., None], step, 0.0)
     return steps
-
-
-def smoothed_in_time(
-    values: NDArray[np.float64], times_s: NDArray[np.float64], width_s: float
-) -> NDArray[np.float64]:
-    """Values (T, ...) averaged over time with a Gaussian of `width_s`, one sigma."""
-    weight = np.exp(-0.5 * ((times_s[:, None] - times_s) / width_s) ** 2)
-    weight /= weight.sum(axis=1, keepdims=True)
-    return np.einsum("ts,s...->t...", weight, values)

@@ -18,14 +18,9 @@ from shapepose_fg.estimation.body_step import joint_targets
 from shapepose_fg.estimation.calibration import Calibration, Clues, from_body, lasting_mean
 from shapepose_fg.estimation.contact import feet_of
 from shapepose_fg.estimation.doubt import association_spread
-from shapepose_fg.estimation.draft import (
-    NARROWING,
-    changed_targets,
-    drafted,
-    limb_steps,
-    smoothed_in_time,
-)
+from shapepose_fg.estimation.draft import NARROWING, changed_targets, drafted, limb_steps
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
+from shapepose_fg.estimation.in_time import near_in_time, smoothed_in_time, waited_s
 from shapepose_fg.estimation.limb_lengths import limb_lengths, limbs_of, with_lengths
 from shapepose_fg.estimation.linearisation import (
     ViewEvidence,
@@ -36,19 +31,11 @@ from shapepose_fg.estimation.linearisation import (
     weakest_sigma,
 )
 from shapepose_fg.estimation.motion_model import MotionModel
-from shapepose_fg.estimation.outcome import (
-    SEEN_M,
-    Problem,
-    how_known,
-    problems,
-    reported_covariance,
-    strong,
-    waited_s,
-)
+from shapepose_fg.estimation.outcome import SEEN_M, Problem, how_known, problems, reported_covariance, strong
 from shapepose_fg.estimation.plain_view import SPEED_M_S, elsewhere_variance, limbs_that_hide
 from shapepose_fg.estimation.smoothing import smoothed
 from shapepose_fg.estimation.state_covariances import state_covariances
-from shapepose_fg.estimation.window_graph import WindowGraph, near_in_time
+from shapepose_fg.estimation.window_graph import WindowGraph
 from shapepose_fg.estimation.window_solution import WindowSolution
 
 ExtraFactors = Callable[[WindowGraph, NDArray[np.int64]], Iterable[gtsam.NonlinearFactor]]

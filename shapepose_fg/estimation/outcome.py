@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Known
 from shapepose_fg.estimation.alternation import Solution, Window
+from shapepose_fg.estimation.in_time import carried
 from shapepose_fg.estimation.linearisation import weakest_sigma
 from shapepose_fg.estimation.motion_model import Lasting
 
@@ -64,24 +65,6 @@ def reported_covariance(
     own = (1 - f) / f**2 * marginal @ said @ marginal
     total = np.where(seen[..., None, None], (1 - kept) * marginal, marginal + own) + (1 - f + kept * f) * left
     return np.where(simple[..., None, None], total, marginal)
-
-
-def waited_s(seen: NDArray[np.bool_], times_s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(T, J) seconds to the nearest frame in which a joint is `seen` (T, J); infinite where there is none."""
-    at = np.broadcast_to(times_s[:, None], seen.shape)
-    return np.where(seen.any(axis=0), np.abs(at - carried(at, seen, times_s)), np.inf)
-
-
-def carried(
-    values: NDArray[np.float64], seen: NDArray[np.bool_], times_s: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Values (T, J, ...) of joints, where they are not `seen` (T, J) from the nearest frame in which they are."""
-    result = values.copy()
-    for joint in np.flatnonzero(seen.any(axis=0) & ~seen.all(axis=0)).tolist():
-        frames = np.flatnonzero(seen[:, joint])
-        nearest = frames[np.abs(times_s[:, None] - times_s[frames]).argmin(axis=1)]
-        result[:, joint] = values[nearest, joint]
-    return result
 
 
 def strong(solution: Solution, observations: Observations) -> NDArray[np.bool_]:

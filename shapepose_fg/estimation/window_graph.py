@@ -31,6 +31,8 @@ from factors import (
     velocity_keys,
 )
 from shapepose_fg.core.bounds import Factor, MetresOrNone, Settings, Share
+from shapepose_fg.estimation.in_time import near_in_time, spanned, speeds
+from shapepose_fg.estimation.message import Message, symmetric_roots
 from shapepose_fg.estimation.motion_model import Lasting, MotionModel
 
 _OF_VIEWS, _OF_BODY = 0, 1
@@ -65,25 +67,6 @@ class WindowGraphConfig(Settings):
         `tune`.
         """
         return cls(rho_3d=0.25, shape_sigma_m=0.03)
-
-
-@dataclass(frozen=True)
-class Message:
-    """What somebody says of the joints of T frames (or of N rows), as Gaussians."""
-
-    xyz: NDArray[np.float64]
-    """(T, J, 3) where they are, metres; anything where the information is zero."""
-    information: NDArray[np.float64]
-    """(T, J, 3, 3) 1/m², positive semi-definite; zero where nothing is said."""
-
-    @property
-    def known(self) -> NDArray[np.bool_]:
-        """(T, J) of which joints anything is said."""
-        return np.asarray(self.information.any(axis=(2, 3)))
-
-    def rows(self, index: NDArray[np.intp]) -> "Message":
-        """Some of the rows."""
-        return Message(self.xyz[index], self.information[index])
 
 
 class WindowGraph:
@@ -409,38 +392,8 @@ class WindowGraph:
         return positions.swapaxes(0, 1), speeds.swapaxes(0, 1)
 
 
-SPEED_S = 0.1
-"""Speeds are taken over this time before and after a step, so that noise does not pass for speed."""
-
-
-def speeds(points: NDArray[np.float64], times_s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(T - 1, J) how fast points (T, J, 3) are in each step, m/s, over `SPEED_S` on either side."""
-    first = np.searchsorted(times_s, times_s[:-1] - SPEED_S, side="left")
-    last = np.searchsorted(times_s, times_s[1:] + SPEED_S, side="right") - 1
-    return np.linalg.norm(points[last] - points[first], axis=2) / (times_s[last] - times_s[first])[:, None]
-
-
-def near_in_time(marked: NDArray[np.bool_], times_s: NDArray[np.float64], within_s: float) -> NDArray[np.bool_]:
-    """(T, J) which frames are at most `within_s` from one that is `marked` (T, J)."""
-    first = np.searchsorted(times_s, times_s - within_s, side="left")
-    last = np.searchsorted(times_s, times_s + within_s, side="right")
-    count = np.concatenate([np.zeros((1, marked.shape[1]), dtype=int), np.cumsum(marked, axis=0)])
-    return count[last] > count[first]
-
-
-def spanned(marked: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(T, J) which frames lie between the first and the last that are `marked` (T, J), these two included."""
-    return np.maximum.accumulate(marked, axis=0) & np.maximum.accumulate(marked[::-1], axis=0)[::-1]
-
-
 def is_determined(covariance: NDArray[np.float64]) -> NDArray[np.bool_]:
     """(...,) whether variables of this `covariance` (..., 3, 3), m² or m²/s², are known to `UNDETERMINED_M`."""
     known = np.asarray(np.isfinite(covariance).all(axis=(-2, -1)))
     largest = np.linalg.eigvalsh(np.where(known[..., None, None], covariance, 0.0))[..., -1]
     return np.asarray(known & (largest < UNDETERMINED_M**2))
-
-
-def symmetric_roots(information: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Symmetric square roots (D, 3, 3) of positive semi-definite matrices."""
-    values, vectors = np.linalg.eigh(information)
-    return np.einsum("dik,dk,djk->dij", vectors, np.sqrt(np.maximum(values, 0.0)), vectors)

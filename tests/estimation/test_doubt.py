@@ -6,7 +6,7 @@ from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.doubt import association_spread
 from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas
-from shapepose_fg.estimation.window_graph import Message
+from shapepose_fg.estimation.message import Message
 
 PLAIN = ObservationConfig(kernel="none", rho_2d_m=1.0)
 NAMES = ("RWrist",)

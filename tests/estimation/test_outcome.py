@@ -7,7 +7,8 @@ import pytest
 
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter
 from shapepose_fg.core.reconstruction import Known
-from shapepose_fg.estimation.draft import drafted, limb_steps, smoothed_in_time
+from shapepose_fg.estimation.draft import drafted, limb_steps
+from shapepose_fg.estimation.in_time import smoothed_in_time
 from shapepose_fg.estimation.limb_lengths import with_lengths
 from shapepose_fg.estimation.linearisation import ViewEvidence
 from shapepose_fg.estimation.motion_model import Lasting

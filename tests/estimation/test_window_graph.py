@@ -9,8 +9,9 @@ from scipy.optimize import minimize
 from factors import DEFAULT_WIDTH_SIGMA, make_camera, split_key
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.estimation.message import Message
 from shapepose_fg.estimation.motion_model import MotionModel
-from shapepose_fg.estimation.window_graph import Message, WindowGraph, WindowGraphConfig
+from shapepose_fg.estimation.window_graph import WindowGraph, WindowGraphConfig
 
 EXACT = WindowGraphConfig(max_iterations=100, tolerance=1e-12)
 """Solved to the end, so that the comparison is with the minimum and not with the stopping rule."""

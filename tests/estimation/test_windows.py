@@ -14,12 +14,13 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Known, Status
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.estimation.alternation import interpolated
 from shapepose_fg.estimation.estimator import Estimates, Estimator, window_rows
 from shapepose_fg.estimation.estimator_config import EstimatorConfig, RefineConfig
+from shapepose_fg.estimation.in_time import interpolated, near_in_time
+from shapepose_fg.estimation.message import symmetric_roots
 from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
 from shapepose_fg.estimation.state_covariances import Chains, state_covariances
-from shapepose_fg.estimation.window_graph import WindowGraph, near_in_time, symmetric_roots
+from shapepose_fg.estimation.window_graph import WindowGraph
 
 FPS = 25.0
 FRAMES = 30
