@@ -16,16 +16,13 @@ SURE_M = 0.02
 """Joints that views see are known to this, metres."""
 CARRIED_MOST = 3.0
 """A joint that no view sees is as doubtful at any sigma over this many times as much: it has room enough then."""
-ENOUGH_VIEWS = 2
-"""Joints that so many views see, or more, are alike; and cameras that are more than so many contradict each
-other where one is wrong."""
 
 
 @dataclass(frozen=True)
 class Clues:
     """How well the joints of N rows, solved over time, are known: what the graph says, and what speaks against it.
 
-    The last three are means over the frames around (`lasting_mean`).
+    The last four are means over the frames around (`lasting_mean`).
     """
 
     frame: NDArray[np.integer]
@@ -34,8 +31,6 @@ class Clues:
     """(N, J, 3) the joints, metres; NaN where unknown."""
     views: NDArray[np.integer]
     """(N, J) how many views see each."""
-    cameras: int
-    """How many there are."""
     covariance: Array
     """(N, J, 3, 3) of the graph, errors that last in it, m²."""
     disagreement: Array
@@ -45,6 +40,8 @@ class Clues:
     draft: Array
     """(N, J, 3, 3) outer product of the way from the draft, around which detections were given out, to the joint,
     m²."""
+    exchange: Array
+    """(N, J, 3, 3) between it and others' joints that may be its own (`doubt.exchange_spread`), m²."""
 
     @property
     def carried(self) -> Array:
@@ -60,10 +57,6 @@ class Calibration:
     scale: Array
     """(J,) what the variances of each joint are multiplied with where nothing speaks against them: by the whole
     recording's errors a shoulder or a hip is known less well than the graph takes it, a nose or a knee better."""
-    few: Array
-    """(3,) and by whether no view sees the joint, one, or more."""
-    two_cameras: float
-    """And with this before two cameras: no third one says where they are wrong."""
     power: float
     """And with one plus the disagreement, to this."""
     unseen: float
@@ -74,6 +67,8 @@ class Calibration:
     frames are one."""
     draft: float
     """Likewise."""
+    exchange: float
+    """Likewise: how probable it is that two limbs that both bodies can have are exchanged."""
 
     @classmethod
     def load(cls, joints: tuple[str, ...]) -> "Calibration":
@@ -83,20 +78,13 @@ class Calibration:
         known = data["scale"]
         mean = float(np.exp(np.mean(np.log(list(known.values())))))
         scale = np.array([known.get(name, mean) for name in joints])
-        few = np.array(data["few"], dtype=np.float64)
-        numbers = (float(data[name]) for name in ("two_cameras", "power", "unseen", "association", "draft"))
-        return cls(scale, few, *numbers)
+        return cls(scale, *(float(data[name]) for name in ("power", "unseen", "association", "draft", "exchange")))
 
     def covariance(self, clues: Clues) -> Array:
         """(N, J, 3, 3) covariances to report, m²."""
-        times = self.scale * self.few[np.minimum(clues.views, ENOUGH_VIEWS)]
-        times = times * (self.two_cameras if clues.cameras <= ENOUGH_VIEWS else 1.0)
-        times = times * (1 + clues.disagreement) ** self.power * clues.carried**self.unseen
-        return (
-            times[..., None, None] * clues.covariance
-            + self.association * clues.association
-            + self.draft * clues.draft
-        )
+        times = self.scale * (1 + clues.disagreement) ** self.power * clues.carried**self.unseen
+        added = self.association * clues.association + self.draft * clues.draft + self.exchange * clues.exchange
+        return times[..., None, None] * clues.covariance + added
 
 
 def from_body(joints: Array, covariance: Array, prior_xyz: Array, information: Array) -> Array:

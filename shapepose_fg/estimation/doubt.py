@@ -1,4 +1,6 @@
-"""What it means for a joint that it is not certain whose its detections are."""
+"""What it means for a joint that it is not certain whose its detections are, or whose limb it is on."""
+
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +17,51 @@ CERTAIN = 0.99
 """Observations that are more probably the person's make no alternatives: four in five."""
 FREE_M = 0.3
 """A joint that nothing but a doubtful observation places is known to this, metres, without it: half an arm."""
+
+REACH_M = 0.6
+"""Limbs of two people whose ends are nearer than this may be exchanged."""
+FITS_M = 0.05
+"""An exchanged limb fits a body if it is as long as the body's own up to this, one sigma, metres: what limbs that
+were solved differ from their bodies' by."""
+_LIMBS = {
+    f"{side}{far}": (f"{side}{near}", f"{side}{end}")
+    for side in "RL"
+    for far, near, end in (
+        ("Elbow", "Shoulder", "Elbow"), ("Wrist", "Elbow", "Wrist"), ("Knee", "Hip", "Knee"),
+        *((foot, "Knee", "Ankle") for foot in ("Ankle", "BigToe", "SmallToe", "Heel")),
+    )
+}  # fmt: skip
+"""Joints that get exchanged with a limb, and from where to where the limb goes: a foot goes with its ankle."""
+
+
+def limbs_to_exchange(joints: Sequence[str]) -> NDArray[np.intp]:
+    """(L, 3) joints of a detector that get exchanged with a limb, and the two ends of the limb."""
+    place = {name: number for number, name in enumerate(joints)}
+    there = [(far, *ends) for far, ends in _LIMBS.items() if {far, *ends} <= place.keys()]
+    return np.array([[place[name] for name in limb] for limb in there], dtype=np.intp).reshape(-1, 3)
+
+
+def exchange_spread(joints: Array, bodies: Array, frame: NDArray[np.integer], limbs: NDArray[np.intp]) -> Array:
+    """(N, J, 3, 3) outer products of the ways from joints to others' that may be theirs, m².
+
+    Of `joints` (N, J, 3) in the `frame` (N,). Two people's limbs can have been exchanged for long, and each frame
+    looks certain. But hardly ever can both bodies have the other's: by chance a stranger's foot is as far from
+    one's own knee as the shin is long, as in the fitted `bodies` (N, J, 3). Where both can, it counts in full, and
+    less and less with what the limbs miss.
+    """
+    spread = np.zeros((*joints.shape, 3))
+    far, near, end = limbs.T
+    length = np.linalg.norm(bodies[:, end] - bodies[:, near], axis=-1)
+    for number in np.unique(frame).tolist():
+        rows = np.flatnonzero(frame == number)
+        X = joints[rows]
+        away = X[None, :, far] - X[:, None, far]  # (P, P, L, 3) from each person's to each other's
+        across = np.linalg.norm(X[None, :, end] - X[:, None, near], axis=-1)
+        misfit = across - length[rows][:, None]
+        fits = np.exp(-0.5 * (misfit**2 + misfit.swapaxes(0, 1) ** 2) / FITS_M**2)
+        fits = np.where(np.linalg.norm(away, axis=-1) < REACH_M, np.nan_to_num(fits), 0.0)
+        spread[rows[:, None], far] = np.einsum("pql,pqli,pqlk->plik", fits, *(np.nan_to_num(away),) * 2)
+    return spread
 
 
 def association_spread(

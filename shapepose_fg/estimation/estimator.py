@@ -17,7 +17,7 @@ from shapepose_fg.estimation.alternation import Solution, Window, alternate, fin
 from shapepose_fg.estimation.body_step import joint_targets
 from shapepose_fg.estimation.calibration import Calibration, Clues, from_body, lasting_mean
 from shapepose_fg.estimation.contact import feet_of
-from shapepose_fg.estimation.doubt import association_spread
+from shapepose_fg.estimation.doubt import association_spread, exchange_spread, limbs_to_exchange
 from shapepose_fg.estimation.draft import NARROWING, changed_targets, drafted, limb_steps
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.in_time import near_in_time, smoothed_in_time, waited_s
@@ -106,6 +106,7 @@ class Estimator:
         self.joints = joints
         self._limbs = limbs_of(joints)
         self._hiding = limbs_that_hide(joints)
+        self._exchanged = limbs_to_exchange(joints)
         self._motion = MotionModel.load(joints, self.config.motion)
         self._calibration = Calibration.load(joints)
 
@@ -306,14 +307,15 @@ class Estimator:
         association = association_spread(observations, sigmas, final, body, views, self.config.observations)
         moved = np.nan_to_num(solved - observations.initial)
         draft = moved[..., None] * moved[..., None, :]
+        exchange = exchange_spread(solved, solution.fit.joints, observations.frame, self._exchanged)
         alone = np.ones(len(X), dtype=bool)
         for window in windows:
             rows, times_s = window.rows, window.graph.times_s
             alone[rows] = not window.graph.temporal
             association[rows] = lasting_mean(association[rows], times_s, count[rows] > 0)
-            for clue in (of_body, draft):
+            for clue in (of_body, draft, exchange):
                 clue[rows] = lasting_mean(clue[rows], times_s)
-        clues = Clues(observations.frame, X, count, len(views), covariance, of_body, association, draft)
+        clues = Clues(observations.frame, X, count, covariance, of_body, association, draft, exchange)
         return np.where(
             alone[:, None, None, None],
             covariance + self._calibration.association * association,

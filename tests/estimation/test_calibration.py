@@ -15,27 +15,24 @@ def clues(**changed):
     """One joint, known to 2 cm, that nothing speaks against."""
     nothing = np.zeros((1, 1, 3, 3))
     plain = Clues(
-        np.zeros(1, dtype=int), np.zeros((1, 1, 3)), np.full((1, 1), 2), 3, np.full((1, 1, 3, 3), 4e-4 * I3),
-        np.zeros((1, 1)), nothing, nothing,
+        np.zeros(1, dtype=int), np.zeros((1, 1, 3)), np.full((1, 1), 2), np.full((1, 1, 3, 3), 4e-4 * I3),
+        np.zeros((1, 1)), nothing, nothing, nothing,
     )  # fmt: skip
     return replace(plain, **changed)
 
 
 def test_each_clue_widens_what_it_speaks_of():
-    few, more = np.array([0.25, 0.5, 1.0]), {"power": 0.5, "unseen": 2.0, "association": 7.0, "draft": 2.0}
-    calibration = Calibration(np.array([0.8]), few, two_cameras=1.5, **more)
+    calibration = Calibration(np.array([0.8]), power=0.5, unseen=2.0, association=7.0, draft=2.0, exchange=0.5)
     plain = calibration.covariance(clues())
     np.testing.assert_allclose(plain[0, 0], 0.8 * 4e-4 * I3)
     np.testing.assert_allclose(calibration.covariance(clues(disagreement=np.full((1, 1), 3.0))), 2 * plain)
-    for views, factor in ((0, 0.25), (1, 0.5), (2, 1.0), (7, 1.0)):
-        found = calibration.covariance(clues(views=np.full((1, 1), views)))
-        np.testing.assert_allclose(found, factor * plain, err_msg="it is known to 2 cm")
-    np.testing.assert_allclose(calibration.covariance(clues(cameras=2)), 1.5 * plain)
-    unseen, wider = {"views": np.zeros((1, 1), dtype=int)}, {"covariance": 4 * clues().covariance}
-    np.testing.assert_allclose(calibration.covariance(clues(**unseen, **wider)), 0.25 * 2**2 * 4 * plain)
+    unseen = {"views": np.zeros((1, 1), dtype=int)}
+    np.testing.assert_allclose(calibration.covariance(clues(**unseen)), plain, err_msg="it is known to 2 cm")
+    wider = {"covariance": 4 * clues().covariance}
+    np.testing.assert_allclose(calibration.covariance(clues(**unseen, **wider)), 2**2 * 4 * plain)
     np.testing.assert_allclose(calibration.covariance(clues(**wider)), 4 * plain)
     along_x = np.diag([0.01, 0, 0])[None, None]
-    for name, weight in (("association", 7.0), ("draft", 2.0)):
+    for name, weight in (("association", 7.0), ("draft", 2.0), ("exchange", 0.5)):
         np.testing.assert_allclose(calibration.covariance(clues(**{name: along_x})), plain + weight * along_x)
 
 
@@ -48,7 +45,7 @@ def test_the_numbers_that_ship():
     assert by_name["Nose"] < by_name["RHip"], "a detector's hip is off for as long as somebody stands"
     assert 0 < found.power < 2 and 0 < found.unseen < 2
     assert found.association > 1, "doubts of neighbouring joints and frames are one"
-    assert found.two_cameras > 1, "no third view contradicts"
+    assert 0 < found.exchange < 1, "a probability"
     assert found.draft > 0
 
 
