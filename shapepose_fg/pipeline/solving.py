@@ -61,7 +61,7 @@ def solve_rows(
         solved = result_rows(observations, estimates, part.observations.candidate, solver.rig, names, part.person)
         parts.append(solved.rows(_inside(part.frame, window.own)))
     solved = replace(Reconstruction.concatenate(parts), run=rows.run) if parts else rows
-    if solver.fitter.model is None:
+    if solver.fitter.model is None or not solver.config.temporal:
         return solved
     return with_bodies_over_time(solved, solver.fitter, floor=Floor.from_dict(rows.run.get("floor")))
 
@@ -123,7 +123,9 @@ class _Window:
 
 
 def _windows(rows: Reconstruction, config: PipelineConfig) -> list[_Window]:
-    """The windows that have any of `rows`, as the recording was cut into them."""
+    """The windows that have any of `rows`, as the recording was cut into them; frame by frame, each frame."""
+    if not config.temporal:
+        return [_Window(frames, frames) for frames in (range(t, t + 1) for t in np.unique(rows.frame).tolist())]
     first, last = (int(rows.frame.min()), int(rows.frame.max()) + 1) if len(rows) > 0 else (0, 0)
     cuts: Sequence[int] = rows.run.get("cuts", ())
     covered = covered_frames(rows.run) or [range(first, last)]

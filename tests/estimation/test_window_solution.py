@@ -1,13 +1,16 @@
 """The graph of a solved window says what is reported: values, marginals, and what one makes of it."""
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
 
 from factors import isotropic
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.window_solution import WindowSolution
-from shapepose_fg.pipeline.pipeline import reconstruct
+from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.pipeline.solving import window_solutions
 from shapepose_fg.simulation import built_in_scene, simulate
 
@@ -55,6 +58,27 @@ def test_marginals_are_the_reported_covariances_and_values_the_reported_joints(p
         bare = gtsam.Marginals(solution.window.graph, solution.window.values)
         wrist = solution.window.keys[6, WRIST]
         assert np.trace(bare.marginalCovariance(wrist)) < 0.5 * np.trace(solution.covariance[6, WRIST])
+
+
+def test_frame_by_frame_every_frame_has_a_graph_of_its_own(scene):
+    """A number is no identity there: rows of the same number in two frames are not tied by motion."""
+    alone = reconstruct(simulate(scene), scene.rig, replace(PipelineConfig(), temporal=False), frames=range(3))
+    found = solutions(alone, scene)
+    assert sorted(int(each.frames[0]) for each in found) == sorted(alone.frame.tolist())
+    for solution in found:
+        assert len(solution.frames) == 1 and (np.abs(ratios(solution) - 1) < 0.05).mean() > 0.95
+        row = (alone.frame == solution.frames[0]) & (alone.person == solution.person)
+        np.testing.assert_array_equal(solution.joints, alone.joints[row])
+        known = np.isfinite(solution.covariance).all(axis=(2, 3))
+        at = np.array([solution.values.atPoint3(key) for key in solution.keys[known].tolist()])
+        np.testing.assert_array_equal(at, solution.joints[known])
+
+
+def test_what_a_graph_cannot_be_made_of_is_refused(people, scene):
+    with pytest.raises(ValueError, match="reconstruct the recording again"):
+        next(window_solutions(replace(people, observations=None), scene.rig))
+    with pytest.raises(InputError, match="configuration is missing"):
+        next(window_solutions(replace(people, run={}), scene.rig))
 
 
 def test_the_reported_error_lasts_from_frame_to_frame(people, scene):
