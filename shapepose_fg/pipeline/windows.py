@@ -32,7 +32,7 @@ class WindowConfig(Settings):
 
     overlap_s: Annotated[float, Interval(ge=0, le=60)] = 0.4
     """What a window takes of the frames before and after its own, and does not return: smoothing reaches a few
-    frames. Windows of other lengths move joints by under 2 mm in the median (tests/test_windows.py)."""
+    frames. Windows of other lengths move joints by under 2 mm in the median (tests/pipeline/test_windows.py)."""
     again_over_time: RepeatsOrNone = 3
     """How often detections are reassociated around a draft of a window: fewer rounds are faster."""
     again_alone: RepeatsOrNone = 5

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-_FILE = Path(__file__).parents[1] / "scripts" / "soak.py"
+_FILE = Path(__file__).parents[2] / "scripts" / "soak.py"
 _SPEC = importlib.util.spec_from_file_location("soak", _FILE)
 assert _SPEC is not None and _SPEC.loader is not None
 soak = importlib.util.module_from_spec(_SPEC)

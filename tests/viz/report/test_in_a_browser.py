@@ -8,8 +8,8 @@ import pytest
 
 from shapepose_fg.core.drawing import thinned
 from shapepose_fg.viz.report.skins import CELL_M
+from tests.io.export.conftest import BARE, FIRST, FPS, FRAMES
 
-from ..export.conftest import BARE, FIRST, FPS, FRAMES
 from .browser import Browser, chromium
 
 PIXELS = "return document.getElementById('canvas').toDataURL('image/png').split(',')[1]"

@@ -6,10 +6,8 @@ the solver stops when steps are small, so that places differ by far less than th
 Where all is mirrored the learned fitter, which is not quite the same on both sides, may differ by more.
 """
 
-import sys
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,8 +15,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-
-sys.path.append(str(Path(__file__).parent))
 
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.detections import Detections, Recording

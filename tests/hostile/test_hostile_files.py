@@ -17,9 +17,6 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-sys.path.append(str(Path(__file__).parent))
-from readers import READERS, tiny_body
-
 from shapepose_fg.body.fitting.weights import FitterWeights
 from shapepose_fg.body.model.smpl_file import read_smpl_file
 from shapepose_fg.core.errors import InputError
@@ -32,6 +29,7 @@ from shapepose_fg.io.detections import read_detections
 from shapepose_fg.io.timestamps import read_timestamps
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.simulation.scene import ring_of_cameras
+from tests.hostile.readers import READERS, tiny_body
 
 
 def refused(read, *arguments) -> str:
@@ -317,7 +315,7 @@ def test_openpose_with_a_key_twice(tmp_path):
 
 @pytest.mark.parametrize("score", ["0", "1e-200", "9e-7"])
 def test_scores_of_nothing_are_nothing(tmp_path, score):
-    import test_people_formats as people
+    from tests.io import test_people_formats as people
 
     rig = people.two_cameras("left", "right")
     for name in rig.names:

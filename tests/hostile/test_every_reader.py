@@ -3,7 +3,6 @@
 import random
 import re
 import signal
-import sys
 import time
 from pathlib import Path
 
@@ -11,11 +10,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-sys.path.append(str(Path(__file__).parent))
-from mutations import mutated
-from readers import READERS
-
 from shapepose_fg.core.errors import InputError
+from tests.hostile.mutations import mutated
+from tests.hostile.readers import READERS
 
 FOUND = Path(__file__).parent / "data" / "fuzz"
 """What `scripts/fuzz.py` found once: folders called after the reader, with the files as they were."""

@@ -11,7 +11,7 @@ from shapepose_fg.evaluation.speed import STAGES, BackAndForth, peak_mib, rows_m
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.simulation import built_in_scene, simulate
 
-SCRIPT = Path(__file__).parents[1] / "scripts" / "benchmark.py"
+SCRIPT = Path(__file__).parents[2] / "scripts" / "benchmark.py"
 
 
 @pytest.fixture(scope="module")

@@ -3,19 +3,12 @@
 import json
 import pickle
 import shutil
-import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import scipy.sparse
-
-sys.path.append(str(Path(__file__).parent))
-sys.path.append(str(Path(__file__).parent / "io"))
-import test_calibration_formats as rigs
-import test_people_formats as people
-import test_reconstruction as results
 
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS, read_smpl_file
@@ -44,6 +37,9 @@ from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.tracking.edits import Action, Edit
 from shapepose_fg.tracking.listing import list_saved_tracks
 from shapepose_fg.viz.report.writing import report_of
+from tests.core import test_reconstruction as results
+from tests.io import test_calibration_formats as rigs
+from tests.io import test_people_formats as people
 
 Read = Callable[[], object]
 """Reads the files; raises InputError, or returns."""
@@ -235,7 +231,7 @@ def _merged(folder: Path) -> None:
 
 
 def _observations(folder: Path, seed: int) -> Read:
-    import test_observation_table as tables
+    from tests.core import test_observation_table as tables
 
     tables.table().save(folder / "observations.npz")
     _unpack(folder / "observations.npz")

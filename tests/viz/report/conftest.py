@@ -9,8 +9,7 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.simulation import Scene
 from shapepose_fg.viz.report.writing import write_report
-
-from ..export.conftest import result, saved, scene, true_bodies
+from tests.io.export.conftest import result, saved, scene, true_bodies
 
 __all__ = ["result", "saved", "scene", "true_bodies"]
 

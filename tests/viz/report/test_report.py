@@ -18,8 +18,8 @@ from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.viz.report.figures import camera_figures, known_counts
 from shapepose_fg.viz.report.writing import report_of, write_report
+from tests.io.export.conftest import AWAY, FIRST, FPS, FRAMES, GUESSED, LOST
 
-from ..export.conftest import AWAY, FIRST, FPS, FRAMES, GUESSED, LOST
 from .conftest import HOSTILE
 
 

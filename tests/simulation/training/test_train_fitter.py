@@ -19,7 +19,7 @@ from shapepose_fg.body.fitting.weights import FitterWeights
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.core.errors import InputError
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "train_fitter.py"
+SCRIPT = Path(__file__).parents[3] / "scripts" / "train_fitter.py"
 
 
 @pytest.fixture
