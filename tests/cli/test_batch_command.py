@@ -91,6 +91,7 @@ def stopped_behind_a_chunk(archive: Path, folder: Path) -> None:
     assert frames_done(folder) == 12
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="stops processes by POSIX signals")
 def test_an_archive_is_interrupted_goes_on_and_is_what_each_recording_alone_gives(archive, tmp_path, capsys):
     pytest.importorskip("distributed", reason="Dask is an extra")

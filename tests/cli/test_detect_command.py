@@ -154,6 +154,7 @@ def command(*words: object) -> int:
     return int(end.value.code or 0)
 
 
+@pytest.mark.slow
 def test_a_man_is_found_in_real_videos_of_rolled_cameras(shared_data, network, tmp_path, capsys):
     """Pose2Sim's demo as it lies, six frames: the man in each, with his head above his feet."""
     data = shared_data / "pose2sim_single"

@@ -28,6 +28,7 @@ QUICK = {each.name: each for each in experiments(Scale(quick=True)) if each.name
 """Those that need no recording, but two that differ from `time` in what is simulated and in settings only."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", QUICK)
 def test_every_experiment_makes_a_table_of_plain_figures(name, tmp_path):
     experiment = QUICK[name]
@@ -170,6 +171,7 @@ def test_all_switches_together_lead_from_one_to_the_other():
     assert ablation.differing(one, ablation.OURS) == everything[:1]
 
 
+@pytest.mark.slow
 def test_nothing_was_learnt_from_anybody_who_is_held_back(shared_data):
     """By the clips that each sequence says it is made of: 60 and 61 dance, all others are test subjects."""
     for stretch in scenes.held_back_stretches(shared_data / "cmu_mocap" / "cmu_smpl24.npz"):

@@ -30,6 +30,11 @@ CONFIG = PipelineConfig(
 CUTS = (30,)
 
 
+def slow(value: float):
+    """A parameter that `make test` leaves out."""
+    return pytest.param(value, marks=pytest.mark.slow)
+
+
 @pytest.fixture(scope="module", autouse=True)
 def short_warm_up():
     """Chunks of a second deserve less than six to warm up."""
@@ -73,6 +78,7 @@ def test_chunks_change_neither_people_nor_names(whole, in_chunks):
         assert one[name] == pytest.approx(other[in_chunk], abs=2e-3)
 
 
+@pytest.mark.slow
 def test_processes_change_no_byte_of_it(scene, recording, in_chunks):
     found = reconstruct(recording, scene.rig, CONFIG, cuts=CUTS, execution=Execution(chunk_frames=12, workers=2))
     for name in found.ROWS:
@@ -80,6 +86,7 @@ def test_processes_change_no_byte_of_it(scene, recording, in_chunks):
         assert np.array_equal(getattr(found, name), getattr(in_chunks, name), equal_nan=equal_nan), name
 
 
+@pytest.mark.slow
 def test_a_dask_cluster_changes_no_byte_of_it(scene, recording, in_chunks):
     pytest.importorskip("distributed", reason="Dask is an extra")
     execution = Execution(chunk_frames=12, workers=2, cluster="local")
@@ -88,6 +95,7 @@ def test_a_dask_cluster_changes_no_byte_of_it(scene, recording, in_chunks):
         assert np.array_equal(getattr(found, name), getattr(in_chunks, name), equal_nan=name != "person"), name
 
 
+@pytest.mark.slow
 def test_a_run_in_chunks_that_was_stopped_goes_on(scene, recording, in_chunks, tmp_path):
     def stop(done: int, _: int) -> None:
         if done >= 20:
@@ -130,8 +138,8 @@ class NobodyIsThere:
         return np.zeros((0, 25, 3)), np.zeros((0, 25, 1), dtype=np.intp)
 
 
-@pytest.mark.parametrize("fps", [3.0, 25.0, 50.0, 60.0])
-@pytest.mark.parametrize("views", [1, 3, 6])
+@pytest.mark.parametrize("fps", [3.0, slow(25.0), 50.0, slow(60.0)])
+@pytest.mark.parametrize("views", [slow(1), 3, slow(6)])
 @pytest.mark.parametrize("batch", [1, 12])
 def test_every_chunk_gives_its_own_frames_and_whole_windows(fps, views, batch):
     """Times of views are rounded when their mean is taken: 0.4 s or 1 s are a frame more or less then."""

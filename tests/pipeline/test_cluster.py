@@ -47,6 +47,7 @@ def test_results_come_in_order_whoever_does_them():
         assert list(cluster.map(late, [])) == []
 
 
+@pytest.mark.slow
 def test_a_killed_process_costs_only_its_own_work(tmp_path):
     with Cluster(None, 2, str(tmp_path / "killed")) as cluster:
         assert list(cluster.map(once_killed, range(6))) == [0, 10, 20, 30, 40, 50]
@@ -114,6 +115,7 @@ def test_processes_of_this_machine_listen_to_this_machine_and_are_deaf_to_ctrl_c
                 assert process.is_running() and process.status() != "zombie"
 
 
+@pytest.mark.slow
 def test_nobody_answers():
     with (
         pytest.raises(InputError, match=r"tcp://127\.0\.0\.1:9: no Dask scheduler answers"),

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
-from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.contact import feet_of
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
@@ -17,13 +16,11 @@ FEET = feet_of(BODY_25.joints)
 
 
 @pytest.fixture(scope="module")
-def runs():
-    """Four people for a second and a half before four cameras, as by default and without contact and floor."""
-    scene = built_in_scene(frames=45, cameras=4)
-    detections, times = simulate(scene), FrameTimes.from_fps(scene.fps, len(scene))
+def without(dance):
+    """The shared recording without contact and floor."""
     config = PipelineConfig()
-    without = replace(config, motion=replace(config.motion, contact=False, floor=False))
-    return scene, *(reconstruct(detections, scene.rig, each, times=times) for each in (config, without))
+    config = replace(config, motion=replace(config.motion, contact=False, floor=False))
+    return reconstruct(dance.recording, dance.scene.rig, config, times=dance.times)
 
 
 def errors(scene, people):
@@ -37,8 +34,9 @@ def errors(scene, people):
     return np.linalg.norm(speed, axis=-1), velocity, place
 
 
-def test_standing_feet_are_still_and_others_as_before(runs):
-    scene, people, without = runs
+@pytest.mark.slow
+def test_standing_feet_are_still_and_others_as_before(dance, without):
+    scene, people = dance.scene, dance.people
     speed, velocity, place = errors(scene, people)
     before_speed, before, place_before = errors(scene, without)
     standing, moving = speed < 0.02, speed > 0.5
@@ -46,10 +44,11 @@ def test_standing_feet_are_still_and_others_as_before(runs):
     assert velocity[standing].mean() < 0.5 * before[before_speed < 0.02].mean()
     assert velocity[moving].mean() < 1.05 * before[before_speed > 0.5].mean()
     assert place.mean() < place_before.mean()
+    assert without.run["floor"] == {"found": False, "why": "not sought"}
 
 
-def test_covariances_of_feet_hold(runs):
-    scene, people, _ = runs
+def test_covariances_of_feet_hold(dance):
+    scene, people = dance.scene, dance.people
     truth = scene.keypoints[people.frame]
     who = np.linalg.norm(people.joints[:, None] - truth, axis=-1).mean(axis=2).argmin(axis=1)
     apart = (people.joints - truth[np.arange(len(people)), who])[:, FEET]
@@ -58,13 +57,12 @@ def test_covariances_of_feet_hold(runs):
     assert 0.90 < (squared < 7.81).mean() <= 1.0
 
 
-def test_bodies_stay_above_the_floor(runs):
-    _, people, without = runs
+def test_bodies_stay_above_the_floor(dance):
+    people = dance.people
     floor = people.run["floor"]
     assert floor["found"] and floor["share"] > 0.9
     # The scene's floor is at 0; SOLE_M.
     assert abs(floor["height_m"]) < 0.015 and floor["normal"][2] > 0.9999
-    assert without.run["floor"] == {"found": False, "why": "not sought"}
     ok = people.status == "ok"
     model = BodyModel.default()
     columns = (people.betas, people.global_orient, people.body_pose, people.transl)

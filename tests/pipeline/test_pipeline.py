@@ -28,19 +28,19 @@ WRISTS = [BODY_25.index("RWrist"), BODY_25.index("LWrist")]
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
-    """Four people in close motion before six cameras: two thirds of a second."""
-    return built_in_scene(seed=0, frames=16)
+def scene(dance) -> Scene:
+    return dance.scene
 
 
 @pytest.fixture(scope="module")
-def recording(scene) -> Recording:
-    return simulate(scene, seed=0)
+def recording(dance) -> Recording:
+    """The first two thirds of a second."""
+    return Recording(BODY_25, [dance.recording[t] for t in range(16)])
 
 
 @pytest.fixture(scope="module")
-def people(scene, recording) -> Reconstruction:
-    return reconstruct(recording, scene.rig)
+def people(dance) -> Reconstruction:
+    return dance.people
 
 
 ALONE = PipelineConfig(temporal=False)
@@ -56,7 +56,7 @@ def assert_same(one: Reconstruction, other: Reconstruction) -> None:
 
 def test_everybody_is_found_once_and_where_they_are(scene, people):
     found = joint_metrics(people, scene.keypoints)
-    assert found.people_found == found.people_true == 64
+    assert found.people_found == found.people_true == 160
     assert found.people_duplicated == found.people_invented == 0
     assert found.precision >= 0.98 and found.recall >= 0.98 and found.mpjpe_mm <= 30
     assert set(people.status) == {Status.OK}
@@ -74,9 +74,9 @@ def test_the_bodies_are_where_the_joints_are(scene, people):
     assert np.median(distance) < 0.02, "the model error that the fit allows for"
 
 
-def test_the_run_says_how_it_came_about(recording, people):
+def test_the_run_says_how_it_came_about(people):
     run = people.run
-    assert run["frames"] == [0, 16]
+    assert run["frames"] == [0, 40]
     assert run["people"]["found"] == len(people) == run["people"]["status"]["ok"]
     assert run["configuration"]["people"]["gate_m"] == PipelineConfig().people.gate_m
     assert set(run["seconds"]) >= {"triangulate", "propose", "follow", "solve"}
@@ -86,6 +86,7 @@ def test_the_run_says_how_it_came_about(recording, people):
 
 
 def test_without_time_frames_stand_alone_and_batches_do_not_matter(scene, recording):
+    recording = Recording(BODY_25, [recording[t] for t in range(10)])
     whole = reconstruct(recording, scene.rig, ALONE)
     part = reconstruct(recording, scene.rig, ALONE, frames=range(5, 9))
     rows = whole.rows((whole.frame >= 5) & (whole.frame < 9))
@@ -101,6 +102,7 @@ def test_the_same_input_gives_the_same_bytes(scene, recording):
         assert getattr(one, name).tobytes() == getattr(other, name).tobytes(), name
 
 
+@pytest.mark.slow
 def test_workers_change_no_byte(scene, recording):
     """Windows of 8 frames, so that there are several; everything in the result, gates and shapes included."""
     config = PipelineConfig(batch_frames=8)
@@ -237,6 +239,7 @@ def test_settings_reach_their_steps(scene, recording):
         replace(strict, batch_frames=0)
 
 
+@pytest.mark.slow
 def test_shelf_is_as_good_as_promised(shared_data):
     """Over time, all frames; the figures are those that the project promises."""
     shelf = shared_data / "shelf"
@@ -249,12 +252,12 @@ def test_shelf_is_as_good_as_promised(shared_data):
     assert score.pcp_average >= 96.4 and (score.pcp >= 92.5).all()
 
 
-def test_the_observations_are_what_the_joints_were_solved_from(scene, recording, people):
+def test_the_observations_are_what_the_joints_were_solved_from(dance, scene, people):
     """Whoever reads observations.npz finds the detections, and projecting the joints gives the residuals."""
     table = people.observations
     assert table.used.mean() > 0.5
     row, joint, view = np.argwhere(table.used)[1000].tolist()
-    seen = recording[int(people.frame[row])]
+    seen = dance.recording[int(people.frame[row])]
     own = np.flatnonzero(seen.view == view)
     detection = own[table.candidate[row, joint, view]]
     assert seen.joint[detection] == joint

@@ -183,6 +183,7 @@ def test_the_setup_of_a_result(scene, people, tmp_path):
         read_setup(folder, replace(loaded, run={}), PipelineConfig)
 
 
+@pytest.mark.slow
 def test_any_damaged_file_of_a_result_is_one_sentence(scene, people, tmp_path, capsys):
     """Bytes of each file changed at random, then listed and corrected: an answer, or one sentence."""
     rng, first = np.random.default_rng(0), int(people.person[0])

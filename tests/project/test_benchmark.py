@@ -58,6 +58,7 @@ def test_memory_of_rows(recording):
     assert 0 < rows_mib(spent.people) < peak_mib()
 
 
+@pytest.mark.slow
 def test_prints_machine_stages_and_ratios(benchmark, five_frames, monkeypatch, capsys):
     monkeypatch.setattr(
         sys, "argv", ["benchmark.py", "--scene", "--frames", "3", "--rounds", "1", "--lengths", "7"]

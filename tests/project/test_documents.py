@@ -73,6 +73,7 @@ def recording(tmp_path, monkeypatch) -> Scene:
     return scene
 
 
+@pytest.mark.slow
 def test_readme_and_using_in_python(recording, tmp_path):
     names = run(ROOT / "README.md", ROOT / "docs" / "using.md")
     saved = Reconstruction.load(tmp_path / "results")
@@ -95,6 +96,7 @@ def wrists_apart(people: Reconstruction) -> float:
     return float(np.median(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)))
 
 
+@pytest.mark.slow
 def test_readme_in_the_shell(recording, tmp_path, capsys):
     lines = [line.split("  #")[0] for block in blocks(ROOT / "README.md", "bash") for line in block.splitlines()]
     commands = [line for line in lines if line.startswith("shapepose-fg") and "SMPL" not in line]
@@ -108,6 +110,7 @@ def test_readme_in_the_shell(recording, tmp_path, capsys):
     assert kinds == {".npz", ".trc", ".c3d", ".bvh", ".glb", ".csv", ".parquet"}
 
 
+@pytest.mark.slow
 def test_extending(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = run(ROOT / "docs" / "extending.md")

@@ -48,6 +48,7 @@ def test_rounds_are_judged(capsys, memory, frame_s, code, said):
     assert all(each in out for each in said)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="looks at processes as Linux shows them")
 def test_a_short_run(tmp_path, capsys):
     """144 frames of one person. Memory is judged, to 20 % because they are few; what a frame takes is only said:

@@ -81,6 +81,7 @@ def test_each_split_uses_its_own_takes_only(real_mocap: Mocap):
     assert min(frames.values()) > 5000
 
 
+@pytest.mark.slow
 def test_dancers_are_the_pairs_and_nobody_else(real: dict[tuple[str, Split], Sequence]):
     for (name, split), scene in real.items():
         dancing = 2 * SEQUENCES[name].pairs

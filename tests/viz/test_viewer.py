@@ -77,6 +77,7 @@ def test_the_picture_is_written_with_everything(tmp_path: Path, scene: Scene, fo
     assert (hues > 1200).sum() >= 4
 
 
+@pytest.mark.slow
 def test_a_person_without_body_and_an_empty_frame_are_drawn(tmp_path: Path, scene: Scene, found: Reconstruction):
     partial = without_body(found, 3)  # the blue one: the most saturated
     for name, people in (("partial", partial), ("full", found), ("nobody", Reconstruction.empty())):
@@ -90,6 +91,7 @@ def test_a_person_without_body_and_an_empty_frame_are_drawn(tmp_path: Path, scen
     assert 0.5 * inked(full) < inked(partly) < 0.95 * inked(full)
 
 
+@pytest.mark.slow
 def test_two_cameras_are_enough(tmp_path: Path, scene: Scene, found: Reconstruction):
     demo_picture(tmp_path / "two.png", Rig(scene.rig.cameras[:2], up="z"), found, 0)
     assert picture(tmp_path / "two.png").shape[1] == 1800

@@ -44,6 +44,7 @@ def test_other_subjects_are_hashed_eight_to_one_to_one_and_stay_where_they_are()
     assert parts == ["train", "train", "train", "validation", "validation", "test"]
 
 
+@pytest.mark.slow
 def test_parts_are_of_different_people_and_leave_nobody_out(cmu):
     parts = [cmu.of(split) for split in SPLITS]
     assert sum(map(len, parts)) == len(cmu) == 90242

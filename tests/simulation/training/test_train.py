@@ -82,6 +82,7 @@ def weights_of(trainer: Trainer) -> list[np.ndarray]:
     return [weight.detach().numpy() for network in networks for weight in network.state_dict().values()]
 
 
+@pytest.mark.slow
 def test_a_few_iterations_lower_the_error(frame):
     trainer = make_trainer(frame)
     before = error_mm(trainer, trainer.network)
@@ -151,6 +152,7 @@ def test_what_is_prepared_is_in_the_frame_in_which_the_fitter_starts(frame):
     assert np.median(forward) > 0.95
 
 
+@pytest.mark.slow
 def test_calibrated_beliefs_hold_what_they_say_of_hidden_joints(frame):
     trainer = make_trainer(frame)
     list(trainer.run(20))

@@ -54,6 +54,7 @@ def tensors(path: Path) -> dict[str, np.ndarray]:
         return {name: file.get_tensor(name).numpy() for name in file.keys()}  # noqa: SIM118
 
 
+@pytest.mark.slow
 def test_a_run_writes_weights_that_fit_and_the_same_each_time(script, tmp_path):
     motions = write_motions(tmp_path / "motions", ("01", "05", "06", "60"))
     whole, part = tmp_path / "whole.safetensors", tmp_path / "part.safetensors"
