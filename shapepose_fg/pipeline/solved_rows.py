@@ -7,14 +7,12 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.observation_table import Gate, ObservationTable
-from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.estimation.estimator import Estimates
+from shapepose_fg.estimation.window_solution import WindowSolution
 
 
 def result_rows(
-    observations: Observations,
-    estimates: Estimates,
+    solution: WindowSolution,
     place: NDArray[np.integer],
     rig: Rig,
     joint_names: Sequence[str],
@@ -24,16 +22,16 @@ def result_rows(
 
     `place` (N, J, V) is each detection's place among those of its view (`place_in_view`), `person` (N,) who it is.
     """
-    fit = estimates.fit
+    fit, observations = solution.fit, solution.observations
     body = {name: getattr(fit, name).copy() for name in ("betas", "global_orient", "body_pose", "transl")}
     for values in body.values():
         values[~fit.ok] = np.nan
-    dropped = np.where(estimates.contradicts[..., None], Gate.CONTRADICTS_BODY, Gate.TOO_FAR)
+    dropped = np.where(solution.contradicts[..., None], Gate.CONTRADICTS_BODY, Gate.TOO_FAR)
     table = ObservationTable.of(
         observations,
         place,
-        estimates.joints,
-        np.where(estimates.inlier, Gate.USED, dropped),
+        solution.joints,
+        np.where(solution.inlier, Gate.USED, dropped),
         rig,
         frame=observations.frame,
         person=person,
@@ -44,13 +42,13 @@ def result_rows(
         person=person,
         time_s=observations.time_s.mean(axis=1),
         joint_names=np.array(joint_names),
-        joints=estimates.joints,
-        covariance=estimates.covariance,
-        velocity=estimates.velocity,
-        velocity_covariance=estimates.velocity_covariance,
-        known=estimates.known,
-        confidence=estimates.confidence,
-        status=estimates.status,
+        joints=solution.joints,
+        covariance=solution.covariance,
+        velocity=solution.velocity,
+        velocity_covariance=solution.velocity_covariance,
+        known=solution.known,
+        confidence=solution.confidence,
+        status=solution.status,
         observations=table,
         **body,
     )

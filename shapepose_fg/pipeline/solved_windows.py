@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from shapepose_fg.core.frame_times import FrameTimes, stretches
 from shapepose_fg.core.observation_table import place_in_view
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.pipeline.engine import Setup
+from shapepose_fg.pipeline.engine import Setup, Solved
 from shapepose_fg.pipeline.runs.borders import Border
 from shapepose_fg.pipeline.runs.checkpoint import Checkpoint
 from shapepose_fg.pipeline.runs.chunks import Chunk, Identities, cut_in_chunks, windows_of
 from shapepose_fg.pipeline.runs.notes import Notebook, Notes
 from shapepose_fg.pipeline.runs.parts import Part
 from shapepose_fg.pipeline.solved_rows import result_rows
-from shapepose_fg.pipeline.windows import Solved, Span
+from shapepose_fg.pipeline.windows import Span
 from shapepose_fg.pipeline.workers import Pool
 from shapepose_fg.proposal.thinning import ThinnedFrames
 from shapepose_fg.tracking.hypotheses import Input
@@ -70,7 +70,7 @@ class SolvedWindows:
                 waiting.append((self.book.torn_off(), behind))
                 yield span
 
-        for solved in pool.map(_solve, spans()):
+        for solved in pool.map(Setup.solve, spans()):
             followed, behind = waiting.popleft()
             notes = self._notes(solved)
             notes.add(followed)
@@ -120,23 +120,25 @@ class SolvedWindows:
                     replace(each, track=identities.name(each.track, names)) for each in notes.problems
                 ]
                 notes.evidence = {identities.name(of, names): each for of, each in notes.evidence.items()}
-                track = [identities.name(each, names) for each in solved.observations.track.tolist()]
+                track = [identities.name(each, names) for each in solved.solution.observations.track.tolist()]
                 if last:
                     notes.add(read)
                     notes.add(found.notes)
-                rows = replace(solved.observations, track=np.array(track, dtype=np.intp))
+                rows = replace(solved.solution.observations, track=np.array(track, dtype=np.intp))
                 behind = Checkpoint(chunk.own.stop, identities.next_id, border=identities.border)
-                yield Part(self._rows(replace(solved, observations=rows)), notes, behind if last else None)
+                named = replace(solved, solution=replace(solved.solution, observations=rows))
+                yield Part(self._rows(named), notes, behind if last else None)
 
     def _notes(self, solved: Solved) -> Notes:
         """What is to be said about a window; people are tracks, or frame by frame numbers within the frame."""
-        temporal, rows, problems = self.setup.config.temporal, solved.observations, list(solved.estimates.problems)
+        temporal, solution = self.setup.config.temporal, solved.solution
+        rows, problems = solution.observations, list(solution.problems)
         if not temporal:
             problems = [
                 replace(each, track=int(((rows.frame == each.frame) & (rows.track < each.track)).sum()))
                 for each in problems
             ]
-        notes = Notes(solved.frames, dict(solved.seconds), problems=problems)
+        notes = Notes(solved.frames, dict(solution.seconds), problems=problems)
         if len(solved.false_positives) > 0:
             notes.dropped[_FALSE_POSITIVE] = list(solved.false_positives)
         said = np.isfinite(rows.evidence)
@@ -150,8 +152,9 @@ class SolvedWindows:
 
     def _rows(self, solved: Solved) -> Reconstruction:
         """Solved rows as rows of the result, by frame and person; bodies that were not fitted are NaN there."""
-        order = np.lexsort((solved.observations.track, solved.observations.frame))
-        rows, estimates = solved.observations.rows(order), solved.estimates.rows(order)
+        rows = solved.solution.observations
+        solution = solved.solution.rows(np.lexsort((rows.track, rows.frame)))
+        rows = solution.observations
         number_in_frame = np.arange(len(rows)) - np.searchsorted(rows.frame, rows.frame)
         person = rows.track if self.setup.config.temporal else number_in_frame
         place = np.full(rows.candidate.shape, -1, dtype=np.int32)
@@ -159,12 +162,7 @@ class SolvedWindows:
             of_frame = rows.frame == frame
             own = self.detections.in_recording(frame, rows.candidate[of_frame])
             place[of_frame] = place_in_view(own, self.detections.frames[frame].view)
-        return result_rows(rows, estimates, place, self.setup.rig, self.setup.skeleton.joints, person)
-
-
-def _solve(setup: Setup, span: Span) -> Solved:
-    """One window, in whatever process."""
-    return setup.solver.solve(span)
+        return result_rows(solution, place, self.setup.rig, self.setup.skeleton.joints, person)
 
 
 @dataclass(frozen=True)
@@ -203,7 +201,7 @@ def solve_chunk(setup: Setup, job: ChunkJob) -> SolvedChunk:
     frames = [given.frame for span in spans for given, _ in span.decided[span.start : span.stop]]
     if frames != list(job.chunk.own):
         raise RuntimeError(f"windows of {len(frames)} frames were found for a chunk of {job.chunk.own}")
-    solved = tuple(setup.solver.solve(span) for span in spans)
+    solved = tuple(setup.solve(span) for span in spans)
     notes = book.torn_off()
     notes.dropped = {why: [each for each in of if each in job.chunk.own] for why, of in notes.dropped.items()}
     return SolvedChunk(solved, notes, Border.of(spans[0]), Border.of(spans[-1]))

@@ -1,14 +1,12 @@
 """Frames in, solved rows out: people are followed, and solved in windows of frames that overlap.
 
 `Engine.follow` goes from (frames, state) to (windows, state): it is quick, and memory does not grow with the
-recording. `WindowSolver.solve` goes from a window to rows: windows know nothing of each other, and are solved here
-or in other processes.
+recording. `Setup.solve` (`pipeline/engine.py`) goes from a window to rows: windows know nothing of each other, and
+are solved here or in other processes.
 """
 
-import time
-from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -16,14 +14,9 @@ from annotated_types import Interval
 from numpy.typing import NDArray
 
 from shapepose_fg.core.bounds import RepeatsOrNone, Settings
-from shapepose_fg.core.observations import Observations
-from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.estimation.estimator import Estimates, Estimator, ExtraFactors
 from shapepose_fg.tracking.following import Decided, FollowingConfig, FollowState, alone, finish, follow
 from shapepose_fg.tracking.hypotheses import Input
-from shapepose_fg.tracking.reassociation import Survival, reassociate
 from shapepose_fg.tracking.tracker import Tracker, Tracks
-from shapepose_fg.tracking.view_assignment import AssignmentConfig
 
 
 @dataclass(frozen=True)
@@ -69,63 +62,6 @@ class Span:
 
 
 @dataclass(frozen=True)
-class Solved:
-    """Rows that are done."""
-
-    observations: Observations
-    """Who, when, and from what."""
-    estimates: Estimates
-    """Joints and bodies."""
-    frames: int
-    """How many frames they are of."""
-    seconds: dict[str, float]
-    """What it took, by stage."""
-    false_positives: tuple[int, ...] = ()
-    """The frame of each row that was left with no detections of its own when they were reassociated."""
-
-
-@dataclass(frozen=True)
-class WindowSolver:
-    """From frames whose people are known to solved rows: plain data, which can be sent to another process."""
-
-    estimator: Estimator
-    """Stage II."""
-    skeleton: Skeleton
-    """The detector's joints."""
-    assignment: AssignmentConfig
-    """How detections are associated."""
-    windows: WindowConfig
-    """How often they are."""
-    extra_factors: ExtraFactors | None = None
-    """The user's own factors."""
-
-    def solve(self, span: Span) -> Solved:
-        """One window."""
-        given = [frame for frame, _ in span.decided]
-        rows = Observations.concatenate([part for _, part in span.decided])
-        before = rows.frame
-        again = self.windows.again_alone if span.alone else self.windows.again_over_time
-        began = time.perf_counter()
-        for n in range(again if len(rows) > 0 else 0):
-            joints, covariance = self.estimator.draft(rows, over_time=not span.alone)
-            survival = Survival().at(n / max(again - 1, 1)) if span.alone else None
-            rows = reassociate(given, rows, joints, covariance, self.skeleton, self.assignment, survival)
-        associated = time.perf_counter()
-        estimates = self.estimator.estimate(rows, self.extra_factors)
-        own = {frame.frame for frame in given[span.start : span.stop]}
-        left = Counter(before.tolist()) - Counter(rows.frame.tolist())
-        index = np.flatnonzero(np.isin(rows.frame, list(own)))
-        problems = tuple(problem for problem in estimates.problems if problem.frame in own)
-        return Solved(
-            rows.rows(index),
-            replace(estimates.rows(index), problems=problems),
-            frames=span.stop - span.start,
-            seconds={"associate again": associated - began, "solve": time.perf_counter() - associated},
-            false_positives=tuple(sorted(frame for frame in left.elements() if frame in own)),
-        )
-
-
-@dataclass(frozen=True)
 class StreamState:
     """What is carried from call to call."""
 
@@ -145,10 +81,10 @@ class Engine:
     """Follows people; finds new ones."""
     following: FollowingConfig
     """What becomes of tracks."""
-    solver: WindowSolver
-    """Solves windows."""
     frames: int
     """Frames that a window returns."""
+    overlap_s: float
+    """`WindowConfig.overlap_s`."""
 
     def start(self, next_id: int = 0) -> StreamState:
         """Before the first frame, or after a cut; identities count from `next_id`."""
@@ -197,5 +133,5 @@ class Engine:
         """The frame `overlap_s` before or after the border at `at`."""
         times = np.array([frame.time_s.mean() for frame, _ in decided])
         border = times[min(at, len(times) - 1)]
-        near = near_border(times, border, self.solver.windows.overlap_s)
+        near = near_border(times, border, self.overlap_s)
         return int(np.flatnonzero(near)[0]) if direction < 0 else int(np.flatnonzero(near)[-1]) + 1

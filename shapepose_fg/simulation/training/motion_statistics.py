@@ -18,8 +18,13 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.body_step import joint_targets
 from shapepose_fg.estimation.in_time import speeds
-from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas, triangulate
-from shapepose_fg.estimation.message import symmetric_roots
+from shapepose_fg.estimation.linearisation import (
+    ObservationConfig,
+    linearise,
+    observation_sigmas,
+    symmetric_roots,
+    triangulate,
+)
 from shapepose_fg.simulation import Scene, simulate
 from shapepose_fg.simulation.mocap import Clip, Mocap
 from shapepose_fg.simulation.shoulder import shoulder_rhythm
