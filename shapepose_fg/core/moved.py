@@ -12,7 +12,7 @@ _ROOMS = {
     "core": "errors camera skeleton detections observations observation_table frame_times bounds"
     " reconstruction provenance run_summary result_files",
     "core.storage": "files kept_arrays output_folder",
-    "pipeline": "engine windows workers cluster solving bodies_over_time solved_rows runs",
+    "pipeline": "engine windows workers cluster solving bodies_over_time runs",
     "cli": "options terminal stopping demo batch",
     "viz": "rendering overlay report viewer",
     "io": "export",
@@ -23,9 +23,12 @@ _MERGED = {
     "core.storage.npz": "npz_reader npz_writer core.storage.npz_reader core.storage.npz_writer",
     "core.storage.schema": "columns core.columns",
     "core.result_files": "result_options core.result_options saved_table core.storage.saved_table",
-    "pipeline.runs.manifest": "pipeline.runs.room",
+    "pipeline.runs.manifest": "pipeline.runs.room pipeline.runs.known_people",
+    "pipeline.runs.assembly": "pipeline.runs.rows_of_people pipeline.runs.standing",
+    "pipeline.runs.chunks": "pipeline.runs.borders",
+    "pipeline.solved_windows": "chunk_work solved_rows pipeline.solved_rows",
+    "cli.reconstruct.request": "reconstruct_inputs reconstruct_outcome",
     "core.drawing": "viz.viewer.palette io.export.bones io.export.light_mesh",
-    "pipeline.runs.parts": "pipeline.runs.rows_of_people",
     "io.export.take": "io.export.axes",
     "io.detections.association_text": "io.detections.association_skeletons",
     "io.export.skinned": "io.export.stretches",
@@ -38,12 +41,10 @@ _MERGED = {
 """Modules that are others now, under whichever name."""
 _RENAMED = {
     "pipeline_config": "pipeline.config",
-    "chunk_work": "pipeline.solved_windows",
     "person_bodies": "pipeline.bodies_over_time",
     "batch_command": "cli.batch.command",
     **{f"{name}_command": f"cli.{name}" for name in "tracks detect overlay export report view setup".split()},
     **{f"reconstruct_{name}": f"cli.reconstruct.{name}" for name in "command ending request run".split()},
-    **{f"reconstruct_{name}": "cli.reconstruct.request" for name in ("inputs", "outcome")},
     "reconstruct_summary": "cli.reconstruct.ending",
     **{old: new for new, names in _MERGED.items() for old in names.split()},
 }

@@ -1,5 +1,7 @@
 """All steps from frames to rows, made of the settings: what every process that takes part needs."""
 
+import time
+from collections import Counter
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -15,7 +17,7 @@ from shapepose_fg.estimation.estimator import Estimator, ExtraFactors
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.runs.notes import Notebook
-from shapepose_fg.pipeline.windows import Engine, WindowSolver
+from shapepose_fg.pipeline.windows import Engine, Solved, Span
 from shapepose_fg.proposal.association import AssociationConfig, associate
 from shapepose_fg.proposal.candidates import CandidateConfig, PairPoints, triangulate_pairs, vote
 from shapepose_fg.proposal.hypotheses import Frame
@@ -23,6 +25,7 @@ from shapepose_fg.proposal.people_2d import without_repeats
 from shapepose_fg.proposal.proposals import ProposalConfig, propose
 from shapepose_fg.proposal.selection import choose
 from shapepose_fg.proposal.thinning import thinned_candidates, thinned_points
+from shapepose_fg.tracking.reassociation import Survival, reassociate
 from shapepose_fg.tracking.tracker import BodyScale, Tracker
 
 FAST_M_S = 3.0
@@ -47,15 +50,38 @@ class Setup:
     """The user's own factors."""
 
     @cached_property
-    def solver(self) -> WindowSolver:
-        """Solves windows."""
-        config = self.config
-        estimator = Estimator(self.rig, self.fitter, self.skeleton.joints, config.estimator)
-        assignment = config.tracking.assignment
-        return WindowSolver(estimator, self.skeleton, assignment, config.windows, self.extra_factors)
+    def estimator(self) -> Estimator:
+        """Stage II."""
+        return Estimator(self.rig, self.fitter, self.skeleton.joints, self.config.estimator)
+
+    def solve(self, span: Span) -> Solved:
+        """One window: detections are reassociated around drafts, then joints and bodies are solved."""
+        windows, assignment = self.config.windows, self.config.tracking.assignment
+        given = [frame for frame, _ in span.decided]
+        rows = Observations.concatenate([part for _, part in span.decided])
+        before = rows.frame
+        again = windows.again_alone if span.alone else windows.again_over_time
+        began = time.perf_counter()
+        for n in range(again if len(rows) > 0 else 0):
+            joints, covariance = self.estimator.draft(rows, over_time=not span.alone)
+            survival = Survival().at(n / max(again - 1, 1)) if span.alone else None
+            rows = reassociate(given, rows, joints, covariance, self.skeleton, assignment, survival)
+        associated = time.perf_counter()
+        estimates = self.estimator.estimate(rows, self.extra_factors)
+        own = {frame.frame for frame in given[span.start : span.stop]}
+        left = Counter(before.tolist()) - Counter(rows.frame.tolist())
+        index = np.flatnonzero(np.isin(rows.frame, list(own)))
+        problems = tuple(problem for problem in estimates.problems if problem.frame in own)
+        return Solved(
+            rows.rows(index),
+            replace(estimates.rows(index), problems=problems),
+            frames=span.stop - span.start,
+            seconds={"associate again": associated - began, "solve": time.perf_counter() - associated},
+            false_positives=tuple(sorted(frame for frame in left.elements() if frame in own)),
+        )
 
     def engine(self, book: Notebook) -> Engine:
-        """Follows people and solves windows; what it has to say goes into `book`."""
+        """Follows people; what it has to say goes into `book`."""
         config, skeleton, sure = self.config, self.skeleton, StageOne.of(self.config)
         # What evidence leaves over may be people whose hips two views saw: whether they are, time tells.
         hips = replace(sure.by_hips(), candidates=replace(sure.candidates, min_votes=1))
@@ -73,7 +99,7 @@ class Setup:
         tracker = Tracker(
             skeleton, scale, find, tracking, config.observations, weak_births=config.temporal, drop=book.drop_in
         )
-        return Engine(tracker, config.following, self.solver, frames=config.batch_frames)
+        return Engine(tracker, config)
 
 
 def find_people(
