@@ -101,7 +101,7 @@ class Setup:
         tracker = Tracker(
             skeleton, scale, find, tracking, config.observations, weak_births=config.temporal, drop=book.drop_in
         )
-        return Engine(tracker, config.following, config.batch_frames, config.windows.overlap_s)
+        return Engine(tracker, config)
 
 
 def find_people(

@@ -1,7 +1,6 @@
 """Chunks of a recording, reconstructed side by side: the same people, the same joints, the same names."""
 
 from dataclasses import dataclass, replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,8 +15,7 @@ from shapepose_fg.pipeline.engine import Setup
 from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.pipeline import PipelineConfig, Task, reconstruct, reconstruct_parts
 from shapepose_fg.pipeline.runs import chunks
-from shapepose_fg.pipeline.runs.borders import Border, same_people
-from shapepose_fg.pipeline.runs.chunks import Chunk, cut_in_chunks, windows_of
+from shapepose_fg.pipeline.runs.chunks import Border, Chunk, cut_in_chunks, same_people, windows_of
 from shapepose_fg.pipeline.solved_windows import ChunkJob, solve_chunk
 from shapepose_fg.pipeline.windows import Engine, WindowConfig
 from shapepose_fg.simulation import built_in_scene, simulate
@@ -151,8 +149,7 @@ def test_every_chunk_gives_its_own_frames_and_whole_windows(fps, views, batch):
         return Input(frame, of_views[frame], Detections.empty(), range(views))  # type: ignore[arg-type]
 
     def spans(chunk: Chunk) -> list[tuple[list[int], int, int]]:
-        solver = SimpleNamespace(windows=config.windows)
-        engine = Engine(NobodyIsThere(), config.following, solver, frames=batch)  # type: ignore[arg-type]
+        engine = Engine(NobodyIsThere(), config)  # type: ignore[arg-type]
         found = windows_of(engine, chunk, read)
         return [([given.frame for given, _ in span.decided], span.start, span.stop) for span in found]
 

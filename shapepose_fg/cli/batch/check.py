@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rich.filesize import decimal
 
-from shapepose_fg.cli.batch.table import Entry
+from shapepose_fg.cli.batch.table import LOG, Entry
 from shapepose_fg.cli.reconstruct.request import OUTPUTS, prepare
 from shapepose_fg.cli.terminal import note
 from shapepose_fg.core.errors import InputError
@@ -17,8 +17,6 @@ from shapepose_fg.io.detections.places import find_places
 from shapepose_fg.io.skeleton_file import find_skeleton
 from shapepose_fg.pipeline.runs.manifest import PARTS
 
-LOG = "log.txt"
-"""What was said about a recording, in its folder."""
 _LEAST, _USUAL = 0.1, 2.0
 """Bytes of results for each byte of detections: many cameras whose files hold hands and faces, and others."""
 

@@ -49,14 +49,14 @@ def summary_table(result: Assembly, people: Reconstruction, span: range, cameras
 
     `people` are rows of the `result` that say how sure the joints are.
     """
-    frame, run, counts = result.columns()["frame"].array(), result.run, result.counts()
-    per_frame = np.bincount(frame - span.start, minlength=len(span))
+    run, counts = result.run, result.counts()
+    per_frame = np.bincount(result.columns()["frame"].array() - span.start, minlength=len(span))
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     table.add_column(style="bold")
     table.add_column(overflow="fold")
     table.add_row("frames", f"{len(span)} ({span.start}:{span.stop}) of {cameras} cameras{rate_words(run)}")
     over_time = run.get("configuration", {}).get("temporal", False)
-    count = f"{len(result.people.counts)} people over time" if over_time else "no identities"
+    count = f"{len(result.rows_of)} people over time" if over_time else "no identities"
     table.add_row("people", f"{count}, {per_frame.mean():.1f} a frame ({per_frame.min()} to {per_frame.max()})")
     table.add_row("rows", f"{len(result)} in all")
     for status, count in sorted(counts["status"].items()):
@@ -72,9 +72,9 @@ def summary_table(result: Assembly, people: Reconstruction, span: range, cameras
         table.add_row("joints", _joints(counts["joints"], people))
     # Loading torch and the body takes a second or two, once; it says nothing about the time of a frame.
     stages = {name: spent for name, spent in run.get("seconds", {}).items() if name != "load"}
-    per_stage = "  ".join(f"{name} {1e3 * spent / len(span):.1f}" for name, spent in stages.items())
     table.add_row("time", f"{1e3 * sum(stages.values()) / len(span):.1f} ms a frame, {seconds:.1f} s in all")
-    table.add_row("", per_stage, style="dim")
+    words = (f"{name} {1e3 * spent / len(span):.1f}" for name, spent in stages.items())
+    table.add_row("", "  ".join(words), style="dim")
     return table
 
 
@@ -91,8 +91,7 @@ def _doubtful(run: dict[str, Any]) -> str:
 def _frames_words(spans: list[list[int]]) -> str:
     """In which frames, as far as there is room: run.json has all."""
     told = [f"{start}" if stop == start + 1 else f"{start}-{stop - 1}" for start, stop in spans[:4]]
-    more = " ..." if len(spans) > len(told) else ""
-    return f" (frames {' '.join(told)}{more})" if told else ""
+    return f" (frames {' '.join(told)}{' ...' * (len(spans) > 4)})" if told else ""
 
 
 def _joints(count: dict[str, int], people: Reconstruction) -> str:
