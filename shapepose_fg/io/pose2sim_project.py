@@ -9,7 +9,7 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import read_toml
 from shapepose_fg.io.calibration.content import load
 from shapepose_fg.io.calibration.reading import FORMATS
-from shapepose_fg.io.detections.frame_files import frame_files, frame_number
+from shapepose_fg.io.detections.json_people import frame_files, frame_number
 from shapepose_fg.io.footage.footage import glance
 from shapepose_fg.io.footage.places import VIDEOS
 

@@ -11,6 +11,7 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.storage.files import read_text
+from shapepose_fg.io.validation import is_number
 
 _FRAME, _TIME = "frame", "time_s"
 """Columns with a meaning of their own; every other column is a camera's."""
@@ -69,14 +70,14 @@ def _table(path: Path, rig: Rig) -> tuple[list[str], NDArray[np.float64], NDArra
             continue
         if len(names) == 0:
             # Cameras may be called by numbers; without a header there is one column.
-            header = not _is_number(words[0]) or (len(words) > 1 and set(rig.names) <= set(words))
+            header = not is_number(words[0]) or (len(words) > 1 and set(rig.names) <= set(words))
             names = words if header else [_TIME]
             if header:
                 continue
         if len(words) != len(names):
             cure = "name the columns in a first line" if names == [_TIME] else "correct the line"
             raise InputError(f"{path}: line {line} must hold {len(names)} numbers, got {len(words)}; {cure}")
-        wrong = next((word for word in words if not _is_number(word)), None)
+        wrong = next((word for word in words if not is_number(word)), None)
         if wrong is not None:
             raise InputError(
                 f"{path}: line {line} must hold numbers, got {wrong[:20]!r}; write seconds like 0.033"
@@ -84,14 +85,6 @@ def _table(path: Path, rig: Rig) -> tuple[list[str], NDArray[np.float64], NDArra
         rows.append([float(word) for word in words])
         lines.append(line)
     return names, np.array(rows).reshape(len(rows), -1 if rows else len(names)), np.array(lines, dtype=np.intp)
-
-
-def _is_number(word: str) -> bool:
-    """Whether `word` is a finite number."""
-    try:
-        return bool(np.isfinite(float(word)))
-    except ValueError:
-        return False
 
 
 def _columns(path: Path, names: list[str], rig: Rig) -> list[int]:

@@ -11,6 +11,7 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import LARGE, read_text
 from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.calibration.written import Format, WrittenCamera, WrittenRig, intrinsics, pose, rotation_of
+from shapepose_fg.io.validation import is_number
 
 _FILES = ("cameras.txt", "images.txt")
 _BINARY = ("cameras.bin", "images.bin")
@@ -86,7 +87,7 @@ def _images(path: Path, lenses: dict[str, WrittenCamera]) -> list[WrittenCamera]
         if line.strip():
             rows.append((number, line.split(maxsplit=9)))
             points, text = next(lines, (0, ""))
-            if len(text.split()) % 3 != 0 or not all(_is_number(word) for word in text.split()):
+            if len(text.split()) % 3 != 0 or not all(is_number(word) for word in text.split()):
                 raise InputError(
                     f"{path}: line {points}: must hold the points of the image before it, three numbers each;"
                     " leave an empty line there where it has none"
@@ -113,15 +114,8 @@ def _names(files: Sequence[str]) -> list[str]:
     return [str(PurePosixPath(file).with_suffix("")) if file else "" for file in files]
 
 
-def _is_number(word: str) -> bool:
-    try:
-        return bool(np.isfinite(float(word)))
-    except ValueError:
-        return False
-
-
 def _numbers(words: Sequence[str], count: int, place: str) -> list[float]:
-    if len(words) != count or not all(map(_is_number, words)):
+    if len(words) != count or not all(map(is_number, words)):
         raise InputError(
             f"{place}: must hold {count} finite numbers here, got {len(words)} words; export it again"
         )
