@@ -10,7 +10,7 @@ from shapepose_fg.core.errors import InputError
 if TYPE_CHECKING:
     from shapepose_fg.io.export.take import Take
     from shapepose_fg.io.footage.footage import Footage
-    from shapepose_fg.io.footage.used import CameraFootage
+    from shapepose_fg.io.footage.placement import CameraFootage
 
 
 @grouped

@@ -18,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter
 
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import MIDDLE, read_json, read_text
+from shapepose_fg.io.camera_names import MOST_FRAME, in_order
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock
 from shapepose_fg.io.json_items import JsonItems
@@ -33,8 +34,6 @@ _RERUN = {
     _ALPHAPOSE: "run AlphaPose again with --format coco",
     _VIDEO: "run MMPose again with --save-predictions or --pred-out-dir",
 }
-_MOST = 10**12
-"""No frame has a higher number."""
 _LONGEST_GAP = 1000
 """Frames that may be missing, and as many as there are: more are numbers of something else."""
 _LONGEST_NAME = 4096
@@ -83,7 +82,7 @@ class _VideoFrame(BaseModel):
     """A frame of MMPose."""
 
     model_config = ConfigDict(strict=True)
-    frame_id: Annotated[int, Field(ge=0, lt=_MOST)]
+    frame_id: Annotated[int, Field(ge=0, lt=MOST_FRAME)]
     instances: list[_Instance]
 
 
@@ -152,15 +151,8 @@ def read_frame_files(folder: Path) -> CameraPeople:
     program = _OPENPOSE
     if not files[0].name.endswith("_keypoints.json"):
         program = _PICTURES if read_text(files[0], most=MIDDLE).lstrip()[:1] == "[" else _POSE2SIM
-    numbered = sorted((frame_number(file), file) for file in files)
+    numbered = in_order([(frame_number(file), file) for file in files])
     first, last = numbered[0][0], numbered[-1][0]
-    if last >= _MOST:
-        raise InputError(
-            f"{numbered[-1][1]}: no frame has so high a number; number them by the recording's frames"
-        )
-    for (number, file), (following, other) in pairwise(numbered):
-        if following == number:
-            raise InputError(f"{other}: frame {number} is also in {file.name}; keep one recording in a folder")
     if last - first + 1 > 2 * len(numbered) + _LONGEST_GAP:
         raise InputError(
             f"{folder}: {len(numbered)} files are numbered from {first} to {last}; number them"
@@ -325,19 +317,19 @@ def _names(others: Mapping[str, Any], path: Path, program: str) -> dict[int | st
 def _number(image: int | str, name: str | None, place: str, program: str) -> int:
     """The frame of a picture: the last number in its name, or its id where that is a number and it has no name."""
     if name is None and isinstance(image, int):
-        if 0 <= image < _MOST:
+        if 0 <= image < MOST_FRAME:
             return image
         raise InputError(f"{place} '{image}' is no frame's number; {_RERUN[program]}, of numbered pictures")
     name = str(image) if name is None else name
     match = _FRAME_NUMBER.search(Path(name).stem) if len(name) <= _LONGEST_NAME else None
-    if match is None or len(match[1]) > len(str(_MOST)):
+    if match is None or len(match[1]) > len(str(MOST_FRAME)):
         raise InputError(f"{place} {name[:40]!r} has no frame number; {_RERUN[program]}, of numbered pictures")
     return int(match[1])
 
 
 def _video(people: _Collected, items: Iterable[Any]) -> CameraPeople:
     """A list of frames, each with its people."""
-    frames, first, last = list[int](), _MOST, -1
+    frames, first, last = list[int](), MOST_FRAME, -1
     for start, found in people.valid(_FRAMES, items):
         rows = list[list[float]]()
         for index, frame in enumerate(found, start):

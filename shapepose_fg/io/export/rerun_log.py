@@ -22,8 +22,7 @@ from shapepose_fg.io.export.markers import sigma_m
 from shapepose_fg.io.export.skinned import rest_joints, skin
 from shapepose_fg.io.export.take import Take
 from shapepose_fg.io.footage.footage import Footage
-from shapepose_fg.io.footage.placement import Placement
-from shapepose_fg.io.footage.used import CameraFootage
+from shapepose_fg.io.footage.placement import CameraFootage, Placement
 
 PEOPLE, CAMERAS = "world/people", "world/cameras"
 """Where people and cameras are in the recording."""
