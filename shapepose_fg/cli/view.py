@@ -29,7 +29,7 @@ def view(
 ) -> None:
     """Show a result in the rerun viewer: people, cameras, and what was used of what they saw, on a timeline."""
     from shapepose_fg.io.export.job import Job
-    from shapepose_fg.io.export.reading import body_file, read_take
+    from shapepose_fg.io.export.registry import read_take
     from shapepose_fg.io.export.rerun_app import (
         body_if_there,
         log_take,
@@ -49,7 +49,7 @@ def view(
             "rerun's statistics of use were on and are switched off now; `rerun analytics enable` switches them on"
         )
     open_viewer(stream, take, connect)
-    arrays, missing = body_if_there(Job(take, part.results, body_file(take, part.body)))
+    arrays, missing = body_if_there(Job(take, part.results, part.body))
     if missing is not None:
         note(missing)
     log_take(stream, take, arrays)

@@ -31,7 +31,7 @@ _MERGED = {
     "io.export.skinned": "io.export.stretches",
     "io.export.registry": "io.export.exporting",
     "io.export.tables": "io.export.table io.export.parquet",
-    "io.export.marker_files": "io.export.trc io.export.c3d io.export.pose2sim_files",
+    "io.export.markers": "io.export.marker_files io.export.trc io.export.c3d io.export.pose2sim_files",
     "io.export.rerun_app": "io.export.rerun_scene io.export.rerun_statistics io.export.rrd",
     "io.export.rerun_log": "io.export.rerun_people io.export.rerun_views io.export.rerun_pictures",
 }

@@ -25,7 +25,7 @@ from shapepose_fg.core.storage.kept_arrays import KeptArrays
 from shapepose_fg.core.storage.output_folder import prepare_output
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.detection_table import DetectionTable
-from shapepose_fg.io.export.marker_files import write_pose2sim_files
+from shapepose_fg.io.export.markers import write_pose2sim_files
 from shapepose_fg.io.solved_setup import CAMERAS
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.execution import Execution
