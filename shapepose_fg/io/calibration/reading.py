@@ -70,6 +70,15 @@ def read_rig(
         raise InputError(f"{path}: {error}") from None
 
 
+def is_calibration(path: Path) -> bool:
+    """Whether a file or folder is of one of the formats."""
+    try:
+        content = load(path)
+    except InputError:
+        return False
+    return content.syntax != "pickle" and any(each.recognise(content) for each in FORMATS)
+
+
 def _unknown(content: Content) -> str:
     """What was found instead of a calibration, and what is known."""
     value = content.value
