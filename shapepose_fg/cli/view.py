@@ -32,13 +32,12 @@ def view(
     from shapepose_fg.io.export.registry import read_take
     from shapepose_fg.io.export.rerun_app import (
         body_if_there,
-        log_take,
         new_stream,
         open_viewer,
         switch_off,
         viewer_file,
     )
-    from shapepose_fg.io.export.rerun_log import log_pictures
+    from shapepose_fg.io.export.rerun_log import log_pictures, log_take
 
     take = read_take(part.results, identities=False, **part.how())
     shown = _pictures(take, pictures) if pictures.videos else []
@@ -50,8 +49,8 @@ def view(
         )
     open_viewer(stream, take, connect)
     arrays, missing = body_if_there(Job(take, part.results, part.body))
-    if missing is not None:
-        note(missing)
+    for each in missing:
+        note(each)
     log_take(stream, take, arrays)
     if len(shown) > 0:
         with progress("showing pictures", "pictures") as done:
