@@ -114,8 +114,8 @@ def detect(
         raise InputError("--videos: missing; give the cameras' videos or pictures")
     from shapepose_fg.detection2d.detector import CameraDetector, DetectionConfig
     from shapepose_fg.detection2d.recording import DetectionRun, run_detection
-    from shapepose_fg.io.footage.given import clocks_of, per_camera, placements_of
-    from shapepose_fg.io.footage.lockstep import align
+    from shapepose_fg.io.footage.lockstep import align, clocks_of
+    from shapepose_fg.io.footage.placement import placements_of
 
     rig = cameras.rig()
     loaded = network.load()
@@ -124,9 +124,7 @@ def detect(
     placements, concluded = placements_of(pictures.image_placement or [], sizes, rig)
     for each in concluded:
         note(each)
-    rates = per_camera("--fps", clock.fps or [], rig, one_for_all=True)
-    starts = per_camera("--start", clock.start or [], rig, one_for_all=False)
-    moments = align(*clocks_of(footage, rates, starts, rig))
+    moments = align(*clocks_of(footage, clock.fps or [], clock.start or [], rig.names))
     moments = _part(moments, frame_range(clock.frames, len(moments)))
     for each in moments.notes:
         note(each)

@@ -12,7 +12,7 @@ import numpy as np
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import read_json, write_atomically
 from shapepose_fg.detection2d.blocks import Block, DetectionRun, write_block, write_text
-from shapepose_fg.io.footage.used import FOOTAGE, CameraFootage, write_used_footage
+from shapepose_fg.io.footage.placement import FOOTAGE, CameraFootage, write_used_footage
 
 BLOCK = 16
 """Moments that are kept together: what a run that is killed loses at most."""

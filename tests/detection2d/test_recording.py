@@ -15,8 +15,7 @@ from shapepose_fg.detection2d.recording import DetectionRun, run_detection
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.io.footage.footage import open_footage
 from shapepose_fg.io.footage.lockstep import CameraClock, align
-from shapepose_fg.io.footage.placement import Placement, PlacementKind
-from shapepose_fg.io.footage.used import FOOTAGE, read_used_footage
+from shapepose_fg.io.footage.placement import FOOTAGE, Placement, PlacementKind, read_used_footage
 from shapepose_fg.io.timestamps import read_timestamps
 from tests.detection2d.conftest import paint
 

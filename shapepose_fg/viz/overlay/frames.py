@@ -11,7 +11,7 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import OpenedReconstruction, Reconstruction
 from shapepose_fg.io.footage.footage import Footage, Picture
-from shapepose_fg.io.footage.used import CameraFootage
+from shapepose_fg.io.footage.placement import CameraFootage
 from shapepose_fg.viz.bodies import surfaces
 from shapepose_fg.viz.overlay.drawing import (
     Colour,
