@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from shapepose_fg.body.fitting.chains import Motion, cut_segments, solve_banded
-from shapepose_fg.body.fitting.motion_prior import NUM_MOVING, MotionPrior
+from shapepose_fg.body.fitting.priors import NUM_MOVING, MotionPrior
 from shapepose_fg.body.model.rotation import exp_so3
 
 

@@ -15,7 +15,7 @@ from shapepose_fg.body.fitting.energy import (
 from shapepose_fg.body.fitting.evidence import determine_pose, weigh
 from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.body.fitting.person_frame import PersonFrame
-from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 

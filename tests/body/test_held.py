@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from shapepose_fg.body.fitting.energy import SETTLED, BodyEnergy, Held, WhitenedTargets
-from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel
 
 ROWS = 3

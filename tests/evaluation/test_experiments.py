@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.evaluation.experiments import ablation, fitters, runner, scenes, stretches
 from shapepose_fg.evaluation.experiments.experiment import Case, Column, Experiment
@@ -21,7 +21,7 @@ from shapepose_fg.evaluation.experiments.stretches import Scale, Stretch
 from shapepose_fg.evaluation.varied import varied
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.simulation.sequences import Sequence
-from shapepose_fg.simulation.training.split import split_of
+from shapepose_fg.simulation.training.motions import split_of
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
 QUICK = {each.name: each for each in experiments(Scale(quick=True)) if each.name not in ("scenes", "time off")}

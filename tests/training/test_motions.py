@@ -7,8 +7,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.simulation.training.motions import SUBJECT_CAP, WALK_CAP, Motions, frame_weights, load_motions
-from shapepose_fg.simulation.training.split import SPLITS, TEST_SUBJECTS, VALIDATION_SUBJECTS, split_of
+from shapepose_fg.simulation.training.motions import (
+    SPLITS,
+    SUBJECT_CAP,
+    TEST_SUBJECTS,
+    VALIDATION_SUBJECTS,
+    WALK_CAP,
+    Motions,
+    frame_weights,
+    load_motions,
+    split_of,
+)
 
 Z_UP = Rotation.from_rotvec([np.pi / 2, 0.0, 0.0])
 

@@ -10,15 +10,23 @@ from scipy.stats import chi2
 from shapepose_fg.body.fitting.descent import LearnedDescent, gradient_scale
 from shapepose_fg.body.fitting.network import NetworkConfig, UpdateNetwork
 from shapepose_fg.body.fitting.person_frame import PersonFrame
-from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.fitting.weights import FitterWeights, fingerprint
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.core.skeleton import SMPL_24
-from shapepose_fg.simulation.training.calibration import INSIDE, calibrated, left_out_squared
 from shapepose_fg.simulation.training.motions import MIRROR_JOINTS, Motions
-from shapepose_fg.simulation.training.train import PeopleSource, Trainer, TrainingConfig, body_points, prepared
+from shapepose_fg.simulation.training.train import (
+    INSIDE,
+    PeopleSource,
+    Trainer,
+    TrainingConfig,
+    body_points,
+    calibrated,
+    left_out_squared,
+    prepared,
+)
 
 ALL = tuple(range(len(BODY_POINTS)))
 SMALL = TrainingConfig(

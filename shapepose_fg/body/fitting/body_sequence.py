@@ -13,8 +13,8 @@ from shapepose_fg.body.fitting.chains import Segment, cut_segments
 from shapepose_fg.body.fitting.energy import SETTLED, BodyEnergy, Held, WhitenedTargets, factored
 from shapepose_fg.body.fitting.evidence import Evidence, weigh
 from shapepose_fg.body.fitting.fitter import BodyFit, FitStatus, JointTargets, SequenceFit, Shapes
-from shapepose_fg.body.fitting.motion_prior import MotionPrior
 from shapepose_fg.body.fitting.posterior import joint_covariance
+from shapepose_fg.body.fitting.priors import MotionPrior
 from shapepose_fg.body.fitting.settings import BodyConfig
 from shapepose_fg.body.fitting.shared_shape import check_groups
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from shapepose_fg.body.fitting.chains import Motion, Segment, solve_banded
 from shapepose_fg.body.fitting.energy import BodyEnergy, Held, WhitenedTargets, robust_cost
-from shapepose_fg.body.fitting.motion_prior import MotionPrior
+from shapepose_fg.body.fitting.priors import MotionPrior
 from shapepose_fg.body.model.rotation import exp_so3, log_so3
 
 Array = NDArray[np.float64]

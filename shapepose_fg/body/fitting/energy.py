@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from shapepose_fg.body.fitting.pose_prior import NUM_ANGLES, PosePrior
+from shapepose_fg.body.fitting.priors import NUM_ANGLES, PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters, accumulate
 from shapepose_fg.body.model.rotation import exp_so3, log_so3, right_jacobian
 

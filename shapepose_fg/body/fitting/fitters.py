@@ -13,10 +13,9 @@ from shapepose_fg.body.fitting.energy import BodyEnergy, Held, WhitenedTargets
 from shapepose_fg.body.fitting.evidence import Evidence, weigh
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus, JointTargets, SequenceFit, Shapes
 from shapepose_fg.body.fitting.left_out import Passes, left_out_sets, plan_passes
-from shapepose_fg.body.fitting.motion_prior import MotionPrior
 from shapepose_fg.body.fitting.optimisers import LevenbergMarquardt, NetworkDescent
-from shapepose_fg.body.fitting.pose_prior import PosePrior
 from shapepose_fg.body.fitting.posterior import JointPosterior, left_out_places
+from shapepose_fg.body.fitting.priors import MotionPrior, PosePrior
 from shapepose_fg.body.fitting.settings import BodyConfig
 from shapepose_fg.body.fitting.shared_shape import check_groups, pooled_betas, shape_precision, shared
 from shapepose_fg.body.fitting.weights import FitterWeights, fingerprint
@@ -35,7 +34,7 @@ _CONVERGED = 9.0
 NOT_CONVERGED; with one, `BodyConfig.unfinished` says so after the plain optimiser has tried."""
 _SPREAD = {"RWrist": 2.0, "LWrist": 2.0}
 """Multiplies the variance of joints without their own target. Elbows bend farther from their mean than a Gaussian
-says: without it, 85 % of the wrists of the validation subjects (training.split) lay in their 90 % ellipsoids."""
+says: without it, 85 % of the wrists of the validation subjects (training.motions) lay in their 90 % ellipsoids."""
 
 
 def make_fitter(config: BodyConfig | None = None, model: BodyModel | None = None) -> "SmplFitter":

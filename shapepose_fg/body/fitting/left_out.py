@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.energy import BodyEnergy, Held, WhitenedTargets
 from shapepose_fg.body.fitting.evidence import Evidence, determine_pose
-from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.fitting.settings import BodyConfig
 
 Array = NDArray[np.float64]

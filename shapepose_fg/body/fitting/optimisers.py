@@ -18,7 +18,7 @@ from shapepose_fg.body.fitting.energy import (
 )
 from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.body.fitting.person_frame import PersonFrame
-from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.fitting.weights import FitterWeights
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets

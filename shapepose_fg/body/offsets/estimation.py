@@ -23,7 +23,7 @@ from shapepose_fg.body.fitting.energy import BodyEnergy, WhitenedTargets, robust
 from shapepose_fg.body.fitting.evidence import Evidence, weigh
 from shapepose_fg.body.fitting.fitter import BodyFit, JointTargets
 from shapepose_fg.body.fitting.fitters import SmplFitter
-from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.fitting.settings import BodyConfig
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import LARGEST_M, RIDES_ON, KeypointOffsets
