@@ -1,6 +1,6 @@
 """What bodies do: the poses that people take, how fast these change, how far joints can be apart.
 
-Both priors were learnt from motion capture by `scripts/fit_priors.py`.
+Both priors were learnt from motion capture (`body/data/*.md`).
 """
 
 from dataclasses import dataclass, fields, replace

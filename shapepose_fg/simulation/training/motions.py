@@ -1,7 +1,6 @@
 """Poses of recorded people, frame by frame: CMU's .npz or a folder of AMASS files, split by subject for good."""
 
 import hashlib
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple, get_args
@@ -149,12 +148,6 @@ def load_motions(path: str | Path) -> Motions:
         weight=np.repeat(frame_weights(length, np.array(subject), np.array(walking)), length),
         subject=np.repeat(subject, length),
     )
-
-
-def clip_weights(clips: Sequence[Clip]) -> NDArray[np.float64]:
-    """`frame_weights` (S,) of clips."""
-    length, subject = np.array([len(clip) for clip in clips]), np.array([clip.subject for clip in clips])
-    return frame_weights(length, subject, np.array([_walks(clip.action) for clip in clips]))
 
 
 def frame_weights(
