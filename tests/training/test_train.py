@@ -53,8 +53,8 @@ def motions(count: int = 200, seed: int = 0) -> Motions:
     root = np.zeros((count, 1, 3))
     root[:, 0, 1] = rng.uniform(-np.pi, np.pi, count)
     poses = np.concatenate((root, PosePrior.default().sample(rng, count)), axis=1).astype(np.float32)
-    ones, subject = np.ones(count), np.full(count, "01")
-    return Motions(poses, np.ones((count, 24), dtype=bool), ones, subject)
+    subject = np.full(count, "01")
+    return Motions(poses, np.ones(count), subject)
 
 
 @pytest.fixture(scope="module")

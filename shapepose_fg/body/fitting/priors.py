@@ -3,10 +3,9 @@
 Both priors were learnt from motion capture (`body/data/*.md`).
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 import torch
@@ -14,7 +13,6 @@ from numpy.typing import NDArray
 
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
-from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.core.storage.npz import read_npz
 
@@ -26,8 +24,7 @@ NUM_MOVING = 3 + NUM_ANGLES + 3
 """Rotation of the root, the other 69 angles, the root's place."""
 
 _DATA = Path(__file__).parents[1] / "data"
-_GAUSSIANS = ("weights", "means", "covariances")
-"""Of the pose prior's file, which could hold several Gaussians: (K,), (K, 69), (K, 69, 69)."""
+_CURE = "install the package again"
 _SAMPLES = 2000
 _MARGIN, _NOISE_M = 1.25, 0.05
 """Other people than the body model knows, and the errors of two joints (3 cm each, one and a half sigma)."""
@@ -74,22 +71,9 @@ class PosePrior:
     @cache
     def default() -> "PosePrior":
         """The prior that ships with the package (read once)."""
-        return PosePrior.load(_DATA / "pose_prior.npz")
-
-    @classmethod
-    def load(cls, path: str | Path) -> Self:
-        """Read a prior that `save` wrote; InputError naming the file if something is missing."""
-        data = _arrays(path, (*_GAUSSIANS, "lower", "upper"), "pose prior")
-        if any(len(data[name]) != 1 for name in _GAUSSIANS):
-            raise InputError(f"{path}: a mixture of {data['weights'].size} Gaussians; fits take one: fit it again")
+        data = read_npz(_DATA / "pose_prior.npz", ("means", "covariances", "lower", "upper", "provenance"), _CURE)
         arrays = (data["means"][0], data["covariances"][0], data["lower"], data["upper"])
-        return cls(*(value.astype(np.float64) for value in arrays), provenance=str(data["provenance"]))
-
-    def save(self, path: str | Path) -> None:
-        """Write the prior as .npz, readable without pickle."""
-        gaussians = dict(zip(_GAUSSIANS, (np.ones(1), self.mean[None], self.covariance[None]), strict=True))
-        rest = {"lower": self.lower, "upper": self.upper, "provenance": np.array(self.provenance)}
-        np.savez_compressed(path, allow_pickle=False, **gaussians, **rest)
+        return PosePrior(*(value.astype(np.float64) for value in arrays), provenance=str(data["provenance"]))
 
     def widened(self, factor: float) -> "PosePrior":
         """The same with standard deviations `factor` times as large."""
@@ -149,32 +133,13 @@ class MotionPrior:
     @cache
     def default() -> "MotionPrior":
         """The prior that ships with the package (read once)."""
-        return MotionPrior.load(_DATA / "motion_prior.npz")
-
-    @classmethod
-    def load(cls, path: str | Path) -> Self:
-        """Read a prior that `save` wrote; InputError naming the file if something is missing."""
-        data = _arrays(path, ("acceleration", "velocity"), "motion prior")
-        return cls(data["acceleration"], data["velocity"], provenance=str(data["provenance"]))
-
-    def save(self, path: str | Path) -> None:
-        """Write the prior as .npz, readable without pickle."""
-        arrays = {field.name: np.array(getattr(self, field.name)) for field in fields(self)}
-        np.savez_compressed(path, allow_pickle=False, **arrays)
+        data = read_npz(_DATA / "motion_prior.npz", ("acceleration", "velocity", "provenance"), _CURE)
+        return MotionPrior(data["acceleration"], data["velocity"], str(data["provenance"]))
 
     def part(self, angles: NDArray[np.intp]) -> tuple[Array, Array]:
         """Acceleration and velocity (N,) of the root, some of the `angles` (A,) and the place."""
         kept = np.concatenate([np.arange(3), 3 + angles, np.arange(-3, 0) + NUM_MOVING])
         return self.acceleration[kept], self.velocity[kept]
-
-
-def _arrays(path: str | Path, names: tuple[str, ...], what: str) -> dict[str, NDArray]:
-    """The arrays of a prior's file, its provenance too; InputError naming those that are missing."""
-    data = read_npz(Path(path), (*names, "provenance"), "fit it again")
-    missing = [name for name in (*names, "provenance") if name not in data]
-    if missing:
-        raise InputError(f"{path}: not a {what}, it has no {' '.join(missing)}; fit it again")
-    return data
 
 
 @cache

@@ -3,7 +3,7 @@
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.core.storage.npz import read_npz
 from shapepose_fg.simulation.mocap import Clip, Mocap
-from shapepose_fg.simulation.shoulder import COLLARS, shoulder_rhythm
+from shapepose_fg.simulation.shoulder import shoulder_rhythm
 
 Split = Literal["train", "validation", "test"]
 
@@ -82,8 +82,6 @@ class Motions:
 
     poses: NDArray[np.float32]
     """(N, 24, 3) axis-angle, rad: the root's in the world, the other joints' relative to their parents."""
-    observed: NDArray[np.bool_]
-    """(N, 24) whether the rotation was recorded; else it is a guess or zero."""
     weight: NDArray[np.float64]
     """(N,) how many frames this one counts for, at most 1: recordings, subjects and walking are capped within
     their split."""
@@ -92,7 +90,7 @@ class Motions:
 
     def __post_init__(self) -> None:
         N = len(self.poses)
-        expected = {"poses": (N, 24, 3), "observed": (N, 24), "weight": (N,), "subject": (N,)}
+        expected = {"poses": (N, 24, 3), "weight": (N,), "subject": (N,)}
         for name, shape in expected.items():
             if getattr(self, name).shape != shape:
                 raise ValueError(f"{name} must be {shape}, got {getattr(self, name).shape}")
@@ -115,13 +113,8 @@ class Motions:
         return self.rows(np.array([split_of(str(name)) == split for name in subjects], dtype=bool)[place])
 
 
-class _Recording(NamedTuple):
-    """One recording as it is read."""
-
-    subject: str
-    walking: bool
-    poses: NDArray[np.float32]
-    observed: NDArray[np.bool_]
+_Recording = tuple[str, bool, NDArray[np.float32]]
+"""Who was recorded, whether it is walking, poses (T, 24, 3)."""
 
 
 def load_motions(path: str | Path) -> Motions:
@@ -140,11 +133,10 @@ def load_motions(path: str | Path) -> Motions:
         recordings = [_of_clip(mocap.clip(index)) for index in range(len(mocap))]
     if len(recordings) == 0:
         raise InputError(f"{path}: holds no recordings, or no .npz; give CMU's file or a folder of AMASS motions")
-    subject, walking, poses, observed = zip(*recordings, strict=True)
+    subject, walking, poses = zip(*recordings, strict=True)
     length = np.array([len(each) for each in poses])
     return Motions(
         poses=np.concatenate(poses),
-        observed=np.repeat(np.stack(observed), length, axis=0),
         weight=np.repeat(frame_weights(length, np.array(subject), np.array(walking)), length),
         subject=np.repeat(subject, length),
     )
@@ -174,13 +166,12 @@ def _walks(action: str) -> bool:
 
 
 def _of_clip(clip: Clip) -> _Recording:
-    observed = np.ones(24, dtype=bool)
-    observed[[*COLLARS, *_HANDS]] = False
-    observed[list(_WRISTS)], observed[list(_TOES)] = clip.wrist_valid, clip.toe_valid
     rotations = shoulder_rhythm(clip.rotations)
     vectors = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_rotvec().reshape(-1, 24, 3)
-    vectors[:, 1:][:, ~observed[1:] & ~np.isin(np.arange(1, 24), COLLARS)] = 0.0
-    return _Recording(clip.subject, _walks(clip.action), vectors.astype(np.float32), observed)
+    for joints, recorded in ((_HANDS, False), (_WRISTS, clip.wrist_valid), (_TOES, clip.toe_valid)):
+        if not recorded:
+            vectors[:, list(joints)] = 0.0
+    return clip.subject, _walks(clip.action), vectors.astype(np.float32)
 
 
 def _read_amass(path: Path) -> _Recording:
@@ -190,7 +181,7 @@ def _read_amass(path: Path) -> _Recording:
     kept = np.zeros((len(poses[::step]), 24, 3))
     kept[:, :22] = poses[::step, :_BODY_COLUMNS].reshape(-1, 22, 3)
     kept[:, 0] = (_Y_UP * Rotation.from_rotvec(kept[:, 0])).as_rotvec()
-    return _Recording(path.parent.name, _walks(path.stem), kept.astype(np.float32), np.arange(24) < 22)
+    return path.parent.name, _walks(path.stem), kept.astype(np.float32)
 
 
 def _amass_arrays(path: Path) -> tuple[NDArray[np.float64], float]:
