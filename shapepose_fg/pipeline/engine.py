@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from shapepose_fg.body.fitting.bone_reach import longest_bones
 from shapepose_fg.body.fitting.fitter import BodyFitter
+from shapepose_fg.body.fitting.priors import longest_bones
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.observations import Observations
