@@ -177,8 +177,8 @@ def _bodies(
     """The bodies of N rows, each a `person` (N,) of the take in a `frame` (N,), for the page's script to bend.
 
     All share one light `mesh`: faces (F, 3), and each vertex's bones (M, 4) with their weights of 255. `rest`
-    (P, M, 3) and `rest_joints` (P, 24, 3) are people in the T-pose; `turns` (N, 24, 4) the quaternions x y z w of a
-    row's bones against their parents, and `pelvis` (N, 3) where it is. Rows without a body are missing in them.
+    (P, M, 3) and `rest_joints` (P, 24, 3) are people in the T-pose; `turns` (N, 24, 4) are quaternions x y z w of
+    bones against their parents, and `pelvis` (N, 3) is where it is. Rows without a body are missing in them.
     """
     kept, faces = thinned(arrays.template, arrays.faces, CELL_M)
     order = np.argsort(-arrays.weights[kept], axis=1, kind="stable")[:, :_MOST_BONES]
