@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from shapepose_fg.evaluation.matching import MAX_DISTANCE_M, Matches, pair_distance
+from shapepose_fg.evaluation.matching import MAX_DISTANCE_M, Matches, mean_distance
 
 UNMATCHED = np.iinfo(np.int64).min
 """Stands for no identity: any other number may be one."""
@@ -43,14 +43,12 @@ def identity_metrics(
     identity: NDArray[np.integer],
     joints: NDArray[np.float64],
     truth: NDArray[np.float64],
-    *,
-    max_distance_m: float = MAX_DISTANCE_M,
 ) -> IdentityMetrics:
     """Compare the identities of rows with those of the truth (T, P, J, 3), NaN where a person is absent.
 
     Row n has `identity` (N,), `joints` (N, J, 3) in metres and belongs to frame `index` (N,) of the truth, -1
     for a frame that is not scored. For IDF1 every identity is one person for good, and every person one identity,
-    so that as many rows as possible are nearer than `max_distance_m` to theirs (Ristani et al., "Performance
+    so that as many rows as possible are nearer than 0.5 m to theirs (Ristani et al., "Performance
     Measures and a Data Set for Multi-Target, Multi-Camera Tracking", 2016). Switches go by `matches`, which are
     made frame by frame.
     """
@@ -62,7 +60,7 @@ def identity_metrics(
         raise ValueError("an identity has two rows in one frame: give each person one row a frame")
     together = np.zeros((len(names), truth.shape[1]), dtype=np.int64)
     for person in range(truth.shape[1]):
-        near = pair_distance(joints[scored], truth[index[scored], person], max_distance_m) < max_distance_m
+        near = mean_distance(joints[scored], truth[index[scored], person]) < MAX_DISTANCE_M
         together[:, person] = np.bincount(number[near], minlength=len(names))
     best = linear_sum_assignment(together, maximize=True)
     matched = np.bincount(number[np.isin(scored, matches.row)], minlength=len(names))

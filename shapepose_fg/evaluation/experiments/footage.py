@@ -10,7 +10,6 @@ from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.evaluation.alternation import before_refinement
 from shapepose_fg.evaluation.baseline import FoundPeople, frame_by_frame, over_time
-from shapepose_fg.evaluation.bodies import body_joints
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures, columns
 from shapepose_fg.evaluation.experiments.scenes import FRAME_BY_FRAME, MODES, OVER_TIME
 from shapepose_fg.evaluation.experiments.segments import Scale
@@ -26,6 +25,7 @@ from shapepose_fg.evaluation.single_person import (
     read_annotated_arms,
 )
 from shapepose_fg.evaluation.smplify import smpl_only
+from shapepose_fg.evaluation.tracking import body_joints
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.detections import read_detections
