@@ -76,27 +76,24 @@ def compare_view(
     table = people.observations
     xy, confidence = (values[:, :, view].astype(np.float64) for values in (table.xy, table.confidence))
     there = np.isfinite(xy).all(axis=-1) & (table.used[:, :, view] | _near(camera, xy, people.joints))
-    squared = [np.zeros(0)]
+    pairs = [np.zeros((0, 2), dtype=np.intp)]
     for frame in np.unique(people.frame).tolist():
         ours, theirs = np.flatnonzero(people.frame == frame), np.flatnonzero(without.frame == frame)
-        matches = match_people(
-            np.zeros(len(theirs), dtype=np.intp), without.joints[theirs], people.joints[ours][None]
-        )
-        ours, theirs = ours[matches.person], theirs[matches.row]
-        pair, joint = np.nonzero(there[ours] & np.isfinite(without.joints[theirs]).all(axis=-1))
-        ours, theirs = ours[pair], theirs[pair]
-        squared.append(
-            squared_distances(
-                camera,
-                xy[ours, joint],
-                confidence[ours, joint],
-                without.joints[theirs, joint],
-                without.covariance[theirs, joint],
-                config.scatter(people.joint_names.tolist())[joint],
-                config,
-            )
-        )
-    found = np.concatenate(squared)
+        none = np.zeros(len(theirs), dtype=np.intp)
+        matches = match_people(none, without.joints[theirs], people.joints[ours][None])
+        pairs.append(np.stack([ours[matches.person], theirs[matches.row]], axis=1))
+    ours, theirs = np.concatenate(pairs).T
+    pair, joint = np.nonzero(there[ours] & np.isfinite(without.joints[theirs]).all(axis=-1))
+    ours, theirs = ours[pair], theirs[pair]
+    found = squared_distances(
+        camera,
+        xy[ours, joint],
+        confidence[ours, joint],
+        without.joints[theirs, joint],
+        without.covariance[theirs, joint],
+        config.scatter(people.joint_names.tolist())[joint],
+        config,
+    )
     known = found[np.isfinite(found)]
     return HeldOut(known, int(there.sum()) - len(known))
 
