@@ -1,7 +1,5 @@
 """A method without bodies and graphs, to compare with: 2D people whose rays meet, triangulated and linked."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, median_filter
@@ -12,6 +10,7 @@ from shapepose_fg.core.detections import Detections, DetectionSequence
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.linearisation import ObservationConfig, triangulate
+from shapepose_fg.evaluation.matching import PlainPeople
 from shapepose_fg.proposal.assignment import match_best_first
 from shapepose_fg.proposal.candidates import CandidateConfig, triangulate_pairs
 from shapepose_fg.proposal.people_2d import group_people
@@ -32,25 +31,13 @@ JUMP_M, GAP_S, SMOOTH_S = 0.15, 1.0, 0.03
 """A joint so far from the median of seven frames is missing; longer gaps stay; sigma of the smoothing Gaussian."""
 
 
-@dataclass(frozen=True)
-class FoundPeople:
-    """N rows, one per person and frame; what `evaluation` scores."""
-
-    frame: NDArray[np.int64]
-    """(N,) frame."""
-    person: NDArray[np.int64]
-    """(N,) identity; the number within the frame where there is no time."""
-    joints: Array
-    """(N, J, 3) metres; NaN where missing."""
-
-
-def frame_by_frame(detections: DetectionSequence, rig: Rig) -> FoundPeople:
+def frame_by_frame(detections: DetectionSequence, rig: Rig) -> PlainPeople:
     """The people of every frame by itself."""
     placed = [people_in_frame(detections[t], rig, detections.skeleton) for t in range(len(detections))]
     count = [len(each) for each in placed]
     frame, person = np.repeat(np.arange(len(placed)), count), [np.arange(each) for each in count]
     nothing = np.zeros((0, len(detections.skeleton), 3))
-    return FoundPeople(frame, np.concatenate([np.arange(0), *person]), np.concatenate([nothing, *placed]))
+    return PlainPeople(frame, np.concatenate([nothing, *placed]), np.concatenate([np.arange(0), *person]))
 
 
 def people_in_frame(found: Detections, rig: Rig, skeleton: Skeleton) -> Array:
@@ -61,8 +48,8 @@ def people_in_frame(found: Detections, rig: Rig, skeleton: Skeleton) -> Array:
     core = np.isfinite(joints[:, skeleton.core]).all(axis=-1).sum(axis=-1)
     kept = list[int]()
     for one in np.argsort(-(held >= 0).sum(axis=(1, 2)), kind="stable").tolist():
-        near = _apart(joints[kept], joints[one]) < DUPLICATE_M
-        if core[one] >= min(MIN_JOINTS, len(skeleton.core)) and not near.any():
+        least = _apart(joints[kept], joints[one]).min(initial=np.inf)
+        if core[one] >= min(MIN_JOINTS, len(skeleton.core)) and least >= DUPLICATE_M:
             kept.append(one)
     return joints[sorted(kept)]
 
@@ -109,7 +96,7 @@ def _nearest(found: Detections, joints: Array, held: NDArray[np.intp], rig: Rig)
     detection, person = np.nonzero(distance < GATE_M)
     slot = (person * J + found.joint[detection]) * V + found.view[detection]
     picked = match_best_first(slot, detection, -distance[detection, person])
-    given = np.where(np.isfinite(joints).all(axis=-1)[..., None], -1, held).ravel()
+    given = np.where(np.isfinite(joints).all(axis=-1, keepdims=True), -1, held).ravel()
     given[np.isin(given, detection[picked])] = -1
     given[slot[picked]] = detection[picked]
     return given.reshape(held.shape)
@@ -123,9 +110,9 @@ def _apart(people: Array, one: Array) -> Array:
     return np.where(both.sum(axis=-1) >= 3, mean, np.inf)
 
 
-def over_time(people: FoundPeople, fps: float) -> FoundPeople:
+def over_time(people: PlainPeople, fps: float) -> PlainPeople:
     """The same people with identities: rows for every frame from the first to the last of each person."""
-    person, parts = _linked(people, fps), list[FoundPeople]()
+    person, parts = _linked(people, fps), list[PlainPeople]()
     for who in np.unique(person):
         rows = np.flatnonzero(person == who)
         if len(rows) < SHORTEST_S * fps:
@@ -133,14 +120,15 @@ def over_time(people: FoundPeople, fps: float) -> FoundPeople:
         frames = np.arange(people.frame[rows].min(), people.frame[rows].max() + 1)
         joints = np.full((len(frames), *people.joints.shape[1:]), np.nan)
         joints[people.frame[rows] - frames[0]] = people.joints[rows]
-        parts.append(FoundPeople(frames, np.full(len(frames), who), _smoothed(joints, fps)))
-    nobody = FoundPeople(people.frame[:0], person[:0], people.joints[:0])
-    columns = [np.concatenate([getattr(part, name) for part in (nobody, *parts)]) for name in vars(nobody)]
-    order = np.lexsort((columns[1], columns[0]))
-    return FoundPeople(*(column[order] for column in columns))
+        parts.append(PlainPeople(frames, _smoothed(joints, fps), np.full(len(frames), who)))
+    parts.append(PlainPeople(people.frame[:0], people.joints[:0], person[:0]))
+    names = ("frame", "joints", "person")
+    frame, joints, who = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
+    order = np.lexsort((who, frame))
+    return PlainPeople(frame[order], joints[order], who[order])
 
 
-def _linked(people: FoundPeople, fps: float) -> NDArray[np.int64]:
+def _linked(people: PlainPeople, fps: float) -> NDArray[np.int64]:
     """(N,) an identity for each row: Hungarian from frame to frame, against where each joint was last."""
     person = np.full(len(people.frame), -1, dtype=np.int64)
     last, seen = list[Array](), list[int]()

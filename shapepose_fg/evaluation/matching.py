@@ -1,12 +1,14 @@
 """Who is who: predicted people matched with true ones, frame by frame, so that the joint errors are least."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
+
+from shapepose_fg.core.skeleton import BODY_25
 
 MAX_DISTANCE_M = 0.5
 """Metres. A prediction this far from a person, in the mean over joints, is not that person."""
@@ -18,12 +20,24 @@ class People(Protocol):
     @property
     def frame(self) -> NDArray[np.integer]:
         """(N,) frame of each row."""
-        ...
 
     @property
     def joints(self) -> NDArray[np.floating]:
         """(N, J, 3) joints of each row, metres, NaN where unknown."""
-        ...
+
+
+@dataclass(frozen=True)
+class PlainPeople:
+    """N rows, one per person and frame, of which nothing but joints is known; implements `People`."""
+
+    frame: NDArray[np.int64]
+    """(N,) frame of each row."""
+    joints: NDArray[np.float64]
+    """(N, J, 3) joints of each row, metres in the world, NaN where unknown."""
+    person: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    """(N,) identity, or the number within the frame; empty where there is none."""
+    joint_names: tuple[str, ...] = BODY_25.joints
+    """(J,) names."""
 
 
 @dataclass(frozen=True)
@@ -78,10 +92,10 @@ def match_people(
         pairs += [(row, index, who) for row, who in zip(rows[at_row], people[at_person], strict=True)]
         missed += [(index, who) for who in np.setdiff1d(people, people[at_person])]
         for left in np.setdiff1d(np.arange(len(rows)), at_row):
-            (duplicated if (cost[left] < MAX_DISTANCE_M).any() else invented).append(rows[left])
+            (duplicated if (cost[left] < MAX_DISTANCE_M).any() else invented).append(int(rows[left]))
     row, at, who = np.array(pairs, dtype=np.intp).reshape(-1, 3).T
-    left_over = (np.array(each, dtype=np.intp) for each in (duplicated, invented))
-    return Matches(row, at, who, *left_over, np.array(missed, dtype=np.intp).reshape(-1, 2))
+    twice, nowhere = (np.array(each, dtype=np.intp) for each in (duplicated, invented))
+    return Matches(row, at, who, twice, nowhere, np.array(missed, dtype=np.intp).reshape(-1, 2))
 
 
 def mean_distance(predicted: NDArray[np.float64], truth: NDArray[np.float64]) -> NDArray[np.float64]:

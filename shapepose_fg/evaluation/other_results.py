@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NoReturn
 
@@ -14,6 +13,7 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25, MID_HIP
 from shapepose_fg.core.storage.files import open_regular, read_text
+from shapepose_fg.evaluation.matching import PlainPeople
 from shapepose_fg.io.export.take import opensim_axes
 
 SHELF_JOINTS = tuple(
@@ -41,21 +41,7 @@ _FILTERED = "_filt_"
 """What Pose2Sim adds to the names of files that it has filtered."""
 
 
-@dataclass(frozen=True)
-class OtherPeople:
-    """N rows, one per person and frame; what `evaluation` scores."""
-
-    frame: NDArray[np.int64]
-    """(N,) frame, as written."""
-    person: NDArray[np.int64]
-    """(N,) id, as written; 0 where there is none."""
-    joints: NDArray[np.float64]
-    """(N, J, 3) metres in the world; NaN where missing."""
-    joint_names: tuple[str, ...]
-    """(J,) names."""
-
-
-def read_people(path: Path | str, up: Axis = "z") -> Reconstruction | OtherPeople:
+def read_people(path: Path | str, up: Axis = "z") -> Reconstruction | PlainPeople:
     """People from a people.npz or its folder, 4D Association's text, a TRC file, or a folder of TRC files.
 
     Joints are BODY_25's, NaN where the file has none of that name; people in Shelf's 15 joints keep these. In a
@@ -94,7 +80,7 @@ def _beginning(path: Path) -> str:
         return ""
 
 
-def _in_body_25(paths: Sequence[Path], parts: Sequence[OtherPeople]) -> OtherPeople:
+def _in_body_25(paths: Sequence[Path], parts: Sequence[PlainPeople]) -> PlainPeople:
     """The people of all files in BODY_25's joints, sorted by frame and person, numbered by their files."""
     placed = list[NDArray[np.float64]]()
     for path, part in zip(paths, parts, strict=True):
@@ -110,7 +96,7 @@ def _in_body_25(paths: Sequence[Path], parts: Sequence[OtherPeople]) -> OtherPeo
     frame = np.concatenate([part.frame for part in parts])
     person = np.concatenate([part.person + number for number, part in enumerate(parts)])
     order = np.lexsort((person, frame))
-    return OtherPeople(frame[order], person[order], np.concatenate(placed)[order], BODY_25.joints)
+    return PlainPeople(frame[order], np.concatenate(placed)[order], person[order])
 
 
 def _check_near(path: Path, joints: NDArray[np.float64]) -> None:
@@ -120,7 +106,7 @@ def _check_near(path: Path, joints: NDArray[np.float64]) -> None:
         raise InputError(f"{path}: a joint is {farthest:.3g} m from the origin; check the unit")
 
 
-def read_skeleton_text(path: Path, *, shelf: bool = False) -> OtherPeople:
+def read_skeleton_text(path: Path, *, shelf: bool = False) -> PlainPeople:
     """Read such a file: the numbers of joints and of frames, then per frame the number of people, and per person
     an id and the rows x, y, z and confidence of all joints.
 
@@ -147,12 +133,13 @@ def read_skeleton_text(path: Path, *, shelf: bool = False) -> OtherPeople:
             who.append((frame, person))
             meanings = (f"{joints} values of {row} in frame {frame}" for row in ("x", "y", "z", "confidence"))
             rows.append(np.stack([lines.numbers(joints, meaning, not shelf) for meaning in meanings], axis=1))
-    lines.expect_end(frames)
+    if lines.left():
+        lines.refuse(f"goes on after the {frames} frames that line 1 promises")
     table = np.stack(rows) if rows else np.zeros((0, joints, 4))
     known = np.isfinite(table).all(axis=-1) & ((table[..., 3] > 0) | shelf)
     frame, person = np.array(who, dtype=np.int64).reshape(-1, 2).T
-    people_ = OtherPeople(frame, person, np.where(known[..., None], table[..., :3], np.nan), ())
-    return replace(people_, joint_names=_text_joints(path, people_.joints))
+    xyz = np.where(known[..., None], table[..., :3], np.nan)
+    return PlainPeople(frame, xyz, person, _text_joints(path, xyz))
 
 
 def _text_joints(path: Path, joints: NDArray[np.float64]) -> tuple[str, ...]:
@@ -207,10 +194,10 @@ class _Lines:
             self.refuse(f"must hold {meaning}, all finite numbers")
         return values
 
-    def expect_end(self, frame_count: int) -> None:
-        for place, _ in self._lines:
-            self._place = place
-            self.refuse(f"goes on after the {frame_count} frames that line 1 promises")
+    def left(self) -> bool:
+        """Whether there is one more, which is the present one then."""
+        self._place, line = next(self._lines, (self._place, ""))
+        return len(line) > 0
 
     def _next(self, count: int, meaning: str) -> list[str]:
         entry = next(self._lines, None)
@@ -225,7 +212,7 @@ class _Lines:
         return words
 
 
-def read_trc(path: Path, up: Axis = "z") -> OtherPeople:
+def read_trc(path: Path, up: Axis = "z") -> PlainPeople:
     """Read one person's markers into a world with the axis `up` upwards, as `export` turns it to TRC's y.
 
     The middle of the hips is named `MidHip`. A marker is missing where a cell is empty or NaN, or the line ends
@@ -282,7 +269,7 @@ def read_trc(path: Path, up: Axis = "z") -> OtherPeople:
     # A marker of which one coordinate is missing is missing.
     xyz = np.where(np.isfinite(xyz).all(axis=-1, keepdims=True), xyz, np.nan) @ opensim_axes(up)
     frame, named = table[:, 0].astype(np.int64), tuple(MID_HIP if name in _MIDDLES else name for name in names)
-    return OtherPeople(frame, np.zeros(len(rows), dtype=np.int64), xyz, named)
+    return PlainPeople(frame, xyz, np.zeros(len(rows), dtype=np.int64), named)
 
 
 def _is_trc(beginning: str) -> bool:

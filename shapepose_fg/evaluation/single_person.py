@@ -83,9 +83,12 @@ def measure_single_person(
         "bystander_found": 100 * seen[people.frame[there]].sum() / max(seen.sum(), 1),
     }
     torn = lengths > LIMB_LIMIT * np.nanmedian(lengths, axis=0) if len(his) > 0 else np.zeros(0)
-    counts = {"frames": len(recording), "man_found": len(his), "torn_limbs": int(torn.sum())}
-    counts["bystander_seen"] = int(seen.sum())
-    return counts | {name: None if value is None else float(value) for name, value in figures.items()}
+    counts = {"frames": len(recording), "man_found": len(his), "bystander_seen": int(seen.sum())}
+    return (
+        counts
+        | {"torn_limbs": int(torn.sum())}
+        | {name: None if value is None else float(value) for name, value in figures.items()}
+    )
 
 
 def man_of(people: Reconstruction, rig: Rig) -> NDArray[np.intp]:
@@ -117,8 +120,8 @@ def residual_to_nearest(people: Reconstruction, recording: DetectionSequence, ri
             for view in range(len(rig)):
                 mine = seen.xy[(seen.joint == joint) & (seen.view == view)]
                 nearest.append(np.linalg.norm(mine - xy[view, joint], axis=1).min(initial=np.inf))
-    known = np.array(nearest)[np.isfinite(nearest)]
-    return float(np.median(known)) if len(known) > 0 else None
+    known = np.isfinite(nearest)
+    return float(np.median(np.array(nearest)[known])) if known.any() else None
 
 
 def _floor(rig: Rig) -> Array:

@@ -137,10 +137,9 @@ class MultiViewSmplify:
         torso = placed & self._torso.numpy()
         used = np.where(torso.sum(axis=1, keepdims=True) >= _MIN_START_JOINTS, torso, placed)
         variance = np.where(used, _START_SIGMA_M**2, 1e6)
-        xyz = torch.from_numpy(np.where(used[..., None], start, 0.0))
         # Nothing of a joint that is not used: its place is that of those that are.
         centre = np.nanmean(np.where(used[..., None], start, np.nan), axis=1, keepdims=True)
-        xyz = torch.where(torch.from_numpy(used)[..., None], xyz, torch.from_numpy(centre))
+        xyz = torch.from_numpy(np.where(used[..., None], start, centre))
         return self._frame.place(xyz, torch.from_numpy(variance), self._slots)
 
     def _solve(self, rotation: Tensor, views: "_ViewTargets") -> Tensor:

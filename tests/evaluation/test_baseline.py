@@ -7,7 +7,8 @@ import numpy as np
 from shapepose_fg.core.detections import Recording
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation import baseline
-from shapepose_fg.evaluation.baseline import FoundPeople, frame_by_frame, over_time, people_in_frame
+from shapepose_fg.evaluation.baseline import frame_by_frame, over_time, people_in_frame
+from shapepose_fg.evaluation.matching import PlainPeople
 from shapepose_fg.evaluation.metrics import joint_metrics
 from shapepose_fg.simulation import built_in_scene, simulate
 
@@ -69,7 +70,7 @@ def test_a_frame_in_which_nobody_is(five_cameras, two_people, seen_exactly):
     assert len(over_time(people, 25.0).frame) == 0  # a single frame is nobody over time
 
 
-def walking(frames: int = 20) -> FoundPeople:
+def walking(frames: int = 20) -> PlainPeople:
     """Two people who walk past each other, 0.6 m apart at the nearest, at 25 frames a second; 4 cm a frame."""
     rng = np.random.default_rng(0)
     body = rng.uniform(-0.1, 0.1, (25, 3))
@@ -77,7 +78,7 @@ def walking(frames: int = 20) -> FoundPeople:
     one, other = body + step, body + np.array([0.8, 0.6, 0.0]) - step
     joints = np.stack([one, other], axis=1).reshape(-1, 25, 3)
     frame = np.repeat(np.arange(frames), 2)
-    return FoundPeople(frame, np.tile([0, 1], frames), joints)
+    return PlainPeople(frame, joints, np.tile([0, 1], frames))
 
 
 def test_people_keep_their_names_and_gaps_are_closed(monkeypatch):
@@ -87,7 +88,7 @@ def test_people_keep_their_names_and_gaps_are_closed(monkeypatch):
     joints[20, 4] = np.nan  # a wrist is missing for a frame,
     joints[24, 4] += 0.5  # and in another it jumps
     kept = np.arange(len(joints)) != 16  # nobody sees the first person in frame 8
-    gaps = FoundPeople(people.frame[kept], people.person[kept], joints[kept])
+    gaps = PlainPeople(people.frame[kept], joints[kept], people.person[kept])
     with monkeypatch.context() as unsmoothed:
         unsmoothed.setattr(baseline, "SMOOTH_S", 1e-9)
         found = over_time(gaps, 25.0)
@@ -110,7 +111,7 @@ def test_who_is_there_for_a_moment_was_nobody(monkeypatch):
         joints=np.concatenate([people.joints, people.joints[:2] + np.array([0, 5, 0])]),
     )
     order = np.argsort(ghost.frame, kind="stable")
-    ghost = FoundPeople(*(getattr(ghost, name)[order] for name in ("frame", "person", "joints")))
+    ghost = PlainPeople(*(getattr(ghost, name)[order] for name in ("frame", "joints", "person")))
     found = over_time(ghost, 25.0)
     assert len(np.unique(found.person)) == 2
     assert found.joints[..., 1].max() < 2

@@ -5,13 +5,13 @@ import pytest
 
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.evaluation.identities import identity_metrics
 from shapepose_fg.evaluation.matching import match_people
 from shapepose_fg.evaluation.tracking import (
     acceleration_errors,
     body_joints,
     fast_wrist_errors,
     frames_unseen,
+    identity_metrics,
     joints_by_frame,
     score_tracks,
 )

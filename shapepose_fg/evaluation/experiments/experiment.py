@@ -74,11 +74,10 @@ class Experiment:
     @property
     def cases(self) -> list[Case]:
         """Every case once, in the order in which they are measured. ValueError for two of one name."""
-        every = {id(case): case for row in self.rows.values() for case in row}.values()
-        names = [case.name for case in every]
-        if len(set(names)) < len(names):
-            raise ValueError(f"{self.name}: two cases have one name: {sorted(names)}")
-        return list(every)
+        every = list({id(case): case for row in self.rows.values() for case in row}.values())
+        if len({case.name for case in every}) < len(every):
+            raise ValueError(f"{self.name}: two cases have one name: {sorted(case.name for case in every)}")
+        return every
 
     def only(self, wanted: Callable[[str], bool]) -> "Experiment":
         """The same with the cases whose names are wanted."""

@@ -9,15 +9,16 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.evaluation.alternation import before_refinement
-from shapepose_fg.evaluation.baseline import FoundPeople, frame_by_frame, over_time
+from shapepose_fg.evaluation.baseline import frame_by_frame, over_time
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures, columns
 from shapepose_fg.evaluation.experiments.scenes import FRAME_BY_FRAME, MODES, OVER_TIME
 from shapepose_fg.evaluation.experiments.segments import Scale
 from shapepose_fg.evaluation.held_out_view import held_out
-from shapepose_fg.evaluation.matching import People
+from shapepose_fg.evaluation.matching import People, PlainPeople
 from shapepose_fg.evaluation.shelf import ACTORS, LIMB_NAMES, ShelfScore, evaluate_shelf, read_shelf_ground_truth
 from shapepose_fg.evaluation.single_person import (
     ANNOTATION,
+    ARMS,
     SINGLE_FPS,
     man_of,
     measure_arms,
@@ -35,10 +36,10 @@ QUICK = range(20)
 """Frames of a recording that a quick run takes."""
 SHELF_FPS = 25.0
 SHELF_COLUMNS = columns(
-    *((f"actor {actor + 1}", f"actor_{actor + 1}", 2) for actor in ACTORS),
-    *(("Avg", "average", 2), ("all limbs", "pooled", 2), ("MPJPE, mm", "mpjpe_mm")),
-    *(("recall at 0.2 m, %", "recall", 2), ("people found", "found", 0)),
-)
+    *((f"actor {actor + 1}", f"actor_{actor + 1}", 2) for actor in ACTORS), ("Avg", "average", 2),
+    ("all limbs", "pooled", 2), ("MPJPE, mm", "mpjpe_mm"), ("recall at 0.2 m, %", "recall", 2),
+    ("people found", "found", 0),
+)  # fmt: skip
 LIMB_COLUMNS = columns(*((heading, heading, 0) for heading in ("actor 1", "actor 2", "actor 3", "lost")))
 ZHANG = {
     "Zhang et al. 2020, with time": (99.47, 99.47, 96.45, 98.46),
@@ -46,23 +47,16 @@ ZHANG = {
 }
 """The strongest other method: what its results on these frames and detections score, actors 1 to 3 and Avg."""
 SINGLE_COLUMNS = columns(
-    *(("frames with the man", "man_found", 0), ("of", "frames", 0)),
-    *(("limbs over 1.25 times their own median", "torn_limbs", 0),),
-    *(("forearm, standard deviation over mean, %", "forearm_spread", 2),),
-    *(("wrists, mean acceleration, m/s²", "wrist_acceleration"), ("largest", "largest_acceleration", 0)),
-    *(("raised wrist under the shoulder, at the most, m", "lowest_wrist_m", 3),),
-    *(
-        ("arms to the nearest detection, median, px", "residual_px", 2),
-        ("bystander found, %", "bystander_found", 0),
-    ),
-    *(
-        (f"{side} {joint}, median error, mm", f"{side[0].upper()}{joint.capitalize()}_mm", 0)
-        for side in ("right", "left")
-        for joint in ("elbow", "wrist")
-    ),
-    *(("further than 20 cm, %", "arms_wrong"), ("inside 50 %, %", "arms_inside_50")),
-    *(("inside 95 %, %", "arms_inside_95"),),
-)
+    ("frames with the man", "man_found", 0), ("of", "frames", 0),
+    ("limbs over 1.25 times their own median", "torn_limbs", 0),
+    ("forearm, standard deviation over mean, %", "forearm_spread", 2),
+    ("wrists, mean acceleration, m/s²", "wrist_acceleration"), ("largest", "largest_acceleration", 0),
+    ("raised wrist under the shoulder, at the most, m", "lowest_wrist_m", 3),
+    ("arms to the nearest detection, median, px", "residual_px", 2), ("bystander found, %", "bystander_found", 0),
+    *((f"{joint}, median error, mm", f"{joint}_mm", 0) for joint in ARMS),
+    ("further than 20 cm, %", "arms_wrong"), ("inside 50 %, %", "arms_inside_50"),
+    ("inside 95 %, %", "arms_inside_95"),
+)  # fmt: skip
 """The last seven are of elbows and wrists that were annotated by hand."""
 
 
@@ -97,8 +91,8 @@ def single_footage(folder: Path) -> Footage:
 
 def shelf(scale: Scale) -> Experiment:
     """PCP of ours, of steps of it, and of others on the whole recording."""
-    folder, rows = scale.recording("shelf"), dict[str, list[Case]]()
-    if folder is not None and not scale.quick:
+    rows = dict[str, list[Case]]()
+    if (folder := scale.recording("shelf")) is not None and not scale.quick:
         rows = {name: [Case(name, partial(_scores, folder, name))] for name in _SHELF}
         for name, (*actors, average) in ZHANG.items():
             figures = {f"actor_{n}": value for n, value in enumerate(actors, 1)} | {"average": average}
@@ -108,28 +102,27 @@ def shelf(scale: Scale) -> Experiment:
 
 def shelf_limbs(scale: Scale) -> Experiment:
     """How many of each actor's limbs are right, over time."""
-    folder = None if scale.quick else scale.recording("shelf")
-    limbs = enumerate(LIMB_NAMES) if folder is not None else ()
-    return Experiment(
-        "shelf limbs", {name: [Case(name, partial(_limb, folder, n))] for n, name in limbs}, LIMB_COLUMNS
-    )
+    rows = {}
+    if (folder := scale.recording("shelf")) is not None and not scale.quick:
+        rows = {name: [Case(name, partial(_limb, folder, n))] for n, name in enumerate(LIMB_NAMES)}
+    return Experiment("shelf limbs", rows, LIMB_COLUMNS)
 
 
 def views(scale: Scale) -> Experiment:
     """Shelf solved without each of its cameras: what it saw against the 95 % regions of the rest."""
-    folder = scale.recording("shelf")
-    cameras = enumerate(shelf_footage(folder).rig.names) if folder is not None else ()
-    rows = {name: [Case(name, partial(_view, folder, scale.quick, view))] for view, name in cameras}
-    headings = ("inside the 95 % region, %", "of its candidates", "joints that the others do not place")
-    figures = (("inside", 1), ("of", 0), ("unmatched", 0))
-    return Experiment("views", rows, columns(*((h, *figure) for h, figure in zip(headings, figures, strict=True))))
+    rows = {}
+    if (folder := scale.recording("shelf")) is not None:
+        names = shelf_footage(folder).rig.names
+        rows = {name: [Case(name, partial(_view, folder, scale.quick, n))] for n, name in enumerate(names)}
+    headings = (("inside the 95 % region, %", "inside"), ("of its candidates", "of", 0))
+    return Experiment("views", rows, columns(*headings, ("joints that the others do not place", "unmatched", 0)))
 
 
 def single(scale: Scale) -> Experiment:
     """Pose2Sim's demo recording, whose truth is a few joints that were annotated by hand."""
-    folder = scale.recording("pose2sim_single")
-    modes = MODES.items() if folder is not None else ()
-    rows = {name: [Case(name, partial(_single, folder, scale.quick, config))] for name, config in modes}
+    rows = {}
+    if (folder := scale.recording("pose2sim_single")) is not None:
+        rows = {name: [Case(name, partial(_single, folder, scale.quick, mode))] for name, mode in MODES.items()}
     return Experiment("single", rows, SINGLE_COLUMNS)
 
 
@@ -139,7 +132,7 @@ def _ours(folder: Path, mode: str) -> Reconstruction:
 
 
 @cache
-def _baseline(folder: Path) -> FoundPeople:
+def _baseline(folder: Path) -> PlainPeople:
     recording = shelf_footage(folder)
     return frame_by_frame(recording.detections, recording.rig)
 

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache, partial
 
 import numpy as np
@@ -15,7 +14,7 @@ from shapepose_fg.evaluation.baseline import frame_by_frame, over_time
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures, columns
 from shapepose_fg.evaluation.experiments.scenes import FRAME_BY_FRAME, OVER_TIME
 from shapepose_fg.evaluation.experiments.segments import Scale, Segment
-from shapepose_fg.evaluation.matching import People
+from shapepose_fg.evaluation.matching import People, PlainPeople
 from shapepose_fg.evaluation.metrics import joint_metrics
 from shapepose_fg.evaluation.smplify import SmplOnly, smpl_only
 from shapepose_fg.pipeline.pipeline import PipelineConfig
@@ -35,16 +34,6 @@ COLUMNS = columns(
     *(("R of mid-hips", "recall_hip"), ("missed", "missed", 0), ("FP", "false_positives", 0)),
     *(("ms a frame", "cpu_ms", 0), ("body fit or stage II, ms a person", "fit_ms")),
 )
-
-
-@dataclass(frozen=True)
-class PlainPeople:
-    """Joints and nothing else; implements `People`."""
-
-    frame: NDArray[np.integer]
-    """(N,) frame of each row."""
-    joints: NDArray[np.floating]
-    """(N, J, 3) metres; NaN where unknown."""
 
 
 def interactions(scale: Scale) -> Experiment:
@@ -74,13 +63,17 @@ def scored(people: People, truth: NDArray[np.float64]) -> Figures:
     """
     found = {f"{limit:g}": joint_metrics(people, truth, correct_m=limit) for limit in THRESHOLDS_M}
     first, hip = found["0.2"], [BODY_25.index("MidHip")]
-    found["hip"] = joint_metrics(PlainPeople(people.frame, np.asarray(people.joints)[:, hip]), truth[:, :, hip])
+    found["hip"] = joint_metrics(_with_joints(people, people.joints[:, hip]), truth[:, :, hip])
     figures = {
         f"{name}_{at}": 100 * getattr(each, name) for at, each in found.items() for name in _SHARES.values()
     }
     figures["mpjpe_mm"] = first.mpjpe_mm
     counts = {"missed": first.people_missed, "false_positives": first.false_positives}
     return {name: value if np.isfinite(value) else None for name, value in figures.items()} | counts
+
+
+def _with_joints(people: People, joints: NDArray[np.floating]) -> PlainPeople:
+    return PlainPeople(people.frame.astype(np.int64), joints.astype(np.float64))
 
 
 def _baseline(segment: Segment, timed: bool) -> tuple[People, Figures]:
@@ -108,7 +101,7 @@ def _frame_by_frame(segment: Segment) -> tuple[Reconstruction, float, SmplOnly]:
 
 def _triangulated(segment: Segment) -> tuple[People, Figures]:
     people, _, same = _frame_by_frame(segment)
-    return PlainPeople(people.frame, same.triangulated), {"cpu_ms": None}
+    return _with_joints(people, same.triangulated), {"cpu_ms": None}
 
 
 def _smpl_only(segment: Segment) -> tuple[People, Figures]:

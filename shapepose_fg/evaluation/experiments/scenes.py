@@ -146,16 +146,14 @@ def who_is_there(scale: Scale) -> Experiment:
 def _crowds(scale: Scale) -> Mapping[tuple[str, int, int], Mapping[int, Segment]]:
     """Recordings by name, cameras and frames a second, and by seed."""
     seeds = scale.seeds[:1] if scale.quick else scale.seeds
+    made = {(name, seed): replace(SEQUENCES[name], seed=seed) for name in ("crowd", "crossing") for seed in seeds}
+    kinds = [*((cameras, rate) for cameras in CAMERAS for rate in RATES), (8, 30)]
     found: dict[tuple[str, int, int], dict[int, Segment]] = {}
-    if not scale.quick and scale.mocap is not None:
-        kinds = [*((cameras, rate) for cameras in CAMERAS for rate in RATES), (8, 30)]
-        for name in ("crowd", "crossing"):
-            for cameras, rate in kinds:
-                span = range(round(SECONDS * rate))
-                base = Segment(name, span, scale.split, cameras, fps=rate, mocap=scale.mocap)
-                found[name, cameras, rate] = {
-                    seed: replace(base, seed=seed, made=replace(SEQUENCES[name], seed=seed)) for seed in seeds
-                }
+    for (name, seed), config in made.items() if not scale.quick and scale.mocap is not None else ():
+        for cameras, rate in kinds:
+            span = range(round(SECONDS * rate))
+            drawn = Segment(name, span, scale.split, cameras, seed, made=config, fps=rate, mocap=scale.mocap)
+            found.setdefault((name, cameras, rate), {})[seed] = drawn
     frames = range(QUICK_FRAMES if scale.quick else round(SECONDS * 30))
     two = Segment("demo", frames, cameras=2, people=2, fps=30)
     return found | {("two people", 2, 30): {seed: replace(two, seed=seed) for seed in seeds}}

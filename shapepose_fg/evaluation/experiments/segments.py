@@ -107,13 +107,9 @@ class Scale:
         """Two of each sequence; none where there is nothing to simulate them from."""
         if self.quick:
             return (Segment("demo", range(QUICK_FRAMES)),)
-        if self.mocap is None:
-            return ()
-        return tuple(
-            Segment(name, range(start, start + 300), self.split, mocap=self.mocap)
-            for name, starts in SEGMENTS[self.split].items()
-            for start in starts
-        )
+        every = SEGMENTS[self.split].items() if self.mocap is not None else ()
+        begins = ((name, start) for name, starts in every for start in starts)
+        return tuple(Segment(name, range(n, n + 300), self.split, mocap=self.mocap) for name, n in begins)
 
     def one_each(self, frames: int) -> tuple[Segment, ...]:
         """The first so many frames of the first segment of each sequence, for what takes long."""
