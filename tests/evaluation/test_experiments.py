@@ -16,14 +16,14 @@ from shapepose_fg.evaluation.experiments.experiment import Case, Column, Experim
 from shapepose_fg.evaluation.experiments.registry import experiments
 from shapepose_fg.evaluation.experiments.segments import Scale, Segment
 from shapepose_fg.pipeline.pipeline import PipelineConfig
-from shapepose_fg.simulation.sequences import Sequence
-from shapepose_fg.simulation.training.split import split_of
+from shapepose_fg.simulation.training.motions import split_of
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
 QUICK = {each.name: each for each in experiments(Scale(quick=True))}
 """Those that need no recording."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", QUICK)
 def test_every_experiment_makes_a_table_of_plain_figures(name, tmp_path):
     experiment = QUICK[name]
@@ -166,11 +166,12 @@ def test_all_switches_together_lead_from_one_to_the_other():
     assert ablation.differing(one, ablation.OURS) == everything[:1]
 
 
+@pytest.mark.slow
 def test_nothing_was_learnt_from_anybody_who_is_held_back(shared_data):
     """By the clips that each sequence says it is made of: 60 and 61 dance, all others are test subjects."""
     for segment in scenes.held_back_segments(shared_data / "cmu_mocap" / "cmu_smpl24.npz"):
         scene = segment.scene
-        assert isinstance(scene, Sequence) and scene.cuts == () and len(scene) == 300
+        assert scene.cuts == () and len(scene) == 300
         subjects = {clip.split("_")[0] for clips in scene.clips for clip in clips}
         assert len(subjects) > 2 and {split_of(subject) for subject in subjects} == {"test"}
     assert len(scenes.held_back(Scale(data=shared_data)).cases) == 6
@@ -184,7 +185,9 @@ def test_a_case_is_drawn_by_its_seed_at_its_rate():
 
 
 def test_after_a_cut_everybody_is_somebody_else(monkeypatch):
-    monkeypatch.setattr(segments, "cuts_of", lambda _: (2, 4))
-    truth = Segment("demo", range(6), cameras=2, people=2).truth
+    segment = Segment("demo", range(6), cameras=2, people=2)
+    scene = replace(segment.scene, cuts=(2, 4))
+    monkeypatch.setattr(segments, "_scene", lambda _: scene)
+    truth = segment.truth
     people = [np.unique(truth.person[truth.frame == frame]).tolist() for frame in range(6)]
     assert people == [[0, 1], [0, 1], [2, 3], [2, 3], [4, 5], [4, 5]]

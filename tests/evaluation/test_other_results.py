@@ -9,8 +9,7 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25, HALPE_26
 from shapepose_fg.evaluation.other_results import SHELF_JOINTS, SKEL_15, SKEL_17, SKEL_19, read_people, read_trc
 from shapepose_fg.evaluation.shelf import shelf_joints
-from shapepose_fg.io.export.marker_files import trc_text
-from shapepose_fg.io.export.markers import Markers, opensim_names
+from shapepose_fg.io.export.markers import Markers, opensim_names, trc_text
 from tests.conftest import STANDING
 
 

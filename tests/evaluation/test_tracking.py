@@ -16,7 +16,7 @@ from shapepose_fg.evaluation.tracking import (
     score_tracks,
 )
 from shapepose_fg.simulation import built_in_scene
-from shapepose_fg.simulation.truth import truth_of
+from shapepose_fg.simulation.files import truth_of
 
 FPS = 30.0
 J = 25

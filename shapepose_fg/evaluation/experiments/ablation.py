@@ -6,8 +6,7 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from operator import attrgetter
 from typing import Any
 
-from shapepose_fg.estimation.estimator_config import RefineConfig
-from shapepose_fg.estimation.window_graph import WindowGraphConfig
+from shapepose_fg.estimation.estimator_config import RefineConfig, WindowGraphConfig
 from shapepose_fg.evaluation.experiments.experiment import Experiment, columns
 from shapepose_fg.evaluation.experiments.scenes import FRAME_BY_FRAME, OVER_TIME, case
 from shapepose_fg.evaluation.experiments.segments import Scale

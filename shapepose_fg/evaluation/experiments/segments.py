@@ -11,11 +11,10 @@ from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.simulation import DetectorConfig, Scene, simulate
-from shapepose_fg.simulation.files import cut, cuts_of, named_scene
+from shapepose_fg.simulation.files import named_scene, truth_of
 from shapepose_fg.simulation.foreign import DETECTOR_S_OWN, people_of, recast
 from shapepose_fg.simulation.room import SequenceConfig
 from shapepose_fg.simulation.sequences import Split
-from shapepose_fg.simulation.truth import truth_of
 
 SEGMENTS: dict[Split, dict[str, tuple[int, int]]] = {
     "report": {"salsa": (108, 618), "crossing": (0, 726), "crowd": (0, 826)},
@@ -75,7 +74,7 @@ class Segment:
     def truth(self) -> Reconstruction:
         """The people as a result, in which everybody is somebody else after a cut."""
         truth = truth_of(self.scene)
-        part = np.searchsorted(cuts_of(self.scene), truth.frame, side="right")
+        part = np.searchsorted(self.scene.cuts, truth.frame, side="right")
         return replace(truth, person=truth.person + part * (int(truth.person.max(initial=0)) + 1))
 
     def shorter(self, frames: int) -> "Segment":
@@ -86,7 +85,7 @@ class Segment:
         """Reconstructed at the scene's rate."""
         scene = self.scene
         times = FrameTimes.from_fps(scene.fps, len(self.span))
-        return reconstruct(self.detections, scene.rig, config, times=times, cuts=cuts_of(scene))
+        return reconstruct(self.detections, scene.rig, config, times=times, cuts=scene.cuts)
 
 
 @dataclass(frozen=True)
@@ -140,7 +139,7 @@ def _scene(segment: Segment) -> Scene:
         fps=segment.fps,
         **own,
     )
-    scene = cut(whole, segment.span)
+    scene = whole.part(segment.span)
     return scene if segment.bodies is None else recast(scene, people_of(segment.bodies, scene.people))
 
 
