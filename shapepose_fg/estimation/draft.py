@@ -1,5 +1,7 @@
 """Roughly where joints are, without a graph: enough to assign the detections again."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,9 +17,24 @@ NARROWING = (4.0, 2.0, 1.0, 1.0)
 """How many times as wide as in the end the kernel of a draft's body is, fit by fit. With priors that are stiff as
 long as it is wide, as in SMPLify, F1 rose by 1.5 points on `tune`, and raised arms hung on real footage."""
 
+_AS_PROBABLY = 0.2
+"""A row is drafted anew where the probability of a detection is another by more than this."""
+
 MOVED_M = 0.02
 """A draft's body is fitted again only where a joint's target moved by this since its last fit, as much as a
 detector's joints lie from the body's, or weighs another share: on Shelf a quarter of all fits are left."""
+
+
+@dataclass(frozen=True)
+class Draft:
+    """About where the joints of N rows are."""
+
+    observations: Observations
+    """What it was made from."""
+    places: NDArray[np.float64]
+    """(N, J, 3) metres; NaN where neither views nor body say any."""
+    covariance: NDArray[np.float64]
+    """(N, J, 3, 3) m²; NaN where the place is."""
 
 
 def draft(
@@ -48,6 +65,35 @@ def draft(
         placed = np.flatnonzero(again.ok)
         body = body.with_rows(rows[placed], again.rows(placed))
     return drafted(evidence, body, config.refine.contradiction)
+
+
+def redraft(
+    last: Draft | None, observations: Observations, views: Views, fitter: BodyFitter, config: EstimatorConfig
+) -> Draft:
+    """`draft`, which leaves rows as they were in the `last` one whose detections are the same, and nearly as
+    probably theirs.
+    """
+    places = np.full(observations.initial.shape, np.nan)
+    covariance = np.full((*places.shape, 3), np.nan)
+    here, there = np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
+    if last is not None:
+        here, there = _unchanged(observations, last.observations)
+        places[here], covariance[here] = last.places[there], last.covariance[there]
+    rows = np.setdiff1d(np.arange(len(places)), here)
+    if len(rows) > 0:
+        places[rows], covariance[rows] = draft(observations.rows(rows), views.rows(rows), fitter, config)
+    return Draft(observations, places, covariance)
+
+
+def _unchanged(now: Observations, before: Observations) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """(K,) rows whose detections are as in a row of the same track and frame `before`, and (K,) those rows."""
+    width = int(max(now.track.max(initial=0), before.track.max(initial=0))) + 1
+    names = [each.frame * width + each.track for each in (now, before)]
+    _, here, there = np.intersect1d(*names, assume_unique=True, return_indices=True)
+    same = now.candidate[here] == before.candidate[there]
+    same &= np.abs(now.probability[here] - before.probability[there]) < _AS_PROBABLY
+    same = same.all(axis=(1, 2))
+    return here[same], there[same]
 
 
 def first_places(

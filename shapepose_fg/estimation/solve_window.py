@@ -14,7 +14,7 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.body_step import BodyStep, disagreement
 from shapepose_fg.estimation.contact import feet_of, walking
-from shapepose_fg.estimation.draft import draft, first_places
+from shapepose_fg.estimation.draft import Draft, first_places, redraft
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.in_time import interpolated
 from shapepose_fg.estimation.linearisation import (
@@ -33,6 +33,10 @@ from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.tracking.hypotheses import Input
 from shapepose_fg.tracking.reassociation import Survival, reassociate
 from shapepose_fg.tracking.view_assignment import AssignmentConfig
+
+_SETTLED = 0.002
+"""Detections are not assigned again when fewer than this share of them changed: in crowds before six cameras after
+three or four rounds, before three after eight or more."""
 
 
 @dataclass(frozen=True)
@@ -80,16 +84,21 @@ def solve_window(
     motion = MotionModel.load(config.joints, config.motion)
 
     # Assign: detections go to whom a draft of joints and bodies puts near them, round by round.
+    drafted: Draft | None = None
     for n in range(assigning.rounds if assigning is not None and len(observations) > 0 else 0):
         assert assigning is not None
-        places, covariance = draft(observations, views, fitter, config)
+        drafted = redraft(drafted, observations, views, fitter, config)
+        places, covariance = drafted.places, drafted.covariance
         if assigning.over_time:
             times_s = observations.time_s.mean(axis=1)
             places, covariance = smoothed(places, covariance, observations.track, times_s, motion)
         survival = None if assigning.over_time else Survival().at(n / max(assigning.rounds - 1, 1))
+        before = observations
         observations = reassociate(
-            assigning.frames, observations, places, covariance, assigning.skeleton, assigning.config, survival
+            assigning.frames, before, places, covariance, assigning.skeleton, assigning.config, survival
         )
+        if assigning.over_time and _changed(before, observations) < _SETTLED:
+            break
     assigned = time.perf_counter()
 
     # Draft: X_0, the observations' sigmas there, and everybody's graph.
@@ -145,6 +154,12 @@ def solve_window(
     solution = outcome(state, fitter)
     solution.seconds.update({"associate again": assigned - began, "solve": time.perf_counter() - assigned})
     return solution
+
+
+def _changed(before: Observations, now: Observations) -> float:
+    """Share of the places where somebody is seen by a view, in the same rows, whose detection is another."""
+    seen = before.seen | now.seen
+    return float((before.candidate != now.candidate)[seen].sum() / max(seen.sum(), 1))
 
 
 def _parts(people: Sequence[WindowGraph]) -> list[tuple[WindowGraph, slice]]:
