@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from factors import CONSTANT_VELOCITY, Motion
 from shapepose_fg.core.bounds import Factor, Seconds, Settings
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import read_json
@@ -59,7 +60,7 @@ class MotionModel:
     """The numbers of a window's motion factors for J joints."""
 
     psd_still: NDArray[np.float64]
-    """(J,) power spectral density of the acceleration of a joint that hardly moves, m²/s³, per axis."""
+    """(J,) density of the noise in the motion of a joint at rest: of its acceleration, m²/s³, per axis."""
     psd_speed: NDArray[np.float64]
     """(J,) what is added to it for each (m/s)² of the joint's speed: fast joints turn faster, too."""
     psd_lost: NDArray[np.float64]
@@ -71,28 +72,30 @@ class MotionModel:
     """What the body says of a joint without the joint's own views."""
     around_s: float = 0.5
     """How long before and after a joint is lost from sight the difference between joint and body is followed."""
-    speed_m_s: float = 2.0
-    """How fast a joint is, one sigma per axis, before anything is known of it."""
+    law: Motion = CONSTANT_VELOCITY
+    """How a state goes on."""
 
     def psd(self, speed_m_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Power spectral density (..., J) of joints of this speed (..., J)."""
+        """Density (..., J) of the noise in the motion of joints of this speed (..., J)."""
         return self.psd_still + self.psd_speed * np.asarray(speed_m_s) ** 2
 
     @classmethod
-    def load(cls, joints: tuple[str, ...], config: MotionConfig | None = None) -> "MotionModel":
-        """The model of the configuration's file for the `joints` of a detector.
+    def load(
+        cls, joints: tuple[str, ...], config: MotionConfig | None = None, law: Motion = CONSTANT_VELOCITY
+    ) -> "MotionModel":
+        """The numbers of the configuration's file for the `joints` of a detector, as the `law` has them.
 
         A joint that the file does not name moves as the mean of those that it does. InputError for a file that is
         not a motion model.
         """
         config = MotionConfig() if config is None else config
         if config.model:
-            return cls._read(Path(config.model), joints, config)
+            return cls._read(Path(config.model), joints, config, law)
         with as_file(files("shapepose_fg.estimation") / "data" / "motion.json") as path:
-            return cls._read(path, joints, config)
+            return cls._read(path, joints, config, law)
 
     @classmethod
-    def _read(cls, path: Path, joints: tuple[str, ...], config: MotionConfig) -> "MotionModel":
+    def _read(cls, path: Path, joints: tuple[str, ...], config: MotionConfig, law: Motion) -> "MotionModel":
         data = read_json(path)
         try:
             if data["format"] != FORMAT:
@@ -116,6 +119,10 @@ class MotionModel:
                 f"{path}: of views and body, white_share must be between 0 and 1, correlation_s positive and kept"
                 " 0 to 1; give what scripts/measure_motion.py writes"
             )
-        chosen = config.psd_scale * np.array([known.get(name, tuple(table.mean(axis=0))) for name in joints])
+        chosen = (
+            config.psd_scale
+            * law.per_acceleration
+            * np.array([known.get(name, tuple(table.mean(axis=0))) for name in joints])
+        )
         still, speed, lost = np.ascontiguousarray(chosen.T)
-        return cls(still, speed, lost, views, body, config.around_s)
+        return cls(still, speed, lost, views, body, config.around_s, law)

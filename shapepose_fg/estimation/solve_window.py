@@ -77,7 +77,7 @@ def solve_window(
             f"views must be of the {len(observations)} rows' {observations.confidence.shape[2]} views"
         )
     began = time.perf_counter()
-    motion = MotionModel.load(config.joints, config.motion)
+    motion = MotionModel.load(config.joints, config.motion, config.law)
 
     # Assign: detections go to whom a draft of joints and bodies puts near them, round by round.
     for n in range(assigning.rounds if assigning is not None and len(observations) > 0 else 0):

@@ -96,8 +96,8 @@ class Setup:
         def find(detections: Detections, rig: Rig, weak: bool) -> Observations:
             return (hips if weak else sure).people(detections, rig, skeleton, book)
 
-        motion = MotionModel.load(skeleton.joints, config.motion)
-        scale = BodyScale(longest_bones(skeleton), motion.psd(np.full(len(skeleton), FAST_M_S)))
+        motion = MotionModel.load(skeleton.joints, config.motion, config.law)
+        scale = BodyScale(longest_bones(skeleton), motion.psd(np.full(len(skeleton), FAST_M_S)), config.law)
         tracker = Tracker(
             skeleton, scale, find, tracking, config.observations, weak_births=config.temporal, drop=book.drop_in
         )

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from shapepose_fg.core.bounds import RepeatsOrNone, Settings
 from shapepose_fg.tracking.following import Decided, FollowingConfig, FollowState, alone, finish, follow
 from shapepose_fg.tracking.hypotheses import Input
-from shapepose_fg.tracking.tracker import Tracker, Tracks
+from shapepose_fg.tracking.tracker import Tracker
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Engine:
 
     def start(self, next_id: int = 0) -> StreamState:
         """Before the first frame, or after a cut; identities count from `next_id`."""
-        return StreamState(FollowState(Tracks.none(self.tracker.skeleton), next_id))
+        return StreamState(FollowState(self.tracker.nobody(), next_id))
 
     def follow(
         self, state: StreamState, frames: Iterable[Input], *, last: bool = False

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from shapepose_fg.body.fitting.chains import Motion, Segment, solve_banded
+from shapepose_fg.body.fitting.chains import Links, Segment, solve_banded
 from shapepose_fg.body.fitting.energy import BodyEnergy, Held, WhitenedTargets, robust_cost
 from shapepose_fg.body.fitting.motion_prior import MotionPrior
 from shapepose_fg.body.model.rotation import exp_so3, log_so3
@@ -107,10 +107,8 @@ class _Normal:
     """(T, G, N, 10) of poses with betas."""
     diagonal: Tensor
     """(T, G, N, N) of poses."""
-    next_one: Tensor
-    """(T, G, N)."""
-    next_two: Tensor
-    """(T, G, N)."""
+    beyond: Tensor
+    """(T, G, N, n)."""
 
 
 def _mixed(better: Tensor, new: T_, old: T_) -> T_:
@@ -131,7 +129,7 @@ class _Batch:
 
     def __init__(self, rows: ChainRows, segments: list[Segment], held: ChainShapes, fixed: bool):
         self._rows, self._held, self._fixed = rows, held, fixed
-        T, G = max(2, *(len(segment.rows) for segment in segments)), len(segments)
+        T, G = max(rows.motion.law.order, *(len(segment.rows) for segment in segments)), len(segments)
         index, step = np.zeros((T, G), dtype=np.intp), np.full((T - 1, G), np.inf)
         mask = np.zeros((T, G), dtype=bool)
         for column, segment in enumerate(segments):
@@ -143,7 +141,7 @@ class _Batch:
         real = self._index[self._mask]
         self._targets = rows.targets[real]
         self._angles = None if rows.angles is None else rows.angles[real]
-        self._motion = Motion(*rows.motion.part(rows.energy.angles), torch.from_numpy(step))
+        self._links = Links(rows.motion.law, *rows.motion.part(rows.energy.angles), torch.from_numpy(step))
 
     def solved(self, free: Tensor) -> tuple[_State, Tensor]:
         """The bodies, and the information about their betas in the rows (G, 10, 10)."""
@@ -177,7 +175,7 @@ class _Batch:
         rows, free = self._rows, self.free(state)[self._mask]
         turn, scale = state.root[self._mask], torch.tensor(rows.kernel_scale)
         (T, G), N = self._mask.shape, free.shape[1] - 10
-        moved = self._motion.at(state.root, state.others)
+        moved = self._links.at(state.root, state.others)
         diagonal = torch.eye(N).double().repeat(T, G, 1, 1)
         across, gradient = diagonal.new_zeros(T, G, N, 10), diagonal.new_zeros(T, G, N)
         away = state.betas[0] - self._held.betas
@@ -199,14 +197,14 @@ class _Batch:
             energy.index_add_(0, chain, (robust_cost(row.squared, scale).sum(-1) + row.prior).double())
         torch.diagonal(diagonal, dim1=-2, dim2=-1).add_(moved.diagonal)
         return _Normal(energy[None], (shape_gradient + pull)[None], shape[None], gradient + moved.gradient, across,
-                       diagonal, moved.next_one, moved.next_two)  # fmt: skip
+                       diagonal, moved.beyond)  # fmt: skip
 
     def _step(self, here: _Normal, damping: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Steps of betas (G, 10) and poses (T, G, N), and the rows' information about the betas (G, 10, 10)."""
         diagonal = here.diagonal.clone()
         torch.diagonal(diagonal, dim1=-2, dim2=-1).mul_(1 + damping[:, None])
         right = torch.cat((here.gradient[..., None], here.across), -1)
-        X = solve_banded(diagonal, here.next_one, here.next_two, right)
+        X = solve_banded(diagonal, here.beyond, right)
         eliminated = (here.across.mT @ X).sum(0)  # (G, 10, 11)
         said = here.shape[0] - eliminated[..., 1:]
         if self._fixed:

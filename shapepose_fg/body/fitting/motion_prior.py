@@ -1,4 +1,4 @@
-"""How fast people's poses change: white noise on the acceleration of every angle, learnt from motion capture."""
+"""How fast people's poses change: noise in the motion of every angle, learnt from motion capture."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from factors import CONSTANT_VELOCITY, Motion
 from shapepose_fg.body.fitting.pose_prior import NUM_ANGLES
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.npz import read_npz
@@ -28,7 +29,8 @@ class MotionPrior:
 
         v_k ~ N(0, velocity / h_k),   v_k+1 - v_k ~ N(0, acceleration (h_k + h_k+1) / 2)
 
-    the second for smooth motion, the first so that what nothing shows does not drift away.
+    the second for smooth motion, the first so that what nothing shows does not drift away. Another `law` of motion
+    takes the place of the second.
     Made by `scripts/fit_motion_prior.py`.
     """
 
@@ -38,6 +40,8 @@ class MotionPrior:
     """(75,) of the velocity: rad²/s, of the place m²/s."""
     provenance: str
     """Where the motions came from and how the prior was made."""
+    law: Motion = CONSTANT_VELOCITY
+    """How the numbers move; `acceleration` becomes the density of its noise (`Motion.per_acceleration`)."""
 
     def __post_init__(self) -> None:
         for name in _ARRAYS:
@@ -68,9 +72,9 @@ class MotionPrior:
         np.savez_compressed(path, allow_pickle=False, **arrays, provenance=np.array(self.provenance))
 
     def part(self, angles: NDArray[np.intp]) -> tuple[Array, Array]:
-        """Acceleration and velocity (N,) of the root, some of the `angles` (A,) and the place."""
+        """Densities (N,) of the noise and the velocity of the root, some of the `angles` (A,) and the place."""
         kept = np.concatenate([np.arange(3), 3 + angles, np.arange(-3, 0) + NUM_MOVING])
-        return self.acceleration[kept], self.velocity[kept]
+        return self.law.per_acceleration * self.acceleration[kept], self.velocity[kept]
 
 
 @lru_cache(maxsize=1)

@@ -176,7 +176,7 @@ def fitter_of(body: Path | None, settings: PipelineConfig, joints: tuple[str, ..
     """The body fitter with the model of the file `body`; without one, the pipeline takes its own."""
     if body is None:
         return None
-    return make_fitter(settings.body, BodyModel.load(body).with_keypoints(joints))
+    return make_fitter(settings.body, BodyModel.load(body).with_keypoints(joints), settings.law)
 
 
 def _known_people(file: Path, body: Path | None) -> SubjectShapes:
