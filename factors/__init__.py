@@ -27,6 +27,7 @@ from factors.lasting import lasting_difference_factors, lasting_prior_factors, o
 from factors.motion import (
     CONSTANT_ACCELERATION,
     CONSTANT_VELOCITY,
+    MEASURED_S,
     MOTIONS,
     Motion,
     matrices,
@@ -63,6 +64,7 @@ __all__ = [
     "CONSTANT_ACCELERATION",
     "CONSTANT_VELOCITY",
     "DEFAULT_WIDTH_SIGMA",
+    "MEASURED_S",
     "MOTIONS",
     "CameraKey",
     "JointKey",

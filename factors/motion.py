@@ -28,6 +28,8 @@ Array = NDArray[np.float64]
 
 ORDERS = (2, 3)
 """Numbers of a state along an axis: position and velocity, or acceleration as well."""
+MEASURED_S = 2 / 30
+"""Over this time people's accelerations were measured: second differences at 30 frames a second."""
 
 
 @dataclass(frozen=True)
@@ -38,8 +40,6 @@ class Motion:
     """n, the numbers of a state along an axis: one of `ORDERS`."""
     start: tuple[float, ...] = (2.0,)
     """Sigma of each derivative along an axis before anything is known: m/s, m/s²."""
-    per_acceleration: float = 1.0
-    """q over the power spectral density of the acceleration, which is what is measured of people (m²/s³)."""
 
     def __post_init__(self) -> None:
         if self.order not in ORDERS or len(self.start) != self.order - 1:
@@ -58,6 +58,13 @@ class Motion:
         return matrices(
             [[q * h ** (i + j + 1) / ((i + j + 1) * factorial(i) * factorial(j)) for j in left] for i in left]
         )
+
+    def density(self, acceleration: ArrayLike, within_s: float = MEASURED_S) -> Array:
+        """The density q that makes positions as uncertain after `within_s` as accelerations of this power spectral
+        density, m²/s³, do: that is what is measured of people, and they have another q on every time scale.
+        """
+        white = within_s**3 / 3
+        return np.asarray(acceleration, dtype=np.float64) * (white / self.noise(within_s)[0, 0])
 
     def step(self, dt_s: float, density: ArrayLike) -> tuple[Array, Array]:
         """F (n, n) and q Q (..., n, n) of a step that may be back in time: derivatives of odd order turn round."""
@@ -111,7 +118,7 @@ class ConstantVelocity(Motion):
 
 CONSTANT_VELOCITY = ConstantVelocity()
 """White noise on acceleration."""
-CONSTANT_ACCELERATION = Motion(3, (2.0, 10.0), 25.0)
+CONSTANT_ACCELERATION = Motion(3, (2.0, 5.0))
 """White noise on jerk."""
 MOTIONS: dict[str, Motion] = {
     "constant velocity": CONSTANT_VELOCITY,

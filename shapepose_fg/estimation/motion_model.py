@@ -7,12 +7,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import CONSTANT_VELOCITY, Motion
+from factors import CONSTANT_VELOCITY, MEASURED_S, Motion
 from shapepose_fg.core.bounds import Factor, Seconds, Settings
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import read_json
 
 FORMAT = "shapepose-fg motion model 1"
+GAP_S = 0.4
+"""So long joints were hidden whose densities across gaps were measured."""
 LOST_M = 0.1
 """A joint whose views leave it less certain than this in some direction, metres, is lost from sight."""
 
@@ -60,7 +62,7 @@ class MotionModel:
     """The numbers of a window's motion factors for J joints."""
 
     psd_still: NDArray[np.float64]
-    """(J,) density of the noise in the motion of a joint at rest: of its acceleration, m²/s³, per axis."""
+    """(J,) power spectral density of the acceleration of a joint that hardly moves, m²/s³, per axis."""
     psd_speed: NDArray[np.float64]
     """(J,) what is added to it for each (m/s)² of the joint's speed: fast joints turn faster, too."""
     psd_lost: NDArray[np.float64]
@@ -75,9 +77,13 @@ class MotionModel:
     law: Motion = CONSTANT_VELOCITY
     """How a state goes on."""
 
-    def psd(self, speed_m_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Density (..., J) of the noise in the motion of joints of this speed (..., J)."""
-        return self.psd_still + self.psd_speed * np.asarray(speed_m_s) ** 2
+    def density(self, speed_m_s: NDArray[np.float64], within_s: float = MEASURED_S) -> NDArray[np.float64]:
+        """Density (..., J) of the noise in the motion of joints of this speed (..., J); see `Motion.density`."""
+        return self.law.density(self.psd_still + self.psd_speed * np.asarray(speed_m_s) ** 2, within_s)
+
+    def density_lost(self, speed_m_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The same while joints are lost from sight, and their speed is a guess."""
+        return np.maximum(self.density(speed_m_s, GAP_S), self.law.density(self.psd_lost, GAP_S))
 
     @classmethod
     def load(
@@ -119,10 +125,6 @@ class MotionModel:
                 f"{path}: of views and body, white_share must be between 0 and 1, correlation_s positive and kept"
                 " 0 to 1; give what scripts/measure_motion.py writes"
             )
-        chosen = (
-            config.psd_scale
-            * law.per_acceleration
-            * np.array([known.get(name, tuple(table.mean(axis=0))) for name in joints])
-        )
+        chosen = config.psd_scale * np.array([known.get(name, tuple(table.mean(axis=0))) for name in joints])
         still, speed, lost = np.ascontiguousarray(chosen.T)
         return cls(still, speed, lost, views, body, config.around_s, law)

@@ -35,7 +35,7 @@ def smoothed(
     variance[at, who] = 4 * np.trace(covariance, axis1=-2, axis2=-1) / 3 + LEAST_SIGMA_M**2
     known = np.asarray(np.isfinite(variance) & np.isfinite(place).all(axis=-1))
     place, variance = np.where(known[..., None], place, 0.0), np.where(known, variance, _UNKNOWN)
-    density, weight = motion.psd(np.full(shape[2], SPEED_M_S)), np.ones(shape)
+    density, weight = motion.density(np.full(shape[2], SPEED_M_S)), np.ones(shape)
     mean, of_mean = place, variance
     for _ in range(_ROUNDS):
         mean, of_mean = _smooth(

@@ -321,16 +321,16 @@ class WindowGraph:
     def _motions(self, near: NDArray[np.float64], lost: NDArray[np.bool_] | None) -> list[gtsam.NonlinearFactor]:
         """Motion of the joints that are in the problem; how far they may turn goes by their speed at `near`."""
         speed = speeds(near, self.times_s)
-        psd: NDArray[np.float64] = self._motion.psd(speed)
+        density = self._motion.density(speed)
         if lost is not None:
-            psd = np.where(lost[1:] & lost[:-1], np.maximum(psd, self._motion.psd_lost), psd)
+            density = np.where(lost[1:] & lost[:-1], self._motion.density_lost(speed), density)
         law, factors = self._motion.law, list[gtsam.NonlinearFactor]()
         unknown = [diagonal(np.full(3, sigma)) for sigma in law.start]
         for joint in np.flatnonzero(self._present[0]).tolist():
             states = self.state_keys[:, joint]
             for key, noise in zip(states[0, 1:].tolist(), unknown, strict=True):
                 factors.append(gtsam.PriorFactorPoint3(key, np.zeros(3), noise))
-            factors += law.factors(states, self.times_s, psd[:, joint])
+            factors += law.factors(states, self.times_s, density[:, joint])
         return factors
 
     def _start(self, initial: NDArray[np.float64], offsets: NDArray[np.bool_]) -> gtsam.Values:

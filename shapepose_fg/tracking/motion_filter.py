@@ -94,6 +94,6 @@ class JointStates:
             np.where(where[..., None, None], other.covariance, self.covariance),
         )
 
-    def with_velocity(self, velocity: Array) -> "JointStates":
-        """The same with other mean velocities (A, J, 3)."""
-        return replace(self, mean=np.concatenate([self.position, velocity, self.mean[..., 6:]], axis=-1))
+    def with_derivatives(self, *derivatives: Array) -> "JointStates":
+        """The same with other mean velocities (A, J, 3), and with what is beyond these."""
+        return replace(self, mean=np.concatenate([self.position, *derivatives], axis=-1))

@@ -206,7 +206,7 @@ class Tracker:
         return np.concatenate(found), np.concatenate(theirs)
 
     def _predict(self, joints: JointStates, step_s: float) -> JointStates:
-        """Joints `step_s` later; an unseen joint comes to move as the person does."""
+        """Joints `step_s` later; an unseen joint comes to move as the person does, straight on."""
         core = list(self.skeleton.core)
         certainty = 1 / joints.sigma_m[:, core, None] ** 2
         at_rest = 1 / _TRUSTED_M**2  # what nothing is known of stands still: it must not drift along a ray
@@ -214,7 +214,8 @@ class Tracker:
         decay = np.exp(-abs(step_s) / _FOLLOW_S)
         unseen = (joints.sigma_m > _FOLLOW_SIGMA_M)[..., None]
         following = person[:, None] + decay * (joints.velocity - person[:, None])
-        joints = joints.with_velocity(np.where(unseen, following, joints.velocity))
+        fading = np.where(unseen, decay, 1.0) * joints.mean[..., 6:]
+        joints = joints.with_derivatives(np.where(unseen, following, joints.velocity), fading)
         return joints.predicted(step_s, self.scale.motion, self.scale.density)
 
     def _beside_neighbours(self, joints: JointStates, lost: NDArray[np.bool_]) -> JointStates:

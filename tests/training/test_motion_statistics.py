@@ -55,4 +55,4 @@ def test_the_shipped_model_holds_what_was_measured():
     slowest, fastest = BODY_25.joints[model.psd_lost.argmin()], BODY_25.joints[model.psd_lost.argmax()]
     assert slowest == "MidHip" and "Toe" in fastest
     assert 0.2 < model.views.white_share < 0.5 and 0.5 < model.body.correlation_s < 2.0
-    assert (model.psd(np.full(25, 2.0)) > 5 * model.psd_still).all()
+    assert (model.density(np.full(25, 2.0)) > 5 * model.psd_still).all()

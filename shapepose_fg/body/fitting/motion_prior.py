@@ -41,7 +41,7 @@ class MotionPrior:
     provenance: str
     """Where the motions came from and how the prior was made."""
     law: Motion = CONSTANT_VELOCITY
-    """How the numbers move; `acceleration` becomes the density of its noise (`Motion.per_acceleration`)."""
+    """How the numbers move; `acceleration` becomes the density of its noise (`Motion.density`)."""
 
     def __post_init__(self) -> None:
         for name in _ARRAYS:
@@ -74,7 +74,7 @@ class MotionPrior:
     def part(self, angles: NDArray[np.intp]) -> tuple[Array, Array]:
         """Densities (N,) of the noise and the velocity of the root, some of the `angles` (A,) and the place."""
         kept = np.concatenate([np.arange(3), 3 + angles, np.arange(-3, 0) + NUM_MOVING])
-        return self.law.per_acceleration * self.acceleration[kept], self.velocity[kept]
+        return self.law.density(self.acceleration[kept]), self.velocity[kept]
 
 
 @lru_cache(maxsize=1)
