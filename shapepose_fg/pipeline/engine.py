@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from shapepose_fg.body.fitting.bone_reach import longest_bones
 from shapepose_fg.body.fitting.fitter import BodyFitter
+from shapepose_fg.body.fitting.priors import longest_bones
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.observations import Observations
@@ -105,7 +105,7 @@ class Setup:
         tracker = Tracker(
             skeleton, scale, find, tracking, config.observations, weak_births=config.temporal, drop=book.drop_in
         )
-        return Engine(tracker, config.following, config.batch_frames, config.windows.overlap_s)
+        return Engine(tracker, config)
 
 
 def find_people(

@@ -1,40 +1,24 @@
-"""Frames in, solved rows out: people are followed, and solved in windows of frames that overlap.
+"""Frames in, windows out: people are followed, and wait to be solved in windows of frames that overlap.
 
 `Engine.follow` goes from (frames, state) to (windows, state): it is quick, and memory does not grow with the
-recording. `Setup.solve` (`pipeline/engine.py`) goes from a window to rows: windows know nothing of each other, and
-are solved here or in other processes.
+recording. Windows know nothing of each other, and are solved here or in other processes (`Setup.solve`).
 """
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
-from annotated_types import Interval
 from numpy.typing import NDArray
 
-from shapepose_fg.core.bounds import RepeatsOrNone, Settings
-from shapepose_fg.tracking.following import Decided, FollowingConfig, FollowState, alone, finish, follow
+from shapepose_fg.pipeline.config import PipelineConfig
+from shapepose_fg.pipeline.config import WindowConfig as WindowConfig
+from shapepose_fg.tracking.following import Decided, FollowState, alone, finish, follow
 from shapepose_fg.tracking.hypotheses import Input
 from shapepose_fg.tracking.tracker import Tracker
 
 
-@dataclass(frozen=True)
-class WindowConfig(Settings):
-    """How frames are cut into windows."""
-
-    overlap_s: Annotated[float, Interval(ge=0, le=60)] = 0.4
-    """What a window takes of the frames before and after its own, and does not return: smoothing reaches a few
-    frames. Windows of other lengths move joints by under 2 mm in the median (tests/test_windows.py)."""
-    again_over_time: RepeatsOrNone = 3
-    """How often detections are reassociated around a draft of a window: fewer rounds are faster."""
-    again_alone: RepeatsOrNone = 5
-    """The same frame by frame; 0: never, as in the paper. From round to round more is asked of who stays
-    (`Survival`): who goes leaves detections to others, so the least sure goes first. Fewer rounds are faster."""
-
-
 def window_stop(start: int, end: int, frames: int) -> int:
-    """Where the window that begins at `start` stops, of `frames` frames, in a stretch that ends before `end`.
+    """Where the window that begins at `start` stops, of `frames` frames, in a segment that ends before `end`.
 
     The last takes up to half a window more: one of a few frames would know its people less well than the others.
     """
@@ -75,16 +59,12 @@ class StreamState:
 
 @dataclass(frozen=True)
 class Engine:
-    """All steps from frames to rows, and their settings."""
+    """From frames to windows whose people are known."""
 
     tracker: Tracker
     """Follows people; finds new ones."""
-    following: FollowingConfig
-    """What becomes of tracks."""
-    frames: int
-    """Frames that a window returns."""
-    overlap_s: float
-    """`WindowConfig.overlap_s`."""
+    config: PipelineConfig
+    """What becomes of tracks, and how frames are cut into windows."""
 
     def start(self, next_id: int = 0) -> StreamState:
         """Before the first frame, or after a cut; identities count from `next_id`."""
@@ -99,7 +79,7 @@ class Engine:
         """
         following, decided = state.follow, list(state.decided)
         for frame in frames:
-            following, more = follow(self.tracker, following, frame, self.following)
+            following, more = follow(self.tracker, following, frame, self.config.following)
             decided += more
         if last:
             following, more = finish(self.tracker, following)
@@ -122,7 +102,7 @@ class Engine:
 
     def _next(self, decided: Sequence[Decided], before: int, last: bool) -> tuple[int, int] | None:
         """Where the next window's own frames stop, and where it ends; None where there is too little."""
-        stop = window_stop(before, len(decided), self.frames)
+        stop = window_stop(before, len(decided), self.config.batch_frames)
         if stop < len(decided):
             end = self._overlap(decided, stop, 1)
             if end < len(decided) or last:
@@ -132,6 +112,5 @@ class Engine:
     def _overlap(self, decided: Sequence[Decided], at: int, direction: int) -> int:
         """The frame `overlap_s` before or after the border at `at`."""
         times = np.array([frame.time_s.mean() for frame, _ in decided])
-        border = times[min(at, len(times) - 1)]
-        near = near_border(times, border, self.overlap_s)
+        near = near_border(times, times[min(at, len(times) - 1)], self.config.windows.overlap_s)
         return int(np.flatnonzero(near)[0]) if direction < 0 else int(np.flatnonzero(near)[-1]) + 1

@@ -20,7 +20,7 @@ from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, 
 from shapepose_fg.estimation.solve_window import solve_window
 from shapepose_fg.estimation.window_graph import WindowGraph
 from shapepose_fg.estimation.window_solution import WindowSolution
-from shapepose_fg.pipeline.solved_rows import result_rows
+from shapepose_fg.pipeline.solved_windows import result_rows
 
 WRIST, ELBOW, KNEE = 4, 3, 13
 

@@ -1,4 +1,4 @@
-"""Rows of people over time as chains, the motion prior along them, and the linear systems of chains."""
+"""Rows of people over time as chains: how they are cut, the motion prior along them, their linear systems."""
 
 from dataclasses import dataclass
 
@@ -54,22 +54,8 @@ def cut_segments(
     return segments
 
 
-@dataclass(frozen=True)
-class MotionTerm:
-    """The motion prior of G chains of up to T rows at some parameters, as a part of a least-squares problem."""
-
-    energy: Tensor
-    """(G,) squared standard deviations."""
-    gradient: Tensor
-    """(T, G, N) half the gradient."""
-    diagonal: Tensor
-    """(T, G, N) of half the Hessian: couplings of one number with itself only."""
-    beyond: Tensor
-    """(T, G, N, n) coupling of a row with the next, the one after, and so on."""
-
-
 class Links:
-    """`MotionPrior` along G chains.
+    """`MotionPrior` along G chains of up to T rows of N numbers, as a part of a least-squares problem.
 
     A model of motion of order n (`factors.Motion`) links n + 1 rows that follow each other: how the last
     derivative of a state goes on, the derivatives being differences of rows. The root's rotation moves in tangents
@@ -77,7 +63,12 @@ class Links:
     from frame to frame; its gradient is exact.
     """
 
-    def __init__(self, motion: Motion, density: Array, velocity: Array, step_s: Tensor):
+    diagonal: Tensor
+    """(T, G, N) of half the Hessian: couplings of one number with itself only."""
+    beyond: Tensor
+    """(T, G, N, n) coupling of a row with the next, the one after, and so on."""
+
+    def __init__(self, law: Motion, acceleration: Array, velocity: Array, step_s: Tensor):
         """Densities (N,) as in `MotionPrior`; `step_s` (T - 1, G) seconds from row to row, infinite past the end.
 
         T is n or more: a single row is one with nothing after it.
@@ -87,17 +78,17 @@ class Links:
         self._slow = torch.where(real, step_s, 0.0)[..., None] / torch.from_numpy(velocity)
         # What goes on: the derivative of this order in velocities v_k, v_k+1, ..., weighted.
         gaps, weights = step_s, [torch.ones_like(step_s)[..., None]]
-        for order in range(2, motion.order + 1):
+        for order in range(2, law.order + 1):
             gaps = (gaps[1:] + gaps[:-1]) / 2
             gaps = torch.where(gaps.isfinite(), gaps, 1.0)
-            last = order == motion.order
-            lasts = torch.from_numpy(motion.transition(gaps.numpy())[..., -1, -1]) if last else 1.0 + 0 * gaps
+            last = order == law.order
+            lasts = torch.from_numpy(law.transition(gaps.numpy())[..., -1, -1]) if last else 1.0 + 0 * gaps
             width = (1.0 + 0 * gaps if last else gaps)[..., None]
             none = 0 * weights[0]
             pairs = zip([*weights, none], [none, *weights], strict=True)
             weights = [(after[1:] - lasts[..., None] * here[:-1]) / width for here, after in pairs]
-        self._weights, n = weights, motion.order
-        noise = torch.from_numpy(motion.noise(gaps.numpy()[..., None], density)[..., -1, -1])
+        self._weights, n = weights, law.order
+        noise = torch.from_numpy(law.noise(gaps.numpy()[..., None], law.density(acceleration))[..., -1, -1])
         self._smooth = real[n - 1 :, :, None] / noise
         # In velocities the prior is banded: slow v² + smooth (weights v)².
         self._bands = [self._slow.clone(), *(0 * self._slow[k:] for k in range(1, n))]
@@ -105,9 +96,14 @@ class Links:
             for k in range(n - i):
                 part = slice(i, i + len(self._smooth))
                 self._bands[k][part] += self._smooth * weights[i] * weights[i + k]
+        self.diagonal, *beyond = self._couplings()
+        self.beyond = torch.stack(beyond, -1)
 
-    def at(self, root: Tensor, others: Tensor) -> MotionTerm:
-        """At rotations of the root (T, G, 3, 3) and everything else (T, G, N - 3), double precision."""
+    def at(self, root: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
+        """Energy (G,) in squared standard deviations, and half its gradient (T, G, N).
+
+        At rotations of the root (T, G, 3, 3) and everything else (T, G, N - 3), double precision.
+        """
         turn = log_so3(root[1:] @ root[:-1].mT)
         v = self._rate * torch.cat((turn, others[1:] - others[:-1]), -1)
         K = len(self._smooth)
@@ -124,9 +120,7 @@ class Links:
         after[..., :3] = (inverse @ force[..., :3, None]).squeeze(-1)
         before[..., :3] = (inverse.mT @ force[..., :3, None]).squeeze(-1)
         edge = torch.zeros_like(v[:1])
-        gradient = torch.cat((edge, after)) - torch.cat((before, edge))
-        diagonal, *beyond = self._couplings()
-        return MotionTerm(energy, gradient, diagonal, torch.stack(beyond, -1))
+        return energy, torch.cat((edge, after)) - torch.cat((before, edge))
 
     def _couplings(self) -> list[Tensor]:
         """H = V^T M V with V the differences of rows, M banded: diagonal, next, next but one, ... (T, G, N)."""
