@@ -111,7 +111,8 @@ class ConstantVelocity(Motion):
     """
 
     def _factors(self, states: NDArray[np.int64], times: Array, densities: Array) -> list[gtsam.NonlinearFactor]:
-        every = [gtsam.StateData(*keys, time) for keys, time in zip(states.tolist(), times.tolist(), strict=True)]
+        states_at = zip(*states.T.tolist(), times.tolist(), strict=True)
+        every = [gtsam.StateData(position, velocity, time) for position, velocity, time in states_at]
         diagonals = np.repeat(densities[:, None], 3, axis=1)
         return list(map(gtsam.WnoaMotionFactorPoint3, every[:-1], every[1:], diagonals))
 
@@ -144,7 +145,7 @@ def motion_factors(
 
 def motion_covariance(dt_s: ArrayLike, psd: ArrayLike) -> Array:
     """Covariance (..., 6, 6) of [x' - x - dt v, v' - v] over steps `dt_s` (...): m², m²/s, m²/s²."""
-    return np.kron(CONSTANT_VELOCITY.noise(dt_s, psd), np.eye(3))
+    return np.asarray(np.kron(CONSTANT_VELOCITY.noise(dt_s, psd), np.eye(3)), dtype=np.float64)
 
 
 def rise(times_s: NDArray[np.float64]) -> bool:

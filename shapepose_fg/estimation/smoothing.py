@@ -88,7 +88,7 @@ def _congruent(A, P, start=None) -> list[list[Array]]:
     def entry(i: int, m: int) -> Array:
         weights = (A[i][j] * A[m][k] + (A[i][k] * A[m][j] if j < k else 0) for j, k in places)
         terms = (weight * P[j][k] for weight, (j, k) in zip(weights, places, strict=True))
-        return sum(terms, 0 if start is None else start[i][m])
+        return sum(terms, np.zeros(()) if start is None else start[i][m])
 
     return [[entry(i, m) for m in range(len(P))] for i in range(len(P))]
 
