@@ -19,15 +19,20 @@ from factors.keys import (
     reported_keys,
     split_camera_key,
     split_key,
+    state_keys,
     velocity_key,
     velocity_keys,
 )
+from factors.lasting import lasting_difference_factors, lasting_prior_factors, offset_factors
 from factors.motion import (
-    lasting_difference_factors,
-    lasting_prior_factors,
+    CONSTANT_ACCELERATION,
+    CONSTANT_VELOCITY,
+    MEASURED_S,
+    MOTIONS,
+    Motion,
+    matrices,
     motion_covariance,
     motion_factors,
-    offset_factors,
 )
 from factors.noise import (
     DEFAULT_WIDTH_SIGMA,
@@ -56,11 +61,16 @@ from factors.rank import determined, joint_information
 from factors.testing import assert_jacobian, assert_zero_at_truth
 
 __all__ = [
+    "CONSTANT_ACCELERATION",
+    "CONSTANT_VELOCITY",
     "DEFAULT_WIDTH_SIGMA",
+    "MEASURED_S",
+    "MOTIONS",
     "CameraKey",
     "JointKey",
     "Kernel",
     "KernelName",
+    "Motion",
     "assert_jacobian",
     "assert_zero_at_truth",
     "body_prior_factor",
@@ -82,6 +92,7 @@ __all__ = [
     "lasting_prior_factors",
     "make_calibration",
     "make_camera",
+    "matrices",
     "motion_covariance",
     "motion_factors",
     "offset_factors",
@@ -98,6 +109,7 @@ __all__ = [
     "split_camera_key",
     "split_key",
     "standing_factors",
+    "state_keys",
     "to_pixels",
     "velocity_key",
     "velocity_keys",

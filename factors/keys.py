@@ -24,9 +24,11 @@ MAX_JOINT = 999
 MAX_FRAME = 99_999_999
 """Largest frame number in a key: 19 days at 60 frames a second."""
 
-_JOINT, _VELOCITY, _CAMERA, _OFFSET, _REPORTED = 1, 2, 3, 4, 7
+_JOINT, _VELOCITY, _CAMERA, _OFFSET, _REPORTED, _ACCELERATION = 1, 2, 3, 4, 7, 8
+_STATE = (_JOINT, _VELOCITY, _ACCELERATION)
 _SOURCES = 3
-_NAMES = {_JOINT: "position", _VELOCITY: "velocity", _CAMERA: "camera", _REPORTED: "reported position"}
+_NAMES = {_JOINT: "position", _VELOCITY: "velocity", _ACCELERATION: "acceleration"}
+_NAMES |= {_CAMERA: "camera", _REPORTED: "reported position"}
 _NAMES |= {_OFFSET + source: f"offset {source}" for source in range(_SOURCES)}
 _PER_JOINT = MAX_FRAME + 1
 _PER_PERSON = (MAX_JOINT + 1) * _PER_JOINT
@@ -80,6 +82,13 @@ def joint_keys(person: int, joints: ArrayLike, frames: ArrayLike = 0) -> NDArray
 def velocity_keys(person: int, joints: ArrayLike, frames: ArrayLike = 0) -> NDArray[np.int64]:
     """`velocity_key` for arrays: `joints` and `frames` broadcast against each other."""
     return _pack(_VELOCITY, person, joints, frames)
+
+
+def state_keys(person: int, joints: ArrayLike, frames: ArrayLike, order: int) -> NDArray[np.int64]:
+    """Keys (..., order) of a joint's position, velocity and, where `order` is 3, acceleration (m/s²); `joints` and
+    `frames` broadcast against each other.
+    """
+    return np.stack([_pack(kind, person, joints, frames) for kind in _STATE[:order]], axis=-1)
 
 
 def offset_keys(person: int, joints: ArrayLike, frames: ArrayLike = 0, source: int = 0) -> NDArray[np.int64]:

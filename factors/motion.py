@@ -1,167 +1,159 @@
-"""How joints move: white noise on acceleration between frames, and knowledge whose error lasts.
+"""How joints move: what a motion model is, and the two that ship.
 
-Native factors only, all linear. Times may have any steps.
+A joint's state s is its position and the first n - 1 derivatives of it, along each axis by itself. A model says
+how it goes on over a step dt, whatever its length:
 
-**Motion** (Barfoot's white-noise-on-acceleration prior): between the states (x, v) of a joint at t and t + dt
+    s' = F(dt) s + w,   w ~ N(0, q Q(dt))
 
-    r = [x' - x - dt v,  v' - v]  ~  N(0, q [[dt³/3, dt²/2], [dt²/2, dt]])
+with q a density of the noise, a number for each joint and step. F and Q are all there is to a model: from them
+come the factors between two states in a graph (`Motion.factors`) and so the covariances, the tracker's prediction,
+the smoother of drafts, and the links between a person's bodies. A model of your own overrides `transition` and
+`noise`, and its name goes into `MOTIONS`.
 
-with q the power spectral density of the acceleration, m²/s³.
-
-**A slowly varying offset.** Who says every frame again where a joint is, and errs the same way every time, has
-said it once. The error of a message "the joint is at m_t, covariance C_t" is split into a share that is new in
-every frame and one that lasts, an Ornstein-Uhlenbeck chain b_t in units of standard deviations. With R_t the
-symmetric square root of the message's information, R_t C_t R_t = I, and w the white share:
-
-    r = R_t (x_t - m_t) - sqrt(1 - w) P_t b_t  ~  N(0, w I)
-    r = b' - a b                               ~  N(0, (1 - a²) I),   a = exp(-dt / correlation_s),   b_0 ~ N(0, I)
-
-P_t = R_t R_t^+ projects on what the message knows, the identity but for a ray: along the ray it says nothing of
-the joint, and so nothing of the offset either.
+`Motion` itself is white noise on the n-th derivative: on acceleration where n is 2 (Barfoot's prior), on jerk
+where it is 3.
 """
 
-from collections.abc import Iterable
-from itertools import pairwise, repeat
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import repeat
+from math import factorial
 
 import gtsam
 import numpy as np
 from gtsam import noiseModel
 from numpy.typing import ArrayLike, NDArray
 
+Array = NDArray[np.float64]
+
+ORDERS = (2, 3)
+"""Numbers of a state along an axis: position and velocity, or acceleration as well."""
+MEASURED_S = 2 / 30
+"""Over this time people's accelerations were measured: second differences at 30 frames a second."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """White noise on the derivative of the position of this `order`."""
+
+    order: int = 2
+    """n, the numbers of a state along an axis: one of `ORDERS`."""
+    start: tuple[float, ...] = (2.0,)
+    """Sigma of each derivative along an axis before anything is known: m/s, m/s²."""
+
+    def __post_init__(self) -> None:
+        if self.order not in ORDERS or len(self.start) != self.order - 1:
+            raise ValueError(f"order must be one of {ORDERS} and start that many less one, got {self}")
+
+    def transition(self, dt_s: ArrayLike) -> Array:
+        """F (..., n, n) over steps of `dt_s` (...) seconds, positive."""
+        h, places = np.asarray(dt_s, dtype=np.float64), range(self.order)
+        return matrices([[h ** (j - i) / factorial(j - i) if j >= i else 0 * h for j in places] for i in places])
+
+    def noise(self, dt_s: ArrayLike, density: ArrayLike = 1.0) -> Array:
+        """Covariance q Q (..., n, n) over steps of `dt_s` (...) seconds, positive, for densities q (...)."""
+        q, h = np.asarray(density, dtype=np.float64), dt_s if isinstance(dt_s, float) else np.asarray(dt_s)
+        left = range(self.order - 1, -1, -1)
+        # The integral over dt of u^i / i! u^j / j!.
+        return matrices(
+            [[q * h ** (i + j + 1) / ((i + j + 1) * factorial(i) * factorial(j)) for j in left] for i in left]
+        )
+
+    def density(self, acceleration: ArrayLike, within_s: float = MEASURED_S) -> Array:
+        """The density q that makes positions as uncertain after `within_s` as accelerations of this power spectral
+        density, m²/s³, do: that is what is measured of people, and they have another q on every time scale.
+        """
+        white = within_s**3 / 3
+        return np.asarray(acceleration, dtype=np.float64) * (white / self.noise(within_s)[0, 0])
+
+    def step(self, dt_s: float, density: ArrayLike) -> tuple[Array, Array]:
+        """F (n, n) and q Q (..., n, n) of a step that may be back in time: derivatives of odd order turn round."""
+        F, Q = self.transition(abs(dt_s)), self.noise(abs(dt_s), density)
+        turn = np.sign(dt_s) ** np.arange(self.order) if dt_s != 0 else np.ones(self.order)
+        both = np.outer(turn, turn)
+        return both * F, both * Q
+
+    def factors(self, keys: ArrayLike, times_s: ArrayLike, density: ArrayLike) -> list[gtsam.NonlinearFactor]:
+        """Between the T consecutive states of one joint: T - 1 native factors, all linear.
+
+        `keys` (T, n) of the states' `Point3`, position first; `times_s` (T,) rising; `density` q: one number or
+        one a step (T - 1,).
+        """
+        times, states = np.asarray(times_s, dtype=np.float64), np.asarray(keys)
+        if states.shape != (len(times), self.order):
+            raise ValueError(f"keys must be (T, {self.order}) and times_s (T,), got {states.shape}, {times.shape}")
+        if not rise(times):
+            raise ValueError("times_s must be finite and rise from state to state")
+        densities = np.broadcast_to(np.asarray(density, dtype=np.float64), max(len(times) - 1, 0))
+        if not np.all((densities > 0) & np.isfinite(densities)):
+            raise ValueError("psd must be positive and finite, m²/s³ (or m²/s⁵ of jerk)")
+        return self._factors(states, times, densities)
+
+    def _factors(self, states: NDArray[np.int64], times: Array, densities: Array) -> list[gtsam.NonlinearFactor]:
+        """A Gaussian p(s' | s) a step: r = s' - F s, whitened."""
+        eye, unit = np.eye(3), noiseModel.Unit.Create(3 * self.order)
+        linear = []
+        for before, after, dt, q in zip(
+            states[:-1].tolist(), states[1:].tolist(), np.diff(times).tolist(), densities, strict=True
+        ):
+            root = np.linalg.cholesky(np.linalg.inv(self.noise(dt, q))).T
+            blocks = np.kron(np.hstack([root, -root @ self.transition(dt)]), eye)
+            terms = list(zip([*after, *before], np.split(blocks, 2 * self.order, axis=1), strict=True))
+            conditional = gtsam.GaussianConditional(terms, self.order, np.zeros(len(blocks)), unit)
+            linear.append(gtsam.JacobianFactor(conditional))
+        return contained(linear, states)
+
+
+class ConstantVelocity(Motion):
+    """White noise on acceleration, by GTSAM's own factor.
+
+    r = [x' - x - dt v,  v' - v]  ~  N(0, q [[dt³/3, dt²/2], [dt²/2, dt]])
+    """
+
+    def _factors(self, states: NDArray[np.int64], times: Array, densities: Array) -> list[gtsam.NonlinearFactor]:
+        states_at = zip(*states.T.tolist(), times.tolist(), strict=True)
+        every = [gtsam.StateData(position, velocity, time) for position, velocity, time in states_at]
+        diagonals = np.repeat(densities[:, None], 3, axis=1)
+        return list(map(gtsam.WnoaMotionFactorPoint3, every[:-1], every[1:], diagonals))
+
+
+CONSTANT_VELOCITY = ConstantVelocity()
+"""White noise on acceleration."""
+CONSTANT_ACCELERATION = Motion(3, (2.0, 5.0))
+"""White noise on jerk."""
+MOTIONS: dict[str, Motion] = {
+    "constant velocity": CONSTANT_VELOCITY,
+    "constant acceleration": CONSTANT_ACCELERATION,
+}
+"""Models by the names that settings call them."""
+
+
+def matrices(rows: Sequence[Sequence[Array]]) -> Array:
+    """Matrices (..., n, n) from their entries (...), row by row."""
+    return np.stack([np.stack(np.broadcast_arrays(*row), axis=-1) for row in rows], axis=-2)
+
 
 def motion_factors(
     keys: ArrayLike, velocity_keys: ArrayLike, times_s: ArrayLike, psd: ArrayLike
-) -> list[gtsam.NoiseModelFactor]:
-    """White noise on acceleration between the T consecutive states of one joint: T - 1 native factors.
-
-    `keys` (T,) of the positions, `velocity_keys` (T,), `times_s` (T,) rising; `psd` in m²/s³: one number or one a
-    step (T - 1,).
-    """
-    times = np.asarray(times_s, dtype=np.float64)
+) -> list[gtsam.NonlinearFactor]:
+    """`CONSTANT_VELOCITY.factors` of positions `keys` (T,) and velocities `velocity_keys` (T,)."""
     positions, velocities = np.asarray(keys), np.asarray(velocity_keys)
-    if not positions.shape == velocities.shape == times.shape == (len(times),):
-        raise ValueError(
-            "keys, velocity_keys and times_s must be (T,), got"
-            f" {positions.shape}, {velocities.shape}, {times.shape}"
-        )
-    if not _rise(times):
-        raise ValueError("times_s must be finite and rise from state to state")
-    densities = np.broadcast_to(np.asarray(psd, dtype=np.float64), max(len(times) - 1, 0))
-    if not np.all((densities > 0) & np.isfinite(densities)):
-        raise ValueError("psd must be positive and finite, m²/s³")
-    states = list(map(gtsam.StateData, positions.tolist(), velocities.tolist(), times.tolist()))
-    diagonals = np.repeat(densities[:, None], 3, axis=1)
-    return list(map(gtsam.WnoaMotionFactorPoint3, states[:-1], states[1:], diagonals))
+    if positions.shape != velocities.shape:
+        raise ValueError(f"keys and velocity_keys must be (T,), got {positions.shape}, {velocities.shape}")
+    return CONSTANT_VELOCITY.factors(np.stack([positions, velocities], axis=-1), times_s, psd)
 
 
-def offset_factors(
-    offset_keys: ArrayLike, times_s: ArrayLike, correlation_s: float
-) -> list[gtsam.NonlinearFactor]:
-    """The chain of offsets b_t: a unit prior on the first, then T - 1 links that forget within `correlation_s`."""
-    times, keys = np.asarray(times_s, dtype=np.float64), np.asarray(offset_keys)
-    if keys.shape != times.shape or times.ndim != 1 or not _rise(times):
-        raise ValueError(
-            f"offset_keys and times_s must be (T,), times finite and rising; got {keys.shape}, {times.shape}"
-        )
-    if not (np.isfinite(correlation_s) and correlation_s > 0):
-        raise ValueError(f"correlation_s must be positive, got {correlation_s}")
-    kept = np.exp(-np.diff(times) / correlation_s)
-    scale = 1.0 / np.sqrt(-np.expm1(-2.0 * np.diff(times) / correlation_s))
-    unit, zero, eye = noiseModel.Unit.Create(3), np.zeros(3), np.eye(3)
-    links = [
-        gtsam.JacobianFactor(key, -a * s * eye, after, s * eye, zero, unit)
-        for (key, after), a, s in zip(pairwise(keys.tolist()), kept.tolist(), scale.tolist(), strict=True)
-    ]
-    first = [gtsam.PriorFactorPoint3(key, zero, unit) for key in keys[:1].tolist()]
-    return [*first, *_contained(links, keys)]
+def motion_covariance(dt_s: ArrayLike, psd: ArrayLike) -> Array:
+    """Covariance (..., 6, 6) of [x' - x - dt v, v' - v] over steps `dt_s` (...): m², m²/s, m²/s²."""
+    return np.asarray(np.kron(CONSTANT_VELOCITY.noise(dt_s, psd), np.eye(3)), dtype=np.float64)
 
 
-def lasting_prior_factors(
-    keys: ArrayLike, offset_keys: ArrayLike, means: ArrayLike, roots: ArrayLike, white_share: float
-) -> list[gtsam.NonlinearFactor]:
-    """D messages about joints whose errors last: position `keys` (D,) against `means` (D, 3) and their offsets.
-
-    Several may be about one joint, each with an offset of its own or with one for all.
-
-    `roots` (D, 3, 3), 1/m, are the symmetric square roots of the messages' information, of the whole error; they
-    may be singular (a ray). `white_share` of the error's variance, between 0 and 1, is new each time.
-    """
-    points, whiten = np.asarray(means, dtype=np.float64), np.asarray(roots, dtype=np.float64)
-    positions, offsets = np.asarray(keys), np.asarray(offset_keys)
-    count = len(positions)
-    if not (offsets.shape == (count,) and points.shape == (count, 3) and whiten.shape == (count, 3, 3)):
-        raise ValueError(
-            f"keys and offset_keys must be (D,), means (D, 3), roots (D, 3, 3), got {positions.shape}, "
-            f"{offsets.shape}, {points.shape}, {whiten.shape}"
-        )
-    if not (np.isfinite(points).all() and np.isfinite(whiten).all()):
-        raise ValueError("a mean or a root holds a value that is not finite: give no prior to such a joint")
-    if not 0 < white_share < 1:
-        raise ValueError(f"white_share must be between 0 and 1, got {white_share}")
-    scaled = whiten / np.sqrt(white_share)
-    of_offsets = -np.sqrt((1.0 - white_share) / white_share) * _projectors(whiten)
-    right = np.einsum("dij,dj->di", scaled, points)
-    linear = map(
-        gtsam.JacobianFactor, positions.tolist(), scaled, offsets.tolist(), of_offsets, right,
-        repeat(noiseModel.Unit.Create(3)),
-    )  # fmt: skip
-    return _contained(linear, np.concatenate([positions, offsets]))
-
-
-def lasting_difference_factors(
-    keys: ArrayLike,
-    of_keys: ArrayLike,
-    offset_keys: ArrayLike,
-    differences: ArrayLike,
-    covariances: ArrayLike,
-    white_share: float,
-) -> list[gtsam.NonlinearFactor]:
-    """D positions `keys` (D,) that differ from those of `of_keys` (D,) by `differences` (D, 3), metres, with
-    errors that last: of `covariances` (D, 3, 3), positive definite, m², of which `white_share` is new each time.
-
-    r = R (y - x - d) - sqrt(1 - w) b  ~  N(0, w I), with R the symmetric root of the information.
-    """
-    away, shape = np.asarray(differences, dtype=np.float64), np.shape(keys)
-    values, vectors = np.linalg.eigh(np.asarray(covariances, dtype=np.float64))
-    if not (shape == np.shape(of_keys) == np.shape(offset_keys) == away.shape[:1] == values.shape[:1]):
-        raise ValueError("keys, of_keys and offset_keys must be (D,), differences (D, 3), covariances (D, 3, 3)")
-    if not (np.isfinite(away).all() and (values > 0).all()):
-        raise ValueError("differences must be finite and covariances positive definite")
-    if not 0 < white_share < 1:
-        raise ValueError(f"white_share must be between 0 and 1, got {white_share}")
-    scaled = (vectors / np.sqrt(white_share * values)[:, None]) @ vectors.mT
-    right, every = (scaled @ away[..., None])[..., 0], [np.asarray(each) for each in (keys, of_keys, offset_keys)]
-    reported, of, offsets = (each.tolist() for each in every)
-    of_offset = repeat(-np.sqrt((1.0 - white_share) / white_share) * np.eye(3))
-    unit = repeat(noiseModel.Unit.Create(3))
-    linear = map(gtsam.JacobianFactor, reported, scaled, of, -scaled, offsets, of_offset, right, unit)
-    return _contained(linear, np.concatenate(every))
-
-
-def motion_covariance(dt_s: ArrayLike, psd: ArrayLike) -> NDArray[np.float64]:
-    """Covariance (..., 6, 6) of [x' - x - dt v, v' - v] over steps `dt_s` (...,): m², m²/s, m²/s²."""
-    dt, q = np.asarray(dt_s, dtype=np.float64), np.asarray(psd, dtype=np.float64)
-    blocks = np.stack([np.stack([dt**3 / 3, dt**2 / 2], -1), np.stack([dt**2 / 2, dt], -1)], -2)
-    return np.einsum("...ab,ij->...aibj", q[..., None, None] * blocks, np.eye(3)).reshape(*blocks.shape[:-2], 6, 6)
-
-
-def _rise(times_s: NDArray[np.float64]) -> bool:
+def rise(times_s: NDArray[np.float64]) -> bool:
     """Whether times (T,) are finite and each is after the one before."""
     return bool(np.isfinite(times_s).all() and (np.diff(times_s) > 0).all())
 
 
-def _projectors(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
-    """R R^+ of each R (D, 3, 3): the projectors on their ranges, the identity exactly where R has full rank.
-
-    Singular values below 1e-5 of the largest are rounding: the root of information that is zero up to 1e-10.
-    """
-    left, values, _ = np.linalg.svd(matrices)
-    ranged = left * (values > 1e-5 * values[:, :1])[:, None]
-    full = (values[:, 2] > 1e-5 * values[:, 0])[:, None, None]
-    return np.where(full, np.eye(3), ranged @ ranged.swapaxes(1, 2))
-
-
-def _contained(linear: Iterable[gtsam.JacobianFactor], keys: NDArray[np.int64]) -> list[gtsam.NonlinearFactor]:
+def contained(linear: Iterable[gtsam.JacobianFactor], keys: NDArray[np.int64]) -> list[gtsam.NonlinearFactor]:
     """Linear factors on `Point3` variables `keys` (D,) as factors of a nonlinear graph.
 
     They must be told that they are linearised at zero: without that their error is always 0.

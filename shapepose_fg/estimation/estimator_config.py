@@ -6,6 +6,7 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Interval
 
+from factors import CONSTANT_VELOCITY, Motion
 from shapepose_fg.core.bounds import Factor, Metres, MetresOrNone, Repeats, Settings, Share
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.linearisation import ObservationConfig
@@ -106,5 +107,7 @@ class EstimatorConfig:
     """How joints and bodies alternate."""
     motion: MotionConfig = field(default_factory=MotionConfig)
     """How frames hang together."""
+    law: Motion = CONSTANT_VELOCITY
+    """How joints move."""
     joints: tuple[str, ...] = BODY_25.joints
     """What the detector calls its joints: motion, sigmas and limbs go by them."""

@@ -7,11 +7,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from factors import CONSTANT_VELOCITY, MEASURED_S, Motion
 from shapepose_fg.core.bounds import Factor, Seconds, Settings
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import read_json
 
 FORMAT = "shapepose-fg motion model 1"
+GAP_S = 0.4
+"""So long joints were hidden whose densities across gaps were measured."""
 LOST_M = 0.1
 """A joint whose views leave it less certain than this in some direction, metres, is lost from sight."""
 
@@ -71,28 +74,34 @@ class MotionModel:
     """What the body says of a joint without the joint's own views."""
     around_s: float = 0.5
     """How long before and after a joint is lost from sight the difference between joint and body is followed."""
-    speed_m_s: float = 2.0
-    """How fast a joint is, one sigma per axis, before anything is known of it."""
+    law: Motion = CONSTANT_VELOCITY
+    """How a state goes on."""
 
-    def psd(self, speed_m_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Power spectral density (..., J) of joints of this speed (..., J)."""
-        return self.psd_still + self.psd_speed * np.asarray(speed_m_s) ** 2
+    def density(self, speed_m_s: NDArray[np.float64], within_s: float = MEASURED_S) -> NDArray[np.float64]:
+        """Density (..., J) of the noise in the motion of joints of this speed (..., J); see `Motion.density`."""
+        return self.law.density(self.psd_still + self.psd_speed * np.asarray(speed_m_s) ** 2, within_s)
+
+    def density_lost(self, speed_m_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The same while joints are lost from sight, and their speed is a guess."""
+        return np.maximum(self.density(speed_m_s, GAP_S), self.law.density(self.psd_lost, GAP_S))
 
     @classmethod
-    def load(cls, joints: tuple[str, ...], config: MotionConfig | None = None) -> "MotionModel":
-        """The model of the configuration's file for the `joints` of a detector.
+    def load(
+        cls, joints: tuple[str, ...], config: MotionConfig | None = None, law: Motion = CONSTANT_VELOCITY
+    ) -> "MotionModel":
+        """The numbers of the configuration's file for the `joints` of a detector, as the `law` has them.
 
         A joint that the file does not name moves as the mean of those that it does. InputError for a file that is
         not a motion model.
         """
         config = MotionConfig() if config is None else config
         if config.model:
-            return cls._read(Path(config.model), joints, config)
+            return cls._read(Path(config.model), joints, config, law)
         with as_file(files("shapepose_fg.estimation") / "data" / "motion.json") as path:
-            return cls._read(path, joints, config)
+            return cls._read(path, joints, config, law)
 
     @classmethod
-    def _read(cls, path: Path, joints: tuple[str, ...], config: MotionConfig) -> "MotionModel":
+    def _read(cls, path: Path, joints: tuple[str, ...], config: MotionConfig, law: Motion) -> "MotionModel":
         data = read_json(path)
         try:
             if data["format"] != FORMAT:
@@ -120,4 +129,4 @@ class MotionModel:
             )
         chosen = config.psd_scale * np.array([known.get(name, tuple(table.mean(axis=0))) for name in joints])
         still, speed, lost = np.ascontiguousarray(chosen.T)
-        return cls(still, speed, lost, views, body, config.around_s)
+        return cls(still, speed, lost, views, body, config.around_s, law)

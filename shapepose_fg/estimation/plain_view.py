@@ -22,7 +22,7 @@ ELSEWHERE_M = 0.25
 in simulated crowds before three and four cameras, whose detector knows every pose, the log score gives all of this
 no weight; an arm that is stretched out on real footage is what speaks for it."""
 SPEED_M_S = 2.0
-"""But no farther than it has moved since a view reported it, at this speed: `MotionModel.speed_m_s`."""
+"""But no farther than it has moved since a view reported it, at this speed: `factors.CONSTANT_VELOCITY.start`."""
 _BEHIND_M = 0.05
 """Limbs hide what is this much behind them."""
 _LIMBS = {

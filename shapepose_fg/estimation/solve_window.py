@@ -81,7 +81,7 @@ def solve_window(
             f"views must be of the {len(observations)} rows' {observations.confidence.shape[2]} views"
         )
     began = time.perf_counter()
-    motion = MotionModel.load(config.joints, config.motion)
+    motion = MotionModel.load(config.joints, config.motion, config.law)
 
     # Assign: detections go to whom a draft of joints and bodies puts near them, round by round.
     drafted: Draft | None = None

@@ -15,17 +15,15 @@ from factors import (
     DEFAULT_WIDTH_SIGMA,
     body_prior_factors,
     diagonal,
-    joint_keys,
     lasting_prior_factors,
     make_camera,
-    motion_factors,
     offset_factors,
     offset_keys,
     projection_factors,
     robust_kernel,
     split_key,
     standing_factors,
-    velocity_keys,
+    state_keys,
 )
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
@@ -86,10 +84,9 @@ class WindowGraph:
         self.times_s = observations.time_s.mean(axis=1)
         """(T,) time of each frame, seconds."""
         joints = np.arange(J)
-        self.keys = joint_keys(self.track, joints, self.frames[:, None])
-        """(T, J) key of each joint's position, `Point3`, metres."""
-        self.velocity_keys = velocity_keys(self.track, joints, self.frames[:, None])
-        """(T, J) key of each joint's velocity, `Point3`, m/s; not in the graph of a single frame."""
+        self.state_keys = state_keys(self.track, joints, self.frames[:, None], motion.law.order)
+        """(T, J, n) keys of each joint's state, `Point3` each: position, velocity, and what the model of motion
+        has beside these; in the graph of a single frame, positions only."""
         self.graph = gtsam.NonlinearFactorGraph()
         """The factors of the last solution."""
         self.values = gtsam.Values()
@@ -120,16 +117,26 @@ class WindowGraph:
         self._tied: list[frozenset[int]] = []
         self._present = np.zeros((T, J), dtype=bool)
 
+    @property
+    def keys(self) -> NDArray[np.int64]:
+        """(T, J) key of each joint's position, `Point3`, metres."""
+        return self.state_keys[..., 0]
+
+    @property
+    def velocity_keys(self) -> NDArray[np.int64]:
+        """(T, J) key of each joint's velocity, `Point3`, m/s; not in the graph of a single frame."""
+        return self.state_keys[..., 1]
+
     def __len__(self) -> int:
         """T, the number of frames."""
         return len(self.frames)
 
     @property
     def states(self) -> NDArray[np.int64]:
-        """(T, J, 4) keys of all that belongs to a joint in a frame: position, velocity, offset of the views and
-        offset of the body; not all of them are in every problem.
+        """(T, J, n + 2) keys of all that belongs to a joint in a frame: its state, offset of the views and offset
+        of the body; not all of them are in every problem.
         """
-        return np.stack([self.keys, self.velocity_keys, *self._offset_keys], axis=-1)
+        return np.concatenate([self.state_keys, np.moveaxis(self._offset_keys, 0, -1)], axis=-1)
 
     @property
     def present(self) -> NDArray[np.bool_]:
@@ -142,12 +149,12 @@ class WindowGraph:
         return len(self) > 1
 
     def add(self, factor: gtsam.NonlinearFactor) -> None:
-        """Append a factor of your own on any of `keys` and `velocity_keys`; it stays through all alternations.
+        """Append a factor of your own on any of `state_keys`; it stays through all alternations.
 
         While one of its variables is not in the problem, because neither views nor body nor motion place it, it
         rests. ValueError if it is on anything but this window's keys.
         """
-        own = {*self.keys.ravel().tolist(), *self.velocity_keys.ravel().tolist()}
+        own = set(self.state_keys.ravel().tolist())
         keys = set(factor.keys())
         if not keys <= own:
             raise ValueError(
@@ -314,29 +321,31 @@ class WindowGraph:
     def _motions(self, near: NDArray[np.float64], lost: NDArray[np.bool_] | None) -> list[gtsam.NonlinearFactor]:
         """Motion of the joints that are in the problem; how far they may turn goes by their speed at `near`."""
         speed = speeds(near, self.times_s)
-        psd: NDArray[np.float64] = self._motion.psd(speed)
+        density = self._motion.density(speed)
         if lost is not None:
-            psd = np.where(lost[1:] & lost[:-1], np.maximum(psd, self._motion.psd_lost), psd)
-        unknown = diagonal(np.full(3, self._motion.speed_m_s))
-        factors: list[gtsam.NonlinearFactor] = []
+            density = np.where(lost[1:] & lost[:-1], self._motion.density_lost(speed), density)
+        law, factors = self._motion.law, list[gtsam.NonlinearFactor]()
+        unknown = [diagonal(np.full(3, sigma)) for sigma in law.start]
         for joint in np.flatnonzero(self._present[0]).tolist():
-            keys, velocities = self.keys[:, joint], self.velocity_keys[:, joint]
-            factors.append(gtsam.PriorFactorPoint3(int(velocities[0]), np.zeros(3), unknown))
-            factors += motion_factors(keys, velocities, self.times_s, psd[:, joint])
+            states = self.state_keys[:, joint]
+            for key, noise in zip(states[0, 1:].tolist(), unknown, strict=True):
+                factors.append(gtsam.PriorFactorPoint3(key, np.zeros(3), noise))
+            factors += law.factors(states, self.times_s, density[:, joint])
         return factors
 
     def _start(self, initial: NDArray[np.float64], offsets: NDArray[np.bool_]) -> gtsam.Values:
-        """`initial` (T, J, 3) with its velocities; `offsets` (2, T, J) of views and body start as they ended."""
+        """`initial` (T, J, 3) with its derivatives; `offsets` (2, T, J) of views and body start as they ended."""
         values = gtsam.Values()
         insert = values.insert
         for key, point in zip(self.keys[self._present].tolist(), initial[self._present], strict=True):
             insert(key, point)
         if not self.temporal:
             return values
-        last = self.values
-        speed = np.gradient(initial, self.times_s, axis=0)
-        for key, velocity in zip(self.velocity_keys[self._present].tolist(), speed[self._present], strict=True):
-            insert(key, last.atPoint3(key) if last.exists(key) else velocity)
+        last, derivative = self.values, initial
+        for keys in np.moveaxis(self.state_keys[..., 1:], -1, 0):
+            derivative = np.gradient(derivative, self.times_s, axis=0)
+            for key, value in zip(keys[self._present].tolist(), derivative[self._present], strict=True):
+                insert(key, last.atPoint3(key) if last.exists(key) else value)
         zero = np.zeros(3)
         for key in self._offset_keys[offsets].tolist():
             insert(key, last.atPoint3(key) if last.exists(key) else zero)

@@ -5,6 +5,7 @@ from typing import Annotated, ClassVar, Literal
 
 from annotated_types import Interval
 
+from factors import MOTIONS, Motion
 from shapepose_fg.body.fitting.fitters import BodyConfig
 from shapepose_fg.core.bounds import Count, Factor, Metres, Repeats, RepeatsOrNone, Seconds, Settings, Share
 from shapepose_fg.estimation.detector_offsets import OffsetConfig
@@ -69,6 +70,14 @@ class SolvingConfig(Settings):
     weight_shape: Factor = 1.0
     """w_shape of Eq. 5, multiplies the squared distances to the body model: less for people whom it does not fit,
     in wide clothes or with a load."""
+    motion: str = "constant velocity"
+    """How joints move over time, a name in `factors.MOTIONS`: "constant velocity" (white noise on acceleration),
+    or "constant acceleration" (on jerk)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.motion not in MOTIONS:
+            raise ValueError(f"motion must be one of {', '.join(MOTIONS)}, got {self.motion}")
 
 
 _CONSTANT = "is no table any more: its settings are constants beside the steps that use them"
@@ -133,6 +142,11 @@ class PipelineConfig(Settings):
         )
 
     @property
+    def law(self) -> Motion:
+        """People over time: how joints and bodies move."""
+        return MOTIONS[self.solving.motion]
+
+    @property
     def candidates(self) -> CandidateConfig:
         """Stage I (b, c): pairs of views to 3D joint candidates."""
         rules = CandidateConfig.paper() if self.method == "paper" else CandidateConfig()
@@ -169,4 +183,4 @@ class PipelineConfig(Settings):
     @property
     def estimator(self) -> EstimatorConfig:
         """Stage II."""
-        return EstimatorConfig(self.observations, self.window_graph, self.refine, self.motion)
+        return EstimatorConfig(self.observations, self.window_graph, self.refine, self.motion, self.law)

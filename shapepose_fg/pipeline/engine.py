@@ -29,6 +29,8 @@ from shapepose_fg.tracking.tracker import BodyScale, Tracker
 
 FAST_M_S = 3.0
 """The tracker predicts joints as if they moved so fast: a hand that is thrown up or strikes."""
+UNSEEN_S = 0.3
+"""Over such gaps it must."""
 _ON_TRIAL = 0.5
 """Share of the probability asked for otherwise that is enough in frames that stand alone: a body will tell."""
 
@@ -96,8 +98,10 @@ class Setup:
         def find(detections: Detections, rig: Rig, weak: bool) -> Observations:
             return (hips if weak else sure).people(detections, rig, skeleton, book)
 
-        motion = MotionModel.load(skeleton.joints, config.motion)
-        scale = BodyScale(longest_bones(skeleton), motion.psd(np.full(len(skeleton), FAST_M_S)))
+        motion = MotionModel.load(skeleton.joints, config.motion, config.law)
+        scale = BodyScale(
+            longest_bones(skeleton), motion.density(np.full(len(skeleton), FAST_M_S), UNSEEN_S), config.law
+        )
         tracker = Tracker(
             skeleton, scale, find, tracking, config.observations, weak_births=config.temporal, drop=book.drop_in
         )

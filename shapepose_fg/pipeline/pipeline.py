@@ -127,7 +127,7 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
     detections = ThinnedFrames(task.detections, len(rig), config.candidates)
     with book.stage("load"):
         if fitter is None:
-            fitter = make_fitter(config.body, BodyModel.default().with_keypoints(skeleton.joints))
+            fitter = make_fitter(config.body, BodyModel.default().with_keypoints(skeleton.joints), config.law)
     check_fitter(fitter)
     setup = Setup(rig, skeleton, config, fitter, task.extra_factors)
     with torch_threads(config.threads):

@@ -40,7 +40,8 @@ class Solver:
     def of(cls, setup: SolvedSetup[PipelineConfig], joint_names: NDArray[np.str_]) -> "Solver":
         """What a result with these joints was solved with."""
         model = BodyModel.default() if setup.body is None else BodyModel.load(setup.body)
-        fitter = make_fitter(setup.settings.body, model.with_keypoints(tuple(joint_names.tolist())))
+        settings, names = setup.settings, tuple(joint_names.tolist())
+        fitter = make_fitter(settings.body, model.with_keypoints(names), settings.law)
         if setup.offsets is not None:
             fitter = fitter.with_keypoint_offsets(setup.offsets)
         return cls(setup.rig, setup.settings, fitter)

@@ -14,7 +14,7 @@ from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.config import WindowConfig as WindowConfig
 from shapepose_fg.tracking.following import Decided, FollowState, alone, finish, follow
 from shapepose_fg.tracking.hypotheses import Input
-from shapepose_fg.tracking.tracker import Tracker, Tracks
+from shapepose_fg.tracking.tracker import Tracker
 
 
 def window_stop(start: int, end: int, frames: int) -> int:
@@ -68,7 +68,7 @@ class Engine:
 
     def start(self, next_id: int = 0) -> StreamState:
         """Before the first frame, or after a cut; identities count from `next_id`."""
-        return StreamState(FollowState(Tracks.none(self.tracker.skeleton), next_id))
+        return StreamState(FollowState(self.tracker.nobody(), next_id))
 
     def follow(
         self, state: StreamState, frames: Iterable[Input], *, last: bool = False

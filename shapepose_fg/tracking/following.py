@@ -111,7 +111,7 @@ def _with_detections(found: Hypotheses, chosen: Chosen, *, first: bool, last: bo
 def alone(tracker: Tracker, given: Input, next_id: int) -> Observations:
     """The people whom stage I finds in a frame that has nothing to do with others, numbered from `next_id` on."""
     none = np.zeros((0, len(tracker.skeleton), len(given.rig)), dtype=np.intp)
-    places, candidate = tracker.newcomers(Tracks.none(tracker.skeleton), none, given.detections, given.rig)
+    places, candidate = tracker.newcomers(tracker.nobody(), none, given.detections, given.rig)
     return _observed(given, candidate, places, next_id + np.arange(len(places)))
 
 

@@ -173,7 +173,7 @@ def lasting(times_s: Array) -> Array:
 
 def _seeds(tracker: Tracker, frames: Sequence[Input]) -> list[Seed]:
     """Worlds beside the one that goes on: people met on the way back, and those seen in single frames."""
-    times, nobody = times_of(frames), Tracks.none(tracker.skeleton)
+    times, nobody = times_of(frames), tracker.nobody()
     none = np.zeros((0, len(tracker.skeleton), len(frames[0].rig)), dtype=np.intp)
     back = Seed(len(frames) - 1, nobody, none, forwards=False, births=True)
     parts = np.array_split(np.arange(len(frames)), max(1, round((times[-1] - times[0]) / _KEY_S)))
@@ -243,7 +243,7 @@ def _follow(
 
     Returns who was found on the way, in the same form.
     """
-    tracks, births = Tracks.none(tracker.skeleton), dict[int, int]()
+    tracks, births = tracker.nobody(), dict[int, int]()
     born = list[tuple[int, Seed, NDArray[np.intp]]]()
     begins = dict[int, list[tuple[Tracks, NDArray[np.intp]]]]()
     for world, seed, numbers in seeds:
@@ -361,7 +361,8 @@ class _Log:
         for t, ids, own, at, counts, costs in self.parts:
             there[ids, t], candidate[ids, t], places[ids, t] = True, own, at
             weight[ids, t], price[ids, t] = counts, costs
-        mean, covariance = np.zeros((H, J, 6)), np.zeros((H, J, 6, 6))
+        size = 3 * self.tracker.scale.motion.order
+        mean, covariance = np.zeros((H, J, size)), np.zeros((H, J, size, size))
         for ids, joints in self.kept:
             mean[ids], covariance[ids] = joints.mean, joints.covariance
         for span, ids, others in reversed(self.twins):

@@ -1,21 +1,24 @@
 """Where joints are, how fast they move and how surely: a Kalman filter, batched over people and joints."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+
+from factors import Motion
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class JointStates:
-    """Position and velocity of A people's J joints, a Gaussian for each joint."""
+    """States of A people's J joints, a Gaussian each: position and n - 1 derivatives (`factors.Motion`)."""
 
     mean: Array
-    """(A, J, 6) position, metres in the world, and velocity, metres per second."""
+    """(A, J, 3 n) position, metres in the world, velocity, metres per second, and so on."""
     covariance: Array
-    """(A, J, 6, 6) its covariance."""
+    """(A, J, 3 n, 3 n) its covariance."""
 
     @property
     def position(self) -> Array:
@@ -25,7 +28,7 @@ class JointStates:
     @property
     def velocity(self) -> Array:
         """(A, J, 3) metres per second."""
-        return self.mean[..., 3:]
+        return self.mean[..., 3:6]
 
     @property
     def sigma_m(self) -> Array:
@@ -59,23 +62,18 @@ class JointStates:
         )
 
     @classmethod
-    def at(cls, position: Array, sigma_m: Array, speed_mps: float) -> "JointStates":
-        """People at `position` (A, J, 3), known to `sigma_m` (A, J), at rest but for `speed_mps` on each axis."""
-        mean = np.concatenate([position, np.zeros_like(position)], axis=-1)
-        return cls(mean, _diagonal(sigma_m, np.full_like(sigma_m, speed_mps)))
+    def at(cls, position: Array, sigma_m: Array, start: Sequence[float]) -> "JointStates":
+        """People at `position` (A, J, 3), known to `sigma_m` (A, J), whose derivatives are 0, known to `start`."""
+        mean = np.concatenate([position, *[np.zeros_like(position)] * len(start)], axis=-1)
+        sigma = np.stack([sigma_m, *(np.full_like(sigma_m, each) for each in start)], axis=-1)
+        return cls(mean, np.repeat(sigma**2, 3, axis=-1)[..., None] * np.eye(mean.shape[-1]))
 
-    def predicted(self, step_s: float, psd: Array) -> "JointStates":
-        """`step_s` seconds later; accelerations are white noise of power spectral density `psd` (J,), m²/s³.
+    def predicted(self, step_s: float, motion: Motion, density: Array) -> "JointStates":
+        """`step_s` seconds later, by a model of motion with noise of this `density` (J,).
 
         A negative step predicts into the past.
         """
-        F, eye, h = np.eye(6), np.eye(3), abs(step_s)
-        F[:3, 3:] = step_s * eye
-        noise = np.zeros((len(psd), 6, 6))
-        noise[:, :3, :3] = psd[:, None, None] * eye * h**3 / 3
-        noise[:, :3, 3:] = psd[:, None, None] * eye * h**2 / 2 * np.sign(step_s)
-        noise[:, 3:, :3] = noise[:, :3, 3:]
-        noise[:, 3:, 3:] = psd[:, None, None] * eye * h
+        F, noise = (np.kron(each, np.eye(3)) for each in motion.step(step_s, density))
         return JointStates(self.mean @ F.T, F @ self.covariance @ F.T + noise)
 
     def updated(self, information: Array, pull: Array) -> "JointStates":
@@ -96,12 +94,6 @@ class JointStates:
             np.where(where[..., None, None], other.covariance, self.covariance),
         )
 
-    def with_velocity(self, velocity: Array) -> "JointStates":
-        """The same with other mean velocities (A, J, 3)."""
-        return replace(self, mean=np.concatenate([self.position, velocity], axis=-1))
-
-
-def _diagonal(position_sigma: Array, velocity_sigma: Array) -> Array:
-    """(..., 6, 6) of standard deviations (...,) of positions and velocities."""
-    variance = np.stack([position_sigma] * 3 + [velocity_sigma] * 3, axis=-1) ** 2
-    return variance[..., None] * np.eye(6)
+    def with_derivatives(self, *derivatives: Array) -> "JointStates":
+        """The same with other mean velocities (A, J, 3), and with what is beyond these."""
+        return replace(self, mean=np.concatenate([self.position, *derivatives], axis=-1))

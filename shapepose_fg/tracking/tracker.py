@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from factors import CONSTANT_VELOCITY, Motion
 from shapepose_fg.core.bounds import Count, Seconds, Settings
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import Detections
@@ -50,8 +51,6 @@ _APART_M = 0.25
 """A new person's joints are at least this far from any track's, in the mean: nearer is the same person."""
 _BIRTH_SIGMA_M = 0.04
 """Sigma of a new person's joints as stage I places them."""
-_BIRTH_SPEED_MPS = 2.0
-"""Sigma of a new person's velocities along each axis."""
 
 
 @dataclass(frozen=True)
@@ -73,8 +72,10 @@ class BodyScale:
 
     longest_m: Array
     """(J,) the longest distance of a joint to its parent on the skeleton, metres; the root's counts nothing."""
-    psd: Array
-    """(J,) power spectral density of each joint's acceleration, m²/s³."""
+    density: Array
+    """(J,) of the noise in each joint's motion (`factors.Motion`): of the acceleration, m²/s³."""
+    motion: Motion = CONSTANT_VELOCITY
+    """How joints move."""
 
 
 @dataclass(frozen=True)
@@ -93,10 +94,11 @@ class Tracks:
     """(A,) time of the last frame with evidence."""
 
     @classmethod
-    def none(cls, skeleton: Skeleton) -> "Tracks":
+    def none(cls, skeleton: Skeleton, motion: Motion = CONSTANT_VELOCITY) -> "Tracks":
         """Nobody."""
-        J, empty = len(skeleton), np.zeros(0, dtype=np.intp)
-        return cls(-np.inf, empty, empty, JointStates(np.zeros((0, J, 6)), np.zeros((0, J, 6, 6))), np.zeros(0))
+        shape, empty = (0, len(skeleton)), np.zeros(0, dtype=np.intp)
+        joints = JointStates.at(np.zeros((*shape, 3)), np.zeros(shape), motion.start)
+        return cls(-np.inf, empty, empty, joints, np.zeros(0))
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -137,6 +139,10 @@ class Tracker:
     drop: NoteDropped = lambda reason, frames: None
     """Is told why somebody was not kept, and in which frames."""
 
+    def nobody(self) -> Tracks:
+        """Tracks of no people."""
+        return Tracks.none(self.skeleton, self.scale.motion)
+
     def step(
         self, tracks: Tracks, detections: Detections, rig: Rig, time_s: float
     ) -> tuple[Tracks, NDArray[np.intp]]:
@@ -172,7 +178,7 @@ class Tracker:
         count = np.maximum(known.sum(axis=1), 1)[:, None]
         centre = (np.where(known[..., None], places, 0.0).sum(axis=1) / count)[:, None]
         sigma = np.where(known, _BIRTH_SIGMA_M, 2 * _LOST_M)
-        joints = JointStates.at(np.where(known[..., None], places, centre), sigma, _BIRTH_SPEED_MPS)
+        joints = JointStates.at(np.where(known[..., None], places, centre), sigma, self.scale.motion.start)
         return Tracks(time_s, ids, world, joints, np.full(len(places), time_s))
 
     def newcomers(
@@ -200,7 +206,7 @@ class Tracker:
         return np.concatenate(found), np.concatenate(theirs)
 
     def _predict(self, joints: JointStates, step_s: float) -> JointStates:
-        """Joints `step_s` later; an unseen joint comes to move as the person does."""
+        """Joints `step_s` later; an unseen joint comes to move as the person does, straight on."""
         core = list(self.skeleton.core)
         certainty = 1 / joints.sigma_m[:, core, None] ** 2
         at_rest = 1 / _TRUSTED_M**2  # what nothing is known of stands still: it must not drift along a ray
@@ -208,8 +214,9 @@ class Tracker:
         decay = np.exp(-abs(step_s) / _FOLLOW_S)
         unseen = (joints.sigma_m > _FOLLOW_SIGMA_M)[..., None]
         following = person[:, None] + decay * (joints.velocity - person[:, None])
-        joints = joints.with_velocity(np.where(unseen, following, joints.velocity))
-        return joints.predicted(step_s, self.scale.psd)
+        fading = np.where(unseen, decay, 1.0) * joints.mean[..., 6:]
+        joints = joints.with_derivatives(np.where(unseen, following, joints.velocity), fading)
+        return joints.predicted(step_s, self.scale.motion, self.scale.density)
 
     def _beside_neighbours(self, joints: JointStates, lost: NDArray[np.bool_]) -> JointStates:
         """Lost joints are put where their parents are, known to a bone's length; a lost root between its hips."""
@@ -229,7 +236,7 @@ class Tracker:
             covariance[row, joint] = covariance[row, above]
             covariance[row, joint, :3, 3:] = covariance[row, joint, 3:, :3] = 0.0
             covariance[row, joint, :3, :3] += (reach[joint] ** 2)[:, None, None] * np.eye(3)
-            covariance[row, joint, 3:, 3:] += np.eye(3)
+            covariance[row, joint, 3:, 3:] += np.eye(mean.shape[-1] - 3)
         return JointStates(mean, covariance)
 
     def _measure(
@@ -257,7 +264,7 @@ class Tracker:
         trusted = measured.sigma_m < _TRUSTED_M
         reach_m = self.config.assignment.farthest_m
         torn = torn_joints(at, trusted, inlier.sum(axis=-1), self.scale.longest_m, self.skeleton, reach_m)
-        doubt = np.zeros((6, 6))
+        doubt = np.zeros(joints.covariance.shape[-2:])
         doubt[:3, :3] = reach_m**2 * np.eye(3)
         doubted = JointStates(measured.mean, measured.covariance + doubt)
         measured = measured.replaced(torn, doubted)

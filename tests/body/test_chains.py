@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from shapepose_fg.body.fitting.chains import Motion, cut_segments, solve_banded
+from factors import CONSTANT_ACCELERATION, CONSTANT_VELOCITY, Motion, matrices
+from shapepose_fg.body.fitting.chains import Links, cut_segments, solve_banded
 from shapepose_fg.body.fitting.priors import NUM_MOVING, MotionPrior
 from shapepose_fg.body.model.rotation import exp_so3
 
@@ -13,38 +14,47 @@ def draw(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.from_numpy(np.random.default_rng(seed).normal(size=shape))
 
 
+@pytest.mark.parametrize("bands", [2, 3])
 @pytest.mark.parametrize("length", [2, 3, 7])
-def test_a_banded_system_is_solved(length):
+def test_a_banded_system_is_solved(length, bands):
     G, N, K = 3, 5, 2
     A = draw(length, G, N, N)
     diagonal = A @ A.mT + 4 * torch.eye(N)
-    one, two, right = (
-        0.5 * draw(length, G, N, seed=1),
-        0.3 * draw(length, G, N, seed=2),
-        draw(length, G, N, K, seed=3),
-    )
-    found = solve_banded(diagonal.clone(), one, two, right.clone())
+    scales = (0.5, 0.3, 0.2)[:bands]
+    beyond = torch.stack([scale * draw(length, G, N, seed=1 + b) for b, scale in enumerate(scales)], -1)
+    right = draw(length, G, N, K, seed=4)
+    found = solve_banded(diagonal.clone(), beyond, right.clone())
     for chain in range(G):
         H = torch.zeros(length * N, length * N, dtype=torch.float64)
         for t in range(length):
             rows = slice(t * N, t * N + N)
             H[rows, rows] = diagonal[t, chain]
-            for s, coupling in ((t + 1, one), (t + 2, two)):
-                if s < length:
-                    H[rows, s * N : s * N + N] = torch.diag(coupling[t, chain])
-                    H[s * N : s * N + N, rows] = torch.diag(coupling[t, chain])
+            for s in range(t + 1, min(t + 1 + bands, length)):
+                coupling = torch.diag(beyond[t, chain, :, s - t - 1])
+                H[rows, s * N : s * N + N] = H[s * N : s * N + N, rows] = coupling
         expected = torch.linalg.solve(H, right[:, chain].flatten(0, 1)).unflatten(0, (length, N))
         torch.testing.assert_close(found[:, chain], expected)
 
 
-@pytest.fixture
-def chain() -> tuple[Motion, torch.Tensor, torch.Tensor]:
+class Damped(Motion):
+    """Velocities that die away: another model of order 2, whose last derivative does not stay."""
+
+    def transition(self, dt_s):
+        h = np.asarray(dt_s)
+        return matrices([[1 + 0 * h, 1 - np.exp(-h)], [0 * h, np.exp(-h)]])
+
+
+LAWS = {"constant velocity": CONSTANT_VELOCITY, "constant acceleration": CONSTANT_ACCELERATION, "damped": Damped()}
+
+
+@pytest.fixture(params=LAWS.values(), ids=LAWS)
+def chain(request) -> tuple[Links, torch.Tensor, torch.Tensor]:
     """Two chains of uneven steps, the second one two rows shorter, turning a few degrees a step."""
     T, N = 6, 8
     rng = np.random.default_rng(0)
     step = torch.from_numpy(rng.uniform(0.02, 0.1, (T - 1, 2)))
     step[3:, 1] = torch.inf
-    motion = Motion(rng.uniform(0.5, 1.5, N), rng.uniform(0.1, 1.1, N), step)
+    motion = Links(request.param, rng.uniform(0.5, 1.5, N), rng.uniform(0.1, 1.1, N), step)
     root = exp_so3(0.05 * draw(T, 2, 3).cumsum(0))
     return motion, root, 0.3 * draw(T, 2, N - 3, seed=1)
 
@@ -64,7 +74,7 @@ def test_motion_s_gradient_and_couplings_are_those_of_its_energy(chain):
     for chain_, number in ((0, 3), (1, 6)):
         whole = H[:, chain_, number][:, :, chain_, number]
         ours = torch.diag(motion.diagonal[:, chain_, number])
-        for offset, coupling in ((1, motion.next_one), (2, motion.next_two)):
+        for offset, coupling in enumerate(motion.beyond.unbind(-1), start=1):
             values = coupling[:-offset, chain_, number]
             ours = ours + torch.diag(values, offset) + torch.diag(values, -offset)
         torch.testing.assert_close(ours, whole, atol=1e-8, rtol=1e-9)
@@ -72,7 +82,7 @@ def test_motion_s_gradient_and_couplings_are_those_of_its_energy(chain):
 
 def test_even_motion_costs_its_speed_alone():
     step = torch.full((9, 1), 0.1, dtype=torch.float64)
-    motion = Motion(np.full(6, 2.0), np.full(6, 0.5), step)
+    motion = Links(CONSTANT_VELOCITY, np.full(6, 2.0), np.full(6, 0.5), step)
     time = 0.1 * torch.arange(10, dtype=torch.float64)[:, None, None]
     root = exp_so3(time * torch.tensor([0.0, 0.0, 0.7], dtype=torch.float64))
     energy, _ = motion.at(root, time * torch.tensor([0.3, 0.0, 0.0], dtype=torch.float64))

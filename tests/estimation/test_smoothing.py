@@ -19,11 +19,11 @@ def test_it_is_the_least_squares_solution_over_all_frames(monkeypatch):
     joints, sigma = rng.normal(size=(T, J, 3)), rng.uniform(0.01, 0.1, T)
     covariance = np.broadcast_to((sigma**2)[:, None, None, None] * np.eye(3), (T, J, 3, 3))
     mean, found = smoothing.smoothed(joints, covariance, np.zeros(T, dtype=int), times, MOTION)
-    q = MOTION.psd(np.full(J, smoothing.SPEED_M_S))[WRIST]
+    q = MOTION.density(np.full(J, smoothing.SPEED_M_S))[WRIST]
     weight = 1 / (4 * sigma**2 + smoothing.LEAST_SIGMA_M**2)
     H, b = np.zeros((2 * T, 2 * T)), np.zeros((2 * T, 3))
     H[::2, ::2], b[::2] = np.diag(weight), weight[:, None] * joints[:, WRIST]
-    H[1, 1] += 1 / smoothing.SPEED_SIGMA_M_S**2
+    H[1, 1] += 1 / MOTION.law.start[0] ** 2
     for k, h in enumerate(np.diff(times)):
         step = np.array([[-1, -h, 1, 0], [0, -1, 0, 1]])
         noise = q * np.array([[h**3 / 3, h**2 / 2], [h**2 / 2, h]])

@@ -387,7 +387,7 @@ def test_near_in_time_reaches_both_ways():
 def test_the_motion_model_is_read_by_name_and_checked(tmp_path):
     model = MotionModel.load(("RWrist", "MidHip", "NoSuchJoint"))
     assert model.psd_still[0] > model.psd_still[1] > 0, "wrists turn faster than hips"
-    np.testing.assert_allclose(model.psd([[2.0, 0, 0]])[0, 0], model.psd_still[0] + 4 * model.psd_speed[0])
+    np.testing.assert_allclose(model.density([[2.0, 0, 0]])[0, 0], model.psd_still[0] + 4 * model.psd_speed[0])
     doubled = MotionModel.load(("RWrist",), MotionConfig(psd_scale=2.0))
     assert doubled.psd_still[0] == pytest.approx(2 * model.psd_still[0])
     (tmp_path / "other.json").write_text('{"format": "something else"}', encoding="utf-8")

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from factors import CONSTANT_VELOCITY
 from shapepose_fg.tracking.motion_filter import JointStates
 
 PSD = np.array([4.0, 9.0])
@@ -15,7 +16,7 @@ def states(seed=0):
 
 def test_a_step_ahead_is_constant_velocity_with_white_acceleration():
     before, h = states(), 0.1
-    after = before.predicted(h, PSD)
+    after = before.predicted(h, CONSTANT_VELOCITY, PSD)
     np.testing.assert_allclose(after.position, before.position + h * before.velocity)
     np.testing.assert_allclose(after.velocity, before.velocity)
     F = np.kron(np.array([[1.0, h], [0.0, 1.0]]), np.eye(3))
@@ -25,7 +26,7 @@ def test_a_step_ahead_is_constant_velocity_with_white_acceleration():
 
 def test_a_step_back_returns_to_where_it_came_from_less_certain():
     before = states()
-    there_and_back = before.predicted(0.2, PSD).predicted(-0.2, PSD)
+    there_and_back = before.predicted(0.2, CONSTANT_VELOCITY, PSD).predicted(-0.2, CONSTANT_VELOCITY, PSD)
     np.testing.assert_allclose(there_and_back.mean, before.mean, atol=1e-12)
     grown = there_and_back.covariance - before.covariance
     assert (np.linalg.eigvalsh(grown) > -1e-9).all() and np.trace(grown, axis1=2, axis2=3).min() > 0

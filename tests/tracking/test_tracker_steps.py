@@ -17,7 +17,7 @@ HIP, SHOULDER, ELBOW, WRIST = (BODY_25.index(name) for name in ("MidHip", "RShou
 def tracks_at(places, sigma_m=0.02, **known) -> Tracks:
     """Tracks 0, 1, ... of one world at `places` (A, 25, 3) at 10 s, with evidence, unless `known` says so."""
     count = len(places)
-    joints = JointStates.at(np.asarray(places, dtype=float), np.full((count, 25), sigma_m), 0.1)
+    joints = JointStates.at(np.asarray(places, dtype=float), np.full((count, 25), sigma_m), (0.1,))
     start = Tracks(10.0, np.arange(count), np.zeros(count, dtype=int), joints, np.full(count, 10.0))
     return replace(start, **known)
 
@@ -28,7 +28,7 @@ def test_an_unseen_joint_comes_to_move_as_the_person_does(tracker, two_people):
     rng = np.random.default_rng(0)
     sigma = np.where(np.arange(25) == WRIST, 0.06, rng.uniform(0.01, 0.05, (1, 25)))
     velocity = rng.normal(0, 1, (1, 25, 3))
-    before = JointStates.at(two_people[:1], sigma, 0.1).with_velocity(velocity)
+    before = JointStates.at(two_people[:1], sigma, (0.1,)).with_derivatives(velocity)
     after = tracker._predict(before, 0.25)
     certainty = sigma[0, CORE] ** -2.0
     person = certainty @ velocity[0, CORE] / (certainty.sum() + 0.1**-2)
@@ -42,8 +42,8 @@ def test_an_unseen_joint_comes_to_move_as_the_person_does(tracker, two_people):
 
 def test_a_lost_joint_is_sought_around_its_parent_and_a_lost_root_between_the_hips(tracker, two_people):
     """Bones are 0.7 m at the longest: on each axis 0.7 / 1.5 m, for each bone on the way."""
-    joints = JointStates.at(two_people, np.full((2, 25), 0.02), 0.1)
-    joints = joints.with_velocity(np.random.default_rng(0).normal(0, 1, (2, 25, 3)))
+    joints = JointStates.at(two_people, np.full((2, 25), 0.02), (0.1,))
+    joints = joints.with_derivatives(np.random.default_rng(0).normal(0, 1, (2, 25, 3)))
     lost = np.zeros((2, 25), dtype=bool)
     lost[0, [ELBOW, WRIST]] = lost[1, HIP] = True
     found = tracker._beside_neighbours(joints, lost)

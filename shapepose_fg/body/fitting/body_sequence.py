@@ -8,6 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from factors import Motion
 from shapepose_fg.body.fitting.chain_solver import ChainRows
 from shapepose_fg.body.fitting.chains import Segment, cut_segments
 from shapepose_fg.body.fitting.energy import SETTLED, BodyEnergy, Held, WhitenedTargets, factored
@@ -42,6 +43,8 @@ class SequenceFitter:
     starts: Callable[[Evidence], tuple[Tensor, Tensor | None, NDArray[np.bool_]]]
     """Bodies of rows (R) by themselves: parameters (R, P) around their centres, around which angles (R, A) they
     are held, which are good."""
+    law: Motion
+    """How they move from row to row."""
     config: BodyConfig
 
     def fit(
@@ -116,7 +119,7 @@ class SequenceFitter:
                     angles[mine] = held[chosen[np.searchsorted(ok, nearest)]]
         xyz = torch.from_numpy(evidence.xyz - origin[:, None]).float()
         targets = WhitenedTargets(xyz, torch.from_numpy(evidence.root).float())
-        rows = ChainRows(self.energy, self.config.kernel_scale, targets, angles, time_s)
+        rows = ChainRows(self.energy, self.config.kernel_scale, targets, angles, time_s, self.law)
         return free, origin, rows, found
 
     def _solved(

@@ -9,7 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from shapepose_fg.body.fitting.chains import Motion, Segment, solve_banded
+from factors import Motion
+from shapepose_fg.body.fitting.chains import Links, Segment, solve_banded
 from shapepose_fg.body.fitting.energy import BodyEnergy, Held, WhitenedTargets
 from shapepose_fg.body.fitting.priors import MotionPrior
 from shapepose_fg.body.model.rotation import exp_so3, log_so3
@@ -42,6 +43,8 @@ class ChainRows:
     """(R, A) around where the pose prior holds them; None: where it expects them."""
     time_s: Array
     """(R,) when."""
+    law: Motion
+    """How they move from row to row."""
 
     def solved(
         self, free: Tensor, segments: list[Segment], mean: Array, information: Array, *, fixed: bool
@@ -116,7 +119,7 @@ class _Batch:
 
     def __init__(self, rows: ChainRows, segments: list[Segment], mean: Tensor, firm: Tensor, fixed: bool):
         self._rows, self._mean, self._firm, self._fixed = rows, mean, firm, fixed
-        T, G = max(2, *(len(segment.rows) for segment in segments)), len(segments)
+        T, G = max(rows.law.order, *(len(segment.rows) for segment in segments)), len(segments)
         index, step = np.zeros((T, G), dtype=np.intp), np.full((T - 1, G), np.inf)
         mask = np.zeros((T, G), dtype=bool)
         for column, segment in enumerate(segments):
@@ -128,7 +131,8 @@ class _Batch:
         real = self._index[self._mask]
         self._targets = rows.targets[real]
         self._angles = None if rows.angles is None else rows.angles[real]
-        self._motion = Motion(*MotionPrior.default().part(rows.energy.angles), torch.from_numpy(step))
+        densities = MotionPrior.default().part(rows.energy.angles)
+        self._links = Links(rows.law, *densities, torch.from_numpy(step))
 
     def solved(self, free: Tensor) -> tuple[_State, Tensor]:
         """The bodies, and the information about their betas in the rows (G, 10, 10)."""
@@ -158,7 +162,7 @@ class _Batch:
         rows, free = self._rows, state.free()[self._mask]
         turn, scale = state.root[self._mask], torch.tensor(rows.kernel_scale)
         (T, G), N = self._mask.shape, free.shape[1] - 10
-        moved, moved_gradient = self._motion.at(state.root, state.others)
+        moved, moved_gradient = self._links.at(state.root, state.others)
         diagonal = torch.eye(N).double().repeat(T, G, 1, 1)
         across, gradient = diagonal.new_zeros(T, G, N, 10), diagonal.new_zeros(T, G, N)
         away = state.betas[0] - self._mean
@@ -178,7 +182,7 @@ class _Batch:
             shape.index_add_(0, chain, H[:, :10, :10])
             shape_gradient.index_add_(0, chain, g[:, :10])
             energy.index_add_(0, chain, row.energy(scale).double())
-        torch.diagonal(diagonal, dim1=-2, dim2=-1).add_(self._motion.diagonal)
+        torch.diagonal(diagonal, dim1=-2, dim2=-1).add_(self._links.diagonal)
         shape_gradient = shape_gradient + pull
         return _Normal(
             energy[None], shape_gradient[None], shape[None], gradient + moved_gradient, across, diagonal
@@ -189,7 +193,7 @@ class _Batch:
         diagonal = here.diagonal.clone()
         torch.diagonal(diagonal, dim1=-2, dim2=-1).mul_(1 + damping[:, None])
         right = torch.cat((here.gradient[..., None], here.across), -1)
-        X = solve_banded(diagonal, self._motion.next_one, self._motion.next_two, right)
+        X = solve_banded(diagonal, self._links.beyond, right)
         eliminated = (here.across.mT @ X).sum(0)  # (G, 10, 11)
         said = here.shape[0] - eliminated[..., 1:]
         if self._fixed:

@@ -7,6 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from factors import Motion
 from shapepose_fg.body.model.rotation import log_so3, right_jacobian_inverse
 
 Array = NDArray[np.float64]
@@ -53,44 +54,50 @@ def cut_segments(
     return segments
 
 
-class Motion:
+class Links:
     """`MotionPrior` along G chains of up to T rows of N numbers, as a part of a least-squares problem.
 
-    The root's rotation moves in tangents of the world, exp(delta) R, in which its coupling is as diagonal as that
-    of the other numbers, up to the turn from frame to frame; its gradient is exact.
+    A model of motion of order n (`factors.Motion`) links n + 1 rows that follow each other: how the last
+    derivative of a state goes on, the derivatives being differences of rows. The root's rotation moves in tangents
+    of the world, exp(delta) R, in which its coupling is as diagonal as that of the other numbers, up to the turn
+    from frame to frame; its gradient is exact.
     """
 
     diagonal: Tensor
     """(T, G, N) of half the Hessian: couplings of one number with itself only."""
-    next_one: Tensor
-    """(T, G, N) coupling of a row with the next."""
-    next_two: Tensor
-    """(T, G, N) coupling of a row with the one after."""
+    beyond: Tensor
+    """(T, G, N, n) coupling of a row with the next, the one after, and so on."""
 
-    def __init__(self, acceleration: Array, velocity: Array, step_s: Tensor):
+    def __init__(self, law: Motion, acceleration: Array, velocity: Array, step_s: Tensor):
         """Densities (N,) as in `MotionPrior`; `step_s` (T - 1, G) seconds from row to row, infinite past the end.
 
-        T is 2 or more: a single row is one with nothing after it.
+        T is n or more: a single row is one with nothing after it.
         """
         real = step_s.isfinite()
         self._rate = torch.where(real, 1 / step_s, 0.0)[..., None]
-        slow = torch.where(real, step_s, 0.0)[..., None] / torch.from_numpy(velocity)
-        pair = torch.where(real[1:], (step_s[1:] + step_s[:-1]) / 2, 1.0)[..., None]
-        smooth = real[1:, :, None] / (pair * torch.from_numpy(acceleration))
-        edge = torch.zeros_like(slow[:1])
-        # In velocities the prior is tridiagonal, slow v² + smooth (v_next - v)²; in rows it is V^T M V, with their
-        # differences V.
-        self._own = slow + torch.cat((edge, smooth)) + torch.cat((smooth, edge))
-        self._slow, self._smooth = slow, smooth
-        own = self._rate.square() * self._own
-        across = self._rate[:-1] * self._rate[1:] * -smooth  # v_k with v_k+1
-        self.diagonal = torch.cat((edge, own)) + torch.cat((own, edge))
-        self.diagonal[1:-1] -= 2 * across
-        one = -own.clone()
-        one[1:] += across
-        one[:-1] += across
-        self.next_one = torch.cat((one, edge))
-        self.next_two = torch.cat((-across, edge, edge))[: len(self.diagonal)]
+        self._slow = torch.where(real, step_s, 0.0)[..., None] / torch.from_numpy(velocity)
+        # What goes on: the derivative of this order in velocities v_k, v_k+1, ..., weighted.
+        gaps, weights = step_s, [torch.ones_like(step_s)[..., None]]
+        for order in range(2, law.order + 1):
+            gaps = (gaps[1:] + gaps[:-1]) / 2
+            gaps = torch.where(gaps.isfinite(), gaps, 1.0)
+            last = order == law.order
+            lasts = torch.from_numpy(law.transition(gaps.numpy())[..., -1, -1]) if last else 1.0 + 0 * gaps
+            width = (1.0 + 0 * gaps if last else gaps)[..., None]
+            none = 0 * weights[0]
+            pairs = zip([*weights, none], [none, *weights], strict=True)
+            weights = [(after[1:] - lasts[..., None] * here[:-1]) / width for here, after in pairs]
+        self._weights, n = weights, law.order
+        noise = torch.from_numpy(law.noise(gaps.numpy()[..., None], law.density(acceleration))[..., -1, -1])
+        self._smooth = real[n - 1 :, :, None] / noise
+        # In velocities the prior is banded: slow v² + smooth (weights v)².
+        self._bands = [self._slow.clone(), *(0 * self._slow[k:] for k in range(1, n))]
+        for i in range(n - 1, -1, -1):
+            for k in range(n - i):
+                part = slice(i, i + len(self._smooth))
+                self._bands[k][part] += self._smooth * weights[i] * weights[i + k]
+        self.diagonal, *beyond = self._couplings()
+        self.beyond = torch.stack(beyond, -1)
 
     def at(self, root: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
         """Energy (G,) in squared standard deviations, and half its gradient (T, G, N).
@@ -99,11 +106,13 @@ class Motion:
         """
         turn = log_so3(root[1:] @ root[:-1].mT)
         v = self._rate * torch.cat((turn, others[1:] - others[:-1]), -1)
-        change = v[1:] - v[:-1]
-        energy = (self._slow * v.square()).sum((0, 2)) + (self._smooth * change.square()).sum((0, 2))
-        force = self._own * v
-        force[:-1] += -self._smooth * v[1:]
-        force[1:] += -self._smooth * v[:-1]
+        K = len(self._smooth)
+        change = sum(weight * v[i : i + K] for i, weight in reversed(list(enumerate(self._weights))))
+        energy = (self._slow * v.square()).sum((0, 2)) + (self._smooth * change**2).sum((0, 2))
+        force = self._bands[0] * v
+        for k, band in enumerate(self._bands[1:], start=1):
+            force[:-k] += band * v[k:]
+            force[k:] += band * v[:-k]
         force = self._rate * force
         after, before = force.clone(), force.clone()
         inverse = right_jacobian_inverse(turn)
@@ -113,8 +122,22 @@ class Motion:
         edge = torch.zeros_like(v[:1])
         return energy, torch.cat((edge, after)) - torch.cat((before, edge))
 
+    def _couplings(self) -> list[Tensor]:
+        """H = V^T M V with V the differences of rows, M banded: diagonal, next, next but one, ... (T, G, N)."""
+        edge, rate = torch.zeros_like(self._slow[:1]), self._rate
+        found = [torch.cat((edge, 0 * self._slow)) for _ in range(len(self._bands) + 1)]
+        for k, band in enumerate(self._bands):  # v_i with v_i+k
+            L = len(band)
+            across = rate[:L] * rate[k:] * band
+            found[k][1 : 1 + L] += across
+            found[k][:L] += across
+            found[k + 1][:L] -= across
+            if k > 0:
+                found[k - 1][1 : 1 + L] -= 2 * across if k == 1 else across
+        return found
 
-def solve_banded(diagonal: Tensor, next_one: Tensor, next_two: Tensor, right: Tensor) -> Tensor:
+
+def solve_banded(diagonal: Tensor, beyond: Tensor, right: Tensor) -> Tensor:
     """X (T, G, N, K) with H X = `right`, for G symmetric positive definite H of T blocks each.
 
     Block elimination along the chain: time and memory grow with T, not with its square. A chain that is shorter
@@ -123,31 +146,30 @@ def solve_banded(diagonal: Tensor, next_one: Tensor, next_two: Tensor, right: Te
     Parameters
     ----------
     diagonal: (T, G, N, N) blocks H_tt; is overwritten.
-    next_one: (T, G, N) diagonal of H_t,t+1, which is a diagonal matrix; of the last row nothing is used.
-    next_two: (T, G, N) the same of H_t,t+2.
+    beyond: (T, G, N, B) diagonals of H_t,t+1 to H_t,t+B, which are diagonal matrices; unused past the end.
     right: (T, G, N, K); is overwritten.
     """
-    T, _, N, _ = diagonal.shape
-    lower, upper = [], []
-    coupling = torch.diag_embed(next_one[0])
+    (T, _, N, _), B = diagonal.shape, beyond.shape[-1]
+    lower, upper, fills = [], [], dict[tuple[int, int], Tensor]()
     for t in range(T):
         factor = torch.linalg.cholesky_ex(diagonal[t])[0]
-        beyond = torch.diag_embed(next_two[t])
-        solved = torch.linalg.solve_triangular(factor, torch.cat((coupling, beyond, right[t]), -1), upper=False)
-        right[t] = solved[..., 2 * N :]
+        blocks = torch.diag_embed(beyond[t].movedim(-1, 0))
+        ahead = [blocks[b] - fills.pop((t, b)) if (t, b) in fills else blocks[b] for b in range(B)]
+        solved = torch.linalg.solve_triangular(factor, torch.cat((*ahead, right[t]), -1), upper=False)
+        right[t] = solved[..., B * N :]
         lower.append(factor)
-        upper.append(solved[..., : 2 * N])
-        if t + 1 < T:
-            fill = solved[..., : 2 * N].mT @ solved
-            diagonal[t + 1] -= fill[:, :N, :N]
-            right[t + 1] -= fill[:, :N, 2 * N :]
-            coupling = torch.diag_embed(next_one[t + 1]) - fill[:, :N, N : 2 * N]
-        if t + 2 < T:
-            diagonal[t + 2] -= fill[:, N:, N : 2 * N]
-            right[t + 2] -= fill[:, N:, 2 * N :]
+        upper.append(solved[..., : B * N])
+        fill = solved[..., : B * N].mT @ solved
+        for a in range(min(B, T - 1 - t)):  # what row t leaves to those ahead of it
+            rows = fill[:, a * N : a * N + N]
+            diagonal[t + 1 + a] -= rows[..., a * N : a * N + N]
+            right[t + 1 + a] -= rows[..., B * N :]
+            for b in range(a + 1, B):
+                key, block = (t + 1 + a, b - a - 1), rows[..., b * N : b * N + N]
+                fills[key] = fills[key] + block if key in fills else block
     nothing = torch.zeros_like(right[0])
     for t in range(T - 1, -1, -1):
-        ahead = [right[s] if s < T else nothing for s in (t + 1, t + 2)]
+        ahead = [right[s] if s < T else nothing for s in range(t + 1, t + B + 1)]
         rest = right[t] - upper[t] @ torch.cat(ahead, -2)
         right[t] = torch.linalg.solve_triangular(lower[t].mT, rest, upper=True)
     return right

@@ -8,6 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from factors import CONSTANT_VELOCITY, Motion
 from shapepose_fg.body.fitting.body_sequence import SequenceFitter
 from shapepose_fg.body.fitting.energy import BodyEnergy, Held
 from shapepose_fg.body.fitting.evidence import Evidence, weigh
@@ -50,19 +51,21 @@ _SPREAD = {"RWrist": 2.0, "LWrist": 2.0}
 says: without it, 85 % of the wrists of the validation subjects (training.motions) lay in their 90 % ellipsoids."""
 
 
-def make_fitter(config: BodyConfig | None = None, model: BodyModel | None = None) -> "SmplFitter":
-    """The fitter that `config` asks for, on `model` or the shipped body.
+def make_fitter(
+    config: BodyConfig | None = None, model: BodyModel | None = None, law: Motion = CONSTANT_VELOCITY
+) -> "SmplFitter":
+    """The fitter that `config` asks for, on `model` or the shipped body; over time bodies move by this `law`.
 
     InputError where the network is asked for and its weights are missing, or for another body.
     """
     config = BodyConfig() if config is None else config
     model = BodyModel.default() if model is None else model
     if config.method == "plain":
-        return SmplFitter(model, config=config)
+        return SmplFitter(model, config=config, law=law)
     weights = FitterWeights.load(Path(config.weights)) if config.weights else FitterWeights.default()
     if config.method == "auto" and not config.weights and fingerprint(model) != weights.body:
-        return SmplFitter(model, config=config)
-    return SmplFitter(model, config=config, weights=weights)
+        return SmplFitter(model, config=config, law=law)
+    return SmplFitter(model, config=config, weights=weights, law=law)
 
 
 class SmplFitter(BodyFitter):
@@ -82,10 +85,13 @@ class SmplFitter(BodyFitter):
         pose_prior: PosePrior | None = None,
         config: BodyConfig | None = None,
         weights: FitterWeights | None = None,
+        law: Motion = CONSTANT_VELOCITY,
     ):
         self.model = BodyModel.default() if model is None else model
         self.prior = PosePrior.default() if pose_prior is None else pose_prior
         self.config = config = BodyConfig() if config is None else config
+        self.law = law
+        """How bodies of a person move from row to row."""
         self.weights = weights
         """Of the network; None: it is off."""
         self.energy = BodyEnergy(self.model.to(torch.float32), self.prior)
@@ -103,7 +109,8 @@ class SmplFitter(BodyFitter):
 
     def with_keypoint_offsets(self, offsets: KeypointOffsets) -> "SmplFitter":
         """The same fitter for a detector that puts its joints so far from the body's."""
-        return SmplFitter(self.model.with_keypoint_offsets(offsets), self.prior, self.config, self.weights)
+        model = self.model.with_keypoint_offsets(offsets)
+        return SmplFitter(model, self.prior, self.config, self.weights, self.law)
 
     @torch.inference_mode()
     def fit(
@@ -134,7 +141,7 @@ class SmplFitter(BodyFitter):
         fixed_shapes: bool = False,
     ) -> SequenceFit:
         """See `BodyFitter`."""
-        sequence = SequenceFitter(self.energy, self._starts, self.config)
+        sequence = SequenceFitter(self.energy, self._starts, self.law, self.config)
         return sequence.fit(targets, groups, time_s, shapes, fixed_shapes=fixed_shapes)
 
     def _fit(

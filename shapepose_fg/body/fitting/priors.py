@@ -8,10 +8,8 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.core.storage.npz import read_npz
@@ -149,6 +147,10 @@ def longest_bones(skeleton: Skeleton) -> Array:
     The 99.9 % quantile over bodies within three standard deviations of shape, in poses drawn from the pose prior,
     with a margin. Joints that the body does not have get the longest of all.
     """
+    import torch  # not before bodies are asked for: who only imports this needs none
+
+    from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
+
     known = [j for j, name in enumerate(skeleton.joints) if name in BODY_POINTS]
     model = BodyModel.default().with_keypoints(tuple(skeleton.joints[j] for j in known))
     rng = np.random.default_rng(0)

@@ -86,7 +86,7 @@ def carry_out(known: Prepared, execution: Execution, *, resume: bool = False, re
         fitter = None
         if asked.body is not None:
             model = BodyModel.load(asked.body).with_keypoints(recording.skeleton.joints)
-            fitter = make_fitter(settings.body, model)
+            fitter = make_fitter(settings.body, model, settings.law)
         task = Task(recording, rig, settings, span, times, cuts, fitter=fitter)
         inputs = reading.checksums((known.calibration, *recording.sources, *files[1:]))
         if settings.offsets.source not in ("recording", "none"):
