@@ -174,26 +174,24 @@ def _client(address: str) -> Iterator[Any]:
 
 def _refuse_other_programs(client: Any, address: str) -> None:
     """InputError where a process has another version of this program, or of what decides on numbers."""
-    own = _program()
     for process, theirs in client.run(_program, on_error="return").items():
         if not isinstance(theirs, dict):
-            reason = " ".join(str(theirs).split())[:200]
             raise InputError(
-                f"--cluster {address}: its process {process} cannot run this program ({reason}); install"
-                ' "shapepose-fg[cluster]" there'
+                f"--cluster {address}: its process {process} cannot run this program"
+                f' ({" ".join(str(theirs).split())[:200]}); install "shapepose-fg[cluster]" there'
             )
-        other = _other_version(own, theirs)
-        if other is not None:
-            raise InputError(f"--cluster {address}: its process {process} has {other}")
+        _refuse_other(f"--cluster {address}: its process {process}", _program(), theirs)
 
 
-def _other_version(own: dict[str, str], theirs: dict[str, str]) -> str | None:
-    """What the program of another process has another version of, with the cure; None where both are the same."""
+def _refuse_other(process: str, own: dict[str, str], theirs: dict[str, str]) -> None:
+    """InputError where the program of a process has another version of anything than `own`."""
     other = next((name for name in own if theirs.get(name) != own[name]), None)
-    if other is None:
-        return None
-    which = f" ({theirs.get(other)} there, {own[other]} here)" if other != _ITSELF else ""
-    return f"another version of {other}{which}; install the same there, or results would depend on who did what"
+    if other is not None:
+        which = f" ({theirs.get(other)} there, {own[other]} here)" if other != _ITSELF else ""
+        raise InputError(
+            f"{process} has another version of {other}{which}; install the same there, or results would depend on"
+            " who did what"
+        )
 
 
 _ITSELF = "shapepose-fg itself"
@@ -228,15 +226,13 @@ def _same(shared: Shared) -> Shared:
 
 
 def _work(program: tuple[tuple[str, str], ...], work: Callable[[Any, Any], Any], shared: Any, item: Any) -> Any:
-    """One item, in a process of the cluster; InputError where it has another `program` than who asks.
+    """One item, in a process of the cluster; InputError where it has another `program` than the one that asks.
 
     Processes may come at any time, after the others were looked at.
     """
     import torch
 
-    other = _other_version(dict(program), _program())
-    if other is not None:
-        raise InputError(f"--cluster: one of its processes, {socket.gethostname()}, has {other}")
+    _refuse_other(f"--cluster: one of its processes, {socket.gethostname()},", dict(program), _program())
     if torch.get_num_threads() != 1:
         torch.set_num_threads(1)
     return work(shared, item)

@@ -11,25 +11,16 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import forkserver, get_context, resource_tracker
-from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 if TYPE_CHECKING:
     from multiprocessing.context import ForkServerContext, SpawnContext
 
 Shared = TypeVar("Shared")
-Given = TypeVar("Given", covariant=True)
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-
-
-class Pool(Protocol[Given]):
-    """Processes that do the same work for many items, each with what is shared."""
-
-    def map(self, work: Callable[[Given, Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-        """`work(shared, item)` for each item, in order; `items` are taken as they are needed."""
-        ...
 
 
 class Workers(Generic[Shared]):
@@ -49,7 +40,6 @@ class Workers(Generic[Shared]):
         self._shared = shared
         self._ahead = ahead
         self._pool: ProcessPoolExecutor | None = None
-        self._lifeline: Any = None
 
     def __enter__(self) -> "Workers[Shared]":
         if self.count > 1:
@@ -61,7 +51,8 @@ class Workers(Generic[Shared]):
                     " at the top of a module, or use workers=1"
                 ) from error
             context = processes(type(self._shared).__module__)
-            held, self._lifeline = context.Pipe(duplex=False)
+            held, lifeline = context.Pipe(duplex=False)
+            self._lifeline: Any = lifeline
             given: tuple[Any, ...] = (content, held)  # one end of a pipe, of one class or another by the system
             self._pool = ProcessPoolExecutor(self.count, context, initializer=_begin, initargs=given)
             with what_workers_inherit():
@@ -71,13 +62,11 @@ class Workers(Generic[Shared]):
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if self._pool is not None:
-            if kind is not None and self._lifeline is not None:
+            if kind is not None:
                 self._lifeline.close()  # what they are at is not wanted any more
             self._pool.shutdown(cancel_futures=True)
-            self._pool = None
-        if self._lifeline is not None:
             self._lifeline.close()
-            self._lifeline = None
+            self._pool = None
 
     def map(self, work: Callable[[Shared, Item], Result], items: Iterable[Item]) -> Iterator[Result]:
         """`work(shared, item)` for each item, in order; `items` are taken as they are needed.
