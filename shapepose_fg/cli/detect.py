@@ -2,22 +2,13 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
-from shapepose_fg.cli.options import (
-    RESULT,
-    RUN,
-    TIME,
-    CameraOptions,
-    FramesOption,
-    frame_range,
-    grouped,
-    option,
-)
+from shapepose_fg.cli.options import RESULT, RUN, TIME, CameraOptions, FramesOption, frame_range, grouped, option
 from shapepose_fg.cli.pictures import PictureOptions
-from shapepose_fg.cli.terminal import note, progress, show
+from shapepose_fg.cli.terminal import note, progress, show, table
 from shapepose_fg.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -26,7 +17,6 @@ if TYPE_CHECKING:
     from shapepose_fg.detection2d.detector import CameraDetector
     from shapepose_fg.detection2d.network import Backend, HeatMapNetwork
     from shapepose_fg.detection2d.recording import DetectionReport, DetectionRun
-    from shapepose_fg.io.footage.lockstep import Lockstep
 
 _NETWORK = "Network"
 
@@ -122,14 +112,15 @@ def detect(
     footage = pictures.opened(rig)
     sizes = {name: each.size for name, each in zip(rig.names, footage, strict=True)}
     placements, concluded = placements_of(pictures.image_placement or [], sizes, rig)
-    for each in concluded:
-        note(each)
+    note(*concluded)
     rates = per_camera("--fps", clock.fps or [], rig, one_for_all=True)
     starts = per_camera("--start", clock.start or [], rig, one_for_all=False)
     moments = align(*clocks_of(footage, rates, starts, rig))
-    moments = _part(moments, frame_range(clock.frames, len(moments)))
-    for each in moments.notes:
-        note(each)
+    span = frame_range(clock.frames, len(moments))
+    part = slice(span.start, span.stop)
+    time_s = None if moments.time_s is None else moments.time_s[part]
+    moments = replace(moments, picture=moments.picture[part], time_s=time_s)
+    note(*moments.notes)
     config = DetectionConfig(long_side=network.long_side)
     detectors = [
         CameraDetector.of(camera, rig.up_vector, placements[camera.name], loaded, config) for camera in rig.cameras
@@ -162,38 +153,19 @@ def _shown_small(detectors: "Sequence[CameraDetector]", size: tuple[int, int]) -
     )
 
 
-def _part(moments: "Lockstep", span: range) -> "Lockstep":
-    """The moments of `span` only."""
-    from dataclasses import replace
-
-    part = slice(span.start, span.stop)
-    time_s = None if moments.time_s is None else moments.time_s[part]
-    return replace(moments, picture=moments.picture[part], time_s=time_s)
-
-
 def _summary(run: "DetectionRun", report: "DetectionReport", seconds: float) -> "Table":
     """What was detected in each camera's pictures, and how long it took."""
-    from rich.table import Table
-
-    table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
-    for name in ("camera", "pictures", "size", "turned", "network", "candidates"):
-        table.add_column(name, justify="left" if name == "camera" else "right")
+    rows = []
     for view, (name, footage, detector) in enumerate(zip(run.rig.names, run.footage, run.detectors, strict=True)):
         pictures = int((run.moments.picture[:, view] >= 0).sum()) - report.unreadable[view]
-        turned = detector.view.turn_deg
-        table.add_row(
-            name,
-            str(pictures),
-            f"{footage.size[0]} x {footage.size[1]}",
-            f"{turned:.0f}°" if abs(turned) > 0.5 else "-",
-            f"{detector.view.size[0]} x {detector.view.size[1]}",
-            f"{report.candidates[view] / max(pictures, 1):.1f}",
-        )
+        turned, size = detector.view.turn_deg, detector.view.size
+        row = (name, str(pictures), f"{footage.size[0]} x {footage.size[1]}")
+        row += (f"{turned:.0f}°" if abs(turned) > 0.5 else "-", f"{size[0]} x {size[1]}")
+        rows.append((*row, f"{report.candidates[view] / max(pictures, 1):.1f}"))
     total = max(report.moments * len(run.rig), 1)
     speed = f"{seconds:.1f} s, {1e3 * seconds / total:.0f} ms a picture"
-    table.caption = f"{report.moments} frames of {len(run.rig)} cameras in {speed}"
-    table.caption_justify = "left"
-    return table
+    caption = f"{report.moments} frames of {len(run.rig)} cameras in {speed}"
+    return table("camera pictures size turned network candidates".split(), rows, caption=caption)
 
 
 def _next_command(run: "DetectionRun", cameras: CameraOptions) -> str:

@@ -21,7 +21,7 @@ from shapepose_fg.cli.setup import check_calibration
 from shapepose_fg.cli.simulate import simulate
 from shapepose_fg.cli.stopping import Stopped, stoppable
 from shapepose_fg.cli.terminal import progress as progress_bar
-from shapepose_fg.cli.terminal import show, use_any_streams
+from shapepose_fg.cli.terminal import say, show, use_any_streams
 from shapepose_fg.cli.tracks import tracks
 from shapepose_fg.cli.view import view
 from shapepose_fg.core.errors import InputError
@@ -37,14 +37,12 @@ app = typer.Typer(
 )
 evaluate = typer.Typer(help="Score a reconstruction against an annotation.")
 _RECORDING, _RESULT, _TRY = "From a recording to a result", "With a result", "To try, and to compare"
-app.command(rich_help_panel=_RECORDING)(detect)
-app.command("check-calibration", rich_help_panel=_RECORDING)(check_calibration)
-app.command(rich_help_panel=_RECORDING)(reconstruct)
-app.command(rich_help_panel=_RECORDING)(batch)
-app.command("report", rich_help_panel=_RESULT)(report)
-app.command(rich_help_panel=_RESULT)(overlay)
-app.command(rich_help_panel=_RESULT)(view)
-app.command(rich_help_panel=_RESULT)(export)
+for _panel, _commands in {
+    _RECORDING: (detect, check_calibration, reconstruct, batch),
+    _RESULT: (report, overlay, view, export),
+}.items():
+    for _command in _commands:
+        app.command(rich_help_panel=_panel)(_command)
 app.add_typer(tracks, name="tracks", rich_help_panel=_RESULT)
 app.add_typer(evaluate, name="evaluate", rich_help_panel=_TRY)
 
@@ -77,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         place = f"{error.filename}: " if error.filename is not None else ""
         code = _fail(f"{place}{error.strerror or error}; check the path, its permissions and the space left")
     except Stopped as stop:
-        _say("stopped", stop.message or "nothing is left half written", "bold yellow")
+        say("stopped", stop.message or "nothing is left half written", "bold yellow")
         code = stop.exit_code
     except (typer.Abort, KeyboardInterrupt):
         code = 130
@@ -138,11 +136,7 @@ def demo(
 app.command(rich_help_panel=_TRY)(simulate)
 
 
-class Preset(StrEnum):
-    """Settings that hang together."""
-
-    DEFAULT = "default"
-    PAPER = "paper"
+Preset = StrEnum("Preset", {"DEFAULT": "default", "PAPER": "paper"})
 
 
 @app.command("config", rich_help_panel=_RECORDING)
@@ -170,16 +164,8 @@ def version() -> None:
 
 def _fail(message: str) -> int:
     """Say what went wrong, in one line on stderr."""
-    _say("error", message, "bold red")
+    say("error", " ".join(message.split()), "bold red")
     return 2
-
-
-def _say(what: str, message: str, style: str) -> None:
-    from rich.console import Console
-    from rich.text import Text
-
-    line = Text.assemble((f"{what}: ", style), " ".join(message.split()))
-    Console(stderr=True).print(line, soft_wrap=True)
 
 
 if __name__ == "__main__":

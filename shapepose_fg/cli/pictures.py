@@ -48,8 +48,7 @@ class PictureOptions:
         from shapepose_fg.io.footage.places import find_footage
 
         places = find_footage(self.videos or [], rig.names)
-        for each in places.notes:
-            note(each)
+        note(*places.notes)
         return [opened(name, path) for name, path in zip(rig.names, places.paths, strict=True)]
 
     def of_result(
@@ -68,6 +67,5 @@ def opened(name: str, path: Path) -> "Footage":
 
     with progress(f"looking through {name}") as done:
         footage = open_footage(path, done)
-    for each in footage.notes:
-        note(each)
+    note(*footage.notes)
     return footage

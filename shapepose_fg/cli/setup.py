@@ -29,8 +29,7 @@ def check_calibration(
     rig = seen.rig()
     with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
         recording = read_detections(seen.detections, rig, seen.skeleton, InFolder(Path(folder)))
-        for each in recording.notes:
-            note(each)
+        note(*recording.notes)
         sizes = () if pictures.videos is None else other_sizes(pictures.videos, rig)
         report = report_of(diagnose(recording, rig, frame_range(frames, len(recording))), rig, sizes)
     if as_json:

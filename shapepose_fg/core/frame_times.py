@@ -108,10 +108,6 @@ def segments(frames: range, cuts: Sequence[int]) -> list[range]:
     return [range(start, stop) for start, stop in pairwise(edges) if stop > start]
 
 
-stretches = segments
-"""Its name until 0.1."""
-
-
 def spans_of(frames: Iterable[int]) -> list[range]:
     """Frames as ranges of those that follow each other."""
     ordered = sorted(set(frames))

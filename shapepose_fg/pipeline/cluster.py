@@ -29,6 +29,7 @@ _LEAST = 2
 """So many items are always under way, so that the next one does not wait for the last."""
 _SECONDS = 10
 """A cluster that does not answer for so long is not there."""
+_ITSELF = "shapepose-fg itself"
 
 
 class Cluster(Generic[Shared]):
@@ -59,9 +60,8 @@ class Cluster(Generic[Shared]):
             client = opened.enter_context(_client(address))
             if self._address is not None:
                 _refuse_other_programs(client, address)
-            with _large():
-                # A task, not data that was scattered: what is lost with a process can be made again.
-                self._client, self._at = client, client.submit(_same, self._shared, pure=False)
+            # A task, not data that was scattered: what is lost with a process can be made again.
+            self._client, self._at = client, client.submit(_same, self._shared, pure=False)
             self._open = opened.pop_all()
         return self
 
@@ -83,10 +83,8 @@ class Cluster(Generic[Shared]):
             raise RuntimeError("a cluster is a context: use it in `with`")
         try:
             for item in items:
-                with _large():
-                    waiting.append(
-                        client.submit(_work, program, work, self._at, item, pure=False, retries=RETRIES)
-                    )
+                submitted = client.submit(_work, program, work, self._at, item, pure=False, retries=RETRIES)
+                waiting.append(submitted)
                 if len(waiting) >= max(_LEAST, self._ahead * len(client.nthreads())):
                     yield waiting.popleft().result()
             while len(waiting) > 0:
@@ -156,8 +154,10 @@ def look_at(address: str) -> Scheduler:
 
 @contextmanager
 def _client(address: str) -> Iterator[Any]:
-    """A connexion to the scheduler at an address."""
+    """A connexion to the scheduler at an address; bodies and minutes of footage are large tasks to it."""
     Client, _ = _dask()
+    import dask.config
+
     try:
         client = Client(address, timeout=_SECONDS)
     except (OSError, ValueError, TimeoutError) as error:
@@ -166,10 +166,8 @@ def _client(address: str) -> Iterator[Any]:
             f"--cluster {address}: no Dask scheduler answers there ({reason}); start one with"
             " `dask scheduler`, or leave it out"
         ) from None
-    try:
+    with client, dask.config.set({"distributed.admin.large-graph-warning-threshold": "1GiB"}):
         yield client
-    finally:
-        client.close()
 
 
 def _refuse_other_programs(client: Any, address: str) -> None:
@@ -194,9 +192,6 @@ def _refuse_other(process: str, own: dict[str, str], theirs: dict[str, str]) -> 
         )
 
 
-_ITSELF = "shapepose-fg itself"
-
-
 @cache
 def _program() -> dict[str, str]:
     """What decides about the numbers of this process."""
@@ -211,13 +206,6 @@ def _dask() -> tuple[Any, Any]:
             'Dask is not installed: pip install "shapepose-fg[cluster]", or leave --cluster out'
         ) from None
     return Client, LocalCluster
-
-
-def _large() -> Any:
-    """Context in which Dask does not complain of large tasks: bodies and minutes of footage are large."""
-    from dask import config
-
-    return config.set({"distributed.admin.large-graph-warning-threshold": "1GiB"})
 
 
 def _same(shared: Shared) -> Shared:

@@ -76,8 +76,7 @@ def carry_out(known: Prepared, execution: Execution, *, resume: bool = False, re
     settings = known.settings()  # what is wrong with them is said before the whole recording is read
     with only_run_in(output, OUTPUTS), _recording_folder(output / ".detections") as kept:
         recording = read_detections(known.detections, rig, asked.skeleton, kept)
-        for each in recording.notes:
-            note(each)
+        note(*recording.notes)
         count = len(recording)
         span, times, cuts = known.span(count), known.times(rig, count), known.cuts(count)
         execution = replace(execution, chunk_frames=asked.chunk_frames).worth(len(span))
@@ -212,8 +211,7 @@ class _Run:
             whole = people if len(people) == len(result) else result.reconstruction()
             made = write_pose2sim_files(whole, self.task.rig.up, project)
             written += map(str, made.files)
-            for each in made.notes:
-                note(each)
+            note(*made.notes)
         return written
 
     def _standing(self) -> str:
