@@ -5,6 +5,7 @@ opened.
 import hashlib
 import json
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO, Generic, TypeVar, cast
@@ -135,14 +136,10 @@ class SavedTable(Generic[T]):
 
     def numbers(self, name: str) -> NDArray[np.integer]:
         """All of a column of whole numbers, checked: rows are chosen by it before the others are read."""
-        try:
+        with self._naming():
             column = self._columns[name].checked(name, self._npz.array(name), {"N": self.count})
             self._columns[name].check_range(name, column)
-        except InputError:
-            raise
-        except ValueError as error:
-            raise InputError(f"{self.file}: {error}; {self.cure}") from None
-        return column
+            return column
 
     def read(self, index: NDArray[np.intp] | None, **others: Any) -> T:
         """The rows `index` (R,), rising, or all, and `others` beside them; InputError where they do not make a
@@ -150,14 +147,10 @@ class SavedTable(Generic[T]):
         """
         self._check_memory(self.count if index is None else len(index))
         read = self._npz.array if index is None else lambda name: self._npz.rows(name, index)
-        try:
+        with self._naming():
             table = self.kind(**{name: read(name) for name in self._rows}, **self._shared)
             table.check_ranges()
             return replace(cast(Any, table), **others) if others else table
-        except InputError:
-            raise
-        except ValueError as error:
-            raise InputError(f"{self.file}: {error}; {self.cure}") from None
 
     def _check_memory(self, count: int) -> None:
         """InputError where so many rows, and as much again to work with them, are more than there is room for."""
@@ -167,6 +160,16 @@ class SavedTable(Generic[T]):
                 f"{self.file}: {count} rows would take {decimal(needed)} of memory, and {decimal(free)} are free;"
                 " take some frames or people at a time (--frames, --person, or Reconstruction.open)"
             )
+
+    @contextmanager
+    def _naming(self) -> Iterator[None]:
+        """A ValueError inside the block is an InputError that names the file."""
+        try:
+            yield
+        except InputError:
+            raise
+        except ValueError as error:
+            raise InputError(f"{self.file}: {error}; {self.cure}") from None
 
     def close(self) -> None:
         """Nothing can be read any more."""
