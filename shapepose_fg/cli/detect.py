@@ -4,9 +4,19 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, cast
 
-from shapepose_fg.cli.options import RESULT, RUN, TIME, CameraOptions, FramesOption, frame_range, grouped, option
+from shapepose_fg.cli.options import (
+    REQUIRED,
+    RESULT,
+    RUN,
+    TIME,
+    CameraOptions,
+    frame_range,
+    frames_option,
+    grouped,
+    option,
+)
 from shapepose_fg.cli.pictures import PictureOptions
 from shapepose_fg.cli.terminal import note, progress, show, table
 from shapepose_fg.core.errors import InputError
@@ -27,26 +37,16 @@ _NETWORK = "Network"
 class NetworkOptions:
     """The network that detects, and how it is run."""
 
-    network: Annotated[
-        str, option(_NETWORK, "ONNX file of a network of OpenPose's kind, or a named one.", metavar="FILE|NAME")
-    ]
-    layout: Annotated[
-        str | None,
-        option(_NETWORK, "How to read it: tf-pose, openpose-coco, openpose-body25.", metavar="NAME"),
-    ] = None
-    download: Annotated[bool, option(_NETWORK, "Fetch a named network that is not here yet.", "--download")] = (
-        False
+    network: str = option(
+        _NETWORK, "ONNX file of a network of OpenPose's kind, or a named one.", REQUIRED, metavar="FILE|NAME"
     )
-    network_address: Annotated[
-        str | None, option(_NETWORK, "Where to fetch it from; its checksum decides.", metavar="URL")
-    ] = None
-    long_side: Annotated[
-        int,
-        option(_NETWORK, "Longer side of what it is shown, pixels: more finds smaller people.", show_default=True),
-    ] = 656
-    backend: Annotated[
-        str, option(RUN, "What runs the network: opencv or onnxruntime.", metavar="NAME", show_default=True)
-    ] = "opencv"
+    layout: str | None = option(
+        _NETWORK, "How to read it: tf-pose, openpose-coco, openpose-body25.", metavar="NAME"
+    )
+    download: bool = option(_NETWORK, "Fetch a named network that is not here yet.", False, "--download")
+    network_address: str | None = option(_NETWORK, "Where to fetch it from; its checksum decides.", metavar="URL")
+    long_side: int = option(_NETWORK, "Longer side of what it is shown, pixels: more finds smaller people.", 656)
+    backend: str = option(RUN, "What runs the network: opencv or onnxruntime.", "opencv", metavar="NAME")
 
     def check(self) -> None:
         """Refuse what makes no sense."""
@@ -71,19 +71,13 @@ class NetworkOptions:
 class ClockOptions:
     """When pictures were taken."""
 
-    fps: Annotated[
-        list[str] | None,
-        option(TIME, "Frames a second, where the files are silent or wrong.", metavar="RATE|CAMERA=RATE"),
-    ] = None
-    start: Annotated[
-        list[str] | None,
-        option(
-            TIME,
-            "When its first frame was taken: 0.2s, or 12f (its own frames); else 0.",
-            metavar="CAMERA=TIME",
-        ),
-    ] = None
-    frames: FramesOption = None
+    fps: list[str] | None = option(
+        TIME, "Frames a second, where the files are silent or wrong.", metavar="RATE|CAMERA=RATE"
+    )
+    start: list[str] | None = option(
+        TIME, "When its first frame was taken: 0.2s, or 12f (its own frames); else 0.", metavar="CAMERA=TIME"
+    )
+    frames: str | None = frames_option()
 
 
 @grouped
@@ -92,7 +86,7 @@ def detect(
     pictures: PictureOptions,
     network: NetworkOptions,
     clock: ClockOptions,
-    output: Annotated[Path, option(RESULT, "Folder for the detections; made if it is not there.")],
+    output: Path = option(RESULT, "Folder for the detections; made if it is not there.", REQUIRED),
 ) -> None:
     """Detect people's joints in videos or pictures, for `reconstruct`: candidates with part affinities.
 

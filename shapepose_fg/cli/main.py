@@ -6,14 +6,14 @@ import sys
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Any, cast
 
 import typer
 
 from shapepose_fg.cli.batch.command import batch
 from shapepose_fg.cli.detect import detect
 from shapepose_fg.cli.export import export
-from shapepose_fg.cli.options import INPUT, RESULT, JsonOption, option
+from shapepose_fg.cli.options import INPUT, REQUIRED, RESULT, argument, grouped, json_option, option
 from shapepose_fg.cli.overlay import overlay
 from shapepose_fg.cli.reconstruct.command import reconstruct
 from shapepose_fg.cli.report import report
@@ -83,16 +83,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 @evaluate.command("shelf")
+@grouped
 def evaluate_shelf_command(
-    results: Annotated[
-        Path,
-        typer.Argument(
-            metavar="RESULTS",
-            help="Folder of a reconstruction, or its people.npz; 4D Association's text; TRC, or a folder of it.",
-        ),
-    ],
-    ground_truth: Annotated[Path, option(INPUT, "Annotation of the Shelf recording, as text.")],
-    as_json: JsonOption = False,
+    results: Path = argument(
+        "RESULTS", "Folder of a reconstruction, or its people.npz; 4D Association's text; TRC, or a folder of it."
+    ),
+    ground_truth: Path = option(INPUT, "Annotation of the Shelf recording, as text.", REQUIRED),
+    as_json: bool = json_option(),
 ) -> None:
     """PCP per limb and actor, MPJPE and recall on the Shelf recording."""
     from shapepose_fg.evaluation.other_results.reading import read_people
@@ -112,13 +109,12 @@ it saw the people are reconstructed, over time."""
 
 
 @app.command(rich_help_panel=_TRY)
+@grouped
 def demo(
-    output: Annotated[Path, option(RESULT, "Folder for the result and the picture.", show_default=True)] = Path(
-        "demo"
+    output: Path = option(RESULT, "Folder for the result and the picture.", Path("demo")),
+    report: bool = option(
+        RESULT, "Leave report.html, the result as a page to look at.", True, "--report/--no-report"
     ),
-    report: Annotated[
-        bool, option(RESULT, "Leave report.html, the result as a page to look at.", "--report/--no-report")
-    ] = True,
 ) -> None:
     """Reconstruct a built-in scene of four people, compare it with the truth, and draw it."""
     prepare_output(output)
@@ -136,15 +132,19 @@ def demo(
 app.command(rich_help_panel=_TRY)(simulate)
 
 
-Preset = StrEnum("Preset", {"DEFAULT": "default", "PAPER": "paper"})
+class Preset(StrEnum):
+    """Settings that hang together."""
+
+    DEFAULT = "default"
+    PAPER = "paper"
 
 
 @app.command("config", rich_help_panel=_RECORDING)
+@grouped
 def print_config(
-    preset: Annotated[
-        Preset,
-        typer.Option(help="paper: the method as it is written, without what is settled differently here."),
-    ] = Preset.DEFAULT,
+    preset: Preset = option(
+        RESULT, "paper: the method as it is written, without what is settled differently here.", Preset.DEFAULT
+    ),
 ) -> None:
     """Print every setting with its value, as TOML."""
     from shapepose_fg.io.config import toml_text

@@ -1,4 +1,4 @@
-"""Where cameras stand and what they see: pinhole cameras in the world, a rig of them, and their views over time."""
+"""Where cameras stand and what they see: pinhole cameras in the world, a rig of them, their views over time."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field

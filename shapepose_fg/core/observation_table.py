@@ -1,7 +1,6 @@
 """What each row of a result was solved from: per joint and view the detection, its residual, and its gate."""
 
 from collections.abc import Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
@@ -182,7 +181,7 @@ class ObservationTable(Table):
 
         `run_id` is that of the people whose observations they must be (`result_files.check_id`).
         """
-        with closing(cls.open(Path(file), run_id)) as opened:
+        with cls.open(Path(file), run_id) as opened:
             return opened.read(None)
 
     @classmethod

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from contextlib import AbstractContextManager, ExitStack, closing
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from enum import IntEnum, StrEnum
 from pathlib import Path
@@ -193,7 +193,7 @@ class Reconstruction(Table):
         return OpenedReconstruction(Path(path))
 
 
-class OpenedReconstruction(AbstractContextManager["OpenedReconstruction"]):
+class OpenedReconstruction(ExitStack):
     """A saved result, open: who is where is in memory, rows are read when they are asked for.
 
     A context, at whose end the files are closed. Who asks for frames in rising order unpacks the files once. What
@@ -206,16 +206,19 @@ class OpenedReconstruction(AbstractContextManager["OpenedReconstruction"]):
         table = file.with_name(OBSERVATIONS)
         self._observed: SavedTable[ObservationTable] | None = None
         self._block = range(0), Reconstruction.empty()
-        with ExitStack() as files:
-            self._people = SavedTable(file, Reconstruction, "give the people.npz of a reconstruction")
-            files.callback(self._people.close)
+        super().__init__()
+        try:
+            people = SavedTable(file, Reconstruction, "give the people.npz of a reconstruction")
+            self._people = self.enter_context(people)
             self.frame, self.person = (self._people.numbers(name) for name in ("frame", "person"))
             """(N,) frame of each row, and identity of each row's person."""
             self.run = _read_run(file.with_name(RUN), self._people.run_id)
             """What run.json says."""
             if table.is_file():
-                self._observed = files.enter_context(closing(ObservationTable.open(table, self._people.run_id)))
-            self._files = files.pop_all()
+                self._observed = self.enter_context(ObservationTable.open(table, self._people.run_id))
+        except InputError:
+            self.close()
+            raise
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -259,13 +262,6 @@ class OpenedReconstruction(AbstractContextManager["OpenedReconstruction"]):
         except ValueError as error:
             file = self._observed.file
             raise InputError(f"{file}: {error}; delete it or run the reconstruction again") from None
-
-    def close(self) -> None:
-        """Nothing can be read any more."""
-        self._files.close()
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 def _read_run(file: Path, people_id: object) -> dict[str, Any]:

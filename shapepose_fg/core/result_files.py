@@ -5,7 +5,7 @@ opened.
 import hashlib
 import json
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO, Generic, TypeVar, cast
@@ -95,16 +95,18 @@ def _told(name: str, column: Pieces, tell: Any) -> Pieces:
     return replace(column, pieces=pieces)
 
 
-class SavedTable(Generic[T]):
-    """people.npz or observations.npz: a table of the class `kind`."""
+class SavedTable(ExitStack, Generic[T]):
+    """people.npz or observations.npz, open: a table of the class `kind`."""
 
     def __init__(self, file: Path, kind: type[T], cure: str) -> None:
         """InputError, with the `cure`, where it cannot be read or an array is missing that earlier files have
         too.
         """
+        super().__init__()
         self.file, self.kind, self.cure = file, kind, cure
         self._columns, told = columns_of(kind), kind.meanings()
-        self._npz = NpzFile(file, (*kind.ROWS, *kind.shared(), *told, RUN_ID), f"{cure}, or run one first")
+        names = (*kind.ROWS, *kind.shared(), *told, RUN_ID)
+        self._npz = self.enter_context(NpzFile(file, names, f"{cure}, or run one first"))
         try:
             there = self._npz.names
             for name in there:
@@ -131,7 +133,7 @@ class SavedTable(Generic[T]):
                     )
             self._shared = {name: self._npz.array(name) for name in kind.shared()}
         except InputError:
-            self._npz.close()
+            self.close()
             raise
 
     def numbers(self, name: str) -> NDArray[np.integer]:
@@ -170,10 +172,6 @@ class SavedTable(Generic[T]):
             raise
         except ValueError as error:
             raise InputError(f"{self.file}: {error}; {self.cure}") from None
-
-    def close(self) -> None:
-        """Nothing can be read any more."""
-        self._npz.close()
 
 
 def free_memory() -> int | None:

@@ -39,7 +39,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-def moved_into_execution(function: Callable[P, R]) -> Callable[P, R]:
+def _with_execution(function: Callable[P, R]) -> Callable[P, R]:
     """`function`, which names `Execution` where it is given an argument that went there."""
 
     @wraps(function)
@@ -51,7 +51,7 @@ def moved_into_execution(function: Callable[P, R]) -> Callable[P, R]:
     return called
 
 
-@moved_into_execution
+@_with_execution
 def reconstruct(
     detections: DetectionSequence,
     rig: Rig,
@@ -128,7 +128,7 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
     with book.stage("load"):
         if fitter is None:
             fitter = make_fitter(config.body, BodyModel.default().with_keypoints(skeleton.joints))
-    check_fitter(fitter)
+        check_fitter(fitter)
     setup = Setup(rig, skeleton, config, fitter, task.extra_factors)
     with torch_threads(config.threads):
         offsets = kept_offsets(kept, setup, detections, book)

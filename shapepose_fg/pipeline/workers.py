@@ -36,9 +36,7 @@ class Workers(Generic[Shared]):
         """
         if count < 1:
             raise ValueError(f"workers must be 1 (no further process) or more, got {count}")
-        self.count = count
-        self._shared = shared
-        self._ahead = ahead
+        self.count, self._shared, self._ahead = count, shared, ahead
         self._pool: ProcessPoolExecutor | None = None
 
     def __enter__(self) -> "Workers[Shared]":
@@ -128,7 +126,7 @@ def what_workers_inherit() -> Iterator[None]:
 
     The terminal sends it to all of them; it is this process that ends them.
     """
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    before = {name: os.environ[name] for name in _ONE_THREAD if name in os.environ}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
     can_block = hasattr(signal, "pthread_sigmask")
     # Python's own helper of spawned processes lets the signal through again when it starts: it has to run by then.
@@ -137,11 +135,9 @@ def what_workers_inherit() -> Iterator[None]:
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        for name in _ONE_THREAD:
+            del os.environ[name]
+        os.environ.update(before)
         if can_block:
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
@@ -156,10 +152,9 @@ def _begin(content: bytes, lifeline: Any) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=end_with, args=(lifeline,), daemon=True).start()
     _shared = pickle.loads(content)  # made by this program a moment ago
-    if "cv2" in sys.modules:
-        sys.modules["cv2"].setNumThreads(1)
-    if "torch" in sys.modules:
-        sys.modules["torch"].set_num_threads(1)
+    for name, setting in (("cv2", "setNumThreads"), ("torch", "set_num_threads")):
+        if name in sys.modules:
+            getattr(sys.modules[name], setting)(1)
 
 
 def end_with(lifeline: Any) -> None:

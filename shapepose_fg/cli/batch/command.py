@@ -3,11 +3,11 @@
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
-from shapepose_fg.cli.options import RESULT, RUN, RunOptions, grouped, option
+from shapepose_fg.cli.options import REQUIRED, RESULT, RUN, RunOptions, argument, grouped, option
 from shapepose_fg.cli.stopping import Stopped
 from shapepose_fg.cli.terminal import note, show, warn
 from shapepose_fg.core.errors import InputError
@@ -27,12 +27,10 @@ BATCH = "batch.json"
 
 @grouped
 def batch(
-    table: Annotated[Path, typer.Argument(metavar="RECORDINGS.TOML", help="The recordings: see docs/batch.md.")],
     running: RunOptions,
-    output: Annotated[Path, option(RESULT, "Folder for a folder of results of each recording, and batch.json.")],
-    at_once: Annotated[
-        int | None, option(RUN, "Recordings under way at a time; by default as many as keep all busy.")
-    ] = None,
+    table: Path = argument("RECORDINGS.TOML", "The recordings: see docs/batch.md."),
+    output: Path = option(RESULT, "Folder for a folder of results of each recording, and batch.json.", REQUIRED),
+    at_once: int | None = option(RUN, "Recordings under way at a time; by default as many as keep all busy."),
 ) -> None:
     """Reconstruct all recordings of a table: each as `reconstruct` would, to the byte, in one queue of work.
 
