@@ -186,23 +186,21 @@ def result_frames(text: str | None) -> range | None:
     if text is None:
         return None
     start, stop = ends(text)
-    stop = 10**18 if stop is None else stop
-    if not start < stop:
+    found = range(start, 10**18 if stop is None else stop)
+    if len(found) == 0:
         raise InputError(f"--frames {text}: must be A:B with A below B, such as 0:100")
-    return range(start, stop)
+    return found
 
 
 def frame_range(text: str | None, count: int) -> range:
     """Frames that `A:B` selects of a recording of `count` frames: half-open, either end optional."""
-    if text is None:
-        return range(count)
-    start, stop = ends(text)
-    stop = count if stop is None else stop
-    if not start < stop <= count:
+    start, stop = (0, count) if text is None else ends(text)
+    found = range(start, count if stop is None else stop)
+    if text is not None and not (found and found.stop <= count):
         raise InputError(
             f"--frames {text}: not in the recording, which has {count} frames; give A:B with 0 <= A < B <= {count}"
         )
-    return range(start, stop)
+    return found
 
 
 def ends(text: str) -> tuple[int, int | None]:

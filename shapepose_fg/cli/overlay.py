@@ -14,7 +14,6 @@ from shapepose_fg.core.frame_times import ASSUMED_FPS
 from shapepose_fg.core.result_files import results_folder
 
 if TYPE_CHECKING:
-    from shapepose_fg.body.model.body_model import BodyModel
     from shapepose_fg.core.camera import Rig
 
 
@@ -66,7 +65,12 @@ def overlay(
         content = OverlayContent(skeletons=drawn.skeletons, detections=drawn.points)
         if drawn.points and not people.observed:
             note(f"{folder}: there is no observations.npz, so no detections are drawn")
-        over = Overlay(people, rig, shown, content, _body(run) if drawn.bodies else None)
+        model, file = None, run.get("body")
+        if drawn.bodies:
+            from shapepose_fg.body.model.body_model import BodyModel
+
+            model = BodyModel.default() if file is None else BodyModel.load(Path(file))
+        over = Overlay(people, rig, shown, content, model)
         length = max(len(used.places) for used, _ in shown)
         if drawn.stills is not None:
             chosen, fps = _stills(drawn.stills, length), None
@@ -90,14 +94,6 @@ def _cameras(text: str, rig: "Rig") -> list[str]:
     if len(names) == 0 or len(set(names)) < len(names):
         raise InputError(f"--cameras {text}: must be names of cameras, each once, such as {rig.names[0]}")
     return names
-
-
-def _body(run: Mapping[str, Any]) -> "BodyModel":
-    """The model that the bodies of a result are of."""
-    from shapepose_fg.body.model.body_model import BodyModel
-
-    file = run.get("body")
-    return BodyModel.default() if file is None else BodyModel.load(Path(str(file)))
 
 
 def _recorded(run: Mapping[str, Any], length: int) -> range:

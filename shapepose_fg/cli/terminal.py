@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
+    from rich.progress import Progress
     from rich.table import Table
 
 
@@ -69,22 +70,20 @@ def warn(message: str) -> None:
 
 
 @contextmanager
-def progress(what: str, unit: str = "frames") -> Iterator[Callable[[int, int], None]]:
-    """A progress bar on stderr while the block runs: a function of how many are done, and how many there are.
-
-    Nothing is shown where stderr is not a terminal.
-    """
+def bars(unit: str = "") -> Iterator["Progress"]:
+    """Progress bars on stderr while the block runs; nothing is shown where that is not a terminal."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn(unit),
-        TimeRemainingColumn(compact=True),
-    )
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(what, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+    console, left = Console(stderr=True), TimeRemainingColumn(compact=True)
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TextColumn(unit))
+    with Progress(*columns, left, console=console, transient=True, disable=not console.is_terminal) as shown:
+        yield shown
+
+
+@contextmanager
+def progress(what: str, unit: str = "frames") -> Iterator[Callable[[int, int], None]]:
+    """One of them: a function of how many are done, and how many there are."""
+    with bars(unit) as shown:
+        task = shown.add_task(what, total=None)
+        yield lambda done, total: shown.update(task, completed=done, total=total)

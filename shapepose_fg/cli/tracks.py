@@ -68,15 +68,11 @@ def merge_people(context: typer.Context, person: Person, other: Other) -> None:
     _correct(context, "merge", person, other=other)
 
 
+New = Annotated[int | None, typer.Option(help="Number of the new person; by default the next free one.")]
+
+
 @tracks.command("split")
-def split_person(
-    context: typer.Context,
-    person: Person,
-    frame: From,
-    new: Annotated[
-        int | None, typer.Option(help="Number of the new person; by default the next free one.")
-    ] = None,
-) -> None:
+def split_person(context: typer.Context, person: Person, frame: From, new: New = None) -> None:
     """From FRAME on A is somebody else: a new person."""
     _correct(context, "split", person, other=new, frame=frame)
 

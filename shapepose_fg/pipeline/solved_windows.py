@@ -17,10 +17,9 @@ from shapepose_fg.estimation.estimator import Estimates
 from shapepose_fg.pipeline.bodies_over_time import BODY
 from shapepose_fg.pipeline.engine import Setup
 from shapepose_fg.pipeline.execution import Pool
-from shapepose_fg.pipeline.runs.checkpoint import Checkpoint
 from shapepose_fg.pipeline.runs.chunks import Border, Chunk, Identities, cut_in_chunks, windows_of
 from shapepose_fg.pipeline.runs.notes import Notebook, Notes
-from shapepose_fg.pipeline.runs.parts import Part
+from shapepose_fg.pipeline.runs.parts import Checkpoint, Part
 from shapepose_fg.pipeline.windows import Solved, Span
 from shapepose_fg.proposal.thinning import ThinnedFrames
 from shapepose_fg.tracking.hypotheses import Input

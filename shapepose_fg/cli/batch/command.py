@@ -9,7 +9,7 @@ import typer
 
 from shapepose_fg.cli.options import REQUIRED, RESULT, RUN, RunOptions, argument, grouped, option
 from shapepose_fg.cli.stopping import Stopped
-from shapepose_fg.cli.terminal import note, show, warn
+from shapepose_fg.cli.terminal import bars, note, show, warn
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.result_files import PEOPLE
 from shapepose_fg.core.result_files import RUN as RUN_FILE
@@ -48,9 +48,8 @@ def batch(
 
 def _run(table: Path, entries: "list[Entry]", output: Path, running: RunOptions, at_once: int | None) -> None:
     """The batch, in a folder that no other process writes to."""
-    from shapepose_fg.cli.batch.campaign import Campaign
-    from shapepose_fg.cli.batch.check import look_at_all
-    from shapepose_fg.cli.batch.standing import Standings, bars
+    from shapepose_fg.cli.batch.campaign import Campaign, look_at_all
+    from shapepose_fg.cli.batch.standing import Bars, Standings
     from shapepose_fg.pipeline.cluster import local_cluster, look_at
     from shapepose_fg.pipeline.workers import cores
 
@@ -75,8 +74,8 @@ def _run(table: Path, entries: "list[Entry]", output: Path, running: RunOptions,
             standings.write()
             campaign = Campaign(entries, sizes, output, scheduler.address, count)
             try:
-                with bars(standings) as watcher:
-                    campaign.run(standings, watcher)
+                with bars() as shown:
+                    campaign.run(standings, Bars(shown, standings))
             except Stopped as stop:
                 done = len(standings.names("done"))
                 where = f"{done} of {len(entries)} recordings are done in {output}; go on with --resume"

@@ -1,15 +1,13 @@
 """How far the recordings of an archive are: batch.json, and what `shapepose-fg batch` says of them."""
 
 import json
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import Progress, TaskID
 from rich.table import Table
 from rich.text import Text
 
@@ -156,15 +154,6 @@ class Bars:
     def _count(self) -> None:
         ended = len(self._standings.of) - len(self._standings.names("waiting"))
         self._bars.update(self._whole, completed=ended)
-
-
-@contextmanager
-def bars(standings: Standings) -> Iterator[Bars]:
-    """`Bars` on stderr while the block runs."""
-    console, text = Console(stderr=True), TextColumn("{task.description}", markup=False)
-    columns = (text, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(compact=True))
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        yield Bars(progress, standings)
 
 
 def clock(seconds: float) -> str:

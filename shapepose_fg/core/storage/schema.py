@@ -63,9 +63,10 @@ class Column:
         if array.dtype.kind not in _ALLOWED[wanted.kind] and array.size > 0:
             raise ValueError(f"{name} must hold {wanted} values, got {array.dtype}")
         if wanted.kind in "iu" and array.size > 0 and array.dtype != wanted:
-            low, high = np.iinfo(cast(Any, wanted)).min, np.iinfo(cast(Any, wanted)).max
-            if array.min() < low or array.max() > high:
-                raise ValueError(f"{name} must hold {low} to {high}, got {array.min()} to {array.max()}")
+            limits = np.iinfo(cast(Any, wanted))
+            if array.min() < limits.min or array.max() > limits.max:
+                got = f"{array.min()} to {array.max()}"
+                raise ValueError(f"{name} must hold {limits.min} to {limits.max}, got {got}")
         array = array.astype(str if wanted.kind == "U" else wanted, copy=False)
         if self.codes is not None and array.size > 0 and array.max() >= len(self.codes):
             raise ValueError(f"{name} must hold codes below {len(self.codes)}, got {array.max()}")
