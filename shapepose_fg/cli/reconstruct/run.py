@@ -216,14 +216,13 @@ class _Run:
 
     def _standing(self) -> str:
         """How far a run that was stopped has come, and how to go on."""
-        output = self.known.output
+        output, count = self.known.output, len(self.task.whole()[0])
         try:
             done = frames_done(output)
         except InputError as error:
             return str(error)
-        if done == 0:
-            return "nothing is kept: no frame was done"
-        return f"{done} of {len(self.task.whole()[0])} frames are kept in {output / PARTS}; go on with --resume"
+        kept = f"{done} of {count} frames are kept in {output / PARTS}; go on with --resume"
+        return kept if done > 0 else "nothing is kept: no frame was done"
 
 
 def _known_people(file: Path, body: Path | None) -> SubjectShapes:
