@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 
 _NETWORK = "Network"
 
-# Everything else is imported inside the command: `--help` must not wait for it.
-
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkOptions:

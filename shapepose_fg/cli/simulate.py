@@ -25,8 +25,6 @@ from shapepose_fg.core.storage.output_folder import prepare_output
 if TYPE_CHECKING:
     from shapepose_fg.simulation.files import Format
 
-# Everything else is imported inside the command: `--help` must not wait for it.
-
 
 @dataclass(frozen=True, kw_only=True)
 class SceneOptions:

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from shapepose_fg.core.reconstruction import Reconstruction
     from shapepose_fg.tracking.edits import Solve
 
-# Everything else is imported inside the commands: `--help` must not wait for it.
 
 tracks = typer.Typer(invoke_without_command=True)
 

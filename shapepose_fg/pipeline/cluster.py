@@ -2,17 +2,16 @@
 
 import socket
 import warnings
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.provenance import program_digest, versions
-from shapepose_fg.pipeline.workers import get_ready, processes, what_workers_inherit
+from shapepose_fg.pipeline.workers import get_ready, in_order, processes, what_workers_inherit
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -77,25 +76,17 @@ class Cluster(Generic[Shared]):
         from distributed import KilledWorker
 
         client: Any = self._client
-        program = tuple(_program().items())
-        waiting = deque["Future[Any]"]()
         if client is None:
             raise RuntimeError("a cluster is a context: use it in `with`")
+        how = {"pure": False, "retries": RETRIES}
+        submit = partial(client.submit, _work, tuple(_program().items()), work, self._at, **how)
         try:
-            for item in items:
-                submitted = client.submit(_work, program, work, self._at, item, pure=False, retries=RETRIES)
-                waiting.append(submitted)
-                if len(waiting) >= max(_LEAST, self._ahead * len(client.nthreads())):
-                    yield waiting.popleft().result()
-            while len(waiting) > 0:
-                yield waiting.popleft().result()
+            yield from in_order(submit, items, lambda: max(_LEAST, self._ahead * len(client.nthreads())))
         except KilledWorker as error:
             raise RuntimeError(
                 f"{error.allowed_failures + 1} processes of the cluster ended one after the other before their"
                 " work: there may be too little memory for one"
             ) from None
-        finally:
-            client.cancel(list(waiting))
 
 
 @dataclass(frozen=True)

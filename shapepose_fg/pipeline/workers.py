@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from functools import partial
 from multiprocessing import forkserver, get_context, resource_tracker
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
@@ -74,19 +75,31 @@ class Workers(Generic[Shared]):
         if self._pool is None:
             yield from (work(self._shared, item) for item in items)
             return
-        waiting: deque[Future[Result]] = deque()
         try:
-            for item in items:
-                waiting.append(self._pool.submit(_work, work, item))
-                if len(waiting) >= self._ahead * self.count:
-                    yield waiting.popleft().result()
-            while len(waiting) > 0:
-                yield waiting.popleft().result()
+            submit: Any = partial(self._pool.submit, _work, work)
+            yield from in_order(submit, items, lambda: self._ahead * self.count)
         except BrokenProcessPool as error:
             raise RuntimeError(
                 "a worker process ended before its work: there may be too little memory for so many; in a script,"
                 " call what takes `workers` below `if __name__ == '__main__':`"
             ) from error
+
+
+def in_order(
+    submit: Callable[[Item], Future[Result]], items: Iterable[Item], most: Callable[[], float]
+) -> Iterator[Result]:
+    """What comes of each item, in order; of those that were submitted `most` are under way at a time."""
+    waiting: deque[Future[Result]] = deque()
+    try:
+        for item in items:
+            waiting.append(submit(item))
+            if len(waiting) >= most():
+                yield waiting.popleft().result()
+        while len(waiting) > 0:
+            yield waiting.popleft().result()
+    finally:
+        for each in waiting:
+            each.cancel()
 
 
 def processes(*modules: str) -> "SpawnContext | ForkServerContext":

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
 BATCH = "batch.json"
 
-# Everything else is imported inside the command: `--help` must not wait for torch.
-
 
 @grouped
 def batch(

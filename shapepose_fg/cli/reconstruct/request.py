@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 OUTPUTS = (PEOPLE, RUN_FILE, OBSERVATIONS, "cameras.json", "report.html")
 """The files that are left in the folder of results."""
 
-# Everything else is imported inside the functions: `--help` must not wait for torch.
-
 
 @dataclass(frozen=True, kw_only=True)
 class Request(DetectionOptions):
