@@ -124,8 +124,9 @@ def _table(title: str, rows: dict[str, tuple[str, str]]) -> Table:
     """Names, figures, and what they mean."""
     table = Table(title=title, title_justify="left", title_style="bold", box=None, padding=(0, 2, 0, 0))
     table.show_header = False
-    for justify, style in (("left", ""), ("right", ""), ("left", "dim")):
-        table.add_column(justify=justify, style=style)
+    table.add_column()
+    table.add_column(justify="right")
+    table.add_column(style="dim")
     for name, (figure, meaning) in rows.items():
         table.add_row(name, figure, meaning)
     return table

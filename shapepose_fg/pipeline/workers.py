@@ -76,8 +76,8 @@ class Workers(Generic[Shared]):
             yield from (work(self._shared, item) for item in items)
             return
         try:
-            submit: Any = partial(self._pool.submit, _work, work)
-            yield from in_order(submit, items, lambda: self._ahead * self.count)
+            pool: Any = self._pool
+            yield from in_order(partial(pool.submit, _work, work), items, lambda: self._ahead * self.count)
         except BrokenProcessPool as error:
             raise RuntimeError(
                 "a worker process ended before its work: there may be too little memory for so many; in a script,"
