@@ -5,17 +5,23 @@ PIP_ARGS ?=
 BIN := $(VENV)/bin
 # With more processes than this, the solvers' own threads fight over the cores.
 JOBS ?= 2
+# A file's tests share what they have made: one process runs them.
+PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 
-.PHONY: demo test check format benchmark clean
+.PHONY: demo test test-all check format benchmark clean
 .DEFAULT_GOAL := demo
 
 ## Reconstruct the built-in scene: prints a table against the truth, leaves a picture in demo/.
 demo: $(VENV)/installed
 	$(BIN)/shapepose-fg demo --output demo
 
-## What CI runs: lint, types, tests.
+## Lint, types, and the tests that notice 95 % of what all of them do (see scripts/mutants.py): under three minutes.
 test: check
-	$(BIN)/python -m pytest -n $(JOBS)
+	$(PYTEST) -m "not slow"
+
+## What CI runs: all tests.
+test-all: check
+	$(PYTEST)
 
 check: $(VENV)/installed
 	$(BIN)/ruff check .

@@ -1,10 +1,10 @@
 """Change valid files until a reader breaks: python scripts/fuzz.py [--seconds 600] [--held-out] [reader ...].
 
-Every reader of files from others (tests/readers.py) is run on changed files, guided by which lines of this
+Every reader of files from others (tests/hostile/readers.py) is run on changed files, guided by which lines of this
 project they reach (atheris, libFuzzer: pip install ".[fuzz]"). A case may end in a result or an InputError.
 Anything else, over 10 s, or over 1 GiB beyond what was in use before, is a fault: its file is kept in
-tests/data/fuzz, where tests/test_every_reader.py tries it again. `--held-out` starts from other files and other
-random numbers, which nothing was mended by, and keeps nothing.
+tests/hostile/data/fuzz, where tests/hostile/test_every_reader.py tries it again. `--held-out` starts from other
+files and other random numbers, which nothing was mended by, and keeps nothing.
 """
 
 import argparse
@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).parents[1]
-FOUND = ROOT / "tests" / "data" / "fuzz"
+FOUND = ROOT / "tests" / "hostile" / "data" / "fuzz"
 CASE_S, CASE_MB = 10, 1024
 
 
@@ -51,8 +51,8 @@ def main() -> None:
 def readers() -> dict[str, Any]:
     """Every reader, as the tests list them."""
     # The project first: of an editable install `factors` would be the folder of tests.
-    sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
-    return importlib.import_module("readers").READERS
+    sys.path.insert(0, str(ROOT))
+    return importlib.import_module("tests.hostile.readers").READERS
 
 
 def fuzz(name: str, seconds: int, held_out: bool) -> tuple[int, int]:

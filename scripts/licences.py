@@ -1,6 +1,6 @@
 """Write docs/licences.md: the licences of everything that is installed with this package.
 
-Run by hand after a dependency is added (python scripts/licences.py); tests/test_licences.py says when.
+Run by hand after a dependency is added (python scripts/licences.py); tests/project/test_licences.py says when.
 """
 
 import re

@@ -1,17 +1,24 @@
 """Shared fixtures: where the real recordings are, cameras around a room, and people seen without error."""
 
 import os
+import pickle
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
+from filelock import FileLock
 from numpy.typing import NDArray
 
 from shapepose_fg.core.camera import Rig
-from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.detections import Detections, Recording
+from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25, Skeleton
+from shapepose_fg.pipeline.pipeline import reconstruct
 from shapepose_fg.pipeline.workers import get_ready
+from shapepose_fg.simulation import Scene, built_in_scene, simulate
 
 # Some tests import others from this folder, where `factors` is the folder of the library's tests: the project goes
 # first, for processes that are begun by a test, too.
@@ -42,6 +49,29 @@ def shared_data() -> Path:
     if not (root / "data").is_dir():
         pytest.skip(f"no real recordings at {root}: set SHAPEPOSE_DATA to their folder to run this test")
     return root / "data"
+
+
+@dataclass(frozen=True)
+class Dance:
+    """Four people in close motion before six cameras, 1.6 s, and their reconstruction by default."""
+
+    scene: Scene
+    recording: Recording
+    times: FrameTimes
+    people: Reconstruction
+
+
+@pytest.fixture(scope="session")
+def dance(tmp_path_factory) -> Dance:
+    """The reconstruction that tests share: pytest-xdist's first process makes it, the others read it."""
+    scene = built_in_scene(seed=0, frames=40)
+    recording, times = simulate(scene, seed=0), FrameTimes.from_fps(scene.fps, len(scene))
+    folder = tmp_path_factory.getbasetemp()
+    file = (folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder) / "dance.pickle"
+    with FileLock(f"{file}.lock"):
+        if not file.exists():
+            file.write_bytes(pickle.dumps(reconstruct(recording, scene.rig, times=times)))
+        return Dance(scene, recording, times, pickle.loads(file.read_bytes()))
 
 
 @pytest.fixture(scope="session")

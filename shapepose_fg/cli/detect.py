@@ -94,10 +94,10 @@ def detect(
     network.check()
     if pictures.videos is None:
         raise InputError("--videos: missing; give the cameras' videos or pictures")
-    from shapepose_fg.detection2d.detector import CameraDetector, DetectionConfig
+    from shapepose_fg.detection2d.detector import CameraDetector
     from shapepose_fg.detection2d.recording import DetectionRun, run_detection
-    from shapepose_fg.io.footage.given import clocks_of, per_camera, placements_of
-    from shapepose_fg.io.footage.lockstep import align
+    from shapepose_fg.io.footage.lockstep import align, clocks_of
+    from shapepose_fg.io.footage.placement import placements_of
 
     rig = cameras.rig()
     loaded = network.load()
@@ -105,17 +105,15 @@ def detect(
     sizes = {name: each.size for name, each in zip(rig.names, footage, strict=True)}
     placements, concluded = placements_of(pictures.image_placement or [], sizes, rig)
     note(*concluded)
-    rates = per_camera("--fps", clock.fps or [], rig, one_for_all=True)
-    starts = per_camera("--start", clock.start or [], rig, one_for_all=False)
-    moments = align(*clocks_of(footage, rates, starts, rig))
+    moments = align(*clocks_of(footage, clock.fps or [], clock.start or [], rig.names))
     span = frame_range(clock.frames, len(moments))
     part = slice(span.start, span.stop)
     time_s = None if moments.time_s is None else moments.time_s[part]
     moments = replace(moments, picture=moments.picture[part], time_s=time_s)
     note(*moments.notes)
-    config = DetectionConfig(long_side=network.long_side)
     detectors = [
-        CameraDetector.of(camera, rig.up_vector, placements[camera.name], loaded, config) for camera in rig.cameras
+        CameraDetector.of(camera, rig.up_vector, placements[camera.name], loaded, network.long_side)
+        for camera in rig.cameras
     ]
     if loaded.only_size is not None:
         note(_shown_small(detectors, loaded.only_size))

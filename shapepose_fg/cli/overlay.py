@@ -54,15 +54,13 @@ def overlay(
     from shapepose_fg.core.reconstruction import Reconstruction
     from shapepose_fg.io.calibration import read_rig
     from shapepose_fg.io.solved_setup import CAMERAS
-    from shapepose_fg.viz.overlay.frames import Overlay, OverlayContent
-    from shapepose_fg.viz.overlay.output import write_overlay
+    from shapepose_fg.viz.overlay.frames import Overlay, write_overlay
 
     folder = results_folder(results)
     with Reconstruction.open(folder) as people:
         rig, run = read_rig(folder / CAMERAS), people.run
         names = pictures.named(rig) if drawn.cameras is None else _cameras(drawn.cameras, rig)
         shown = pictures.of_result(run, rig, names, detections)
-        content = OverlayContent(skeletons=drawn.skeletons, detections=drawn.points)
         if drawn.points and not people.observed:
             note(f"{folder}: there is no observations.npz, so no detections are drawn")
         model, file = None, run.get("body")
@@ -70,7 +68,7 @@ def overlay(
             from shapepose_fg.body.model.body_model import BodyModel
 
             model = BodyModel.default() if file is None else BodyModel.load(Path(file))
-        over = Overlay(people, rig, shown, content, model)
+        over = Overlay(people, rig, shown, drawn.skeletons, drawn.points, model)
         length = max(len(used.places) for used, _ in shown)
         if drawn.stills is not None:
             chosen, fps = _stills(drawn.stills, length), None

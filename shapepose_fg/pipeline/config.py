@@ -8,10 +8,9 @@ from annotated_types import Interval
 from shapepose_fg.body.fitting.fitters import BodyConfig
 from shapepose_fg.core.bounds import Count, Factor, Metres, Repeats, RepeatsOrNone, Seconds, Settings, Share
 from shapepose_fg.estimation.detector_offsets import OffsetConfig
-from shapepose_fg.estimation.estimator_config import EstimatorConfig, RefineConfig
+from shapepose_fg.estimation.estimator_config import EstimatorConfig, RefineConfig, WindowGraphConfig
 from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.estimation.motion_model import MotionConfig
-from shapepose_fg.estimation.window_graph import WindowGraphConfig
 from shapepose_fg.proposal.association import AssociationConfig
 from shapepose_fg.proposal.candidates import CandidateConfig
 from shapepose_fg.proposal.proposals import ProposalConfig

@@ -1,23 +1,23 @@
 """All steps from frames to rows, made of the settings: what every process that takes part needs."""
 
-import time
 from collections import Counter
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
-from shapepose_fg.body.fitting.bone_reach import longest_bones
 from shapepose_fg.body.fitting.fitter import BodyFitter
-from shapepose_fg.core.camera import Rig
+from shapepose_fg.body.fitting.priors import longest_bones
+from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.estimation.estimator import Estimator, ExtraFactors
 from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.solve_window import Assigning, solve_window
+from shapepose_fg.estimation.window_graph import ExtraFactors
+from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.runs.notes import Notebook
-from shapepose_fg.pipeline.windows import Engine, Solved, Span
+from shapepose_fg.pipeline.windows import Engine, Span
 from shapepose_fg.proposal.association import AssociationConfig, associate
 from shapepose_fg.proposal.candidates import CandidateConfig, PairPoints, triangulate_pairs, vote
 from shapepose_fg.proposal.hypotheses import Frame
@@ -25,13 +25,24 @@ from shapepose_fg.proposal.people_2d import without_repeats
 from shapepose_fg.proposal.proposals import ProposalConfig, propose
 from shapepose_fg.proposal.selection import choose
 from shapepose_fg.proposal.thinning import thinned_candidates, thinned_points
-from shapepose_fg.tracking.reassociation import Survival, reassociate
 from shapepose_fg.tracking.tracker import BodyScale, Tracker
 
 FAST_M_S = 3.0
 """The tracker predicts joints as if they moved so fast: a hand that is thrown up or strikes."""
 _ON_TRIAL = 0.5
 """Share of the probability asked for otherwise that is enough in frames that stand alone: a body will tell."""
+
+
+@dataclass(frozen=True)
+class Solved:
+    """A window that is done: its own frames."""
+
+    solution: WindowSolution
+    """The rows."""
+    frames: int
+    """How many frames they are of."""
+    false_positives: tuple[int, ...]
+    """The frame of each row that was left with no detections of its own when they were reassociated."""
 
 
 @dataclass(frozen=True)
@@ -49,34 +60,25 @@ class Setup:
     extra_factors: ExtraFactors | None = None
     """The user's own factors."""
 
-    @cached_property
-    def estimator(self) -> Estimator:
-        """Stage II."""
-        return Estimator(self.rig, self.fitter, self.skeleton.joints, self.config.estimator)
-
     def solve(self, span: Span) -> Solved:
-        """One window: detections are reassociated around drafts, then joints and bodies are solved."""
-        windows, assignment = self.config.windows, self.config.tracking.assignment
-        given = [frame for frame, _ in span.decided]
+        """One window, in whatever process."""
+        config, given = self.config, [frame for frame, _ in span.decided]
         rows = Observations.concatenate([part for _, part in span.decided])
-        before = rows.frame
-        again = windows.again_alone if span.alone else windows.again_over_time
-        began = time.perf_counter()
-        for n in range(again if len(rows) > 0 else 0):
-            joints, covariance = self.estimator.draft(rows, over_time=not span.alone)
-            survival = Survival().at(n / max(again - 1, 1)) if span.alone else None
-            rows = reassociate(given, rows, joints, covariance, self.skeleton, assignment, survival)
-        associated = time.perf_counter()
-        estimates = self.estimator.estimate(rows, self.extra_factors)
+        rounds = config.windows.again_alone if span.alone else config.windows.again_over_time
+        assigning = Assigning(given, self.skeleton, config.tracking.assignment, rounds, over_time=not span.alone)
+        solution = solve_window(
+            rows,
+            Views.of(self.rig),
+            self.fitter,
+            replace(config.estimator, joints=self.skeleton.joints),
+            assigning=assigning,
+            extra_factors=self.extra_factors,
+        )
         own = {frame.frame for frame in given[span.start : span.stop]}
-        left = Counter(before.tolist()) - Counter(rows.frame.tolist())
-        index = np.flatnonzero(np.isin(rows.frame, list(own)))
-        problems = tuple(problem for problem in estimates.problems if problem.frame in own)
+        left = Counter(rows.frame.tolist()) - Counter(solution.observations.frame.tolist())
         return Solved(
-            rows.rows(index),
-            replace(estimates.rows(index), problems=problems),
+            solution.rows(np.flatnonzero(np.isin(solution.observations.frame, list(own)))),
             frames=span.stop - span.start,
-            seconds={"associate again": associated - began, "solve": time.perf_counter() - associated},
             false_positives=tuple(sorted(frame for frame in left.elements() if frame in own)),
         )
 

@@ -18,8 +18,8 @@ from shapepose_fg.core.provenance import versions
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.core.storage.kept_arrays import InMemory, KeptArrays
-from shapepose_fg.estimation.estimator import ExtraFactors
 from shapepose_fg.estimation.floor import Floor
+from shapepose_fg.estimation.window_graph import ExtraFactors
 from shapepose_fg.pipeline.bodies_over_time import Person, fit_everybody
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.engine import Setup

@@ -11,16 +11,15 @@ from numpy.typing import NDArray
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.frame_times import FrameTimes, segments
 from shapepose_fg.core.observation_table import Gate, ObservationTable, place_in_view
-from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.estimation.estimator import Estimates
+from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.pipeline.bodies_over_time import BODY
-from shapepose_fg.pipeline.engine import Setup
+from shapepose_fg.pipeline.engine import Setup, Solved
 from shapepose_fg.pipeline.execution import Pool
 from shapepose_fg.pipeline.runs.chunks import Border, Chunk, Identities, cut_in_chunks, windows_of
 from shapepose_fg.pipeline.runs.notes import Notebook, Notes
 from shapepose_fg.pipeline.runs.parts import Checkpoint, Part
-from shapepose_fg.pipeline.windows import Solved, Span
+from shapepose_fg.pipeline.windows import Span
 from shapepose_fg.proposal.thinning import ThinnedFrames
 from shapepose_fg.tracking.hypotheses import Input
 
@@ -119,23 +118,25 @@ class SolvedWindows:
                     replace(each, track=identities.name(each.track, names)) for each in notes.problems
                 ]
                 notes.evidence = {identities.name(of, names): each for of, each in notes.evidence.items()}
-                track = [identities.name(each, names) for each in solved.observations.track.tolist()]
+                track = [identities.name(each, names) for each in solved.solution.observations.track.tolist()]
                 if last:
                     notes.add(read)
                     notes.add(found.notes)
-                rows = replace(solved.observations, track=np.array(track, dtype=np.intp))
+                rows = replace(solved.solution.observations, track=np.array(track, dtype=np.intp))
                 behind = Checkpoint(chunk.own.stop, identities.next_id, border=identities.border)
-                yield Part(self._rows(replace(solved, observations=rows)), notes, behind if last else None)
+                named = replace(solved, solution=replace(solved.solution, observations=rows))
+                yield Part(self._rows(named), notes, behind if last else None)
 
     def _notes(self, solved: Solved) -> Notes:
         """What is to be said about a window; people are tracks, or frame by frame numbers within the frame."""
-        temporal, rows, problems = self.setup.config.temporal, solved.observations, list(solved.estimates.problems)
+        temporal, solution = self.setup.config.temporal, solved.solution
+        rows, problems = solution.observations, list(solution.problems)
         if not temporal:
             problems = [
                 replace(each, track=int(((rows.frame == each.frame) & (rows.track < each.track)).sum()))
                 for each in problems
             ]
-        notes = Notes(solved.frames, Counter(solved.seconds), problems=problems)
+        notes = Notes(solved.frames, Counter(solution.seconds), problems=problems)
         if len(solved.false_positives) > 0:
             notes.dropped[_FALSE_POSITIVE] = list(solved.false_positives)
         said = np.isfinite(rows.evidence)
@@ -148,45 +149,45 @@ class SolvedWindows:
         return notes
 
     def _rows(self, solved: Solved) -> Reconstruction:
-        """Solved rows as rows of the result, by frame and person."""
-        order = np.lexsort((solved.observations.track, solved.observations.frame))
-        rows, estimates = solved.observations.rows(order), solved.estimates.rows(order)
-        if not self.setup.config.temporal:
-            number_in_frame = np.arange(len(rows)) - np.searchsorted(rows.frame, rows.frame)
-            rows = replace(rows, track=number_in_frame)
+        """Solved rows as rows of the result, by frame and person; bodies that were not fitted are NaN there."""
+        rows = solved.solution.observations
+        solution = solved.solution.rows(np.lexsort((rows.track, rows.frame)))
+        rows = solution.observations
+        number_in_frame = np.arange(len(rows)) - np.searchsorted(rows.frame, rows.frame)
+        person = rows.track if self.setup.config.temporal else number_in_frame
         place = np.full(rows.candidate.shape, -1, dtype=np.int32)
         for frame in np.unique(rows.frame).tolist():
             of_frame = rows.frame == frame
             own = self.detections.in_recording(frame, rows.candidate[of_frame])
             place[of_frame] = place_in_view(own, self.detections.frames[frame].view)
-        return result_rows(rows, estimates, place, self.setup.rig, self.setup.skeleton.joints)
+        return result_rows(solution, place, self.setup.rig, self.setup.skeleton.joints, person)
 
 
 def result_rows(
-    observations: Observations,
-    estimates: Estimates,
+    solution: WindowSolution,
     place: NDArray[np.integer],
     rig: Rig,
     joint_names: Sequence[str],
+    person: NDArray[np.integer],
 ) -> Reconstruction:
-    """N solved rows as a result, in their order, `track` as person; bodies that were not fitted are NaN there.
+    """N solved rows as a result, in their order; bodies that were not fitted are NaN there.
 
-    `place` (N, J, V) is each detection's place among those of its view (`place_in_view`).
+    `place` (N, J, V) is each detection's place among those of its view (`place_in_view`), `person` (N,) who it is.
     """
-    fit = estimates.fit
+    fit, observations = solution.fit, replace(solution.observations, track=person)
     body = {name: getattr(fit, name).copy() for name in BODY}
     for values in body.values():
         values[~fit.ok] = np.nan
-    dropped = np.where(estimates.contradicts[..., None], Gate.CONTRADICTS_BODY, Gate.TOO_FAR)
-    gate = np.where(estimates.inlier, Gate.USED, dropped)
+    dropped = np.where(solution.contradicts[..., None], Gate.CONTRADICTS_BODY, Gate.TOO_FAR)
+    gate = np.where(solution.inlier, Gate.USED, dropped)
     names = ("joints", "covariance", "velocity", "velocity_covariance", "known", "confidence", "status")
     return Reconstruction(
         frame=observations.frame,
-        person=observations.track,
+        person=person,
         time_s=observations.time_s.mean(axis=1),
         joint_names=np.array(joint_names),
-        observations=ObservationTable.of(observations, place, estimates.joints, gate, rig, joint_names),
-        **{name: getattr(estimates, name) for name in names},
+        observations=ObservationTable.of(observations, place, solution.joints, gate, rig, joint_names),
+        **{name: getattr(solution, name) for name in names},
         **body,
     )
 

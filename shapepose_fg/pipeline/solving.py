@@ -10,14 +10,14 @@ from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.threads import torch_threads
-from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.frame_times import segments
-from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.run_summary import covered_frames
-from shapepose_fg.estimation.estimator import Estimates, Estimator, ExtraFactors
 from shapepose_fg.estimation.floor import Floor
-from shapepose_fg.estimation.window_solution import WindowSolution
+from shapepose_fg.estimation.solve_window import solve_window
+from shapepose_fg.estimation.window_graph import ExtraFactors
+from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution
 from shapepose_fg.io.solved_setup import SolvedSetup, setup_of
 from shapepose_fg.pipeline.bodies_over_time import with_bodies_over_time
 from shapepose_fg.pipeline.config import PipelineConfig
@@ -53,10 +53,10 @@ def solve_rows(rows: Reconstruction, solver: Solver) -> Reconstruction:
     they were solved from.
     """
     parts = []
-    for own, part, estimates, observations, _ in _solved(rows, solver, None):
+    for own, part, solution in _solved(rows, solver, None):
         assert part.observations is not None
         names = tuple(part.joint_names.tolist())
-        solved = result_rows(observations, estimates, part.observations.candidate, solver.rig, names)
+        solved = result_rows(solution, part.observations.candidate, solver.rig, names, part.person)
         parts.append(solved.rows(_inside(part.frame, own)))
     solved = replace(Reconstruction.concatenate(parts), run=rows.run) if parts else rows
     if solver.fitter.model is None or not solver.config.temporal:
@@ -66,7 +66,7 @@ def solve_rows(rows: Reconstruction, solver: Solver) -> Reconstruction:
 
 def window_solutions(
     people: Reconstruction, rig: Rig, *, extra_factors: ExtraFactors | None = None
-) -> Iterator[WindowSolution]:
+) -> Iterator[PersonGraph]:
     """Every person of every window of a result as one graph, whose values and marginals are the result's.
 
     Joints and covariances are those of `people`; the graph below is solved anew from their observations, before
@@ -75,28 +75,31 @@ def window_solutions(
     does not say the settings, ValueError where there are no observations.
     """
     solver = Solver.of(setup_of(people, rig, PipelineConfig), people.joint_names)
-    for _, part, _, _, solutions in _solved(people, solver, extra_factors):
-        for solution in solutions:
-            as_reported = {"joints": part.joints[solution.rows], "covariance": part.covariance[solution.rows]}
-            yield solution if extra_factors is not None else replace(solution, **as_reported)
+    for _, part, solution in _solved(people, solver, extra_factors):
+        for person in solution.people:
+            as_reported = {"joints": part.joints[person.rows], "covariance": part.covariance[person.rows]}
+            yield person if extra_factors is not None else replace(person, **as_reported)
 
 
 def _solved(
     rows: Reconstruction, solver: Solver, extra_factors: ExtraFactors | None
-) -> Iterator[tuple[range, Reconstruction, Estimates, Observations, list[WindowSolution]]]:
+) -> Iterator[tuple[range, Reconstruction, WindowSolution]]:
     """Each window of the recording: its own frames, and its rows with those around it, solved."""
     if rows.observations is None:
         raise ValueError("rows without observations cannot be solved anew; reconstruct the recording again")
-    config, names = solver.config, tuple(rows.joint_names.tolist())
-    estimator = Estimator(solver.rig, solver.fitter, names, config.estimator)
+    config, views = solver.config, Views.of(solver.rig)
+    settings = replace(config.estimator, joints=tuple(rows.joint_names.tolist()))
     with torch_threads(config.threads):
         for own, segment in _windows(rows, config):
             part = rows.rows(_rows_of(rows, own, segment, config.windows.overlap_s))
             assert part.observations is not None
             # From the views: the joints as they are may be somebody else's.
             observations = part.observations.observations(np.full_like(part.joints, np.nan), part.time_s)
-            estimates, solutions = estimator.solve(observations, extra_factors)
-            yield own, part, estimates, observations, solutions
+            yield (
+                own,
+                part,
+                solve_window(observations, views, solver.fitter, settings, extra_factors=extra_factors),
+            )
 
 
 def _rows_of(rows: Reconstruction, own: range, segment: range, overlap_s: float) -> NDArray[np.intp]:

@@ -10,8 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.core.observations import Observations
-from shapepose_fg.estimation.estimator import Estimates
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.config import WindowConfig as WindowConfig
 from shapepose_fg.tracking.following import Decided, FollowState, alone, finish, follow
@@ -45,22 +43,6 @@ class Span:
     """The one after the last."""
     alone: bool = False
     """Whether every frame is a recording of its own."""
-
-
-@dataclass(frozen=True)
-class Solved:
-    """Rows that are done."""
-
-    observations: Observations
-    """Who, when, and from what."""
-    estimates: Estimates
-    """Joints and bodies."""
-    frames: int
-    """How many frames they are of."""
-    seconds: dict[str, float]
-    """What it took, by stage."""
-    false_positives: tuple[int, ...] = ()
-    """The frame of each row that was left with no detections of its own when they were reassociated."""
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ from shapepose_fg.body.fitting.evidence import weigh
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
 from shapepose_fg.body.fitting.fitters import SmplFitter, evenly, make_fitter
 from shapepose_fg.body.fitting.left_out import left_out_sets, plan_passes
-from shapepose_fg.body.fitting.pose_prior import PosePrior
 from shapepose_fg.body.fitting.posterior import LIMB_M, joint_covariance
+from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.target_skeletons import TARGET_SKELETONS
 from shapepose_fg.core.skeleton import BODY_25
@@ -23,6 +23,13 @@ NOISE_M = 0.01
 COUNT = 160
 FITTERS = {"plain": SmplFitter, "learned": make_fitter}
 """Every fitter that ships."""
+
+
+def slow(*values: object) -> list:
+    """Parameters that `make test` leaves out."""
+    return [
+        pytest.param(*(each if isinstance(each, tuple) else (each,)), marks=pytest.mark.slow) for each in values
+    ]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -75,7 +82,7 @@ def mahalanobis(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     return np.einsum("...i,...ij,...j->...", error, np.linalg.inv(covariance), error)
 
 
-@pytest.mark.parametrize("name", ["RKnee", "LElbow", "RWrist", "MidHip", "LBigToe"])
+@pytest.mark.parametrize("name", ["RKnee", "LElbow", *slow("RWrist", "MidHip", "LBigToe")])
 def test_a_joints_own_target_does_not_come_back_to_it(fitter, people, fit, name):
     joint = BODY_25.index(name)
     xyz = people[1].copy()
@@ -118,7 +125,11 @@ def test_gain_on_own_noise_is_nothing(fitter, people, fit):
 
 @pytest.mark.parametrize(
     ("name", "median_m"),
-    [("LHip", 0.01), ("RKnee", 0.01), ("RAnkle", 0.01), ("RElbow", 0.01), ("LWrist", 0.025), ("Nose", 0.01)],
+    [
+        ("RKnee", 0.01),
+        ("LWrist", 0.025),
+        *slow(("LHip", 0.01), ("RAnkle", 0.01), ("RElbow", 0.01), ("Nose", 0.01)),
+    ],
 )
 def test_the_prior_is_a_refit_without_the_joint(fitter, people, fit, name, median_m):
     """Others of its set are left out too: they are to tell little of it."""
@@ -253,6 +264,7 @@ def test_priors_are_calibrated_on_bodies_from_the_priors(people):
     assert (by_joint > 1.0).all() and (by_joint < 4.0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "hidden", [("RWrist",), ("LElbow", "LWrist"), ("RAnkle", "RBigToe", "RSmallToe", "RHeel")]
 )

@@ -13,7 +13,7 @@ from shapepose_fg.core.storage import files
 from shapepose_fg.core.storage.kept_arrays import InFolder
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections import read_detections
-from shapepose_fg.io.detections.one_file import read_one_file
+from shapepose_fg.io.detections.json_people import read_one_file
 from shapepose_fg.io.write_detections import write_association
 from shapepose_fg.simulation import Scene, built_in_scene, simulate
 
@@ -99,6 +99,7 @@ def test_people_in_files_give_the_same_and_scores_are_judged_over_all(rig, tmp_p
     assert {file.name.split("-")[0] for file in (tmp_path / "a").iterdir()} == {"seen"}
 
 
+@pytest.mark.slow
 def test_a_file_of_all_frames_takes_the_memory_of_its_numbers(tmp_path):
     """10,000 people of COCO, in any order: 4 MB as arrays, 5 MB of text, and 40 as Python's objects."""
     rng = np.random.default_rng(0)
@@ -166,6 +167,7 @@ def test_text_is_utf_8_and_may_have_a_mark_and_other_ends_of_lines(text, scene, 
         read_detections(tmp_path, scene.rig)
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_recording(scene, once, tmp_path, monkeypatch):
     """Three times the frames in as much memory."""
     monkeypatch.setattr(files, "PIECE", 2**15)  # a tenth of a block

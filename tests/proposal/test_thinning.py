@@ -128,6 +128,7 @@ def test_many_points_are_clustered_as_if_one_by_one():
     np.testing.assert_array_equal(_greedy_seeds(points, radius), expected)
 
 
+@pytest.mark.slow
 def test_a_crowd_of_strangers_ends():
     """120 people a view, none of whom two views share: 3.6 million pairs, and once a frame without end."""
     rig = ring_of_cameras(5, np.random.default_rng(0))

@@ -22,9 +22,8 @@ from shapepose_fg.evaluation.spoiled_setups import (
 )
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
-from shapepose_fg.setup_check.changes import Kind
 from shapepose_fg.setup_check.diagnosis import diagnose
-from shapepose_fg.setup_check.words import sentence
+from shapepose_fg.setup_check.findings import Kind, sentence
 
 
 def only_finding(recording, rig):
@@ -97,6 +96,7 @@ def test_a_camera_that_is_listed_twice_is_named(recording, room):
     assert found.duplicate.same_pose and not found.duplicate.same_detections
 
 
+@pytest.mark.slow
 def test_mistakes_of_all_cameras_are_named(recording, room):
     everybody = tuple(range(5))
     for detections, rig, kind in (
@@ -143,6 +143,7 @@ def test_the_range_of_frames_is_kept_to(recording, room):
     assert diagnose(half, room, range(20, 60)).findings[0].kind == Kind.LATE
 
 
+@pytest.mark.slow
 def test_shelf_says_nothing_and_its_mistakes_are_named(shared_data):
     rig = read_rig(shared_data / "shelf" / "calibration.json")
     recording = read_detections(shared_data / "shelf", rig)

@@ -115,6 +115,7 @@ main.main(["simulate", "demo", "--people", "2", "--cameras", "2", "--frames", ":
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="asks Linux which processes run")
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_ctrl_c_and_the_end_of_the_parent_end_everybody(how: signal.Signals, tmp_path: Path):

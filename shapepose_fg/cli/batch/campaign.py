@@ -29,7 +29,7 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import open_regular
 from shapepose_fg.core.storage.output_folder import prepare_output
 from shapepose_fg.io.corrections import refuse_corrected
-from shapepose_fg.io.detections.places import find_places
+from shapepose_fg.io.detections.reading import find_places
 from shapepose_fg.io.skeleton_file import find_skeleton
 from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.runs.manifest import PARTS
@@ -269,7 +269,7 @@ def _look_at(entry: Entry, folder: Path, begun: bool) -> int:
     """Bytes of a recording's detections."""
     known = prepare(entry.request, folder, tell=lambda _: None)
     asked = known.request
-    places = find_places(known.detections, asked.rig())
+    places, _ = find_places(known.detections, asked.rig())
     find_skeleton(asked.skeleton)
     source = known.settings().offsets.source
     for file in (asked.body, asked.timestamps, None if source in ("recording", "none") else Path(source)):
@@ -283,5 +283,5 @@ def _look_at(entry: Entry, folder: Path, begun: bool) -> int:
         raise InputError(
             f"{folder / PARTS}: a run was stopped here; go on with --resume, or begin anew with --restart"
         )
-    files = (file for path in places.paths for file in (path.rglob("*") if path.is_dir() else (path,)))
+    files = (file for path in places for file in (path.rglob("*") if path.is_dir() else (path,)))
     return sum(file.stat().st_size for file in files if file.is_file())

@@ -13,11 +13,10 @@ from shapepose_fg.core.frame_times import rate_words
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.pipeline.pipeline import Task
 from shapepose_fg.pipeline.runs.assembly import Assembly
-from shapepose_fg.setup_check.camera_use import use_table
-from shapepose_fg.setup_check.diagnosis import diagnose
 from shapepose_fg.setup_check.in_result import ResultCheck, result_check
-from shapepose_fg.setup_check.pictures import other_sizes
-from shapepose_fg.setup_check.report import report_of
+from shapepose_fg.setup_check.plain import other_sizes
+from shapepose_fg.setup_check.report import check_setup as check_detections
+from shapepose_fg.setup_check.table import use_table
 
 _SURE = 0.9
 """Whoever is less probable is named."""
@@ -40,7 +39,7 @@ def check_setup(known: Prepared, task: Task, people: Reconstruction) -> ResultCh
             sizes = other_sizes([str(videos)], task.rig) if videos.is_dir() else ()
         except InputError as error:  # the result does not need them
             note(f"{error}; their sizes are not checked")
-    report = report_of(diagnose(task.detections, task.rig, frames), task.rig, sizes)
+    report = check_detections(task.detections, task.rig, frames, sizes)
     return result_check(report, people, task.detections, task.rig, frames)
 
 

@@ -28,7 +28,7 @@ from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.corrections import refuse_corrected
 from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.detections import read_detections
-from shapepose_fg.io.export.marker_files import write_pose2sim_files
+from shapepose_fg.io.export.markers import write_pose2sim_files
 from shapepose_fg.io.solved_setup import CAMERAS
 from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.pipeline import Task, reconstruct_parts

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from shapepose_fg.estimation.outcome import Problem
+from shapepose_fg.estimation.window_solution import Problem
 from shapepose_fg.tracking.hypotheses import Input
 
 

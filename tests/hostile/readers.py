@@ -1,0 +1,357 @@
+"""Every reader of files from others, with valid files to be changed: for property tests and `scripts/fuzz.py`."""
+
+import json
+import pickle
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse
+
+from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
+from shapepose_fg.body.model.smpl_file import SMPL_PARENTS, read_smpl_file
+from shapepose_fg.body.shapes import SubjectShapes, read_body
+from shapepose_fg.cli.batch.standing import Standing, Standings, read_standings
+from shapepose_fg.cli.batch.table import read_table
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.observation_table import ObservationTable
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.skeleton import BODY_25, COCO_17
+from shapepose_fg.detection2d.onnx_file import read_onnx
+from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
+from shapepose_fg.evaluation.other_results import read_people
+from shapepose_fg.io.calibration import read_rig, write_rig
+from shapepose_fg.io.config import read_config, toml_text
+from shapepose_fg.io.corrections import correct, read_corrections, take_back
+from shapepose_fg.io.detections import read_detections
+from shapepose_fg.io.export.markers import Markers, opensim_names, trc_text
+from shapepose_fg.io.export.registry import chosen, export_result
+from shapepose_fg.io.footage.placement import read_used_footage
+from shapepose_fg.io.pose2sim_project import read_pose2sim_project
+from shapepose_fg.io.skeleton_file import read_skeleton
+from shapepose_fg.io.timestamps import read_timestamps
+from shapepose_fg.pipeline.pipeline import PipelineConfig
+from shapepose_fg.tracking.edits import Action, Edit
+from shapepose_fg.tracking.listing import list_saved_tracks
+from shapepose_fg.viz.report.writing import report_of
+from tests.core import test_reconstruction as results
+from tests.io import test_calibration_formats as rigs
+from tests.io import test_people_formats as people
+
+Read = Callable[[], object]
+"""Reads the files; raises InputError, or returns."""
+Prepare = Callable[[Path, int], Read]
+"""Writes valid files into a folder, other ones for another seed, and returns what reads them."""
+
+
+def _calibration(program: str) -> Prepare:
+    def prepare(folder: Path, seed: int) -> Read:
+        write, wishes, _ = rigs.WRITERS[program]
+        path = write(folder)
+        return lambda: read_rig(path, **wishes)
+
+    return prepare
+
+
+def _rig_file(folder: Path, seed: int) -> Read:
+    write_rig(_rig(seed), folder / "rig.json")
+    return lambda: read_rig(folder / "rig.json")
+
+
+def _association(folder: Path, seed: int) -> Read:
+    cameras = {
+        camera.name: {
+            "K": camera.K.ravel().tolist(),
+            "RT": camera.cTw.ravel().tolist(),
+            "imgSize": list(camera.image_size),
+            "distCoeff": [0.1, 0, 0, 0, 0],
+        }
+        for camera in _rig(seed).cameras
+    }
+    (folder / "calibration.json").write_text(json.dumps(cameras))
+    return lambda: read_rig(folder / "calibration.json")
+
+
+def _colmap(folder: Path, seed: int) -> Read:
+    shutil.copytree(rigs.DATA / "colmap", folder / "colmap")
+    return lambda: read_rig(folder / "colmap", unit="m", up="z")
+
+
+def _people(program: str) -> Prepare:
+    def prepare(folder: Path, seed: int) -> Read:
+        people.WRITERS[program](folder, people.people_of(BODY_25 if seed % 2 else COCO_17))
+        rig = people.two_cameras("left", "right")
+        return lambda: read_detections(folder, rig)
+
+    return prepare
+
+
+def _text(folder: Path, seed: int) -> Read:
+    """4D Association's: two hips, three necks and a wrist; nobody; a nose, hips and knees."""
+    rng = np.random.default_rng(seed)
+    for name in ("left", "right"):
+        lines = ["4 3"]
+        for count in ({8: 2, 1: 3, 4: 1}, {}, {0: 1, 9: 2, 10: 2}):
+            for joint in range(25):
+                lines += [str(count.get(joint, 0)), *(_row(rng, count.get(joint, 0)) for _ in range(3))]
+            lines += [_row(rng, count.get(a, 0) * count.get(b, 0)) for a, b in BODY_25.limbs]
+        (folder / f"{name}.txt").write_text("\n".join(lines))
+    rig = people.two_cameras("left", "right")
+    return lambda: read_detections(folder, rig)
+
+
+def _row(rng: np.random.Generator, count: int) -> str:
+    return " ".join(f"{value:.3f}" for value in rng.uniform(0.1, 0.9, count))
+
+
+def _skeleton(folder: Path, seed: int) -> Read:
+    (folder / "ours.toml").write_text(people.USER)
+    return lambda: read_skeleton(folder / "ours.toml")
+
+
+def _settings(folder: Path, seed: int) -> Read:
+    (folder / "settings.toml").write_text(toml_text(PipelineConfig()))
+    return lambda: read_config(folder / "settings.toml", PipelineConfig)
+
+
+def _times(folder: Path, seed: int) -> Read:
+    (folder / "times.csv").write_text(
+        "frame, cam0, cam1\n" + "".join(f"{t}, {t / 25}, {t / 25}\n" for t in range(9))
+    )
+    rig = _rig(seed, 2)
+    return lambda: read_timestamps(folder / "times.csv", rig, 9)
+
+
+def _project(folder: Path, seed: int) -> Read:
+    rig = _rig(seed, 2)
+    (folder / "calibration").mkdir()
+    write_rig(rig, folder / "calibration" / "rig.json")
+    for name in rig.names:
+        (folder / "pose" / f"{name}_json").mkdir(parents=True)
+        (folder / "pose" / f"{name}_json" / f"{name}_000003.json").write_text('{"version": 1.3, "people": []}')
+    text = "[project]\nmulti_person = false\nframe_rate = 50\nframe_range = [3, 4]\n[pose]\npose_model = 'Body'\n"
+    (folder / "Config.toml").write_text(text)
+    return lambda: read_pose2sim_project(folder)
+
+
+def _recordings(folder: Path, seed: int) -> Read:
+    text = '[defaults]\nfps = 25\ncalibration = "cameras.toml"\n'
+    text += '[recordings.walk]\ndetections = "walk"\ncuts = [300, 600]\nskeleton = "COCO_17"\n'
+    text += '[recordings.dance-2]\nproject = "/data/dance"\nframes = "0:100"\nshapes = "who.npz"\n'
+    (folder / "recordings.toml").write_text(text)
+    return lambda: read_table(folder / "recordings.toml")
+
+
+def _batch(folder: Path, seed: int) -> Read:
+    standings = Standings(folder / "batch.json", "recordings.toml", {"walk": Standing({"fps": 25.0, "cuts": [3]})})
+    standings.set("dance", Standing({}).failed("no", 1.5, 1))
+    return lambda: read_standings(folder / "batch.json")
+
+
+def _network(folder: Path, seed: int) -> Read:
+    """A graph in a node's attribute, and a tensor in each."""
+
+    def field(number: int, content: bytes) -> bytes:
+        return bytes([number << 3 | 2, len(content)]) + content
+
+    tensor = field(9, bytes(40)) + bytes([2 << 3, 1])
+    inside = field(6, field(5, tensor))
+    (folder / "n.onnx").write_bytes(field(7, field(5, tensor) + field(1, field(5, inside))))
+    return lambda: read_onnx(folder / "n.onnx")
+
+
+def _corrections(folder: Path, seed: int) -> Read:
+    edits = [{"action": "split", "person": 1, "other": 7, "frame": 4}, {"action": "drop", "person": 2}]
+    content = {"format": "shapepose-fg corrections 1", "people": "0" * 64, "edits": edits}
+    (folder / "corrections.json").write_text(json.dumps(content))
+    (folder / "people.npz").write_bytes(b"others")
+    return lambda: read_corrections(folder)
+
+
+def _footage(folder: Path, seed: int) -> Read:
+    camera = {"name": "c", "path": "c.mp4", "placement": "letterbox", "picture_size": [960, 512]}
+    camera |= {"calibrated_size": [1920, 1080], "pictures": [3, 4, -1, 6]}
+    content = {"format": "shapepose-fg footage 1", "network": {}, "cameras": [camera]}
+    (folder / "footage.json").write_text(json.dumps(content))
+    return lambda: read_used_footage(folder / "footage.json")
+
+
+def _offsets(folder: Path, seed: int) -> Read:
+    KeypointOffsets.identity().save(folder / "offsets.json")
+    return lambda: KeypointOffsets.load(folder / "offsets.json")
+
+
+def _motion(folder: Path, seed: int) -> Read:
+    from importlib.resources import files
+
+    (folder / "motion.json").write_text((files("shapepose_fg.estimation") / "data" / "motion.json").read_text())
+    config = MotionConfig(model=str(folder / "motion.json"))
+    return lambda: MotionModel.load(BODY_25.joints, config)
+
+
+def _result(folder: Path, seed: int) -> Read:
+    results.people([0, 0, 3], seed).save(folder)
+    _unpack(folder / "people.npz")
+    return lambda: Reconstruction.load(folder)
+
+
+def _result_for(use: Callable[[Path], object]) -> Prepare:
+    """A result, of which `use` is made in a copy: what is written there is no file to be changed."""
+
+    def prepare(folder: Path, seed: int) -> Read:
+        results.people([0, 0, 3], seed).save(folder)
+        _unpack(folder / "people.npz")
+
+        def read() -> None:
+            with tempfile.TemporaryDirectory() as copy:
+                shutil.copytree(folder, copy, dirs_exist_ok=True)
+                use(Path(copy))
+
+        return read
+
+    return prepare
+
+
+def _exported(folder: Path) -> None:
+    for name in ("csv", "bvh", "c3d"):
+        export_result(folder, chosen([name]), folder / "export", up="z")
+
+
+def _listed(folder: Path) -> None:
+    with Reconstruction.open(folder) as opened:
+        list_saved_tracks(opened, read_body())
+
+
+def _merged(folder: Path) -> None:
+    correct(folder, Edit(Action.MERGE, 0, 2))
+    take_back(folder)
+
+
+def _observations(folder: Path, seed: int) -> Read:
+    from tests.core import test_observation_table as tables
+
+    tables.table().save(folder / "observations.npz")
+    _unpack(folder / "observations.npz")
+    return lambda: ObservationTable.load(folder / "observations.npz")
+
+
+def _shapes(folder: Path, seed: int) -> Read:
+    betas, information = np.random.default_rng(seed).normal(size=(2, 10)), np.tile(np.eye(10), (2, 1, 1))
+    SubjectShapes(np.array(["a", "b"]), betas, information, "body").save(folder / "shapes.npz")
+    _unpack(folder / "shapes.npz")
+    return lambda: SubjectShapes.load(folder / "shapes.npz", "body")
+
+
+def _unpack(file: Path) -> None:
+    """Without compression, so that changed bytes are changed numbers."""
+    with np.load(file) as archive:
+        columns = dict(archive)
+    np.savez(file, **columns)
+
+
+def _body(pickled: bool) -> Prepare:
+    def prepare(folder: Path, seed: int) -> Read:
+        arrays = tiny_body(seed)
+        if pickled:
+            arrays["J_regressor"] = scipy.sparse.csc_matrix(arrays["J_regressor"])
+            (folder / "body.pkl").write_bytes(pickle.dumps(arrays, protocol=2 + seed % 3))
+            return lambda: read_smpl_file(folder / "body.pkl")
+        np.savez(folder / "body.npz", **arrays)
+        return lambda: read_smpl_file(folder / "body.npz")
+
+    return prepare
+
+
+def tiny_body(seed: int) -> dict[str, np.ndarray]:
+    """A body in SMPL's format with two vertices at each joint and keypoint of the shipped one, and no more."""
+    from shapepose_fg.body.shapes import read_body
+
+    body, rng = read_body(), np.random.default_rng(seed)
+    points = np.concatenate([body.joint_regressor, body.keypoint_regressor]) @ body.template
+    apart = rng.normal(0, 0.01, points.shape)
+    count = 2 * len(points)
+    pairs = np.kron(np.eye(len(points)), [[0.5, 0.5]])
+    weights = np.repeat(np.eye(len(points))[:, :24] + 1e-3, 2, axis=0)
+    return {
+        "v_template": np.stack([points + apart, points - apart], axis=1).reshape(-1, 3),
+        "shapedirs": rng.normal(0, 0.01, (count, 3, 10)),
+        "J_regressor": pairs[:24],
+        "keypoint_regressor": pairs[24:],
+        "weights": weights / weights.sum(axis=1, keepdims=True),
+        "kintree_table": np.array([(2**32 - 1, *SMPL_PARENTS[1:]), range(24)], dtype=np.uint32),
+        "f": rng.integers(0, count, (20, 3)).astype(np.uint32),
+    }
+
+
+def _weights(folder: Path, seed: int) -> Read:
+    from shapepose_fg.body.fitting.network import NetworkConfig, UpdateNetwork
+    from shapepose_fg.body.fitting.weights import FitterWeights
+
+    network = UpdateNetwork(NetworkConfig(width=2, blocks=1))
+    shipped = FitterWeights.default()
+    FitterWeights(network, shipped.frame, "body", shipped.spread, {}).save(folder / "weights.safetensors")
+    return lambda: FitterWeights.load(folder / "weights.safetensors")
+
+
+def _rig(seed: int, cameras: int = 3) -> Rig:
+    from shapepose_fg.simulation.scene import ring_of_cameras
+
+    return ring_of_cameras(cameras, np.random.default_rng(seed))
+
+
+def _people_text(folder: Path, seed: int) -> Read:
+    path, rng = folder / "skel.txt", np.random.default_rng(seed)
+    joints = (15, 17, 19)[seed % 3]
+    lines = [f"{joints}\t2"]
+    for count in (2, 1):
+        lines.append(str(count))
+        for person in range(count):
+            rows = np.concatenate([rng.normal(0, 1, (3, joints)), np.ones((1, joints))])
+            lines += [str(person), *(" ".join(f"{value:10.6g}" for value in row) for row in rows)]
+    path.write_text("\n".join(lines) + "\n")
+    return lambda: read_people(path)
+
+
+def _people_trc(folder: Path, seed: int) -> Read:
+    rng = np.random.default_rng(seed)
+    for person in range(2):
+        markers = Markers(opensim_names(BODY_25.joints), rng.normal(0, 1, (3, 25, 3)), np.zeros((3, 25)))
+        text = trc_text(markers, np.arange(3), np.arange(3) / 25, 25.0, f"P{person}.trc")
+        (folder / f"P{person}.trc").write_text(text)
+    return lambda: read_people(folder)
+
+
+READERS: dict[str, Prepare] = {
+    **{f"cameras of {program}": _calibration(program) for program in rigs.WRITERS},
+    **{f"detections of {program}": _people(program) for program in people.WRITERS},
+    "cameras of COLMAP": _colmap,
+    "cameras of 4D Association": _association,
+    "cameras in our rig file": _rig_file,
+    "detections of 4D Association": _text,
+    "skeleton": _skeleton,
+    "settings": _settings,
+    "times": _times,
+    "project of Pose2Sim": _project,
+    "recordings": _recordings,
+    "batch": _batch,
+    "network": _network,
+    "corrections": _corrections,
+    "footage": _footage,
+    "offsets": _offsets,
+    "motion": _motion,
+    "result": _result,
+    "result for export": _result_for(_exported),
+    "result for its report": _result_for(report_of),
+    "result for its tracks": _result_for(_listed),
+    "result for corrections": _result_for(_merged),
+    "observations": _observations,
+    "shapes": _shapes,
+    "body": _body(False),
+    "pickled body": _body(True),
+    "weights": _weights,
+    "people in 4D Association's text": _people_text,
+    "people in TRC": _people_trc,
+}
+"""Every reader, by what it reads."""

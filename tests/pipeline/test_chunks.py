@@ -1,0 +1,195 @@
+"""Chunks of a recording, reconstructed side by side: the same people, the same joints, the same names."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from shapepose_fg.body.fitting.fitters import make_fitter
+from shapepose_fg.cli.stopping import Stopped
+from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.core.storage.kept_arrays import InFolder
+from shapepose_fg.pipeline.engine import Setup
+from shapepose_fg.pipeline.execution import Execution
+from shapepose_fg.pipeline.pipeline import PipelineConfig, Task, reconstruct, reconstruct_parts
+from shapepose_fg.pipeline.runs import chunks
+from shapepose_fg.pipeline.runs.chunks import Border, Chunk, cut_in_chunks, same_people, windows_of
+from shapepose_fg.pipeline.solved_windows import solve_chunk
+from shapepose_fg.pipeline.windows import Engine, WindowConfig
+from shapepose_fg.simulation import built_in_scene, simulate
+from shapepose_fg.tracking.following import FollowingConfig
+from shapepose_fg.tracking.hypotheses import Input
+
+CONFIG = PipelineConfig(
+    batch_frames=12, following=FollowingConfig(look_ahead_s=0.3), windows=WindowConfig(overlap_s=0.16)
+)
+CUTS = (30,)
+
+
+def slow(value: float):
+    """A parameter that `make test` leaves out."""
+    return pytest.param(value, marks=pytest.mark.slow)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_warm_up():
+    """Chunks of a second deserve less than six to warm up."""
+    before, chunks.WARM_S = chunks.WARM_S, 0.5
+    yield
+    chunks.WARM_S = before
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Two people before four cameras, 54 frames with a cut after 30."""
+    return built_in_scene(seed=3, people=2, cameras=4, frames=54)
+
+
+@pytest.fixture(scope="module")
+def recording(scene):
+    return simulate(scene, seed=3)
+
+
+@pytest.fixture(scope="module")
+def whole(scene, recording):
+    return reconstruct(recording, scene.rig, CONFIG, cuts=CUTS)
+
+
+@pytest.fixture(scope="module")
+def in_chunks(scene, recording):
+    return reconstruct(recording, scene.rig, CONFIG, cuts=CUTS, execution=Execution(chunk_frames=12))
+
+
+def test_chunks_change_neither_people_nor_names(whole, in_chunks):
+    assert np.array_equal(in_chunks.frame, whole.frame)
+    pairs = set(zip(whole.person.tolist(), in_chunks.person.tolist(), strict=True))
+    assert len(pairs) == len(np.unique(whole.person)) == len(np.unique(in_chunks.person))
+    # The same windows and detections. Only where tracks expected joints differs, after half a second of warm-up,
+    # and that is where joints start that no two views see.
+    apart = np.abs(in_chunks.joints - whole.joints)
+    assert apart.max() < 2e-3 and apart.mean() < 1e-5
+    one, other = ({e["person"]: e["evidence"] for e in each.run["probability"]} for each in (whole, in_chunks))
+    assert one.keys() == {name for name, _ in pairs}
+    for name, in_chunk in pairs:
+        assert one[name] == pytest.approx(other[in_chunk], abs=2e-3)
+
+
+@pytest.mark.slow
+def test_processes_change_no_byte_of_it(scene, recording, in_chunks):
+    found = reconstruct(recording, scene.rig, CONFIG, cuts=CUTS, execution=Execution(chunk_frames=12, workers=2))
+    for name in found.ROWS:
+        equal_nan = name != "status"
+        assert np.array_equal(getattr(found, name), getattr(in_chunks, name), equal_nan=equal_nan), name
+
+
+@pytest.mark.slow
+def test_a_dask_cluster_changes_no_byte_of_it(scene, recording, in_chunks):
+    pytest.importorskip("distributed", reason="Dask is an extra")
+    execution = Execution(chunk_frames=12, workers=2, cluster="local")
+    found = reconstruct(recording, scene.rig, CONFIG, cuts=CUTS, execution=execution)
+    for name in ("joints", "covariance", "person", "body_pose"):
+        assert np.array_equal(getattr(found, name), getattr(in_chunks, name), equal_nan=name != "person"), name
+
+
+@pytest.mark.slow
+def test_a_run_in_chunks_that_was_stopped_goes_on(scene, recording, in_chunks, tmp_path):
+    def stop(done: int, _: int) -> None:
+        if done >= 20:
+            raise Stopped(15)
+
+    task = Task(recording, scene.rig, CONFIG, cuts=CUTS)
+    with pytest.raises(Stopped):
+        reconstruct_parts(InFolder(tmp_path), task, Execution(chunk_frames=12, progress=stop))
+    done: list[int] = []
+    execution = Execution(chunk_frames=12, progress=lambda n, _: done.append(n))
+    found = reconstruct_parts(InFolder(tmp_path), task, execution).reconstruction()
+    assert done[0] > 20
+    for name in ("joints", "covariance", "person", "body_pose", "frame"):
+        equal_nan = name not in ("person", "frame")
+        assert np.array_equal(getattr(found, name), getattr(in_chunks, name), equal_nan=equal_nan), name
+
+
+def test_every_frame_is_in_one_chunk_whose_borders_are_those_of_windows():
+    times = FrameTimes.from_fps(25.0, 1000)
+    config = replace(CONFIG, batch_frames=20)
+    found = cut_in_chunks(range(10, 1000), (333,), times.frame_s, config, 100)
+    frames = [frame for chunk in found for frame in chunk.own]
+    assert frames == list(range(10, 1000))
+    for chunk in found:
+        start = 10 if chunk.own.start < 333 else 333
+        assert (chunk.own.start - start) % 20 == 0 and (chunk.first - start) % 20 == 0
+        assert chunk.first >= start and chunk.until <= (333 if chunk.own.stop <= 333 else 1000)
+        assert chunk.until >= chunk.own.stop
+        assert chunk.ended == (chunk.until in (333, 1000))
+
+
+@dataclass(frozen=True)
+class NobodyIsThere:
+    """A tracker that finds nobody, and so is quick."""
+
+    skeleton = BODY_25
+
+    def newcomers(self, *_: object) -> tuple[np.ndarray, np.ndarray]:
+        """Nobody."""
+        return np.zeros((0, 25, 3)), np.zeros((0, 25, 1), dtype=np.intp)
+
+
+@pytest.mark.parametrize("fps", [3.0, slow(25.0), 50.0, slow(60.0)])
+@pytest.mark.parametrize("views", [slow(1), 3, slow(6)])
+@pytest.mark.parametrize("batch", [1, 12])
+def test_every_chunk_gives_its_own_frames_and_whole_windows(fps, views, batch):
+    """Times of views are rounded when their mean is taken: 0.4 s or 1 s are a frame more or less then."""
+    config = PipelineConfig(batch_frames=batch)
+    times = FrameTimes.from_fps(fps, 200)
+    of_views = times.of_views(views)
+
+    def read(frame: int) -> Input:
+        return Input(frame, of_views[frame], Detections.empty(), range(views))  # type: ignore[arg-type]
+
+    def spans(chunk: Chunk) -> list[tuple[list[int], int, int]]:
+        engine = Engine(NobodyIsThere(), config)  # type: ignore[arg-type]
+        found = windows_of(engine, chunk, read)
+        return [([given.frame for given, _ in span.decided], span.start, span.stop) for span in found]
+
+    whole = [
+        (frames, start, stop)
+        for stretch in (range(170), range(170, 200))
+        for frames, start, stop in spans(Chunk(stretch, stretch.start, stretch.stop, ended=True))
+    ]
+    pieces = []
+    for chunk in cut_in_chunks(range(200), (170,), times.frame_s, config, max(24, 2 * batch)):
+        found = spans(chunk)
+        own = [frame for frames, start, stop in found for frame in frames[start:stop]]
+        assert own == list(chunk.own), chunk
+        pieces += found
+    # The frames that a chunk's first window overlaps are those of the windows without chunks, too.
+    assert pieces == whole
+
+
+def test_a_chunk_without_its_frames_is_an_error_and_no_gap(scene, recording):
+    setup = Setup(scene.rig, recording.skeleton, CONFIG, make_fitter(CONFIG.body))
+    given = tuple(Input(n, np.full(4, n / 25), Detections.empty(), scene.rig) for n in range(16))
+    short = Chunk(range(0, 12), 0, 16, ended=False)  # half a window and 0.3 s more are needed
+    with pytest.raises(RuntimeError, match=r"windows of 0 frames were found for a chunk of range\(0, 12\)"):
+        solve_chunk(setup, (short, given))
+
+
+def border(track, candidate, place):
+    """Rows of one frame with one joint and one view."""
+    n = len(track)
+    return Border(
+        np.zeros(n, int), np.array(track), np.array(candidate).reshape(n, 1, 1), np.array(place).reshape(n, 1, 3)
+    )
+
+
+def test_who_is_who_by_detections_and_out_of_sight_by_place():
+    before = border([0, 1, 2], [7, 8, -1], [[0, 0, 0], [9, 0, 0], [5, 0, 0.0]])
+    after = border([10, 11, 12, 13], [8, 7, -1, -1], [[0, 0, 0], [9, 0, 0], [5.1, 0, 0], [5.0, 2, 0.0]])
+    assert same_people(before, after) == {10: 1, 11: 0, 12: 2}
+
+
+def test_chunks_shorter_than_a_window_are_refused(scene, recording):
+    with pytest.raises(ValueError, match="chunk_frames must be at least batch_frames"):
+        reconstruct(recording, scene.rig, CONFIG, execution=Execution(chunk_frames=3))

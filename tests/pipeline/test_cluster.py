@@ -1,0 +1,124 @@
+"""The processes of a Dask cluster: order, lost processes, and sentences."""
+
+import os
+import signal
+import time
+
+import pytest
+
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.pipeline.cluster import Cluster, _program, _work, has_dashboard, local_cluster
+
+
+def power(base: int, exponent: int) -> int:
+    """The work."""
+    return base**exponent
+
+
+def once_killed(marker: str, item: int) -> int:
+    """Ends its own process the first time that anybody does item 3."""
+    try:
+        if item == 3:
+            os.close(os.open(marker, os.O_CREAT | os.O_EXCL))
+            os.kill(os.getpid(), signal.SIGKILL)
+    except FileExistsError:
+        pass
+    return 10 * item
+
+
+def late(_: str, item: int) -> int:
+    """Later items are done sooner."""
+    time.sleep(0.05 * (6 - item))
+    return item
+
+
+def fails(_: str, item: int) -> int:
+    raise ArithmeticError(f"item {item}")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def installed():
+    pytest.importorskip("distributed", reason="Dask is an extra")
+
+
+def test_results_come_in_order_whoever_does_them():
+    with Cluster(None, 2, "") as cluster:
+        assert list(cluster.map(late, range(6))) == list(range(6))
+        assert list(cluster.map(late, [])) == []
+
+
+@pytest.mark.slow
+def test_a_killed_process_costs_only_its_own_work(tmp_path):
+    with Cluster(None, 2, str(tmp_path / "killed")) as cluster:
+        assert list(cluster.map(once_killed, range(6))) == [0, 10, 20, 30, 40, 50]
+    assert (tmp_path / "killed").exists()
+
+
+def test_a_process_that_comes_later_with_another_program_does_no_work():
+    """Whoever asks says what it has; a process compares, whenever it came."""
+    own = _program()
+    assert _work(tuple(own.items()), power, 2, 5) == 32
+    other = tuple((own | {"numpy": "1.0"}).items())
+    with pytest.raises(InputError, match=r"another version of numpy \(\S+ there, 1\.0 here\); install the same"):
+        _work(other, power, 2, 5)
+
+
+class FakeClient:
+    """Four processes that do everything at once."""
+
+    def nthreads(self):
+        return dict.fromkeys("abcd", 1)
+
+    def submit(self, *_, **__):
+        return self
+
+    def result(self) -> int:
+        return 0
+
+    def cancel(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize(("sharing", "under_way"), [(1, 8), (2, 4), (30, 2)])
+def test_who_shares_a_cluster_keeps_a_part_of_the_work_ready(sharing, under_way):
+    """Two items a process, of all who share them together; two at the least."""
+    taken: list[int] = []
+    cluster = Cluster("tcp://x", 1, "", sharing=sharing)
+    cluster._client = FakeClient()
+    next(cluster.map(late, (taken.append(n) or n for n in range(20))))
+    assert len(taken) == under_way
+
+
+def test_an_error_of_the_work_is_that_error():
+    with Cluster(None, 1, "") as cluster, pytest.raises(ArithmeticError, match="item 0"):
+        list(cluster.map(fails, range(3)))
+
+
+def test_processes_of_this_machine_listen_to_this_machine_and_are_deaf_to_ctrl_c():
+    import psutil
+
+    with local_cluster(1, dashboard=True) as scheduler:
+        own = psutil.Process()
+        listening = [
+            each.laddr.ip
+            for process in (own, *own.children(recursive=True))
+            for each in process.net_connections()
+            if each.status == "LISTEN"
+        ]
+        assert len(listening) >= 2 and set(listening) == {"127.0.0.1"}
+        assert scheduler.address.startswith("tcp://127.0.0.1:") and scheduler.processes == 1
+        assert (scheduler.dashboard is not None) == has_dashboard()
+        for process in own.children(recursive=True):
+            if "fork" in process.cmdline()[-1]:  # a worker; the others are Python's own helpers
+                os.kill(process.pid, signal.SIGINT)
+                time.sleep(0.2)
+                assert process.is_running() and process.status() != "zombie"
+
+
+@pytest.mark.slow
+def test_nobody_answers():
+    with (
+        pytest.raises(InputError, match=r"tcp://127\.0\.0\.1:9: no Dask scheduler answers"),
+        Cluster("tcp://127.0.0.1:9", 1, 2),
+    ):
+        pass

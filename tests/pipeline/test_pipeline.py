@@ -1,0 +1,272 @@
+"""The whole way: what goes in as 2D candidates comes out as people."""
+
+import inspect
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+import torch
+
+from factors import isotropic
+from shapepose_fg.core.detections import Detections, Recording
+from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.reconstruction import Known, Reconstruction, Status
+from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.estimation.detector_offsets import OffsetConfig
+from shapepose_fg.evaluation.metrics import joint_metrics
+from shapepose_fg.evaluation.shelf import evaluate_shelf, read_shelf_ground_truth
+from shapepose_fg.io.calibration import read_rig
+from shapepose_fg.io.detections import read_detections
+from shapepose_fg.pipeline.config import PeopleConfig
+from shapepose_fg.pipeline.execution import Execution
+from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people, reconstruct
+from shapepose_fg.simulation import built_in_scene, simulate
+from shapepose_fg.simulation.scene import Scene
+
+WRISTS = [BODY_25.index("RWrist"), BODY_25.index("LWrist")]
+
+
+@pytest.fixture(scope="module")
+def scene(dance) -> Scene:
+    return dance.scene
+
+
+@pytest.fixture(scope="module")
+def recording(dance) -> Recording:
+    """The first two thirds of a second."""
+    return Recording(BODY_25, [dance.recording[t] for t in range(16)])
+
+
+@pytest.fixture(scope="module")
+def people(dance) -> Reconstruction:
+    return dance.people
+
+
+ALONE = PipelineConfig(temporal=False)
+
+
+def assert_same(one: Reconstruction, other: Reconstruction) -> None:
+    """Rows do not influence each other; batches round differently, well under a millimetre."""
+    np.testing.assert_array_equal(one.frame, other.frame)
+    np.testing.assert_array_equal(one.status, other.status)
+    np.testing.assert_allclose(one.joints, other.joints, atol=5e-4)
+    np.testing.assert_allclose(one.betas, other.betas, atol=0.05)
+
+
+def test_everybody_is_found_once_and_where_they_are(scene, people):
+    found = joint_metrics(people, scene.keypoints)
+    assert found.people_found == found.people_true == 160
+    assert found.people_duplicated == found.people_invented == 0
+    assert found.precision >= 0.98 and found.recall >= 0.98 and found.mpjpe_mm <= 30
+    assert set(people.status) == {Status.OK}
+    assert np.isfinite(people.joints).all() and np.isfinite(people.covariance).all()
+    assert (np.linalg.eigvalsh(people.covariance) > 0).all()
+
+
+def test_the_bodies_are_where_the_joints_are(scene, people):
+    body = scene.body
+    from shapepose_fg.body.model.body_model import BodyParameters
+
+    columns = (people.betas, people.global_orient, people.body_pose, people.transl)
+    fitted = body.keypoints(BodyParameters(*(torch.from_numpy(c).to(body.dtype) for c in columns))).numpy()
+    distance = np.linalg.norm(fitted - people.joints, axis=-1)
+    assert np.median(distance) < 0.02, "the model error that the fit allows for"
+
+
+def test_the_run_says_how_it_came_about(people):
+    run = people.run
+    assert run["frames"] == [0, 40]
+    assert run["people"]["found"] == len(people) == run["people"]["status"]["ok"]
+    assert run["configuration"]["people"]["gate_m"] == PipelineConfig().people.gate_m
+    assert set(run["seconds"]) >= {"triangulate", "propose", "follow", "solve"}
+    assert run["versions"]["gtsam"].startswith("4.")
+    assert [each["person"] for each in run["probability"]] == np.unique(people.person).tolist()
+    assert all(0.3 < each["evidence"] <= 1 and 0.9 < each["probability"] <= 1 for each in run["probability"])
+
+
+def test_without_time_frames_stand_alone_and_batches_do_not_matter(scene, recording):
+    recording = Recording(BODY_25, [recording[t] for t in range(10)])
+    whole = reconstruct(recording, scene.rig, ALONE)
+    part = reconstruct(recording, scene.rig, ALONE, frames=range(5, 9))
+    rows = whole.rows((whole.frame >= 5) & (whole.frame < 9))
+    assert_same(part, rows)
+    assert part.run["frames"] == [5, 9]
+    assert sum(part.run["probability"].values()) == len(part) and set(part.run["probability"]) <= {"0.8", "0.9"}
+    assert_same(reconstruct(recording, scene.rig, replace(ALONE, batch_frames=3), frames=range(5, 9)), rows)
+
+
+def test_the_same_input_gives_the_same_bytes(scene, recording):
+    one, other = (reconstruct(recording, scene.rig, frames=range(3)) for _ in range(2))
+    for name in Reconstruction.ROWS:
+        assert getattr(one, name).tobytes() == getattr(other, name).tobytes(), name
+
+
+@pytest.mark.slow
+def test_workers_change_no_byte(scene, recording):
+    """Windows of 8 frames, so that there are several; everything in the result, gates and shapes included."""
+    config = PipelineConfig(batch_frames=8)
+    counts = list[int]()
+    alone = reconstruct(recording, scene.rig, config)
+    execution = Execution(workers=2, progress=lambda done, _: counts.append(done))
+    helped = reconstruct(recording, scene.rig, config, execution=execution)
+    assert counts == [8, 16]
+    for name in Reconstruction.ROWS:
+        assert getattr(alone, name).tobytes() == getattr(helped, name).tobytes(), name
+    assert alone.observations is not None and helped.observations is not None
+    for name, column in alone.observations.columns().items():
+        assert column.array().tobytes() == helped.observations.columns()[name].array().tobytes(), name
+    assert alone.shapes is not None and helped.shapes is not None
+    assert alone.shapes.betas.tobytes() == helped.shapes.betas.tobytes()
+
+
+def test_factors_that_cannot_be_sent_to_workers_are_refused(scene, recording):
+    with pytest.raises(ValueError, match="at the top of a module, or use workers=1"):
+        reconstruct(recording, scene.rig, extra_factors=lambda window, keys: (), execution=Execution(workers=2))
+
+
+def test_arguments_that_went_into_execution_are_named(scene, recording):
+    for name in ("workers", "cluster", "chunk_frames", "progress"):
+        with pytest.raises(TypeError, match=rf"give execution=Execution\({name}=\.\.\.\)"):
+            reconstruct(recording, scene.rig, **{name: None})
+    assert len(inspect.signature(reconstruct).parameters) <= 10
+
+
+def test_progress_counts_frames_and_torch_gets_its_threads_back(scene, recording):
+    before, seen = torch.get_num_threads(), []
+    reconstruct(
+        recording,
+        scene.rig,
+        PipelineConfig(batch_frames=4),
+        frames=range(10),
+        execution=Execution(progress=lambda *done: seen.append(done)),
+    )
+    assert seen == [(4, 10), (10, 10)], "two frames are no window of their own"
+    assert torch.get_num_threads() == before
+
+
+@pytest.mark.parametrize("frames", [range(0, 17), range(-1, 3), range(0, 8, 2)])
+def test_frames_that_are_not_there_are_refused(scene, recording, frames):
+    with pytest.raises(ValueError, match="within 0:16"):
+        reconstruct(recording, scene.rig, frames=frames)
+
+
+@pytest.mark.filterwarnings("error")
+def test_nobody_and_nothing_are_empty_results(scene):
+    nobody = reconstruct(Recording(BODY_25, [Detections.empty()] * 3), scene.rig)
+    assert len(nobody) == 0 and nobody.run["people"]["found"] == 0
+    assert len(reconstruct(Recording(BODY_25, []), scene.rig)) == 0
+
+
+def test_an_empty_frame_and_a_blind_view_harm_no_other(scene, recording):
+    blind = recording[1].only(recording[1].view != 2)
+    frames = [recording[0], Detections.empty(), blind, recording[3]]
+    # What is learnt of the detector is learnt from all frames, so it is left out here.
+    config = PipelineConfig(offsets=OffsetConfig(source="none"), temporal=False)
+    result = reconstruct(Recording(BODY_25, frames), scene.rig, config)
+    assert np.bincount(result.frame, minlength=4).tolist() == [4, 0, 4, 4]
+    assert_same(result.at(0), reconstruct(recording, scene.rig, config, frames=range(1)))
+    without_view = joint_metrics([result.joints[result.frame == 2]], scene.keypoints[1:2])
+    assert without_view.people_found == 4 and without_view.mpjpe_mm < 40
+
+
+@pytest.mark.parametrize(("seed", "frame"), [(0, 34), (1003, 8), (1004, 3)])
+def test_nobody_is_cut_in_two_and_nobody_invented(seed, frame):
+    """Frames where rays to different hips cross near somebody: that hip took the legs, or odds and ends."""
+    scene = built_in_scene(seed=seed)
+    seen = simulate(scene, seed=seed, frames=range(frame, frame + 1))[0]
+    people = find_people(seen, scene.rig, BODY_25, PipelineConfig())
+    apart = np.linalg.norm(people.initial[:, None] - scene.keypoints[frame][None], axis=-1)
+    assert len(people) == 4
+    assert sorted(np.nanmedian(apart, axis=-1).argmin(axis=1)) == [0, 1, 2, 3]
+
+
+def test_one_person_before_two_cameras():
+    scene = built_in_scene(seed=0, people=1, cameras=2, frames=6)
+    found = joint_metrics(reconstruct(simulate(scene, seed=0), scene.rig), scene.keypoints)
+    assert found.people_found == 6 and found.people_invented == 0
+    # Two views, one baseline: no third to vote an error down.
+    assert found.mpjpe_mm < 60
+
+
+def test_factors_of_one_s_own_reach_every_person(scene, recording):
+    def hands_apart(window, keys):
+        right, left = keys[0, WRISTS].tolist()
+        yield gtsam.RangeFactor3(right, left, 0.5, isotropic(1, 1e-4))
+
+    result = reconstruct(recording, scene.rig, frames=range(1), extra_factors=hands_apart)
+    apart = np.linalg.norm(result.joints[:, WRISTS[0]] - result.joints[:, WRISTS[1]], axis=-1)
+    np.testing.assert_allclose(apart, 0.5, atol=0.005)
+
+
+def test_a_factor_that_throws_a_wrist_away_is_a_status_that_names_it(scene, recording):
+    def throw(window, keys):
+        far = np.array([1000.0, 0.0, 0.0])
+        yield gtsam.PriorFactorPoint3(int(keys[0, WRISTS[0]]), far, isotropic(3, 1e-3))
+
+    result = reconstruct(recording, scene.rig, frames=range(6), extra_factors=throw)
+    failed = result.rows(result.status == Status.NOT_SOLVED)
+    # Motion takes the frames around with it: none of them may pass for solved.
+    assert 0 in failed.frame and len(failed) == len(result)
+    problems = result.run["people"]["problems"]
+    assert {(each["person"], each["frame"], each["joint"]) for each in problems} >= {
+        (person, frame, "RWrist")
+        for person, frame in zip(failed.person.tolist(), failed.frame.tolist(), strict=True)
+    }
+
+
+def test_without_time_problems_and_phantoms_are_those_of_the_frames(scene, recording):
+    """Who is named is in people.npz; who goes when detections are given out again is counted."""
+
+    def throw(window, keys):
+        far = np.array([1000.0, 0.0, 0.0])
+        yield gtsam.PriorFactorPoint3(int(keys[0, WRISTS[0]]), far, isotropic(3, 1e-3))
+
+    config = PipelineConfig(temporal=False, offsets=OffsetConfig(source="none"))
+    result = reconstruct(recording, scene.rig, config, frames=range(3), extra_factors=throw)
+    named = {(each["person"], each["frame"]) for each in result.run["people"]["problems"]}
+    assert named == set(zip(result.person.tolist(), result.frame.tolist(), strict=True))
+    assert {person for person, _ in named} == {0, 1, 2, 3}
+    # Nobody else was proposed who would have to go when detections are given out again.
+    gone = "next to no detections of their own, or in somebody else's place"
+    assert gone not in result.run["people"]["dropped"]
+
+
+def test_settings_reach_their_steps(scene, recording):
+    strict = PipelineConfig(people=PeopleConfig(min_probability=1.0))
+    assert len(find_people(recording[0], scene.rig, BODY_25, strict)) == 0
+    with pytest.raises(ValueError, match="batch_frames must be at least 1"):
+        replace(strict, batch_frames=0)
+
+
+@pytest.mark.slow
+def test_shelf_is_as_good_as_promised(shared_data):
+    """Over time, all frames; the figures are those that the project promises."""
+    shelf = shared_data / "shelf"
+    rig = read_rig(shelf / "calibration.json")
+    detections = read_detections(shelf, rig)
+    truth = read_shelf_ground_truth(shelf / "gt_dev.txt")
+    times = FrameTimes.from_fps(25.0, len(detections))
+    score = evaluate_shelf(reconstruct(detections, rig, times=times), truth)
+    assert score.people_found == score.people
+    assert score.pcp_average >= 96.4 and (score.pcp >= 92.5).all()
+
+
+def test_the_observations_are_what_the_joints_were_solved_from(dance, scene, people):
+    """Whoever reads observations.npz finds the detections, and projecting the joints gives the residuals."""
+    table = people.observations
+    assert table.used.mean() > 0.5
+    row, joint, view = np.argwhere(table.used)[1000].tolist()
+    seen = dance.recording[int(people.frame[row])]
+    own = np.flatnonzero(seen.view == view)
+    detection = own[table.candidate[row, joint, view]]
+    assert seen.joint[detection] == joint
+    np.testing.assert_allclose(table.xy[row, joint, view], seen.xy[detection], rtol=1e-6)
+    projected, _ = scene.rig.project(people.joints)
+    residual = projected[view, row, joint] - seen.xy[detection]
+    np.testing.assert_allclose(table.residual_px[row, joint, view], residual, atol=1e-3)
+    assert np.median(np.linalg.norm(table.residual_px[table.used], axis=-1)) < 10
+    # Seen means that a detection was used; nobody is known by motion where every frame stands alone.
+    np.testing.assert_array_equal(Known.observed(people.known), table.used.any(axis=-1))
+    assert set(np.unique(people.known)) <= {Known.SEEN, Known.WEAK, Known.BODY}
+    assert people.run["people"]["joints"]["seen"] == (people.known == Known.SEEN).sum()

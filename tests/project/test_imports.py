@@ -1,0 +1,187 @@
+"""Data walks one way: who may import whom, and that a light import stays light."""
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+LEVELS = (
+    "factors core.errors core.moved",
+    "core.camera core.skeleton",
+    "core.drawing",
+    "core.storage.files core.bounds",
+    "core.storage.npz",
+    "core.storage.schema",
+    "core.storage.output_folder core.storage.kept_arrays core.shapes core.provenance"
+    " core.run_summary viz.rendering pipeline.workers body.threads cli.terminal cli.stopping",
+    "core.result_files",
+    "body.model",
+    "body.fitting body.shapes",
+    "body.offsets",
+    "core.detections core.frame_times",
+    "core.observations",
+    "core.observation_table",
+    "core.reconstruction",
+    "proposal",
+    "estimation",
+    "tracking",
+    "estimation.solve_window",
+    "pipeline.config pipeline.cluster pipeline.bodies_over_time",
+    "pipeline.windows",
+    "pipeline.runs",
+    "pipeline.engine pipeline.execution",
+    "pipeline.offsets pipeline.solved_windows",
+    "pipeline.pipeline",
+    "io",
+    "pipeline.solving",
+    "simulation viz.bodies detection2d",
+    "viz.overlay setup_check",
+    "viz.viewer",
+    "io.export",
+    "viz.report",
+    "evaluation",
+    "cli.options",
+    "cli.pictures",
+    "cli.reconstruct",
+    "cli.batch",
+    "cli.demo cli.tracks cli.detect cli.overlay cli.export cli.report cli.view cli.setup cli.simulate"
+    " cli.batch.command",
+    "cli.main",
+    "__main__",
+)
+"""Each level imports only from those before it; a package may import its own modules too."""
+
+LEVEL_OF = {name: level for level, names in enumerate(LEVELS) for name in names.split()}
+
+
+def modules(package: str) -> Iterator[tuple[str, ast.Module]]:
+    """Every module of a package with its syntax tree, as `shapepose_fg.body.model.body_model`."""
+    for path in sorted((ROOT / package).rglob("*.py")):
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        yield ".".join(parts).removesuffix(".__init__"), ast.parse(path.read_text(encoding="utf-8"))
+
+
+def imports(tree: ast.AST) -> set[str]:
+    """Names of all modules that are imported anywhere in a file, those inside functions included."""
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0 and node.module, f"line {node.lineno}: write imports in full"
+            found.add(node.module)
+            # `from shapepose_fg.core import camera` imports a module too.
+            inside = f"{node.module}.".replace(".", "/")
+            found |= {
+                f"{node.module}.{alias.name}"
+                for alias in node.names
+                if (ROOT / inside / f"{alias.name}.py").exists() or (ROOT / inside / alias.name).is_dir()
+            }
+    return found
+
+
+def imported_on_import(tree: ast.Module) -> set[str]:
+    """Modules that importing the file imports: not those in functions, nor those for the type checker alone."""
+    waiting, found = list(tree.body), set()
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            found |= imports(node)
+        elif isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
+            waiting += node.orelse
+        elif isinstance(node, ast.If | ast.Try | ast.With):
+            waiting += [child for child in ast.iter_child_nodes(node) if isinstance(child, ast.stmt)]
+    return found
+
+
+def room(module: str) -> str:
+    """The name in `LEVELS` that a module belongs to: `body.model` for shapepose_fg.body.model.rotation."""
+    first, *rest = module.split(".")
+    if first != "shapepose_fg" or len(rest) == 0:
+        return first
+    names = [".".join(rest[:n]) for n in range(len(rest), 0, -1)]
+    return next((name for name in names if name in LEVEL_OF), rest[0])
+
+
+def ours(names: set[str]) -> set[str]:
+    return {name for name in names if name.split(".")[0] in ("factors", "shapepose_fg")}
+
+
+FOLDERS = {f"shapepose_fg{name}" for name in ("", ".body", ".cli", ".core", ".core.storage")}
+FOLDERS |= {"shapepose_fg.pipeline", "shapepose_fg.viz"}
+LIBRARY = {name: tree for name, tree in modules("shapepose_fg") if name not in FOLDERS}
+"""All modules but folders whose files have levels of their own."""
+
+
+@pytest.mark.parametrize("module", LIBRARY)
+def test_a_module_imports_only_from_levels_before_its_own(module):
+    here = room(module)
+    assert here in LEVEL_OF, f"{module} is new: give it a place in LEVELS"
+    for other in ours(imports(LIBRARY[module])):
+        assert other != "shapepose_fg", f"{module}: import from the module itself, not from the package's front"
+        if room(other) != here:
+            assert LEVEL_OF[room(other)] < LEVEL_OF[here], f"{module} must not import {other}"
+
+
+def test_every_place_in_the_table_is_taken():
+    assert {room(module) for module in LIBRARY} | {"factors"} == set(LEVEL_OF)
+
+
+def test_modules_import_each_other_in_no_circle():
+    known = set(LIBRARY)
+    graph = {module: (imports(tree) & known) - {module} for module, tree in LIBRARY.items()}
+    order = list(TopologicalSorter(graph).static_order())  # CycleError names the circle
+    assert order.index("shapepose_fg.core.camera") < order.index("shapepose_fg.pipeline.pipeline")
+
+
+def test_factors_know_gtsam_and_numpy_only():
+    allowed = set(sys.stdlib_module_names) | {"factors", "gtsam", "numpy"}
+    for module, tree in modules("factors"):
+        foreign = {name.split(".")[0] for name in imports(tree)} - allowed
+        assert not foreign, f"{module} imports {foreign}"
+
+
+def test_torch_is_imported_for_bodies_only():
+    users = {room(name) for name, tree in LIBRARY.items() if "torch" in imported_on_import(tree)}
+    # The scene's people are bodies; everybody else imports torch in the function that needs it, or not at all.
+    assert users <= {f"body.{name}" for name in ("model", "fitting", "offsets", "threads")} | {
+        "evaluation",
+        "simulation",
+    }
+
+
+LIGHT = {
+    "the package": "import shapepose_fg; dir(shapepose_fg)",
+    "readers": "from shapepose_fg import InputError, Reconstruction, read_detections, read_rig, write_rig",
+    "stage I": "import shapepose_fg.proposal.association",
+    "stage II": "import shapepose_fg.estimation.solve_window",
+    "processes that look": "import shapepose_fg.simulation.visibility",
+    "help": (
+        "from shapepose_fg.cli.main import main\n"
+        "sys.argv = ['shapepose-fg', '--help']\n"
+        "try:\n    raise SystemExit(main())\nexcept SystemExit as end:\n    assert not end.code, end.code"
+    ),
+}
+
+
+@pytest.mark.parametrize("code", LIGHT.values(), ids=LIGHT)
+def test_loads_no_torch(code):
+    code = f"import sys\n{code}\nassert 'torch' not in sys.modules, 'torch was loaded'"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_package_s_front_offers_what_it_names():
+    import shapepose_fg
+
+    assert {"read_rig", "read_detections", "reconstruct", "Reconstruction"} <= set(dir(shapepose_fg))
+    for name in ("read_rig", "InputError", "Reconstruction"):
+        assert getattr(shapepose_fg, name).__name__ == name
+    with pytest.raises(AttributeError, match="no attribute 'no_such_thing'"):
+        _ = shapepose_fg.no_such_thing

@@ -1,0 +1,51 @@
+"""docs/licences.md names everything that is installed, and every module that is imported is asked for."""
+
+import ast
+import importlib.util
+import re
+import sys
+import tomllib
+from importlib.metadata import packages_distributions
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+
+def script():
+    spec = importlib.util.spec_from_file_location("licences", ROOT / "scripts" / "licences.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_every_dependency_and_its_licence_is_listed():
+    licences = script()
+    rows = dict(re.findall(r"^\| (\S+) \| (.+) \|$", licences.PAGE.read_text(encoding="utf-8"), re.MULTILINE))
+    installed = licences.needed(licences.EXTRAS)  # of those, what is installed here
+    assert {"torch", "numpy", "gtsam"} <= installed.keys()
+    # Packages that only other systems or other builds of torch need may be missing here.
+    missing = {name for name in installed if name not in rows and not name.startswith(("nvidia", "triton"))}
+    assert missing == set(), "run scripts/licences.py"
+    for name, found in installed.items():
+        assert name not in rows or rows[name] == licences.licence(found), "run scripts/licences.py"
+    assert not any(re.search(r"\bA?GPL", text) for text in rows.values())
+
+
+def test_what_is_imported_is_asked_for():
+    asked = [
+        *PROJECT["dependencies"],
+        *(each for group in PROJECT["optional-dependencies"].values() for each in group),
+    ]
+    asked = {re.match(r"[\w-]+", each)[0].lower() for each in asked}
+    whose = packages_distributions()
+    for path in [*(ROOT / "shapepose_fg").rglob("*.py"), *(ROOT / "factors").rglob("*.py")]:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = [each.name for each in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
+            for name in (
+                {each.split(".")[0] for each in names} - {"shapepose_fg", "factors"} - sys.stdlib_module_names
+            ):
+                distributions = {each.lower() for each in whose.get(name, [])}
+                assert not distributions or distributions & asked, f"{path}: {name}"
