@@ -71,30 +71,26 @@ def fuzz(name: str, seconds: int, held_out: bool) -> tuple[int, int]:
             left -= time.monotonic() - start
             counts = re.findall(r"^#(\d+)|stat::number_of_executed_units:\s*(\d+)", ended.stderr, re.MULTILINE)
             cases += max((int(one or other) for one, other in counts), default=0)
-            found = [each for each in Path(folder).iterdir() if re.match(r"(crash|timeout|oom|leak)-", each.name)]
             if ended.returncode != 0:
                 faults += 1
-                print(_told(ended.stdout + ended.stderr), flush=True)
+                said = ended.stdout + ended.stderr
+                start_of = said.find("=== Uncaught Python exception")
+                lines = said[max(start_of, 0) :].splitlines()
+                print("\n".join(lines[:40] if start_of >= 0 else lines[-40:]), flush=True)
                 if not held_out:
-                    _keep(name, found)
+                    _keep(name, Path(folder))
         seed += 1
     return cases, faults
 
 
-def _told(text: str) -> str:
-    """The traceback of a fault, or its last lines."""
-    start = text.find("=== Uncaught Python exception")
-    return "\n".join(text[start:].splitlines()[:40]) if start >= 0 else "\n".join(text.splitlines()[-40:])
-
-
-def _keep(name: str, found: list[Path]) -> None:
+def _keep(name: str, folder: Path) -> None:
     """Lay what broke a reader where a test tries it again: which of the reader's files, and its content."""
-    folder = FOUND / re.sub(r"\W+", "_", name)
-    for each in found:
+    place = FOUND / re.sub(r"\W+", "_", name)
+    for each in (file for file in folder.iterdir() if re.match(r"(crash|timeout|oom|leak)-", file.name)):
         content = each.read_bytes()
-        folder.mkdir(parents=True, exist_ok=True)
+        place.mkdir(parents=True, exist_ok=True)
         if content:
-            (folder / f"{content[0]}-{each.name.rsplit('-', 1)[1][:8]}").write_bytes(content[1:])
+            (place / f"{content[0]}-{each.name.rsplit('-', 1)[1][:8]}").write_bytes(content[1:])
 
 
 def work(name: str, held_out: bool, seed: int, seconds: int) -> None:

@@ -61,25 +61,23 @@ def needed(extras: tuple[str, ...]) -> dict[str, Distribution]:
 def licence(of: Distribution) -> str:
     """The licence that a distribution's metadata name, as short as they do."""
     metadata: Any = of.metadata
-    expression = metadata.get("License-Expression")
-    if expression:
-        return expression
-    classifiers = [each.split(" :: ")[-1] for each in metadata.get_all("Classifier", []) if each[:7] == "License"]
-    named: list[str] = [str(_SHORT.get(each.lower(), each)) for each in classifiers if each != "OSI Approved"]
+    if metadata.get("License-Expression"):
+        return metadata.get("License-Expression")
     text = (metadata.get("License") or "").strip()
     if text and len(text) < 40 and "\n" not in text:
         return text
-    return " or ".join(named) if named else "see its own files"
+    classifiers = [each.split(" :: ")[-1] for each in metadata.get_all("Classifier", []) if each[:7] == "License"]
+    named: list[str] = [str(_SHORT.get(each.lower(), each)) for each in classifiers if each != "OSI Approved"]
+    return " or ".join(named) or "see its own files"
 
 
 def page() -> str:
     """The whole document."""
-    always, more = needed(()), needed(EXTRAS)
-    tables = [always, {name: each for name, each in more.items() if name not in always}]
-    text = HEAD
-    for title, rows in zip(("## Always", f"## With the extras {', '.join(EXTRAS)}"), tables, strict=True):
-        lines = [f"| {name} | {licence(each)} |" for name, each in rows.items()]
-        text += f"\n{title}\n\n| package | licence |\n|---|---|\n" + "\n".join(lines) + "\n"
+    always, text = needed(()), HEAD
+    more = {name: each for name, each in needed(EXTRAS).items() if name not in always}
+    for title, rows in (("## Always", always), (f"## With the extras {', '.join(EXTRAS)}", more)):
+        lines = "".join(f"| {name} | {licence(each)} |\n" for name, each in rows.items())
+        text += f"\n{title}\n\n| package | licence |\n|---|---|\n{lines}"
     return text
 
 

@@ -1,6 +1,6 @@
 """The demo: the built-in scene reconstructed, compared with the truth, and drawn."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,31 +13,15 @@ from rich.table import Table
 from shapepose_fg.core.detections import Recording
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.evaluation.alternation import JointErrors, alternation_errors, before_refinement
 from shapepose_fg.evaluation.matching import Matches, match_people
 from shapepose_fg.evaluation.metrics import CORRECT_M, covariance_calibration, joint_metrics
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.solved_setup import CAMERAS
 from shapepose_fg.pipeline.execution import Execution
-from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
+from shapepose_fg.pipeline.pipeline import reconstruct
 from shapepose_fg.simulation import Scene, built_in_scene, simulate
 from shapepose_fg.viz.report.writing import REPORT, write_report
 from shapepose_fg.viz.viewer.picture import demo_picture
-
-_STAGES = {
-    "triangulate": "pairs of views to 3D points",
-    "vote": "points to 3D joint candidates",
-    "propose": "candidates to new people",
-    "associate": "new people to their 2D observations",
-    "follow": "people from frame to frame",
-    "associate again": "detections reassociated",
-    "offsets": "where the detector puts joints on the body",
-    "solve": "bodies and factor graphs, covariances",
-    "bodies over time": "one shape a person, poses linked in time",
-}
-"""The stages that are worth a line, and what each does."""
-SEEN_BADLY = 0.25
-"""Mean confidence over all views under which the paper gives a joint to the body (its rho_3D)."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +34,6 @@ class Demo:
     """What the reconstruction was given."""
     people: Reconstruction
     """What it made of it."""
-    errors: JointErrors
-    """How far joints are off before and after stage II."""
 
     @cached_property
     def matches(self) -> Matches:
@@ -59,26 +41,55 @@ class Demo:
         return match_people(self.people.frame, self.people.joints, self.scene.keypoints)
 
     @cached_property
+    def error_m(self) -> np.ndarray:
+        """(M, J, 3) of the rows that are matched, metres."""
+        matches = self.matches
+        return self.people.joints[matches.row] - self.scene.keypoints[matches.frame, matches.person]
+
+    @cached_property
     def typical_frame(self) -> int:
         """The frame whose error is the median of all frames: the picture shows no lucky one."""
-        matches, T = self.matches, len(self.scene)
-        true = self.scene.keypoints[matches.frame, matches.person]
-        error = np.nanmean(np.linalg.norm(self.people.joints[matches.row] - true, axis=-1), axis=-1)
-        count = np.bincount(matches.frame, minlength=T)
-        mean = np.bincount(matches.frame, error, minlength=T) / np.maximum(count, 1)
+        frame, T = self.matches.frame, len(self.scene)
+        count = np.bincount(frame, minlength=T)
+        error = np.nanmean(np.linalg.norm(self.error_m, axis=-1), axis=-1)
+        mean = np.bincount(frame, error, minlength=T) / np.maximum(count, 1)
         # People who were missed have no error: rank their frames last.
         return int(np.argsort(np.where(count == count.max(), mean, np.inf), kind="stable")[T // 2])
 
     def tables(self) -> RenderableType:
         """The comparison with the truth, for a terminal."""
-        parts = (_accuracy(self), _alternation(self), _covariances(self), _time(self))
-        return Group(*(Padding(part, (1, 0, 0, 2)) for part in parts))
-
-    def draw(self, path: Path) -> None:
-        """Write the picture of a typical frame."""
-        frame = self.typical_frame
-        seen, truth = self.detections[frame], self.scene.vertices_at(frame)
-        demo_picture(path, self.scene.rig, self.people, frame, seen, truth)
+        metrics = joint_metrics(self.people, self.scene.keypoints)
+        distance_mm = 1e3 * np.linalg.norm(self.error_m, axis=-1)
+        median_mm = float(np.nanmedian(distance_mm)) if distance_mm.size else float("nan")
+        accuracy = {
+            "people found": (f"{metrics.people_found} of {metrics.people_true}", "in all frames together"),
+            "found twice": (str(metrics.people_duplicated), ""),
+            "invented": (str(metrics.people_invented), ""),
+            "precision": (_percent(metrics.precision), f"joints within {CORRECT_M} m, of those placed"),
+            "recall": (_percent(metrics.recall), f"joints within {CORRECT_M} m, of all true ones"),
+            "F1": (_percent(metrics.f1), ""),
+            "MPJPE": (f"{metrics.mpjpe_mm:.1f} mm", "mean distance of a joint to the true one"),
+            "median": (f"{median_mm:.1f} mm", "half of the joints are nearer than this"),
+        }
+        calibration = covariance_calibration(self.error_m, self.people.covariance[self.matches.row])
+        covariances = {
+            f"inside the {100 * level:.0f} % ellipsoid": (
+                _percent(share),
+                f"should be {100 * level:.0f} %; more is cautious",
+            )
+            for level, share in calibration.coverage.items()
+        }
+        covariances["mean NEES"] = (f"{calibration.mean_nees:.2f}", "should be 3; more is too sure")
+        frames = max(len(self.scene), 1)
+        spent = {stage: s for stage, s in self.people.run["seconds"].items() if stage != "load"}
+        time = {stage: (f"{1e3 * each / frames:.1f}", "") for stage, each in spent.items()}
+        time["all"] = (f"{1e3 * sum(spent.values()) / frames:.1f}", "bodies are cheaper in longer recordings")
+        tables = {
+            "Against the truth": accuracy,
+            "Is the truth where the covariances say?": covariances,
+            "Time, milliseconds a frame": time,
+        }
+        return Group(*(Padding(_table(title, rows), (1, 0, 0, 2)) for title, rows in tables.items()))
 
     def save(self, folder: Path, *, report: bool = True) -> list[str]:
         """Write people.npz and what belongs to it, the report and the picture; returns what to tell the user."""
@@ -94,99 +105,32 @@ class Demo:
             told.append(f"{write_report(folder, self.people, self.scene.rig)}  to look at, in a browser")
         else:
             (folder / REPORT).unlink(missing_ok=True)
-        picture = folder / "picture.png"
-        self.draw(picture)
-        return [*told, f"{picture}  frame {self.typical_frame}, one of middling error; grey: the truth"]
+        picture, frame = folder / "picture.png", self.typical_frame
+        seen, truth = self.detections[frame], self.scene.vertices_at(frame)
+        demo_picture(picture, self.scene.rig, self.people, frame, seen, truth)
+        return [*told, f"{picture}  frame {frame}, one of middling error; grey: the truth"]
 
 
-def run_demo(progress: Callable[[int, int], None] | None = None, scene: Scene | None = None) -> Demo:
-    """Simulate what a detector sees of the scene (by default the built-in one), and reconstruct it."""
-    scene = built_in_scene() if scene is None else scene
+def run_demo(progress: Callable[[int, int], None] | None = None) -> Demo:
+    """Simulate what a detector sees of the built-in scene, and reconstruct it."""
+    scene = built_in_scene()
     detections = simulate(scene)
-    config = PipelineConfig()
-    before = before_refinement(detections, scene.rig, config)
     times = FrameTimes.from_fps(scene.fps, len(scene))
-    people = reconstruct(detections, scene.rig, config, times=times, execution=Execution(progress=progress))
-    return Demo(scene, detections, people, alternation_errors(before, people, scene.keypoints))
+    people = reconstruct(detections, scene.rig, times=times, execution=Execution(progress=progress))
+    return Demo(scene, detections, people)
 
 
-def _accuracy(demo: Demo) -> Table:
-    """How many people and joints are right."""
-    metrics = joint_metrics(demo.people, demo.scene.keypoints)
-    median_mm = float(np.nanmedian(demo.errors.after_mm)) if demo.errors.after_mm.size else float("nan")
-    rows = (
-        ("people found", f"{metrics.people_found} of {metrics.people_true}", "in all frames together"),
-        ("found twice", str(metrics.people_duplicated), ""),
-        ("invented", str(metrics.people_invented), ""),
-        ("precision", _percent(metrics.precision), f"joints within {CORRECT_M} m, of those placed"),
-        ("recall", _percent(metrics.recall), f"joints within {CORRECT_M} m, of all true ones"),
-        ("F1", _percent(metrics.f1), ""),
-        ("MPJPE", f"{metrics.mpjpe_mm:.1f} mm", "mean distance of a joint to the true one"),
-        ("median", f"{median_mm:.1f} mm", "half of the joints are nearer than this"),
-    )
-    return _table("Against the truth", rows)
-
-
-def _alternation(demo: Demo) -> Table:
-    """What the factor graphs and the body make of what the views alone say."""
-    notes = (f"mean confidence {SEEN_BADLY:g} or more", "less: body and motion help", "the body fills them in")
-    rows = [
-        (name, str(int(mask.sum())), _mm(demo.errors.before_mm[mask]), _mm(demo.errors.after_mm[mask]), note)
-        for (name, mask), note in zip(demo.errors.groups(SEEN_BADLY).items(), notes, strict=True)
-    ]
-    title = "What comes after stage I: mean distance to the truth"
-    return _table(title, rows, ("joints", "count", "before", "after", ""))
-
-
-def _covariances(demo: Demo) -> Table:
-    """Whether a joint lies where its covariance says."""
-    matches, people = demo.matches, demo.people
-    error = people.joints[matches.row] - demo.scene.keypoints[matches.frame, matches.person]
-    calibration = covariance_calibration(error, people.covariance[matches.row])
-    rows = [
-        (
-            f"inside the {100 * level:.0f} % ellipsoid",
-            _percent(share),
-            f"should be {100 * level:.0f} %; more is cautious",
-        )
-        for level, share in calibration.coverage.items()
-    ]
-    rows.append(("mean NEES", f"{calibration.mean_nees:.2f}", "should be 3; more is too sure"))
-    return _table("Is the truth where the covariances say?", rows)
-
-
-def _time(demo: Demo) -> Table:
-    """Milliseconds a frame, stage by stage."""
-    seconds, frames = demo.people.run["seconds"], max(len(demo.scene), 1)
-    total = sum(spent for stage, spent in seconds.items() if stage != "load")
-    stages = [(stage, f"{1e3 * seconds.get(stage, 0.0) / frames:.1f}", what) for stage, what in _STAGES.items()]
-    whole = ("all", f"{1e3 * total / frames:.1f}", "bodies are cheaper in longer recordings")
-    return _table("Time, milliseconds a frame", [*stages, whole])
-
-
-def _table(title: str, rows: Iterable[tuple[str, ...]], heads: Sequence[str] = ("", "", "")) -> Table:
-    """Names, figures, and in the last column what they mean."""
+def _table(title: str, rows: dict[str, tuple[str, str]]) -> Table:
+    """Names, figures, and what they mean."""
     table = Table(title=title, title_justify="left", title_style="bold", box=None, padding=(0, 2, 0, 0))
-    table.show_header = any(heads)
-    for n, head in enumerate(heads):
-        inner = 0 < n < len(heads) - 1
-        table.add_column(
-            head,
-            "",
-            justify="right" if inner else "left",
-            header_style="dim",
-            style="dim" if n + 1 == len(heads) else "",
-        )
-    for row in rows:
-        table.add_row(*row)
+    table.show_header = False
+    table.add_column()
+    table.add_column(justify="right")
+    table.add_column(style="dim")
+    for name, (figure, meaning) in rows.items():
+        table.add_row(name, figure, meaning)
     return table
 
 
 def _percent(share: float) -> str:
     return f"{100 * share:.2f} %" if np.isfinite(share) else "-"
-
-
-def _mm(errors: np.ndarray) -> str:
-    """Mean of the errors that are known."""
-    known = errors[np.isfinite(errors)]
-    return f"{known.mean():.0f} mm" if known.size else "-"

@@ -2,22 +2,23 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, cast
 
 from shapepose_fg.cli.options import (
+    REQUIRED,
     RESULT,
     RUN,
     TIME,
     CameraOptions,
-    FramesOption,
     frame_range,
+    frames_option,
     grouped,
     option,
 )
 from shapepose_fg.cli.pictures import PictureOptions
-from shapepose_fg.cli.terminal import note, progress, show
+from shapepose_fg.cli.terminal import note, progress, show, table
 from shapepose_fg.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -26,37 +27,24 @@ if TYPE_CHECKING:
     from shapepose_fg.detection2d.detector import CameraDetector
     from shapepose_fg.detection2d.network import Backend, HeatMapNetwork
     from shapepose_fg.detection2d.recording import DetectionReport, DetectionRun
-    from shapepose_fg.io.footage.lockstep import Lockstep
 
 _NETWORK = "Network"
-
-# Everything else is imported inside the command: `--help` must not wait for it.
 
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkOptions:
     """The network that detects, and how it is run."""
 
-    network: Annotated[
-        str, option(_NETWORK, "ONNX file of a network of OpenPose's kind, or a named one.", metavar="FILE|NAME")
-    ]
-    layout: Annotated[
-        str | None,
-        option(_NETWORK, "How to read it: tf-pose, openpose-coco, openpose-body25.", metavar="NAME"),
-    ] = None
-    download: Annotated[bool, option(_NETWORK, "Fetch a named network that is not here yet.", "--download")] = (
-        False
+    network: str = option(
+        _NETWORK, "ONNX file of a network of OpenPose's kind, or a named one.", REQUIRED, metavar="FILE|NAME"
     )
-    network_address: Annotated[
-        str | None, option(_NETWORK, "Where to fetch it from; its checksum decides.", metavar="URL")
-    ] = None
-    long_side: Annotated[
-        int,
-        option(_NETWORK, "Longer side of what it is shown, pixels: more finds smaller people.", show_default=True),
-    ] = 656
-    backend: Annotated[
-        str, option(RUN, "What runs the network: opencv or onnxruntime.", metavar="NAME", show_default=True)
-    ] = "opencv"
+    layout: str | None = option(
+        _NETWORK, "How to read it: tf-pose, openpose-coco, openpose-body25.", metavar="NAME"
+    )
+    download: bool = option(_NETWORK, "Fetch a named network that is not here yet.", False, "--download")
+    network_address: str | None = option(_NETWORK, "Where to fetch it from; its checksum decides.", metavar="URL")
+    long_side: int = option(_NETWORK, "Longer side of what it is shown, pixels: more finds smaller people.", 656)
+    backend: str = option(RUN, "What runs the network: opencv or onnxruntime.", "opencv", metavar="NAME")
 
     def check(self) -> None:
         """Refuse what makes no sense."""
@@ -81,19 +69,13 @@ class NetworkOptions:
 class ClockOptions:
     """When pictures were taken."""
 
-    fps: Annotated[
-        list[str] | None,
-        option(TIME, "Frames a second, where the files are silent or wrong.", metavar="RATE|CAMERA=RATE"),
-    ] = None
-    start: Annotated[
-        list[str] | None,
-        option(
-            TIME,
-            "When its first frame was taken: 0.2s, or 12f (its own frames); else 0.",
-            metavar="CAMERA=TIME",
-        ),
-    ] = None
-    frames: FramesOption = None
+    fps: list[str] | None = option(
+        TIME, "Frames a second, where the files are silent or wrong.", metavar="RATE|CAMERA=RATE"
+    )
+    start: list[str] | None = option(
+        TIME, "When its first frame was taken: 0.2s, or 12f (its own frames); else 0.", metavar="CAMERA=TIME"
+    )
+    frames: str | None = frames_option()
 
 
 @grouped
@@ -102,7 +84,7 @@ def detect(
     pictures: PictureOptions,
     network: NetworkOptions,
     clock: ClockOptions,
-    output: Annotated[Path, option(RESULT, "Folder for the detections; made if it is not there.")],
+    output: Path = option(RESULT, "Folder for the detections; made if it is not there.", REQUIRED),
 ) -> None:
     """Detect people's joints in videos or pictures, for `reconstruct`: candidates with part affinities.
 
@@ -122,12 +104,13 @@ def detect(
     footage = pictures.opened(rig)
     sizes = {name: each.size for name, each in zip(rig.names, footage, strict=True)}
     placements, concluded = placements_of(pictures.image_placement or [], sizes, rig)
-    for each in concluded:
-        note(each)
+    note(*concluded)
     moments = align(*clocks_of(footage, clock.fps or [], clock.start or [], rig.names))
-    moments = _part(moments, frame_range(clock.frames, len(moments)))
-    for each in moments.notes:
-        note(each)
+    span = frame_range(clock.frames, len(moments))
+    part = slice(span.start, span.stop)
+    time_s = None if moments.time_s is None else moments.time_s[part]
+    moments = replace(moments, picture=moments.picture[part], time_s=time_s)
+    note(*moments.notes)
     detectors = [
         CameraDetector.of(camera, rig.up_vector, placements[camera.name], loaded, network.long_side)
         for camera in rig.cameras
@@ -160,38 +143,19 @@ def _shown_small(detectors: "Sequence[CameraDetector]", size: tuple[int, int]) -
     )
 
 
-def _part(moments: "Lockstep", span: range) -> "Lockstep":
-    """The moments of `span` only."""
-    from dataclasses import replace
-
-    part = slice(span.start, span.stop)
-    time_s = None if moments.time_s is None else moments.time_s[part]
-    return replace(moments, picture=moments.picture[part], time_s=time_s)
-
-
 def _summary(run: "DetectionRun", report: "DetectionReport", seconds: float) -> "Table":
     """What was detected in each camera's pictures, and how long it took."""
-    from rich.table import Table
-
-    table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
-    for name in ("camera", "pictures", "size", "turned", "network", "candidates"):
-        table.add_column(name, justify="left" if name == "camera" else "right")
+    rows = []
     for view, (name, footage, detector) in enumerate(zip(run.rig.names, run.footage, run.detectors, strict=True)):
         pictures = int((run.moments.picture[:, view] >= 0).sum()) - report.unreadable[view]
-        turned = detector.view.turn_deg
-        table.add_row(
-            name,
-            str(pictures),
-            f"{footage.size[0]} x {footage.size[1]}",
-            f"{turned:.0f}°" if abs(turned) > 0.5 else "-",
-            f"{detector.view.size[0]} x {detector.view.size[1]}",
-            f"{report.candidates[view] / max(pictures, 1):.1f}",
-        )
+        turned, size = detector.view.turn_deg, detector.view.size
+        row = (name, str(pictures), f"{footage.size[0]} x {footage.size[1]}")
+        row += (f"{turned:.0f}°" if abs(turned) > 0.5 else "-", f"{size[0]} x {size[1]}")
+        rows.append((*row, f"{report.candidates[view] / max(pictures, 1):.1f}"))
     total = max(report.moments * len(run.rig), 1)
     speed = f"{seconds:.1f} s, {1e3 * seconds / total:.0f} ms a picture"
-    table.caption = f"{report.moments} frames of {len(run.rig)} cameras in {speed}"
-    table.caption_justify = "left"
-    return table
+    caption = f"{report.moments} frames of {len(run.rig)} cameras in {speed}"
+    return table("camera pictures size turned network candidates".split(), rows, caption=caption)
 
 
 def _next_command(run: "DetectionRun", cameras: CameraOptions) -> str:

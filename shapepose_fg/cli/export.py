@@ -1,11 +1,8 @@
 """The command `export`: a result as files of other programs."""
 
 from pathlib import Path
-from typing import Annotated
 
-import typer
-
-from shapepose_fg.cli.options import RESULT, TakeOptions, grouped, option
+from shapepose_fg.cli.options import RESULT, TakeOptions, argument, grouped, option
 from shapepose_fg.cli.terminal import note
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.result_files import results_folder
@@ -14,17 +11,14 @@ from shapepose_fg.core.result_files import results_folder
 @grouped
 def export(
     take: TakeOptions,
-    formats: Annotated[
-        list[str],
-        typer.Argument(metavar="FORMAT...", help="One or more of amass trc c3d bvh glb csv parquet rrd, or all."),
-    ],
-    output: Annotated[Path | None, option(RESULT, "Folder for the files; by default `export` in RESULTS.")] = None,
-    markers: Annotated[
-        str, option(RESULT, "In trc and c3d: opensim (Pose2Sim's names), joints (ours) or body (SMPL's).")
-    ] = "opensim",
-    fill_gaps: Annotated[
-        float, option(RESULT, "Holes up to this long are filled in amass and bvh.", metavar="SECONDS")
-    ] = 0.2,
+    formats: list[str] = argument("FORMAT...", "One or more of amass trc c3d bvh glb csv parquet rrd, or all."),
+    output: Path | None = option(RESULT, "Folder for the files; by default `export` in RESULTS."),
+    markers: str = option(
+        RESULT, "In trc and c3d: opensim (Pose2Sim's names), joints (ours) or body (SMPL's).", "opensim"
+    ),
+    fill_gaps: float = option(
+        RESULT, "Holes up to this long are filled in amass and bvh.", 0.2, metavar="SECONDS"
+    ),
 ) -> None:
     """Write a result for other programs: shapepose-fg export RESULTS amass trc c3d bvh glb csv parquet rrd."""
     from shapepose_fg.io.export.markers import MarkerSet

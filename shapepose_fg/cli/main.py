@@ -6,14 +6,14 @@ import sys
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Any, cast
 
 import typer
 
 from shapepose_fg.cli.batch.command import batch
 from shapepose_fg.cli.detect import detect
 from shapepose_fg.cli.export import export
-from shapepose_fg.cli.options import INPUT, RESULT, JsonOption, option
+from shapepose_fg.cli.options import INPUT, REQUIRED, RESULT, argument, grouped, json_option, option
 from shapepose_fg.cli.overlay import overlay
 from shapepose_fg.cli.reconstruct.command import reconstruct
 from shapepose_fg.cli.report import report
@@ -21,7 +21,7 @@ from shapepose_fg.cli.setup import check_calibration
 from shapepose_fg.cli.simulate import simulate
 from shapepose_fg.cli.stopping import Stopped, stoppable
 from shapepose_fg.cli.terminal import progress as progress_bar
-from shapepose_fg.cli.terminal import show, use_any_streams
+from shapepose_fg.cli.terminal import say, show, use_any_streams
 from shapepose_fg.cli.tracks import tracks
 from shapepose_fg.cli.view import view
 from shapepose_fg.core.errors import InputError
@@ -37,14 +37,12 @@ app = typer.Typer(
 )
 evaluate = typer.Typer(help="Score a reconstruction against an annotation.")
 _RECORDING, _RESULT, _TRY = "From a recording to a result", "With a result", "To try, and to compare"
-app.command(rich_help_panel=_RECORDING)(detect)
-app.command("check-calibration", rich_help_panel=_RECORDING)(check_calibration)
-app.command(rich_help_panel=_RECORDING)(reconstruct)
-app.command(rich_help_panel=_RECORDING)(batch)
-app.command("report", rich_help_panel=_RESULT)(report)
-app.command(rich_help_panel=_RESULT)(overlay)
-app.command(rich_help_panel=_RESULT)(view)
-app.command(rich_help_panel=_RESULT)(export)
+for _panel, _commands in {
+    _RECORDING: (detect, check_calibration, reconstruct, batch),
+    _RESULT: (report, overlay, view, export),
+}.items():
+    for _command in _commands:
+        app.command(rich_help_panel=_panel)(_command)
 app.add_typer(tracks, name="tracks", rich_help_panel=_RESULT)
 app.add_typer(evaluate, name="evaluate", rich_help_panel=_TRY)
 
@@ -77,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         place = f"{error.filename}: " if error.filename is not None else ""
         code = _fail(f"{place}{error.strerror or error}; check the path, its permissions and the space left")
     except Stopped as stop:
-        _say("stopped", stop.message or "nothing is left half written", "bold yellow")
+        say("stopped", stop.message or "nothing is left half written", "bold yellow")
         code = stop.exit_code
     except (typer.Abort, KeyboardInterrupt):
         code = 130
@@ -85,16 +83,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 @evaluate.command("shelf")
+@grouped
 def evaluate_shelf_command(
-    results: Annotated[
-        Path,
-        typer.Argument(
-            metavar="RESULTS",
-            help="Folder of a reconstruction, or its people.npz; 4D Association's text; TRC, or a folder of it.",
-        ),
-    ],
-    ground_truth: Annotated[Path, option(INPUT, "Annotation of the Shelf recording, as text.")],
-    as_json: JsonOption = False,
+    results: Path = argument(
+        "RESULTS", "Folder of a reconstruction, or its people.npz; 4D Association's text; TRC, or a folder of it."
+    ),
+    ground_truth: Path = option(INPUT, "Annotation of the Shelf recording, as text.", REQUIRED),
+    as_json: bool = json_option(),
 ) -> None:
     """PCP per limb and actor, MPJPE and recall on the Shelf recording."""
     from shapepose_fg.evaluation.other_results import read_people
@@ -114,13 +109,12 @@ it saw the people are reconstructed, over time."""
 
 
 @app.command(rich_help_panel=_TRY)
+@grouped
 def demo(
-    output: Annotated[Path, option(RESULT, "Folder for the result and the picture.", show_default=True)] = Path(
-        "demo"
+    output: Path = option(RESULT, "Folder for the result and the picture.", Path("demo")),
+    report: bool = option(
+        RESULT, "Leave report.html, the result as a page to look at.", True, "--report/--no-report"
     ),
-    report: Annotated[
-        bool, option(RESULT, "Leave report.html, the result as a page to look at.", "--report/--no-report")
-    ] = True,
 ) -> None:
     """Reconstruct a built-in scene of four people, compare it with the truth, and draw it."""
     prepare_output(output)
@@ -146,11 +140,11 @@ class Preset(StrEnum):
 
 
 @app.command("config", rich_help_panel=_RECORDING)
+@grouped
 def print_config(
-    preset: Annotated[
-        Preset,
-        typer.Option(help="paper: the method as it is written, without what is settled differently here."),
-    ] = Preset.DEFAULT,
+    preset: Preset = option(
+        RESULT, "paper: the method as it is written, without what is settled differently here.", Preset.DEFAULT
+    ),
 ) -> None:
     """Print every setting with its value, as TOML."""
     from shapepose_fg.io.config import toml_text
@@ -170,16 +164,8 @@ def version() -> None:
 
 def _fail(message: str) -> int:
     """Say what went wrong, in one line on stderr."""
-    _say("error", message, "bold red")
+    say("error", " ".join(message.split()), "bold red")
     return 2
-
-
-def _say(what: str, message: str, style: str) -> None:
-    from rich.console import Console
-    from rich.text import Text
-
-    line = Text.assemble((f"{what}: ", style), " ".join(message.split()))
-    Console(stderr=True).print(line, soft_wrap=True)
 
 
 if __name__ == "__main__":

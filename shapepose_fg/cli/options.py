@@ -3,7 +3,7 @@
 import inspect
 import re
 from collections.abc import Callable
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast, get_type_hints
@@ -18,36 +18,46 @@ if TYPE_CHECKING:
 
 INPUT, TIME, RESULT, RUN, DRAW = "Input", "Time", "Result", "Run", "What is drawn"
 """Headings under which `--help` lists options."""
+REQUIRED: Any = MISSING
+"""In place of a default."""
 
 
-def option(group: str, text: str, *names: str, **more: Any) -> Any:
-    """An option under a heading, with its help."""
-    how: dict[str, Any] = {"show_default": False} | more
-    return typer.Option(*names, help=text, rich_help_panel=group, **how)
+def option(group: str, text: str, default: Any = None, *names: str, **more: Any) -> Any:
+    """An option under a heading, with its help: the default of a `grouped` command's parameter, or of a field."""
+    shown = isinstance(default, str | int | float | Path) and not isinstance(default, bool)
+    how: dict[str, Any] = {"show_default": shown, "help": text, "rich_help_panel": group}
+    return field(default=default, metadata={"typer": typer.Option(*names, **how | more)})
+
+
+def argument(metavar: str, text: str) -> Any:
+    """The same, given by its place in the line."""
+    return field(metadata={"typer": typer.Argument(metavar=metavar, help=text)})
 
 
 def grouped(command: Callable[..., Any]) -> Callable[..., Any]:
     """`command` as typer takes it: a dataclass among its parameters becomes an option for each of its fields."""
-    hints = get_type_hints(command, include_extras=True)
-    groups = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
+    hints, parameters = get_type_hints(command), list[inspect.Parameter]()
     taken: dict[str, list[str]] = {}
-    parameters = []
+
+    def take(name: str, hint: Any, given: Field[Any]) -> None:
+        default = inspect.Parameter.empty if given.default is MISSING else given.default
+        added = inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default)
+        parameters.append(added.replace(annotation=Annotated[hint, given.metadata["typer"]]))
+
     for name, parameter in inspect.signature(command).parameters.items():
-        if name not in groups:
-            parameters.append(parameter.replace(kind=parameter.KEYWORD_ONLY, annotation=hints[name]))
-            continue
-        within = get_type_hints(groups[name], include_extras=True)
-        taken[name] = [each.name for each in fields(groups[name]) if hasattr(within[each.name], "__metadata__")]
-        for each in fields(groups[name]):
-            if each.name in taken[name]:
-                default = parameter.empty if each.default is MISSING else each.default
-                added = inspect.Parameter(each.name, parameter.KEYWORD_ONLY, default=default)
-                parameters.append(added.replace(annotation=within[each.name]))
+        if is_dataclass(group := hints[name]):
+            within = get_type_hints(group)
+            options = [each for each in fields(group) if "typer" in each.metadata]
+            taken[name] = [each.name for each in options]
+            for each in options:
+                take(each.name, within[each.name], each)
+        else:
+            take(name, hints[name], parameter.default)
 
     @wraps(command)
     def called(**given: Any) -> Any:
         made = {
-            name: cast(Any, groups[name])(**{key: given.pop(key) for key in keys}) for name, keys in taken.items()
+            name: cast(Any, hints[name])(**{key: given.pop(key) for key in keys}) for name, keys in taken.items()
         }
         return command(**made, **given)
 
@@ -57,30 +67,33 @@ def grouped(command: Callable[..., Any]) -> Callable[..., Any]:
     return called
 
 
-FramesOption = Annotated[
-    str | None, option(TIME, "Frames A to B-1; either may be left out.", metavar="A:B", show_default=False)
-]
-WorkersOption = Annotated[
-    int | None, option(RUN, "Processes of this machine; by default as many as pay. They change no byte.")
-]
-JsonOption = Annotated[bool, option(RESULT, "Print everything as JSON.", "--json")]
+def frames_option() -> Any:
+    """Which frames of a recording, or of a result."""
+    return option(TIME, "Frames A to B-1; either may be left out.", metavar="A:B")
+
+
+def workers_option() -> Any:
+    """How many processes take part."""
+    return option(RUN, "Processes of this machine; by default as many as pay. They change no byte.")
+
+
+def json_option() -> Any:
+    """Numbers instead of words."""
+    return option(RESULT, "Print everything as JSON.", False, "--json")
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions:
     """What runs the work, and what becomes of work that was stopped."""
 
-    workers: WorkersOption = None
-    cluster: Annotated[
-        str | None,
-        option(
-            RUN,
-            "Dask scheduler (tcp://host:8786) whose processes solve; `local`: Dask's own, here.",
-            metavar="ADDRESS",
-        ),
-    ] = None
-    resume: Annotated[bool, option(RUN, "Go on with what was stopped in --output.", "--resume")] = False
-    restart: Annotated[bool, option(RUN, "Begin anew, whatever was stopped in --output.", "--restart")] = False
+    workers: int | None = workers_option()
+    cluster: str | None = option(
+        RUN,
+        "Dask scheduler (tcp://host:8786) whose processes solve; `local`: Dask's own, here.",
+        metavar="ADDRESS",
+    )
+    resume: bool = option(RUN, "Go on with what was stopped in --output.", False, "--resume")
+    restart: bool = option(RUN, "Begin anew, whatever was stopped in --output.", False, "--restart")
 
     def check(self) -> None:
         """Refuse what contradicts itself."""
@@ -98,12 +111,12 @@ class RunOptions:
 class CameraOptions:
     """The cameras of a recording."""
 
-    calibration: Annotated[Path, option(INPUT, "Cameras: a file, or a folder, of one of the formats known.")]
-    up: Annotated[str | None, option(INPUT, "World axis that points up: x -x y -y z -z.", metavar="AXIS")] = None
-    unit: Annotated[str | None, option(INPUT, "Unit of the calibration: m, cm or mm.", metavar="UNIT")] = None
-    image_size: Annotated[
-        str | None, option(INPUT, "Size of the calibrated pictures, where the file has none.", metavar="WxH")
-    ] = None
+    calibration: Path = option(INPUT, "Cameras: a file, or a folder, of one of the formats known.", REQUIRED)
+    up: str | None = option(INPUT, "World axis that points up: x -x y -y z -z.", metavar="AXIS")
+    unit: str | None = option(INPUT, "Unit of the calibration: m, cm or mm.", metavar="UNIT")
+    image_size: str | None = option(
+        INPUT, "Size of the calibrated pictures, where the file has none.", metavar="WxH"
+    )
 
     def rig(self) -> "Rig":
         """The cameras; InputError where they cannot be used."""
@@ -121,22 +134,20 @@ class CameraOptions:
 class DetectionOptions(CameraOptions):
     """Cameras, and what a 2D detector saw with them."""
 
-    detections: Annotated[Path, option(INPUT, "Folder with what a 2D detector wrote of every camera.")]
-    skeleton: Annotated[
-        str | None, option(INPUT, "The detector's skeleton, or a TOML file that describes it.", metavar="NAME")
-    ] = None
+    detections: Path = option(INPUT, "Folder with what a 2D detector wrote of every camera.", REQUIRED)
+    skeleton: str | None = option(
+        INPUT, "The detector's skeleton, or a TOML file that describes it.", metavar="NAME"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
 class ResultOptions:
     """A saved result, and how it is read."""
 
-    results: Annotated[Path, typer.Argument(metavar="RESULTS", help="Folder of a reconstruction.")]
-    fps: Annotated[float | None, option(TIME, "Frames a second, in place of the result's own times.")] = None
-    up: Annotated[
-        str | None, option(INPUT, "Axis that points up, where cameras.json is not there.", metavar="AXIS")
-    ] = None
-    body: Annotated[Path | None, option(INPUT, "The body model of the result, where its file has moved.")] = None
+    results: Path = argument("RESULTS", "Folder of a reconstruction.")
+    fps: float | None = option(TIME, "Frames a second, in place of the result's own times.")
+    up: str | None = option(INPUT, "Axis that points up, where cameras.json is not there.", metavar="AXIS")
+    body: Path | None = option(INPUT, "The body model of the result, where its file has moved.")
 
     def how(self) -> dict[str, Any]:
         """How it is read, as keywords."""
@@ -148,20 +159,14 @@ class ResultOptions:
 class TakeOptions(ResultOptions):
     """A part of a saved result."""
 
-    frames: FramesOption = None
-    person: Annotated[list[int] | None, option(RESULT, "Only this person; may be given several times.")] = None
-    seen_only: Annotated[
-        bool, option(RESULT, "Leave out joints that no view saw in that frame.", "--seen-only")
-    ] = False
+    frames: str | None = frames_option()
+    person: list[int] | None = option(RESULT, "Only this person; may be given several times.")
+    seen_only: bool = option(RESULT, "Leave out joints that no view saw in that frame.", False, "--seen-only")
 
     def how(self) -> dict[str, Any]:
         """How it is read, as keywords."""
-        persons = tuple(self.person) if self.person else None
-        return super().how() | {
-            "seen_only": self.seen_only,
-            "frames": result_frames(self.frames),
-            "persons": persons,
-        }
+        persons, frames = tuple(self.person) if self.person else None, result_frames(self.frames)
+        return super().how() | {"seen_only": self.seen_only, "frames": frames, "persons": persons}
 
 
 def check_fps(fps: float | None) -> None:
@@ -181,23 +186,21 @@ def result_frames(text: str | None) -> range | None:
     if text is None:
         return None
     start, stop = ends(text)
-    stop = 10**18 if stop is None else stop
-    if not start < stop:
+    found = range(start, 10**18 if stop is None else stop)
+    if len(found) == 0:
         raise InputError(f"--frames {text}: must be A:B with A below B, such as 0:100")
-    return range(start, stop)
+    return found
 
 
 def frame_range(text: str | None, count: int) -> range:
     """Frames that `A:B` selects of a recording of `count` frames: half-open, either end optional."""
-    if text is None:
-        return range(count)
-    start, stop = ends(text)
-    stop = count if stop is None else stop
-    if not start < stop <= count:
+    start, stop = (0, count) if text is None else ends(text)
+    found = range(start, count if stop is None else stop)
+    if text is not None and not (found and found.stop <= count):
         raise InputError(
             f"--frames {text}: not in the recording, which has {count} frames; give A:B with 0 <= A < B <= {count}"
         )
-    return range(start, stop)
+    return found
 
 
 def ends(text: str) -> tuple[int, int | None]:

@@ -4,11 +4,9 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-import typer
-
-from shapepose_fg.cli.options import DRAW, INPUT, RESULT, FramesOption, frame_range, grouped, option
+from shapepose_fg.cli.options import DRAW, INPUT, RESULT, argument, frame_range, frames_option, grouped, option
 from shapepose_fg.cli.pictures import PictureOptions
 from shapepose_fg.cli.terminal import note, progress
 from shapepose_fg.core.errors import InputError
@@ -16,7 +14,6 @@ from shapepose_fg.core.frame_times import ASSUMED_FPS
 from shapepose_fg.core.result_files import results_folder
 
 if TYPE_CHECKING:
-    from shapepose_fg.body.model.body_model import BodyModel
     from shapepose_fg.core.camera import Rig
 
 
@@ -24,34 +21,25 @@ if TYPE_CHECKING:
 class Drawn:
     """What is drawn, and how large."""
 
-    cameras: Annotated[str | None, option(DRAW, "Only these cameras.", metavar="A,B")] = None
-    stills: Annotated[
-        str | None, option(DRAW, "Still pictures of these frames instead of a video.", metavar="A,B")
-    ] = None
-    each: Annotated[
-        bool, option(DRAW, "A file for each camera at its own size, or all in one.", "--each/--grid")
-    ] = False
-    bodies: Annotated[bool, option(DRAW, "Draw the bodies' surfaces.", "--bodies/--no-bodies")] = False
-    skeletons: Annotated[bool, option(DRAW, "Draw joints and bones.", "--skeletons/--no-skeletons")] = True
-    points: Annotated[
-        bool, option(DRAW, "Draw the 2D detections; red crosses were not used.", "--points/--no-points")
-    ] = True
-    width: Annotated[int, option(DRAW, "Width of the grid, pixels.", show_default=True)] = 1920
+    cameras: str | None = option(DRAW, "Only these cameras.", metavar="A,B")
+    stills: str | None = option(DRAW, "Still pictures of these frames instead of a video.", metavar="A,B")
+    each: bool = option(DRAW, "A file for each camera at its own size, or all in one.", False, "--each/--grid")
+    bodies: bool = option(DRAW, "Draw the bodies' surfaces.", False, "--bodies/--no-bodies")
+    skeletons: bool = option(DRAW, "Draw joints and bones.", True, "--skeletons/--no-skeletons")
+    points: bool = option(DRAW, "Draw the 2D detections; red crosses were not used.", True, "--points/--no-points")
+    width: int = option(DRAW, "Width of the grid, pixels.", 1920)
 
 
 @grouped
 def overlay(
-    results: Annotated[Path, typer.Argument(metavar="RESULTS", help="Folder of a reconstruction.")],
     pictures: PictureOptions,
     drawn: Drawn,
-    detections: Annotated[
-        Path | None,
-        option(INPUT, "Folder that `detect` wrote: it says which picture belongs to which frame."),
-    ] = None,
-    frames: FramesOption = None,
-    output: Annotated[
-        Path | None, option(RESULT, "Folder for videos and pictures; by default RESULTS/overlay.")
-    ] = None,
+    results: Path = argument("RESULTS", "Folder of a reconstruction."),
+    detections: Path | None = option(
+        INPUT, "Folder that `detect` wrote: it says which picture belongs to which frame."
+    ),
+    frames: str | None = frames_option(),
+    output: Path | None = option(RESULT, "Folder for videos and pictures; by default RESULTS/overlay."),
 ) -> None:
     """Draw a result over the videos or pictures that it was made from: mp4, or still pictures.
 
@@ -75,8 +63,12 @@ def overlay(
         shown = pictures.of_result(run, rig, names, detections)
         if drawn.points and not people.observed:
             note(f"{folder}: there is no observations.npz, so no detections are drawn")
-        body = _body(run) if drawn.bodies else None
-        over = Overlay(people, rig, shown, drawn.skeletons, drawn.points, body)
+        model, file = None, run.get("body")
+        if drawn.bodies:
+            from shapepose_fg.body.model.body_model import BodyModel
+
+            model = BodyModel.default() if file is None else BodyModel.load(Path(file))
+        over = Overlay(people, rig, shown, drawn.skeletons, drawn.points, model)
         length = max(len(used.places) for used, _ in shown)
         if drawn.stills is not None:
             chosen, fps = _stills(drawn.stills, length), None
@@ -100,14 +92,6 @@ def _cameras(text: str, rig: "Rig") -> list[str]:
     if len(names) == 0 or len(set(names)) < len(names):
         raise InputError(f"--cameras {text}: must be names of cameras, each once, such as {rig.names[0]}")
     return names
-
-
-def _body(run: Mapping[str, Any]) -> "BodyModel":
-    """The model that the bodies of a result are of."""
-    from shapepose_fg.body.model.body_model import BodyModel
-
-    file = run.get("body")
-    return BodyModel.default() if file is None else BodyModel.load(Path(str(file)))
 
 
 def _recorded(run: Mapping[str, Any], length: int) -> range:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 from shapepose_fg.cli.options import INPUT, option
 from shapepose_fg.cli.terminal import note, progress
@@ -18,25 +18,20 @@ if TYPE_CHECKING:
 class PictureOptions:
     """The cameras' videos or pictures."""
 
-    videos: Annotated[
-        list[str] | None,
-        option(
-            INPUT,
-            "Folder with a video, a picture, or a folder of pictures named after each camera; or each one's own,"
-            " given once for each camera.",
-            "--videos",
-            "--images",
-            metavar="FOLDER|CAMERA=PATH",
-        ),
-    ] = None
-    image_placement: Annotated[
-        list[str] | None,
-        option(
-            INPUT,
-            "How pictures of another size than the calibration's came about: scale, letterbox, crop, crop-centre.",
-            metavar="KIND|CAMERA=KIND",
-        ),
-    ] = None
+    videos: list[str] | None = option(
+        INPUT,
+        "Folder with a video, a picture, or a folder of pictures named after each camera; or each one's own,"
+        " given once for each camera.",
+        None,
+        "--videos",
+        "--images",
+        metavar="FOLDER|CAMERA=PATH",
+    )
+    image_placement: list[str] | None = option(
+        INPUT,
+        "How pictures of another size than the calibration's came about: scale, letterbox, crop, crop-centre.",
+        metavar="KIND|CAMERA=KIND",
+    )
 
     def named(self, rig: "Rig") -> list[str]:
         """The cameras whose videos are given one by one; all where none is."""
@@ -48,8 +43,7 @@ class PictureOptions:
         from shapepose_fg.io.footage.places import find_footage
 
         places = find_footage(self.videos or [], rig.names)
-        for each in places.notes:
-            note(each)
+        note(*places.notes)
         return [opened(name, path) for name, path in zip(rig.names, places.paths, strict=True)]
 
     def of_result(
@@ -68,6 +62,5 @@ def opened(name: str, path: Path) -> "Footage":
 
     with progress(f"looking through {name}") as done:
         footage = open_footage(path, done)
-    for each in footage.notes:
-        note(each)
+    note(*footage.notes)
     return footage

@@ -6,14 +6,17 @@ from pathlib import Path
 
 import typer
 
-from shapepose_fg.cli.options import DetectionOptions, FramesOption, JsonOption, frame_range, grouped
+from shapepose_fg.cli.options import DetectionOptions, frame_range, frames_option, grouped, json_option
 from shapepose_fg.cli.pictures import PictureOptions
 from shapepose_fg.cli.terminal import note, show
 
 
 @grouped
 def check_calibration(
-    seen: DetectionOptions, pictures: PictureOptions, frames: FramesOption = None, as_json: JsonOption = False
+    seen: DetectionOptions,
+    pictures: PictureOptions,
+    frames: str | None = frames_option(),
+    as_json: bool = json_option(),
 ) -> None:
     """Check whether cameras and detections fit: turned, exchanged or late cameras, wrong units, in words.
 
@@ -28,8 +31,7 @@ def check_calibration(
     rig = seen.rig()
     with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
         recording = read_detections(seen.detections, rig, seen.skeleton, InFolder(Path(folder)))
-        for each in recording.notes:
-            note(each)
+        note(*recording.notes)
         sizes = () if pictures.videos is None else other_sizes(pictures.videos, rig)
         report = check_setup(recording, rig, frame_range(frames, len(recording)), sizes)
     if as_json:

@@ -4,19 +4,19 @@ import re
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
-
-import typer
+from typing import TYPE_CHECKING, cast
 
 from shapepose_fg.cli.options import (
     INPUT,
+    REQUIRED,
     RESULT,
-    FramesOption,
-    WorkersOption,
+    argument,
     check_workers,
     frame_range,
+    frames_option,
     grouped,
     option,
+    workers_option,
 )
 from shapepose_fg.cli.terminal import progress as progress_bar
 from shapepose_fg.core.errors import InputError
@@ -25,34 +25,26 @@ from shapepose_fg.core.storage.output_folder import prepare_output
 if TYPE_CHECKING:
     from shapepose_fg.simulation.files import Format
 
-# Everything else is imported inside the command: `--help` must not wait for it.
-
 
 @dataclass(frozen=True, kw_only=True)
 class SceneOptions:
     """What is simulated."""
 
-    name: Annotated[str, typer.Argument(help="demo, or an interaction sequence: salsa, crossing or crowd.")]
-    split: Annotated[
-        str, option(INPUT, "Takes of a sequence: tune, to choose settings by; report.", show_default=True)
-    ] = "tune"
-    cameras: Annotated[int, option(INPUT, "Cameras around the room, 2 to 12.", show_default=True)] = 6
-    people: Annotated[int | None, option(INPUT, "People in demo, 0 to 12; a sequence has its own.")] = None
-    seed: Annotated[
-        int, option(INPUT, "Fixes the detector's errors, and the people of demo.", show_default=True)
-    ] = 0
-    mocap: Annotated[Path | None, option(INPUT, "Recorded motions (.npz) that sequences are made of.")] = None
+    name: str = argument("NAME", "demo, or an interaction sequence: salsa, crossing or crowd.")
+    split: str = option(INPUT, "Takes of a sequence: tune, to choose settings by; report.", "tune")
+    cameras: int = option(INPUT, "Cameras around the room, 2 to 12.", 6)
+    people: int | None = option(INPUT, "People in demo, 0 to 12; a sequence has its own.")
+    seed: int = option(INPUT, "Fixes the detector's errors, and the people of demo.", 0)
+    mocap: Path | None = option(INPUT, "Recorded motions (.npz) that sequences are made of.")
 
 
 @grouped
 def simulate(
     scene: SceneOptions,
-    output: Annotated[Path, option(RESULT, "Folder for cameras, detections and truth.")],
-    frames: FramesOption = None,
-    format: Annotated[
-        str, option(RESULT, "Detections as association (4D Association) or openpose.", show_default=True)
-    ] = "association",
-    workers: WorkersOption = None,
+    output: Path = option(RESULT, "Folder for cameras, detections and truth.", REQUIRED),
+    frames: str | None = frames_option(),
+    format: str = option(RESULT, "Detections as association (4D Association) or openpose.", "association"),
+    workers: int | None = workers_option(),
 ) -> None:
     """Simulate a recording with known truth: cameras, 2D detections, and people.npz to compare with."""
     if format not in ("association", "openpose"):

@@ -5,7 +5,6 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import NoReturn
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -41,7 +40,7 @@ def stoppable() -> Iterator[None]:
         nonlocal stopped
         if not stopped:
             stopped = True
-            _raise(number)
+            raise Stopped(number)
 
     before = {number: signal.getsignal(number) for number in _SIGNALS}
     heard = [number for number in _SIGNALS if before[number] not in (signal.SIG_IGN, None)]
@@ -52,7 +51,3 @@ def stoppable() -> Iterator[None]:
     finally:
         for number in heard:
             signal.signal(number, before[number])
-
-
-def _raise(number: int) -> NoReturn:
-    raise Stopped(number)

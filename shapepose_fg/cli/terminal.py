@@ -2,12 +2,14 @@
 
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
+    from rich.progress import Progress
+    from rich.table import Table
 
 
 def use_any_streams() -> None:
@@ -36,39 +38,52 @@ def show(content: "RenderableType") -> None:
     Console(markup=False, emoji=False).print(content)
 
 
-def note(message: str) -> None:
-    """Say on stderr, in one line, what was made of the input."""
+def table(heads: Sequence[str], rows: Iterable[Sequence[Any]], *, left: int = 1, caption: str = "") -> "Table":
+    """Rows under headings, the first `left` columns to the left, and a caption under them."""
+    from rich.table import Table
+
+    made = Table(box=None, padding=(0, 2, 0, 0), header_style="dim", caption=caption, caption_justify="left")
+    for n, head in enumerate(heads):
+        made.add_column(head, justify="left" if n < left else "right", overflow="fold")
+    for row in rows:
+        made.add_row(*row)
+    return made
+
+
+def say(what: str, message: str, style: str) -> None:
+    """Say on stderr, in one paragraph that begins with `what`."""
     from rich.console import Console
     from rich.text import Text
 
-    Console(stderr=True).print(Text.assemble(("note: ", "bold"), message), soft_wrap=True)
+    Console(stderr=True).print(Text.assemble((f"{what}: ", style), message), soft_wrap=True)
+
+
+def note(*messages: str) -> None:
+    """Say on stderr, each in one line, what was made of the input."""
+    for message in messages:
+        say("note", message, "bold")
 
 
 def warn(message: str) -> None:
     """Say on stderr, in one paragraph, what looks wrong."""
-    from rich.console import Console
-    from rich.text import Text
+    say("warning", message, "bold yellow")
 
-    Console(stderr=True).print(Text.assemble(("warning: ", "bold yellow"), message), soft_wrap=True)
+
+@contextmanager
+def bars(unit: str = "") -> Iterator["Progress"]:
+    """Progress bars on stderr while the block runs; nothing is shown where that is not a terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console, left = Console(stderr=True), TimeRemainingColumn(compact=True)
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TextColumn(unit))
+    with Progress(*columns, left, console=console, transient=True, disable=not console.is_terminal) as shown:
+        yield shown
 
 
 @contextmanager
 def progress(what: str, unit: str = "frames") -> Iterator[Callable[[int, int], None]]:
-    """A progress bar on stderr while the block runs: a function of how many are done, and how many there are.
-
-    Nothing is shown where stderr is not a terminal.
-    """
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn(unit),
-        TimeRemainingColumn(compact=True),
-    )
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(what, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+    """One of them: a function of how many are done, and how many there are."""
+    with bars(unit) as shown:
+        task = shown.add_task(what, total=None)
+        yield lambda done, total: shown.update(task, completed=done, total=total)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from shapepose_fg.cli.terminal import show
+from shapepose_fg.cli.terminal import show, table
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.result_files import results_folder
 
@@ -18,9 +18,8 @@ if TYPE_CHECKING:
 
     from shapepose_fg.body.model.smpl_file import SmplArrays
     from shapepose_fg.core.reconstruction import Reconstruction
-    from shapepose_fg.tracking.edits import Edited, Solve
+    from shapepose_fg.tracking.edits import Solve
 
-# Everything else is imported inside the commands: `--help` must not wait for it.
 
 tracks = typer.Typer(invoke_without_command=True)
 
@@ -68,15 +67,11 @@ def merge_people(context: typer.Context, person: Person, other: Other) -> None:
     _correct(context, "merge", person, other=other)
 
 
+New = Annotated[int | None, typer.Option(help="Number of the new person; by default the next free one.")]
+
+
 @tracks.command("split")
-def split_person(
-    context: typer.Context,
-    person: Person,
-    frame: From,
-    new: Annotated[
-        int | None, typer.Option(help="Number of the new person; by default the next free one.")
-    ] = None,
-) -> None:
+def split_person(context: typer.Context, person: Person, frame: From, new: New = None) -> None:
     """From FRAME on A is somebody else: a new person."""
     _correct(context, "split", person, other=new, frame=frame)
 
@@ -115,7 +110,6 @@ def _tracks_table(results: Path) -> "RenderableType":
     """Everybody of a result, and what was corrected."""
     from rich.console import Group
     from rich.padding import Padding
-    from rich.table import Table
 
     from shapepose_fg.core.frame_times import rate_words
     from shapepose_fg.core.reconstruction import Reconstruction
@@ -125,32 +119,34 @@ def _tracks_table(results: Path) -> "RenderableType":
     with Reconstruction.open(results) as opened:
         run, rows = opened.run, len(opened)
         listed = list_saved_tracks(opened, _body_of(run))
-    table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
-    for name in ("person", "frames", "rows", "gaps", "stature", "seen", "confidence", "walked"):
-        table.add_column(name, justify="right")
-    for track in listed:
-        table.add_row(
-            str(track.person),
-            f"{track.first}-{track.last}",
-            str(track.rows),
-            str(track.gaps),
-            _or_dash(track.stature_m, "{:.2f} m"),
-            _or_dash(100 * track.seen, "{:.0f} %"),
-            f"{track.confidence:.2f}",
-            f"{track.walked_m:.1f} m",
-        )
+
+    def or_dash(value: float, text: str) -> str:
+        return "-" if value != value else text.format(value)  # NaN
+
+    people = table(
+        "person frames rows gaps stature seen confidence walked".split(),
+        (
+            (
+                str(track.person),
+                f"{track.first}-{track.last}",
+                str(track.rows),
+                str(track.gaps),
+                or_dash(track.stature_m, "{:.2f} m"),
+                or_dash(100 * track.seen, "{:.0f} %"),
+                f"{track.confidence:.2f}",
+                f"{track.walked_m:.1f} m",
+            )
+            for track in listed
+        ),
+        left=0,
+    )
     lines = [f"{len(listed)} people, {rows} rows{rate_words(run)}"]
     if not run.get("configuration", {}).get("temporal", True):
         lines.append("every frame was solved by itself: a number is no identity")
     edits = read_corrections(results_folder(results))
     if len(edits) > 0:
         lines.append(f"corrected: {'; '.join(map(str, edits))}")
-    return Group(*([table] if listed else []), Padding("\n".join(lines), (1 if listed else 0, 0, 0, 0)))
-
-
-def _or_dash(value: float, text: str) -> str:
-    """`value` as `text` formats it; a dash where it is NaN."""
-    return "-" if value != value else text.format(value)
+    return Group(*([people] if listed else []), Padding("\n".join(lines), (1 if listed else 0, 0, 0, 0)))
 
 
 def _body_of(run: "Mapping[str, Any]") -> "SmplArrays | None":
@@ -176,7 +172,10 @@ def _correct(context: typer.Context, action: str, person: int, **more: int | Non
     edit = Edit(Action(action), person, **more)
     solve = _solver(folder)
     edited = correct(folder, edit, solve)
-    print(f"done: {edit}{_solved_words(edited, solve)}")
+    words = "; joints and bodies stay as they were solved"
+    if solve is not None:
+        words = f"; solved anew: {' '.join(map(str, sorted(edited.changed)))}"
+    print(f"done: {edit}{words if len(edited.changed) > 0 else ''}")
     show(_tracks_table(context.obj))
     print(f"take it back: shapepose-fg tracks {context.obj} undo")
     _renew_report(folder)
@@ -197,36 +196,23 @@ def _renew_report(folder: Path) -> None:
 
 
 def _solver(folder: Path) -> "Solve | None":
-    """What solves rows of the result in `folder` anew.
+    """What solves rows of the result in `folder` anew; None where the result does not hold what that takes.
 
-    None where the result does not hold what that takes, or without time: then every row is solved by itself,
-    whoever it is.
+    Without time, too: then every row is solved by itself, whoever it is.
     """
     from shapepose_fg.core.reconstruction import Reconstruction
-    from shapepose_fg.io.solved_setup import CAMERAS
+    from shapepose_fg.io.solved_setup import CAMERAS, read_setup
 
-    needed = [folder / name for name in ("run.json", "observations.npz", CAMERAS)]
-    if not all(file.is_file() for file in needed):
+    if not all((folder / name).is_file() for name in ("run.json", "observations.npz", CAMERAS)):
         return None
     with Reconstruction.open(folder) as opened:
-        temporal = opened.run.get("configuration", {}).get("temporal", False)
-    if not temporal:
-        return None
+        if not opened.run.get("configuration", {}).get("temporal", False):
+            return None
 
     def solve(rows: "Reconstruction") -> "Reconstruction":
-        from shapepose_fg.io.solved_setup import read_setup
         from shapepose_fg.pipeline.config import PipelineConfig
         from shapepose_fg.pipeline.solving import Solver, solve_rows
 
         return solve_rows(rows, Solver.of(read_setup(folder, rows, PipelineConfig), rows.joint_names))
 
     return solve
-
-
-def _solved_words(edited: "Edited", solve: "Solve | None") -> str:
-    """Who was solved anew, in words."""
-    if len(edited.changed) == 0:
-        return ""
-    if solve is None:
-        return "; joints and bodies stay as they were solved"
-    return f"; solved anew: {' '.join(map(str, sorted(edited.changed)))}"

@@ -1,6 +1,6 @@
 """The command `view`: a result in the rerun viewer."""
 
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 from shapepose_fg.cli.options import RUN, TakeOptions, grouped, option
 from shapepose_fg.cli.pictures import PictureOptions
@@ -17,15 +17,13 @@ if TYPE_CHECKING:
 def view(
     part: TakeOptions,
     pictures: PictureOptions,
-    connect: Annotated[
-        str | None, option(RUN, "A viewer that runs already: rerun+http://HOST:9876/proxy.", metavar="URL")
-    ] = None,
-    statistics: Annotated[
-        bool,
-        option(
-            RUN, "Leave rerun's statistics of use, sent to its makers, as they are set: not off.", "--statistics"
-        ),
-    ] = False,
+    connect: str | None = option(RUN, "A viewer that runs already: rerun+http://HOST:9876/proxy.", metavar="URL"),
+    statistics: bool = option(
+        RUN,
+        "Leave rerun's statistics of use, sent to its makers, as they are set.",
+        False,
+        "--statistics",
+    ),
 ) -> None:
     """Show a result in the rerun viewer: people, cameras, and what was used of what they saw, on a timeline."""
     from shapepose_fg.io.export.job import Job

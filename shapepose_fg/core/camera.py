@@ -1,6 +1,4 @@
-"""Where a camera stands and what it sees: pinhole cameras in the world, a rig of them, and their views over
-time.
-"""
+"""Where cameras stand and what they see: pinhole cameras in the world, a rig of them, their views over time."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -57,11 +55,8 @@ class Camera:
         if self.lens not in _COEFFICIENTS:
             raise refuse(f"lens must be perspective or fisheye, got {self.lens!r}")
         lengths = [(count,) for count in _COEFFICIENTS[self.lens]]
-        for name, shapes, most in (
-            ("K", [(3, 3)], _MOST_PIXELS),
-            ("wTc", [(4, 4)], _MOST_METRES),
-            ("distortion", lengths, _MOST_DISTORTION),
-        ):
+        arrays = {"K": ([(3, 3)], _MOST_PIXELS), "wTc": ([(4, 4)], _MOST_METRES)}
+        for name, (shapes, most) in (arrays | {"distortion": (lengths, _MOST_DISTORTION)}).items():
             value = np.asarray(getattr(self, name), dtype=np.float64)
             if value.shape not in shapes:
                 raise refuse(f"{name} must be {' or '.join(map(str, shapes))}, got {value.shape}")
@@ -280,7 +275,7 @@ class Views:
     """(V, 2) width and height, pixels; infinite where they are not known."""
 
     def __post_init__(self) -> None:
-        K, cTw = np.asarray(self.K, dtype=np.float64), np.asarray(self.cTw, dtype=np.float64)
+        K, cTw = self.K, self.cTw
         if K.shape[-2:] != (3, 3) or cTw.shape[-2:] != (3, 4) or K.ndim not in (3, 4) or cTw.ndim not in (3, 4):
             raise ValueError(f"K must be ([N,] V, 3, 3) and cTw ([N,] V, 3, 4), got {K.shape} and {cTw.shape}")
         if K.shape[-3] != cTw.shape[-3] or (K.ndim == cTw.ndim == 4 and len(K) != len(cTw)):

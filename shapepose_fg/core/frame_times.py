@@ -29,15 +29,13 @@ class FrameTimes:
         if time_s.ndim not in (1, 2):
             raise ValueError(f"time_s must be (T,) or (T, V), got {time_s.shape}")
         object.__setattr__(self, "time_s", time_s)
-        cameras = tuple(range(1, time_s.ndim))
-        finite = np.isfinite(time_s).all(axis=cameras)
+        columns = time_s if time_s.ndim == 2 else time_s[:, None]
+        finite = np.isfinite(columns).all(axis=1)
         if not finite.all():
-            raise ValueError(f"time_s must be finite, at frame {int(np.argmin(finite))} it is not")
-        rising = np.append(True, (np.diff(time_s, axis=0) > 0).all(axis=cameras))
+            raise ValueError(f"time_s must be finite, at frame {np.argmin(finite)} it is not")
+        rising = np.append(True, (np.diff(columns, axis=0) > 0).all(axis=1))
         if not rising.all():
-            raise ValueError(
-                f"time_s must rise from frame to frame, at frame {int(np.argmin(rising))} it does not"
-            )
+            raise ValueError(f"time_s must rise from frame to frame, at frame {np.argmin(rising)} it does not")
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -106,10 +104,6 @@ def segments(frames: range, cuts: Sequence[int]) -> list[range]:
     inside = [cut for cut in cuts if frames.start < cut < frames.stop]
     edges = [frames.start, *inside, frames.stop]
     return [range(start, stop) for start, stop in pairwise(edges) if stop > start]
-
-
-stretches = segments
-"""Its name until 0.1."""
 
 
 def spans_of(frames: Iterable[int]) -> list[range]:

@@ -136,8 +136,7 @@ class ObservationTable(Table):
         cls, joint_names: Sequence[str] = BODY_25.joints, view_names: Sequence[str] = ()
     ) -> "ObservationTable":
         """The table of a result without rows."""
-        names = {"joint_names": joint_names, "view_names": view_names}
-        return cls.without_rows(**{name: np.array(each, dtype=str) for name, each in names.items()})
+        return cls.without_rows(joint_names=np.array(joint_names, str), view_names=np.array(view_names, str))
 
     @classmethod
     def concatenate(cls, parts: Sequence["ObservationTable"]) -> "ObservationTable":
@@ -182,11 +181,8 @@ class ObservationTable(Table):
 
         `run_id` is that of the people whose observations they must be (`result_files.check_id`).
         """
-        opened = cls.open(Path(file), run_id)
-        try:
+        with cls.open(Path(file), run_id) as opened:
             return opened.read(None)
-        finally:
-            opened.close()
 
     @classmethod
     def open(cls, file: Path, run_id: object = None) -> "SavedTable[ObservationTable]":

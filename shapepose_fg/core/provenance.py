@@ -39,7 +39,7 @@ def checksums(inputs: Iterable[str | Path]) -> dict[str, str]:
 
     A recording of 10,000 JSON files is one line of run.json, and a file renamed or lost changes it.
     """
-    return {str(path): _digest(Path(path)) for path in inputs}
+    return {str(path): _digest(Path(path), _INPUTS) for path in inputs}
 
 
 class ReadInputs:
@@ -66,12 +66,13 @@ class ReadInputs:
 
 def program_digest() -> str:
     """sha256 of this program itself, its data included: whether two runs are by the same version."""
-    whole, here = hashlib.sha256(), Path(__file__).parents[1]
-    for package in (here, here.with_name("factors")):
-        for file in sorted(package.rglob("*")):
-            if file.suffix in (".py", ".npz", ".json", ".safetensors"):
-                whole.update(f"{file.relative_to(package).as_posix()} {_digest(file)}\n".encode())
-    return whole.hexdigest()
+    here, data = Path(__file__).parents[1], (".py", ".npz", ".json", ".safetensors")
+    parts = (_digest(package, data) for package in (here, here.with_name("factors")))
+    return hashlib.sha256(" ".join(parts).encode()).hexdigest()
+
+
+def _files(folder: Path, endings: tuple[str, ...]) -> Iterator[Path]:
+    return (file for file in folder.rglob("*") if file.suffix in endings)
 
 
 def _states(paths: Iterable[str | Path | None]) -> Iterator[tuple[str, int]]:
@@ -80,20 +81,19 @@ def _states(paths: Iterable[str | Path | None]) -> Iterator[tuple[str, int]]:
     Plain values: hours of footage are half a million files.
     """
     for path in (Path(path) for path in paths if path is not None):
-        files = (file for file in path.rglob("*") if file.suffix in _INPUTS) if path.is_dir() else (path,)
-        for file in files:
+        for file in _files(path, _INPUTS) if path.is_dir() else (path,):
             with suppress(OSError):
                 state = file.stat()
                 yield str(file), state.st_size << 64 | state.st_mtime_ns
 
 
-def _digest(path: Path) -> str:
-    """sha256 in hexadecimal."""
+def _digest(path: Path, endings: tuple[str, ...]) -> str:
+    """sha256 in hexadecimal of a file, or of those of a folder with these endings."""
     try:
         if path.is_dir():
             whole = hashlib.sha256()
-            for file in sorted(file for file in path.rglob("*") if file.suffix in _INPUTS):
-                whole.update(f"{file.relative_to(path).as_posix()} {_digest(file)}\n".encode())
+            for file in sorted(_files(path, endings)):
+                whole.update(f"{file.relative_to(path).as_posix()} {_digest(file, endings)}\n".encode())
             return whole.hexdigest()
         with path.open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()

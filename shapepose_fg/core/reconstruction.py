@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from enum import IntEnum, StrEnum
 from pathlib import Path
@@ -192,7 +193,7 @@ class Reconstruction(Table):
         return OpenedReconstruction(Path(path))
 
 
-class OpenedReconstruction:
+class OpenedReconstruction(ExitStack):
     """A saved result, open: who is where is in memory, rows are read when they are asked for.
 
     A context, at whose end the files are closed. Who asks for frames in rising order unpacks the files once. What
@@ -202,17 +203,19 @@ class OpenedReconstruction:
     def __init__(self, path: Path) -> None:
         """InputError where there is no result, or its files are of two runs."""
         file = path / PEOPLE if path.is_dir() else path
+        table = file.with_name(OBSERVATIONS)
         self._observed: SavedTable[ObservationTable] | None = None
         self._block = range(0), Reconstruction.empty()
-        self._people = SavedTable(file, Reconstruction, "give the people.npz of a reconstruction")
+        super().__init__()
         try:
+            people = SavedTable(file, Reconstruction, "give the people.npz of a reconstruction")
+            self._people = self.enter_context(people)
             self.frame, self.person = (self._people.numbers(name) for name in ("frame", "person"))
             """(N,) frame of each row, and identity of each row's person."""
-            self.run = self._read_run(file.with_name(RUN))
+            self.run = _read_run(file.with_name(RUN), self._people.run_id)
             """What run.json says."""
-            table = file.with_name(OBSERVATIONS)
             if table.is_file():
-                self._observed = ObservationTable.open(table, self._people.run_id)
+                self._observed = self.enter_context(ObservationTable.open(table, self._people.run_id))
         except InputError:
             self.close()
             raise
@@ -260,30 +263,18 @@ class OpenedReconstruction:
             file = self._observed.file
             raise InputError(f"{file}: {error}; delete it or run the reconstruction again") from None
 
-    def close(self) -> None:
-        """Nothing can be read any more."""
-        self._people.close()
-        if self._observed is not None:
-            self._observed.close()
 
-    def __enter__(self) -> "OpenedReconstruction":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def _read_run(self, file: Path) -> dict[str, Any]:
-        """What run.json says, if it is of the same run; empty where there is none."""
-        run = read_json(file) if file.is_file() else {}
+def _read_run(file: Path, people_id: object) -> dict[str, Any]:
+    """What run.json says, if it is of the run with that id; empty where there is none."""
+    run = read_json(file) if file.is_file() else {}
+    try:
         if not isinstance(run, dict):
-            raise InputError(f"{file}: must hold an object; restore it or delete it")
-        try:
-            check_run(run)
-        except ValueError as error:
-            raise InputError(f"{file}: {error}; restore it or delete it") from None
-        # People that were changed and saved have another id.
-        check_id(self._people.run_id, run.pop(RUN_ID, None), file)
-        return run
+            raise ValueError("must hold an object")
+        check_run(run)
+    except ValueError as error:
+        raise InputError(f"{file}: {error}; restore it or delete it") from None
+    check_id(people_id, run.pop(RUN_ID, None), file)
+    return run
 
 
 _BLOCK = 128

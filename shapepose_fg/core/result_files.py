@@ -5,6 +5,7 @@ opened.
 import hashlib
 import json
 from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO, Generic, TypeVar, cast
@@ -94,16 +95,18 @@ def _told(name: str, column: Pieces, tell: Any) -> Pieces:
     return replace(column, pieces=pieces)
 
 
-class SavedTable(Generic[T]):
-    """people.npz or observations.npz: a table of the class `kind`."""
+class SavedTable(ExitStack, Generic[T]):
+    """people.npz or observations.npz, open: a table of the class `kind`."""
 
     def __init__(self, file: Path, kind: type[T], cure: str) -> None:
         """InputError, with the `cure`, where it cannot be read or an array is missing that earlier files have
         too.
         """
+        super().__init__()
         self.file, self.kind, self.cure = file, kind, cure
         self._columns, told = columns_of(kind), kind.meanings()
-        self._npz = NpzFile(file, (*kind.ROWS, *kind.shared(), *told, RUN_ID), f"{cure}, or run one first")
+        names = (*kind.ROWS, *kind.shared(), *told, RUN_ID)
+        self._npz = self.enter_context(NpzFile(file, names, f"{cure}, or run one first"))
         try:
             there = self._npz.names
             for name in there:
@@ -130,19 +133,15 @@ class SavedTable(Generic[T]):
                     )
             self._shared = {name: self._npz.array(name) for name in kind.shared()}
         except InputError:
-            self._npz.close()
+            self.close()
             raise
 
     def numbers(self, name: str) -> NDArray[np.integer]:
         """All of a column of whole numbers, checked: rows are chosen by it before the others are read."""
-        try:
+        with self._naming():
             column = self._columns[name].checked(name, self._npz.array(name), {"N": self.count})
             self._columns[name].check_range(name, column)
-        except InputError:
-            raise
-        except ValueError as error:
-            raise InputError(f"{self.file}: {error}; {self.cure}") from None
-        return column
+            return column
 
     def read(self, index: NDArray[np.intp] | None, **others: Any) -> T:
         """The rows `index` (R,), rising, or all, and `others` beside them; InputError where they do not make a
@@ -150,14 +149,10 @@ class SavedTable(Generic[T]):
         """
         self._check_memory(self.count if index is None else len(index))
         read = self._npz.array if index is None else lambda name: self._npz.rows(name, index)
-        try:
+        with self._naming():
             table = self.kind(**{name: read(name) for name in self._rows}, **self._shared)
             table.check_ranges()
             return replace(cast(Any, table), **others) if others else table
-        except InputError:
-            raise
-        except ValueError as error:
-            raise InputError(f"{self.file}: {error}; {self.cure}") from None
 
     def _check_memory(self, count: int) -> None:
         """InputError where so many rows, and as much again to work with them, are more than there is room for."""
@@ -168,9 +163,15 @@ class SavedTable(Generic[T]):
                 " take some frames or people at a time (--frames, --person, or Reconstruction.open)"
             )
 
-    def close(self) -> None:
-        """Nothing can be read any more."""
-        self._npz.close()
+    @contextmanager
+    def _naming(self) -> Iterator[None]:
+        """A ValueError inside the block is an InputError that names the file."""
+        try:
+            yield
+        except InputError:
+            raise
+        except ValueError as error:
+            raise InputError(f"{self.file}: {error}; {self.cure}") from None
 
 
 def free_memory() -> int | None:

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -116,7 +116,7 @@ def check_run(run: Mapping[str, Any]) -> None:
     if run.get("time", {}).get("fps") is not None:
         numbers["time.fps"] = run["time"]["fps"]
     for name, value in numbers.items():
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        if type(value) not in (int, float) or not math.isfinite(value):
             raise refuse(name, "a number", value)
     cuts = run.get("cuts", [])
     if not isinstance(cuts, list) or not all(type(cut) is int and cut >= 0 for cut in cuts):
@@ -128,18 +128,15 @@ def check_run(run: Mapping[str, Any]) -> None:
     count = sum(span.stop - span.start for span in spans)
     if any(span.start < 0 or span.stop < span.start for span in spans) or count > _MOST_FRAMES:
         raise refuse("frames", f"[start, stop] of at most {_MOST_FRAMES} frames", run["frames"])
-    endless = _not_finite(run)
-    if endless is not None:  # such as 1e999, which could not be written again
-        raise ValueError(f'"{".".join(endless[:-1])[:80]}" must be a finite number, got {endless[-1]}')
+    for way, value in _leaves(run):
+        if isinstance(value, float) and not math.isfinite(value):  # 1e999, which could not be written again
+            raise ValueError(f'"{way[:80]}" must be a finite number, got {value}')
 
 
-def _not_finite(value: object) -> list[str] | None:
-    """Keys and indices that lead to a number that is not finite, and the number; None where there is none."""
-    if isinstance(value, float):
-        return None if math.isfinite(value) else [str(value)]
-    items = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list) else ()
-    for key, child in items:
-        way = _not_finite(child)
-        if way is not None:
-            return [str(key), *way]
-    return None
+def _leaves(value: object, way: str = "") -> Iterator[tuple[str, object]]:
+    """What is no list and no object in plain values, each with the dotted keys and indices that lead to it."""
+    items = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list) else None
+    if items is None:
+        yield way, value
+    for key, child in items or ():
+        yield from _leaves(child, f"{way}.{key}" if way else str(key))

@@ -34,14 +34,13 @@ class SubjectShapes(Table):
         """Check every shape and type; that names differ; that betas are finite and information is definite."""
         super().__post_init__()
         names = self.names.tolist()
-        twice = next((name for name in names if names.count(name) > 1), None)
-        if twice is not None:
-            raise ValueError(f"names must differ, {twice!r} occurs twice")
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"names must differ, {name!r} occurs twice")
         finite = np.isfinite(self.betas).all(axis=1) & np.isfinite(self.information).all(axis=(1, 2))
         if not finite.all():
-            raise ValueError(
-                f"betas and information must be finite, those of {names[np.argmin(finite)]!r} are not"
-            )
+            whose = names[np.argmin(finite)]
+            raise ValueError(f"betas and information must be finite, those of {whose!r} are not")
         largest = float(np.abs(self.information).max(initial=0.0))
         symmetric = np.allclose(self.information, self.information.mT, rtol=0.0, atol=1e-5 * largest)
         if not symmetric or (len(self) > 0 and (np.linalg.eigvalsh(self.information) <= 0).any()):

@@ -59,8 +59,8 @@ class Skeleton:
             anchor = MID_HIP
         joints = (*(joint for joint in keypoints if joint), *middles)
         place = {joint: index for index, joint in enumerate(joints)}
-        if len(place) < len(joints):
-            twice = next(joint for joint, count in Counter(joints).items() if count > 1)
+        twice = next((joint for joint, count in Counter(joints).items() if count > 1), None)
+        if twice is not None:
             raise ValueError(f"{name}: joint {twice} occurs twice; give each its own name")
         pairs = [*limbs, *mirror, *middles.values()]
         for joint in (anchor, *core, *(end for pair in pairs for end in pair)):
@@ -79,11 +79,9 @@ class Skeleton:
             )
         other = {place[a]: place[b] for a, b in (*mirror, *((b, a) for a, b in mirror))}
         edges = tuple((place[a], place[b]) for a, b in limbs)
-        grown = (
-            _grown(place[anchor], edges, len(joints))
-            if parents is None
-            else [place.get(parents.get(joint, ""), -1) for joint in joints]
-        )
+        grown = _grown(place[anchor], edges, len(joints))
+        if parents is not None:
+            grown = [place.get(parents.get(joint, ""), -1) for joint in joints]
         lost = [joints[j] for j, parent in enumerate(grown) if parent < 0 and joints[j] != anchor]
         if lost:
             raise ValueError(f"{name}: no limbs lead from the anchor {anchor} to {' '.join(lost)}; add limbs")
@@ -137,13 +135,10 @@ class Skeleton:
     @cached_property
     def tree_levels(self) -> tuple[NDArray[np.intp], ...]:
         """Joints by their distance from the root: level 0 is the root alone, level 1 its children, ..."""
-        depth = np.zeros(len(self), dtype=int)
-        for joint in range(len(self)):
-            node = joint
-            while self.parents[node] >= 0:
-                node = self.parents[node]
-                depth[joint] += 1
-        return tuple(np.flatnonzero(depth == level) for level in range(depth.max() + 1))
+        levels = [np.array([self.root])]
+        while len(children := np.flatnonzero(np.isin(self.parents, levels[-1]))) > 0:
+            levels.append(children)
+        return tuple(levels)
 
     @cached_property
     def adjacency(self) -> NDArray[np.intp]:
@@ -156,12 +151,10 @@ class Skeleton:
     @cached_property
     def tree_neighbours(self) -> NDArray[np.intp]:
         """(J, N) parent and children of each joint in the tree, filled up with -1."""
-        children = [[j for j in range(len(self)) if self.parents[j] == joint] for joint in range(len(self))]
-        lists = [[p for p in (self.parents[joint],) if p >= 0] + children[joint] for joint in range(len(self))]
-        table = np.full((len(self), max(len(row) for row in lists)), -1, dtype=np.intp)
-        for joint, row in enumerate(lists):
-            table[joint, : len(row)] = row
-        return table
+        parents = np.array(self.parents)
+        lists = [[*parents[[j]][parents[[j]] >= 0], *np.flatnonzero(parents == j)] for j in range(len(self))]
+        most = max(map(len, lists))
+        return np.array([row + [-1] * (most - len(row)) for row in lists], dtype=np.intp)
 
 
 def _limbs(text: str) -> tuple[tuple[int, int], ...]:

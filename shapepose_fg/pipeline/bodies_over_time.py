@@ -17,16 +17,14 @@ from shapepose_fg.core.reconstruction import Reconstruction, Status
 from shapepose_fg.core.storage.kept_arrays import InMemory, KeptArrays
 from shapepose_fg.estimation.floor import Floor
 
-STRETCH_ROWS = 4000
+SEGMENT_ROWS = 4000
 """Rows of a person that are fitted together at the most. The shape of a longer track is what so many of its rows
-say, in pieces spread evenly over it; poses are then fitted with that shape, stretch by stretch. Neither memory nor
+say, in pieces spread evenly over it; poses are then fitted with that shape, segment by segment. Neither memory nor
 the time of a row grows with the recording."""
 PIECE_ROWS = 160
 """Rows of such a piece: some seconds, so that poses are linked in time there, too."""
 _OVERLAP_ROWS = 32
-"""Rows that a stretch has of its neighbours, on either side, when poses are fitted."""
-
-
+"""Rows that a segment has of its neighbours, on either side, when poses are fitted."""
 BODY = ("betas", "global_orient", "body_pose", "transl")
 """The columns of a result that are a body."""
 
@@ -134,7 +132,7 @@ def fit_everybody(
     fits: Fits,
     kept: KeptArrays,
     known: SubjectShapes,
-    lengths: tuple[int, int] = (STRETCH_ROWS, PIECE_ROWS),
+    lengths: tuple[int, int] = (SEGMENT_ROWS, PIECE_ROWS),
 ) -> BodiesOverTime:
     """Fit one body per person to the joints as they were solved; what is kept already is not fitted again.
 
@@ -143,35 +141,30 @@ def fit_everybody(
     recordings: who is recognised by shape (`recognise`) is fitted again with that as the prior. `lengths` are rows
     of a segment and of a piece.
     """
-    stretch_rows, piece_rows = lengths
-    long = [number for number, count in counts.items() if count > stretch_rows]
+    most, piece = lengths
+    long = [number for number, count in counts.items() if count > most]
+    places: dict[int, dict[str, range]] = {}
 
-    def fitted(jobs: Mapping[str, Callable[[], Person]]) -> None:
+    def fit(jobs: Mapping[str, Callable[[], Person]]) -> None:
         """Fit what is not kept yet under these names."""
-        there = set(kept.names(""))
-        missing = [name for name in jobs if name not in there]
+        missing = sorted(jobs.keys() - set(kept.names("")), key=list(jobs).index)
         for name, bodies in zip(missing, fits(jobs[name]() for name in missing), strict=True):
             kept.keep(name, bodies)
 
+    def whole(number: int, prior: Shapes | None) -> Person:
+        """What the shape is fitted to, and the bodies where the track is short."""
+        if number in long:
+            rows = person(number, _spread(counts[number], most, piece))
+            return replace(rows, shapes=prior, kept=range(0))
+        return replace(person(number, [range(counts[number])]), shapes=prior)
+
     def found(kind: str, prior: Mapping[int, Shapes | None]) -> dict[int, Shapes]:
         """Some people's shapes, and their bodies where the track is short."""
-
-        def job(number: int) -> Person:
-            count = counts[number]
-            if number not in long:
-                return replace(person(number, [range(count)]), shapes=prior[number])
-            rows = person(number, _spread(count, stretch_rows, piece_rows))
-            return replace(rows, shapes=prior[number], kept=range(0))
-
         names = {number: f"{kind}-{number}" for number in prior}
-        fitted({name: partial(job, number) for number, name in names.items()})
+        fit({name: partial(whole, number, prior[number]) for number, name in names.items()})
         places.update({number: {name: range(counts[number])} for number, name in names.items()})
-        return {
-            number: Shapes(kept.array(name, "mean"), kept.array(name, "information"))
-            for number, name in names.items()
-        }
+        return {n: Shapes(kept.array(name, "mean"), kept.array(name, "information")) for n, name in names.items()}
 
-    places: dict[int, dict[str, range]] = {}
     shapes = found("bodies", dict.fromkeys(counts))
     whose = recognise(_subjects(shapes, known.body), known)
     prior = {
@@ -181,24 +174,18 @@ def fit_everybody(
     }
     shapes |= found("recognised", prior)
 
-    def stretch(number: int, own: range) -> Person:
+    def segment(number: int, own: range) -> Person:
         first = max(own.start - _OVERLAP_ROWS, 0)
         rows = person(number, [range(first, min(own.stop + _OVERLAP_ROWS, counts[number]))])
         inside = range(own.start - first, own.stop - first)
         return replace(rows, shapes=shapes[number], fixed_shapes=True, kept=inside)
 
     for number in long:
-        stretches = _stretches(counts[number], stretch_rows)
-        places[number] = {f"stretch-{number}-{n:04d}": own for n, own in enumerate(stretches)}
-    fitted({name: partial(stretch, number, own) for number in long for name, own in places[number].items()})
-    names = _names(np.array(list(counts), dtype=np.intp), known, whose)
+        edges = np.linspace(0, counts[number], 1 - (-counts[number] // most)).round().astype(int).tolist()
+        places[number] = {f"segment-{number}-{n:04d}": range(*ends) for n, ends in enumerate(pairwise(edges))}
+    fit({name: partial(segment, number, own) for number in long for name, own in places[number].items()})
+    names = _names(list(counts), known, whose.tolist())
     return BodiesOverTime(kept, places, _subjects(shapes, known.body).named(names))
-
-
-def _stretches(count: int, most: int) -> list[range]:
-    """So many rows in stretches of equal length, at most so long."""
-    edges = np.linspace(0, count, 1 + max(1, -(-count // most))).round().astype(int).tolist()
-    return [range(start, stop) for start, stop in pairwise(edges)]
 
 
 def _spread(count: int, most: int, length: int) -> list[range]:
@@ -253,13 +240,13 @@ def _subjects(shapes: Mapping[int, Shapes], body: str) -> SubjectShapes:
     return SubjectShapes(np.array([str(number) for number in shapes]), mean, information, body)
 
 
-def _names(groups: NDArray[np.intp], known: SubjectShapes, whose: NDArray[np.intp]) -> list[str]:
+def _names(numbers: Sequence[int], known: SubjectShapes, whose: Sequence[int]) -> list[str]:
     """What people are called in the file of shapes: known names; strangers by their number, or the next free."""
     names, taken = [], set(known.names.tolist())
-    for group, subject in zip(groups.tolist(), whose.tolist(), strict=True):
-        number = group
-        while subject < 0 and str(number) in taken:
-            number = 1 + max(int(name) for name in taken if name.isdecimal())
-        names.append(str(known.names[subject]) if subject >= 0 else str(number))
-        taken.add(names[-1])
+    for number, subject in zip(numbers, whose, strict=True):
+        name = str(number) if subject < 0 else str(known.names[subject])
+        if subject < 0 and name in taken:
+            name = str(1 + max(int(each) for each in taken if each.isdecimal()))
+        names.append(name)
+        taken.add(name)
     return names

@@ -2,17 +2,16 @@
 
 import socket
 import warnings
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.provenance import program_digest, versions
-from shapepose_fg.pipeline.workers import get_ready, processes, what_workers_inherit
+from shapepose_fg.pipeline.workers import get_ready, in_order, processes, what_workers_inherit
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -29,6 +28,7 @@ _LEAST = 2
 """So many items are always under way, so that the next one does not wait for the last."""
 _SECONDS = 10
 """A cluster that does not answer for so long is not there."""
+_ITSELF = "shapepose-fg itself"
 
 
 class Cluster(Generic[Shared]):
@@ -59,9 +59,8 @@ class Cluster(Generic[Shared]):
             client = opened.enter_context(_client(address))
             if self._address is not None:
                 _refuse_other_programs(client, address)
-            with _large():
-                # A task, not data that was scattered: what is lost with a process can be made again.
-                self._client, self._at = client, client.submit(_same, self._shared, pure=False)
+            # A task, not data that was scattered: what is lost with a process can be made again.
+            self._client, self._at = client, client.submit(_same, self._shared, pure=False)
             self._open = opened.pop_all()
         return self
 
@@ -77,27 +76,17 @@ class Cluster(Generic[Shared]):
         from distributed import KilledWorker
 
         client: Any = self._client
-        program = tuple(_program().items())
-        waiting = deque["Future[Any]"]()
         if client is None:
             raise RuntimeError("a cluster is a context: use it in `with`")
+        how = {"pure": False, "retries": RETRIES}
+        submit = partial(client.submit, _work, tuple(_program().items()), work, self._at, **how)
         try:
-            for item in items:
-                with _large():
-                    waiting.append(
-                        client.submit(_work, program, work, self._at, item, pure=False, retries=RETRIES)
-                    )
-                if len(waiting) >= max(_LEAST, self._ahead * len(client.nthreads())):
-                    yield waiting.popleft().result()
-            while len(waiting) > 0:
-                yield waiting.popleft().result()
+            yield from in_order(submit, items, lambda: max(_LEAST, self._ahead * len(client.nthreads())))
         except KilledWorker as error:
             raise RuntimeError(
                 f"{error.allowed_failures + 1} processes of the cluster ended one after the other before their"
                 " work: there may be too little memory for one"
             ) from None
-        finally:
-            client.cancel(list(waiting))
 
 
 @dataclass(frozen=True)
@@ -156,8 +145,10 @@ def look_at(address: str) -> Scheduler:
 
 @contextmanager
 def _client(address: str) -> Iterator[Any]:
-    """A connexion to the scheduler at an address."""
+    """A connexion to the scheduler at an address; bodies and minutes of footage are large tasks to it."""
     Client, _ = _dask()
+    import dask.config
+
     try:
         client = Client(address, timeout=_SECONDS)
     except (OSError, ValueError, TimeoutError) as error:
@@ -166,37 +157,30 @@ def _client(address: str) -> Iterator[Any]:
             f"--cluster {address}: no Dask scheduler answers there ({reason}); start one with"
             " `dask scheduler`, or leave it out"
         ) from None
-    try:
+    with client, dask.config.set({"distributed.admin.large-graph-warning-threshold": "1GiB"}):
         yield client
-    finally:
-        client.close()
 
 
 def _refuse_other_programs(client: Any, address: str) -> None:
     """InputError where a process has another version of this program, or of what decides on numbers."""
-    own = _program()
     for process, theirs in client.run(_program, on_error="return").items():
         if not isinstance(theirs, dict):
-            reason = " ".join(str(theirs).split())[:200]
             raise InputError(
-                f"--cluster {address}: its process {process} cannot run this program ({reason}); install"
-                ' "shapepose-fg[cluster]" there'
+                f"--cluster {address}: its process {process} cannot run this program"
+                f' ({" ".join(str(theirs).split())[:200]}); install "shapepose-fg[cluster]" there'
             )
-        other = _other_version(own, theirs)
-        if other is not None:
-            raise InputError(f"--cluster {address}: its process {process} has {other}")
+        _refuse_other(f"--cluster {address}: its process {process}", _program(), theirs)
 
 
-def _other_version(own: dict[str, str], theirs: dict[str, str]) -> str | None:
-    """What the program of another process has another version of, with the cure; None where both are the same."""
+def _refuse_other(process: str, own: dict[str, str], theirs: dict[str, str]) -> None:
+    """InputError where the program of a process has another version of anything than `own`."""
     other = next((name for name in own if theirs.get(name) != own[name]), None)
-    if other is None:
-        return None
-    which = f" ({theirs.get(other)} there, {own[other]} here)" if other != _ITSELF else ""
-    return f"another version of {other}{which}; install the same there, or results would depend on who did what"
-
-
-_ITSELF = "shapepose-fg itself"
+    if other is not None:
+        which = f" ({theirs.get(other)} there, {own[other]} here)" if other != _ITSELF else ""
+        raise InputError(
+            f"{process} has another version of {other}{which}; install the same there, or results would depend on"
+            " who did what"
+        )
 
 
 @cache
@@ -215,28 +199,19 @@ def _dask() -> tuple[Any, Any]:
     return Client, LocalCluster
 
 
-def _large() -> Any:
-    """Context in which Dask does not complain of large tasks: bodies and minutes of footage are large."""
-    from dask import config
-
-    return config.set({"distributed.admin.large-graph-warning-threshold": "1GiB"})
-
-
 def _same(shared: Shared) -> Shared:
     """What all work shares."""
     return shared
 
 
 def _work(program: tuple[tuple[str, str], ...], work: Callable[[Any, Any], Any], shared: Any, item: Any) -> Any:
-    """One item, in a process of the cluster; InputError where it has another `program` than who asks.
+    """One item, in a process of the cluster; InputError where it has another `program` than the one that asks.
 
     Processes may come at any time, after the others were looked at.
     """
     import torch
 
-    other = _other_version(dict(program), _program())
-    if other is not None:
-        raise InputError(f"--cluster: one of its processes, {socket.gethostname()}, has {other}")
+    _refuse_other(f"--cluster: one of its processes, {socket.gethostname()},", dict(program), _program())
     if torch.get_num_threads() != 1:
         torch.set_num_threads(1)
     return work(shared, item)

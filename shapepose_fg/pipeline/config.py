@@ -1,7 +1,7 @@
 """The settings of the whole way, and the paper's; what else the steps are made of stands beside them."""
 
 from dataclasses import dataclass, field, replace
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, TypeVar
 
 from annotated_types import Interval
 
@@ -80,6 +80,7 @@ class SolvingConfig(Settings):
             raise ValueError(f"motion must be one of {', '.join(MOTIONS)}, got {self.motion}")
 
 
+Rules = TypeVar("Rules", CandidateConfig, ProposalConfig, AssociationConfig, WindowGraphConfig, RefineConfig)
 _CONSTANT = "is no table any more: its settings are constants beside the steps that use them"
 
 
@@ -141,6 +142,10 @@ class PipelineConfig(Settings):
             temporal=False,
         )
 
+    def _rules(self, kind: type[Rules]) -> Rules:
+        """The constants of a step, ours or the paper's."""
+        return kind.paper() if self.method == "paper" else kind()
+
     @property
     def law(self) -> Motion:
         """People over time: how joints and bodies move."""
@@ -149,19 +154,18 @@ class PipelineConfig(Settings):
     @property
     def candidates(self) -> CandidateConfig:
         """Stage I (b, c): pairs of views to 3D joint candidates."""
-        rules = CandidateConfig.paper() if self.method == "paper" else CandidateConfig()
-        return replace(rules, gate_m=self.people.gate_m, most_pairs=self.people.most_pairs)
+        own = self.people
+        return replace(self._rules(CandidateConfig), gate_m=own.gate_m, most_pairs=own.most_pairs)
 
     @property
     def proposals(self) -> ProposalConfig:
         """Stage I (d): candidates to people."""
-        rules = ProposalConfig.paper() if self.method == "paper" else ProposalConfig()
-        return replace(rules, min_probability=self.people.min_probability)
+        return replace(self._rules(ProposalConfig), min_probability=self.people.min_probability)
 
     @property
     def association(self) -> AssociationConfig:
         """Stage I (e): people to their 2D observations."""
-        return AssociationConfig.paper() if self.method == "paper" else AssociationConfig()
+        return self._rules(AssociationConfig)
 
     @property
     def tracking(self) -> TrackingConfig:
@@ -171,14 +175,14 @@ class PipelineConfig(Settings):
     @property
     def window_graph(self) -> WindowGraphConfig:
         """Stage II: the factor graph of a person."""
-        rules = WindowGraphConfig.paper() if self.method == "paper" else WindowGraphConfig()
-        return replace(rules, weight_shape=self.solving.weight_shape)
+        return replace(self._rules(WindowGraphConfig), weight_shape=self.solving.weight_shape)
 
     @property
     def refine(self) -> RefineConfig:
         """Stage II: the alternation."""
-        rules, own = RefineConfig.paper() if self.method == "paper" else RefineConfig(), self.solving
-        return replace(rules, alternations=own.alternations, window_alternations=own.window_alternations)
+        own = self.solving
+        counts = {"alternations": own.alternations, "window_alternations": own.window_alternations}
+        return replace(self._rules(RefineConfig), **counts)
 
     @property
     def estimator(self) -> EstimatorConfig:

@@ -8,6 +8,8 @@ from shapepose_fg.pipeline.cluster import Cluster
 from shapepose_fg.pipeline.workers import Workers, suitable_workers
 
 Shared = TypeVar("Shared")
+Pool = Workers[Shared] | Cluster[Shared]
+"""Processes that do the same work for many items, in order, each with what is shared."""
 
 Progress = Callable[[int, int], None]
 """Called with the number of frames that are done and the number of all."""
@@ -36,7 +38,7 @@ class Execution:
         count = suitable_workers(frames, _FRAMES_WORTH_A_WORKER) if self.workers is None else self.workers
         return replace(self, workers=count)
 
-    def pool(self, shared: Shared, frames: int) -> "Workers[Shared] | Cluster[Shared]":
+    def pool(self, shared: Shared, frames: int) -> Pool[Shared]:
         """The processes that take part in solving so many frames; all have what is `shared`."""
         count = self.worth(frames).workers or 0
         if self.cluster is None:

@@ -34,8 +34,8 @@ def estimate_offsets(
     From frames spread over the recording and joints that at least three views see well; what `reconstruct` does
     by itself. `fitter` says on which body, by default the shipped one. `config.offsets.source` is not looked at.
     """
-    config = PipelineConfig() if config is None else config
-    fitter = make_fitter(config.body) if fitter is None else fitter
+    config = config or PipelineConfig()
+    fitter = fitter or make_fitter(config.body)
     config = replace(config, offsets=replace(config.offsets, source="recording"))
     with torch_threads(config.threads):
         thinned = ThinnedFrames(detections, len(rig), config.candidates)

@@ -1,6 +1,6 @@
 """The whole way: triangulate, vote, propose, associate; follow, solve in windows, put bodies on; rows out."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar
@@ -39,7 +39,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-def moved_into_execution(function: Callable[P, R]) -> Callable[P, R]:
+def _with_execution(function: Callable[P, R]) -> Callable[P, R]:
     """`function`, which names `Execution` where it is given an argument that went there."""
 
     @wraps(function)
@@ -51,7 +51,7 @@ def moved_into_execution(function: Callable[P, R]) -> Callable[P, R]:
     return called
 
 
-@moved_into_execution
+@_with_execution
 def reconstruct(
     detections: DetectionSequence,
     rig: Rig,
@@ -128,7 +128,7 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
     with book.stage("load"):
         if fitter is None:
             fitter = make_fitter(config.body, BodyModel.default().with_keypoints(skeleton.joints), config.law)
-    check_fitter(fitter)
+        check_fitter(fitter)
     setup = Setup(rig, skeleton, config, fitter, task.extra_factors)
     with torch_threads(config.threads):
         offsets = kept_offsets(kept, setup, detections, book)
@@ -184,21 +184,12 @@ def _names(
     tracks: Assembly, skeleton: Skeleton, config: PipelineConfig, cuts_s: Sequence[float]
 ) -> dict[int, int]:
     """What tracks are called when those of one person are joined over longer times out of sight."""
-    traces = (
-        Trace.concatenate(
-            [
-                Trace.of(track, time_s, joints, skeleton)
-                for time_s, joints in tracks.own_pieces(track, ("time_s", "joints"))
-            ]
-        )
-        for track in tracks.rows_of
-    )
-    return stitch(Ends.of(traces), config.stitching, cuts_s)
 
+    def trace(track: int) -> Trace:
+        pieces = tracks.own_pieces(track, ("time_s", "joints"))
+        return Trace.concatenate([Trace.of(track, time_s, joints, skeleton) for time_s, joints in pieces])
 
-def _spans_by_name(frames: Mapping[str, Sequence[int]]) -> dict[str, list[list[int]]]:
-    """Frames as [start, stop), by what became of them."""
-    return {name: [[span.start, span.stop] for span in spans_of(numbers)] for name, numbers in frames.items()}
+    return stitch(Ends.of(map(trace, tracks.rows_of)), config.stitching, cuts_s)
 
 
 def _summary(notes: Notes, config: PipelineConfig, frames: range, result: Assembly) -> dict[str, Any]:
@@ -213,16 +204,17 @@ def _summary(notes: Notes, config: PipelineConfig, frames: range, result: Assemb
         for each in notes.problems
     ]
     dropped = {reason: frames for reason, frames in notes.dropped.items() if len(frames) > 0}
+
+    def spans(of: dict[str, list[int]]) -> dict[str, list[list[int]]]:
+        return {name: [[span.start, span.stop] for span in spans_of(numbers)] for name, numbers in of.items()}
+
     named = Notes()
     for track, each in notes.evidence.items():
         named.add(Notes(evidence={result.names.get(track, track): each}))
+    mean = {name: total / rows for name, (total, rows) in sorted(named.evidence.items())}
     probable = [
-        {
-            "person": name,
-            "evidence": round(total / rows, 3),
-            "probability": round(probability(total / rows), 3),
-        }
-        for name, (total, rows) in sorted(named.evidence.items())
+        {"person": name, "evidence": round(each, 3), "probability": round(probability(each), 3)}
+        for name, each in mean.items()
     ]
     return {
         "configuration": asdict(config),
@@ -235,6 +227,6 @@ def _summary(notes: Notes, config: PipelineConfig, frames: range, result: Assemb
             "problems": problems,
         },
         "probability": probable if config.temporal else dict(sorted(notes.probable.items())),
-        "dropped_frames": _spans_by_name(dropped),
-        "thinned_frames": _spans_by_name(notes.thinned_frames),
+        "dropped_frames": spans(dropped),
+        "thinned_frames": spans(notes.thinned_frames),
     }

@@ -15,12 +15,11 @@ from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.pipeline.bodies_over_time import BODY
 from shapepose_fg.pipeline.engine import Setup, Solved
-from shapepose_fg.pipeline.runs.checkpoint import Checkpoint
+from shapepose_fg.pipeline.execution import Pool
 from shapepose_fg.pipeline.runs.chunks import Border, Chunk, Identities, cut_in_chunks, windows_of
 from shapepose_fg.pipeline.runs.notes import Notebook, Notes
-from shapepose_fg.pipeline.runs.parts import Part
+from shapepose_fg.pipeline.runs.parts import Checkpoint, Part
 from shapepose_fg.pipeline.windows import Span
-from shapepose_fg.pipeline.workers import Pool
 from shapepose_fg.proposal.thinning import ThinnedFrames
 from shapepose_fg.tracking.hypotheses import Input
 
@@ -101,12 +100,12 @@ class SolvedWindows:
         chunks = cut_in_chunks(self.frames, self.cuts, self.times.frame_s, self.setup.config, chunk_frames)
         waiting: deque[tuple[Chunk, Notes]] = deque()
 
-        def jobs() -> Iterator[ChunkJob]:
+        def jobs() -> Iterator[tuple[Chunk, Sequence[Input]]]:
             for chunk in chunks:
                 if chunk.own.start >= begin.frame:
                     given = tuple(self.read(frame) for frame in range(chunk.first, chunk.until))
                     waiting.append((chunk, self.book.torn_off()))
-                    yield ChunkJob(chunk, given)
+                    yield chunk, given
 
         identities = Identities(begin.next_id, begin.border)
         for found in pool.map(solve_chunk, jobs()):
@@ -194,16 +193,6 @@ def result_rows(
 
 
 @dataclass(frozen=True)
-class ChunkJob:
-    """A chunk that waits; plain data, which can be sent to another process."""
-
-    chunk: Chunk
-    """Which frames."""
-    given: tuple[Input, ...]
-    """What the cameras gave, from `chunk.first` on."""
-
-
-@dataclass(frozen=True)
 class SolvedChunk:
     """A chunk that is done; its tracks count from 0."""
 
@@ -217,19 +206,21 @@ class SolvedChunk:
     """And at its end."""
 
 
-def solve_chunk(setup: Setup, job: ChunkJob) -> SolvedChunk:
+def solve_chunk(setup: Setup, job: tuple[Chunk, Sequence[Input]]) -> SolvedChunk:
     """Follow people through a chunk and solve its windows, in whatever process.
 
-    RuntimeError where these are not the frames of the chunk, each once.
+    With the chunk goes what the cameras gave from `chunk.first` on. RuntimeError where these are not the frames
+    of the chunk, each once.
     """
+    chunk, given = job
     book = Notebook()
     engine = setup.engine(book)
     with book.stage("follow"):
-        spans = list(windows_of(engine, job.chunk, lambda frame: job.given[frame - job.chunk.first]))
-    frames = [given.frame for span in spans for given, _ in span.decided[span.start : span.stop]]
-    if frames != list(job.chunk.own):
-        raise RuntimeError(f"windows of {len(frames)} frames were found for a chunk of {job.chunk.own}")
+        spans = list(windows_of(engine, chunk, lambda frame: given[frame - chunk.first]))
+    frames = [each.frame for span in spans for each, _ in span.decided[span.start : span.stop]]
+    if frames != list(chunk.own):
+        raise RuntimeError(f"windows of {len(frames)} frames were found for a chunk of {chunk.own}")
     solved = tuple(map(setup.solve, spans))
     notes = book.torn_off()
-    notes.dropped = {why: [each for each in of if each in job.chunk.own] for why, of in notes.dropped.items()}
+    notes.dropped = {why: [each for each in of if each in chunk.own] for why, of in notes.dropped.items()}
     return SolvedChunk(solved, notes, Border.of(spans[0]), Border.of(spans[-1]))

@@ -47,16 +47,14 @@ class Solver:
         return cls(setup.rig, setup.settings, fitter)
 
 
-def solve_rows(
-    rows: Reconstruction, solver: Solver, *, extra_factors: ExtraFactors | None = None
-) -> Reconstruction:
+def solve_rows(rows: Reconstruction, solver: Solver) -> Reconstruction:
     """Some people of a result solved anew, each over all of their rows, in the windows of the whole recording.
 
     Detections stay with whom they were given; gates are decided anew. ValueError where `rows` do not say what
     they were solved from.
     """
     parts = []
-    for own, part, solution in _solved(rows, solver, extra_factors):
+    for own, part, solution in _solved(rows, solver, None):
         assert part.observations is not None
         names = tuple(part.joint_names.tolist())
         solved = result_rows(solution, part.observations.candidate, solver.rig, names, part.person)

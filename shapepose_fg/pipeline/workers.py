@@ -10,26 +10,18 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from functools import partial
 from multiprocessing import forkserver, get_context, resource_tracker
-from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 if TYPE_CHECKING:
     from multiprocessing.context import ForkServerContext, SpawnContext
 
 Shared = TypeVar("Shared")
-Given = TypeVar("Given", covariant=True)
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-
-
-class Pool(Protocol[Given]):
-    """Processes that do the same work for many items, each with what is shared."""
-
-    def map(self, work: Callable[[Given, Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-        """`work(shared, item)` for each item, in order; `items` are taken as they are needed."""
-        ...
 
 
 class Workers(Generic[Shared]):
@@ -45,11 +37,8 @@ class Workers(Generic[Shared]):
         """
         if count < 1:
             raise ValueError(f"workers must be 1 (no further process) or more, got {count}")
-        self.count = count
-        self._shared = shared
-        self._ahead = ahead
+        self.count, self._shared, self._ahead = count, shared, ahead
         self._pool: ProcessPoolExecutor | None = None
-        self._lifeline: Any = None
 
     def __enter__(self) -> "Workers[Shared]":
         if self.count > 1:
@@ -61,7 +50,8 @@ class Workers(Generic[Shared]):
                     " at the top of a module, or use workers=1"
                 ) from error
             context = processes(type(self._shared).__module__)
-            held, self._lifeline = context.Pipe(duplex=False)
+            held, lifeline = context.Pipe(duplex=False)
+            self._lifeline: Any = lifeline
             given: tuple[Any, ...] = (content, held)  # one end of a pipe, of one class or another by the system
             self._pool = ProcessPoolExecutor(self.count, context, initializer=_begin, initargs=given)
             with what_workers_inherit():
@@ -71,13 +61,11 @@ class Workers(Generic[Shared]):
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if self._pool is not None:
-            if kind is not None and self._lifeline is not None:
+            if kind is not None:
                 self._lifeline.close()  # what they are at is not wanted any more
             self._pool.shutdown(cancel_futures=True)
-            self._pool = None
-        if self._lifeline is not None:
             self._lifeline.close()
-            self._lifeline = None
+            self._pool = None
 
     def map(self, work: Callable[[Shared, Item], Result], items: Iterable[Item]) -> Iterator[Result]:
         """`work(shared, item)` for each item, in order; `items` are taken as they are needed.
@@ -87,19 +75,31 @@ class Workers(Generic[Shared]):
         if self._pool is None:
             yield from (work(self._shared, item) for item in items)
             return
-        waiting: deque[Future[Result]] = deque()
         try:
-            for item in items:
-                waiting.append(self._pool.submit(_work, work, item))
-                if len(waiting) >= self._ahead * self.count:
-                    yield waiting.popleft().result()
-            while len(waiting) > 0:
-                yield waiting.popleft().result()
+            pool: Any = self._pool
+            yield from in_order(partial(pool.submit, _work, work), items, lambda: self._ahead * self.count)
         except BrokenProcessPool as error:
             raise RuntimeError(
                 "a worker process ended before its work: there may be too little memory for so many; in a script,"
                 " call what takes `workers` below `if __name__ == '__main__':`"
             ) from error
+
+
+def in_order(
+    submit: Callable[[Item], Future[Result]], items: Iterable[Item], most: Callable[[], float]
+) -> Iterator[Result]:
+    """What comes of each item, in order; of those that were submitted `most` are under way at a time."""
+    waiting: deque[Future[Result]] = deque()
+    try:
+        for item in items:
+            waiting.append(submit(item))
+            if len(waiting) >= most():
+                yield waiting.popleft().result()
+        while len(waiting) > 0:
+            yield waiting.popleft().result()
+    finally:
+        for each in waiting:
+            each.cancel()
 
 
 def processes(*modules: str) -> "SpawnContext | ForkServerContext":
@@ -139,7 +139,7 @@ def what_workers_inherit() -> Iterator[None]:
 
     The terminal sends it to all of them; it is this process that ends them.
     """
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    before = {name: os.environ[name] for name in _ONE_THREAD if name in os.environ}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
     can_block = hasattr(signal, "pthread_sigmask")
     # Python's own helper of spawned processes lets the signal through again when it starts: it has to run by then.
@@ -148,11 +148,9 @@ def what_workers_inherit() -> Iterator[None]:
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        for name in _ONE_THREAD:
+            del os.environ[name]
+        os.environ.update(before)
         if can_block:
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
@@ -167,10 +165,9 @@ def _begin(content: bytes, lifeline: Any) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=end_with, args=(lifeline,), daemon=True).start()
     _shared = pickle.loads(content)  # made by this program a moment ago
-    if "cv2" in sys.modules:
-        sys.modules["cv2"].setNumThreads(1)
-    if "torch" in sys.modules:
-        sys.modules["torch"].set_num_threads(1)
+    for name, setting in (("cv2", "setNumThreads"), ("torch", "set_num_threads")):
+        if name in sys.modules:
+            getattr(sys.modules[name], setting)(1)
 
 
 def end_with(lifeline: Any) -> None:

@@ -371,7 +371,6 @@ def test_demo_compares_with_the_truth_and_leaves_a_picture(short_scene, tmp_path
         "people found 20 of 20",
         "found twice 0",
         "invented 0",
-        "seen badly",
         "inside the 90 % ellipsoid",
     ):
         assert part in words

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from shapepose_fg.core.frame_times import FrameTimes, check_cuts, stretches
+from shapepose_fg.core.frame_times import FrameTimes, check_cuts, segments
 
 
 def test_times_from_a_rate():
@@ -52,10 +52,10 @@ def test_times_of_another_recording():
 
 def test_a_recording_from_cut_to_cut():
     cuts = check_cuts([3, 10, 12], 20)
-    assert stretches(range(0, 20), cuts) == [range(0, 3), range(3, 10), range(10, 12), range(12, 20)]
-    assert stretches(range(3, 11), cuts) == [range(3, 10), range(10, 11)]
-    assert stretches(range(4, 9), cuts) == [range(4, 9)]
-    assert stretches(range(4, 4), cuts) == []
+    assert segments(range(0, 20), cuts) == [range(0, 3), range(3, 10), range(10, 12), range(12, 20)]
+    assert segments(range(3, 11), cuts) == [range(3, 10), range(10, 11)]
+    assert segments(range(4, 9), cuts) == [range(4, 9)]
+    assert segments(range(4, 4), cuts) == []
     assert check_cuts((), 0) == ()
     for wrong in ([0], [20], [3, 3], [5, 2], [1.5], [[1]]):
         with pytest.raises(ValueError, match="cuts must be rising frame numbers between 1 and 19"):

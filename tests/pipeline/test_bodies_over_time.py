@@ -15,7 +15,7 @@ from shapepose_fg.body.shapes import SubjectShapes
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.storage.kept_arrays import InMemory
 from shapepose_fg.pipeline.bodies_over_time import (
-    STRETCH_ROWS,
+    SEGMENT_ROWS,
     BodiesOverTime,
     Person,
     fit_everybody,
@@ -96,7 +96,7 @@ def test_a_long_track_is_fitted_in_stretches_that_fit_together(fitter):
         parts = [bodies.filled(name, getattr(people, name), people.person, {}) for name in columns]
         return bodies, BodyParameters(*(torch.from_numpy(part).float() for part in parts))
 
-    whole, expected = fitted(STRETCH_ROWS)
+    whole, expected = fitted(SEGMENT_ROWS)
     assert given == [[range(240)]]
     given.clear()
     cut, found = fitted(80)

@@ -16,7 +16,7 @@ from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.pipeline import PipelineConfig, Task, reconstruct, reconstruct_parts
 from shapepose_fg.pipeline.runs import chunks
 from shapepose_fg.pipeline.runs.chunks import Border, Chunk, cut_in_chunks, same_people, windows_of
-from shapepose_fg.pipeline.solved_windows import ChunkJob, solve_chunk
+from shapepose_fg.pipeline.solved_windows import solve_chunk
 from shapepose_fg.pipeline.windows import Engine, WindowConfig
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.tracking.following import FollowingConfig
@@ -173,7 +173,7 @@ def test_a_chunk_without_its_frames_is_an_error_and_no_gap(scene, recording):
     given = tuple(Input(n, np.full(4, n / 25), Detections.empty(), scene.rig) for n in range(16))
     short = Chunk(range(0, 12), 0, 16, ended=False)  # half a window and 0.3 s more are needed
     with pytest.raises(RuntimeError, match=r"windows of 0 frames were found for a chunk of range\(0, 12\)"):
-        solve_chunk(setup, ChunkJob(short, given))
+        solve_chunk(setup, (short, given))
 
 
 def border(track, candidate, place):

@@ -75,7 +75,7 @@ class FakeClient:
     def result(self) -> int:
         return 0
 
-    def cancel(self, _) -> None:
+    def cancel(self) -> None:
         pass
 
 

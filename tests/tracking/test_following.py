@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from shapepose_fg.core.detections import Detections
-from shapepose_fg.pipeline.runs.checkpoint import Checkpoint, checkpoint_arrays, checkpoint_of
+from shapepose_fg.pipeline.runs.parts import Checkpoint, checkpoint_arrays, checkpoint_of
 from shapepose_fg.pipeline.windows import StreamState
 from shapepose_fg.tracking.following import BLOCK_S, FollowingConfig, FollowState, finish, follow
 from shapepose_fg.tracking.hypotheses import Input, Seed, follow_worlds

@@ -5,6 +5,7 @@ Python's lock.
 """
 
 import os
+import shutil
 import signal
 import sys
 import threading
@@ -16,13 +17,20 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
+from rich.filesize import decimal
+
 from shapepose_fg.cli.batch.standing import Bars, Standings
 from shapepose_fg.cli.batch.table import LOG, Entry
-from shapepose_fg.cli.reconstruct.request import Request, prepare
+from shapepose_fg.cli.reconstruct.request import OUTPUTS, Request, prepare
 from shapepose_fg.cli.reconstruct.run import Ended, carry_out
 from shapepose_fg.cli.stopping import Stopped, stoppable
-from shapepose_fg.cli.terminal import use_any_streams
+from shapepose_fg.cli.terminal import note, use_any_streams
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import open_regular
+from shapepose_fg.core.storage.output_folder import prepare_output
+from shapepose_fg.io.corrections import refuse_corrected
+from shapepose_fg.io.detections.reading import find_places
+from shapepose_fg.io.skeleton_file import find_skeleton
 from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.runs.manifest import PARTS
 from shapepose_fg.pipeline.workers import end_with, processes, what_workers_inherit
@@ -31,6 +39,8 @@ ATTEMPTS = 2
 """A recording that has failed so often is left, and the others go on."""
 _PATIENCE_S = 20.0
 """So long a leader may take to let go of its work."""
+_LEAST, _USUAL = 0.1, 2.0
+"""Bytes of results for each byte of detections: many cameras whose files hold hands and faces, and others."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +97,9 @@ class Campaign:
             while True:
                 while len(leaders) < self.at_once and (entry := self._next(standings, leaders)) is not None:
                     watcher.began(entry.name)
-                    leaders.append(Leader(self._assignment(entry, standings)))
+                    folder, restart = self.output / entry.name, standings.of[entry.name].anew
+                    how = self.cluster, self.at_once, not restart and (folder / PARTS).exists(), restart
+                    leaders.append(Leader(Assignment(entry.name, entry.request, folder, *how)))
                 if len(leaders) == 0:
                     break
                 for ready in wait([leader.told for leader in leaders]):
@@ -118,12 +130,6 @@ class Campaign:
                 found.append(entry)
         turn = {each.name: (standings.of[each.name].attempts, -self.sizes[each.name]) for each in found}
         return min(found, key=lambda each: turn[each.name], default=None)
-
-    def _assignment(self, entry: Entry, standings: Standings) -> Assignment:
-        """What its leader is to do."""
-        folder, restart = self.output / entry.name, standings.of[entry.name].anew
-        resume = not restart and (folder / PARTS).exists()
-        return Assignment(entry.name, entry.request, folder, self.cluster, self.at_once, resume, restart)
 
     def _heard(self, leader: "Leader", standings: Standings, watcher: Bars) -> bool:
         """Take in what a leader tells; whether it has ended."""
@@ -227,3 +233,55 @@ def _lead(assignment: Assignment, tell: Connection, lifeline: Connection) -> Non
         traceback.print_exc()
         words = " ".join(str(error).split())[:300]
         tell.send(Failed(f"{type(error).__name__}: {words} (all of it in {log})"))
+
+
+def look_at_all(table: Path, entries: Sequence[Entry], output: Path, *, begun: bool) -> dict[str, int]:
+    """Bytes of each recording's detections, whose cameras, settings and places are all there.
+
+    `begun` says that runs which were stopped in their folders are meant to go on, or begin anew.
+    InputError where something is missing, wrong or in the way, for the first such recording, and how many others
+    there are; or where the disk of `output` has no room for what all of them will leave.
+    """
+    sizes, problems = {}, []
+    for entry in entries:
+        try:
+            sizes[entry.name] = _look_at(entry, output / entry.name, begun)
+        except InputError as error:
+            problems.append(f"recording {entry.name}: {error}")
+    if len(problems) > 0:
+        others = [problem.split(":")[0].removeprefix("recording ") for problem in problems[1:]]
+        listed = ", ".join(others[:5]) + (f" and {len(others) - 5} more" if len(others) > 5 else "")
+        more = f" (and something is wrong with {listed}, too)" if len(others) > 0 else ""
+        raise InputError(f"{table}: {problems[0]}{more}")
+    whole, free = sum(sizes.values()), shutil.disk_usage(output).free
+    if free < _LEAST * whole:
+        raise InputError(
+            f"{output}: at least {decimal(int(_LEAST * whole))} are needed for {len(entries)} recordings, and"
+            f" {decimal(free)} are free; make room, give another --output, or split the table"
+        )
+    if free < _USUAL * whole:
+        usual = decimal(int(_USUAL * whole))
+        note(f"{output}: {decimal(free)} are free, and results of so much footage mostly take {usual}")
+    return sizes
+
+
+def _look_at(entry: Entry, folder: Path, begun: bool) -> int:
+    """Bytes of a recording's detections."""
+    known = prepare(entry.request, folder, tell=lambda _: None)
+    asked = known.request
+    places, _ = find_places(known.detections, asked.rig())
+    find_skeleton(asked.skeleton)
+    source = known.settings().offsets.source
+    for file in (asked.body, asked.timestamps, None if source in ("recording", "none") else Path(source)):
+        if file is not None:
+            open_regular(file).close()
+    if asked.shapes is not None:
+        prepare_output(asked.shapes.parent, [asked.shapes.name])
+    prepare_output(folder, (*OUTPUTS, LOG))
+    refuse_corrected(folder)
+    if (folder / PARTS).exists() and not begun:
+        raise InputError(
+            f"{folder / PARTS}: a run was stopped here; go on with --resume, or begin anew with --restart"
+        )
+    files = (file for path in places for file in (path.rglob("*") if path.is_dir() else (path,)))
+    return sum(file.stat().st_size for file in files if file.is_file())

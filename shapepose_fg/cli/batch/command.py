@@ -3,13 +3,13 @@
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
-from shapepose_fg.cli.options import RESULT, RUN, RunOptions, grouped, option
+from shapepose_fg.cli.options import REQUIRED, RESULT, RUN, RunOptions, argument, grouped, option
 from shapepose_fg.cli.stopping import Stopped
-from shapepose_fg.cli.terminal import note, show, warn
+from shapepose_fg.cli.terminal import bars, note, show, warn
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.result_files import PEOPLE
 from shapepose_fg.core.result_files import RUN as RUN_FILE
@@ -22,17 +22,13 @@ if TYPE_CHECKING:
 
 BATCH = "batch.json"
 
-# Everything else is imported inside the command: `--help` must not wait for torch.
-
 
 @grouped
 def batch(
-    table: Annotated[Path, typer.Argument(metavar="RECORDINGS.TOML", help="The recordings: see docs/batch.md.")],
     running: RunOptions,
-    output: Annotated[Path, option(RESULT, "Folder for a folder of results of each recording, and batch.json.")],
-    at_once: Annotated[
-        int | None, option(RUN, "Recordings under way at a time; by default as many as keep all busy.")
-    ] = None,
+    table: Path = argument("RECORDINGS.TOML", "The recordings: see docs/batch.md."),
+    output: Path = option(RESULT, "Folder for a folder of results of each recording, and batch.json.", REQUIRED),
+    at_once: int | None = option(RUN, "Recordings under way at a time; by default as many as keep all busy."),
 ) -> None:
     """Reconstruct all recordings of a table: each as `reconstruct` would, to the byte, in one queue of work.
 
@@ -50,9 +46,8 @@ def batch(
 
 def _run(table: Path, entries: "list[Entry]", output: Path, running: RunOptions, at_once: int | None) -> None:
     """The batch, in a folder that no other process writes to."""
-    from shapepose_fg.cli.batch.campaign import Campaign
-    from shapepose_fg.cli.batch.check import look_at_all
-    from shapepose_fg.cli.batch.standing import Standings, bars
+    from shapepose_fg.cli.batch.campaign import Campaign, look_at_all
+    from shapepose_fg.cli.batch.standing import Bars, Standings
     from shapepose_fg.pipeline.cluster import local_cluster, look_at
     from shapepose_fg.pipeline.workers import cores
 
@@ -77,8 +72,8 @@ def _run(table: Path, entries: "list[Entry]", output: Path, running: RunOptions,
             standings.write()
             campaign = Campaign(entries, sizes, output, scheduler.address, count)
             try:
-                with bars(standings) as watcher:
-                    campaign.run(standings, watcher)
+                with bars() as shown:
+                    campaign.run(standings, Bars(shown, standings))
             except Stopped as stop:
                 done = len(standings.names("done"))
                 where = f"{done} of {len(entries)} recordings are done in {output}; go on with --resume"

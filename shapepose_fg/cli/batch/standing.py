@@ -1,18 +1,17 @@
 """How far the recordings of an archive are: batch.json, and what `shapepose-fg batch` says of them."""
 
 import json
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import Progress, TaskID
 from rich.table import Table
 from rich.text import Text
 
+from shapepose_fg.cli.terminal import table
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.provenance import versions
 from shapepose_fg.core.storage.files import read_json, write_content
@@ -92,19 +91,16 @@ class Standings:
 
     def summary(self, seconds: float) -> Table:
         """How each recording ended, frames, people and time; under it what all of them took."""
-        table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
-        for name in ("recording", "", "frames", "people", "rows", "time", "warnings"):
-            table.add_column(name, justify="left" if name in ("recording", "") else "right", overflow="fold")
+        rows = []
         for name, each in self.of.items():
-            numbers = ["" if number is None else str(number) for number in (each.frames, each.people, each.rows)]
-            numbers.append(clock(each.seconds) if each.attempts > 0 else "")
-            warnings = str(len(each.warnings)) if len(each.warnings) > 0 else ""
-            table.add_row(Text(name), Text(each.status, style=_STYLES[each.status]), *numbers, warnings)
+            row = ["" if number is None else str(number) for number in (each.frames, each.people, each.rows)]
+            row += [clock(each.seconds) if each.attempts > 0 else "", str(len(each.warnings) or "")]
+            rows.append((Text(name), Text(each.status, style=_STYLES[each.status]), *row))
         counts = [f"{len(self.names(each))} {each}" for each in _STYLES if len(self.names(each)) > 0]
         frames = sum(each.frames or 0 for each in self.of.values())
-        table.caption = f"{', '.join(counts)}; {frames} frames; this time {clock(seconds)}"
-        table.caption_justify = "left"
-        return table
+        caption = f"{', '.join(counts)}; {frames} frames; this time {clock(seconds)}"
+        heads = ("recording", "", "frames", "people", "rows", "time", "warnings")
+        return table(heads, rows, left=2, caption=caption)
 
     def failures(self) -> Sequence[str]:
         """A sentence for each recording that failed."""
@@ -158,15 +154,6 @@ class Bars:
     def _count(self) -> None:
         ended = len(self._standings.of) - len(self._standings.names("waiting"))
         self._bars.update(self._whole, completed=ended)
-
-
-@contextmanager
-def bars(standings: Standings) -> Iterator[Bars]:
-    """`Bars` on stderr while the block runs."""
-    console, text = Console(stderr=True), TextColumn("{task.description}", markup=False)
-    columns = (text, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(compact=True))
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        yield Bars(progress, standings)
 
 
 def clock(seconds: float) -> str:

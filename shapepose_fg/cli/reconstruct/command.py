@@ -3,7 +3,6 @@
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
 
 from shapepose_fg.cli.options import RESULT, TIME, RunOptions, grouped, option
 from shapepose_fg.cli.reconstruct.request import Request, prepare
@@ -14,12 +13,8 @@ from shapepose_fg.core.errors import InputError
 def reconstruct(
     request: Request,
     running: RunOptions,
-    cuts: Annotated[
-        str | None, option(TIME, "First frames after a cut: nothing carries over to them.", metavar="A,B")
-    ] = None,
-    output: Annotated[
-        Path | None, option(RESULT, "Folder for people.npz and run.json; made if it is not there.")
-    ] = None,
+    cuts: str | None = option(TIME, "First frames after a cut: nothing carries over to them.", metavar="A,B"),
+    output: Path | None = option(RESULT, "Folder for people.npz and run.json; made if it is not there."),
 ) -> None:
     """Reconstruct the people of a recording: 3D joints with covariances, and bodies."""
     running.check()

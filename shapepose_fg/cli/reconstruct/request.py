@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 from shapepose_fg.cli.options import (
     INPUT,
@@ -11,10 +11,10 @@ from shapepose_fg.cli.options import (
     RUN,
     TIME,
     DetectionOptions,
-    FramesOption,
     check_fps,
     ends,
     frame_range,
+    frames_option,
     option,
 )
 from shapepose_fg.cli.terminal import note
@@ -31,49 +31,34 @@ if TYPE_CHECKING:
 OUTPUTS = (PEOPLE, RUN_FILE, OBSERVATIONS, "cameras.json", "report.html")
 """The files that are left in the folder of results."""
 
-# Everything else is imported inside the functions: `--help` must not wait for torch.
-
 
 @dataclass(frozen=True, kw_only=True)
 class Request(DetectionOptions):
     """One recording, and what is wanted of it: the options of `shapepose-fg reconstruct`, by their names."""
 
-    calibration: Annotated[
-        Path | None, option(INPUT, "Cameras: a file, or a folder, of one of the formats known.")
-    ] = None
-    detections: Annotated[Path | None, option(INPUT, "Folder with what a 2D detector wrote of every camera.")] = (
-        None
+    calibration: Path | None = option(INPUT, "Cameras: a file, or a folder, of one of the formats known.")
+    detections: Path | None = option(INPUT, "Folder with what a 2D detector wrote of every camera.")
+    project: Path | None = option(
+        INPUT, "A Pose2Sim project instead: its cameras, detections, settings; adds TRC and C3D."
     )
-    project: Annotated[
-        Path | None,
-        option(INPUT, "A Pose2Sim project instead: its cameras, detections, settings; adds TRC and C3D."),
-    ] = None
-    config: Annotated[Path | None, option(RESULT, "Settings as TOML; `shapepose-fg config` prints all.")] = None
-    frames: FramesOption = None
-    body: Annotated[Path | None, option(INPUT, "Body model in SMPL's file format, instead of the built-in.")] = (
-        None
-    )
-    fps: Annotated[float | None, option(TIME, "Frames a second; 30 are assumed otherwise.")] = None
-    timestamps: Annotated[
-        Path | None, option(TIME, "Text file with the time of every frame in seconds, also by camera.")
-    ] = None
+    config: Path | None = option(RESULT, "Settings as TOML; `shapepose-fg config` prints all.")
+    frames: str | None = frames_option()
+    body: Path | None = option(INPUT, "Body model in SMPL's file format, instead of the built-in.")
+    fps: float | None = option(TIME, "Frames a second; 30 are assumed otherwise.")
+    timestamps: Path | None = option(TIME, "Text file with the time of every frame in seconds, also by camera.")
     cuts: tuple[int, ...] = ()
     """First frames after a cut."""
-    temporal: Annotated[
-        bool | None, option(TIME, "People over time, or every frame by itself.", "--temporal/--no-temporal")
-    ] = None
-    shapes: Annotated[
-        Path | None, option(RESULT, "File (.npz) of people's shapes: read where it is there, kept up to date.")
-    ] = None
-    chunk_frames: Annotated[
-        int | None, option(RUN, "Follow people side by side, too, in chunks of about so many frames.")
-    ] = None
-    report: Annotated[
-        bool, option(RESULT, "Leave report.html, the result as a page to look at.", "--report/--no-report")
-    ] = True
-    check: Annotated[
-        bool, option(RESULT, "Whether cameras and detections fit, and what is wrong.", "--check/--no-check")
-    ] = True
+    temporal: bool | None = option(
+        TIME, "People over time, or every frame by itself.", None, "--temporal/--no-temporal"
+    )
+    shapes: Path | None = option(RESULT, "File (.npz) of people's shapes: read where it is, kept up to date.")
+    chunk_frames: int | None = option(RUN, "Follow people side by side, too, in chunks of about so many frames.")
+    report: bool = option(
+        RESULT, "Leave report.html, the result as a page to look at.", True, "--report/--no-report"
+    )
+    check: bool = option(
+        RESULT, "Whether cameras and detections fit, and what is wrong.", True, "--check/--no-check"
+    )
 
 
 @dataclass(frozen=True)

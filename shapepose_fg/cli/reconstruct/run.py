@@ -32,18 +32,8 @@ from shapepose_fg.io.export.markers import write_pose2sim_files
 from shapepose_fg.io.solved_setup import CAMERAS
 from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.pipeline import Task, reconstruct_parts
+from shapepose_fg.pipeline.runs import manifest
 from shapepose_fg.pipeline.runs.assembly import Assembly
-from shapepose_fg.pipeline.runs.manifest import (
-    PARTS,
-    check_room,
-    checksum_at_start,
-    end_run,
-    expected_bytes,
-    frames_done,
-    open_run,
-    people_at_start,
-    write_people,
-)
 from shapepose_fg.pipeline.workers import get_ready
 from shapepose_fg.viz.report.writing import MOST_ROWS, REPORT, th, write_report
 
@@ -76,8 +66,7 @@ def carry_out(known: Prepared, execution: Execution, *, resume: bool = False, re
     settings = known.settings()  # what is wrong with them is said before the whole recording is read
     with only_run_in(output, OUTPUTS), _recording_folder(output / ".detections") as kept:
         recording = read_detections(known.detections, rig, asked.skeleton, kept)
-        for each in recording.notes:
-            note(each)
+        note(*recording.notes)
         count = len(recording)
         span, times, cuts = known.span(count), known.times(rig, count), known.cuts(count)
         execution = replace(execution, chunk_frames=asked.chunk_frames).worth(len(span))
@@ -148,11 +137,13 @@ class _Run:
         Whatever stops it, what is done is kept there, and the next call with `resume` goes on.
         """
         output = self.known.output
-        if not (output / PARTS).is_dir():
-            check_room(output, expected_bytes(self.recording, self.task.rig, self.task.whole()[0]))
+        if not (output / manifest.PARTS).is_dir():
+            manifest.check_room(
+                output, manifest.expected_bytes(self.recording, self.task.rig, self.task.whole()[0])
+            )
             if resume:
                 note(f"{output}: no run was stopped here; this one begins anew")
-        kept = open_run(output, self.begun(), resume=resume, restart=restart)
+        kept = manifest.open_run(output, self.begun(), resume=resume, restart=restart)
         try:
             return self._finished(kept)
         except Stopped as stop:
@@ -165,7 +156,9 @@ class _Run:
         """The reconstruction, its files, and what is said of it."""
         asked, output, rig, frames = self.known.request, self.known.output, self.task.rig, self.task.whole()[0]
         file, inputs = asked.shapes, dict(self.inputs)
-        known = None if file is None else people_at_start(kept, file, lambda: _known_people(file, asked.body))
+        known = (
+            None if file is None else manifest.people_at_start(kept, file, lambda: _known_people(file, asked.body))
+        )
         start = time.perf_counter()
         told = self.execution.progress
         task = replace(self.task, shapes=known)
@@ -173,7 +166,7 @@ class _Run:
             result = reconstruct_parts(kept, task, replace(self.execution, progress=told))
         seconds = time.perf_counter() - start
         if file is not None and known is not None and len(known) > 0:
-            inputs[str(file)] = checksum_at_start(kept)
+            inputs[str(file)] = manifest.checksum_at_start(kept)
         result = result.with_run(inputs=inputs, notes=list(self.recording.notes), body=asked.body)
         every = max(1, -(-len(result) // MOST_ROWS))
         if every > 1:
@@ -190,9 +183,9 @@ class _Run:
         for n, written in enumerate(self._written(result, people, every)):
             summary.add_row("" if n > 0 else "written", written)
         if file is not None and known is not None and result.shapes is not None:
-            write_people(kept, file, known.updated(result.shapes))
+            manifest.write_people(kept, file, known.updated(result.shapes))
             summary.add_row("", f"{file}  shapes of {len(result.shapes)} people")
-        end_run(output)
+        manifest.end_run(output)
         show(summary)
         if checked is not None:
             show_check(checked)
@@ -212,20 +205,18 @@ class _Run:
             whole = people if len(people) == len(result) else result.reconstruction()
             made = write_pose2sim_files(whole, self.task.rig.up, project)
             written += map(str, made.files)
-            for each in made.notes:
-                note(each)
+            note(*made.notes)
         return written
 
     def _standing(self) -> str:
         """How far a run that was stopped has come, and how to go on."""
-        output = self.known.output
+        output, count = self.known.output, len(self.task.whole()[0])
         try:
-            done = frames_done(output)
+            done = manifest.frames_done(output)
         except InputError as error:
             return str(error)
-        if done == 0:
-            return "nothing is kept: no frame was done"
-        return f"{done} of {len(self.task.whole()[0])} frames are kept in {output / PARTS}; go on with --resume"
+        kept = f"{done} of {count} frames are kept in {output / manifest.PARTS}; go on with --resume"
+        return kept if done > 0 else "nothing is kept: no frame was done"
 
 
 def _known_people(file: Path, body: Path | None) -> SubjectShapes:

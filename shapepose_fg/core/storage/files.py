@@ -7,7 +7,6 @@ import os
 import re
 import stat
 import tomllib
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -128,7 +127,7 @@ def read_json(path: Path, *, most: int = LARGE) -> Any:
 
 
 def not_text(path: Path, byte: int) -> InputError:
-    """An error about a file whose `byte` is none of UTF-8 text."""
+    """The error of a file whose `byte` is none of UTF-8 text."""
     return InputError(f"{path}: byte {byte} is not UTF-8 text; check that this is the file that you mean")
 
 
@@ -258,8 +257,9 @@ def _naming(path: Path) -> Iterator[None]:
 
 def unique_keys(pairs: list[tuple[str, Any]], path: Path) -> dict[str, Any]:
     """An object's members, if no key occurs twice: JSON itself would keep the last one in silence."""
-    members = dict(pairs)
-    if len(members) < len(pairs):
-        twice = next(key for key, count in Counter(key for key, _ in pairs).items() if count > 1)
-        raise InputError(f'{path}: key "{twice}" occurs twice in one object; give each its own name')
+    members: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in members:
+            raise InputError(f'{path}: key "{key}" occurs twice in one object; give each its own name')
+        members[key] = value
     return members

@@ -4,7 +4,7 @@ import math
 import os
 import zipfile
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, BinaryIO
@@ -111,7 +111,7 @@ class _Member:
         return self.dtype.itemsize * math.prod(self.shape[1:])
 
 
-class NpzFile:
+class NpzFile(ExitStack):
     """An `.npz` file that is open, until it is closed or the block is left of which it is the context.
 
     Rows are packed: those in front of the wanted ones are unpacked and passed over. Who asks for rows in rising
@@ -120,18 +120,19 @@ class NpzFile:
 
     def __init__(self, file: Path, names: Collection[str], cure: str) -> None:
         """Only arrays that are called one of `names` are looked at. InputError with the `cure` where it fails."""
+        super().__init__()
         self.file, self._cure = file, cure
         self._open: dict[str, _Member] = {}
-        self._stream = open_regular(file, cure)
+        stream = self.enter_context(open_regular(file, cure))
         try:
             with self._telling():
-                self._archive = zipfile.ZipFile(self._stream)
+                self._archive = self.enter_context(zipfile.ZipFile(stream))
                 every = self._archive.infolist()
                 members = [each for each in every if each.filename.removesuffix(".npy") in names]
-                _check_members(members, os.fstat(self._stream.fileno()).st_size)
+                _check_members(members, os.fstat(stream.fileno()).st_size)
                 self._members = {each.filename.removesuffix(".npy"): each for each in members}
         except InputError:
-            self._stream.close()
+            self.close()
             raise
 
     @property
@@ -179,24 +180,11 @@ class NpzFile:
                 array[begin:end] = block[index[begin:end] - first]
             return _with_letters(name, array)
 
-    def close(self) -> None:
-        """Nothing can be read any more."""
-        for member in self._open.values():
-            member.stream.close()
-        self._archive.close()
-        self._stream.close()
-
-    def __enter__(self) -> "NpzFile":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def _member(self, name: str) -> _Member:
         """An array's stream, behind its header; ValueError where zip and header disagree on its size."""
         if name not in self._open:
             info = self._members[name]
-            stream = self._archive.open(info)
+            stream = self.enter_context(self._archive.open(info))
             version = npy.read_magic(stream)
             if version not in _HEADERS:
                 raise ValueError(f"{info.filename} is of NumPy's format {version}, 1.0 and 2.0 are read")

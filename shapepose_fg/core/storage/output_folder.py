@@ -44,8 +44,10 @@ def only_run_in(folder: Path, names: Iterable[str]) -> Iterator[None]:
     try:
         lock.acquire()
     except Timeout:
+        number = file.read_text().strip() if file.is_file() else ""
+        whose = f" (process {number})" if number.isdecimal() else ""
         raise InputError(
-            f"{folder}: another run writes its results here{_whose(file)}; wait for it, or give another --output"
+            f"{folder}: another run writes its results here{whose}; wait for it, or give another --output"
         ) from None
     try:
         file.write_text(f"{os.getpid()}\n")
@@ -59,12 +61,3 @@ def only_run_in(folder: Path, names: Iterable[str]) -> Iterator[None]:
         if is_new:
             with suppress(OSError):  # it has something in it
                 folder.rmdir()
-
-
-def _whose(file: Path) -> str:
-    """The process that holds a lock, in words."""
-    try:
-        number = file.read_text().strip()
-    except OSError:
-        return ""
-    return f" (process {number})" if number.isdecimal() else ""

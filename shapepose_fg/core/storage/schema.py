@@ -1,9 +1,5 @@
 """Tables of arrays: what each column holds is said once, in the type of its field, and checked wherever one is
-made.
-
-class Walk(Table):
-frame: Annotated[NDArray[np.int64], Column("N", np.int64, most=1e9)]
-place: Annotated[NDArray[np.float64], Column("N 3", unit="m", most=1e6)]
+made: `place: Annotated[NDArray[np.float64], Column("N 3", unit="m", most=1e6)]`.
 """
 
 from collections.abc import Sequence
@@ -51,8 +47,7 @@ class Column:
         return tuple(int(axis) if axis.isdecimal() else sizes.get(axis, 0) for axis in self.axes.split())
 
     def checked(self, name: str, value: Any, sizes: dict[str, int]) -> NDArray[Any]:
-        """`value` as an array of the column's shape and type; ValueError naming the column where it is anything
-        else.
+        """`value` as an array of the column's shape and type; ValueError naming the column where it is not.
 
         Lengths that are not in `sizes` yet are taken from it. Numbers of another size are converted, but real
         numbers are not cut to whole ones, and whole numbers that do not fit are refused. Text keeps its own width.
@@ -68,9 +63,10 @@ class Column:
         if array.dtype.kind not in _ALLOWED[wanted.kind] and array.size > 0:
             raise ValueError(f"{name} must hold {wanted} values, got {array.dtype}")
         if wanted.kind in "iu" and array.size > 0 and array.dtype != wanted:
-            low, high = np.iinfo(cast(Any, wanted)).min, np.iinfo(cast(Any, wanted)).max
-            if array.min() < low or array.max() > high:
-                raise ValueError(f"{name} must hold {low} to {high}, got {array.min()} to {array.max()}")
+            limits = np.iinfo(cast(Any, wanted))
+            if array.min() < limits.min or array.max() > limits.max:
+                got = f"{array.min()} to {array.max()}"
+                raise ValueError(f"{name} must hold {limits.min} to {limits.max}, got {got}")
         array = array.astype(str if wanted.kind == "U" else wanted, copy=False)
         if self.codes is not None and array.size > 0 and array.max() >= len(self.codes):
             raise ValueError(f"{name} must hold codes below {len(self.codes)}, got {array.max()}")

@@ -87,8 +87,7 @@ def _refuse_other(folder: Path, before: Any, now: dict[str, Any]) -> None:
     if found is None:
         return
     name, was, is_now = found
-    short = all(len(repr(value)) <= 40 for value in (was, is_now))
-    how = f" ({was} then, {is_now} now)" if short else ""
+    how = f" ({was} then, {is_now} now)" if max(len(repr(was)), len(repr(is_now))) <= 40 else ""
     raise InputError(
         f"{folder}: the run that was stopped here had another {_WORDS.get(name, name)}{how}; start it as it was to"
         " go on, or begin anew with --restart"
