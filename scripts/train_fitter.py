@@ -18,8 +18,7 @@ import torch
 import typer
 from rich.progress import Progress, TimeRemainingColumn
 
-from shapepose_fg.body.fitting.descent import LearnedDescent, gradient_scale
-from shapepose_fg.body.fitting.network import UpdateNetwork, num_weights
+from shapepose_fg.body.fitting.descent import LearnedDescent, UpdateNetwork, gradient_scale, num_weights
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.weights import FitterWeights, fingerprint
 from shapepose_fg.body.model.body_model import BodyModel

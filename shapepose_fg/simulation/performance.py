@@ -9,9 +9,8 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.model.body_model import BodyModel
-from shapepose_fg.simulation.mocap import Clip
+from shapepose_fg.simulation.mocap import Clip, shoulder_rhythm
 from shapepose_fg.simulation.motion import Motion
-from shapepose_fg.simulation.shoulder import shoulder_rhythm
 
 Array = NDArray[np.float64]
 

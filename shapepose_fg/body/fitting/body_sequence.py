@@ -8,8 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from shapepose_fg.body.fitting.chain_solver import ChainRows
-from shapepose_fg.body.fitting.chains import Segment, cut_segments
+from shapepose_fg.body.fitting.chains import ChainRows, Segment, cut_segments
 from shapepose_fg.body.fitting.energy import SETTLED, BodyEnergy, Held, WhitenedTargets, factored
 from shapepose_fg.body.fitting.evidence import Evidence, weigh
 from shapepose_fg.body.fitting.fitter import (

@@ -13,7 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from shapepose_fg.body.fitting.network import NetworkConfig, UpdateNetwork
+from shapepose_fg.body.fitting.descent import NetworkConfig, UpdateNetwork
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, slots

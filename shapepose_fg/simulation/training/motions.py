@@ -13,8 +13,7 @@ from shapepose_fg.body.model.target_skeletons import BODY_POINTS, MIRROR
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.core.storage.npz import read_npz
-from shapepose_fg.simulation.mocap import Clip, Mocap
-from shapepose_fg.simulation.shoulder import shoulder_rhythm
+from shapepose_fg.simulation.mocap import Clip, Mocap, shoulder_rhythm
 
 Split = Literal["train", "validation", "test"]
 

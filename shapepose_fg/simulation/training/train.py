@@ -9,15 +9,20 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 from torch import Tensor
 
-from shapepose_fg.body.fitting.descent import BodyState, DescentTargets, LearnedDescent
+from shapepose_fg.body.fitting.descent import (
+    NUM_ROTATIONS,
+    BodyState,
+    DescentTargets,
+    LearnedDescent,
+    NetworkConfig,
+    UpdateNetwork,
+)
 from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.body.fitting.fitters import SmplFitter
-from shapepose_fg.body.fitting.network import NUM_ROTATIONS, NetworkConfig, UpdateNetwork
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.weights import FitterWeights
 from shapepose_fg.body.model.body_model import BodyModel, accumulate
-from shapepose_fg.body.model.rotation import exp_so3
-from shapepose_fg.body.model.small_matrices import inverse_3x3
+from shapepose_fg.body.model.rotation import exp_so3, inverse_3x3
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, MIRROR, TARGET_SKELETONS, slots
 from shapepose_fg.simulation.training.corruption import CorruptionConfig, corrupt
 from shapepose_fg.simulation.training.motions import MIRROR_JOINTS, Motions
