@@ -98,12 +98,6 @@ class _Block(nn.Module):
         return self.layers(hidden)
 
 
-@torch.no_grad()
-def num_weights(network: nn.Module) -> int:
-    """Count of trained numbers."""
-    return sum(weight.numel() for weight in network.parameters())
-
-
 @dataclass(frozen=True)
 class DescentTargets:
     """Targets in the person's own frame."""

@@ -224,6 +224,24 @@ for _row, _names in enumerate(TARGET_SKELETONS.values()):
     _OFFERED[_row, list(slots(_names))] = 1
 
 
+class Validation:
+    """How far a network is from people who are the same each time."""
+
+    def __init__(self, source: PeopleSource, frame: PersonFrame, config: TrainingConfig, people: int):
+        generator = torch.Generator().manual_seed(1)
+        drawn = source.draw(people, generator)
+        self._model, self._scale = source.model, config.kernel_scale
+        self._targets, self._start, _, self._points = prepared(drawn, frame, config, generator)
+
+    @torch.no_grad()
+    def errors_mm(self, network: UpdateNetwork) -> list[float]:
+        """The mean joint error after each step."""
+        descent = LearnedDescent(self._model.points, _ALL, network.eval(), self._scale)
+        states = descent.unroll(self._start, self._targets)
+        distances = [body_points(self._model, state) - self._points for state in states]
+        return [1000 * float(torch.linalg.vector_norm(distance, dim=-1).mean()) for distance in distances]
+
+
 def _judge(
     model: BodyModel, state: BodyState, truth: BodyState, true_points: Tensor, config: TrainingConfig
 ) -> tuple[Tensor, Tensor]:
