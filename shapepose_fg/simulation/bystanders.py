@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.simulation.limbs import turned_about
 from shapepose_fg.simulation.mocap import Clip, Mocap, blend
 from shapepose_fg.simulation.motion import along, left_of
-from shapepose_fg.simulation.performance import Figure, Performance, about_z, grounded, perform
+from shapepose_fg.simulation.performance import Figure, Performance, grounded, perform
 
 Array = NDArray[np.float64]
 
@@ -109,7 +110,7 @@ def walk_along(
     phase = (np.cumsum(advance) / gain + start) % 1.0 * count
     low = phase.astype(int) % count
     high, share = (low + 1) % count, phase % 1.0
-    turn = about_z(heading)
+    turn = turned_about("z", heading)
     rotations = blend(cycle.rotations[low], cycle.rotations[high], share)
     rotations[:, 0] = turn @ rotations[:, 0]
     side = cycle.joints[low, 0, 1:] + share[:, None] * (cycle.joints[high, 0, 1:] - cycle.joints[low, 0, 1:])

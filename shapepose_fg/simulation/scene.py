@@ -103,7 +103,7 @@ def built_in_scene(
     rig = ring_of_cameras(cameras, rng)
     betas = np.clip(rng.normal(0.0, 1.0, (people, body.num_betas)), -1.8, 1.8)
     builds = builds_of(body, betas)
-    motion = Motion(betas, *close_motion(builds, frames, fps, rng))
+    motion = close_motion(betas, builds, frames, fps, rng)
     return Scene(rig, body, _on_the_floor(body, motion, builds), fps)
 
 

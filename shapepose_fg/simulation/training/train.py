@@ -121,15 +121,9 @@ def body_points(model: BodyModel, state: BodyState) -> Tensor:
     return points.positions(accumulate(state.local), state.betas, state.transl, points.feature(state.local))
 
 
-def _chain(joints: tuple[int, ...]) -> Tensor:
-    chain = torch.zeros(24, dtype=torch.bool)
-    chain[list(joints)] = True
-    return chain
-
-
-_CHAINS = torch.stack(
-    [_chain((13, 16, 18, 20)), _chain((14, 17, 19, 21)), _chain((1, 4, 7, 10)), _chain((2, 5, 8, 11))]
-)
+_CHAINS = torch.zeros(4, 24, dtype=torch.bool)
+for _row, _joints in enumerate(((13, 16, 18, 20), (14, 17, 19, 21), (1, 4, 7, 10), (2, 5, 8, 11))):
+    _CHAINS[_row, list(_joints)] = True
 """(4, 24) arms and legs."""
 
 
