@@ -105,7 +105,6 @@ def test_an_untrained_network_stands_still(model):
     assert len(arrived) == 3
     for state in arrived:
         assert_same(state, start, atol=1e-6)
-    assert len(list(descent.unroll(start, targets_of(ALL), steps=2))) == 2
 
 
 @pytest.mark.parametrize("name", TARGET_SKELETONS)

@@ -1,7 +1,7 @@
 """Chains of rows over time: the motion prior along them, and Levenberg-Marquardt for all poses and one shape."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
@@ -245,10 +245,8 @@ class _Normal:
 
 def _mixed(better: Tensor, new: T_, old: T_) -> T_:
     """The chains that are `better` (G,) from `new`, the rest from `old`."""
-    if bool(better.all()):
-        return new
-    pairs = ((name, value, getattr(new, name)) for name, value in vars(old).items())
-    return replace(old, **{n: torch.where(better.view(1, -1, *(1,) * (a.ndim - 2)), b, a) for n, a, b in pairs})
+    pairs = zip(vars(new).values(), vars(old).values(), strict=True)
+    return type(old)(*(torch.where(better.view(1, -1, *(1,) * (a.ndim - 2)), a, b) for a, b in pairs))
 
 
 class _Batch:

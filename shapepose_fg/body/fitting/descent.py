@@ -149,10 +149,10 @@ class LearnedDescent:
         self._slots, self._rest = torch.tensor(slots), torch.tensor(rest, dtype=torch.long)
         self._kernel_scale = torch.tensor(kernel_scale)
 
-    def unroll(self, state: BodyState, targets: DescentTargets, steps: int | None = None) -> Iterator[BodyState]:
+    def unroll(self, state: BodyState, targets: DescentTargets) -> Iterator[BodyState]:
         """The states after each update. Each starts from the last one detached."""
         believed, trust = _believed(targets.information)
-        for step in range(self.network.config.steps if steps is None else steps):
+        for step in range(self.network.config.steps):
             inputs = self._inputs(state, targets, believed, trust)
             state = _moved(state, self.network(inputs, step))
             yield state

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from shapepose_fg.body.fitting.fitter import BodyFit
 from shapepose_fg.body.fitting.priors import NUM_ANGLES, PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters, accumulate
 from shapepose_fg.body.model.rotation import exp_so3, log_so3, right_jacobian
@@ -198,6 +199,12 @@ class BodyEnergy:
         pose[:, self._visible] = angles
         pose[:, self._hidden] = angles @ self._gain.T + self._at_zero
         return BodyParameters(free[:, :10], free[:, 10:13], pose.unflatten(1, (23, 3)), free[:, -3:])
+
+    def parameters(self, fit: BodyFit, origin: np.ndarray) -> Tensor:
+        """Free parameters (B, P) of fitted bodies around their origins (B, 3), double precision."""
+        angles = fit.body_pose.reshape(len(fit), -1)[:, self.angles]
+        parts = (fit.betas, fit.global_orient, angles, fit.transl - origin)
+        return torch.from_numpy(np.concatenate(parts, axis=1))
 
     def retract(self, free: Tensor, step: Tensor) -> Tensor:
         """Move by a step (B, P): the orientation by R exp(step), all else by addition.

@@ -249,10 +249,9 @@ class SmplFitter(BodyFitter):
 
     def _start(self, initial: BodyFit, centre: Array) -> Tensor:
         """Free parameters (R, P) of bodies around their origins (R, 3); NaN where there is none."""
-        angles = initial.body_pose.reshape(len(initial), -1)[:, self.energy.angles]
-        parts = (initial.betas, initial.global_orient, angles, initial.transl - centre)
-        start = np.where(initial.ok[:, None], np.concatenate(parts, axis=1), np.nan)
-        return torch.from_numpy(start).float()
+        start = self.energy.parameters(initial, centre).float()
+        start[torch.from_numpy(~initial.ok)] = torch.nan
+        return start
 
 
 def evenly(groups: NDArray[np.intp], count: int) -> NDArray[np.bool_]:

@@ -95,7 +95,7 @@ def _solved(
         part = rows[start : start + _CHUNK]
         centred = evidence.xyz[part] - evidence.centre[part, None]
         seen = WhitenedTargets(torch.from_numpy(centred), torch.from_numpy(evidence.root[part]))
-        here = _eliminate(energy, _free(energy, fit.rows(part), evidence.centre[part]), seen, kernel_scale)
+        here = _eliminate(energy, energy.parameters(fit.rows(part), evidence.centre[part]), seen, kernel_scale)
         hessian, gradient, prior = hessian + here[0], gradient + here[1], prior + here[2] / len(rows)
     count = (np.abs(evidence.root[rows]).max(axis=(-1, -2)) > 0).sum(axis=0)
     current = energy.model.keypoint_offsets.xyz_m.ravel()
@@ -114,12 +114,6 @@ def _made(xyz_m: Array, precision: Array, count: Array) -> KeypointOffsets:
     length = np.linalg.norm(xyz, axis=1, keepdims=True)
     inside = xyz * np.minimum(1.0, 0.999 * LARGEST_M / np.maximum(length, 1e-9))
     return KeypointOffsets(inside, np.sqrt(variance), count.astype(np.intp), RIDES_ON)
-
-
-def _free(energy: BodyEnergy, fit: BodyFit, centre: Array) -> Tensor:
-    """Free parameters (R, P) of fitted bodies, with `centre` (R, 3) as origin."""
-    angles = fit.body_pose.reshape(len(fit), -1)[:, energy.angles]
-    return torch.from_numpy(np.concatenate([fit.betas, fit.global_orient, angles, fit.transl - centre], axis=1))
 
 
 def _eliminate(
