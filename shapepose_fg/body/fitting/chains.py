@@ -264,7 +264,7 @@ class _Batch:
             step[: count - 1, column] = np.diff(rows.time_s[segment.rows])
         self._index, self._mask = torch.from_numpy(index), torch.from_numpy(mask)
         real = self._index[self._mask]
-        self._targets = rows.targets[real]
+        self._targets = rows.targets.rows(real)
         self._angles = None if rows.angles is None else rows.angles[real]
         self._motion = Motion(*MotionPrior.default().part(rows.energy.angles), torch.from_numpy(step))
 
@@ -306,7 +306,7 @@ class _Batch:
         for at in range(0, len(free), _CHUNK):
             part = slice(at, at + _CHUNK)
             held = Held(torch.zeros(10), torch.zeros(1), None if self._angles is None else self._angles[part])
-            row = rows.energy.linearise(free[part].float(), self._targets[part], scale, held)
+            row = rows.energy.linearise(free[part].float(), self._targets.rows(part), scale, held)
             H, g, R = row.hessian.double(), row.gradient.double(), turn[part]
             H[:, 10:13] = R @ H[:, 10:13]
             H[:, :, 10:13] = H[:, :, 10:13] @ R.mT

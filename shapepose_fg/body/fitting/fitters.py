@@ -171,7 +171,7 @@ class SmplFitter(BodyFitter):
                     body, _ = self.optimiser.first(targets, variance, _part(start, chunk))
                 else:
                     rows = torch.from_numpy(chunk)
-                    body = self.optimiser.again(shaped[0][rows], targets, shaped[1][rows])
+                    body = self.optimiser.again(shaped[0][rows], targets, shaped[1].rows(rows))
                 found.append(JointPosterior.of(body, passes.asked(chunk)))
             part = JointPosterior.concatenated(found)
             # Each pass by itself: what a target does to another pass must not decide which optimiser this one has.
@@ -195,7 +195,7 @@ class SmplFitter(BodyFitter):
             voting = np.flatnonzero(passes.votes[chunk])
             if len(voting) > 0:
                 rows = torch.from_numpy(voting)
-                body = self.optimiser.again(free[rows], targets[rows], held[rows])
+                body = self.optimiser.again(free[rows], targets.rows(rows), held.rows(rows))
                 free[rows] = body.free
                 places.append(chunk[voting])
                 precisions.append(shape_precision(body.factor))
@@ -220,7 +220,9 @@ class SmplFitter(BodyFitter):
         done &= np.isfinite(prior_xyz).all(axis=(1, 2)) & np.isfinite(prior_covariance).all(axis=(1, 2, 3))
         fit.status[rows[~done]] = FitStatus.NOT_CONVERGED
         rows, origin = rows[done], evidence.centre[done]
-        fit.put(rows, self.energy.complete(torch.from_numpy(found.free[done]).to(self.energy.dtype)), origin)
+        fit.put_bodies(
+            rows, self.energy.complete(torch.from_numpy(found.free[done]).to(self.energy.dtype)), origin
+        )
         fit.joints[rows] = found.xyz[done] + origin[:, None]
         fit.covariance[rows] = np.where(unseen, wider * found.covariance, found.covariance)[done]
         fit.prior_xyz[rows] = prior_xyz[done] + origin[:, None]
