@@ -124,15 +124,23 @@ class Mocap:
 
     def clip(self, index: int) -> Clip:
         """Clip `index`, glitches of single markers bridged."""
-        own = {name: self.arrays[name][index] for name in _OF_CLIP}
+        own = {name: self.arrays[name][index].item() for name in _OF_CLIP}
         frames = slice(int(own["seq_start"]), int(own["seq_start"]) + int(self.lengths[index]))
-        vectors = self.arrays["poses"][frames].astype(np.float64)
+        vectors, fps = self.arrays["poses"][frames].astype(np.float64), float(own["fps"])
         rotations = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(-1, 24, 3, 3)
-        rotations, pelvis = _bridged(rotations, self.arrays["trans"][frames].astype(np.float64), float(own["fps"]))
-        lengths = {name: float(own[name]) for name in ("fps", "leg_m", "floor_y")}
-        valid = {name: bool(own[name]) for name in ("wrist_valid", "toe_valid")}
-        about = {"name": self.names[index], "subject": self.subjects[index], "action": self.actions[index]}
-        return Clip(**about, rotations=rotations, pelvis=pelvis, **lengths, **valid)
+        rotations, pelvis = _bridged(rotations, self.arrays["trans"][frames].astype(np.float64), fps)
+        return Clip(
+            name=self.names[index],
+            subject=self.subjects[index],
+            action=self.actions[index],
+            rotations=rotations,
+            pelvis=pelvis,
+            fps=fps,
+            leg_m=float(own["leg_m"]),
+            floor_y=float(own["floor_y"]),
+            wrist_valid=bool(own["wrist_valid"]),
+            toe_valid=bool(own["toe_valid"]),
+        )
 
 
 def blend(first: Array, second: Array, share: Array) -> Array:

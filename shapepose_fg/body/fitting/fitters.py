@@ -235,19 +235,17 @@ class SmplFitter(BodyFitter):
         Returns their parameters (R, P) around `evidence.centre`, around which angles (R, A) they are held (None:
         those that the prior expects), and which (R,) are finished.
         """
-        passes, parts = Passes.whole(evidence, np.arange(len(evidence.xyz))), []
-        for chunk in passes.chunks(_CHUNK)[0]:
-            body, held = self.optimiser.first(*passes.given(chunk), None)
-            parts.append((body.free, body.left < self._unfinished, held.angles))
-        free, done, angles = (
-            None if column[0] is None else torch.cat(column) for column in zip(*parts, strict=True)
-        )
-        unsettled = np.flatnonzero(~done.numpy())
+        passes = Passes.whole(evidence, np.arange(len(evidence.xyz)))
+        found = [self.optimiser.first(*passes.given(chunk), None) for chunk in passes.chunks(_CHUNK)[0]]
+        free, held = torch.cat([body.free for body, _ in found]), Held.concatenated([held for _, held in found])
+        done = torch.cat([body.left < self._unfinished for body, _ in found]).numpy()
+        unsettled = np.flatnonzero(~done)
         if self._fallback is not None and len(unsettled) > 0:
             body, _ = self._fallback.first(*passes.given(unsettled), None)
-            free[unsettled], done[unsettled] = body.free, body.left < self._unfinished
-            angles[unsettled] = body.free[:, 13:-3]
-        return free, angles, done.numpy()
+            free[unsettled], done[unsettled] = body.free, (body.left < self._unfinished).numpy()
+            if held.angles is not None:
+                held.angles[unsettled] = body.free[:, 13:-3]
+        return free, held.angles, done
 
     def _start(self, initial: BodyFit, centre: Array) -> Tensor:
         """Free parameters (R, P) of bodies around their origins (R, 3); NaN where there is none."""
