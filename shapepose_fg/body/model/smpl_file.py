@@ -73,10 +73,8 @@ def read_smpl_file(path: Path, keypoint_regressor: NDArray[np.floating] | None =
     count = len(template)
     entries.check_tree()
     joint_regressor = entries.floats("J_regressor", (24, count))
-    if keypoint_regressor is not None:
-        keypoints = entries.checked("keypoint_regressor", keypoint_regressor, (_NUM_KEYPOINTS, count))
-    elif _KEYPOINTS in entries:
-        keypoints = entries.floats(_KEYPOINTS, (_NUM_KEYPOINTS, count))
+    if keypoint_regressor is not None or _KEYPOINTS in entries.content:
+        keypoints = entries.floats(_KEYPOINTS, (_NUM_KEYPOINTS, count), keypoint_regressor)
     elif count == _SMPL_NUM_VERTICES:
         keypoints = _smpl_keypoint_regressor(joint_regressor)
     else:
@@ -124,9 +122,6 @@ class _Entries:
     def __init__(self, path: Path, content: dict[str, Any]):
         self.path, self.content = path, content
 
-    def __contains__(self, name: str) -> bool:
-        return name in self.content
-
     def array(self, name: str) -> NDArray[Any]:
         """The array called `name`."""
         if name not in self.content:
@@ -137,13 +132,9 @@ class _Entries:
         except Exception as error:  # records of a damaged pickle can hold anything
             raise InputError(f"{self.path}: {name} is not an array ({error}): fetch the file again") from error
 
-    def floats(self, name: str, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
-        """The float64 array called `name`, of that shape and finite."""
-        return self.checked(name, self.array(name), shape)
-
-    def checked(self, name: str, value: Any, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
-        """`value` as a finite float64 array of that shape; None stands for any length but 0."""
-        value = np.asarray(value)
+    def floats(self, name: str, shape: tuple[int | None, ...], value: Any = None) -> NDArray[np.float64]:
+        """The array called `name`, or a `value` for it, finite and of that shape; None is any length but 0."""
+        value = self.array(name) if value is None else np.asarray(value)
         fits = value.ndim == len(shape) and all(
             n == m if n is not None else m > 0 for n, m in zip(shape, value.shape, strict=True)
         )
@@ -165,11 +156,11 @@ class _Entries:
                 f"{self.path}: shapedirs must be ({count}, 3, {NUM_BETAS} or more), got {shapes.shape}: "
                 f"use the file with {NUM_BETAS} shape components"
             )
-        return self.checked("shapedirs", shapes[..., :NUM_BETAS], (count, 3, NUM_BETAS))
+        return self.floats("shapedirs", (count, 3, NUM_BETAS), shapes[..., :NUM_BETAS])
 
     def pose_blend(self, count: int) -> NDArray[np.float64] | None:
         """The pose blend shapes, or None for a model without."""
-        if "posedirs" not in self or not np.any(self.array("posedirs")):
+        if "posedirs" not in self.content or not np.any(self.array("posedirs")):
             return None
         return self.floats("posedirs", (count, 3, 207))
 
