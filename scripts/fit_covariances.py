@@ -16,15 +16,14 @@ from unittest.mock import patch
 
 import numpy as np
 import torch
-from scipy.optimize import linear_sum_assignment
 
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.calibration import Calibration, Clues
+from shapepose_fg.evaluation.matching import match_people
 from shapepose_fg.pipeline.pipeline import reconstruct
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.mocap import Mocap
-from shapepose_fg.simulation.scene import Scene
 from shapepose_fg.simulation.sequences import SEQUENCES, Split, sequence
 
 CASES: tuple[tuple[str, Split, int, int], ...] = (
@@ -38,8 +37,6 @@ CASES: tuple[tuple[str, Split, int, int], ...] = (
 """Scene, split, seed, cameras. Of `report` the seeds that all was developed on: exchanged limbs are rare, and in
 those of `tune` there were none for long."""
 FRAMES, FPS = 120, 30.0
-MATCHED_M = 0.5
-"""Mean distance of the joints at which somebody is a person of the truth."""
 SHARES = (0.5, 0.7, 1.0)
 """Of joints that no view, one, and more see."""
 FAR = 30.0
@@ -60,44 +57,31 @@ def main() -> None:
 
 def errors(name: str, split: Split, seed: int, cameras: int, mocap: Mocap) -> Iterator[tuple[Clues, np.ndarray]]:
     """For each window of a recording what is known of its joints, and how far they are off (N, J, 3), metres; NaN
-    where nobody is.
+    for false positives.
     """
-    scene = _scene(name, split, seed, cameras, mocap)
+    if name == "two":
+        scene = built_in_scene(seed, people=2, cameras=cameras, frames=FRAMES, fps=FPS)
+    else:
+        config = replace(SEQUENCES[name], seed=seed)
+        whole = sequence(name, split, mocap, cameras=cameras, until=FRAMES, fps=FPS, config=config)
+        scene = whole.part(range(FRAMES))
     detections, seen = simulate(scene, seed=seed), []
     truly = Calibration.covariance
     with patch.object(Calibration, "covariance", lambda self, clues: seen.append(clues) or truly(self, clues)):
         times = FrameTimes.from_fps(FPS, len(detections))
         reconstruct(detections, scene.rig, times=times, cuts=scene.cuts)
     for clues in seen:
-        yield clues, clues.joints - _truth_of(clues, scene.keypoints)
-
-
-def _scene(name: str, split: Split, seed: int, cameras: int, mocap: Mocap) -> Scene:
-    if name == "two":
-        return built_in_scene(seed, people=2, cameras=cameras, frames=FRAMES, fps=FPS)
-    config = replace(SEQUENCES[name], seed=seed)
-    whole = sequence(name, split, mocap, cameras=cameras, until=FRAMES, fps=FPS, config=config)
-    return whole.part(range(FRAMES))
-
-
-def _truth_of(clues: Clues, keypoints: np.ndarray) -> np.ndarray:
-    """(N, J, 3) the true joints (T, P, J, 3) of whoever each row is; NaN for nobody."""
-    true = np.full(clues.joints.shape, np.nan)
-    for frame in np.unique(clues.frame).tolist():
-        rows = np.flatnonzero(clues.frame == frame)
-        apart = np.linalg.norm(clues.joints[rows][:, None] - keypoints[frame][None], axis=-1)
-        known = np.isfinite(apart)
-        mean = np.where(known, apart, 0).sum(-1) / np.maximum(known.sum(-1), 1) + 9 * ~known.any(-1)
-        ours, theirs = linear_sum_assignment(np.minimum(mean, 2 * MATCHED_M))
-        near = mean[ours, theirs] < MATCHED_M
-        true[rows[ours[near]]] = keypoints[frame][theirs[near]]
-    return true
+        found, true = match_people(clues.frame, clues.joints, scene.keypoints), np.full(clues.joints.shape, np.nan)
+        true[found.row] = scene.keypoints[found.frame, found.person]
+        yield clues, clues.joints - true
 
 
 def fitted(found: list[tuple[Clues, np.ndarray]]) -> dict:
     """The file's content."""
     names = BODY_25.joints
-    group = np.array([next(n for n, each in enumerate(ALIKE) if _is_one(name, each)) for name in names])
+    group = np.array(
+        [next(n for n, each in enumerate(ALIKE) if name.endswith(tuple(each.split()))) for name in names]
+    )
     parts = []
     for clues, off in found:
         known = np.isfinite(off).all(-1) & np.isfinite(clues.covariance).all((-1, -2))
@@ -139,10 +123,6 @@ def fitted(found: list[tuple[Clues, np.ndarray]]) -> dict:
             for name, value in zip("power unseen association draft exchange".split(), weights, strict=True)
         },
     }
-
-
-def _is_one(joint: str, of: str) -> bool:
-    return any(joint.endswith(name) for name in of.split())
 
 
 if __name__ == "__main__":

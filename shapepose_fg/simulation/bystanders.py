@@ -1,5 +1,6 @@
 """People around those whom a scene is about: recorded gestures without end, recorded walks past all the others."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -8,9 +9,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.simulation.limbs import turned_about
 from shapepose_fg.simulation.mocap import Clip, Mocap, blend
 from shapepose_fg.simulation.motion import along, left_of
-from shapepose_fg.simulation.performance import Figure, Performance, about_z, grounded, perform
+from shapepose_fg.simulation.performance import Figure, Performance, grounded, perform
 
 Array = NDArray[np.float64]
 
@@ -44,30 +46,30 @@ def standing_clips(mocap: Mocap, *, without: frozenset[str]) -> list[int]:
     """Clips of people who stand and gesture, of subjects other than `without`."""
     return [
         index
-        for index in _long_enough(mocap, 90, without)
-        if any(word in mocap.actions[index].lower() for word in _STILL)
-        and np.ptp(_floor_plan(mocap, index), axis=0).max() < _STILL_M
+        for index, action, plan in _clips(mocap, 90, without)
+        if any(word in action for word in _STILL) and np.ptp(plan, axis=0).max() < _STILL_M
     ]
 
 
 def walking_clips(mocap: Mocap, *, without: frozenset[str]) -> list[int]:
     """Clips of people who walk straight on, of subjects other than `without`."""
     found = []
-    for index in _long_enough(mocap, 60, without):
-        action = mocap.actions[index].lower()
-        if "walk" not in action or "uneven" in action or mocap.tiers[index] > 0:
-            continue
-        plan = _floor_plan(mocap, index)
-        way = np.linalg.norm(plan[-1] - plan[0])
-        speed = way / len(plan) * float(mocap.arrays["fps"][index])
-        if way > _WALK_M and way > 0.95 * np.linalg.norm(np.diff(plan, axis=0), axis=1).sum() and speed < 1.6:
-            found.append(index)
+    for index, action, plan in _clips(mocap, 60, without):
+        if "walk" in action and "uneven" not in action and mocap.tiers[index] <= 0:
+            way = np.linalg.norm(plan[-1] - plan[0])
+            speed = way / len(plan) * float(mocap.arrays["fps"][index])
+            straight = way > 0.95 * np.linalg.norm(np.diff(plan, axis=0), axis=1).sum()
+            found += [index] if way > _WALK_M and straight and speed < 1.6 else []
     return found
 
 
-def _long_enough(mocap: Mocap, frames: int, without: frozenset[str]) -> list[int]:
-    there = [subject not in without for subject in mocap.subjects]
-    return np.flatnonzero(np.array(there, dtype=bool) & (mocap.lengths >= frames)).tolist()
+def _clips(mocap: Mocap, frames: int, without: frozenset[str]) -> Iterator[tuple[int, str, Array]]:
+    """Clips of so many frames, what is done in them, and where (T, 2) the pelvis is over the floor."""
+    for index, (subject, action) in enumerate(zip(mocap.subjects, mocap.actions, strict=True)):
+        if subject not in without and mocap.lengths[index] >= frames:
+            start = int(mocap.arrays["seq_start"][index])
+            places = mocap.arrays["trans"][start : start + int(mocap.lengths[index])]
+            yield index, action.lower(), places[:, [0, 2]].astype(np.float64)
 
 
 def endless(clip: Clip, frames: int, start: int = 0) -> Clip:
@@ -109,18 +111,12 @@ def walk_along(
     phase = (np.cumsum(advance) / gain + start) % 1.0 * count
     low = phase.astype(int) % count
     high, share = (low + 1) % count, phase % 1.0
-    turn = about_z(heading)
+    turn = turned_about("z", heading)
     rotations = blend(cycle.rotations[low], cycle.rotations[high], share)
     rotations[:, 0] = turn @ rotations[:, 0]
     side = cycle.joints[low, 0, 1:] + share[:, None] * (cycle.joints[high, 0, 1:] - cycle.joints[low, 0, 1:])
     pelvis = np.concatenate([path + left_of(heading) * side[:, :1], side[:, 1:]], axis=1)
     return grounded(Figure(body, betas), rotations, pelvis, fps, bend_toes=False)
-
-
-def _floor_plan(mocap: Mocap, index: int) -> Array:
-    """(T, 2) where the pelvis of a clip is over the floor."""
-    start = int(mocap.arrays["seq_start"][index])
-    return mocap.arrays["trans"][start : start + int(mocap.lengths[index])][:, [0, 2]].astype(np.float64)
 
 
 def _cycle(walk: Performance) -> tuple[Performance, float]:

@@ -1,7 +1,8 @@
 """The same motions by people whose proportions the fitted model lacks; a detector with joints of its own."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,20 +33,18 @@ DETECTOR_S_OWN = KeypointOffsets.symmetric(
 """A detector with hips, shoulders, neck, face, elbows, knees and heels of its own: 18 to 46 mm off."""
 
 PEOPLE = ("the body that is fitted", "own bones", "long arms", "children", "all of these")
-"""Whom `people_of` knows."""
+"""Whom `people_of` knows; of the last, every second one is a child."""
 
 _STIFF_M = 0.01
 """A bone's frame is stretched along what joins it to the next joints; farther across than this it is not."""
 _CHILDREN = {bone: [joint for joint in range(24) if SMPL_PARENTS[joint] == bone] for bone in range(24)}
-_LEGS = np.array([SMPL_24.index(f"{side}_{name}") for side in ("left", "right") for name in ("knee", "ankle")])
-_ARMS = np.array([SMPL_24.index(f"{side}_{name}") for side in ("left", "right") for name in ("elbow", "wrist")])
-_HEAD = SMPL_24.index("head")
+_LEGS = ("left_knee", "left_ankle", "right_knee", "right_ankle")
+_ARMS = ("left_elbow", "left_wrist", "right_elbow", "right_wrist")
 _CHILD_M = 1.2
 """Stature of a child of seven (CDC growth charts, 2000: the median is 1.22 m)."""
 
 
-@dataclass(frozen=True)
-class Proportions:
+class Proportions(NamedTuple):
     """How a body differs from one that the model has."""
 
     length: Array
@@ -53,53 +52,41 @@ class Proportions:
     girth: Array
     """(24,) factor of the size of each bone's flesh across."""
 
-    def __post_init__(self) -> None:
-        for name in ("length", "girth"):
-            value = getattr(self, name)
-            if value.shape != (24,) or not (np.isfinite(value).all() and (value > 0).all()):
-                raise ValueError(f"{name} must be 24 positive numbers, got {value}")
 
-    def times(self, other: "Proportions") -> "Proportions":
-        """Both, one after the other."""
-        return Proportions(self.length * other.length, self.girth * other.girth)
+def people_of(kind: str, count: int, seed: int = 0) -> list[Proportions]:
+    """The proportions of `count` people of one kind of `PEOPLE`; ValueError for any other.
 
-    @classmethod
-    def usual(cls) -> "Proportions":
-        """Those that the model has."""
-        return cls(np.ones(24), np.ones(24))
-
-    @classmethod
-    def own_bones(cls, rng: np.random.Generator, spread: float = 0.05) -> "Proportions":
-        """Every bone longer or shorter by its own share, at most `spread`; left and right are drawn apart."""
-        return cls(1 + rng.uniform(-spread, spread, 24), np.ones(24))
-
-    @classmethod
-    def long_arms(cls, factor: float = 1.15) -> "Proportions":
-        """Upper and lower arms that are longer than those of anybody of this stature."""
-        return cls(_only(_ARMS, factor), np.ones(24))
-
-    @classmethod
-    def child(cls) -> "Proportions":
-        """A child of about seven years, of 1.2 m where the body is the mean adult: a larger head, shorter legs.
-
-        The head is a sixth of the stature, that of adults 1 / 7.5 or less (Domljan et al. 2024); the hips are at
-        half the stature, those of this adult at 52 %: children sit higher for their stature (Snyder et al. 1977,
-        UM-HSRI-77-17).
-        """
-        adult_m, hip_m = 1.70, 0.893
-        legs, head = 0.5 * _CHILD_M / hip_m, (_CHILD_M / 6) / (adult_m / 7.6)
-        length = np.full(24, 0.685)
-        length[_LEGS] = legs
-        length[_HEAD], length[SMPL_24.index("neck")] = 0.8, 0.69
-        length[[SMPL_24.index("left_foot"), SMPL_24.index("right_foot")]] = 0.72
-        girth = np.full(24, _CHILD_M / adult_m)
-        girth[_HEAD] = head
-        return cls(length, girth)
+    Own bones are longer or shorter by their own share, left and right drawn apart. A child is about seven years
+    old, 1.2 m where the body is the mean adult. The head is a sixth of the stature, that of adults 1 / 7.5 or less
+    (Domljan et al. 2024); the hips are at half the stature, those of this adult at 52 %: children sit higher for
+    their stature (Snyder et al. 1977, UM-HSRI-77-17).
+    """
+    if kind not in PEOPLE:
+        raise ValueError(f"kind must be one of {', '.join(PEOPLE)}; got {kind}")
+    rng, usual = np.random.default_rng([seed, 24]), np.ones(24)
+    bones = [1 + rng.uniform(-0.05, 0.05, 24) for _ in range(count)]
+    arms = _scaled(usual, {joint: 1.15 for joint in _ARMS})
+    adult_m, hip_m = 1.70, 0.893
+    legs = dict.fromkeys(_LEGS, 0.5 * _CHILD_M / hip_m)
+    child = _scaled(np.full(24, 0.685), legs | {"head": 0.8, "neck": 0.69, "left_foot": 0.72, "right_foot": 0.72})
+    slight = _scaled(np.full(24, _CHILD_M / adult_m), {"head": (_CHILD_M / 6) / (adult_m / 7.6)})
+    kinds = [
+        [Proportions(usual, usual)] * count,
+        [Proportions(own, usual) for own in bones],
+        [Proportions(arms, usual)] * count,
+        [Proportions(child, slight)] * count,
+        [
+            Proportions(own * (child if place % 2 else arms), slight if place % 2 else usual)
+            for place, own in enumerate(bones)
+        ],
+    ]
+    return kinds[PEOPLE.index(kind)]
 
 
-def _only(joints: NDArray[np.intp], factor: float) -> Array:
-    factors = np.ones(24)
-    factors[joints] = factor
+def _scaled(factors: Array, own: dict[str, float]) -> Array:
+    """(24,) `factors` with those of some joints replaced."""
+    factors = factors.copy()
+    factors[[SMPL_24.index(joint) for joint in own]] = list(own.values())
     return factors
 
 
@@ -145,23 +132,6 @@ def _stretched(vertices: Array, joints: Array, weights: Array, proportions: Prop
     return stretched
 
 
-def people_of(kind: str, count: int, seed: int = 0) -> list[Proportions]:
-    """The proportions of `count` people: of one kind of `PEOPLE`, or of all, every second one a child."""
-    rng = np.random.default_rng([seed, 24])
-    usual, bones = Proportions.usual(), [Proportions.own_bones(rng) for _ in range(count)]
-    arms, child = Proportions.long_arms(), Proportions.child()
-    kinds = {
-        "the body that is fitted": [usual] * count,
-        "own bones": bones,
-        "long arms": [arms] * count,
-        "children": [child] * count,
-        "all of these": [own.times(child if place % 2 else arms) for place, own in enumerate(bones)],
-    }
-    if kind not in kinds:
-        raise ValueError(f"kind must be one of {', '.join(PEOPLE)}; got {kind}")
-    return kinds[kind]
-
-
 def recast(scene: Scene, proportions: Sequence[Proportions]) -> Scene:
     """The same motions by people of other `proportions` (one for each): every bone turns as it did.
 
@@ -178,11 +148,11 @@ def recast(scene: Scene, proportions: Sequence[Proportions]) -> Scene:
         vectors = np.concatenate([motion.global_orient[:, person, None], motion.body_pose[:, person]], axis=1)
         turns = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(-1, 24, 3, 3)
         pelvis = before.rest[0] + transl[:, person]
+
+        def sole(figure: Figure, turns: Array = turns, pelvis: Array = pelvis) -> Array:
+            """Height (T,) of the lowest point of both feet of who has the pelvis there, z up."""
+            return figure.lowest_sole(*figure.joints(turns, pelvis))
+
         transl[:, person] = pelvis - after.rest[0]
-        transl[:, person, 2] += _sole(before, turns, pelvis) - _sole(after, turns, pelvis)
+        transl[:, person, 2] += sole(before) - sole(after)
     return replace(scene, body=body, motion=Motion(betas, motion.global_orient, motion.body_pose, transl))
-
-
-def _sole(figure: Figure, rotations: NDArray[np.float64], pelvis: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Height (T,) of the lowest point of both feet of who has the pelvis there, z up."""
-    return figure.lowest_sole(*figure.joints(rotations, pelvis))

@@ -78,7 +78,7 @@ def pose(puppet: Puppet, rest: Array) -> tuple[Array, Array, Array]:
         grow(hip)
         pole = turned[:, PELVIS] @ np.array([0.12 * (1, -1)[side], 0.0, 1.0])
         _two_bones(turned, position, bones, (hip, knee, ankle), puppet.ankles[:, side], pole, _KNEE_HINGE)
-        turned[:, ankle] = _facing(puppet.foot_heading[:, side]) @ _about("x", puppet.foot_pitch[:, side])
+        turned[:, ankle] = _facing(puppet.foot_heading[:, side]) @ turned_about("x", puppet.foot_pitch[:, side])
         turned[:, ankle + 3] = turned[:, ankle]
     for side, (collar, shoulder, elbow, wrist) in enumerate(ARMS):
         sign = (1.0, -1.0)[side]
@@ -86,7 +86,7 @@ def pose(puppet: Puppet, rest: Array) -> tuple[Array, Array, Array]:
         grow(shoulder)
         target = _hand_target(puppet, turned, position, bones, side)
         above = target[:, 2] - position[:, shoulder, 2]
-        grow(collar, _about("z", sign * 0.35 * np.clip(above / 0.4, 0.0, 1.0)))
+        grow(collar, turned_about("z", sign * 0.35 * np.clip(above / 0.4, 0.0, 1.0)))
         grow(shoulder)
         # Elbows point backward under hanging arms and outward under raised ones: never along the arm.
         raised = np.clip((above + 0.35) / 0.5, 0.0, 1.0)[:, None]
@@ -103,10 +103,10 @@ def pose(puppet: Puppet, rest: Array) -> tuple[Array, Array, Array]:
 
 def _facing(heading: Array) -> Array:
     """World from body (T, 3, 3) of a body (y up, facing +z) that stands upright in a world with z up."""
-    return _about("z", heading + np.pi / 2) @ _about("x", np.full(1, np.pi / 2))
+    return turned_about("z", heading + np.pi / 2) @ turned_about("x", np.full(1, np.pi / 2))
 
 
-def _about(axis: str, angle: Array) -> Array:
+def turned_about(axis: str, angle: Array) -> Array:
     """Rotations (T, 3, 3) by `angle` (T,) about a coordinate axis."""
     return Rotation.from_rotvec(np.eye(3)["xyz".index(axis)] * angle[:, None]).as_matrix()
 

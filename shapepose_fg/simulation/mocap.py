@@ -6,6 +6,7 @@ SMPL's T-pose, y up, row 0 the global orientation; `trans` (N, 3) the pelvis' pl
 `floor_y` (S,); `pairs` (K, 2) clips of two people together; `parents` (24,).
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,11 +20,27 @@ from shapepose_fg.core.storage.npz import read_npz
 
 Array = NDArray[np.float64]
 
-_ARRAYS = {"poses": ("N", 24, 3), "trans": ("N", 3), "seq_start": ("S",), "seq_len": ("S",), "fps": ("S",)}
-_ARRAYS |= {name: ("S",) for name in ("names", "subject", "action", "tier", "wrist_valid", "toe_valid")}
-_ARRAYS |= {"leg_m": ("S",), "floor_y": ("S",), "pairs": ("K", 2), "parents": (24,)}
+_OF_CLIP = "seq_start seq_len fps names subject action tier wrist_valid toe_valid leg_m floor_y".split()
+_ARRAYS = {"poses": ("N", 24, 3), "trans": ("N", 3), **dict.fromkeys(_OF_CLIP, ("S",))}
+_ARRAYS |= {"pairs": ("K", 2), "parents": (24,)}
 _GLITCH_RAD_S = np.radians(900.0)
 """No joint of a walker or dancer turns faster; a marker that jumps does."""
+
+COLLARS, SHOULDERS = (13, 14), (16, 17)
+"""Left and right in SMPL's order."""
+_SETTING = np.radians(30.0)
+"""Up to this elevation of the arm only the glenohumeral joint turns (Inman, Saunders and Abbott 1944)."""
+_RISE = 0.2
+"""Elevation of the clavicle for each radian of the arm's beyond `_SETTING`: 30 degrees with the arm overhead.
+
+Overhead, a third of the arm's elevation is the shoulder blade's (1:2), and half of that the clavicle's; the other
+half, at the outer end of the clavicle, hardly moves the shoulder's centre, and SMPL's tree has no joint for it.
+"""
+_REST = np.radians(60.0)
+"""The arm's elevation at which the collar is as in the T-pose: the T-pose of a body file is made by turning the
+arms of one that stands with arms half raised, its collars stay."""
+_SWEEP = 0.22
+"""Radians by which the collar goes forward when the raised arm points forward, and back when it points back."""
 
 
 @dataclass(frozen=True)
@@ -97,23 +114,19 @@ class Mocap:
     @classmethod
     def load(cls, path: str | Path) -> "Mocap":
         """The recordings in `path` (.npz); InputError where it cannot be used."""
-        arrays = _read(Path(path))
-        return cls(
-            names=tuple(map(str, arrays["names"])),
-            subjects=tuple(map(str, arrays["subject"])),
-            actions=tuple(map(str, arrays["action"])),
-            lengths=arrays["seq_len"].astype(np.int64),
-            tiers=arrays["tier"].astype(np.int64),
-            pairs=tuple((int(lead), int(follow)) for lead, follow in arrays["pairs"]),
-            arrays=arrays,
-        )
+        arrays = read_npz(Path(path), _ARRAYS, "copy the recorded motions again")
+        for problem in _problems(arrays):
+            raise InputError(f"{path}: {problem}")
+        names, subjects, actions = (tuple(map(str, arrays[name])) for name in ("names", "subject", "action"))
+        pairs = tuple((int(lead), int(follow)) for lead, follow in arrays["pairs"])
+        lengths, tiers = (arrays[name].astype(np.int64) for name in ("seq_len", "tier"))
+        return cls(names, subjects, actions, lengths, tiers, pairs, arrays)
 
     def clip(self, index: int) -> Clip:
         """Clip `index`, glitches of single markers bridged."""
-        start = int(self.arrays["seq_start"][index])
-        frames = slice(start, start + int(self.lengths[index]))
-        vectors = self.arrays["poses"][frames].astype(np.float64)
-        fps = float(self.arrays["fps"][index])
+        own = {name: self.arrays[name][index].item() for name in _OF_CLIP}
+        frames = slice(int(own["seq_start"]), int(own["seq_start"]) + int(self.lengths[index]))
+        vectors, fps = self.arrays["poses"][frames].astype(np.float64), float(own["fps"])
         rotations = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(-1, 24, 3, 3)
         rotations, pelvis = _bridged(rotations, self.arrays["trans"][frames].astype(np.float64), fps)
         return Clip(
@@ -123,10 +136,10 @@ class Mocap:
             rotations=rotations,
             pelvis=pelvis,
             fps=fps,
-            leg_m=float(self.arrays["leg_m"][index]),
-            floor_y=float(self.arrays["floor_y"][index]),
-            wrist_valid=bool(self.arrays["wrist_valid"][index]),
-            toe_valid=bool(self.arrays["toe_valid"][index]),
+            leg_m=float(own["leg_m"]),
+            floor_y=float(own["floor_y"]),
+            wrist_valid=bool(own["wrist_valid"]),
+            toe_valid=bool(own["toe_valid"]),
         )
 
 
@@ -161,33 +174,58 @@ def _bridged(rotations: Array, pelvis: Array, fps: float) -> tuple[Array, Array]
     )
 
 
-def _read(path: Path) -> dict[str, NDArray]:
-    """The arrays of the file, shapes, ranges and indices checked."""
-    arrays = read_npz(path, _ARRAYS, "copy the recorded motions again")
+def _problems(arrays: dict[str, NDArray]) -> Iterator[str]:
+    """What does not fit, and the cure."""
     missing = [name for name in _ARRAYS if name not in arrays]
     if missing:
-        raise InputError(f"{path}: array {missing[0]!r} is missing; give motions in SMPL's structure")
-    _check(path, arrays)
-    return arrays
-
-
-def _check(path: Path, arrays: dict[str, NDArray]) -> None:
-    """InputError that names the array that does not fit."""
+        yield f"array {missing[0]!r} is missing; give motions in SMPL's structure"
     sizes = {"N": len(arrays["poses"]), "S": len(arrays["seq_start"]), "K": len(arrays["pairs"])}
     for name, shape in _ARRAYS.items():
         expected = tuple(sizes[size] if isinstance(size, str) else size for size in shape)
         if arrays[name].shape != expected:
-            raise InputError(f"{path}: {name} must be {expected}, is {arrays[name].shape}; write the file again")
+            yield f"{name} must be {expected}, is {arrays[name].shape}; write the file again"
     for name in ("poses", "trans", "fps", "leg_m", "floor_y"):
         if not np.isfinite(arrays[name]).all():
-            raise InputError(f"{path}: {name} holds values that are not finite; write the file again")
+            yield f"{name} holds values that are not finite; write the file again"
     if not ((arrays["fps"] > 0).all() and (arrays["leg_m"] > 0.1).all()):
-        raise InputError(f"{path}: fps and leg_m must be positive; write the file again")
+        yield "fps and leg_m must be positive; write the file again"
     start, length = arrays["seq_start"].astype(np.int64), arrays["seq_len"].astype(np.int64)
     if not ((start >= 0) & (length > 0) & (start + length <= sizes["N"])).all():
-        raise InputError(f"{path}: seq_start and seq_len reach beyond the last frame; write the file again")
+        yield "seq_start and seq_len reach beyond the last frame; write the file again"
     pairs = arrays["pairs"].astype(np.int64)
     if not ((pairs >= 0) & (pairs < sizes["S"])).all() or (length[pairs[:, 0]] != length[pairs[:, 1]]).any():
-        raise InputError(f"{path}: pairs must name two clips of one length each; write the file again")
+        yield "pairs must name two clips of one length each; write the file again"
     if tuple(arrays["parents"].tolist()) != SMPL_PARENTS:
-        raise InputError(f"{path}: parents are not SMPL's tree; give motions in SMPL's structure")
+        yield "parents are not SMPL's tree; give motions in SMPL's structure"
+
+
+def shoulder_rhythm(rotations: Array) -> Array:
+    """Local rotations (T, 24, 3, 3) with collars that follow the arms; collars that came with them are dropped.
+
+    The collar rises and sweeps with the upper arm's direction in the chest's frame (scapulohumeral rhythm);
+    the shoulder turns back by as much, so the upper arm's rotation in the chest's frame, and with it in the
+    world, is exactly what it was.
+    """
+    adapted = rotations.copy()
+    for side, (collar, shoulder) in enumerate(zip(COLLARS, SHOULDERS, strict=True)):
+        sign = (1.0, -1.0)[side]
+        arm = rotations[:, collar] @ rotations[:, shoulder]
+        along = sign * arm[:, :, 0]  # the T-pose's arm lies along +x on the left
+        turned = _collar(along, sign)
+        adapted[:, collar] = turned
+        adapted[:, shoulder] = np.swapaxes(turned, -1, -2) @ arm
+    return adapted
+
+
+def _collar(along: Array, sign: float) -> Array:
+    """Rotation (T, 3, 3) of the collar when the upper arm points `along` (T, 3) in the chest's frame."""
+    elevation = np.arccos(np.clip(-along[:, 1], -1.0, 1.0))  # 0 hanging, pi overhead
+    rise = _RISE * (_ramp(elevation - _SETTING) - _ramp(np.array([_REST - _SETTING])))
+    raised = np.sin(np.clip(elevation, 0.0, np.pi / 2)) ** 2
+    sweep = _SWEEP * raised * along[:, 2] - 0.35 * np.maximum(rise, 0.0)
+    return Rotation.from_euler("yz", np.stack([-sign * sweep, sign * rise], axis=1)).as_matrix()
+
+
+def _ramp(angle: Array) -> Array:
+    """0 below 0 and `angle` above it, rounded over a tenth of a radian: the collar does not start with a jerk."""
+    return 0.05 * np.logaddexp(0.0, angle / 0.05)

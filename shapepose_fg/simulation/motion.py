@@ -63,45 +63,24 @@ class Motion:
                 raise ValueError(f"{name} must be {shape}, got {getattr(self, name).shape}")
 
 
-@dataclass(frozen=True)
 class Build:
-    """The measures of a body that a role needs."""
+    """The measures of a body that a role needs, metres."""
 
-    rest: Array
-    """(24, 3) joints in the T-pose, y up, facing +z."""
-    floor: float
-    """y of the soles in the T-pose."""
-
-    @property
-    def pelvis_m(self) -> float:
-        """Height of the pelvis of who stands upright."""
-        return float(self.rest[0, 1] - self.floor)
-
-    @property
-    def ankle_m(self) -> float:
-        """Height of the ankles of who stands."""
-        return float(self.rest[7, 1] - self.floor)
-
-    @property
-    def shoulder_m(self) -> float:
-        """Height of the shoulders of who stands upright."""
-        return float(self.rest[16, 1] - self.floor)
-
-    @property
-    def leg_m(self) -> float:
+    def __init__(self, rest: Array, floor: float):
+        """`rest` (24, 3) are the joints in the T-pose, y up, facing +z; `floor` is y of the soles there."""
+        self.rest, self.floor = rest, floor
+        self.pelvis_m, self.ankle_m, self.shoulder_m = (float(rest[joint, 1] - floor) for joint in (0, 7, 16))
+        """Heights of these joints of who stands upright."""
+        hip, knee, ankle = rest[list(LEGS[0])]
+        self.leg_m = float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
         """Length of thigh and shank together."""
-        hip, knee, ankle = self.rest[list(LEGS[0])]
-        return float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
 
 
-def close_motion(
-    builds: list[Build], frames: int, fps: float, rng: np.random.Generator
-) -> tuple[Array, Array, Array]:
-    """Poses of people in close motion, by fours: a couple that dances, one who walks through, one who waves.
+def close_motion(betas: Array, builds: list[Build], frames: int, fps: float, rng: np.random.Generator) -> Motion:
+    """People of shapes `betas` (P, 10) in close motion, by fours: a couple dances, one walks through, one waves.
 
-    Returns global_orient (T, P, 3), body_pose (T, P, 23, 3), transl (T, P, 3). The first four are in the
-    middle of the room, each further four in a corner of their own; who is left over fills the first roles,
-    and who would dance alone waves.
+    The first four are in the middle of the room, each further four in a corner of their own; who is left over
+    fills the first roles, and who would dance alone waves.
     """
     time = np.arange(frames) / fps
     puppets: list[Puppet] = []
@@ -117,9 +96,8 @@ def close_motion(
             puppets.append(wave(group[-1], time, centre + WAVER, np.pi, rng))
     posed = [pose(puppet, build.rest) for puppet, build in zip(puppets, builds, strict=True)]
     if len(posed) == 0:
-        return np.zeros((frames, 0, 3)), np.zeros((frames, 0, 23, 3)), np.zeros((frames, 0, 3))
-    orient, body_pose, transl = (np.stack(part, axis=1) for part in zip(*posed, strict=True))
-    return orient, body_pose, transl
+        return Motion.still(betas, frames)
+    return Motion(betas, *(np.stack(part, axis=1) for part in zip(*posed, strict=True)))
 
 
 def dance(pair: list[Build], time: Array, centre: Array, rng: np.random.Generator) -> list[Puppet]:

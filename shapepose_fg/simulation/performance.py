@@ -9,9 +9,9 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.model.body_model import BodyModel
-from shapepose_fg.simulation.mocap import Clip
+from shapepose_fg.simulation.limbs import turned_about
+from shapepose_fg.simulation.mocap import Clip, shoulder_rhythm
 from shapepose_fg.simulation.motion import Motion
-from shapepose_fg.simulation.shoulder import shoulder_rhythm
 
 Array = NDArray[np.float64]
 
@@ -50,7 +50,7 @@ class Performance:
 
     def moved(self, xy: Array, turn_rad: float = 0.0) -> "Performance":
         """Turned about the vertical through the origin, then shifted by `xy` (2,)."""
-        turn = about_z(np.array([turn_rad]))[0]
+        turn = turned_about("z", np.array([turn_rad]))[0]
         rotations = self.rotations.copy()
         rotations[:, 0] = turn @ rotations[:, 0]
         return replace(self, rotations=rotations, joints=self.joints @ turn.T + np.array([*xy, 0.0]))
@@ -134,11 +134,6 @@ def together(betas: Array, performances: list[Performance], frames: int) -> Moti
     return motion
 
 
-def about_z(angle: Array) -> Array:
-    """Rotations (T, 3, 3) by `angle` (T,) about the vertical."""
-    return Rotation.from_rotvec(np.array([0.0, 0.0, 1.0]) * angle[:, None]).as_matrix()
-
-
 def _floor(lowest: Array, fps: float) -> Array:
     """Height (T,) of the floor under somebody whose lowest point is at `lowest` (T,): smooth, blind for jumps."""
     if len(lowest) == 0:
@@ -159,7 +154,7 @@ def _toes_on_the_floor(rotations: Array, joints: Array, world: Array, lowest: Ar
         pitch = np.arcsin(np.clip(-world[:, ankle, 2, 2], -1.0, 1.0))  # of the foot's +z, below the horizontal
         near = np.clip((0.14 - (joints[:, ball, 2] - lowest)) / 0.06, 0.0, 1.0)
         angle = -np.clip(pitch, 0.0, 0.7) * near
-        bent[:, ball] = Rotation.from_rotvec(np.array([1.0, 0.0, 0.0]) * angle[:, None]).as_matrix()
+        bent[:, ball] = turned_about("x", angle)
     return bent
 
 

@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.simulation.bystanders import stand, walk_along, way_through
+from shapepose_fg.simulation.limbs import turned_about
 from shapepose_fg.simulation.mocap import Clip
-from shapepose_fg.simulation.performance import Figure, Performance, about_z, hold_hands, perform
+from shapepose_fg.simulation.performance import Figure, Performance, hold_hands, perform
 
 Array = NDArray[np.float64]
 
@@ -160,7 +161,7 @@ class Room:
     def _worth(self, two: list[Performance], turn: float, shift: Array) -> float:
         """How well a pair is placed: inside the room, close to others, but not closer than allowed."""
         steps = np.concatenate([one.joints[::3, list(_MIDDLES), :2] for one in two], axis=1)
-        steps = steps @ about_z(np.array([turn]))[0, :2, :2].T + shift
+        steps = steps @ turned_about("z", np.array([turn]))[0, :2, :2].T + shift
         outside = float(np.maximum(np.abs(steps) - _HALF_ROOM_M, 0.0).max())
         gaps = np.linalg.norm(steps[:, :, None] - self.points(_MIDDLES)[::3, None], axis=-1)
         spare = float(gaps.min()) - self.config.close_m if gaps.size > 0 else 0.0

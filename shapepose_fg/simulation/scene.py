@@ -69,9 +69,6 @@ class Scene:
 
     def vertices_at(self, frame: int, only: NDArray[np.intp] | None = None) -> NDArray[np.float32]:
         """(P, Nv, 3) the true surfaces of one frame; or (P, M, 3), the vertices `only` (M,) of them."""
-        if self.people == 0:
-            count = self.body.num_vertices if only is None else len(only)
-            return np.zeros((0, count, 3), dtype=np.float32)
         import torch
 
         parameters = parameters_of(self.body, self.motion[frame : frame + 1])
@@ -103,7 +100,7 @@ def built_in_scene(
     rig = ring_of_cameras(cameras, rng)
     betas = np.clip(rng.normal(0.0, 1.0, (people, body.num_betas)), -1.8, 1.8)
     builds = builds_of(body, betas)
-    motion = Motion(betas, *close_motion(builds, frames, fps, rng))
+    motion = close_motion(betas, builds, frames, fps, rng)
     return Scene(rig, body, _on_the_floor(body, motion, builds), fps)
 
 
@@ -135,8 +132,6 @@ def ring_of_cameras(
 
 def builds_of(body: "BodyModel", betas: NDArray[np.float64]) -> list[Build]:
     """The measures of P shapes `betas` (P, 10) that motions are made to."""
-    if len(betas) == 0:
-        return []
     import torch
 
     parameters = parameters_of(body, Motion.still(betas))
@@ -148,21 +143,15 @@ def builds_of(body: "BodyModel", betas: NDArray[np.float64]) -> list[Build]:
 
 def keypoints_of(body: "BodyModel", motion: Motion) -> NDArray[np.float64]:
     """BODY_25 keypoints (T, P, 25, 3) of a motion."""
-    frames, people = motion.transl.shape[:2]
-    if frames * people == 0:
-        return np.zeros((frames, people, 25, 3))
     import torch
 
     with torch.no_grad():
         points = body.keypoints(parameters_of(body, motion)).numpy()
-    return points.astype(np.float64).reshape(frames, people, -1, 3)
+    return points.astype(np.float64).reshape(*motion.transl.shape[:2], *points.shape[1:])
 
 
 def _on_the_floor(body: "BodyModel", motion: Motion, builds: list[Build]) -> Motion:
     """Shift everybody up or down so that in each frame the lowest toe or heel is as high as in standing."""
-    frames, people = motion.transl.shape[:2]
-    if frames * people == 0:
-        return motion
     floors = np.array([build.floor for build in builds])
     soles = keypoints_of(body, Motion.still(motion.betas))[0][:, _FEET, 1].min(axis=1) - floors
     transl = motion.transl.copy()

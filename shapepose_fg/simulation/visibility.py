@@ -2,7 +2,6 @@
 
 from collections.abc import Generator, Iterable
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -88,11 +87,6 @@ class Skin:
         mean = np.stack([np.bincount(cell, share) for share in shown.T], axis=1) / np.bincount(cell)[:, None]
         return cls(vertices, faces.astype(np.int32), mean >= 0.5)
 
-    @cached_property
-    def _shows_or_none(self) -> NDArray[np.bool_]:
-        """(M + 1, J) `shows`, and a last row for vertex -1, which is none."""
-        return np.concatenate([self.shows, np.zeros((1, self.shows.shape[1]), dtype=bool)])
-
 
 def see(
     rig: Rig, joints: NDArray[np.float64], surfaces: NDArray[np.floating], skin: Skin, config: VisibilityConfig
@@ -120,7 +114,7 @@ def see(
         met_depth[view], met[view] = first_surface_at(points, faces, camera, column, row)
     own = np.arange(people)[:, None, None]
     owner, place = np.divmod(met, max(size, 1))  # nothing met: owner -1
-    shows = skin._shows_or_none[np.where(owner == own, place, -1), np.arange(joints.shape[1])[:, None]]
+    shows = (owner == own) & skin.shows[place, np.arange(joints.shape[1])[:, None]]
     gap = depth[..., None] - met_depth  # -inf where nothing is met
     deep = np.full((joints.shape[1], 1), np.inf)
     deep[list(FACE)] = config.face_depth_m

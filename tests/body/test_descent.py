@@ -6,13 +6,15 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.fitting.descent import (
+    NUM_PARAMETERS,
     BodyState,
     DescentTargets,
     LearnedDescent,
+    NetworkConfig,
+    UpdateNetwork,
     gradient_scale,
     inverse_3x3,
 )
-from shapepose_fg.body.fitting.network import NUM_PARAMETERS, NetworkConfig, UpdateNetwork
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel
@@ -103,7 +105,6 @@ def test_an_untrained_network_stands_still(model):
     assert len(arrived) == 3
     for state in arrived:
         assert_same(state, start, atol=1e-6)
-    assert len(list(descent.unroll(start, targets_of(ALL), steps=2))) == 2
 
 
 @pytest.mark.parametrize("name", TARGET_SKELETONS)

@@ -9,8 +9,8 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
+from shapepose_fg.body.fitting.descent import NetworkConfig, UpdateNetwork
 from shapepose_fg.body.fitting.fitters import BodyConfig, SmplFitter, make_fitter
-from shapepose_fg.body.fitting.network import NetworkConfig, UpdateNetwork
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.fitting.weights import FitterWeights, fingerprint

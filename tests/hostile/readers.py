@@ -286,7 +286,7 @@ def tiny_body(seed: int) -> dict[str, np.ndarray]:
 
 
 def _weights(folder: Path, seed: int) -> Read:
-    from shapepose_fg.body.fitting.network import NetworkConfig, UpdateNetwork
+    from shapepose_fg.body.fitting.descent import NetworkConfig, UpdateNetwork
     from shapepose_fg.body.fitting.weights import FitterWeights
 
     network = UpdateNetwork(NetworkConfig(width=2, blocks=1))

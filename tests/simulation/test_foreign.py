@@ -9,7 +9,7 @@ from shapepose_fg.body.model.smpl_file import SMPL_PARENTS
 from shapepose_fg.body.shapes import statures_m
 from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 from shapepose_fg.simulation import built_in_scene
-from shapepose_fg.simulation.foreign import PEOPLE, Proportions, people_of, recast, reshaped
+from shapepose_fg.simulation.foreign import PEOPLE, people_of, recast, reshaped
 
 BODY = BodyModel.default()
 LIMBS = [
@@ -71,7 +71,7 @@ def test_long_arms_change_nothing_else():
 def test_a_child_is_1_2_m_with_a_large_head_and_short_legs():
     joints, vertices = made("children")
     plain, skin = rest(BODY, np.zeros(10))
-    model, betas = reshaped(BODY, np.zeros((1, 10)), [Proportions.child()])
+    model, betas = reshaped(BODY, np.zeros((1, 10)), people_of("children", 1))
     assert statures_m(betas, model.arrays)[0] == pytest.approx(1.2, abs=0.005)
     hip = [
         (each[1, 1] - points[:, 1].min()) / np.ptp(points[:, 1])
@@ -109,10 +109,8 @@ def test_children_move_as_the_adults_did_and_stand_on_the_floor():
 
 def test_what_cannot_be_made_is_refused():
     with pytest.raises(ValueError, match="up to 10 people"):
-        reshaped(BODY, np.zeros((11, 10)), [Proportions.usual()] * 11)
+        reshaped(BODY, np.zeros((11, 10)), people_of(PEOPLE[0], 11))
     with pytest.raises(ValueError, match="proportions for each"):
-        reshaped(BODY, np.zeros((2, 10)), [Proportions.usual()])
+        reshaped(BODY, np.zeros((2, 10)), people_of(PEOPLE[0], 1))
     with pytest.raises(ValueError, match="kind must be one of"):
         people_of("giants", 2)
-    with pytest.raises(ValueError, match="24 positive numbers"):
-        Proportions(np.zeros(24), np.ones(24))

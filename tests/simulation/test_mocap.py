@@ -11,10 +11,9 @@ from scipy.spatial.transform import Rotation
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.simulation.bystanders import endless, stand, walk_along
-from shapepose_fg.simulation.mocap import Clip, Mocap
+from shapepose_fg.simulation.mocap import Clip, Mocap, shoulder_rhythm
 from shapepose_fg.simulation.performance import Figure, Performance, hold_hands, perform, together
 from shapepose_fg.simulation.scene import Scene, keypoints_of, parameters_of, ring_of_cameras
-from shapepose_fg.simulation.shoulder import shoulder_rhythm
 
 SHAPES = np.clip(np.random.default_rng(0).normal(0.0, 0.8, (4, 10)), -1.8, 1.8)
 Z_UP = Rotation.from_rotvec([np.pi / 2, 0.0, 0.0]).as_matrix()

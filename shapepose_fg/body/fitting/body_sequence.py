@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from factors import Motion
-from shapepose_fg.body.fitting.chain_solver import ChainRows
-from shapepose_fg.body.fitting.chains import Segment, cut_segments
+from shapepose_fg.body.fitting.chains import ChainRows, Segment, cut_segments
 from shapepose_fg.body.fitting.energy import SETTLED, BodyEnergy, Held, WhitenedTargets, factored
 from shapepose_fg.body.fitting.evidence import Evidence, weigh
 from shapepose_fg.body.fitting.fitter import (
@@ -161,7 +160,7 @@ class SequenceFitter:
         """Fill the rows `part` (R,) of `fit` with the bodies `body` (R, P) around `origin` (R, 3)."""
         index, scale = torch.from_numpy(part), torch.tensor(self.config.kernel_scale)
         held = Held(body[:, :10], torch.tensor([SETTLED]), None if rows.angles is None else rows.angles[index])
-        found = self.energy.evaluate(body, rows.targets[index], scale, held)
+        found = self.energy.evaluate(body, rows.targets.rows(index), scale, held)
         by_joint = found.jacobian.unflatten(1, (-1, 3)).double()
         known = joint_covariance(factored(found.here.hessian.double()), by_joint).numpy()
         xyz, squared = found.here.xyz.double().numpy(), found.here.squared.double().sum(-1).numpy()
@@ -170,7 +169,7 @@ class SequenceFitter:
             residual_m = np.sqrt(squared / evidence.total_information[part])
         fit.status[part] = np.where(ok, FitStatus.OK, FitStatus.NOT_CONVERGED)
         part, origin = part[ok], origin[ok]
-        fit.put(part, self.energy.complete(body[torch.from_numpy(ok)]), origin)
+        fit.put_bodies(part, self.energy.complete(body[torch.from_numpy(ok)]), origin)
         fit.joints[part] = xyz[ok] + origin[:, None]
         fit.covariance[part], fit.residual_m[part] = known[ok], residual_m[ok]
 

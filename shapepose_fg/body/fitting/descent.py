@@ -1,6 +1,6 @@
 """Learned gradient descent: a body moves towards its targets, one step of the update network after the other.
 
-    Theta <- Theta + N_w(dE_shape/dTheta, Theta, X)                                       (Eq. 5 of the paper)
+    Theta <- Theta + N_w(dE_shape/dTheta, Theta, X)              (Eq. 5 of the paper; Song et al., ECCV 2020)
 
 in the person's own frame: pelvis near the origin, upright, facing +z (see `PersonFrame`). E_shape is the data term
 of `BodyEnergy`, its gradient analytic. Training unrolls the very same code.
@@ -8,18 +8,25 @@ of `BodyEnergy`, its gradient analytic. Training unrolls the very same code.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
-from torch import Tensor
+from annotated_types import Interval
+from torch import Tensor, nn
 
 from shapepose_fg.body.fitting.energy import robust_weight
-from shapepose_fg.body.fitting.network import NUM_ROTATIONS, UpdateNetwork
 from shapepose_fg.body.model.body_model import accumulate
-from shapepose_fg.body.model.rotation import from_six_d, six_d
+from shapepose_fg.body.model.rotation import from_six_d, inverse_3x3, six_d
 from shapepose_fg.body.model.skinned_points import SkinnedPoints
-from shapepose_fg.body.model.small_matrices import inverse_3x3
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
+from shapepose_fg.core.bounds import Settings
 
+NUM_ROTATIONS = 22
+"""Root and the 21 joints of SMPL that are not hands: what the network turns."""
+NUM_PARAMETERS = 10 + 6 * NUM_ROTATIONS + 3
+"""betas, rotations as 6D, translation."""
+_NUM_TANGENT = 10 + 3 * NUM_ROTATIONS + 3
+_NUM_POINTS = len(BODY_POINTS)
 _REACH_M = 0.1
 """A target is believed against where the body is now as if that were known to this, metres."""
 _TRUST_M = 0.03
@@ -32,6 +39,63 @@ _SEEN_M, _TURN_RAD = 0.02, 0.3
 """Sigma of a joint well seen, and of an angle that no joint tells: for the size of gradients only."""
 _STEP = 0.1
 """What the network's output of 1 means, in betas' tenths, entries of rotations, metres."""
+
+
+@dataclass(frozen=True)
+class NetworkConfig(Settings):
+    """The size of an `UpdateNetwork`."""
+
+    width: Annotated[int, Interval(ge=1, le=8192)] = 384
+    """Units of every layer."""
+    blocks: Annotated[int, Interval(ge=1, le=64)] = 2
+    """Residual blocks."""
+    steps: Annotated[int, Interval(ge=1, le=14)] = 3
+    """Updates that it is made for; each knows its number."""
+    dropout: Annotated[float, Interval(ge=0, le=0.99)] = 0.1
+    """Share of the units that are left out in training."""
+    half_precision: bool = True
+    """Trains with bfloat16 products, twice as fast on processors that have them; fits are always in float32."""
+
+
+class UpdateNetwork(nn.Module):
+    """From gradient, parameters and targets to the next step of the parameters.
+
+    A multilayer perceptron with residual blocks; its last layer starts at zero, so an untrained one stands still.
+    """
+
+    num_inputs = 7 * _NUM_POINTS + NUM_PARAMETERS + _NUM_TANGENT
+
+    def __init__(self, config: NetworkConfig):
+        super().__init__()
+        self.config = config
+        self.enter = nn.Linear(self.num_inputs + config.steps, config.width)
+        self.blocks = nn.ModuleList(_Block(config.width, config.dropout) for _ in range(config.blocks))
+        self.leave = nn.Linear(config.width, NUM_PARAMETERS)
+        nn.init.zeros_(self.leave.weight)
+        nn.init.zeros_(self.leave.bias)
+        self.gradient_scale: Tensor
+        self.register_buffer("gradient_scale", torch.ones(_NUM_TANGENT))
+
+    def forward(self, inputs: Tensor, step: int) -> Tensor:
+        """(B, `NUM_PARAMETERS`) the change of the parameters in update number `step`; inputs (B, `num_inputs`)."""
+        place = self.leave.weight.device
+        with torch.autocast(place.type, torch.bfloat16, enabled=self.training and self.config.half_precision):
+            weight, bias = self.enter.weight, self.enter.bias + self.enter.weight[:, self.num_inputs + step]
+            hidden = nn.functional.linear(inputs.to(place), weight[:, : self.num_inputs], bias)
+            for block in self.blocks:
+                hidden = hidden + block(hidden)
+            return self.leave(hidden).float().to(inputs.device)
+
+
+class _Block(nn.Module):
+    def __init__(self, width: int, dropout: float):
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.LayerNorm(width), nn.Linear(width, width), nn.GELU(), nn.Dropout(dropout), nn.Linear(width, width)
+        )
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        return self.layers(hidden)
 
 
 @dataclass(frozen=True)
@@ -85,10 +149,10 @@ class LearnedDescent:
         self._slots, self._rest = torch.tensor(slots), torch.tensor(rest, dtype=torch.long)
         self._kernel_scale = torch.tensor(kernel_scale)
 
-    def unroll(self, state: BodyState, targets: DescentTargets, steps: int | None = None) -> Iterator[BodyState]:
+    def unroll(self, state: BodyState, targets: DescentTargets) -> Iterator[BodyState]:
         """The states after each update. Each starts from the last one detached."""
         believed, trust = _believed(targets.information)
-        for step in range(self.network.config.steps if steps is None else steps):
+        for step in range(self.network.config.steps):
             inputs = self._inputs(state, targets, believed, trust)
             state = _moved(state, self.network(inputs, step))
             yield state

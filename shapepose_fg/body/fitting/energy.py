@@ -8,12 +8,12 @@ with S_iᵀ S_i the information of target z_i, rho a robust kernel, p the pose p
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from shapepose_fg.body.fitting.fitter import BodyFit, Rows
 from shapepose_fg.body.fitting.priors import NUM_ANGLES, PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters, accumulate
 from shapepose_fg.body.model.rotation import exp_so3, log_so3, right_jacobian
@@ -25,7 +25,7 @@ VISIBLE_M_PER_RAD = 1e-3
 
 
 @dataclass(frozen=True)
-class WhitenedTargets:
+class WhitenedTargets(Rows):
     """Targets as the energy wants them: torch, one floating point type."""
 
     xyz: Tensor
@@ -33,12 +33,9 @@ class WhitenedTargets:
     root: Tensor
     """(B, K, 3, 3) symmetric square root S_i of the information, 1/m."""
 
-    def __getitem__(self, rows: "Tensor | slice") -> "WhitenedTargets":
-        return WhitenedTargets(self.xyz[rows], self.root[rows])
-
 
 @dataclass(frozen=True)
-class Held:
+class Held(Rows):
     """Around what shape and pose are held."""
 
     betas: Tensor
@@ -59,9 +56,6 @@ class Held:
         """The rows of all, in order; all hold the same."""
         columns = zip(*((part.betas, part.stiffness, part.angles) for part in parts), strict=True)
         return Held(*(None if column[0] is None else torch.cat(column) for column in columns))  # type: ignore[arg-type]
-
-    def __getitem__(self, rows: "Tensor | slice") -> "Held":
-        return Held(self.betas[rows], self.stiffness[rows], None if self.angles is None else self.angles[rows])
 
     def at_shape(self, betas: Tensor, settled: Tensor) -> "Held":
         """The same, but next to immovable at shapes `betas` (B, 10) in the rows that are `settled` (B,)."""
@@ -87,7 +81,7 @@ def _chosen(where: Tensor, new: Tensor, old: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Slope:
+class Slope(Rows):
     """Bodies and the slope of their energy, at 40 % of the cost of a `Linearisation`."""
 
     xyz: Tensor
@@ -110,9 +104,6 @@ class Linearisation(Slope):
 
     hessian: Tensor
     """(B, P, P) half the Gauss-Newton Hessian, robust weights included."""
-
-    def __getitem__(self, rows: Tensor) -> Self:
-        return type(self)(*(value[rows] for value in vars(self).values()))
 
     def replaced(self, where: Tensor, other: Slope) -> "Linearisation":
         """The same, but with the rows `where` (B,) taken from another, if that is a slope all but the Hessian."""
@@ -198,6 +189,12 @@ class BodyEnergy:
         pose[:, self._visible] = angles
         pose[:, self._hidden] = angles @ self._gain.T + self._at_zero
         return BodyParameters(free[:, :10], free[:, 10:13], pose.unflatten(1, (23, 3)), free[:, -3:])
+
+    def parameters(self, fit: BodyFit, origin: np.ndarray) -> Tensor:
+        """Free parameters (B, P) of fitted bodies around their origins (B, 3), double precision."""
+        angles = fit.body_pose.reshape(len(fit), -1)[:, self.angles]
+        parts = (fit.betas, fit.global_orient, angles, fit.transl - origin)
+        return torch.from_numpy(np.concatenate(parts, axis=1))
 
     def retract(self, free: Tensor, step: Tensor) -> Tensor:
         """Move by a step (B, P): the orientation by R exp(step), all else by addition.

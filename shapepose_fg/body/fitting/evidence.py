@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.body.fitting.fitter import STATUS_TYPE, FitStatus, JointTargets
+from shapepose_fg.body.fitting.fitter import STATUS_TYPE, FitStatus, JointTargets, Rows
 
 Array = NDArray[np.float64]
 
@@ -21,7 +21,7 @@ about it."""
 
 
 @dataclass(frozen=True)
-class Evidence:
+class Evidence(Rows):
     """Targets, judged: which rows can be fitted, and their information with the model's error in it."""
 
     status: NDArray[np.str_]
@@ -39,10 +39,6 @@ class Evidence:
     def total_information(self) -> Array:
         """(B,) of all joints of a row, mean over the axes, 1/m²."""
         return np.square(self.root).sum(axis=(1, 2, 3)) / 3
-
-    def rows(self, index: NDArray[np.intp]) -> "Evidence":
-        """The rows `index` (R,)."""
-        return Evidence(*(value[index] for value in vars(self).values()))
 
 
 def weigh(targets: JointTargets, model_sigma_m: float) -> Evidence:

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self, get_args
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
 from annotated_types import Interval
@@ -79,26 +79,30 @@ STATUS_TYPE = np.dtype(f"U{max(map(len, FitStatus))}")
 """Of arrays that hold any `FitStatus`: one made of a shorter text would cut off the others."""
 
 
-class _Rows:
-    """Arrays of one length."""
+class Rows:
+    """Arrays or tensors of one length; None stays None."""
 
     def __len__(self) -> int:
         return len(next(iter(vars(self).values())))
 
-    def rows(self, index: NDArray[np.intp]) -> Self:
+    def rows(self, index: Any) -> Self:
         """The rows `index` (R,)."""
-        return type(self)(**{name: value[index] for name, value in vars(self).items()})
+        return type(self)(*(None if value is None else value[index] for value in vars(self).values()))
 
-    def with_rows(self, index: NDArray[np.intp], other: Self) -> Self:
-        """The same, with the rows `index` (R,) from `other`."""
-        changed = {name: value.copy() for name, value in vars(self).items()}
-        for name, values in changed.items():
+    def put(self, index: Any, other: Self) -> None:
+        """Write the rows of `other` over the rows `index` (R,)."""
+        for name, values in vars(self).items():
             values[index] = vars(other)[name]
-        return type(self)(**changed)
+
+    def with_rows(self, index: Any, other: Self) -> Self:
+        """The same, with the rows `index` (R,) from `other`."""
+        changed = type(self)(*(value.copy() for value in vars(self).values()))
+        changed.put(index, other)
+        return changed
 
 
 @dataclass(frozen=True)
-class JointTargets(_Rows):
+class JointTargets(Rows):
     """Where the joints of B people (rows: people, frames or both) should be, and how surely."""
 
     xyz: NDArray[np.float64]
@@ -120,7 +124,7 @@ class JointTargets(_Rows):
 
 
 @dataclass(frozen=True)
-class BodyFit(_Rows):
+class BodyFit(Rows):
     """The bodies of B rows.
 
     A row whose status is not OK has NaN joints and covariances and zero parameters: parameters are never NaN.
@@ -160,7 +164,7 @@ class BodyFit(_Rows):
         columns = [np.zeros((B, *shape)) for shape in zeros] + [np.full((B, *shape), np.nan) for shape in unknown]
         return cls(*columns, status=np.asarray(status).astype(STATUS_TYPE))
 
-    def put(self, index: NDArray[np.intp], body: "BodyParameters", origin: NDArray[np.float64]) -> None:
+    def put_bodies(self, index: NDArray[np.intp], body: "BodyParameters", origin: NDArray[np.float64]) -> None:
         """Write bodies (R) that were found around `origin` (R, 3), metres, over the rows `index` (R,)."""
         for name in ("betas", "global_orient", "body_pose"):
             getattr(self, name)[index] = getattr(body, name).double().numpy()

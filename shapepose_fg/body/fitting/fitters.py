@@ -178,7 +178,7 @@ class SmplFitter(BodyFitter):
                     body, _ = self.optimiser.first(targets, variance, _part(start, chunk))
                 else:
                     rows = torch.from_numpy(chunk)
-                    body = self.optimiser.again(shaped[0][rows], targets, shaped[1][rows])
+                    body = self.optimiser.again(shaped[0][rows], targets, shaped[1].rows(rows))
                 found.append(JointPosterior.of(body, passes.asked(chunk)))
             part = JointPosterior.concatenated(found)
             # Each pass by itself: what a target does to another pass must not decide which optimiser this one has.
@@ -202,7 +202,7 @@ class SmplFitter(BodyFitter):
             voting = np.flatnonzero(passes.votes[chunk])
             if len(voting) > 0:
                 rows = torch.from_numpy(voting)
-                body = self.optimiser.again(free[rows], targets[rows], held[rows])
+                body = self.optimiser.again(free[rows], targets.rows(rows), held.rows(rows))
                 free[rows] = body.free
                 places.append(chunk[voting])
                 precisions.append(shape_precision(body.factor))
@@ -227,7 +227,9 @@ class SmplFitter(BodyFitter):
         done &= np.isfinite(prior_xyz).all(axis=(1, 2)) & np.isfinite(prior_covariance).all(axis=(1, 2, 3))
         fit.status[rows[~done]] = FitStatus.NOT_CONVERGED
         rows, origin = rows[done], evidence.centre[done]
-        fit.put(rows, self.energy.complete(torch.from_numpy(found.free[done]).to(self.energy.dtype)), origin)
+        fit.put_bodies(
+            rows, self.energy.complete(torch.from_numpy(found.free[done]).to(self.energy.dtype)), origin
+        )
         fit.joints[rows] = found.xyz[done] + origin[:, None]
         fit.covariance[rows] = np.where(unseen, wider * found.covariance, found.covariance)[done]
         fit.prior_xyz[rows] = prior_xyz[done] + origin[:, None]
@@ -240,26 +242,23 @@ class SmplFitter(BodyFitter):
         Returns their parameters (R, P) around `evidence.centre`, around which angles (R, A) they are held (None:
         those that the prior expects), and which (R,) are finished.
         """
-        passes, parts = Passes.whole(evidence, np.arange(len(evidence.xyz))), []
-        for chunk in passes.chunks(_CHUNK)[0]:
-            body, held = self.optimiser.first(*passes.given(chunk), None)
-            parts.append((body.free, body.left < self._unfinished, held.angles))
-        free, done, angles = (
-            None if column[0] is None else torch.cat(column) for column in zip(*parts, strict=True)
-        )
-        unsettled = np.flatnonzero(~done.numpy())
+        passes = Passes.whole(evidence, np.arange(len(evidence.xyz)))
+        found = [self.optimiser.first(*passes.given(chunk), None) for chunk in passes.chunks(_CHUNK)[0]]
+        free, held = torch.cat([body.free for body, _ in found]), Held.concatenated([held for _, held in found])
+        done = torch.cat([body.left < self._unfinished for body, _ in found]).numpy()
+        unsettled = np.flatnonzero(~done)
         if self._fallback is not None and len(unsettled) > 0:
             body, _ = self._fallback.first(*passes.given(unsettled), None)
-            free[unsettled], done[unsettled] = body.free, body.left < self._unfinished
-            angles[unsettled] = body.free[:, 13:-3]
-        return free, angles, done.numpy()
+            free[unsettled], done[unsettled] = body.free, (body.left < self._unfinished).numpy()
+            if held.angles is not None:
+                held.angles[unsettled] = body.free[:, 13:-3]
+        return free, held.angles, done
 
     def _start(self, initial: BodyFit, centre: Array) -> Tensor:
         """Free parameters (R, P) of bodies around their origins (R, 3); NaN where there is none."""
-        angles = initial.body_pose.reshape(len(initial), -1)[:, self.energy.angles]
-        parts = (initial.betas, initial.global_orient, angles, initial.transl - centre)
-        start = np.where(initial.ok[:, None], np.concatenate(parts, axis=1), np.nan)
-        return torch.from_numpy(start).float()
+        start = self.energy.parameters(initial, centre).float()
+        start[torch.from_numpy(~initial.ok)] = torch.nan
+        return start
 
 
 def evenly(groups: NDArray[np.intp], count: int) -> NDArray[np.bool_]:

@@ -122,7 +122,7 @@ class NetworkDescent:
             change = (robust_weight(body.here.squared, scale) - before).abs().amax(1)
             stale = torch.nonzero(change > STALE)[:, 0]
             if len(stale) > 0:
-                body.put(stale, energy.evaluate(body.free[stale], targets[stale], scale, held[stale]))
+                body.put(stale, energy.evaluate(body.free[stale], targets.rows(stale), scale, held.rows(stale)))
         return body
 
 
@@ -184,7 +184,7 @@ class LevenbergMarquardt:
                 continue
             result[rows[~going]] = free[~going]
             rows, free, damping, widening = rows[going], free[going], damping[going], widening[going]
-            here, targets, held = here[going], targets[going], held[going]
+            here, targets, held = here.rows(going), targets.rows(going), held.rows(going)
             if len(rows) == 0:
                 break
         result[rows] = free

@@ -1,6 +1,6 @@
 """What fits say: of joints, given all targets and without each joint's own; and of shapes, rows put together."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from shapepose_fg.body.fitting.energy import Evaluated, Held, factored
+from shapepose_fg.body.fitting.fitter import Rows
 from shapepose_fg.body.fitting.left_out import Passes
 
 Array = NDArray[np.float64]
@@ -19,7 +20,7 @@ Chosen so that hidden wrists, arms and legs of held-out motions lie where their 
 
 
 @dataclass(frozen=True)
-class JointPosterior:
+class JointPosterior(Rows):
     """What B passes say of their joints."""
 
     free: Array
@@ -48,12 +49,7 @@ class JointPosterior:
     @classmethod
     def concatenated(cls, parts: "list[JointPosterior]") -> "JointPosterior":
         """The rows of all, in order."""
-        return cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))
-
-    def put(self, index: NDArray[np.intp], other: "JointPosterior") -> None:
-        """Write the rows of `other` over the rows `index`."""
-        for field in fields(self):
-            getattr(self, field.name)[index] = getattr(other, field.name)
+        return cls(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
 
 
 def joint_covariance(factor: Tensor, jacobian: Tensor) -> Tensor:

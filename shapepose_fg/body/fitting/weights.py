@@ -13,7 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from shapepose_fg.body.fitting.network import NetworkConfig, UpdateNetwork
+from shapepose_fg.body.fitting.descent import NetworkConfig, UpdateNetwork
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, slots
@@ -22,8 +22,9 @@ from shapepose_fg.core.storage.files import open_regular
 
 _DEFAULT = Path(__file__).parents[1] / "data" / "fitter.safetensors"
 _FORMAT = "shapepose-fg fitter 1"
-_KINDS = ("F32", "F64", "I64")
-"""Of numbers, as safetensors calls them: weights, and what a checkpoint counts."""
+_KINDS = ("F32", "F64")
+"""Of numbers, as safetensors calls them."""
+_CURE = "train or fetch it again"
 _FRAME, _SPREAD = "frame.", "spread"
 
 
@@ -47,9 +48,10 @@ class FitterWeights:
             raise ValueError(f"spread must be ({len(BODY_POINTS)},), got {tuple(self.spread.shape)}")
 
     @staticmethod
+    @cache
     def default() -> "FitterWeights":
         """The weights that ship with the package (read once)."""
-        return _load_default()
+        return FitterWeights.load(_DEFAULT)
 
     def spread_of(self, names: tuple[str, ...]) -> NDArray[np.float64]:
         """(J,) `spread` of the keypoints with these names."""
@@ -58,7 +60,7 @@ class FitterWeights:
     @classmethod
     def load(cls, path: Path) -> "FitterWeights":
         """Read a safetensors file; InputError naming it where it cannot be used."""
-        about, tensors = read_tensors(path, "train or fetch it again")
+        about, tensors = _read_tensors(path)
         if about.get("format") != _FORMAT:
             raise InputError(f"{path}: not weights of the learned fitter; make them with scripts/train_fitter.py")
         if not all(bool(torch.isfinite(tensor).all()) for tensor in tensors.values()):
@@ -73,10 +75,8 @@ class FitterWeights:
             network.requires_grad_(False)
             return cls(network.eval(), frame, about["body"], spread, json.loads(about["card"]))
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
-            why = str(error).splitlines()[0]
-            raise InputError(
-                f"{path}: weights of another version of the fitter ({why}); train them anew"
-            ) from error
+            why = f"weights of another version of the fitter ({str(error).splitlines()[0]}); train them anew"
+            raise InputError(f"{path}: {why}") from error
 
     def save(self, path: Path) -> None:
         """Write a safetensors file."""
@@ -101,20 +101,18 @@ class FitterWeights:
             )
 
 
-def read_tensors(path: Path, cure: str) -> tuple[dict[str, str], dict[str, Tensor]]:
-    """Texts and tensors of a safetensors file; InputError with the `cure` where it cannot be read."""
+def _read_tensors(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
+    """Texts and tensors of a safetensors file; InputError where it cannot be read."""
     try:
-        with open_regular(path, cure), safe_open(path, framework="pt") as file:
+        with open_regular(path, _CURE), safe_open(path, framework="pt") as file:
             names = list(file.keys())
             for name in names:
                 kind = file.get_slice(name).get_dtype()
                 if kind not in _KINDS:
-                    raise InputError(f"{path}: {name} holds {kind}, not numbers of {' '.join(_KINDS)}; {cure}")
+                    raise InputError(f"{path}: {name} holds {kind}, not numbers of {' '.join(_KINDS)}; {_CURE}")
             return file.metadata() or {}, {name: file.get_tensor(name) for name in names}
-    except InputError:
-        raise
     except (OSError, SafetensorError) as error:
-        raise InputError(f"{path}: not readable as safetensors ({error}); {cure}") from error
+        raise InputError(f"{path}: not readable as safetensors ({error}); {_CURE}") from error
 
 
 def fingerprint(model: BodyModel) -> str:
@@ -123,8 +121,3 @@ def fingerprint(model: BodyModel) -> str:
     for array in (model.arrays.template, model.arrays.shapes, model.arrays.joint_regressor):
         digest.update(np.ascontiguousarray(array, dtype=np.float32).tobytes())
     return digest.hexdigest()
-
-
-@cache
-def _load_default() -> FitterWeights:
-    return FitterWeights.load(_DEFAULT)

@@ -5,6 +5,7 @@ blend shapes (where the file has any), linear blend skinning.
 The model's own frame: metres, y up, facing +z, T-pose.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
 from pathlib import Path
@@ -103,10 +104,11 @@ class BodyModel:
         self._joints = self.points.part(list(slots(SMPL_24)))
         self._last_part: tuple[bytes, _Mesh] | None = None
 
-    @classmethod
-    def default(cls) -> "BodyModel":
+    @staticmethod
+    @cache
+    def default() -> "BodyModel":
         """The open body that ships with the package, float32; read once."""
-        return _default_model()
+        return BodyModel.load(_DEFAULT_FILE)
 
     @classmethod
     def load(cls, path: str | Path, *, keypoint_regressor: NDArray[np.floating] | None = None) -> "BodyModel":
@@ -278,53 +280,49 @@ class _Mesh:
         )
 
 
-@cache
-def _default_model() -> BodyModel:
-    return BodyModel.load(_DEFAULT_FILE)
-
-
-def _tree_levels() -> tuple[list[tuple[list[int], list[int]]], list[int]]:
-    """Joints level by level with their parents' places in the level above, and the way back to SMPL's order."""
-    level, order, levels = [0], [0], []
+def _tree_levels() -> Iterator[tuple[Tensor, Tensor]]:
+    """Joints level by level below the root, and their parents' places in the level above."""
+    level = [0]
     while children := [j for j in range(1, len(SMPL_PARENTS)) if SMPL_PARENTS[j] in level]:
-        levels.append((children, [level.index(SMPL_PARENTS[j]) for j in children]))
-        level, order = children, order + children
-    return levels, [order.index(j) for j in range(len(SMPL_PARENTS))]
+        yield torch.tensor(children), torch.tensor([level.index(SMPL_PARENTS[j]) for j in children])
+        level = children
 
 
-_TREE_LEVELS, _FROM_LEVEL_ORDER = _tree_levels()
-_LEVEL_INDICES = [(torch.tensor(joints), torch.tensor(parents)) for joints, parents in _TREE_LEVELS]
-_FROM_LEVEL_INDEX = torch.tensor(_FROM_LEVEL_ORDER)
+_LEVELS = list(_tree_levels())
+_FROM_LEVEL_ORDER = torch.cat((torch.zeros(1, dtype=torch.long), *(joints for joints, _ in _LEVELS))).argsort()
 
 
 def accumulate(local: Tensor) -> Tensor:
     """World rotations of SMPL's bones from those relative to their parents; (B, 24, 3, 3) both."""
     levels = [local[:, :1]]
-    for joints, parents_in_level in _LEVEL_INDICES:  # tensors: lists would be converted each time
+    for joints, parents_in_level in _LEVELS:  # tensors: lists would be converted each time
         levels.append(levels[-1].index_select(1, parents_in_level) @ local.index_select(1, joints))
-    return torch.cat(levels, 1).index_select(1, _FROM_LEVEL_INDEX)
-
-
-def _rest_joints(arrays: SmplArrays) -> NDArray[np.float64]:
-    """(24, 3, 11) rest positions of the joints: mean shape, then per unit of each beta."""
-    components = np.concatenate((arrays.template[..., None], arrays.shapes), -1)
-    return np.einsum("jv,vxn->jxn", arrays.joint_regressor, components, optimize=True)
-
-
-def _keypoint_points(arrays: SmplArrays) -> SkinnedPoints:
-    """The contraction of the keypoint regressor."""
-    touched = np.flatnonzero(np.any(arrays.keypoint_regressor != 0, axis=0))
-    regressor, weights = arrays.keypoint_regressor[:, touched], arrays.weights[touched]
-    components = [arrays.template[touched, :, None], arrays.shapes[touched]]
-    components += [] if arrays.pose_blend is None else [arrays.pose_blend[touched]]
-    moments = np.einsum("kv,vj,vxn->kjxn", regressor, weights, np.concatenate(components, -1), optimize=True)
-    return contract(moments, regressor @ weights, _rest_joints(arrays), SMPL_PARENTS, regressor.sum(1),
-                    arrays.pose_blend is not None)  # fmt: skip
+    return torch.cat(levels, 1).index_select(1, _FROM_LEVEL_ORDER)
 
 
 def _contract(arrays: SmplArrays) -> SkinnedPoints:
     """All `BODY_POINTS` of a mesh, float64, where the body itself has them."""
-    return _keypoint_points(arrays).joined(_head_top(arrays)).joined(_joint_points(arrays))
+    components = np.concatenate((arrays.template[..., None], arrays.shapes), -1)
+    joints = np.einsum("jv,vxn->jxn", arrays.joint_regressor, components, optimize=True)  # at rest, (24, 3, 11)
+    top = np.zeros((1, len(arrays.template)))  # of the head: the highest vertex of the T-pose
+    top[0, np.argmax(arrays.template[:, 1])] = 1
+    keypoints, head = (_regressed(arrays, each, joints) for each in (arrays.keypoint_regressor, top))
+    # Joint j rides on bone j at the joint's own rest position.
+    eye = np.eye(len(SMPL_PARENTS))
+    moments = eye[:, :, None, None] * joints[:, None]
+    own = contract(moments, eye, joints, SMPL_PARENTS, np.ones(len(eye)), has_pose_blend=False)
+    return keypoints.joined(head).joined(own)
+
+
+def _regressed(arrays: SmplArrays, regressor: NDArray[np.float64], joints: NDArray[np.float64]) -> SkinnedPoints:
+    """The contraction of a regressor (K, Nv)."""
+    touched = np.flatnonzero(np.any(regressor != 0, axis=0))
+    regressor, weights = regressor[:, touched], arrays.weights[touched]
+    components = [arrays.template[touched, :, None], arrays.shapes[touched]]
+    components += [] if arrays.pose_blend is None else [arrays.pose_blend[touched]]
+    moments = np.einsum("kv,vj,vxn->kjxn", regressor, weights, np.concatenate(components, -1), optimize=True)
+    shares, total = regressor @ weights, regressor.sum(1)
+    return contract(moments, shares, joints, SMPL_PARENTS, total, arrays.pose_blend is not None)
 
 
 def _moved(points: SkinnedPoints, offsets: KeypointOffsets) -> SkinnedPoints:
@@ -332,17 +330,3 @@ def _moved(points: SkinnedPoints, offsets: KeypointOffsets) -> SkinnedPoints:
     moved = points.offsets.clone()
     moved[torch.arange(len(offsets.bones)), :, torch.from_numpy(offsets.bones)] += torch.from_numpy(offsets.xyz_m)
     return replace(points, offsets=moved)
-
-
-def _head_top(arrays: SmplArrays) -> SkinnedPoints:
-    """The top of the head: the highest vertex of the T-pose."""
-    top = np.zeros((1, len(arrays.template)))
-    top[0, np.argmax(arrays.template[:, 1])] = 1
-    return _keypoint_points(replace(arrays, keypoint_regressor=top))
-
-
-def _joint_points(arrays: SmplArrays) -> SkinnedPoints:
-    """The joints as points: joint j rides on bone j at the joint's own rest position."""
-    joints, eye = _rest_joints(arrays), np.eye(len(SMPL_PARENTS))
-    moments = eye[:, :, None, None] * joints[:, None]
-    return contract(moments, eye, joints, SMPL_PARENTS, np.ones(len(eye)), has_pose_blend=False)

@@ -62,10 +62,8 @@ class KeypointOffsets:
     """(25,) index in `SMPL_24` of the bone that each joint rides on."""
 
     def __post_init__(self) -> None:
-        kinds = {"xyz_m": (np.float64, (25, 3)), "sigma_m": (np.float64, (25,))}
-        kinds |= {"count": (np.intp, (25,)), "bones": (np.intp, (25,))}
-        for name, (kind, shape) in kinds.items():
-            value = np.asarray(getattr(self, name))
+        for name, kind in {"xyz_m": float, "sigma_m": float, "count": np.intp, "bones": np.intp}.items():
+            value, shape = np.asarray(getattr(self, name)), (25, 3) if name == "xyz_m" else (25,)
             if value.shape != shape:
                 raise ValueError(f"{name} must be {shape}, got {value.shape}")
             if not np.isfinite(value).all():

@@ -1,4 +1,4 @@
-"""Rotations in torch: axis-angle to matrix and back, and the Jacobians between them.
+"""Rotations in torch: axis-angle to matrix and back, and the Jacobians between them; inverses of 3x3 matrices.
 
 Everything takes leading batch dimensions, is exact at angle 0 (no epsilon) and differentiable.
 The tangent convention of the whole package is the right one: `R exp(delta)`.
@@ -112,3 +112,14 @@ def from_six_d(columns: Tensor) -> Tensor:
     across = second - (x * second).sum(-1, keepdim=True) * x
     y = across / torch.linalg.vector_norm(across, dim=-1, keepdim=True)
     return torch.stack((x, y, torch.linalg.cross(x, y)), -1)
+
+
+def inverse_3x3(matrix: Tensor) -> Tensor:
+    """Inverses (..., 3, 3) by cross products of the rows; a singular matrix gives infinities, not an error.
+
+    LAPACK would go through a batch one by one.
+    """
+    a, b, c = matrix.unbind(-2)
+    columns = torch.stack((torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)), -1)
+    determinant = (a * columns[..., 0]).sum(-1)
+    return columns / determinant[..., None, None]

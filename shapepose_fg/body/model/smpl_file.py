@@ -1,16 +1,16 @@
-"""Reads a body model in SMPL's file format, `.npz` or the official `.pkl`, and checks all of it."""
+"""Reads a body model in SMPL's file format, `.npz` or the official `.pkl`, and checks that it is a person's."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.body.model.plausible_body import implausible
 from shapepose_fg.body.model.smpl_pickle import RefusedPickle, as_array, read_smpl_pickle
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 from shapepose_fg.core.storage.npz import read_npz
 
 NUM_BETAS = 10
@@ -29,6 +29,21 @@ _SMPL_JOINT_KEYPOINTS = {
     "RHip": 2, "RKnee": 5, "RAnkle": 8, "LHip": 1, "LKnee": 4, "LAnkle": 7,
 }  # fmt: skip
 """SMPL joints that stand for keypoints."""
+_HEIGHT_M = (0.4, 3.0)
+"""From a newborn to more than any adult: a template in centimetres or millimetres is far outside."""
+_SUM_TOLERANCE = 0.02
+"""Regressors are weighted means, printed with a few digits."""
+_BELONGS = {
+    "RShoulder": "right_shoulder", "RElbow": "right_elbow", "RWrist": "right_wrist",
+    "LShoulder": "left_shoulder", "LElbow": "left_elbow", "LWrist": "left_wrist",
+    "RHip": "right_hip", "RKnee": "right_knee", "RAnkle": "right_ankle",
+    "LHip": "left_hip", "LKnee": "left_knee", "LAnkle": "left_ankle",
+}  # fmt: skip
+"""SMPL joints that keypoints lie at."""
+_FARTHEST = 0.15
+"""How far they may be from these, as a part of the body's height."""
+_RISING = ("ankle", "knee", "hip", "shoulder")
+"""Joints from below to above in the T-pose."""
 
 
 @dataclass(frozen=True)
@@ -58,10 +73,8 @@ def read_smpl_file(path: Path, keypoint_regressor: NDArray[np.floating] | None =
     count = len(template)
     entries.check_tree()
     joint_regressor = entries.floats("J_regressor", (24, count))
-    if keypoint_regressor is not None:
-        keypoints = entries.checked("keypoint_regressor", keypoint_regressor, (_NUM_KEYPOINTS, count))
-    elif _KEYPOINTS in entries:
-        keypoints = entries.floats(_KEYPOINTS, (_NUM_KEYPOINTS, count))
+    if keypoint_regressor is not None or _KEYPOINTS in entries.content:
+        keypoints = entries.floats(_KEYPOINTS, (_NUM_KEYPOINTS, count), keypoint_regressor)
     elif count == _SMPL_NUM_VERTICES:
         keypoints = _smpl_keypoint_regressor(joint_regressor)
     else:
@@ -69,7 +82,7 @@ def read_smpl_file(path: Path, keypoint_regressor: NDArray[np.floating] | None =
             f"{path}: no keypoint_regressor, and with {count} vertices this is not SMPL's own mesh: add the key, "
             f"or pass keypoint_regressor= ({_NUM_KEYPOINTS}, {count}), the weights that make BODY_25 from vertices"
         )
-    problem = implausible(template, joint_regressor, keypoints)
+    problem = _implausible(template, joint_regressor, keypoints)
     if problem is not None:
         raise InputError(f"{path}: {problem}")
     return SmplArrays(
@@ -109,9 +122,6 @@ class _Entries:
     def __init__(self, path: Path, content: dict[str, Any]):
         self.path, self.content = path, content
 
-    def __contains__(self, name: str) -> bool:
-        return name in self.content
-
     def array(self, name: str) -> NDArray[Any]:
         """The array called `name`."""
         if name not in self.content:
@@ -122,13 +132,9 @@ class _Entries:
         except Exception as error:  # records of a damaged pickle can hold anything
             raise InputError(f"{self.path}: {name} is not an array ({error}): fetch the file again") from error
 
-    def floats(self, name: str, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
-        """The float64 array called `name`, of that shape and finite."""
-        return self.checked(name, self.array(name), shape)
-
-    def checked(self, name: str, value: Any, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
-        """`value` as a finite float64 array of that shape; None stands for any length but 0."""
-        value = np.asarray(value)
+    def floats(self, name: str, shape: tuple[int | None, ...], value: Any = None) -> NDArray[np.float64]:
+        """The array called `name`, or a `value` for it, finite and of that shape; None is any length but 0."""
+        value = self.array(name) if value is None else np.asarray(value)
         fits = value.ndim == len(shape) and all(
             n == m if n is not None else m > 0 for n, m in zip(shape, value.shape, strict=True)
         )
@@ -150,11 +156,11 @@ class _Entries:
                 f"{self.path}: shapedirs must be ({count}, 3, {NUM_BETAS} or more), got {shapes.shape}: "
                 f"use the file with {NUM_BETAS} shape components"
             )
-        return self.checked("shapedirs", shapes[..., :NUM_BETAS], (count, 3, NUM_BETAS))
+        return self.floats("shapedirs", (count, 3, NUM_BETAS), shapes[..., :NUM_BETAS])
 
     def pose_blend(self, count: int) -> NDArray[np.float64] | None:
         """The pose blend shapes, or None for a model without."""
-        if "posedirs" not in self or not np.any(self.array("posedirs")):
+        if "posedirs" not in self.content or not np.any(self.array("posedirs")):
             return None
         return self.floats("posedirs", (count, 3, 207))
 
@@ -204,3 +210,41 @@ def _smpl_keypoint_regressor(joint_regressor: NDArray[np.float64]) -> NDArray[np
     for middle, sides in {"Neck": ("RShoulder", "LShoulder"), "MidHip": ("RHip", "LHip")}.items():
         regressor[BODY_25.index(middle)] = regressor[[BODY_25.index(side) for side in sides]].mean(0)
     return regressor
+
+
+def _implausible(
+    template: NDArray[np.float64], joint_regressor: NDArray[np.float64], keypoint_regressor: NDArray[np.float64]
+) -> str | None:
+    """What is wrong, as the end of a sentence that names the array; None where it may be a person.
+
+    `template` (Nv, 3) in T-pose, y up, facing +z; regressors (24, Nv) and (25, Nv).
+    """
+    height = float(np.ptp(template[:, 1]))
+    if not _HEIGHT_M[0] <= height <= _HEIGHT_M[1]:
+        return f"v_template is {height:.4g} high along y: give it in metres, y up"
+    for name, regressor in (("J_regressor", joint_regressor), ("keypoint_regressor", keypoint_regressor)):
+        off = np.abs(regressor.sum(axis=1) - 1).max()
+        if off > _SUM_TOLERANCE:
+            return (
+                f"{name} has rows that do not sum to 1 (off by {off:.2g}): use the file of one and the same model"
+            )
+    joints: dict[str, NDArray[np.float64]] = dict(zip(SMPL_24, joint_regressor @ template, strict=True))
+    keypoints: dict[str, NDArray[np.float64]] = dict(
+        zip(BODY_25.joints, keypoint_regressor @ template, strict=True)
+    )
+    for part in (*_RISING, "elbow", "wrist"):
+        if not joints[f"left_{part}"][0] > joints[f"right_{part}"][0]:
+            return f"J_regressor puts left_{part} to the right of right_{part}: the body's left is +x"
+    for side in ("left", "right"):
+        for low, high in pairwise(_RISING):
+            if not joints[f"{side}_{low}"][1] < joints[f"{side}_{high}"][1]:
+                return (
+                    f"J_regressor puts {side}_{low} above {side}_{high}: rows are SMPL's joints in order, y is up"
+                )
+    for name, joint in _BELONGS.items():
+        distance = float(np.linalg.norm(keypoints[name] - joints[joint]))
+        side, part = joint.split("_")
+        mirrored = joints[f"{'right' if side == 'left' else 'left'}_{part}"]
+        if distance > _FARTHEST * height or distance > np.linalg.norm(keypoints[name] - mirrored):
+            return f"keypoint_regressor puts {name} {distance:.2g} m from {joint}: rows are BODY_25 in order"
+    return None

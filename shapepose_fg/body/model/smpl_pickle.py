@@ -97,6 +97,10 @@ class _Reader(pickle._Unpickler):  # type: ignore[name-defined]
     """Python's machine, on a short leash; text of Python 2 is read as Latin-1."""
 
     dispatch: ClassVar[_Instructions]
+    stack: list[Any]
+    append: Callable[[Any], None]
+    read: Callable[[int], bytes]
+    pop_mark: Callable[[], list[Any]]
 
     def __init__(self, content: bytes):
         super().__init__(io.BytesIO(content), encoding="latin1")

@@ -76,49 +76,35 @@ def learn_offsets(
         if not fit.ok.any():
             break
         energy = BodyEnergy(model.to(torch.float64), wide)
-        sums = _summed(energy, fit, weigh(targets, config.model_sigma_m), config.kernel_scale)
-        model = model.with_keypoint_offsets(_solve(sums, model.keypoint_offsets, precision, prior))
+        evidence = weigh(targets, config.model_sigma_m)
+        model = model.with_keypoint_offsets(_solved(energy, fit, evidence, config.kernel_scale, precision))
     return model.keypoint_offsets
 
 
-@dataclass(frozen=True)
-class _Sums:
-    """What the rows together say of offsets and mean (75 + P), bodies eliminated."""
-
-    hessian: Array
-    """(75 + P, 75 + P)."""
-    gradient: Array
-    """(75 + P,)."""
-    prior: Array
-    """(P, P) Hessian of one row's prior of shape and pose, the mean over the rows."""
-    count: Array
-    """(25,) rows in which each joint took part."""
-
-
-def _summed(energy: BodyEnergy, fit: BodyFit, evidence: Evidence, kernel_scale: float) -> _Sums:
-    """The sums over the rows that have a body."""
-    rows = np.flatnonzero(fit.ok)
-    size = 75 + energy.num_free
+def _solved(
+    energy: BodyEnergy,
+    fit: BodyFit,
+    evidence: Evidence,
+    kernel_scale: float,
+    precision: Array,
+) -> KeypointOffsets:
+    """One Newton step in offsets and mean; the mean starts from zero, which is where the bodies were fitted."""
+    rows, size = np.flatnonzero(fit.ok), 75 + energy.num_free
     hessian, gradient, prior = np.zeros((size, size)), np.zeros(size), np.zeros((size - 75, size - 75))
     for start in range(0, len(rows), _CHUNK):
         part = rows[start : start + _CHUNK]
         centred = evidence.xyz[part] - evidence.centre[part, None]
         seen = WhitenedTargets(torch.from_numpy(centred), torch.from_numpy(evidence.root[part]))
-        here = _eliminate(energy, _free(energy, fit.rows(part), evidence.centre[part]), seen, kernel_scale)
+        here = _eliminate(energy, energy.parameters(fit.rows(part), evidence.centre[part]), seen, kernel_scale)
         hessian, gradient, prior = hessian + here[0], gradient + here[1], prior + here[2] / len(rows)
     count = (np.abs(evidence.root[rows]).max(axis=(-1, -2)) > 0).sum(axis=0)
-    return _Sums(hessian, gradient, prior, count)
-
-
-def _solve(sums: _Sums, offsets: KeypointOffsets, precision: Array, prior: OffsetPrior) -> KeypointOffsets:
-    """One Newton step in offsets and mean; the mean starts from zero, which is where the bodies were fitted."""
-    current = offsets.xyz_m.ravel()
-    hessian, gradient = sums.hessian / _ROWS_PER_DRAW, sums.gradient / _ROWS_PER_DRAW
+    current = energy.model.keypoint_offsets.xyz_m.ravel()
+    hessian, gradient = hessian / _ROWS_PER_DRAW, gradient / _ROWS_PER_DRAW
     hessian[:75, :75] += precision
     gradient[:75] += precision @ current
     # The root's place and turn have no prior, and no say in the sums either: any small number holds them at zero.
-    hessian[75:, 75:] += sums.prior + 1e-9 * np.eye(len(sums.prior))
-    return _made(current - np.linalg.solve(hessian, gradient)[:75], hessian, sums.count)
+    hessian[75:, 75:] += prior + 1e-9 * np.eye(len(prior))
+    return _made(current - np.linalg.solve(hessian, gradient)[:75], hessian, count)
 
 
 def _made(xyz_m: Array, precision: Array, count: Array) -> KeypointOffsets:
@@ -128,12 +114,6 @@ def _made(xyz_m: Array, precision: Array, count: Array) -> KeypointOffsets:
     length = np.linalg.norm(xyz, axis=1, keepdims=True)
     inside = xyz * np.minimum(1.0, 0.999 * LARGEST_M / np.maximum(length, 1e-9))
     return KeypointOffsets(inside, np.sqrt(variance), count.astype(np.intp), RIDES_ON)
-
-
-def _free(energy: BodyEnergy, fit: BodyFit, centre: Array) -> Tensor:
-    """Free parameters (R, P) of fitted bodies, with `centre` (R, 3) as origin."""
-    angles = fit.body_pose.reshape(len(fit), -1)[:, energy.angles]
-    return torch.from_numpy(np.concatenate([fit.betas, fit.global_orient, angles, fit.transl - centre], axis=1))
 
 
 def _eliminate(

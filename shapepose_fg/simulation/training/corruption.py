@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from shapepose_fg.body.model.small_matrices import inverse_3x3
+from shapepose_fg.body.model.rotation import inverse_3x3
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, MIRROR
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.simulation.detector_statistics import JOINT_GROUP, DetectorStatistics, measured

@@ -13,8 +13,7 @@ from shapepose_fg.body.model.target_skeletons import BODY_POINTS, MIRROR
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.core.storage.npz import read_npz
-from shapepose_fg.simulation.mocap import Clip, Mocap
-from shapepose_fg.simulation.shoulder import shoulder_rhythm
+from shapepose_fg.simulation.mocap import Clip, Mocap, shoulder_rhythm
 
 Split = Literal["train", "validation", "test"]
 
@@ -161,17 +160,13 @@ def frame_weights(
     return total / length
 
 
-def _walks(action: str) -> bool:
-    return "walk" in action.lower()
-
-
 def _of_clip(clip: Clip) -> _Recording:
     rotations = shoulder_rhythm(clip.rotations)
     vectors = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_rotvec().reshape(-1, 24, 3)
     for joints, recorded in ((_HANDS, False), (_WRISTS, clip.wrist_valid), (_TOES, clip.toe_valid)):
         if not recorded:
             vectors[:, list(joints)] = 0.0
-    return clip.subject, _walks(clip.action), vectors.astype(np.float32)
+    return clip.subject, "walk" in clip.action.lower(), vectors.astype(np.float32)
 
 
 def _read_amass(path: Path) -> _Recording:
@@ -181,7 +176,7 @@ def _read_amass(path: Path) -> _Recording:
     kept = np.zeros((len(poses[::step]), 24, 3))
     kept[:, :22] = poses[::step, :_BODY_COLUMNS].reshape(-1, 22, 3)
     kept[:, 0] = (_Y_UP * Rotation.from_rotvec(kept[:, 0])).as_rotvec()
-    return path.parent.name, _walks(path.stem), kept.astype(np.float32)
+    return path.parent.name, "walk" in path.stem.lower(), kept.astype(np.float32)
 
 
 def _amass_arrays(path: Path) -> tuple[NDArray[np.float64], float]:

@@ -9,15 +9,20 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 from torch import Tensor
 
-from shapepose_fg.body.fitting.descent import BodyState, DescentTargets, LearnedDescent
+from shapepose_fg.body.fitting.descent import (
+    NUM_ROTATIONS,
+    BodyState,
+    DescentTargets,
+    LearnedDescent,
+    NetworkConfig,
+    UpdateNetwork,
+)
 from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.body.fitting.fitters import SmplFitter
-from shapepose_fg.body.fitting.network import NUM_ROTATIONS, NetworkConfig, UpdateNetwork
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.weights import FitterWeights
 from shapepose_fg.body.model.body_model import BodyModel, accumulate
-from shapepose_fg.body.model.rotation import exp_so3
-from shapepose_fg.body.model.small_matrices import inverse_3x3
+from shapepose_fg.body.model.rotation import exp_so3, inverse_3x3
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, MIRROR, TARGET_SKELETONS, slots
 from shapepose_fg.simulation.training.corruption import CorruptionConfig, corrupt
 from shapepose_fg.simulation.training.motions import MIRROR_JOINTS, Motions
@@ -116,15 +121,9 @@ def body_points(model: BodyModel, state: BodyState) -> Tensor:
     return points.positions(accumulate(state.local), state.betas, state.transl, points.feature(state.local))
 
 
-def _chain(joints: tuple[int, ...]) -> Tensor:
-    chain = torch.zeros(24, dtype=torch.bool)
-    chain[list(joints)] = True
-    return chain
-
-
-_CHAINS = torch.stack(
-    [_chain((13, 16, 18, 20)), _chain((14, 17, 19, 21)), _chain((1, 4, 7, 10)), _chain((2, 5, 8, 11))]
-)
+_CHAINS = torch.zeros(4, 24, dtype=torch.bool)
+for _row, _joints in enumerate(((13, 16, 18, 20), (14, 17, 19, 21), (1, 4, 7, 10), (2, 5, 8, 11))):
+    _CHAINS[_row, list(_joints)] = True
 """(4, 24) arms and legs."""
 
 
@@ -217,6 +216,24 @@ _SEEN_M = 0.2
 _OFFERED = torch.zeros(len(TARGET_SKELETONS), len(BODY_POINTS))
 for _row, _names in enumerate(TARGET_SKELETONS.values()):
     _OFFERED[_row, list(slots(_names))] = 1
+
+
+class Validation:
+    """How far a network is from people who are the same each time."""
+
+    def __init__(self, source: PeopleSource, frame: PersonFrame, config: TrainingConfig, people: int):
+        generator = torch.Generator().manual_seed(1)
+        drawn = source.draw(people, generator)
+        self._model, self._scale = source.model, config.kernel_scale
+        self._targets, self._start, _, self._points = prepared(drawn, frame, config, generator)
+
+    @torch.no_grad()
+    def errors_mm(self, network: UpdateNetwork) -> list[float]:
+        """The mean joint error after each step."""
+        descent = LearnedDescent(self._model.points, _ALL, network.eval(), self._scale)
+        states = descent.unroll(self._start, self._targets)
+        distances = [body_points(self._model, state) - self._points for state in states]
+        return [1000 * float(torch.linalg.vector_norm(distance, dim=-1).mean()) for distance in distances]
 
 
 def _judge(

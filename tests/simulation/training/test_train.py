@@ -7,8 +7,7 @@ import pytest
 import torch
 from scipy.stats import chi2
 
-from shapepose_fg.body.fitting.descent import LearnedDescent, gradient_scale
-from shapepose_fg.body.fitting.network import NetworkConfig, UpdateNetwork
+from shapepose_fg.body.fitting.descent import LearnedDescent, NetworkConfig, UpdateNetwork, gradient_scale
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.fitting.weights import FitterWeights, fingerprint
