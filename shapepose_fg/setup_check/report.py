@@ -116,13 +116,13 @@ def _camera_figures(diagnosis: Diagnosis, rig: Rig) -> tuple[CameraFigures, ...]
     look = diagnosis.look
     groups, structure = look.structure(steps=5)
     px = np.linalg.norm(structure.residual, axis=-1)
-    mm = 1e3 * px * structure.depth / look.setup.views.focal_px
+    mm = 1e3 * px * structure.depth / look.views.focal_px
     seen = np.bincount(look.sightings.view, minlength=len(rig))
     remaining = [lag.frames if lag.is_offset else 0 for lag in diagnosis.lags] or [0] * len(rig)
-    late = diagnosis.corrected.setup.lag + remaining  # what was found, and what remains
+    late = diagnosis.corrected.lag + remaining  # what was found, and what remains
     found = []
     for view, name in enumerate(rig.names):
-        others, mine, camera = look.others(view), look.seen_by(view), look.setup.camera(view)
+        others, mine, camera = look.others(view), look.seen_by(view), look.camera(view)
         matched = match(others, mine, camera)
         points = others.points[matched.person]
         out_px = np.linalg.norm(residuals(points, mine.xy[matched.sighting], camera.K, camera.cTw), axis=-1)
@@ -135,7 +135,7 @@ def _camera_figures(diagnosis: Diagnosis, rig: Rig) -> tuple[CameraFigures, ...]
             *quantiles(px[..., view], 0.5, 0.9),
             *quantiles(mm[..., view], 0.5, 0.9),
             *quantiles(out_px, 0.5),
-            *quantiles(1e3 * out_px * depth / look.setup.views.focal_px[view], 0.5),
+            *quantiles(1e3 * out_px * depth / look.views.focal_px[view], 0.5),
             float(len(matched.person) / max(matched.possible, 1)),
             int(late[view]),
         )

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from shapepose_fg.core.camera import Views
 from shapepose_fg.setup_check.adjustment import CENTRE, FOCAL, POSE, Normal, Q, changed, normal_equations
 from shapepose_fg.setup_check.evidence import Look
+from shapepose_fg.setup_check.findings import Finding, Kind
 from shapepose_fg.setup_check.fit import difference
 from shapepose_fg.setup_check.matching import Groups
 from shapepose_fg.setup_check.structure import KERNEL, Structure, observed, triangulate
@@ -47,20 +48,6 @@ class SmallErrors:
 
 
 @dataclass(frozen=True)
-class OtherPose:
-    """The pose of one camera that explains most."""
-
-    view: int
-    """Which camera."""
-    turned_deg: float
-    """By how much it is turned."""
-    moved: float
-    """How far it is moved, the calibration's unit."""
-    cost: float
-    """What remains of the robust cost of all residuals, as a part of what it was."""
-
-
-@dataclass(frozen=True)
 class Problem:
     """The residuals of a recording, to be explained by changes of its V cameras."""
 
@@ -76,7 +63,7 @@ class Problem:
     @classmethod
     def of(cls, look: Look) -> "Problem":
         """Of people spread over the frames."""
-        groups, views = look.groups(), look.setup.views
+        groups, views = look.groups(), look.views
         step = max(1, -(-len(groups) // _MOST_PEOPLE))
         seen = observed(Groups(groups.frame[::step], groups.member[::step]), look.sightings)
         structure = triangulate(*seen, views, 5)
@@ -105,8 +92,8 @@ class Problem:
         """At least so much of the cost another pose of one camera would take away."""
         return float(self._pose_gains.max() / max(_cost(self.structure), 1e-12))
 
-    def other_pose(self) -> OtherPose:
-        """The one camera whose pose, changed, explains most of the residuals."""
+    def other_pose(self) -> tuple[Finding, float]:
+        """The one camera whose pose, changed, explains most of the residuals, and what remains of their cost."""
         view = int(np.argmax(self._pose_gains))
         columns = np.array(POSE) + Q * view
 
@@ -116,7 +103,8 @@ class Problem:
             return change
 
         views, _, cost = self._solved(step)
-        return OtherPose(view, *difference(self.views.cTw[view], views.cTw[view]), cost)
+        turn, moved = difference(self.views.cTw[view], views.cTw[view])
+        return Finding(Kind.TURNED if turn > 1 else Kind.MOVED, (view,), turn, moved=moved), cost
 
     @property
     def _pose_gains(self) -> Array:
