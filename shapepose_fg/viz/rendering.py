@@ -20,9 +20,15 @@ _FAR_M = 100.0
 """Faces beyond this are not drawn by OpenCV, metres."""
 _NUMBER = np.float32(2.0**-20)
 """What a vertex counts as colour: OpenCV takes colours of 0 to 1, and float32 holds these exactly."""
-_FLAT, _BOTH_SIDES = (
-    cv2.TriangleRasterizeSettings().setShadingType(cv2.RASTERIZE_SHADING_FLAT).setCullingMode(culling)
-    for culling in (cv2.RASTERIZE_CULLING_CW, cv2.RASTERIZE_CULLING_NONE)
+_FLAT = (
+    cv2.TriangleRasterizeSettings()
+    .setShadingType(cv2.RASTERIZE_SHADING_FLAT)
+    .setCullingMode(cv2.RASTERIZE_CULLING_CW)
+)
+_BOTH_SIDES = (
+    cv2.TriangleRasterizeSettings()
+    .setShadingType(cv2.RASTERIZE_SHADING_FLAT)
+    .setCullingMode(cv2.RASTERIZE_CULLING_NONE)
 )
 _AMBIENT = 0.45
 """Light that reaches every part of a shaded mesh."""
@@ -96,6 +102,7 @@ def first_surface_at(
     The vertex is the first corner of the face that is met. inf and -1 where nothing is. The same picture as
     `render_depth` with `cull_back` makes, by OpenCV and in half the time. At most 2**20 points.
     """
+    width, height = camera.image_size
     cTw = camera.cTw.astype(np.float32)
     points = cTw[:, :3] @ np.asarray(points_world, dtype=np.float32).T
     points += cTw[:, 3:]
@@ -104,8 +111,10 @@ def first_surface_at(
         faces = faces[~near[faces].any(axis=1)]
     if len(faces) == 0:
         return np.full(row.shape, np.inf, dtype=np.float32), np.full(row.shape, -1, dtype=np.intp)
-    number, depth = _drawn(_as_opengl(points, camera), faces, _numbers(points.shape[1]), camera.image_size, _FLAT)
-    met = number[row, column]
+    colour, depth = _canvas.blank(height, width)
+    corners, number = _as_opengl(points, camera), _numbers(points.shape[1])
+    cv2.triangleRasterize(corners, faces, number, colour, depth, np.eye(4), 1.0, NEAR_M, _FAR_M, _FLAT)
+    met = colour[row, column, 0]
     vertex = np.where(met >= 0, np.rint(met / _NUMBER), -1).astype(np.intp)
     return np.where(met >= 0, depth[row, column], np.float32(np.inf)), vertex
 
@@ -129,7 +138,7 @@ class _Canvas(threading.local):
     def __init__(self) -> None:
         self._colour = self._depth = np.empty(0, dtype=np.float32)
 
-    def blank(self, width: int, height: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def blank(self, height: int, width: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Colour (H, W, 3), -1 everywhere, and depth (H, W), `_FAR_M` everywhere; until the next call."""
         if self._depth.shape != (height, width):
             self._colour = np.empty((height, width, 3), dtype=np.float32)
@@ -140,21 +149,6 @@ class _Canvas(threading.local):
 
 
 _canvas = _Canvas()
-
-
-def _drawn(
-    corners: NDArray[np.float32],
-    faces: NDArray[np.integer],
-    number: NDArray[np.float32],
-    size: tuple[int, int],
-    style: cv2.TriangleRasterizeSettings,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The first `number` (N, 3) on each pixel's ray, -1 where there is none, and its depth, (H, W) until the next
-    call; `corners` (N, 3) as `_as_opengl` gives them.
-    """
-    colour, depth = _canvas.blank(*size)
-    cv2.triangleRasterize(corners, faces, number, colour, depth, np.eye(4), 1.0, NEAR_M, _FAR_M, style)
-    return colour[..., 0], depth
 
 
 @lru_cache(maxsize=4)
@@ -191,11 +185,14 @@ def rasterise(
     flat = (xy - middle) * depth[:, None] / focal * (1.0, -1.0)
     corners = np.column_stack([flat, -depth])[faces[index]].reshape(-1, 3).astype(np.float32)
     number = np.repeat(_numbers(len(index)), 3, axis=0)
+    colour = np.full((height, width, 3), -1.0, dtype=np.float32)
+    met = np.full((height, width), _FAR_M, dtype=np.float32)
     each = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
-    met, near = _drawn(corners, each, number, size, _FLAT if cull_back else _BOTH_SIDES)
-    hit = met >= 0
-    face = np.where(hit, index[np.where(hit, np.rint(met / _NUMBER), 0).astype(np.intp)], -1)
-    return Surface(np.where(hit, near, np.float32(np.inf)), face.astype(np.int32))
+    style = _FLAT if cull_back else _BOTH_SIDES
+    cv2.triangleRasterize(corners, each, number, colour, met, np.eye(4), 1.0, NEAR_M, _FAR_M, style)
+    hit = colour[..., 0] >= 0
+    face = np.where(hit, index[np.where(hit, np.rint(colour[..., 0] / _NUMBER), 0).astype(np.intp)], -1)
+    return Surface(np.where(hit, met, np.float32(np.inf)), face.astype(np.int32))
 
 
 def render_shaded(
