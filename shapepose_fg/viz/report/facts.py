@@ -30,6 +30,7 @@ def told_by(run: Run) -> dict[str, Any]:
         "body": run.get("body"),
         "time": _time(objects(run.get("seconds"))),
         "configured": isinstance(run.get("configuration"), dict),
+        "over_time": bool(objects(run.get("configuration")).get("temporal", True)),
         "changed": _changed_settings(run),
         **{
             key: [(str(name), _text(value)) for name, value in objects(run.get(key)).items()]
