@@ -12,7 +12,7 @@ from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.setup_check.findings import Kind
-from shapepose_fg.setup_check.report import SetupReport, quantiles, rounded
+from shapepose_fg.setup_check.report import SetupReport, quantile, rounded
 from shapepose_fg.setup_check.sightings import size_of
 from shapepose_fg.setup_check.structure import triangulate
 
@@ -46,7 +46,7 @@ class Distances:
     def of(cls, px: Array, mm: Array) -> "Distances":
         """Of all finite distances `px` and `mm`, arrays of one shape."""
         finite = np.isfinite(px) & np.isfinite(mm)
-        return cls(int(finite.sum()), *quantiles(px[finite], 0.5, 0.9), *quantiles(mm[finite], 0.5, 0.9))
+        return cls(int(finite.sum()), *(quantile(each[finite], part) for each in (px, mm) for part in (0.5, 0.9)))
 
 
 @dataclass(frozen=True)

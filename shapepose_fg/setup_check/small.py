@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,7 +72,7 @@ class Problem:
 
     def small_errors(self, parts: Parts = ALL) -> SmallErrors:
         """What small errors of the cameras the residuals look like, with a sparse prior."""
-        views, change, cost = self._solved(lambda *now: _sparse_step(*now, parts))
+        views, change, cost = self._solved(partial(_sparse_step, parts))
         shift_deg = np.rad2deg(np.hypot(*change[:, CENTRE].T) / views.focal_px)
         return SmallErrors(
             change[:, CENTRE], shift_deg, np.rad2deg(change[:, 2]), np.exp(change[:, 8]), views, cost
@@ -127,7 +128,7 @@ class Problem:
         return views, total.reshape(-1, Q), _cost(structure) / max(_cost(self.structure), 1e-12)
 
 
-def _sparse_step(normal: Normal, structure: Structure, total: Array, parts: Parts) -> Array:
+def _sparse_step(parts: Parts, normal: Normal, structure: Structure, total: Array) -> Array:
     """The step (V Q,) of all cameras whose sum with `total` is small in most groups (iterated reweighting)."""
     V = structure.xy.shape[2]
     columns = np.array([view * Q + c for view in range(V) for names, _ in parts for c in names])
