@@ -109,9 +109,9 @@ def camera_use(people: Reconstruction, detections: DetectionSequence, rig: Rig, 
     table = people.observations
     if table is None:
         return []
-    offered = np.sum(
-        [np.bincount(detections[frame].view, minlength=len(rig)) for frame in frames], axis=0, dtype=int
-    )
+    offered = np.zeros(len(rig), dtype=np.int64)
+    for frame in frames:
+        offered += np.bincount(detections[frame].view, minlength=len(rig))
     depth = np.moveaxis(rig.project(people.joints)[1], 0, 2)
     px = np.linalg.norm(table.residual_px.astype(np.float64), axis=-1)
     mm = 1e3 * px * depth / rig.focal_px
