@@ -11,7 +11,7 @@ from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.reconstruction import Known, Reconstruction
 from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.io.export.markers import sigma_m
-from shapepose_fg.viz.report.facts import number, objects
+from shapepose_fg.viz.report.facts import lists, number, objects
 
 _BINS = 60
 """Points of a line over time: as many as can be told apart in a cell of a table."""
@@ -65,8 +65,7 @@ def camera_figures(people: Reconstruction) -> list[CameraFigures]:
     if table is None:
         return []
     px, segment = np.linalg.norm(table.residual_px, axis=-1), _segments(table)
-    listed = people.run.get("cameras")
-    entries = [objects(each) for each in (listed if isinstance(listed, list) else [])]
+    entries = [objects(each) for each in lists(people.run.get("cameras"))]
     told = {str(each.get("camera")): each for each in entries}
     made = []
     for view, name in enumerate(table.view_names.tolist()):  # a handful of cameras
