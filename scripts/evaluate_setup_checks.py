@@ -11,9 +11,8 @@ and `clean` many simulated recordings without any mistake, of which nothing shou
 
 import argparse
 import os
-import time
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -37,32 +36,22 @@ def main() -> None:
     """Measure what was asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parts = (*REAL, "simulated", "clean")
-    parser.add_argument("parts", nargs="*", metavar="PART", help=f"{', '.join(parts)}; all by default")
+    parser.add_argument("parts", nargs="*", choices=parts, metavar="PART", help=f"{', '.join(parts)}; or all")
     parser.add_argument("--data", type=Path, default=SHARED)
     parser.add_argument("--recordings", type=int, default=6, help="simulated recordings; ten times as many clean")
     parser.add_argument("--seed", type=int, default=0, help="fixes the axes of turns, and the simulated people")
     arguments = parser.parse_args()
-    if not set(arguments.parts) <= set(parts):
-        parser.error(f"parts are {' '.join(parts)}")
+    count, seed = arguments.recordings, arguments.seed
     for part in arguments.parts or parts:
-        if part == "clean":
-            seeds = range(arguments.seed + 100, arguments.seed + 100 + 10 * arguments.recordings)
-            said = Counter(str(finding.kind) for seed in seeds for finding in diagnose(*simulated(seed)).findings)
+        if part in REAL:
+            rig = read_rig(arguments.data / "data" / REAL[part][0])
+            confusion(part, [(read_detections(arguments.data / "data" / REAL[part][1], rig), rig)], seed)
+        elif part == "simulated":
+            confusion(part, map(simulated, range(seed, seed + count)), seed)
+        else:
+            seeds = range(seed + 100, seed + 100 + 10 * count)
+            said = Counter(str(finding.kind) for each in seeds for finding in diagnose(*simulated(each)).findings)
             print(f"\nclean: {len(seeds)} recordings, {said.total()} findings {dict(said)}")
-            continue
-        print(f"\n{part}{'mistake':>20}{'named':>12}   instead")
-        confusion(recordings(part, arguments), arguments.seed)
-
-
-def recordings(part: str, arguments: argparse.Namespace) -> Iterator[tuple[DetectionSequence, Rig]]:
-    """The recordings of a part."""
-    if part in REAL:
-        cameras, folder = (arguments.data / "data" / each for each in REAL[part])
-        rig = read_rig(cameras)
-        yield read_detections(folder, rig), rig
-        return
-    for number in range(arguments.recordings):
-        yield simulated(arguments.seed + number)
 
 
 def simulated(seed: int) -> tuple[DetectionSequence, Rig]:
@@ -74,24 +63,22 @@ def simulated(seed: int) -> tuple[DetectionSequence, Rig]:
     return simulate(scene, seed=seed), scene.rig
 
 
-def confusion(given: Iterator[tuple[DetectionSequence, Rig]], seed: int) -> None:
+def confusion(part: str, recordings: Iterable[tuple[DetectionSequence, Rig]], seed: int) -> None:
     """Print how often each mistake was named, and as what otherwise."""
-    named, count, said, seconds = Counter[str](), Counter[str](), defaultdict(Counter[str]), list[float]()
-    for detections, rig in given:
+    named, count, said = Counter[str](), Counter[str](), defaultdict(Counter[str])
+    for detections, rig in recordings:
         for each in spoiled(detections, rig, seed):
-            start = time.process_time()
             findings = diagnose(each.detections, each.rig).findings
-            seconds.append(time.process_time() - start)
             count[each.what] += 1
             if each.named_by(findings):
                 named[each.what] += 1
             else:
                 said[each.what]["; ".join(str(finding.kind) for finding in findings) or "nothing"] += 1
+    print(f"\n{part}{'mistake':>20}{'named':>12}   instead")
     for what in count:
         instead = ", ".join(f"{words} ({times})" for words, times in said[what].items())
         print(f"{what:<26}{f'{named[what]} of {count[what]}':>12}   {instead}")
     print(f"{'all':<26}{f'{named.total()} of {count.total()}':>12}")
-    print(f"{np.median(seconds):.1f} s of processor a check, {max(seconds):.1f} s at most")
 
 
 if __name__ == "__main__":

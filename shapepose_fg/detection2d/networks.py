@@ -63,27 +63,29 @@ class KnownNetwork:
     """Size of its file."""
     address: str | None
     """Where it is fetched from; None where no public address is known, and the user names one."""
+    weights: str = ""
+    """Where its weights come from, in words."""
 
 
 @lru_cache(maxsize=1)
-def _table() -> dict[str, Any]:
+def _table() -> dict[str, dict[str, dict[str, Any]]]:
     return json.loads((files("shapepose_fg.detection2d") / "data" / "networks.json").read_text(encoding="utf-8"))
 
 
 @lru_cache(maxsize=1)
 def layouts() -> dict[str, NetworkLayout]:
     """All layouts by name."""
-    return {name: _layout(name, entry) for name, entry in _table()["layouts"].items()}
+    every = {}
+    for name, entry in _table()["layouts"].items():
+        limbs = tuple(tuple(map(int, limb.split("-"))) for limb in entry["limbs"].split())
+        every[name] = NetworkLayout(name, **(entry | {"joints": tuple(entry["joints"].split()), "limbs": limbs}))
+    return every
 
 
 @lru_cache(maxsize=1)
 def known_networks() -> dict[str, KnownNetwork]:
     """All named networks by name."""
-    names = ("about", "layout", "sha256", "bytes", "address")
-    return {
-        name: KnownNetwork(name, **{each: entry[each] for each in names})
-        for name, entry in _table()["networks"].items()
-    }
+    return {name: KnownNetwork(name, **entry) for name, entry in _table()["networks"].items()}
 
 
 def find_layout(wanted: str | None, sha256: str, channels: int | None, place: object) -> NetworkLayout:
@@ -109,16 +111,4 @@ def find_layout(wanted: str | None, sha256: str, channels: int | None, place: ob
     raise InputError(
         f"{place}: the network {gives}, which does not say how its output is to be read; give --layout {choice}"
         f" (known are {listing})"
-    )
-
-
-def _layout(name: str, entry: dict[str, Any]) -> NetworkLayout:
-    """A layout as the table writes it."""
-    limbs = (limb.split("-") for limb in entry["limbs"].split())
-    rest = {each: value for each, value in entry.items() if each not in ("joints", "limbs")}
-    return NetworkLayout(
-        name=name,
-        joints=tuple(entry["joints"].split()),
-        limbs=tuple((int(first), int(second)) for first, second in limbs),
-        **rest,
     )

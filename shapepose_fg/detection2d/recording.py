@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -87,20 +87,23 @@ def run_detection(run: DetectionRun, progress: Progress = lambda done, total: No
     _refuse_others(run, unfinished)
     write_content(unfinished / _SETTINGS, _json(run.settings))
     total, views = len(run.moments), len(run.rig)
-    blocks: list[_Block] = []
+    files, counts = list[Path](), np.zeros((2, views), dtype=np.intp)
     for start in range(0, total, BLOCK):
-        blocks.append(_Block(unfinished / f"{start:09d}.json", views))
+        files.append(unfinished / f"{start:09d}.json")
         moments = range(start, min(start + BLOCK, total))
-        if not blocks[-1].file.exists():
-            blocks[-1].write(run, moments, progress)
+        if not files[-1].exists():
+            _write_block(run, moments, files[-1], progress)
+        counts += [_read_block(files[-1], views, name) for name in ("found", "failed")]
         progress(moments.stop * views, total * views)
-    counts = np.sum([[block.read(name) for name in ("found", "failed")] for block in blocks], axis=0, dtype=int)
     skeleton = TEXT_SKELETONS[run.detectors[0].network.layout.skeleton]
+
+    def text_of(view: int) -> Iterator[bytes]:
+        yield f"{skeleton.number} {total}\n".encode()
+        for file in files:
+            yield _read_block(file, views, "text")[view].encode()
+
     for view, name in enumerate(run.rig.names):
-        parts = (f"{skeleton.number} {total}\n", *(block.read("text")[view] for block in blocks))
-        write_atomically(
-            run.output / f"{name}.txt", lambda stream, parts=parts: stream.writelines(map(str.encode, parts))
-        )
+        write_atomically(run.output / f"{name}.txt", lambda stream, view=view: stream.writelines(text_of(view)))
     _write_times(run)
     used = [
         CameraFootage(name, footage.path.resolve(), detector.placement, run.moments.picture[:, view])
@@ -113,46 +116,42 @@ def run_detection(run: DetectionRun, progress: Progress = lambda done, total: No
     return DetectionReport(total, *(tuple(each) for each in counts.tolist()))
 
 
-@dataclass(frozen=True)
-class _Block:
-    """What was found in a few moments: for each of V cameras its text, how many candidates, how many pictures that
-    could not be read.
+def _write_block(run: DetectionRun, moments: range, file: Path, progress: Progress) -> None:
+    """Detect in the pictures of some moments, camera after camera of each moment, and keep what was found.
+
+    For each camera that is its text, how many candidates it has, and how many pictures could not be read.
     """
+    views = len(run.rig)
+    lines: list[list[str]] = [[] for _ in range(views)]
+    found, failed = [0] * views, [0] * views
+    for t in moments:
+        for v, detector in enumerate(run.detectors):
+            place = int(run.moments.picture[t, v])
+            picture = run.footage[v].at(place) if place >= 0 else None
+            failed[v] += place >= 0 and picture is None
+            candidates = Candidates.none() if picture is None else detector.detect(picture)
+            found[v] += len(candidates)
+            lines[v] += association_lines(
+                TEXT_SKELETONS[detector.network.layout.skeleton],
+                candidates.joint,
+                candidates.xy / (np.array(run.rig.cameras[v].image_size) - 1.0),
+                candidates.score,
+                candidates.pairs,
+                candidates.affinity,
+            )
+            progress(t * views + v + 1, len(run.moments) * views)
+    text = ["".join(f"{line}\n" for line in each) for each in lines]
+    write_content(file, _json({"text": text, "found": found, "failed": failed}))
 
-    file: Path
-    views: int
 
-    def read(self, name: str) -> list[Any]:
-        """(V,) one of its entries; InputError where the file is not as `write` leaves it."""
-        block = read_json(self.file)
-        values = block.get(name) if isinstance(block, dict) else None
-        kind = str if name == "text" else int
-        if not isinstance(values, list) or len(values) != self.views or {*map(type, values)} != {kind}:
-            raise InputError(f"{self.file}: not a block of this version; delete the folder that it is in")
-        return values
-
-    def write(self, run: DetectionRun, moments: range, progress: Progress) -> None:
-        """Detect in the pictures of some moments, camera after camera of each moment, and keep what was found."""
-        lines: list[list[str]] = [[] for _ in range(self.views)]
-        found, failed = [0] * self.views, [0] * self.views
-        for t in moments:
-            for v, detector in enumerate(run.detectors):
-                place = int(run.moments.picture[t, v])
-                picture = run.footage[v].at(place) if place >= 0 else None
-                failed[v] += place >= 0 and picture is None
-                candidates = Candidates.none() if picture is None else detector.detect(picture)
-                found[v] += len(candidates)
-                lines[v] += association_lines(
-                    TEXT_SKELETONS[detector.network.layout.skeleton],
-                    candidates.joint,
-                    candidates.xy / (np.array(run.rig.cameras[v].image_size) - 1.0),
-                    candidates.score,
-                    candidates.pairs,
-                    candidates.affinity,
-                )
-                progress(t * self.views + v + 1, len(run.moments) * self.views)
-        text = ["".join(f"{line}\n" for line in each) for each in lines]
-        write_content(self.file, _json({"text": text, "found": found, "failed": failed}))
+def _read_block(file: Path, views: int, name: str) -> list[Any]:
+    """(V,) an entry of what `_write_block` wrote; InputError on anything else."""
+    block = read_json(file)
+    values = block.get(name) if isinstance(block, dict) else None
+    kind = str if name == "text" else int
+    if not isinstance(values, list) or len(values) != views or {*map(type, values)} != {kind}:
+        raise InputError(f"{file}: not a block of this version; delete the folder that it is in")
+    return values
 
 
 def _write_times(run: DetectionRun) -> None:

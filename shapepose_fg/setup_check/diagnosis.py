@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import DetectionSequence
-from shapepose_fg.setup_check.evidence import Evidence, Look, Setup, gather
+from shapepose_fg.setup_check.evidence import Evidence, Look, gather
 from shapepose_fg.setup_check.findings import Finding, Kind
 from shapepose_fg.setup_check.hypotheses import gross_mistake
 from shapepose_fg.setup_check.lag import Lag, lag_of, lags
@@ -68,31 +68,31 @@ class Diagnosis:
 def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = None) -> Diagnosis:
     """What is wrong with cameras and detections of a recording, all of its `frames` by default."""
     evidence = gather(detections, range(len(detections)) if frames is None else frames)
-    given = Look(evidence, Setup.given(rig))
+    given = Look.given(evidence, rig)
     findings, evidence = _twice(given, rig)
     findings += _blind(given)
-    look = Look(evidence, given.setup)
+    look = replace(given, evidence=evidence)
     if len(rig) < 2 or len(look.sightings) < MIN_SIGHTINGS:
         return Diagnosis(tuple(findings), given, look)
     rng = np.random.default_rng(0)
     while len(findings) < _MOST_FINDINGS and (change := gross_mistake(look, rng)) is not None:
         findings.append(change.finding)
-        look = Look(evidence, change.setup)
+        look = replace(change.look, evidence=evidence)
     if len(look.groups()) < MIN_SIGHTINGS // 2:
         none = look.cameras_used > 1 and len(look.groups()) < _NOBODY * len(look.sightings)
         return Diagnosis((*findings, *(_nobody(look) if none else [])), given, look)
     problem = Problem.of(look)
     small = problem.small_errors()
-    remaining = lags(refined := look.with_views(small.views))
+    remaining = lags(refined := replace(look, views=small.views))
     for _ in range(_MOST_FINDINGS):
         late = [view for view, lag in enumerate(remaining) if abs(lag.frames) >= 2 and lag.is_offset]
         if len(late) == 0:
             break
         view = max(late, key=lambda view: remaining[view].gain)
-        before = look.setup.lag[view]
+        before = look.lag[view]
         look, problem, small = _settled(look, view, remaining[view].frames)
-        findings = _with_late(findings, view, int(look.setup.lag[view] - before))
-        remaining = lags(refined := look.with_views(small.views))
+        findings = _with_late(findings, view, int(look.lag[view] - before))
+        remaining = lags(refined := replace(look, views=small.views))
     known = {view for finding in findings for view in finding.cameras}
     findings += _small_findings(look, problem, small, known)
     findings += _unfit(look, known)
@@ -134,10 +134,10 @@ def _settled(look: Look, view: int, frames: int) -> tuple[Look, Problem, SmallEr
     People who move mostly one way look as if the camera was turned, so offset and turn are found in turns.
     """
     for _ in range(_LAG_ROUNDS):
-        look = Look(look.evidence, look.setup.later(view, frames))
+        look = look.later(view, frames)
         problem = Problem.of(look)
         small = problem.small_errors()
-        more = lag_of(look.with_views(small.views), view, _LAG_NEAR)
+        more = lag_of(replace(look, views=small.views), view, _LAG_NEAR)
         frames = more.frames
         if frames == 0 or more.agreement < 0:
             break
@@ -157,10 +157,9 @@ def _small_findings(look: Look, problem: Problem, small: SmallErrors, known: set
     largest, log = float(np.hypot(small.shift_deg, small.roll_deg).max()), np.abs(np.log(small.focal))
     if largest < _OFF_DEG and log.max() < _OFF_FOCAL and problem.pose_gain < _LEAST_GAIN:
         return []
-    pose, shifted = problem.other_pose(), problem.small_errors(SHIFT)
-    if pose.cost < min(small.cost, shifted.cost) - _POSE_GAIN and pose.view not in known:
-        kind = Kind.TURNED if pose.turned_deg > 1 else Kind.MOVED
-        return [Finding(kind, (pose.view,), pose.turned_deg, moved=pose.moved)]
+    (pose, cost), shifted = problem.other_pose(), problem.small_errors(SHIFT)
+    if cost < min(small.cost, shifted.cost) - _POSE_GAIN and known.isdisjoint(pose.cameras):
+        return [pose]
     turned, focal = _off(problem, small, shifted)
     off = np.flatnonzero(turned | focal)
     if len(off) == 0:
@@ -174,7 +173,7 @@ def _small_findings(look: Look, problem: Problem, small: SmallErrors, known: set
         if focal[view]:
             return [Finding(Kind.FOCAL, (view,), float(1 / small.focal[view]))]
         found = _turned(small, view)
-        if pose.view == view and 1 - pose.cost > _SINGLE * (1 - small.cost):
+        if pose.cameras == (view,) and 1 - cost > _SINGLE * (1 - small.cost):
             return [found if found.amount > _TURN_DEG else replace(found, kind=Kind.PRINCIPAL_POINT)]
     if shifted.cost > _MOST_COST:
         return []

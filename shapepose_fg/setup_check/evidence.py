@@ -1,7 +1,7 @@
 """What the check looks at: people seen at some frames of a recording, and the cameras as they are taken to be."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -44,38 +44,6 @@ class Evidence:
         return replace(self, anchors=self.anchors[:: max(1, len(self.anchors) // frames)])
 
 
-@dataclass(frozen=True)
-class Setup:
-    """What the cameras and their detections are thought to be; changed as mistakes are found."""
-
-    views: Views
-    """The cameras."""
-    lag: NDArray[np.intp]
-    """(V,) frames by which each is late."""
-
-    @classmethod
-    def given(cls, rig: Rig) -> "Setup":
-        """The cameras as the user gives them."""
-        return cls(Views.of(rig), np.zeros(len(rig), dtype=np.intp))
-
-    def camera(self, view: int) -> Pinhole:
-        """One of the cameras."""
-        return Pinhole(self.views.K[view], self.views.cTw[view])
-
-    def with_cameras(self, cameras: Mapping[int, Pinhole]) -> "Setup":
-        """The same with other cameras in the place of some."""
-        K, cTw = self.views.K.copy(), self.views.cTw.copy()
-        for view, camera in cameras.items():
-            K[view], cTw[view] = camera.K, camera.cTw
-        return replace(self, views=Views(K, cTw))
-
-    def later(self, view: int, frames: int) -> "Setup":
-        """The same with one camera known to be late."""
-        lag = self.lag.copy()
-        lag[view] += frames
-        return replace(self, lag=lag)
-
-
 def gather(detections: DetectionSequence, frames: range) -> Evidence:
     """The people seen at frames spread over a recording."""
     count = len(frames)
@@ -97,22 +65,45 @@ def gather(detections: DetectionSequence, frames: range) -> Evidence:
     return Evidence(spread, sightings, most)
 
 
+@dataclass(frozen=True, eq=False)
 class Look:
-    """A recording looked at with one idea of its cameras."""
+    """A recording looked at with one idea of its cameras, which changes as mistakes are found."""
 
-    def __init__(self, evidence: Evidence, setup: Setup) -> None:
-        self.evidence, self.setup = evidence, setup
-        self._others: dict[tuple[int, ...], Others] = {}
+    evidence: Evidence
+    """The people that were seen."""
+    views: Views
+    """What the V cameras are thought to be."""
+    lag: NDArray[np.intp]
+    """(V,) frames by which each is thought to be late."""
+    _others: dict[tuple[int, ...], Others] = field(init=False, default_factory=dict)
 
-    def with_views(self, views: Views) -> "Look":
-        """The same recording with other cameras."""
-        return Look(self.evidence, replace(self.setup, views=views))
+    @classmethod
+    def given(cls, evidence: Evidence, rig: Rig) -> "Look":
+        """With the cameras as the user gives them."""
+        return cls(evidence, Views.of(rig), np.zeros(len(rig), dtype=np.intp))
+
+    def camera(self, view: int) -> Pinhole:
+        """One of the cameras."""
+        return Pinhole(self.views.K[view], self.views.cTw[view])
+
+    def with_cameras(self, cameras: Mapping[int, Pinhole]) -> "Look":
+        """The same with other cameras in the place of some."""
+        K, cTw = self.views.K.copy(), self.views.cTw.copy()
+        for view, camera in cameras.items():
+            K[view], cTw[view] = camera.K, camera.cTw
+        return replace(self, views=Views(K, cTw))
+
+    def later(self, view: int, frames: int) -> "Look":
+        """The same with one camera known to be late."""
+        lag = self.lag.copy()
+        lag[view] += frames
+        return replace(self, lag=lag)
 
     @cached_property
     def shifted(self) -> Sightings:
         """All sightings, at the frames at which they would have been taken without the offsets."""
         every = self.evidence.sightings
-        return replace(every, frame=every.frame - self.setup.lag[every.view])
+        return replace(every, frame=every.frame - self.lag[every.view])
 
     @cached_property
     def sightings(self) -> Sightings:
@@ -122,12 +113,12 @@ class Look:
     @cached_property
     def pairs(self) -> Pairs:
         """Which of them may be one person."""
-        return pair_up(self.sightings, self.setup.views)
+        return pair_up(self.sightings, self.views)
 
     @property
     def view_count(self) -> int:
         """V."""
-        return len(self.setup.views)
+        return len(self.views)
 
     @property
     def cameras_used(self) -> int:
@@ -147,7 +138,7 @@ class Look:
     def structure(self, without: tuple[int, ...] = (), steps: int = 6) -> tuple[Groups, Structure]:
         """These people, and where they are."""
         groups = self.groups(without)
-        return groups, triangulate(*observed(groups, self.sightings), self.setup.views, steps)
+        return groups, triangulate(*observed(groups, self.sightings), self.views, steps)
 
     def others(self, *without: int) -> Others:
         """The people that all cameras but these see."""
@@ -162,7 +153,7 @@ class Look:
         views = range(self.view_count)
         if self.cameras_used < 3:
             return np.full(self.view_count, self._pair_score)
-        return np.array([match(self.others(v), self.seen_by(v), self.setup.camera(v)).score for v in views])
+        return np.array([match(self.others(v), self.seen_by(v), self.camera(v)).score for v in views])
 
     @property
     def _pair_score(self) -> float:

@@ -153,7 +153,7 @@ def scaled(camera: Pinhole, factor: float, centre: Array) -> Pinhole:
     return Pinhole(K, camera.cTw)
 
 
-def refined(others: Others, seen: Sightings, camera: Pinhole, columns: tuple[int, ...]) -> Pinhole:
+def refined(others: Others, seen: Sightings, camera: Pinhole, columns: list[int]) -> Pinhole:
     """The camera, some of its parameters (`adjustment.PARAMETERS`) fitted to the people that it matches."""
     for _ in range(_ROUNDS):
         found = match(others, seen, camera)
@@ -162,7 +162,7 @@ def refined(others: Others, seen: Sightings, camera: Pinhole, columns: tuple[int
         points, xy = others.points[found.person], seen.xy[found.sighting]
         both = ~np.isnan(points[..., 0]) & ~np.isnan(xy[..., 0])
         size = np.broadcast_to(seen.size_px[found.sighting][:, None], both.shape)[both]
-        camera = _solved(points[both], xy[both], _WIDTH * size, camera, list(columns))
+        camera = _solved(points[both], xy[both], _WIDTH * size, camera, columns)
     return camera
 
 

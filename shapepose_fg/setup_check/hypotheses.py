@@ -1,14 +1,14 @@
 """Gross mistakes of a set-up, each tried as a change that would put it right; and which explains best."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.setup_check.adjustment import FOCAL, POSE, TURN
-from shapepose_fg.setup_check.evidence import Look, Setup
+from shapepose_fg.setup_check.evidence import Look
 from shapepose_fg.setup_check.findings import Finding, Kind
 from shapepose_fg.setup_check.fit import (
     CORNER,
@@ -66,8 +66,8 @@ class Change:
 
     finding: Finding
     """What is wrong if the change is right."""
-    setup: Setup
-    """The set-up after it."""
+    look: Look
+    """The recording after it."""
     score: float
     """How well the camera fits the others after it (`Match.score`); all cameras, for what all share."""
     freedom: int = 0
@@ -94,7 +94,7 @@ def gross_mistake(look: Look, rng: np.random.Generator) -> Change | None:
         found += [(change.score - look.total, change) for change in poses]
     fit = max((gain for gain, _ in found), default=0.0) + look.total
     if len(weak) > look.view_count / 2 and fit < _EXPLAINED:
-        few = Look(look.evidence.thinned(_FEW), look.setup)
+        few = replace(look, evidence=look.evidence.thinned(_FEW))
         found += [(change.score - few.total, change) for change in _of_all(few)]
     found = [(gain, change) for gain, change in found if gain > _GAIN / look.view_count]
     return max(found, key=lambda pair: pair[0])[1] if found else None
@@ -102,20 +102,21 @@ def gross_mistake(look: Look, rng: np.random.Generator) -> Change | None:
 
 def _judged(look: Look, change: Change) -> float:
     """How much better everything fits after a change, less the price of its parameters."""
-    return Look(look.evidence, change.setup).total - look.total - _PRICE * change.freedom / look.view_count
+    return change.look.total - look.total - _PRICE * change.freedom / look.view_count
 
 
 def _of_one(look: Look, view: int, rng: np.random.Generator) -> Iterator[Change]:
     """Changes of one camera that fit it to the people that the others see, the best of each kind."""
-    others, seen, camera = look.others(view), look.seen_by(view), look.setup.camera(view)
+    others, seen, camera = look.others(view), look.seen_by(view), look.camera(view)
     if len(others) == 0 or len(seen) == 0:
         return
     for kind in _MISREAD:
-        setup = look.setup.with_cameras({view: misread(kind, camera)})
-        yield Change(Finding(kind, (view,)), setup, match(others, seen, setup.camera(view)).score)
+        other = misread(kind, camera)
+        score = match(others, seen, other).score
+        yield Change(Finding(kind, (view,)), look.with_cameras({view: other}), score)
     lag = lag_of(look, view).frames
     score = match(others, look.seen_by(view, every_frame=True), camera, lag).score
-    yield Change(Finding(Kind.LATE, (view,), lag), look.setup.later(view, lag), score, 1)
+    yield Change(Finding(Kind.LATE, (view,), lag), look.later(view, lag), score, 1)
     pairs = list(tries(others, seen, rng))
     for kind, fitted, columns in _FITTED:
         best = _best(others, seen, camera, pairs, fitted)
@@ -128,8 +129,8 @@ def _of_one(look: Look, view: int, rng: np.random.Generator) -> Iterator[Change]
             kind, turn
         )  # what the calibration has over what fits
         finding = Finding(Kind.TURNED if turn > _PLAIN_TURN_DEG else kind, (view,), amount, moved=moved)
-        setup = look.setup.with_cameras({view: best})
-        yield Change(finding, setup, match(others, seen, best).score, max(len(columns), 1))
+        score = match(others, seen, best).score
+        yield Change(finding, look.with_cameras({view: best}), score, max(len(columns), 1))
 
 
 def _best(
@@ -148,9 +149,9 @@ def _best(
 def _of_two(look: Look, first: int, second: int) -> Change:
     """Two cameras exchanged, as the people that all others see say it; scored 0 where they see none."""
     others = look.others(first, second)
-    setup = look.setup.with_cameras({first: look.setup.camera(second), second: look.setup.camera(first)})
-    score = min(match(others, look.seen_by(view), setup.camera(view)).score for view in (first, second))
-    return Change(Finding(Kind.EXCHANGED, (first, second)), setup, score)
+    change = look.with_cameras({first: look.camera(second), second: look.camera(first)})
+    score = min(match(others, look.seen_by(view), change.camera(view)).score for view in (first, second))
+    return Change(Finding(Kind.EXCHANGED, (first, second)), change, score)
 
 
 def _of_all(look: Look) -> Iterator[Change]:
@@ -159,19 +160,19 @@ def _of_all(look: Look) -> Iterator[Change]:
     for kind in _MISREAD:
         yield _misread(look, kind, everybody)
     for factor in _FACTORS:
-        cameras = {view: scaled(look.setup.camera(view), factor, CORNER) for view in everybody}
+        cameras = {view: scaled(look.camera(view), factor, CORNER) for view in everybody}
         yield _whole(look, Finding(Kind.RESIZED, everybody, factor), cameras)
 
 
 def _misread(look: Look, kind: Kind, views: tuple[int, ...]) -> Change:
     """The poses of some cameras misunderstood, by how well all fit."""
-    return _whole(look, Finding(kind, views), {view: misread(kind, look.setup.camera(view)) for view in views})
+    return _whole(look, Finding(kind, views), {view: misread(kind, look.camera(view)) for view in views})
 
 
 def _whole(look: Look, finding: Finding, cameras: dict[int, Pinhole]) -> Change:
     """A change that is judged by how well everything fits."""
-    setup = look.setup.with_cameras(cameras)
-    return Change(finding, setup, Look(look.evidence, setup).total)
+    change = look.with_cameras(cameras)
+    return Change(finding, change, change.total)
 
 
 def misread(kind: Kind, camera: Pinhole) -> Pinhole:

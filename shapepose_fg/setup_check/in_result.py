@@ -12,7 +12,7 @@ from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.setup_check.findings import Kind
-from shapepose_fg.setup_check.report import SetupReport, quantiles, rounded
+from shapepose_fg.setup_check.report import SetupReport, quantile, rounded
 from shapepose_fg.setup_check.sightings import size_of
 from shapepose_fg.setup_check.structure import triangulate
 
@@ -46,7 +46,7 @@ class Distances:
     def of(cls, px: Array, mm: Array) -> "Distances":
         """Of all finite distances `px` and `mm`, arrays of one shape."""
         finite = np.isfinite(px) & np.isfinite(mm)
-        return cls(int(finite.sum()), *quantiles(px[finite], 0.5, 0.9), *quantiles(mm[finite], 0.5, 0.9))
+        return cls(int(finite.sum()), *(quantile(each[finite], part) for each in (px, mm) for part in (0.5, 0.9)))
 
 
 @dataclass(frozen=True)
@@ -109,9 +109,9 @@ def camera_use(people: Reconstruction, detections: DetectionSequence, rig: Rig, 
     table = people.observations
     if table is None:
         return []
-    offered = np.sum(
-        [np.bincount(detections[frame].view, minlength=len(rig)) for frame in frames], axis=0, dtype=int
-    )
+    offered = np.zeros(len(rig), dtype=np.int64)
+    for frame in frames:
+        offered += np.bincount(detections[frame].view, minlength=len(rig))
     depth = np.moveaxis(rig.project(people.joints)[1], 0, 2)
     px = np.linalg.norm(table.residual_px.astype(np.float64), axis=-1)
     mm = 1e3 * px * depth / rig.focal_px

@@ -58,7 +58,7 @@ def lags(look: Look) -> list[Lag]:
 def lag_of(look: Look, view: int, most: int | None = None) -> Lag:
     """A camera's offset in time against the others, up to `most` frames: where its sightings fit people best."""
     most = look.evidence.most_lag if most is None else min(most, look.evidence.most_lag)
-    others, seen, camera = look.others(view), look.seen_by(view, every_frame=True), look.setup.camera(view)
+    others, seen, camera = look.others(view), look.seen_by(view, every_frame=True), look.camera(view)
     step = max(1, len(others) // _MOST_PEOPLE)
     others = Others(others.frame[::step], others.points[::step])
     still = _nearest(others, seen, camera, 0)

@@ -116,28 +116,30 @@ def _camera_figures(diagnosis: Diagnosis, rig: Rig) -> tuple[CameraFigures, ...]
     look = diagnosis.look
     groups, structure = look.structure(steps=5)
     px = np.linalg.norm(structure.residual, axis=-1)
-    mm = 1e3 * px * structure.depth / look.setup.views.focal_px
+    mm = 1e3 * px * structure.depth / look.views.focal_px
     seen = np.bincount(look.sightings.view, minlength=len(rig))
     remaining = [lag.frames if lag.is_offset else 0 for lag in diagnosis.lags] or [0] * len(rig)
-    late = diagnosis.corrected.setup.lag + remaining  # what was found, and what remains
+    late = diagnosis.corrected.lag + remaining  # what was found, and what remains
     found = []
     for view, name in enumerate(rig.names):
-        others, mine, camera = look.others(view), look.seen_by(view), look.setup.camera(view)
+        others, mine, camera = look.others(view), look.seen_by(view), look.camera(view)
         matched = match(others, mine, camera)
         points = others.points[matched.person]
         out_px = np.linalg.norm(residuals(points, mine.xy[matched.sighting], camera.K, camera.cTw), axis=-1)
         depth = points @ camera.cTw[2, :3] + camera.cTw[2, 3]
         out_px = np.where(np.isfinite(out_px), out_px, np.nan)
         figures = CameraFigures(
-            name,
-            int(seen[view]),
-            float((groups.member[:, view] >= 0).sum() / max(seen[view], 1)),
-            *quantiles(px[..., view], 0.5, 0.9),
-            *quantiles(mm[..., view], 0.5, 0.9),
-            *quantiles(out_px, 0.5),
-            *quantiles(1e3 * out_px * depth / look.setup.views.focal_px[view], 0.5),
-            float(len(matched.person) / max(matched.possible, 1)),
-            int(late[view]),
+            camera=name,
+            people=int(seen[view]),
+            matched=float((groups.member[:, view] >= 0).sum() / max(seen[view], 1)),
+            median_px=quantile(px[..., view], 0.5),
+            high_px=quantile(px[..., view], 0.9),
+            median_mm=quantile(mm[..., view], 0.5),
+            high_mm=quantile(mm[..., view], 0.9),
+            left_out_px=quantile(out_px, 0.5),
+            left_out_mm=quantile(1e3 * out_px * depth / look.views.focal_px[view], 0.5),
+            left_out_matched=float(len(matched.person) / max(matched.possible, 1)),
+            late_frames=int(late[view]),
         )
         found.append(figures)
     return tuple(found)
@@ -149,13 +151,13 @@ def _pair_figures(look: Look, rig: Rig, first: int, second: int) -> PairFigures:
     if possible == 0:
         return PairFigures(*names, None, None)
     miss = error * look.sightings.size_px[groups.member[:, first]]
-    return PairFigures(*names, float((error < GATE / 2).sum() / possible), *quantiles(miss, 0.5))
+    return PairFigures(*names, float((error < GATE / 2).sum() / possible), quantile(miss, 0.5))
 
 
-def quantiles(values: Array, *parts: float) -> list[float | None]:
-    """Of the finite ones; None where there are none."""
+def quantile(values: Array, part: float) -> float | None:
+    """Of the finite values; None where there are none."""
     values = values[np.isfinite(values)]
-    return [float(np.quantile(values, part)) if len(values) > 0 else None for part in parts]
+    return float(np.quantile(values, part)) if len(values) > 0 else None
 
 
 def rounded(value: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from shapepose_fg.core.camera import Views
 from shapepose_fg.setup_check.adjustment import CENTRE, FOCAL, POSE, Normal, Q, changed, normal_equations
 from shapepose_fg.setup_check.evidence import Look
+from shapepose_fg.setup_check.findings import Finding, Kind
 from shapepose_fg.setup_check.fit import difference
 from shapepose_fg.setup_check.matching import Groups
 from shapepose_fg.setup_check.structure import KERNEL, Structure, observed, triangulate
@@ -47,20 +49,6 @@ class SmallErrors:
 
 
 @dataclass(frozen=True)
-class OtherPose:
-    """The pose of one camera that explains most."""
-
-    view: int
-    """Which camera."""
-    turned_deg: float
-    """By how much it is turned."""
-    moved: float
-    """How far it is moved, the calibration's unit."""
-    cost: float
-    """What remains of the robust cost of all residuals, as a part of what it was."""
-
-
-@dataclass(frozen=True)
 class Problem:
     """The residuals of a recording, to be explained by changes of its V cameras."""
 
@@ -76,7 +64,7 @@ class Problem:
     @classmethod
     def of(cls, look: Look) -> "Problem":
         """Of people spread over the frames."""
-        groups, views = look.groups(), look.setup.views
+        groups, views = look.groups(), look.views
         step = max(1, -(-len(groups) // _MOST_PEOPLE))
         seen = observed(Groups(groups.frame[::step], groups.member[::step]), look.sightings)
         structure = triangulate(*seen, views, 5)
@@ -84,7 +72,7 @@ class Problem:
 
     def small_errors(self, parts: Parts = ALL) -> SmallErrors:
         """What small errors of the cameras the residuals look like, with a sparse prior."""
-        views, change, cost = self._solved(lambda *now: _sparse_step(*now, parts))
+        views, change, cost = self._solved(partial(_sparse_step, parts))
         shift_deg = np.rad2deg(np.hypot(*change[:, CENTRE].T) / views.focal_px)
         return SmallErrors(
             change[:, CENTRE], shift_deg, np.rad2deg(change[:, 2]), np.exp(change[:, 8]), views, cost
@@ -105,8 +93,8 @@ class Problem:
         """At least so much of the cost another pose of one camera would take away."""
         return float(self._pose_gains.max() / max(_cost(self.structure), 1e-12))
 
-    def other_pose(self) -> OtherPose:
-        """The one camera whose pose, changed, explains most of the residuals."""
+    def other_pose(self) -> tuple[Finding, float]:
+        """The one camera whose pose, changed, explains most of the residuals, and what remains of their cost."""
         view = int(np.argmax(self._pose_gains))
         columns = np.array(POSE) + Q * view
 
@@ -116,7 +104,8 @@ class Problem:
             return change
 
         views, _, cost = self._solved(step)
-        return OtherPose(view, *difference(self.views.cTw[view], views.cTw[view]), cost)
+        turn, moved = difference(self.views.cTw[view], views.cTw[view])
+        return Finding(Kind.TURNED if turn > 1 else Kind.MOVED, (view,), turn, moved=moved), cost
 
     @property
     def _pose_gains(self) -> Array:
@@ -139,7 +128,7 @@ class Problem:
         return views, total.reshape(-1, Q), _cost(structure) / max(_cost(self.structure), 1e-12)
 
 
-def _sparse_step(normal: Normal, structure: Structure, total: Array, parts: Parts) -> Array:
+def _sparse_step(parts: Parts, normal: Normal, structure: Structure, total: Array) -> Array:
     """The step (V Q,) of all cameras whose sum with `total` is small in most groups (iterated reweighting)."""
     V = structure.xy.shape[2]
     columns = np.array([view * Q + c for view in range(V) for names, _ in parts for c in names])

@@ -56,9 +56,11 @@ def triangulate(xy: Array, confidence: Array, size: Array, views: Views, steps: 
     prior = np.where((seen.sum(axis=-1) >= 2)[..., None], prior, 0.0)
     points = _linear(xy, prior, views)
     weight = prior
-    for _ in range(steps):
+    for step in range(steps + 1):
         pixels, depth, jacobian = views.project(points)
-        residual = np.where(seen[..., None] & (prior > 0)[..., None], pixels - xy, np.nan)
+        residual = np.where((prior > 0)[..., None], pixels - xy, np.nan)
+        if step == steps:
+            break
         ok = ~np.isnan(residual[..., 0])
         square = np.where(ok, prior * np.nansum(residual**2, axis=-1), 0.0)
         weight = np.where(ok, prior / (1 + square), 0.0)
@@ -70,8 +72,6 @@ def triangulate(xy: Array, confidence: Array, size: Array, views: Views, steps: 
         scale = np.trace(H, axis1=-2, axis2=-1)[..., None, None]
         H = H + (1e-9 * scale + 1e-300) * np.eye(3)
         points = points - np.linalg.solve(H, A.swapaxes(-1, -2) @ r)[..., 0]
-    pixels, depth, jacobian = views.project(points)
-    residual = np.where((prior > 0)[..., None], pixels - xy, np.nan)
     return Structure(points, xy, residual, depth, size, weight, jacobian)
 
 

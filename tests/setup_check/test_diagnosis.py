@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import Detections, Recording
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.spoiled_setups import (
@@ -22,6 +22,7 @@ from shapepose_fg.evaluation.spoiled_setups import (
 )
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
+from shapepose_fg.setup_check.adjustment import FOCAL, Q, changed
 from shapepose_fg.setup_check.diagnosis import diagnose
 from shapepose_fg.setup_check.findings import Kind, sentence
 
@@ -78,6 +79,14 @@ def test_mistakes_of_one_camera_are_told_apart(recording, room):
         assert (found.kind, found.cameras) == (kind, (3,))
         if amount is not None:
             assert found.amount == pytest.approx(amount, rel=0.03)
+
+
+def test_no_step_of_a_focal_length_leaves_the_numbers(room):
+    """As the fit of a camera takes them whose pose is far off: exp(1000) is none."""
+    change = np.zeros((len(room), Q))
+    change[1, FOCAL], change[2, FOCAL] = 1e3, -1e3
+    views = changed(Views.of(room), change)
+    assert (views.focal_px > 0).all() and np.isfinite(views.focal_px).all()
 
 
 def test_exchanged_cameras_are_named(recording, room):

@@ -11,8 +11,11 @@ from numpy.typing import NDArray
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.footage.footage import Footage, open_footage
-from shapepose_fg.io.footage.placement import FOOTAGE, CameraFootage, Placement, placements_of, read_used_footage
+from shapepose_fg.io.footage.placement import FOOTAGE, CameraFootage, placements_of, read_used_footage
 from shapepose_fg.io.footage.places import find_footage
+
+_MOST_FRAMES = 10_000_000
+"""No recording is as long: numbers in the names of pictures that are not those of frames."""
 
 
 @dataclass(frozen=True)
@@ -41,52 +44,50 @@ def pictures_of(
     `run` is what the result's run.json says. `open_one` opens the pictures of a camera, by its name; `tell` is
     given what was taken to be what.
     """
-    drawn = wanted.drawn
     used = {each.name: each for each in _used_footage(run, wanted.detections)}
+    unknown = [name for name in wanted.drawn if name not in used]
+    notes: list[str] = []
     if wanted.videos is not None:
-        places = find_footage(wanted.videos, drawn)
-        paths = dict(zip(drawn, places.paths, strict=True))
-        for text in places.notes:
-            tell(text)
+        places = find_footage(wanted.videos, wanted.drawn)
+        paths, notes = dict(zip(wanted.drawn, places.paths, strict=True)), [*places.notes]
+    elif len(unknown) > 0:
+        raise InputError(
+            f"nothing says where the pictures of camera {unknown[0]} are; give --videos, or with --detections the"
+            " folder that `shapepose-fg detect` wrote"
+        )
     else:
-        missing = next((name for name in drawn if name not in used), None)
-        if missing is not None:
-            raise InputError(
-                f"nothing says where the pictures of camera {missing} are; give --videos, or with --detections the"
-                " folder that `shapepose-fg detect` wrote"
-            )
-        paths = {name: used[name].path for name in drawn}
-    opened: dict[str, Footage] = {}
+        paths = {name: used[name].path for name in wanted.drawn}
     for name, path in paths.items():
         if not path.exists():
             raise InputError(f"{path}: the pictures of camera {name} are not there any more; give --videos")
-        opened[name] = open_one(name, path)
+    opened = {name: open_one(name, path) for name, path in paths.items()}
     # What detect was told of the pictures holds as long as they have the same size.
     alike = {
         name: used[name].placement
         for name, each in opened.items()
         if name in used and used[name].placement.picture_size == each.size and not wanted.image_placement
     }
-    sizes = {name: each.size for name, each in opened.items() if name not in alike}
     for name, placement in alike.items():
-        _refuse_other_calibration(name, placement, rig)
-    placements, notes = placements_of(wanted.image_placement, sizes, rig)
-    counted = [name for name in drawn if name not in used]
-    if len(counted) > 0:
-        notes.append(f"frame 0 of the result is taken to be the first picture of {' '.join(counted)}, and so on")
+        size = rig.cameras[rig.names.index(name)].image_size
+        if placement.calibrated_size != size:
+            theirs, ours = (f"{width} x {height}" for width, height in (placement.calibrated_size, size))
+            raise InputError(
+                f"{FOOTAGE}: camera {name} was calibrated for pictures of {theirs}, and the cameras.json of the"
+                f" result is for {ours}; give --detections with the folder of this result, or --image-placement"
+            )
+    sizes = {name: each.size for name, each in opened.items() if name not in alike}
+    placements, concluded = placements_of(wanted.image_placement, sizes, rig)
+    notes += concluded
+    if len(unknown) > 0:
+        notes.append(f"frame 0 of the result is taken to be the first picture of {' '.join(unknown)}, and so on")
     for text in notes:
         tell(text)
-    placements |= alike
     pairs = []
     for name, footage in opened.items():
         index = used[name].places if name in used else _counted(footage)
         index = np.where(index < len(footage.number), index, -1)
-        pairs.append((CameraFootage(name, footage.path, placements[name], index), footage))
+        pairs.append((CameraFootage(name, footage.path, (placements | alike)[name], index), footage))
     return pairs
-
-
-_MOST_FRAMES = 10_000_000
-"""No recording is as long: numbers in the names of pictures that are not those of frames."""
 
 
 def _counted(footage: Footage) -> NDArray[np.intp]:
@@ -102,17 +103,6 @@ def _counted(footage: Footage) -> NDArray[np.intp]:
     return index
 
 
-def _refuse_other_calibration(name: str, placement: Placement, rig: Rig) -> None:
-    """InputError where what `detect` wrote is of pictures that were calibrated at another size."""
-    size = rig.cameras[rig.names.index(name)].image_size
-    if placement.calibrated_size != size:
-        theirs, ours = (f"{width} x {height}" for width, height in (placement.calibrated_size, size))
-        raise InputError(
-            f"{FOOTAGE}: camera {name} was calibrated for pictures of {theirs}, and the cameras.json of the result"
-            f" is for {ours}; give --detections with the folder of this result, or --image-placement"
-        )
-
-
 def _used_footage(run: Mapping[str, Any], detections: Path | None) -> list[CameraFootage]:
     """What `detect` wrote of the pictures, beside the detections that the result was made from."""
     if detections is not None:
@@ -121,8 +111,6 @@ def _used_footage(run: Mapping[str, Any], detections: Path | None) -> list[Camer
             raise InputError(f"{file}: there is no such file; give the folder that `shapepose-fg detect` wrote")
         return read_used_footage(file)
     inputs = run.get("inputs")
-    for text in inputs if isinstance(inputs, dict) else ():
-        file = Path(str(text)).parent / FOOTAGE
-        if Path(str(text)).suffix == ".txt" and file.is_file():
-            return read_used_footage(file)
-    return []
+    texts = [Path(str(each)) for each in (inputs if isinstance(inputs, dict) else ())]
+    files = [each.parent / FOOTAGE for each in texts if each.suffix == ".txt"]
+    return next((read_used_footage(file) for file in files if file.is_file()), [])

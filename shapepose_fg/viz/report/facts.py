@@ -15,11 +15,10 @@ def told_by(run: Run) -> dict[str, Any]:
     people, time = objects(run.get("people")), objects(run.get("time"))
     problems, spans = people.get("problems"), covered_frames(run) or []
     return {
-        "warnings": _texts(objects(run.get("setup")).get("warnings")),
-        "notes": _texts(run.get("notes")),
+        "warnings": [*map(str, lists(objects(run.get("setup")).get("warnings")))],
+        "notes": [*map(str, lists(run.get("notes")))],
         "problems": [
-            ", ".join(f"{key} {value}" for key, value in objects(each).items())
-            for each in (problems if isinstance(problems, list) else [])
+            ", ".join(f"{key} {value}" for key, value in objects(each).items()) for each in lists(problems)
         ],
         "dropped": _dropped(objects(people.get("dropped")), objects(run.get("dropped_frames"))),
         "probabilities": _probabilities(run.get("probability")),
@@ -30,6 +29,7 @@ def told_by(run: Run) -> dict[str, Any]:
         "body": run.get("body"),
         "time": _time(objects(run.get("seconds"))),
         "configured": isinstance(run.get("configuration"), dict),
+        "over_time": bool(objects(run.get("configuration")).get("temporal", True)),
         "changed": _changed_settings(run),
         **{
             key: [(str(name), _text(value)) for name, value in objects(run.get(key)).items()]
@@ -76,7 +76,7 @@ def _dropped(reasons: Run, frames: Run) -> list[tuple[str, int, str]]:
 
 def _probabilities(listed: object) -> dict[int, float]:
     """How probable it is that each person was there, by number; empty frame by frame."""
-    entries = [objects(each) for each in (listed if isinstance(listed, list) else [])]
+    entries = [objects(each) for each in lists(listed)]
     found = {number(each.get("person")): number(each.get("probability")) for each in entries}
     return {int(who): value for who, value in found.items() if who is not None and value is not None}
 
@@ -89,8 +89,9 @@ def _time(seconds: Run) -> str:
     return f"{sum(spent.values()):.1f} s of processors: {listed}" if len(spent) > 0 else ""
 
 
-def _texts(value: object) -> list[str]:
-    return [str(each) for each in value] if isinstance(value, list) else []
+def lists(value: object) -> list[Any]:
+    """A list of run.json; an empty one for anything else."""
+    return value if isinstance(value, list) else []
 
 
 def _flat(table: object, prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -113,8 +114,8 @@ def _text(value: object) -> str:
 def _frames_words(spans: object) -> str:
     """`0-3, 17, 20-25 and more` of [start, stop) spans."""
     told = []
-    for span in spans if isinstance(spans, list) else []:
-        ends = [number(end) for end in span] if isinstance(span, list) else []
+    for span in lists(spans):
+        ends = [number(end) for end in lists(span)]
         if len(ends) == 2 and None not in ends:
             start, stop = int(ends[0] or 0), int(ends[1] or 0)
             told.append(f"{start}" if stop == start + 1 else f"{start}–{stop - 1}")

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.reconstruction import Known, Reconstruction
+from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.io.export.markers import sigma_m
-from shapepose_fg.viz.report.facts import number, objects
+from shapepose_fg.viz.report.facts import lists, number, objects
 
 _BINS = 60
 """Points of a line over time: as many as can be told apart in a cell of a table."""
@@ -64,8 +65,7 @@ def camera_figures(people: Reconstruction) -> list[CameraFigures]:
     if table is None:
         return []
     px, segment = np.linalg.norm(table.residual_px, axis=-1), _segments(table)
-    listed = people.run.get("cameras")
-    entries = [objects(each) for each in (listed if isinstance(listed, list) else [])]
+    entries = [objects(each) for each in lists(people.run.get("cameras"))]
     told = {str(each.get("camera")): each for each in entries}
     made = []
     for view, name in enumerate(table.view_names.tolist()):  # a handful of cameras
@@ -93,6 +93,7 @@ def overall(people: Reconstruction) -> dict[str, Any]:
     table, known = people.observations, people.known[people.known != Known.UNKNOWN]
     sigma = sigma_m(people.covariance)
     sigma = sigma[np.isfinite(sigma)]
+    spans = [np.arange(span.start, span.stop) for span in covered_frames(people.run) or []]
     gate = np.zeros(0) if table is None else table.gate[table.gate != Gate.NOT_SEEN]
     return {
         "placed": bool(np.isfinite(people.joints).all(axis=-1).any()),
@@ -102,6 +103,8 @@ def overall(people: Reconstruction) -> dict[str, Any]:
         "sigma_mm": 1e3 * float(np.median(sigma)) if len(sigma) > 0 else None,
         "solved": _share(people.status == "ok"),
         "rows": len(people),
+        "people": len(np.unique(people.person)),
+        "frames": len(np.unique(np.concatenate([people.frame, *spans]))),
         "status": ", ".join(f"{count} {name}" for name, count in Counter(people.status.tolist()).items()),
     }
 

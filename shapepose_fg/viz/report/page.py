@@ -3,7 +3,6 @@
 import base64
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
 from importlib.resources import files
 
 import numpy as np
@@ -11,7 +10,6 @@ import numpy as np
 from shapepose_fg.core.drawing import PALETTE
 from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.tracking.listing import TrackSummary
 from shapepose_fg.viz.report.facts import told_by
 from shapepose_fg.viz.report.figures import KINDS, camera_figures, known_counts, overall
@@ -21,51 +19,38 @@ _SCRIPTS = ("geometry.js", "skin.js", "drawing.js", "page.js")
 """In the order in which they are loaded."""
 
 
-@dataclass(frozen=True)
-class Content:
-    """Everything that a page says."""
+def page_text(
+    title: str,
+    people: Reconstruction,
+    tracks: Sequence[TrackSummary],
+    scene: Scene | None,
+    remarks: Sequence[str],
+) -> str:
+    """The page of a result as HTML: self-contained, with no address of anything else in it.
 
-    title: str
-    """Name of the result."""
-    people: Reconstruction
-    """The result."""
-    tracks: Sequence[TrackSummary]
-    """Its identities."""
-    scene: Scene | None
-    """What is drawn; None where there are no people."""
-    remarks: Sequence[str] = ()
-    """What the page lacks, a sentence each."""
-
-
-def page_text(content: Content) -> str:
-    """The page as HTML: self-contained, with no address of anything else in it.
-
-    Texts of the input are escaped, and the page's own policy forbids every script but those that are part of it.
+    `tracks` are its identities, `scene` is drawn where there is one, and `remarks` say what the page lacks. Texts
+    of the input are escaped, and the page's own policy forbids every script but those that are part of it.
     """
     from jinja2 import Environment, StrictUndefined
 
-    people, tracks = content.people, content.tracks
     page = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, extensions=["jinja2.ext.do"])
     page.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
     page.filters |= {"dash": _dash, "share": _share, "percent": _percent, "count": _count, "path": _path}
-    scripts = [_asset(name) for name in _SCRIPTS] if content.scene is not None else []
+    scripts = [_asset(name) for name in _SCRIPTS] if scene is not None else []
     hashes = " ".join(f"'sha256-{_sha256(text)}'" for text in scripts) or "'none'"
-    cameras, run, over_time = camera_figures(people), told_by(people.run), _over_time(people)
     by_person = known_counts(people, np.searchsorted([each.person for each in tracks], people.person))
     by_joint, kinds = known_counts(people), [kind.name.lower() for kind in KINDS]
     return page.from_string(_asset("page.html")).render(
         Gate=Gate,
         policy=f"default-src 'none'; style-src 'unsafe-inline'; script-src {hashes}; img-src data:",
-        title=content.title,
+        title=title,
         style=_asset("report.css"),
         scripts=scripts,
-        scene=content.scene,
-        remarks=[*content.remarks],
-        run=run,
-        summary=_sentence(people, len(cameras), run, over_time),
-        over_time=over_time,
+        scene=scene,
+        remarks=[*remarks],
+        run=told_by(people.run),
         overall=overall(people),
-        cameras=cameras,
+        cameras=camera_figures(people),
         tracks=[
             (each, dict(zip(kinds, counts, strict=True)), PALETTE[each.person % len(PALETTE)])
             for each, counts in zip(tracks, by_person.tolist(), strict=True)
@@ -76,30 +61,6 @@ def page_text(content: Content) -> str:
             for name, counts in zip(people.joint_names.tolist(), by_joint.tolist(), strict=True)
         ],
     )
-
-
-def _over_time(people: Reconstruction) -> bool:
-    """Whether a person's number is an identity."""
-    return bool(people.run.get("configuration", {}).get("temporal", True))
-
-
-def _sentence(people: Reconstruction, cameras: int, run: dict, over_time: bool) -> str:
-    """How many people in how many frames, those without people too."""
-    spans = covered_frames(people.run) or []
-    frames = len(np.unique(np.concatenate([people.frame, *(np.arange(span.start, span.stop) for span in spans)])))
-    who = _plural(len(np.unique(people.person)), "person", "people")
-    if not over_time:
-        who = f"{_plural(len(people), 'person', 'people')}, frame by frame,"
-    told = ""
-    if run["fps"] is not None and run["fps"] > 0:
-        assumed = ", a rate that is assumed because none was given" if run["source"] == "assumed" else ""
-        told = f", {frames / run['fps']:.1f}\u00a0s at {run['fps']:.4g} a second{assumed}"
-    by = f" of {cameras} cameras" if cameras > 0 else ""
-    return f"{who if len(people) > 0 else 'Nobody was found'} in {_plural(frames, 'frame', 'frames')}{by}{told}."
-
-
-def _plural(count: int, one: str, several: str) -> str:
-    return f"{count} {one if count == 1 else several}"
 
 
 def _dash(value: float | None, text: str, none: str = "–") -> str:

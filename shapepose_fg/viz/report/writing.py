@@ -16,7 +16,7 @@ from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.export.take import Take
 from shapepose_fg.io.solved_setup import CAMERAS
 from shapepose_fg.tracking.listing import list_tracks
-from shapepose_fg.viz.report.page import Content, page_text
+from shapepose_fg.viz.report.page import page_text
 from shapepose_fg.viz.report.scene import Scene, scene_of
 
 MOST_ROWS = 40_000
@@ -62,7 +62,7 @@ def write_report(
         except ValueError as error:
             remarks.append(f"there is no scene: {error}")
     title = folder.resolve().name or str(folder)
-    text = page_text(Content(title, people, list_tracks(people, arrays, every), scene, remarks))
+    text = page_text(title, people, list_tracks(people, arrays, every), scene, remarks)
     file = folder / REPORT
     # A name may hold half of a pair of surrogates, which no file can.
     write_atomically(file, lambda stream: stream.write(text.encode("utf-8", "replace")))
@@ -108,18 +108,14 @@ def _timed(people: Reconstruction) -> bool:
 
 
 def _standing(people: Reconstruction) -> Axis:
-    """The axis along which people stand: from their hips to their heads, mostly."""
-    names = people.joint_names.tolist()
-    heads = [names.index(name) for name in ("Neck", "Nose", "Head") if name in names]
-    feet = [names.index(name) for name in ("RAnkle", "LAnkle", "RKnee", "LKnee") if name in names]
-    if len(people) == 0 or not heads or not feet:
-        return "z"
-    joints = people.joints
-    along = (joints[:, heads][:, :, None] - joints[:, feet][:, None]).reshape(-1, 3)
+    """The axis along which people stand: from their feet to their heads, mostly."""
+    ends = (("Neck", "Nose", "Head"), ("RAnkle", "LAnkle", "RKnee", "LKnee"))
+    heads, feet = (people.joints[:, np.isin(people.joint_names, each)] for each in ends)
+    along = (heads[:, :, None] - feet[:, None]).reshape(-1, 3)
     along = along[np.isfinite(along).all(axis=1)]
     if len(along) == 0:
         return "z"
     mean = np.median(along, axis=0)
-    axes: tuple[tuple[Axis, Axis], ...] = (("x", "-x"), ("y", "-y"), ("z", "-z"))
     best = int(np.abs(mean).argmax())
-    return axes[best][0 if mean[best] > 0 else 1]
+    axes: tuple[Axis, ...] = ("x", "y", "z", "-x", "-y", "-z")
+    return axes[best if mean[best] > 0 else best + 3]
