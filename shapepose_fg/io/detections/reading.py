@@ -126,7 +126,7 @@ def find_places(path: Path, rig: Rig) -> tuple[list[Path], list[str]]:
             " with <camera>.txt (4D Association), <camera>/ or <camera>_json/ with a JSON file per frame"
             " (OpenPose, Pose2Sim, MMPose), or <camera>.json (COCO's results, AlphaPose, MMPose)"
         )
-    return list(told[0]), [told[1]]
+    return told
 
 
 def _named(folder: Path, name: str, patterns: Sequence[str]) -> Path | None:

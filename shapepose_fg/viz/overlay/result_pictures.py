@@ -44,9 +44,9 @@ def pictures_of(
     drawn = wanted.drawn
     used = {each.name: each for each in _used_footage(run, wanted.detections)}
     if wanted.videos is not None:
-        places = find_footage(wanted.videos, drawn)
-        paths = dict(zip(drawn, places.paths, strict=True))
-        for text in places.notes:
+        places, notes = find_footage(wanted.videos, drawn)
+        paths = dict(zip(drawn, places, strict=True))
+        for text in notes:
             tell(text)
     else:
         missing = next((name for name in drawn if name not in used), None)
