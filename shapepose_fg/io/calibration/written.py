@@ -74,10 +74,8 @@ class Format:
 
     name: str
     """For messages."""
-    recognise: Callable[[Content], bool]
-    """Whether a content is meant to be of this format, though it may be faulty."""
-    read: Callable[[Content], WrittenRig]
-    """The cameras; InputError naming file, place and cure where it is faulty."""
+    read: Callable[[Content], WrittenRig | None]
+    """The cameras; None where the content is of another format, InputError where it is of this one and faulty."""
 
 
 @dataclass(frozen=True)
