@@ -85,11 +85,9 @@ def _blocks(
         view = _candidates(numbers, kind, counts, starts - numbers.first, start, camera)
         yield with_middles(view, kind.skeleton) if kind.skeleton.middles else view
     if numbers.reaches(position + 1):
-        more = numbers.count() - position
+        what = f"more numbers follow the last of the {frame_count} frames"
         raise numbers.refuse(
-            position,
-            f"{more} numbers follow the last of the {frame_count} frames",
-            "correct the number of frames in line 1, or write the detections again",
+            position, what, "correct the number of frames in line 1, or write the detections again"
         )
 
 

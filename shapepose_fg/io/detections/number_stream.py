@@ -59,13 +59,6 @@ class NumberStream:
         """The first `count` numbers of the file are done with."""
         self.values, self.first = self.values[count - self.first :].copy(), count
 
-    def count(self) -> int:
-        """How many numbers the file has; all are forgotten."""
-        while True:
-            self.forget(self.first + len(self.values))
-            if not self.reaches(self.first + 1):
-                return self.first
-
     def refuse(self, index: int | None, problem: str, cure: str) -> InputError:
         """An error about number `index`; None is what should be behind the last."""
         return InputError(f"{self.path}: line {self._line(index)}: {problem}; {cure}")

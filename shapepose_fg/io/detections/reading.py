@@ -15,7 +15,7 @@ from shapepose_fg.io.camera_names import listing, told_by_parts
 from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.detections.association_text import read_association_text
 from shapepose_fg.io.detections.json_people import is_one_file, read_frame_files, read_one_file
-from shapepose_fg.io.detections.people import CameraPeople, KeptPeople, ScoreRule, candidates_of
+from shapepose_fg.io.detections.people import CameraPeople, KeptPeople, candidates_of, score_rule
 from shapepose_fg.io.detections.view_streams import ViewStream, assemble
 from shapepose_fg.io.skeleton_file import find_skeleton
 
@@ -188,14 +188,14 @@ def _streams_of(people: Sequence[KeptPeople], skeleton: Skeleton) -> tuple[list[
     """The people of every camera as candidates, and what was made of their scores and frames."""
     cameras = [each.camera for each in people]
     first, last = _span(cameras)
-    rule = ScoreRule.of(people)
+    rule, note = score_rule(people)
     for each, camera in zip(people, cameras, strict=True):
         if each.farthest is not None and each.farthest <= 1:
             raise InputError(
                 f"{camera.source}: recognised as {camera.program}, but all keypoints lie between -1"
                 f" and 1, and pixels were expected; {camera.rerun}"
             )
-    notes = [] if rule.note is None else [rule.note]
+    notes = [] if note is None else [note]
     if first > 0 and not all(camera.every_frame for camera in cameras):
         notes.append(f"frame 0 is number {first} of the files")
     streams = []
