@@ -25,8 +25,6 @@ _KEPT: dict[str, Any] = {
     "affinity": np.float64,
 }
 """What is kept of a block, and as which numbers: 28 bytes a candidate, 16 an affinity."""
-_INDICES = ("view", "joint", "pairs")
-"""Those that are indices."""
 
 
 @dataclass(frozen=True)
@@ -64,9 +62,10 @@ class DetectionTable:
         block = self._at_hand[number]
         rows = slice(*block["candidate_start"][at : at + 2].tolist())
         links = slice(*block["pair_start"][at : at + 2].tolist())
-        parts = {name: block[name][links if name in ("pairs", "affinity") else rows] for name in _KEPT}
+        view, joint = (block[name][rows].astype(np.intp) for name in ("view", "joint"))
+        pairs = block["pairs"][links].astype(np.intp)
         return Detections(
-            **{name: part.astype(np.intp) if name in _INDICES else part for name, part in parts.items()}
+            view, joint, block["xy"][rows], block["confidence"][rows], pairs, block["affinity"][links]
         )
 
     def __iter__(self) -> Iterator[Detections]:

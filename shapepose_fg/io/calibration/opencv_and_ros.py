@@ -166,7 +166,7 @@ def _read_ros(content: Content) -> WrittenRig | None:
             " <camera>_pose.yaml of every camera"
         )
     files = _loaded(content, ".yaml .yml") if content.syntax == "folder" else {}
-    values = {path: each.value if each.syntax == "YAML" else None for path, each in files.items()}
+    values: dict[Path, Any] = {path: each.value if each.syntax == "YAML" else None for path, each in files.items()}
     if not any(map(_is_info, values.values())):
         return None
     poses = {path.stem.removesuffix("_pose"): path for path, value in values.items() if not _is_info(value)}

@@ -18,6 +18,7 @@ from shapepose_fg.io.calibration.written import (
     pose,
     rotation_of,
 )
+from shapepose_fg.io.validation import is_number
 
 _QTM, _NEXUS = "export the calibration from QTM again", "export the calibration from Nexus or Shogun again"
 _SUBPIXEL = 64.0
@@ -115,7 +116,7 @@ def _vicon(camera: ET.Element, place: str) -> WrittenCamera:
     if name:
         numbers = _node(ET.Element("", VICON_RADIAL2=radial), place, _NEXUS).needed("VICON_RADIAL2", 5)
         distortion = [*numbers[2:4], 0.0, 0.0, numbers[4]]
-    elif any(word.strip("0.") for word in key_frame.get("VICON_RADIAL", "").split()[-2:]):
+    elif not all(is_number(word) and float(word) == 0 for word in key_frame.get("VICON_RADIAL", "").split()[-2:]):
         raise InputError(
             f"{place}: VICON_RADIAL without VICON_RADIAL2 is not read; calibrate with Nexus 2 or newer, or"
             " undistort the pictures and write 0 0"

@@ -208,7 +208,7 @@ def _streams_of(people: Sequence[KeptPeople], skeleton: Skeleton) -> tuple[list[
             (since, until), more = camera.gaps[0], ", and others" if len(camera.gaps) > 1 else ""
             where = f"frame {since}" if since == until else f"frames {since} to {until}"
             have = "frames have" if count > 1 else "frame has"
-            notes.append(f"{camera.source}: {count} {have} no file ({where}{more}); nobody is seen there")
+            notes.append(f"{camera.source}: {count} {have} no file ({where}{more}); no people are seen there")
     return streams, notes
 
 

@@ -90,7 +90,9 @@ def export_result(
     """
     job: Job | None = None
     if not all(each.rows for each in formats):
-        needs = {name: any(getattr(each, name) for each in formats) for name in ("identities", "observations")}
+        needs: Any = {
+            name: any(getattr(each, name) for each in formats) for name in ("identities", "observations")
+        }
         job = Job(read_take(results, **options, **needs), folder, body, markers, fill_gaps_s)
     done: dict[str, Written] = {}
     for each in formats:
@@ -156,6 +158,6 @@ def chosen_rows(
     found, there = mine & (opened.frame >= frames.start) & (opened.frame < frames.stop), opened.frame[mine]
     if len(there) > 0 and not found.any():
         raise InputError(
-            f"--frames: {path} has nobody in these frames; people are in frames {there.min()} to {there.max()}"
+            f"--frames: {path} has no people in these frames; people are in frames {there.min()} to {there.max()}"
         )
     return np.flatnonzero(found)

@@ -137,7 +137,7 @@ def align(clocks: Sequence[CameraClock], has_clock: bool) -> Lockstep:
         if len(missing) > 0:
             notes.append(
                 f"camera {each.name}: no picture within half a frame of {len(missing)} of {len(moment)} moments"
-                f" (the first is frame {missing[0]}); it sees nobody there"
+                f" (the first is frame {missing[0]}); it sees no people there"
             )
         if has_clock and misfit.max(initial=0.0) > 1e3 * _MISFIT_S:
             misfits.append(
