@@ -116,10 +116,8 @@ def refuse_corrected(folder: Path) -> None:
     """InputError where `folder` holds a result that was corrected by hand: a new one would make that worthless."""
     there = [name for name in (CORRECTIONS, UNCORRECTED) if (folder / name).exists()]
     if len(there) > 0:
-        raise InputError(
-            f"{folder}: this result was corrected by hand ({' and '.join(there)}); give another folder, or delete"
-            f" {CORRECTIONS} and {UNCORRECTED} first"
-        )
+        cure = f"give another folder, or delete {CORRECTIONS} and {UNCORRECTED} first"
+        raise InputError(f"{folder}: this result was corrected by hand ({' and '.join(there)}); {cure}")
 
 
 def _write(folder: Path, people: Reconstruction, edits: Sequence[Edit]) -> None:
@@ -135,10 +133,8 @@ def _kept_edits(folder: Path) -> tuple[Edit, ...]:
     """`read_corrections`; InputError where the result as it was before them is not there any more."""
     edits, file = read_corrections(folder), folder / UNCORRECTED / PEOPLE
     if len(edits) > 0 and not file.is_file():
-        raise InputError(
-            f"{file}: the result as it was before the corrections is not there; put it back, or delete"
-            f" {CORRECTIONS} to keep the result as it is now"
-        )
+        cure = f"put it back, or delete {CORRECTIONS} to keep the result as it is now"
+        raise InputError(f"{file}: the result as it was before the corrections is not there; {cure}")
     return edits
 
 

@@ -84,10 +84,8 @@ def _images(path: Path, lenses: dict[str, WrittenCamera]) -> list[WrittenCamera]
             rows.append((number, line.split(maxsplit=9)))
             points, text = next(lines, (0, ""))
             if len(text.split()) % 3 != 0 or not all(is_number(word) for word in text.split()):
-                raise InputError(
-                    f"{path}: line {points}: must hold the points of the image before it, three numbers each;"
-                    " leave an empty line there where it has none"
-                )
+                problem = f"line {points}: must hold the points of the image before it, three numbers each"
+                raise InputError(f"{path}: {problem}; leave an empty line there where it has none")
     names = _names([words[9] if len(words) == 10 else "" for _, words in rows])
     cameras = []
     for (number, words), name in zip(rows, names, strict=True):

@@ -161,10 +161,8 @@ def _read_ros(content: Content) -> WrittenRig | None:
     """
     if content.syntax == "YAML" and (_is_info(content.value) or _message_of(content.value) is not None):
         what = "the intrinsics" if _is_info(content.value) else "the pose"
-        raise InputError(
-            f"{content.path}: this is {what} of one camera of ROS; give the folder with <camera>.yaml and"
-            " <camera>_pose.yaml of every camera"
-        )
+        cure = "give the folder with <camera>.yaml and <camera>_pose.yaml of every camera"
+        raise InputError(f"{content.path}: this is {what} of one camera of ROS; {cure}")
     files = _loaded(content, ".yaml .yml") if content.syntax == "folder" else {}
     values: dict[Path, Any] = {path: each.value if each.syntax == "YAML" else None for path, each in files.items()}
     if not any(map(_is_info, values.values())):

@@ -194,15 +194,11 @@ def pose(
     with np.errstate(over="ignore", invalid="ignore"):  # of numbers like 1e300, which are refused here
         off = np.abs(R @ R.T - np.eye(3)).max()
     if not off <= _ROTATION_TOLERANCE:
-        raise InputError(
-            f"{place}: the rotation of {key} is not orthonormal (R Rᵀ is off by {off:.2g});"
-            " give a pure rotation without scale, row by row"
-        )
+        problem = f"the rotation of {key} is not orthonormal (R Rᵀ is off by {off:.2g})"
+        raise InputError(f"{place}: {problem}; give a pure rotation without scale, row by row")
     if np.linalg.det(R) < 0:
-        raise InputError(
-            f"{place}: the rotation of {key} mirrors (determinant -1); use a right-handed world and"
-            " OpenCV's camera axes: x right, y down, z forward"
-        )
+        cure = "use a right-handed world and OpenCV's camera axes: x right, y down, z forward"
+        raise InputError(f"{place}: the rotation of {key} mirrors (determinant -1); {cure}")
     if off >= _EXACT:
         U, _, Vt = np.linalg.svd(R)
         R = U @ Vt

@@ -117,10 +117,8 @@ def _vicon(camera: ET.Element, place: str) -> WrittenCamera:
         numbers = _node(ET.Element("", VICON_RADIAL2=radial), place, _NEXUS).needed("VICON_RADIAL2", 5)
         distortion = [*numbers[2:4], 0.0, 0.0, numbers[4]]
     elif not all(is_number(word) and float(word) == 0 for word in key_frame.get("VICON_RADIAL", "").split()[-2:]):
-        raise InputError(
-            f"{place}: VICON_RADIAL without VICON_RADIAL2 is not read; calibrate with Nexus 2 or newer, or"
-            " undistort the pictures and write 0 0"
-        )
+        cure = "calibrate with Nexus 2 or newer, or undistort the pictures and write 0 0"
+        raise InputError(f"{place}: VICON_RADIAL without VICON_RADIAL2 is not read; {cure}")
     return WrittenCamera(camera.attrib["DEVICEID"], K, wTc, (round(width), round(height)), distortion)
 
 

@@ -70,10 +70,8 @@ class _Instance(BaseModel):
     def flat(self, place: str, program: str) -> list[float]:
         """x, y and score of each keypoint."""
         if len(self.keypoints) != len(self.keypoint_scores):
-            raise InputError(
-                f"{place}: {len(self.keypoints)} keypoints have {len(self.keypoint_scores)} keypoint_scores;"
-                f" {_RERUN[program]}"
-            )
+            problem = f"{len(self.keypoints)} keypoints have {len(self.keypoint_scores)} keypoint_scores"
+            raise InputError(f"{place}: {problem}; {_RERUN[program]}")
         pairs = zip(self.keypoints, self.keypoint_scores, strict=True)
         return [number for (x, y), score in pairs for number in (x, y, score)]
 
@@ -154,10 +152,8 @@ def read_frame_files(folder: Path) -> CameraPeople:
     numbered = in_order([(frame_number(file), file) for file in files])
     first, last = numbered[0][0], numbered[-1][0]
     if last - first + 1 > 2 * len(numbered) + _LONGEST_GAP:
-        raise InputError(
-            f"{folder}: {len(numbered)} files are numbered from {first} to {last}; number them"
-            f" by the frames of the recording, or {_RERUN[program]}"
-        )
+        problem = f"{len(numbered)} files are numbered from {first} to {last}"
+        raise InputError(f"{folder}: {problem}; number them by the frames of the recording, or {_RERUN[program]}")
     gaps = tuple((one + 1, other - 1) for (one, _), (other, _) in pairwise(numbered) if other > one + 1)
     blocks = _frame_blocks(folder, program, numbered)
     return CameraPeople(folder, program, blocks, first, last, gaps=gaps, rerun=_RERUN[program])
@@ -296,10 +292,8 @@ def _results(people: _Collected, items: Iterable[Any], others: Mapping[str, Any]
     first: dict[int, int | str] = {}
     for image, frame in frames.items():
         if first.setdefault(frame, image) != image:
-            raise InputError(
-                f"{path}: the pictures {str(first[frame])[:40]!r} and {str(image)[:40]!r} are both frame {frame};"
-                f" {_RERUN[program]}, of one camera with a number for each picture"
-            )
+            problem = f"the pictures {str(first[frame])[:40]!r} and {str(image)[:40]!r} are both frame {frame}"
+            raise InputError(f"{path}: {problem}; {_RERUN[program]}, of one camera with a number for each picture")
     return people.camera([frames[image] for image in images], (min(first), max(first)) if first else (0, -1))
 
 

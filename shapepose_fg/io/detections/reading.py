@@ -216,14 +216,10 @@ def _span(cameras: Sequence[CameraPeople]) -> tuple[int, int]:
     """Numbers of the first and last frame that any camera lists."""
     listed = [each for each in cameras if each.last >= each.first]
     if len(listed) == 0:
-        raise InputError(
-            f"{cameras[0].source}: recognised as {cameras[0].program}, where no camera lists a frame;"
-            " give detections of people"
-        )
+        problem = f"recognised as {cameras[0].program}, where no camera lists a frame"
+        raise InputError(f"{cameras[0].source}: {problem}; give detections of people")
     first, last = min(each.first for each in listed), max(each.last for each in listed)
     if last - first >= _MOST_FRAMES:
-        raise InputError(
-            f"{listed[0].source}: recognised as {listed[0].program}, whose frames would run from {first} to"
-            f" {last}; number the pictures by their frames"
-        )
+        problem = f"recognised as {listed[0].program}, whose frames would run from {first} to {last}"
+        raise InputError(f"{listed[0].source}: {problem}; number the pictures by their frames")
     return first, last

@@ -54,10 +54,8 @@ class Job:
         except InputError as error:
             if self.body is None or self.body.exists():
                 raise
-            raise InputError(
-                f"{self.body}: the body model of this result is not there any more; put it back, or say with"
-                " --body where it is"
-            ) from error
+            problem = "the body model of this result is not there any more"
+            raise InputError(f"{self.body}: {problem}; put it back, or say with --body where it is")
 
 
 @dataclass

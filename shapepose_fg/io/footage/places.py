@@ -90,10 +90,8 @@ def _in_folder(folder: Path, cameras: Sequence[str]) -> tuple[list[Path], list[s
             return _in_folder(inner[0], cameras)
     missing = next(camera for camera, found in zip(cameras, exact, strict=True) if len(found) == 0)
     holds = listing([path.name for path in offered], "no video, picture or folder of pictures")
-    raise InputError(
-        f"{folder}: nothing here is named after camera {missing}, it holds {holds}; name a video or a folder"
-        f" of pictures after each camera, or give --videos {missing}=PATH for each"
-    )
+    cure = f"name a video or a folder of pictures after each camera, or give --videos {missing}=PATH for each"
+    raise InputError(f"{folder}: nothing here is named after camera {missing}, it holds {holds}; {cure}")
 
 
 def _is_footage(path: Path) -> bool:
