@@ -55,7 +55,7 @@ class Job:
             if self.body is None or self.body.exists():
                 raise
             problem = "the body model of this result is not there any more"
-            raise InputError(f"{self.body}: {problem}; put it back, or say with --body where it is")
+            raise InputError(f"{self.body}: {problem}; put it back, or say with --body where it is") from error
 
 
 @dataclass
