@@ -27,7 +27,7 @@ _MERGED = {
     "core.drawing": "viz.viewer.palette io.export.bones io.export.light_mesh",
     "pipeline.runs.parts": "pipeline.runs.rows_of_people",
     "io.export.take": "io.export.axes",
-    "io.detections.association_text": "io.detections.association_skeletons",
+    "io.detections.association_text": "io.detections.association_skeletons io.detections.number_stream",
     "io.detections.json_people": "io.detections.one_file io.detections.frame_files",
     "io.detections.reading": "io.detections.formats io.detections.places",
     "io.calibration.json_and_toml": "io.calibration.rig_file io.calibration.json_files",

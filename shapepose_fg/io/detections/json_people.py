@@ -115,6 +115,20 @@ def _of_one_model(known: set[int], people: Iterable[list[float]], source: Path, 
         raise InputError(f"{source}: {what}; give the detections of one model")
 
 
+def read_json_people(place: Path) -> CameraPeople:
+    """The people of one camera: of a JSON file with all its frames, also the only one of a folder, or of a folder
+    with a file per frame. InputError naming file, key and cure.
+    """
+    if not place.is_dir():
+        return read_one_file(place)
+    lists = _lists(place)
+    if len(lists) == 1:
+        items = JsonItems(lists[0], _LISTS)
+        if items.key is not None or (items.found and _known(next(iter(items), {"image_id": None}))):
+            return read_one_file(lists[0])
+    return read_frame_files(place)
+
+
 # A file per frame.
 
 
@@ -190,17 +204,6 @@ def _people_of_frame(file: Path, program: str) -> list[list[float]]:
 # One file with all frames.
 
 
-def is_one_file(path: Path) -> bool:
-    """Whether all frames of one camera are in a JSON file, or in the only one of a folder."""
-    if not path.is_dir():
-        return path.is_file()
-    lists = _lists(path)
-    if len(lists) != 1:
-        return False
-    items = JsonItems(lists[0], _LISTS)
-    return items.key is not None or (items.found and _known(next(iter(items), {"image_id": None})))
-
-
 def _lists(folder: Path) -> list[Path]:
     return [each for each in folder.glob("*.json") if not each.name.startswith(".")]
 
@@ -212,7 +215,6 @@ def _known(item: Any) -> bool:
 
 def read_one_file(path: Path) -> CameraPeople:
     """Read all frames that one camera saw; InputError naming file, key and cure."""
-    path = _lists(path)[0] if path.is_dir() else path
     items = JsonItems(path, _LISTS)
     if items.key is not None and not items.found:
         raise InputError(f"{path}: the file must be a list, got {describe(items.value)}; {_RERUN[_COCO]}")
