@@ -37,7 +37,7 @@ _MERGED = {
     "io.footage.lockstep": "io.footage.given",
     "io.export.motion_files": "io.export.amass io.export.bvh",
     "io.export.skinned": "io.export.stretches",
-    "io.export.registry": "io.export.exporting io.export.reading",
+    "io.export.registry": "io.export.exporting io.export.reading io.export.job",
     "io.export.tables": "io.export.table io.export.parquet",
     "io.export.markers": "io.export.marker_files io.export.trc io.export.c3d io.export.pose2sim_files",
     "io.export.rerun_app": "io.export.rerun_scene io.export.rerun_statistics io.export.rrd",
