@@ -20,7 +20,6 @@ from shapepose_fg.io.validation import describe, validated
 RIG_FORMAT = "shapepose-fg rig 1"
 """The tag by which a rig file of our own is known."""
 
-_FIVE = "write at most k1 k2 p1 p2 k3, as OpenCV orders them"
 _MATRIX = "write the 3x3 intrinsic matrix row by row, in pixels"
 _CAMERA_FROM_WORLD = "write the 3x4 camera-from-world matrix row by row"
 _ROTATION = "write the 3x3 camera-from-world rotation row by row"
@@ -31,7 +30,10 @@ _CURES = {
     **{"T": "write the 3 numbers of the translation", "wTc": "write the 4x4 world-from-camera matrix row by row"},
     **dict.fromkeys(("rotation", "translation"), _EXTRINSICS),
     **dict.fromkeys(("imgSize", "resolution", "size", "image_size"), _SIZE),
-    **dict.fromkeys(("distCoeff", "dist", "distortion", "distCoef", "distortions"), _FIVE),
+    **dict.fromkeys(("distCoeff", "dist", "distCoef"), "write at most k1 k2 p1 p2 k3, as OpenCV orders them"),
+    **dict.fromkeys(
+        ("distortion", "distortions"), "write k1 k2 p1 p2 k3 as OpenCV does, or k1 to k4 of a fisheye"
+    ),
     "lens": "write perspective or fisheye",
 }
 """What to do about a value, by its name in any of the formats."""

@@ -151,7 +151,7 @@ class Node:
         """World from camera (4, 4), of a rotation (9 numbers, or axis times angle) and a translation from the
         world; or instead of that the camera's centre.
         """
-        turn, shift = self.needed(R, 9, 3), self.needed(t, 3)
+        turn, shift = self.needed(R, 9) if centre else self.needed(R, 9, 3), self.needed(t, 3)
         shift = -turn.reshape(3, 3) @ shift if centre else shift
         return pose(turn, shift, self.named(R) or R, self.place)
 
