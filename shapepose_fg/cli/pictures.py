@@ -42,9 +42,9 @@ class PictureOptions:
         """The videos or pictures of every camera, looked through."""
         from shapepose_fg.io.footage.places import find_footage
 
-        places = find_footage(self.videos or [], rig.names)
-        note(*places.notes)
-        return [opened(name, path) for name, path in zip(rig.names, places.paths, strict=True)]
+        places, notes = find_footage(self.videos or [], rig.names)
+        note(*notes)
+        return [opened(name, path) for name, path in zip(rig.names, places, strict=True)]
 
     def of_result(
         self, run: Mapping[str, Any], rig: "Rig", drawn: Sequence[str], detections: Path | None = None

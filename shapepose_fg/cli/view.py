@@ -26,8 +26,7 @@ def view(
     ),
 ) -> None:
     """Show a result in the rerun viewer: people, cameras, and what was used of what they saw, on a timeline."""
-    from shapepose_fg.io.export.job import Job
-    from shapepose_fg.io.export.registry import read_take
+    from shapepose_fg.io.export.registry import Job, read_take
     from shapepose_fg.io.export.rerun_app import (
         body_if_there,
         new_stream,

@@ -40,14 +40,14 @@ def _one_number_each(names: Sequence[str]) -> list[int] | None:
 
 def told_by_parts(
     folder: Path, cameras: Sequence[str], paths: Sequence[Path], names: Sequence[str]
-) -> tuple[tuple[Path, ...], str] | None:
+) -> tuple[list[Path], list[str]] | None:
     """Of `paths` in a folder, which are called `names`, that of each camera by `match_names`, and a note of it."""
     chosen = match_names(cameras, names)
     if chosen is None:
         return None
-    found = tuple(paths[index] for index in chosen)
+    found = [paths[index] for index in chosen]
     pairs = ", ".join(f"{camera} is {path.name}" for camera, path in zip(cameras, found, strict=True))
-    return found, f"{folder}: cameras were told by parts of the names: {pairs}"
+    return found, [f"{folder}: cameras were told by parts of the names: {pairs}"]
 
 
 def listing(names: Sequence[str], nothing: str = "nothing") -> str:

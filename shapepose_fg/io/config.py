@@ -29,8 +29,7 @@ def read_config(path: str | Path, kind: type[T]) -> T:
     A field that is itself a dataclass is a table. Raises InputError naming the file, the key and the cure
     for bad TOML, an unknown key, a wrong type, or a value that the dataclass refuses.
     """
-    path = Path(path)
-    return _build(kind, read_toml(path, may_be_empty=True), path)
+    return config_from(read_toml(Path(path), may_be_empty=True), kind, path)
 
 
 _CURE = "`shapepose-fg config` shows the defaults"
@@ -46,47 +45,42 @@ def config_from(
     `place` is the dotted name of the table in the file. Raises InputError naming file and key, as `read_config`
     does, with `cure` at its end.
     """
-    return _build(kind, table, Path(path), f"{place}." if place else "", cure)
-
-
-def toml_text(config: object) -> str:
-    """`config` (a dataclass) as TOML that `read_config` reads back, each field's docstring above it."""
-    return "\n".join(_lines(config)).strip() + "\n"
-
-
-def _build(kind: type[T], table: dict[str, Any], path: Path, prefix: str = "", cure: str = _CURE) -> T:
-    """A dataclass from its table; `prefix` is the dotted name of the table, with its dot."""
-    hints = get_type_hints(kind)
+    hints, prefix = get_type_hints(kind), f"{place}." if place else ""
     known = [field.name for field in fields(cast(Any, kind)) if field.init]
+    replaced: dict[str, str] = getattr(kind, "replaced", {})
     values = {}
     for key, value in table.items():
-        replaced: dict[str, str] = getattr(kind, "replaced", {})
+        name = f"{prefix}{key}"
         if key in replaced:
-            raise InputError(f"{path}: {prefix}{key} {replaced[key]}; {cure}")
+            raise InputError(f"{path}: {name} {replaced[key]}; {cure}")
         if key not in known:
             near = get_close_matches(key, known, n=1, cutoff=0)[0]
             meant = cure if cure == ANOTHER_VERSION else f"did you mean {prefix}{near}?"
-            raise InputError(f"{path}: {prefix}{key} is not a known key; {meant}")
-        values[key] = _value(hints[key], value, path, f"{prefix}{key}", cure)
+            raise InputError(f"{path}: {name} is not a known key; {meant}")
+        hint = hints[key]
+        if is_dataclass(hint) and not isinstance(value, dict):
+            raise InputError(
+                f"{path}: {name} must be a table, got {describe(value)}; write [{name}] above its keys"
+            )
+        if is_dataclass(hint):
+            values[key] = config_from(value, cast(type, hint), path, place=name, cure=cure)
+            continue
+        try:
+            # As JSON, strict types still let a list be a tuple and a text be an enumeration.
+            values[key] = _adapter(hint).validate_json(json.dumps(value, default=str))
+        except ValidationError as error:
+            inside, problem = first_problem(error)
+            index = "".join(f"[{part}]" for part in inside if isinstance(part, int))
+            raise InputError(f"{path}: {name}{index} {problem}; {cure}") from None
     try:
         return kind(**values)
     except ValueError as error:
         raise InputError(f"{path}: {prefix}{error}; {cure}") from None
 
 
-def _value(hint: Any, value: Any, path: Path, key: str, cure: str) -> Any:
-    """One setting, in the type that its field has."""
-    if is_dataclass(hint):
-        if not isinstance(value, dict):
-            raise InputError(f"{path}: {key} must be a table, got {describe(value)}; write [{key}] above its keys")
-        return _build(cast(type, hint), value, path, f"{key}.", cure)
-    try:
-        # As JSON, strict types still let a list be a tuple and a text be an enumeration.
-        return _adapter(hint).validate_json(json.dumps(value, default=str))
-    except ValidationError as error:
-        place, problem = first_problem(error)
-        index = "".join(f"[{part}]" for part in place if isinstance(part, int))
-        raise InputError(f"{path}: {key}{index} {problem}; {cure}") from None
+def toml_text(config: object) -> str:
+    """`config` (a dataclass) as TOML that `read_config` reads back, each field's docstring above it."""
+    return "\n".join(_lines(config)).strip() + "\n"
 
 
 @cache

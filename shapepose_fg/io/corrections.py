@@ -73,9 +73,7 @@ def correct(folder: str | Path, edit: Edit, solve: Solve | None = None) -> Edite
     correction cannot be made. The first one keeps the result as it was in `uncorrected`.
     """
     folder = Path(folder)
-    edits, people = read_corrections(folder), Reconstruction.load(folder)
-    if len(edits) > 0:
-        _check_kept(folder)
+    edits, people = _kept_edits(folder), Reconstruction.load(folder)
     try:
         edited = apply(people, edit)
     except ValueError as error:
@@ -85,9 +83,9 @@ def correct(folder: str | Path, edit: Edit, solve: Solve | None = None) -> Edite
         part = folder / _PART
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir()
-        for name in _FILES:
-            if (folder / name).is_file():
-                shutil.copy2(folder / name, part / name)
+        for file in (folder / name for name in _FILES):
+            if file.is_file():
+                shutil.copy2(file, part / file.name)
         part.rename(folder / UNCORRECTED)
     _write(folder, solved, (*edits, edit))
     return replace(edited, people=solved)
@@ -100,12 +98,11 @@ def take_back(folder: str | Path, solve: Solve | None = None) -> tuple[Edit, Rec
     correction touched are solved anew.
     """
     folder = Path(folder)
-    edits = read_corrections(folder)
+    edits = _kept_edits(folder)
     if len(edits) == 0:
         raise InputError(
             f"{folder}: there is no correction to take back; shapepose-fg tracks {folder} lists people"
         )
-    _check_kept(folder)
     if len(edits) == 1:
         _restore(folder)
         return edits[-1], Reconstruction.load(folder)
@@ -119,10 +116,8 @@ def refuse_corrected(folder: Path) -> None:
     """InputError where `folder` holds a result that was corrected by hand: a new one would make that worthless."""
     there = [name for name in (CORRECTIONS, UNCORRECTED) if (folder / name).exists()]
     if len(there) > 0:
-        raise InputError(
-            f"{folder}: this result was corrected by hand ({' and '.join(there)}); give another folder, or delete"
-            f" {CORRECTIONS} and {UNCORRECTED} first"
-        )
+        cure = f"give another folder, or delete {CORRECTIONS} and {UNCORRECTED} first"
+        raise InputError(f"{folder}: this result was corrected by hand ({' and '.join(there)}); {cure}")
 
 
 def _write(folder: Path, people: Reconstruction, edits: Sequence[Edit]) -> None:
@@ -134,14 +129,13 @@ def _write(folder: Path, people: Reconstruction, edits: Sequence[Edit]) -> None:
     write_content(folder / CORRECTIONS, json.dumps(content, indent=1) + "\n")
 
 
-def _check_kept(folder: Path) -> None:
-    """InputError where the result as it was before the corrections is not there any more."""
-    file = folder / UNCORRECTED / PEOPLE
-    if not file.is_file():
-        raise InputError(
-            f"{file}: the result as it was before the corrections is not there; put it back, or delete"
-            f" {CORRECTIONS} to keep the result as it is now"
-        )
+def _kept_edits(folder: Path) -> tuple[Edit, ...]:
+    """`read_corrections`; InputError where the result as it was before them is not there any more."""
+    edits, file = read_corrections(folder), folder / UNCORRECTED / PEOPLE
+    if len(edits) > 0 and not file.is_file():
+        cure = f"put it back, or delete {CORRECTIONS} to keep the result as it is now"
+        raise InputError(f"{file}: the result as it was before the corrections is not there; {cure}")
+    return edits
 
 
 def _restore(folder: Path) -> None:

@@ -54,29 +54,22 @@ class DetectionTable:
         if not -len(self) <= frame < len(self):
             raise IndexError(f"frame {frame} is not among the {len(self)} frames")
         number, at = divmod(frame % len(self), BLOCK_FRAMES)
-        block = self._block(number)
+        if number not in self._at_hand:
+            while len(self._at_hand) >= _AT_HAND:
+                del self._at_hand[next(iter(self._at_hand))]
+            names = (*_KEPT, "candidate_start", "pair_start")
+            self._at_hand[number] = {name: self.kept.array(_name(number), name) for name in names}
+        block = self._at_hand[number]
         rows = slice(*block["candidate_start"][at : at + 2].tolist())
         links = slice(*block["pair_start"][at : at + 2].tolist())
+        view, joint = (block[name][rows].astype(np.intp) for name in ("view", "joint"))
+        pairs = block["pairs"][links].astype(np.intp)
         return Detections(
-            block["view"][rows].astype(np.intp),
-            block["joint"][rows].astype(np.intp),
-            block["xy"][rows],
-            block["confidence"][rows],
-            block["pairs"][links].astype(np.intp),
-            block["affinity"][links],
+            view, joint, block["xy"][rows], block["confidence"][rows], pairs, block["affinity"][links]
         )
 
     def __iter__(self) -> Iterator[Detections]:
         return (self[frame] for frame in range(len(self)))
-
-    def _block(self, number: int) -> Arrays:
-        """A block, as `keep_block` kept it."""
-        if number not in self._at_hand:
-            names = (*_KEPT, "candidate_start", "pair_start")
-            while len(self._at_hand) >= _AT_HAND:
-                del self._at_hand[next(iter(self._at_hand))]
-            self._at_hand[number] = {name: self.kept.array(_name(number), name) for name in names}
-        return self._at_hand[number]
 
 
 def keep_block(

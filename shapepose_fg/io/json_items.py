@@ -30,18 +30,13 @@ class JsonItems:
         """Values under other keys, those behind the list when all items have been read."""
         self._text = _Text(path)
         begin = self._text.peek()
-        self.found = begin == "["
-        """Whether there is one."""
-        self._in_object = begin == "{"
-        if begin == "{":
+        self.found, self._in_object = begin == "[", begin == "{"
+        """`found`: whether there is one."""
+        if self._in_object:
             self.value = {}
             self._text.next_of("{")
-            if self._text.peek() == "}":
-                self._text.next_of("}")
-                self._text.end()
-            else:
-                self._members(keys)
-        elif begin != "[":
+            self._members(keys, may_end=True)
+        elif not self.found:
             self.value = self._text.value()
             self._text.end()
         if self.found:
@@ -63,10 +58,11 @@ class JsonItems:
         else:
             text.end()
 
-    def _members(self, keys: Collection[str]) -> None:
+    def _members(self, keys: Collection[str], *, may_end: bool = False) -> None:
         """Take in keys and values of the object, to the list under one of `keys` or to the object's end."""
         text = self._text
-        while True:
+        going = not (may_end and text.peek() == "}" and text.next_of("}"))
+        while going:
             if text.peek() != '"':
                 raise text.refuse("Expecting property name enclosed in double quotes")
             key = text.value()
@@ -74,16 +70,14 @@ class JsonItems:
             if key in self.others or key == self.key:
                 unique_keys([(key, None), (key, None)], self.path)
             if key in keys:
-                self.key = key
-                self.found = text.peek() == "["
+                self.key, self.found = key, text.peek() == "["
                 if self.found:
                     return
                 self.value = text.value()
             else:
                 self.others[key] = text.value()
-            if text.next_of(",}") == "}":
-                text.end()
-                return
+            going = text.next_of(",}") == ","
+        text.end()
 
 
 class _Text:

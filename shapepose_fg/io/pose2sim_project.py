@@ -171,10 +171,8 @@ def _calibration(session: Path, folder: Path) -> Path:
     found = next((each for each in (*files, rooms[0]) if is_calibration(each)), None)
     if found is None:
         there = listing(sorted(each.name for each in rooms[0].iterdir()))
-        raise InputError(
-            f"{rooms[0]}: no calibration that is known here, only {there}; run Pose2Sim's calibration, or put one"
-            " of the formats of docs/conventions.md there"
-        )
+        cure = "run Pose2Sim's calibration, or put one of the formats of docs/conventions.md there"
+        raise InputError(f"{rooms[0]}: no calibration that is known here, only {there}; {cure}")
     return found
 
 
@@ -190,10 +188,8 @@ def _detections(folder: Path, calibration: Path, has_videos: bool) -> Path:
             return place
     pose, videos = folder / "pose", folder / "videos"
     if not has_videos:
-        raise InputError(
-            f"{folder}: neither 2D detections ({' '.join(_POSES)}) nor videos here; put the videos into"
-            f" {videos} and detect people in them"
-        )
+        problem = f"neither 2D detections ({' '.join(_POSES)}) nor videos here"
+        raise InputError(f"{folder}: {problem}; put the videos into {videos} and detect people in them")
     raise InputError(
         f"{pose}: no 2D detections yet; run Pose2Sim's poseEstimation, or shapepose-fg detect --calibration"
         f" {calibration} --videos {videos} --network NETWORK --output {pose}"

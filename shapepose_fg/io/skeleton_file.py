@@ -53,38 +53,7 @@ def read_skeleton(path: str | Path) -> Skeleton:
     """
     path = Path(path)
     file = validated(_File, read_toml(path), path, "docs/conventions.md describes the file")
-    points = _points(file, path)
-
-    def pairs(rows: list[list[str]]) -> list[tuple[str, str]]:
-        return [(points.get(first, first), points.get(second, second)) for first, second in rows]
-
-    anchor = points.get(file.anchor, file.anchor) if isinstance(file.anchor, str) else pairs([file.anchor])[0]
-    if not isinstance(anchor, str) and not any(set(anchor) == hips for hips in _HIPS):
-        raise InputError(
-            f"{path}: an anchor of two is the middle of the hips; name others under [middles] and anchor there"
-        )
-    if file.core is None:
-        core = [point for point in points.values() if point not in _FACE_AND_TOES]
-        core += [] if isinstance(anchor, str) else [MID_HIP]
-    else:
-        core = [points.get(joint, joint) for joint in file.core]
-    middles = dict(zip(file.middles, pairs(list(file.middles.values())), strict=True))
-    try:
-        return Skeleton.of(
-            file.name,
-            [points.get(joint, "") for joint in file.keypoints],
-            pairs(file.limbs),
-            anchor=anchor,
-            mirror=pairs(file.mirror),
-            core=core,
-            middles={points[joint]: pair for joint, pair in middles.items()},
-        )
-    except ValueError as error:
-        raise InputError(f"{path}: {error}") from None
-
-
-def _points(file: _File, path: Path) -> dict[str, str]:
-    """The point of the body that each joint is, by the joint's name in the file."""
+    # The point of the body that each joint is, by the joint's name in the file.
     points = {joint: file.body.get(joint, joint) for joint in (*file.keypoints, *file.middles) if joint}
     unknown = [name for name in file.body if name not in points]
     if unknown:
@@ -95,4 +64,28 @@ def _points(file: _File, path: Path) -> dict[str, str]:
                 f"{path}: the body has no point {point!r}; say under [body] which of its points {joint} is"
                 f' ({" ".join(BODY_POINTS)}), or write "" for keypoints to be passed over'
             )
-    return points
+
+    def pair(names: list[str]) -> tuple[str, str]:
+        return points.get(names[0], names[0]), points.get(names[1], names[1])
+
+    anchor = points.get(file.anchor, file.anchor) if isinstance(file.anchor, str) else pair(file.anchor)
+    if not isinstance(anchor, str) and set(anchor) not in _HIPS:
+        raise InputError(
+            f"{path}: an anchor of two is the middle of the hips; name others under [middles] and anchor there"
+        )
+    core = [points.get(joint, joint) for joint in file.core or ()]
+    if file.core is None:
+        core = [point for point in points.values() if point not in _FACE_AND_TOES]
+        core += [] if isinstance(anchor, str) else [MID_HIP]
+    try:
+        return Skeleton.of(
+            file.name,
+            [points.get(joint, "") for joint in file.keypoints],
+            [pair(limb) for limb in file.limbs],
+            anchor=anchor,
+            mirror=[pair(both) for both in file.mirror],
+            core=core,
+            middles={points[joint]: pair(ends) for joint, ends in file.middles.items()},
+        )
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from None

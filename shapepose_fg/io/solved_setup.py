@@ -53,9 +53,5 @@ def setup_of(
         raise InputError(f"{run_file}: configuration is missing; reconstruct the recording again")
     settings = config_from(configuration, kind, run_file, cure=ANOTHER_VERSION)
     offsets, body = people.run.get("keypoint_offsets"), people.run.get("body")
-    return SolvedSetup(
-        rig=rig,
-        settings=settings,
-        offsets=None if offsets is None else KeypointOffsets.read(offsets, run_file),
-        body=None if body is None else Path(str(body)),
-    )
+    offsets = None if offsets is None else KeypointOffsets.read(offsets, run_file)
+    return SolvedSetup(rig, settings, offsets, None if body is None else Path(str(body)))

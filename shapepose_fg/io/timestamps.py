@@ -38,18 +38,14 @@ def read_timestamps(path: str | Path, rig: Rig, frames: int) -> FrameTimes:
     wanted = [_TIME] if _TIME in names else rig.names
     missing = [name for name in wanted if name not in names]
     if len(missing) > 0:
-        raise InputError(
-            f"{path}: no times of camera {missing[0]}, the columns are {' '.join(names)[:80]}; name a column"
-            f" {_TIME}, or one for each camera of the calibration"
-        )
+        problem = f"no times of camera {missing[0]}, the columns are {' '.join(names)[:80]}"
+        raise InputError(f"{path}: {problem}; name a column {_TIME}, or one for each camera of the calibration")
     picked = np.arange(frames)
     if _FRAME in names:
         picked = _lines_of_frames(path, numbers[:, names.index(_FRAME)], lines, frames)
     elif len(numbers) != frames:
-        raise InputError(
-            f"{path}: must hold a time for each of the {frames} frames, got {len(numbers)}; add a column frame"
-            " where it is of more frames than the recording"
-        )
+        problem = f"must hold a time for each of the {frames} frames, got {len(numbers)}"
+        raise InputError(f"{path}: {problem}; add a column frame where it is of more frames than the recording")
     time_s = numbers[picked][:, [names.index(name) for name in wanted]]
     steps, apart = np.diff(time_s, axis=0), np.ptp(time_s, axis=1)
     if (steps <= 0).any():

@@ -19,7 +19,7 @@ def validated(model: type[Model], value: object, place: object, cure: str | Mapp
     try:
         return model.model_validate(value)
     except ValidationError as error:
-        raise refused(error, place, cure) from None
+        raise _refused(error, place, cure) from None
 
 
 def validated_list(
@@ -29,17 +29,17 @@ def validated_list(
     try:
         return kind.validate_python(value)
     except ValidationError as error:
-        raise refused(error, place, cure, start) from None
+        raise _refused(error, place, cure, start) from None
 
 
-def refused(error: ValidationError, place: object, cure: str | Mapping[str, str], start: int = 0) -> InputError:
+def _refused(error: ValidationError, place: object, cure: str | Mapping[str, str], start: int = 0) -> InputError:
     """The first problem of `error` as a sentence."""
     keys, problem = first_problem(error)
     if start > 0 and isinstance(keys[0], int):
         keys = (keys[0] + start, *keys[1:])
     if not isinstance(cure, str):
-        known = [cure[str(key)] for key in reversed(keys) if key in cure]
-        cure = known[0] if known else "see docs/conventions.md for the format"
+        default = "see docs/conventions.md for the format"
+        cure = next((cure[str(key)] for key in reversed(keys) if key in cure), default)
     return InputError(f"{place}: {key_text(keys)} {problem}; {cure}")
 
 
@@ -48,8 +48,23 @@ def first_problem(error: ValidationError) -> tuple[tuple[int | str, ...], str]:
 
     For example `(("RT",), "must hold 12 values, got 11")`.
     """
-    problem = error.errors(include_url=False)[0]
-    return problem["loc"], _complaint(problem["type"], problem)
+    problem: Any = error.errors(include_url=False)[0]
+    kind, got, context = problem["type"], describe(problem["input"]), problem.get("ctx", {})
+    what = f"is refused: {problem['msg'][:1].lower()}{problem['msg'][1:]}, got {got}"
+    if kind in _SAYINGS:
+        what = _SAYINGS[kind]
+    elif kind in ("too_short", "too_long"):
+        bound = context["min_length" if kind == "too_short" else "max_length"]
+        what = f"must hold {bound} value{'s' if bound != 1 else ''}, got {len(problem['input'])}"
+    elif kind == "greater_than":
+        what = f"must be greater than {context['gt']}, got {got}"
+    elif kind in ("literal_error", "enum"):
+        what = f"must be {context['expected']}, got {got}"
+    elif kind in _WANTED:
+        what = f"must be {_WANTED[kind]}, got {got}"
+    elif kind in ("value_error", "assertion_error"):
+        what = f"is refused: {context.get('error', problem['msg'])}"
+    return problem["loc"], what
 
 
 def key_text(place: tuple[int | str, ...]) -> str:
@@ -83,6 +98,7 @@ def is_number(word: str) -> bool:
         return False
 
 
+_SAYINGS = {"missing": "is missing", "extra_forbidden": "is not a known key"}
 _WANTED = {
     "float_type": "a number",
     "float_parsing": "a number",
@@ -99,24 +115,3 @@ _WANTED = {
     "finite_number": "a finite number",
 }
 """What each of pydantic's type errors asks for, in words."""
-
-
-def _complaint(kind: str, problem: Any) -> str:
-    """What is wrong with the value, after its key."""
-    got, context = describe(problem["input"]), problem.get("ctx", {})
-    if kind == "missing":
-        return "is missing"
-    if kind == "extra_forbidden":
-        return "is not a known key"
-    if kind in ("too_short", "too_long"):
-        bound = context["min_length" if kind == "too_short" else "max_length"]
-        return f"must hold {bound} value{'s' if bound != 1 else ''}, got {len(problem['input'])}"
-    if kind == "greater_than":
-        return f"must be greater than {context['gt']}, got {got}"
-    if kind in ("literal_error", "enum"):
-        return f"must be {context['expected']}, got {got}"
-    if kind in _WANTED:
-        return f"must be {_WANTED[kind]}, got {got}"
-    if kind in ("value_error", "assertion_error"):
-        return f"is refused: {context.get('error', problem['msg'])}"
-    return f"is refused: {problem['msg'][:1].lower()}{problem['msg'][1:]}, got {got}"

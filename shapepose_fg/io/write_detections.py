@@ -7,13 +7,13 @@ import json
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.camera import Camera, Rig
-from shapepose_fg.core.detections import Detections, DetectionSequence
+from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.core.storage.files import write_atomically, write_content
@@ -41,8 +41,16 @@ def write_association(recording: DetectionSequence, rig: Rig, folder: str | Path
         raise ValueError(
             f"the format has z up, this rig {rig.up}: turn the world before writing, and the truth with it"
         )
-    folder = Path(folder)
-    calibration = {camera.name: _calibration(camera) for camera in rig.cameras}
+    folder, calibration = Path(folder), dict[str, Any]()
+    for camera in rig.cameras:
+        entry = {
+            "K": camera.K.ravel().tolist(),
+            "RT": camera.cTw.ravel().tolist(),
+            "imgSize": [*camera.image_size],
+        }
+        # Distortion under the key that the format's readers know.
+        straight = not camera.distortion.any()
+        calibration[camera.name] = entry | ({} if straight else {"distCoeff": camera.distortion[:5].tolist()})
     write_content(folder / "calibration.json", json.dumps(calibration, indent=1, allow_nan=False))
     for view, camera in enumerate(rig.cameras):
         content = partial(_write_frames, recording=recording, view=view, camera=camera)
@@ -67,10 +75,16 @@ def write_openpose(
         found = recording[frame]
         people = [members for members in group_people(found) if len(members) >= smallest_person]
         for view, (camera, each) in enumerate(zip(rig.cameras, folders, strict=True)):
-            mine = [members for members in people if found.view[members[0]] == view]
+            listed = []
+            for members in people:
+                if found.view[members[0]] == view:
+                    keypoints = np.zeros((len(BODY_25), 3))  # a joint that a person lacks is 0 0 0
+                    keypoints[found.joint[members], :2] = camera.distort(found.xy[members]).round(3)
+                    keypoints[found.joint[members], 2] = found.confidence[members].round(6)
+                    listed.append({"person_id": [-1], "pose_keypoints_2d": keypoints.ravel().tolist()})
             # Thousands of small files: written plainly, the reader notices one that is missing or cut.
             file = each / f"{camera.name}_{frame:012d}_keypoints.json"
-            file.write_text(json.dumps(_frame_object(found, mine, camera), allow_nan=False))
+            file.write_text(json.dumps({"version": 1.3, "people": listed}, allow_nan=False))
 
 
 def refuse_leftovers(rig: Rig, folder: str | Path) -> None:
@@ -89,41 +103,20 @@ def _check(recording: DetectionSequence) -> None:
         raise ValueError("there is no frame to write: these formats have at least one")
 
 
-def _calibration(camera: Camera) -> dict[str, list[float] | list[int]]:
-    """A camera in 4D Association's calibration; distortion under the key that the format's readers know."""
-    entry: dict[str, list[float] | list[int]] = {"K": camera.K.ravel().tolist(), "RT": camera.cTw.ravel().tolist()}
-    entry["imgSize"] = list(camera.image_size)
-    if camera.distortion.any():
-        entry["distCoeff"] = camera.distortion[:5].tolist()
-    return entry
-
-
 def _write_frames(stream: BinaryIO, recording: DetectionSequence, view: int, camera: Camera) -> None:
     """The text of one camera, frame by frame: the recording may be larger than memory."""
-    stream.write(f"{TEXT_SKELETONS[BODY_25.name].number} {len(recording)}\n".encode())
+    kind, size = TEXT_SKELETONS[BODY_25.name], np.array(camera.image_size, dtype=np.float64)
+    stream.write(f"{kind.number} {len(recording)}\n".encode())
     for frame in range(len(recording)):
-        stream.write("".join(f"{line}\n" for line in _frame_lines(recording[frame], view, camera)).encode())
-
-
-def _frame_lines(found: Detections, view: int, camera: Camera) -> Iterable[str]:
-    """The lines of one frame of one camera."""
-    size = np.array(camera.image_size, dtype=np.float64)
-    rows = np.flatnonzero(found.view == view)
-    xy = camera.distort(found.xy[rows])
-    near = np.all((xy > -MARGIN * size) & (xy < (1 + MARGIN) * size), axis=1)
-    rows, xy = rows[near], xy[near]
-    place = np.full(len(found), -1, dtype=np.intp)
-    place[rows] = np.arange(len(rows))
-    pairs = place[found.pairs]
-    kept = np.all(pairs >= 0, axis=1)
-    return association_lines(
-        TEXT_SKELETONS[BODY_25.name],
-        found.joint[rows],
-        xy / (size - 1),
-        found.confidence[rows],
-        pairs[kept],
-        found.affinity[kept],
-    )
+        found = recording[frame]
+        found = found.only(found.view == view)
+        xy = camera.distort(found.xy)
+        near = np.all((xy > -MARGIN * size) & (xy < (1 + MARGIN) * size), axis=1)
+        found, xy = found.only(near), xy[near]
+        lines = association_lines(
+            kind, found.joint, xy / (size - 1), found.confidence, found.pairs, found.affinity
+        )
+        stream.write("".join(f"{line}\n" for line in lines).encode())
 
 
 def association_lines(
@@ -164,14 +157,3 @@ def association_lines(
 def _numbers(values: NDArray[np.float64], decimals: int) -> str:
     """Numbers in a line; zeros short, for they are most of an affinity matrix."""
     return " ".join("0" if value == 0 else f"{value:.{decimals}f}" for value in values.tolist())
-
-
-def _frame_object(found: Detections, people: list[NDArray[np.intp]], camera: Camera) -> dict[str, object]:
-    """One frame of one camera as OpenPose writes it; a joint that a person lacks is 0 0 0."""
-    listed = []
-    for members in people:
-        keypoints = np.zeros((len(BODY_25), 3))
-        keypoints[found.joint[members], :2] = camera.distort(found.xy[members]).round(3)
-        keypoints[found.joint[members], 2] = found.confidence[members].round(6)
-        listed.append({"person_id": [-1], "pose_keypoints_2d": keypoints.ravel().tolist()})
-    return {"version": 1.3, "people": listed}

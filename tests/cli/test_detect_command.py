@@ -102,7 +102,7 @@ def test_folders_of_pictures_need_no_rate(kitchen, capsys):
     Path(f"shots/{rig.names[1]}/img_102.png").unlink()
     assert run(*COMMON, "--images", "shots") == 0
     said = capsys.readouterr()
-    assert "1 of 4 pictures are missing" in said.err and "sees nobody there" in said.err
+    assert "1 of 4 pictures are missing" in said.err and "sees no people there" in said.err
     assert "--timestamps" not in said.out and not Path("out/times.csv").exists()
     table = read_detections("out", rig)
     assert [frame.view.tolist() for frame in table] == [[0, 1, 2], [0, 1, 2], [0, 2], [0, 1, 2]]

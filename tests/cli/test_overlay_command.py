@@ -36,7 +36,7 @@ def solved(tmp_path_factory) -> Path:
         for frame in range(FRAMES + 1):
             writer.write(np.full((size[1], size[0], 3), 40 + 40 * frame, dtype=np.uint8))
         writer.release()
-        placement = Placement.of(PlacementKind.SCALE, size, camera.image_size)
+        placement = Placement(PlacementKind.SCALE, size, camera.image_size)
         places = np.arange(FRAMES) + (v == 0)
         used.append(CameraFootage(camera.name, path, placement, places))
     write_used_footage(folder / "detections" / "footage.json", used, {})

@@ -55,7 +55,7 @@ def pictures(rolled_rig, apart, tmp_path_factory) -> Path:
 
 def run_of(rig: Rig, pictures: Path, output: Path, network, long_side: int = 640) -> DetectionRun:
     footage = [open_footage(pictures / name) for name in rig.names]
-    placements = [Placement.of(PlacementKind.SAME, each.size, each.size) for each in footage]
+    placements = [Placement(PlacementKind.SAME, each.size, each.size) for each in footage]
     detectors = [
         CameraDetector.of(camera, rig.up_vector, placement, network, long_side)
         for camera, placement in zip(rig.cameras, placements, strict=True)

@@ -622,3 +622,10 @@ def test_freemocap_ros_and_panoptic(shared_data):
     assert np.all((rig.centres[:, 2] > 1.5) & (rig.centres[:, 2] < 3.5))
     xy, depth = rig.project(np.array([[0.0, 0.0, 1.0]]))
     assert np.all((xy > 0) & (xy < (1920, 1080))) and np.all(depth > 0)
+
+
+def test_voxelpose_s_rotations_are_matrices(tmp_path):
+    content = json.loads(voxelpose(tmp_path).read_text())
+    content["beta"]["R"] = [0.1, 0.2, 0.3]
+    path = written(tmp_path / "calibration.json", json.dumps(content))
+    refuses(path, 'camera "beta": R must hold 9 numbers, got 3; write it as VoxelPose does')

@@ -207,7 +207,7 @@ def test_openpose_frames_may_be_missing_in_between_and_it_is_said(openpose_folde
     assert set(whole[1].view.tolist()) == {0, 1} and set(table[1].view.tolist()) == {0}
     for frame in (0, 2):
         np.testing.assert_array_equal(table[frame].xy, whole[frame].xy)
-    assert f"{openpose_folder / 'right'}: 1 frame has no file (frame 8); nobody is seen there" in table.notes
+    assert f"{openpose_folder / 'right'}: 1 frame has no file (frame 8); no people are seen there" in table.notes
     assert whole.notes == ()
 
 

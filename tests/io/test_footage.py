@@ -140,15 +140,15 @@ def touched(folder: Path, *names: str) -> Path:
     (("view_1.jpg", "view_2.jpg"), ("view_1.jpg", "view_2.jpg")),
 ])  # fmt: skip
 def test_footage_is_found_as_people_lay_it_out(tmp_path, names, found):
-    places = find_footage([str(touched(tmp_path, *names))], CAMERAS)
-    assert places.paths == tuple(tmp_path / name for name in found)
-    assert (len(places.notes) == 1) == ("cam1" not in (Path(found[0]).stem, found[0]))
+    places, notes = find_footage([str(touched(tmp_path, *names))], CAMERAS)
+    assert places == [tmp_path / name for name in found]
+    assert (len(notes) == 1) == ("cam1" not in (Path(found[0]).stem, found[0]))
 
 
 def test_footage_camera_by_camera(tmp_path):
     touched(tmp_path, "left.mp4", "r=1.mp4")
     given = [f"cam2={tmp_path / 'r=1.mp4'}", f"cam1={tmp_path / 'left.mp4'}"]
-    assert find_footage(given, CAMERAS).paths == (tmp_path / "left.mp4", tmp_path / "r=1.mp4")
+    assert find_footage(given, CAMERAS) == ([tmp_path / "left.mp4", tmp_path / "r=1.mp4"], [])
 
 
 def test_footage_that_is_not_found_is_named(tmp_path):
@@ -209,7 +209,7 @@ def test_letterboxed_pixels_are_where_the_recording_s_own_formula_puts_them():
 @pytest.mark.parametrize("kind", PlacementKind)
 def test_placements_go_both_ways_and_stay_in_the_picture(kind):
     size = (640, 480) if kind is PlacementKind.SAME else (600, 500)
-    placement = Placement.of(kind, size, (640, 480))
+    placement = Placement(kind, size, (640, 480))
     xy = np.random.default_rng(0).uniform(0, 480, (9, 2))
     np.testing.assert_allclose(placement.to_calibrated(placement.to_picture(xy)), xy, atol=1e-9)
     left, top, right, bottom = placement.region
@@ -217,7 +217,7 @@ def test_placements_go_both_ways_and_stay_in_the_picture(kind):
 
 
 def test_what_was_used_is_read_back(tmp_path):
-    placement = Placement.of(PlacementKind.LETTERBOX, (960, 512), (1920, 1080))
+    placement = Placement(PlacementKind.LETTERBOX, (960, 512), (1920, 1080))
     used = [CameraFootage("c", tmp_path / "c.mp4", placement, np.array([3, 4, -1, 6]))]
     file = tmp_path / "footage.json"
     write_used_footage(file, used, {"network": {"sha256": "0"}})

@@ -230,7 +230,7 @@ def test_c3d_of_high_frame_numbers(project, two_tracks):
 
 def test_nobody_is_a_note(project):
     written = write_pose2sim_files(Reconstruction.empty(BODY_25.joints), "z", read_pose2sim_project(project))
-    assert written.files == [] and "nobody was found" in written.notes[0]
+    assert written.files == [] and "no people were found" in written.notes[0]
 
 
 def test_reconstruct_takes_a_project(shared_data, tmp_path, capsys):

@@ -25,7 +25,7 @@ def scene():
 
 
 def view_of(camera: Camera, size: tuple[int, int] | None = None) -> PictureView:
-    placement = Placement.of(PlacementKind.SAME, camera.image_size, camera.image_size)
+    placement = Placement(PlacementKind.SAME, camera.image_size, camera.image_size)
     return PictureView(camera, placement, size or camera.image_size)
 
 
@@ -143,7 +143,7 @@ def test_a_letterboxed_picture_is_drawn_on_where_the_people_are(scene):
     """The same person in the same camera, whose pictures were halved and got bars on two sides."""
     camera = scene.rig.cameras[0]
     width, height = camera.image_size
-    placement = Placement.of(PlacementKind.LETTERBOX, (width // 2 + 100, height // 2), camera.image_size)
+    placement = Placement(PlacementKind.LETTERBOX, (width // 2 + 100, height // 2), camera.image_size)
     view = PictureView(camera, placement, placement.picture_size)
     xy, _ = view.project(scene.keypoints[0, 0])
     plain, _ = camera.project(scene.keypoints[0, 0])

@@ -36,16 +36,12 @@ _CURES = {
 }
 
 
-def _recognise(content: Content) -> bool:
-    """Whether this is one of the two files, or a folder with COLMAP's model."""
-    if content.syntax == "folder":
-        return any(path.name in (*_FILES, *_BINARY) for path in content.value)
-    return content.syntax == "text" and content.path.name in _FILES
-
-
-def _read(content: Content) -> WrittenRig:
+def _read(content: Content) -> WrittenRig | None:
     """A camera per image, in the order of images.txt; called after the image, or its folder."""
     folder = content.path if content.syntax == "folder" else content.path.parent
+    names = [path.name for path in content.value] if content.syntax == "folder" else [content.path.name]
+    if content.syntax not in ("folder", "text") or not set(names) & {*_FILES, *_BINARY}:
+        return None
     for name, binary in zip(_FILES, _BINARY, strict=True):
         if not (folder / name).is_file():
             cure = "copy it there too"
@@ -88,10 +84,8 @@ def _images(path: Path, lenses: dict[str, WrittenCamera]) -> list[WrittenCamera]
             rows.append((number, line.split(maxsplit=9)))
             points, text = next(lines, (0, ""))
             if len(text.split()) % 3 != 0 or not all(is_number(word) for word in text.split()):
-                raise InputError(
-                    f"{path}: line {points}: must hold the points of the image before it, three numbers each;"
-                    " leave an empty line there where it has none"
-                )
+                problem = f"line {points}: must hold the points of the image before it, three numbers each"
+                raise InputError(f"{path}: {problem}; leave an empty line there where it has none")
     names = _names([words[9] if len(words) == 10 else "" for _, words in rows])
     cameras = []
     for (number, words), name in zip(rows, names, strict=True):
@@ -122,4 +116,4 @@ def _numbers(words: Sequence[str], count: int, place: str) -> list[float]:
     return [float(word) for word in words]
 
 
-COLMAP = Format("COLMAP's cameras.txt and images.txt", _recognise, _read)
+COLMAP = Format("COLMAP's cameras.txt and images.txt", _read)

@@ -20,7 +20,6 @@ from shapepose_fg.io.validation import describe, validated
 RIG_FORMAT = "shapepose-fg rig 1"
 """The tag by which a rig file of our own is known."""
 
-_FIVE = "write at most k1 k2 p1 p2 k3, as OpenCV orders them"
 _MATRIX = "write the 3x3 intrinsic matrix row by row, in pixels"
 _CAMERA_FROM_WORLD = "write the 3x4 camera-from-world matrix row by row"
 _ROTATION = "write the 3x3 camera-from-world rotation row by row"
@@ -31,7 +30,10 @@ _CURES = {
     **{"T": "write the 3 numbers of the translation", "wTc": "write the 4x4 world-from-camera matrix row by row"},
     **dict.fromkeys(("rotation", "translation"), _EXTRINSICS),
     **dict.fromkeys(("imgSize", "resolution", "size", "image_size"), _SIZE),
-    **dict.fromkeys(("distCoeff", "dist", "distortion", "distCoef", "distortions"), _FIVE),
+    **dict.fromkeys(("distCoeff", "dist", "distCoef"), "write at most k1 k2 p1 p2 k3, as OpenCV orders them"),
+    **dict.fromkeys(
+        ("distortion", "distortions"), "write k1 k2 p1 p2 k3 as OpenCV does, or k1 to k4 of a fisheye"
+    ),
     "lens": "write perspective or fisheye",
 }
 """What to do about a value, by its name in any of the formats."""
@@ -80,8 +82,10 @@ def _members(content: Content) -> dict[str, Any]:
     return content.value if content.syntax == "JSON" and isinstance(content.value, dict) else {}
 
 
-def _read_rig_file(content: Content) -> WrittenRig:
+def _read_rig_file(content: Content) -> WrittenRig | None:
     """Our own file: all that a `Rig` is."""
+    if "format" not in _members(content):
+        return None
     if content.value["format"] != RIG_FORMAT:
         got = describe(content.value["format"])
         raise InputError(f'{content.path}: format must be "{RIG_FORMAT}", got {got}; this version reads no other')
@@ -100,15 +104,11 @@ def _read_rig_file(content: Content) -> WrittenRig:
     return WrittenRig(cameras, rig.unit, rig.up, cures)
 
 
-def _is_association(content: Content) -> bool:
-    """An object of objects, at least one of which has something of a camera."""
-    members = _members(content).values()
-    known = {"K", "RT", "R", "T", "imgSize"}
-    return all(isinstance(each, dict) for each in members) and any(known & each.keys() for each in members)
-
-
-def _read_association(content: Content) -> WrittenRig:
-    """Zhang et al., CVPR 2020: metres, z up; keys of other tools are passed over."""
+def _read_association(content: Content) -> WrittenRig | None:
+    """Zhang et al., CVPR 2020, an object of cameras: metres, z up; keys of other tools are passed over."""
+    members, known = _members(content).values(), {"K", "RT", "R", "T", "imgSize"}
+    if not all(isinstance(each, dict) for each in members) or not any(known & each.keys() for each in members):
+        return None
     cameras = []
     for name, value in content.value.items():
         node = Node(value, f'{content.path}: camera "{name}"', _CURES)
@@ -118,18 +118,15 @@ def _read_association(content: Content) -> WrittenRig:
     return WrittenRig(cameras, "m", "z")
 
 
-def _is_panoptic(content: Content) -> bool:
-    """An object with a list of cameras."""
+def _read_panoptic(content: Content) -> WrittenRig | None:
+    """The CMU studio's own file, a list of cameras: centimetres, y down, camera from world."""
     listed = _members(content).get("cameras")
-    if not isinstance(listed, list):
-        return False
-    return all(isinstance(each, dict) and {"K", "R", "t"} & each.keys() for each in listed)
-
-
-def _read_panoptic(content: Content) -> WrittenRig:
-    """The CMU studio's own file: centimetres, y down, camera from world."""
+    if not isinstance(listed, list) or not all(isinstance(each, dict) for each in listed):
+        return None
+    if not all({"K", "R", "t"} & each.keys() for each in listed):
+        return None
     cameras = []
-    for index, value in enumerate(content.value["cameras"]):
+    for index, value in enumerate(listed):
         node = Node(value, f"{content.path}: cameras[{index}]", _CURES)
         if not isinstance(value.get("name"), str):
             raise node.refuse("name", f"must be text, got {describe(value.get('name'))}")
@@ -138,25 +135,22 @@ def _read_panoptic(content: Content) -> WrittenRig:
     return WrittenRig(cameras, "cm", "-y")
 
 
-def _voxelpose(content: Content) -> dict[str, Any]:
-    """The cameras of a VoxelPose file by name: an object of them, a list, or a list under a sequence's name."""
-    value = content.value
-    if content.syntax != "JSON":
-        return {}
+def _read_voxelpose(content: Content) -> WrittenRig | None:
+    """An object of cameras, a list, or a list under a sequence's name: millimetres, z up, R (X - T), distortion in
+    two parts, K for pictures whose size is not written.
+    """
+    value = content.value if content.syntax == "JSON" else None
     if isinstance(value, dict) and len(value) == 1 and isinstance(next(iter(value.values())), list):
         value = next(iter(value.values()))
     if isinstance(value, list):
         value = {str(index): camera for index, camera in enumerate(value)}
     if not isinstance(value, dict) or not all(isinstance(each, dict) for each in value.values()):
-        return {}
-    return value if any("fx" in each and "R" in each for each in value.values()) else {}
-
-
-def _read_voxelpose(content: Content) -> WrittenRig:
-    """Millimetres, z up, R (X - T), distortion in two parts, K for pictures whose size is not written."""
+        return None
+    if not any("fx" in each and "R" in each for each in value.values()):
+        return None
     cameras = []
-    for name, value in _voxelpose(content).items():
-        node = Node(value, f'{content.path}: camera "{name}"', {"": "write it as VoxelPose does"})
+    for name, camera in value.items():
+        node = Node(camera, f'{content.path}: camera "{name}"', {"": "write it as VoxelPose does"})
         fx, fy, cx, cy = (float(node.needed(key, 1)[0]) for key in ("fx", "fy", "cx", "cy"))
         (k1, k2, k3), (p1, p2) = node.needed("k", 3).tolist(), node.needed("p", 2).tolist()
         wTc = node.pose("R", "T", centre=True)
@@ -164,34 +158,24 @@ def _read_voxelpose(content: Content) -> WrittenRig:
     return WrittenRig(cameras, "mm", "z")
 
 
-def _tables(content: Content) -> dict[str, dict[str, Any]]:
-    """The tables of cameras, by their keys; none where this is another TOML."""
-    if content.syntax != "TOML":
-        return {}
-    inner = content.value.get("cameras")
-    tables = inner if isinstance(inner, dict) else content.value
-    return {key: table for key, table in tables.items() if isinstance(table, dict) and "matrix" in table}
+def _program(tables: Mapping[str, dict[str, Any]], metadata: Any) -> str:
+    """Whose TOML it is. Pose2Sim says of every camera that it is no fisheye; AniPose says it of fisheyes only."""
+    if any("cam_id" in table or "port" in table for table in tables.values()):
+        return "Caliscope"
+    if isinstance(metadata, dict) and any(key.startswith(("charuco_", "freemocap")) for key in metadata):
+        return "FreeMoCap"
+    return "Pose2Sim" if all(table.get("fisheye") is False for table in tables.values()) else "AniPose"
 
 
-def _is_caliscope(content: Content) -> bool:
-    return any("cam_id" in table or "port" in table for table in _tables(content).values())
-
-
-def _is_freemocap(content: Content) -> bool:
-    metadata = content.value.get("metadata", {}) if len(_tables(content)) > 0 else {}
-    return isinstance(metadata, dict) and any(key.startswith(("charuco_", "freemocap")) for key in metadata)
-
-
-def _is_pose2sim(content: Content) -> bool:
-    """Pose2Sim says of every camera that it is no fisheye; AniPose says it of fisheyes only."""
-    tables = _tables(content)
-    return len(tables) > 0 and all(table.get("fisheye") is False for table in tables.values())
-
-
-def _read_tables(content: Content, unit: Unit | None, up: Axis | None, cures: Mapping[str, str]) -> WrittenRig:
+def _read_tables(content: Content, program: str) -> WrittenRig | None:
     """The cameras that are not to be ignored: camera from world; keys of single programs are passed over."""
+    inner = content.value.get("cameras") if content.syntax == "TOML" else None
+    every = inner if isinstance(inner, dict) else content.value if content.syntax == "TOML" else {}
+    tables = {key: table for key, table in every.items() if isinstance(table, dict) and "matrix" in table}
+    if len(tables) == 0 or _program(tables, content.value.get("metadata")) != program:
+        return None
     cameras = []
-    for key, table in _tables(content).items():
+    for key, table in tables.items():
         if table.get("ignore") is True:
             continue
         node = Node(table, f'{content.path}: camera "{key}"', _CURES)
@@ -204,25 +188,22 @@ def _read_tables(content: Content, unit: Unit | None, up: Axis | None, cures: Ma
             raise node.refuse("fisheye", f"must be true or false, got {describe(fisheye)}")
         name, lens = str(table.get("name") or numbered), "fisheye" if fisheye else "perspective"
         cameras.append(node.camera(name, "matrix", wTc, ["size"], "distortions", lens))
+    unit, up, cures = _DIALECTS[program]
     return WrittenRig(cameras, unit, up, cures)
 
 
 _UP = "pass the axis of the world that points up with --up; it is often -y of a first camera that stood level"
-_FREEMOCAP = {"unit": "pass --unit (FreeMoCap works in mm)", "up": _UP}
-_ANIPOSE = {"unit": "pass --unit, that of the board's squares", "up": _UP}
+_DIALECTS: dict[str, tuple[Unit | None, Axis | None, dict[str, str]]] = {
+    "Caliscope": ("m", None, {"up": _UP}),
+    "FreeMoCap": (None, None, {"unit": "pass --unit (FreeMoCap works in mm)", "up": _UP}),
+    "Pose2Sim": ("m", "z", {}),
+    "AniPose": (None, None, {"unit": "pass --unit, that of the board's squares", "up": _UP}),
+}
+"""AniPose's world is one that nothing levels, in the unit of the board; FreeMoCap's is the first camera."""
 JSON_AND_TOML = (
-    Format("our own rig file", lambda content: "format" in _members(content), _read_rig_file),
-    Format("CMU Panoptic's JSON", _is_panoptic, _read_panoptic),
-    Format("VoxelPose's JSON", lambda content: len(_voxelpose(content)) > 0, _read_voxelpose),
-    Format("4D Association's calibration.json", _is_association, _read_association),
-    Format("Caliscope's TOML", _is_caliscope, partial(_read_tables, unit="m", up=None, cures={"up": _UP})),
-    Format("FreeMoCap's TOML", _is_freemocap, partial(_read_tables, unit=None, up=None, cures=_FREEMOCAP)),
-    Format("Pose2Sim's TOML", _is_pose2sim, partial(_read_tables, unit="m", up="z", cures={})),
-    Format(
-        "AniPose's TOML",
-        lambda content: len(_tables(content)) > 0,
-        partial(_read_tables, unit=None, up=None, cures=_ANIPOSE),
-    ),
+    Format("our own rig file", _read_rig_file),
+    Format("CMU Panoptic's JSON", _read_panoptic),
+    Format("VoxelPose's JSON", _read_voxelpose),
+    Format("4D Association's calibration.json", _read_association),
+    *(Format(f"{program}'s TOML", partial(_read_tables, program=program)) for program in _DIALECTS),
 )
-"""The first that recognises a file reads it. AniPose's world is one that nothing levels, in the unit of the board;
-FreeMoCap's is the first camera."""

@@ -2,6 +2,7 @@
 EasyMocap's), and ROS' camera_info.
 """
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -39,13 +40,10 @@ def _loaded(content: Content, suffixes: str) -> dict[Path, Content]:
     return {path: load(path) for path in content.value if path.suffix in suffixes.split() and path.is_file()}
 
 
-def _is_multiview(content: Content) -> bool:
-    """Whether this is what OpenCV's multiview_calibration.py saves."""
-    return content.syntax == "OpenCV" and {"Rs", "Ts", "Ks"} <= content.value.keys()
-
-
-def _read_multiview(content: Content) -> WrittenRig:
-    """Camera from the first camera, in the unit of the board."""
+def _read_multiview(content: Content) -> WrittenRig | None:
+    """What OpenCV's multiview_calibration.py saves: camera from the first camera, in the unit of the board."""
+    if content.syntax != "OpenCV" or not {"Rs", "Ts", "Ks"} <= content.value.keys():
+        return None
     nodes = Node(content.value, str(content.path), _AGAIN)
     flat = nodes.needed("Ks", most=_MOST)
     count = len(flat) // 9
@@ -74,26 +72,17 @@ def _read_multiview(content: Content) -> WrittenRig:
     return WrittenRig(cameras, None, None, _ASK)
 
 
-def _nodes(content: Content) -> dict[str, dict[str, Any]]:
-    """The nodes of cameras by name, of a file or of the files of a folder; none where one is of something else."""
-    nodes = content.value
+def _read_nodes(content: Content) -> WrittenRig | None:
+    """Cameras with a node, or a file, each, of MC-Calib or written by hand: K, distortion, size and pose."""
+    nodes = content.value if content.syntax == "OpenCV" else {}
     if content.syntax == "folder":
         files = _loaded(content, ".yml .yaml .xml").values()
         nodes = {each.path.stem: each.value if each.syntax == "OpenCV" else None for each in files}
-        if not all(isinstance(node, dict) and Node(node, "").named(_K) for node in nodes.values()):
-            return {}
-    return {name: node for name, node in nodes.items() if isinstance(node, dict) and Node(node, "").named(_K)}
-
-
-def _is_of_nodes(content: Content) -> bool:
-    """Whether every camera has a node, or a file, of its own; also the intrinsics of one camera alone."""
-    return content.syntax == "OpenCV" or (content.syntax == "folder" and len(_nodes(content)) > 0)
-
-
-def _read_nodes(content: Content) -> WrittenRig:
-    """Cameras by name, of MC-Calib or of hand-written files: K, distortion, picture size and pose."""
+    known = {name: node for name, node in nodes.items() if isinstance(node, dict) and Node(node, "").named(_K)}
+    if content.syntax != "OpenCV" and (len(known) == 0 or len(known) < len(nodes)):
+        return None
     cameras = []
-    for name, values in _nodes(content).items():
+    for name, values in known.items():
         node = Node(values, f'{content.path}: camera "{name}"', _STORAGE)
         if node.named(_POSE) is not None:
             wTc = node.pose_of_matrix(_POSE)
@@ -110,22 +99,14 @@ def _read_nodes(content: Content) -> WrittenRig:
     return WrittenRig(cameras, None, None, _ASK)
 
 
-def _is_half(name: str) -> bool:
-    return name.endswith((".yml", ".yaml")) and ("intri" in name or "extri" in name)
-
-
-def _is_easymocap(content: Content) -> bool:
-    """Whether this is one of the two files, or the folder of both."""
-    if content.syntax == "folder":
-        return any(_is_half(path.name) for path in content.value)
-    there = content.syntax == "OpenCV" and _is_half(content.path.name)
-    return there and isinstance(content.value.get("names"), list)
-
-
-def _read_easymocap(content: Content) -> WrittenRig:
+def _read_easymocap(content: Content) -> WrittenRig | None:
     """EasyMocap's intri.yml and extri.yml, metres, z up: the cameras in the order of the names in the first."""
-    folder = content.syntax == "folder"
-    one = next(path for path in content.value if _is_half(path.name)) if folder else content.path
+    paths = content.value if content.syntax == "folder" else [content.path]
+    halves_of = [path for path in paths if re.search(r"(intri|extri).*\.ya?ml$", path.name)]
+    there = content.syntax == "OpenCV" and isinstance(content.value.get("names"), list)
+    if len(halves_of) == 0 or not (content.syntax == "folder" or there):
+        return None
+    one = halves_of[0]
     halves = []
     for path in (
         one.with_name(one.name.replace("extri", "intri")),
@@ -172,29 +153,20 @@ def _is_info(value: Any) -> bool:
     return known and ("camera_matrix" in value or {"distortion_model", "height", "width"} <= value.keys())
 
 
-def _is_ros(content: Content) -> bool:
-    """Whether this is a camera_info file, or a folder in which there is one."""
-    if content.syntax == "folder":
-        return any(
-            each.syntax == "YAML" and _is_info(each.value) for each in _loaded(content, ".yaml .yml").values()
-        )
-    return content.syntax == "YAML" and (_is_info(content.value) or _message_of(content.value) is not None)
-
-
-def _read_ros(content: Content) -> WrittenRig:
+def _read_ros(content: Content) -> WrittenRig | None:
     """The cameras in the order of their files' names, metres, z up (REP 103).
 
     `<camera>.yaml` is camera_info. `<camera>_pose.yaml` is a Pose, PoseStamped, Transform or TransformStamped: the
     camera's optical frame in the world, so world from camera.
     """
-    if content.syntax != "folder":
+    if content.syntax == "YAML" and (_is_info(content.value) or _message_of(content.value) is not None):
         what = "the intrinsics" if _is_info(content.value) else "the pose"
-        raise InputError(
-            f"{content.path}: this is {what} of one camera of ROS; give the folder with <camera>.yaml and"
-            " <camera>_pose.yaml of every camera"
-        )
-    files = _loaded(content, ".yaml .yml")
-    values = {path: each.value if each.syntax == "YAML" else None for path, each in files.items()}
+        cure = "give the folder with <camera>.yaml and <camera>_pose.yaml of every camera"
+        raise InputError(f"{content.path}: this is {what} of one camera of ROS; {cure}")
+    files = _loaded(content, ".yaml .yml") if content.syntax == "folder" else {}
+    values: dict[Path, Any] = {path: each.value if each.syntax == "YAML" else None for path, each in files.items()}
+    if not any(map(_is_info, values.values())):
+        return None
     poses = {path.stem.removesuffix("_pose"): path for path, value in values.items() if not _is_info(value)}
     cameras = []
     for path, value in values.items():
@@ -252,8 +224,8 @@ def _message_of(value: Any) -> tuple[Any, Any] | None:
 
 
 OPENCV = (
-    Format("EasyMocap's intri.yml and extri.yml", _is_easymocap, _read_easymocap),
-    Format("OpenCV's multi-view calibration", _is_multiview, _read_multiview),
-    Format("OpenCV's FileStorage with a node or file per camera", _is_of_nodes, _read_nodes),
+    Format("EasyMocap's intri.yml and extri.yml", _read_easymocap),
+    Format("OpenCV's multi-view calibration", _read_multiview),
+    Format("OpenCV's FileStorage with a node or file per camera", _read_nodes),
 )
-ROS = Format("ROS' camera_info and pose YAML", _is_ros, _read_ros)
+ROS = Format("ROS' camera_info and pose YAML", _read_ros)

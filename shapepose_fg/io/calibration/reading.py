@@ -15,7 +15,7 @@ from shapepose_fg.io.camera_names import listing
 from shapepose_fg.io.validation import describe
 
 FORMATS: tuple[Format, ...] = (*JSON_AND_TOML, QUALISYS, VICON, *OPENCV, COLMAP, ROS)
-"""All formats that are known; the first that recognises a file reads it."""
+"""All formats that are known; the first to which a file belongs reads it."""
 
 _MISSING = {
     "unit": "pass --unit m, cm or mm",
@@ -48,10 +48,10 @@ def read_rig(
             f"{path}: this is a Python pickle, as OpenCap writes it, and could run any program when it is opened;"
             " write it as a rig file where you trust it, as docs/conventions.md shows"
         )
-    form = next((each for each in FORMATS if each.recognise(content)), None)
-    if form is None:
+    tried = ((each, each.read(content)) for each in FORMATS)
+    form, written = next((both for both in tried if both[1] is not None), (FORMATS[0], None))
+    if written is None:
         raise InputError(_unknown(content))
-    written = form.read(content)
     up, unit = up or written.up, unit or written.unit
     sizes_missing = any(camera.image_size is None for camera in written.cameras)
     if image_size is not None and not sizes_missing:
@@ -71,12 +71,15 @@ def read_rig(
 
 
 def is_calibration(path: Path) -> bool:
-    """Whether a file or folder is of one of the formats."""
+    """Whether a file or folder is of one of the formats, though it may be faulty."""
     try:
         content = load(path)
     except InputError:
         return False
-    return content.syntax != "pickle" and any(each.recognise(content) for each in FORMATS)
+    try:
+        return content.syntax != "pickle" and any(each.read(content) is not None for each in FORMATS)
+    except InputError:
+        return True
 
 
 def _unknown(content: Content) -> str:

@@ -74,10 +74,8 @@ class Format:
 
     name: str
     """For messages."""
-    recognise: Callable[[Content], bool]
-    """Whether a content is meant to be of this format, though it may be faulty."""
-    read: Callable[[Content], WrittenRig]
-    """The cameras; InputError naming file, place and cure where it is faulty."""
+    read: Callable[[Content], WrittenRig | None]
+    """The cameras; None where the content is of another format, InputError where it is of this one and faulty."""
 
 
 @dataclass(frozen=True)
@@ -153,7 +151,7 @@ class Node:
         """World from camera (4, 4), of a rotation (9 numbers, or axis times angle) and a translation from the
         world; or instead of that the camera's centre.
         """
-        turn, shift = self.needed(R, 9, 3), self.needed(t, 3)
+        turn, shift = self.needed(R, 9) if centre else self.needed(R, 9, 3), self.needed(t, 3)
         shift = -turn.reshape(3, 3) @ shift if centre else shift
         return pose(turn, shift, self.named(R) or R, self.place)
 
@@ -196,15 +194,11 @@ def pose(
     with np.errstate(over="ignore", invalid="ignore"):  # of numbers like 1e300, which are refused here
         off = np.abs(R @ R.T - np.eye(3)).max()
     if not off <= _ROTATION_TOLERANCE:
-        raise InputError(
-            f"{place}: the rotation of {key} is not orthonormal (R Rᵀ is off by {off:.2g});"
-            " give a pure rotation without scale, row by row"
-        )
+        problem = f"the rotation of {key} is not orthonormal (R Rᵀ is off by {off:.2g})"
+        raise InputError(f"{place}: {problem}; give a pure rotation without scale, row by row")
     if np.linalg.det(R) < 0:
-        raise InputError(
-            f"{place}: the rotation of {key} mirrors (determinant -1); use a right-handed world and"
-            " OpenCV's camera axes: x right, y down, z forward"
-        )
+        cure = "use a right-handed world and OpenCV's camera axes: x right, y down, z forward"
+        raise InputError(f"{place}: the rotation of {key} mirrors (determinant -1); {cure}")
     if off >= _EXACT:
         U, _, Vt = np.linalg.svd(R)
         R = U @ Vt

@@ -18,6 +18,7 @@ from shapepose_fg.io.calibration.written import (
     pose,
     rotation_of,
 )
+from shapepose_fg.io.validation import is_number
 
 _QTM, _NEXUS = "export the calibration from QTM again", "export the calibration from Nexus or Shogun again"
 _SUBPIXEL = 64.0
@@ -33,16 +34,20 @@ _NO_DISTORTION = dict.fromkeys(
 
 
 def _cameras(
-    content: Content, path: str, model: str, name: str, cure: str, read: Callable[[ET.Element, str], WrittenCamera]
-) -> WrittenRig:
+    content: Content, root: str, path: str, model: str, name: str, read: Callable[[ET.Element, str], WrittenCamera]
+) -> WrittenRig | None:
     """The video cameras where the file tells them by `model` from marker cameras, else all of them."""
+    if content.syntax != "XML" or content.value.tag != root or content.value.find(path.split("/")[0]) is None:
+        return None
     every = content.value.findall(path)
     chosen = [camera for camera in every if "video" in camera.get(model, "").lower()] or every
+    cameras = []
     for number, camera in enumerate(chosen):
+        place = f"{content.path}: camera {number}"
         if not camera.get(name):
-            raise InputError(f"{content.path}: camera {number}: {name} is missing; {cure}")
-    places = [f'{content.path}: camera {number} "{camera.get(name)}"' for number, camera in enumerate(chosen)]
-    return WrittenRig([read(*each) for each in zip(chosen, places, strict=True)], "mm", "z")
+            raise InputError(f"{place}: {name} is missing; export the calibration again")
+        cameras.append(read(camera, f'{place} "{camera.get(name)}"'))
+    return WrittenRig(cameras, "mm", "z")
 
 
 def _node(element: ET.Element | None, place: str, cure: str) -> Node:
@@ -111,25 +116,14 @@ def _vicon(camera: ET.Element, place: str) -> WrittenCamera:
     if name:
         numbers = _node(ET.Element("", VICON_RADIAL2=radial), place, _NEXUS).needed("VICON_RADIAL2", 5)
         distortion = [*numbers[2:4], 0.0, 0.0, numbers[4]]
-    elif any(word.strip("0.") for word in key_frame.get("VICON_RADIAL", "").split()[-2:]):
-        raise InputError(
-            f"{place}: VICON_RADIAL without VICON_RADIAL2 is not read; calibrate with Nexus 2 or newer, or"
-            " undistort the pictures and write 0 0"
-        )
+    elif not all(is_number(word) and float(word) == 0 for word in key_frame.get("VICON_RADIAL", "").split()[-2:]):
+        cure = "calibrate with Nexus 2 or newer, or undistort the pictures and write 0 0"
+        raise InputError(f"{place}: VICON_RADIAL without VICON_RADIAL2 is not read; {cure}")
     return WrittenCamera(camera.attrib["DEVICEID"], K, wTc, (round(width), round(height)), distortion)
-
-
-def _has(content: Content, tag: str, child: str) -> bool:
-    return content.syntax == "XML" and content.value.tag == tag and content.value.find(child) is not None
 
 
 QUALISYS = Format(
     "Qualisys' .qca.txt",
-    lambda content: _has(content, "calibration", "cameras"),
-    lambda content: _cameras(content, "cameras/camera", "model", "serial", _QTM, _qualisys),
+    lambda content: _cameras(content, "calibration", "cameras/camera", "model", "serial", _qualisys),
 )
-VICON = Format(
-    "Vicon's .xcp",
-    lambda content: _has(content, "Cameras", "Camera"),
-    lambda content: _cameras(content, "Camera", "TYPE", "DEVICEID", _NEXUS, _vicon),
-)
+VICON = Format("Vicon's .xcp", lambda content: _cameras(content, "Cameras", "Camera", "TYPE", "DEVICEID", _vicon))

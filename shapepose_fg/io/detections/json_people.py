@@ -70,10 +70,8 @@ class _Instance(BaseModel):
     def flat(self, place: str, program: str) -> list[float]:
         """x, y and score of each keypoint."""
         if len(self.keypoints) != len(self.keypoint_scores):
-            raise InputError(
-                f"{place}: {len(self.keypoints)} keypoints have {len(self.keypoint_scores)} keypoint_scores;"
-                f" {_RERUN[program]}"
-            )
+            problem = f"{len(self.keypoints)} keypoints have {len(self.keypoint_scores)} keypoint_scores"
+            raise InputError(f"{place}: {problem}; {_RERUN[program]}")
         pairs = zip(self.keypoints, self.keypoint_scores, strict=True)
         return [number for (x, y), score in pairs for number in (x, y, score)]
 
@@ -117,6 +115,20 @@ def _of_one_model(known: set[int], people: Iterable[list[float]], source: Path, 
         raise InputError(f"{source}: {what}; give the detections of one model")
 
 
+def read_json_people(place: Path) -> CameraPeople:
+    """The people of one camera: of a JSON file with all its frames, also the only one of a folder, or of a folder
+    with a file per frame. InputError naming file, key and cure.
+    """
+    if not place.is_dir():
+        return read_one_file(place)
+    lists = _lists(place)
+    if len(lists) == 1:
+        items = JsonItems(lists[0], _LISTS)
+        if items.key is not None or (items.found and _known(next(iter(items), {"image_id": None}))):
+            return read_one_file(lists[0])
+    return read_frame_files(place)
+
+
 # A file per frame.
 
 
@@ -154,10 +166,8 @@ def read_frame_files(folder: Path) -> CameraPeople:
     numbered = in_order([(frame_number(file), file) for file in files])
     first, last = numbered[0][0], numbered[-1][0]
     if last - first + 1 > 2 * len(numbered) + _LONGEST_GAP:
-        raise InputError(
-            f"{folder}: {len(numbered)} files are numbered from {first} to {last}; number them"
-            f" by the frames of the recording, or {_RERUN[program]}"
-        )
+        problem = f"{len(numbered)} files are numbered from {first} to {last}"
+        raise InputError(f"{folder}: {problem}; number them by the frames of the recording, or {_RERUN[program]}")
     gaps = tuple((one + 1, other - 1) for (one, _), (other, _) in pairwise(numbered) if other > one + 1)
     blocks = _frame_blocks(folder, program, numbered)
     return CameraPeople(folder, program, blocks, first, last, gaps=gaps, rerun=_RERUN[program])
@@ -194,17 +204,6 @@ def _people_of_frame(file: Path, program: str) -> list[list[float]]:
 # One file with all frames.
 
 
-def is_one_file(path: Path) -> bool:
-    """Whether all frames of one camera are in a JSON file, or in the only one of a folder."""
-    if not path.is_dir():
-        return path.is_file()
-    lists = _lists(path)
-    if len(lists) != 1:
-        return False
-    items = JsonItems(lists[0], _LISTS)
-    return items.key is not None or (items.found and _known(next(iter(items), {"image_id": None})))
-
-
 def _lists(folder: Path) -> list[Path]:
     return [each for each in folder.glob("*.json") if not each.name.startswith(".")]
 
@@ -216,7 +215,6 @@ def _known(item: Any) -> bool:
 
 def read_one_file(path: Path) -> CameraPeople:
     """Read all frames that one camera saw; InputError naming file, key and cure."""
-    path = _lists(path)[0] if path.is_dir() else path
     items = JsonItems(path, _LISTS)
     if items.key is not None and not items.found:
         raise InputError(f"{path}: the file must be a list, got {describe(items.value)}; {_RERUN[_COCO]}")
@@ -296,10 +294,8 @@ def _results(people: _Collected, items: Iterable[Any], others: Mapping[str, Any]
     first: dict[int, int | str] = {}
     for image, frame in frames.items():
         if first.setdefault(frame, image) != image:
-            raise InputError(
-                f"{path}: the pictures {str(first[frame])[:40]!r} and {str(image)[:40]!r} are both frame {frame};"
-                f" {_RERUN[program]}, of one camera with a number for each picture"
-            )
+            problem = f"the pictures {str(first[frame])[:40]!r} and {str(image)[:40]!r} are both frame {frame}"
+            raise InputError(f"{path}: {problem}; {_RERUN[program]}, of one camera with a number for each picture")
     return people.camera([frames[image] for image in images], (min(first), max(first)) if first else (0, -1))
 
 

@@ -1,6 +1,6 @@
 """People of one camera as detectors write them: kept, given scores from 0 to 1, taken apart into candidates."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -103,47 +103,32 @@ class KeptPeople:
             yield block
 
 
-@dataclass(frozen=True)
-class ScoreRule:
-    """How detectors' scores become probabilities, the same for all cameras.
+Scores = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+"""Turns a detector's scores (...) into ones from 0 to 1."""
+
+
+def score_rule(people: Sequence[KeptPeople]) -> tuple[Scores, str | None]:
+    """How the scores of all cameras become probabilities; and what is said of it, None where they were before.
 
     - COCO's visibilities (only 0, 1 and 2, and a 2 among them): 2 is 1, and 1, hidden, is 0.5.
     - Scores that exceed 1.1: divided by the score that 1 in 100 exceeds, if that is above 1, then cut at 1.
       RTMPose's are heights of two curves and lie mostly under 1; others' are a few units, or per cent.
     """
-
-    scale: float = 1.0
-    """They are divided by it, then cut at 1."""
-    visibilities: bool = False
-    """They are COCO's instead."""
-    note: str | None = None
-    """What is said of it; None where they were probabilities before."""
-
-    @classmethod
-    def of(cls, people: Sequence[KeptPeople]) -> "ScoreRule":
-        """The rule for the scores of all cameras."""
-        top = max(each.top_score for each in people)
-        if top == 2 and all(each.visibilities for each in people):
-            note = "scores are COCO's visibilities: 2 was read as 1, and 1, a hidden joint, as 0.5"
-            return cls(visibilities=True, note=note)
-        if top <= OVERSHOOT:
-            return cls()
-        step = -(-sum(each.score_count for each in people) // _MOST_LOOKED_AT)
-        looked_at = np.concatenate([block.scores[::step] for each in people for block in each.blocks()])
-        scale = max(1.0, float(np.quantile(looked_at, 1 - _RARE)))
-        divided = f"divided by {scale:.3g}, which 1 in 100 exceeds, and " if scale > 1 else ""
-        return cls(
-            scale, note=f"scores reach {top:.3g}, so they are no probabilities: they were {divided}cut at 1"
-        )
-
-    def applied(self, score: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Scores (...) from 0 to 1."""
-        if self.visibilities:
-            return np.where(score == 1, _OCCLUDED, score / 2)
-        return np.minimum(score / self.scale, 1.0)
+    top = max(each.top_score for each in people)
+    if top == 2 and all(each.visibilities for each in people):
+        note = "scores are COCO's visibilities: 2 was read as 1, and 1, a hidden joint, as 0.5"
+        return lambda score: np.where(score == 1, _OCCLUDED, score / 2), note
+    if top <= OVERSHOOT:
+        return lambda score: np.minimum(score, 1.0), None
+    step = -(-sum(each.score_count for each in people) // _MOST_LOOKED_AT)
+    looked_at = np.concatenate([block.scores[::step] for each in people for block in each.blocks()])
+    scale = max(1.0, float(np.quantile(looked_at, 1 - _RARE)))
+    divided = f"divided by {scale:.3g}, which 1 in 100 exceeds, and " if scale > 1 else ""
+    note = f"scores reach {top:.3g}, so they are no probabilities: they were {divided}cut at 1"
+    return lambda score: np.minimum(score / scale, 1.0), note
 
 
-def candidates_of(people: KeptPeople, rule: ScoreRule, skeleton: Skeleton, first: int, last: int) -> ViewStream:
+def candidates_of(people: KeptPeople, rule: Scores, skeleton: Skeleton, first: int, last: int) -> ViewStream:
     """The joints of people as candidates, with affinity 1 between those of one person that a limb joins.
 
     So that grouped and ungrouped detections walk the same way. Frames run from number `first` to `last`. Joints
@@ -170,7 +155,7 @@ def candidates_of(people: KeptPeople, rule: ScoreRule, skeleton: Skeleton, first
 
 
 def _candidates(
-    frame: NDArray[np.intp], keypoints: NDArray[np.float64], rule: ScoreRule, skeleton: Skeleton
+    frame: NDArray[np.intp], keypoints: NDArray[np.float64], rule: Scores, skeleton: Skeleton
 ) -> ViewCandidates:
     """The joints of the people of some frames."""
     joints = _joints(keypoints, rule, skeleton)
@@ -186,12 +171,12 @@ def _candidates(
     return ViewCandidates.of(frame[person], joint, xy, score, pairs, np.ones(len(pairs)))
 
 
-def _joints(keypoints: NDArray[np.float64], rule: ScoreRule, skeleton: Skeleton) -> NDArray[np.float64]:
+def _joints(keypoints: NDArray[np.float64], rule: Scores, skeleton: Skeleton) -> NDArray[np.float64]:
     """(N, J, 3) the skeleton's joints with scores from 0 to 1, 0 0 0 where not seen."""
     target = np.arange(len(skeleton)) if skeleton.keypoints is None else np.array(skeleton.keypoints)
     joints = np.zeros((len(keypoints), len(skeleton), 3))
     joints[:, target[target >= 0]] = keypoints[:, target >= 0]
-    joints[..., 2] = rule.applied(joints[..., 2])
+    joints[..., 2] = rule(joints[..., 2])
     joints[~(np.isfinite(joints).all(axis=2) & (joints[..., 2] > 0))] = 0
     for middle, first, second in skeleton.middles:
         ends = joints[:, [first, second]]

@@ -14,8 +14,8 @@ from shapepose_fg.core.storage.kept_arrays import InMemory, KeptArrays
 from shapepose_fg.io.camera_names import listing, told_by_parts
 from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.detections.association_text import read_association_text
-from shapepose_fg.io.detections.json_people import is_one_file, read_frame_files, read_one_file
-from shapepose_fg.io.detections.people import CameraPeople, KeptPeople, ScoreRule, candidates_of
+from shapepose_fg.io.detections.json_people import read_json_people
+from shapepose_fg.io.detections.people import CameraPeople, KeptPeople, candidates_of, score_rule
 from shapepose_fg.io.detections.view_streams import ViewStream, assemble
 from shapepose_fg.io.skeleton_file import find_skeleton
 
@@ -31,31 +31,17 @@ class Format:
     """For messages and documents."""
     names: tuple[str, ...]
     """What a camera's file, or without an ending its folder, is called; {} is the camera."""
-    recognise: Callable[[Path], bool]
-    """Whether a file or folder that is called so is meant to be of this format, though it may be faulty."""
     read: Callable[[Path, Camera], CameraPeople | ViewStream]
     """What a camera saw: people, or candidates with affinities; InputError naming file, place and cure."""
 
 
-_JSON = (
-    "{}", "{}_json", "{}.json", "results_{}.json", "{}_results.json", "alphapose-results_{}.json",
-)  # fmt: skip
-FORMATS = [
-    Format("4D Association's text", ("{}.txt",), lambda place: place.suffix == ".txt", read_association_text),
-    Format(
-        "COCO's keypoint results, AlphaPose's JSON, MMPose's JSON of a video",
-        _JSON,
-        is_one_file,
-        lambda place, camera: read_one_file(place),
-    ),
-    Format(
-        "a JSON file per frame of OpenPose, Pose2Sim or MMPose",
-        _JSON,
-        Path.is_dir,
-        lambda place, camera: read_frame_files(place),
-    ),
-]
-"""The first that recognises a camera's file or folder reads it."""
+JSON = Format(
+    "JSON of OpenPose, Pose2Sim, MMPose, AlphaPose, or COCO's keypoint results",
+    ("{}", "{}_json", "{}.json", "results_{}.json", "{}_results.json", "alphapose-results_{}.json"),
+    lambda place, camera: read_json_people(place),
+)
+FORMATS = [Format("4D Association's text", ("{}.txt",), read_association_text), JSON]
+"""The first by whose names some camera has a file or folder reads those of all cameras."""
 
 
 def read_detections(
@@ -70,17 +56,15 @@ def read_detections(
     sentence that names file, place and cure.
     """
     kept = InMemory() if kept is None else kept
-    places, notes = find_places(Path(path), rig)
+    form, places, notes = find_places(Path(path), rig)
     wanted = find_skeleton(skeleton)
     streams, people = list[ViewStream](), list[KeptPeople]()
     for n, (place, camera) in enumerate(zip(places, rig.cameras, strict=True)):
-        read = next(each for each in FORMATS if each.recognise(place)).read(place, camera)
+        read = form.read(place, camera)
         if isinstance(read, CameraPeople):
             people.append(KeptPeople(read, kept, f"camera-{n:04d}"))
         else:
             streams.append(read)
-    if len(people) > 0 and len(streams) > 0:
-        raise InputError(f"{path}: some cameras have people and some candidates; give one format for all cameras")
     if len(people) > 0:
         skeleton, how = _skeleton_of_people(people, wanted), "made as middles, where a person's two ends were seen"
         streams, said = _streams_of(people, skeleton)
@@ -93,8 +77,9 @@ def read_detections(
     return replace(table, notes=(*notes, *table.notes))
 
 
-def find_places(path: Path, rig: Rig) -> tuple[list[Path], list[str]]:
-    """Every camera's file or folder in the folder `path`, in the rig's order, and what was taken to be what.
+def find_places(path: Path, rig: Rig) -> tuple[Format, list[Path], list[str]]:
+    """The format, every camera's file or folder in the folder `path`, in the rig's order, and what was taken to be
+    what.
 
     InputError naming the camera that is missing.
     """
@@ -105,15 +90,15 @@ def find_places(path: Path, rig: Rig) -> tuple[list[Path], list[str]]:
     folder = path / "detection" if (path / "detection").is_dir() else path
     entries = sorted(each for each in folder.iterdir() if not each.name.startswith("."))
     holds = listing([each.name for each in entries])
-    for patterns in dict.fromkeys(each.names for each in FORMATS):
-        found = [_named(folder, name, patterns) for name in rig.names]
+    for form in FORMATS:
+        found = [_named(folder, name, form.names) for name in rig.names]
         there = [place for place in found if place is not None]
         if len(there) == len(rig):
-            return there, []
+            return form, there, []
         if len(there) > 0:
             missing = rig.names[found.index(None)]
             raise InputError(
-                f'{folder / patterns[0].format(missing)}: the detections of camera "{missing}" are missing,'
+                f'{folder / form.names[0].format(missing)}: the detections of camera "{missing}" are missing,'
                 f" {folder} holds {holds}; add them, or take the camera out of the calibration"
             )
     # `walk_Miqus_1_23087_json` of camera `23087`, `cam01_json` of camera `int_cam1`.
@@ -126,7 +111,7 @@ def find_places(path: Path, rig: Rig) -> tuple[list[Path], list[str]]:
             " with <camera>.txt (4D Association), <camera>/ or <camera>_json/ with a JSON file per frame"
             " (OpenPose, Pose2Sim, MMPose), or <camera>.json (COCO's results, AlphaPose, MMPose)"
         )
-    return list(told[0]), [told[1]]
+    return JSON, *told
 
 
 def _named(folder: Path, name: str, patterns: Sequence[str]) -> Path | None:
@@ -188,14 +173,14 @@ def _streams_of(people: Sequence[KeptPeople], skeleton: Skeleton) -> tuple[list[
     """The people of every camera as candidates, and what was made of their scores and frames."""
     cameras = [each.camera for each in people]
     first, last = _span(cameras)
-    rule = ScoreRule.of(people)
+    rule, note = score_rule(people)
     for each, camera in zip(people, cameras, strict=True):
         if each.farthest is not None and each.farthest <= 1:
             raise InputError(
                 f"{camera.source}: recognised as {camera.program}, but all keypoints lie between -1"
                 f" and 1, and pixels were expected; {camera.rerun}"
             )
-    notes = [] if rule.note is None else [rule.note]
+    notes = [] if note is None else [note]
     if first > 0 and not all(camera.every_frame for camera in cameras):
         notes.append(f"frame 0 is number {first} of the files")
     streams = []
@@ -208,7 +193,7 @@ def _streams_of(people: Sequence[KeptPeople], skeleton: Skeleton) -> tuple[list[
             (since, until), more = camera.gaps[0], ", and others" if len(camera.gaps) > 1 else ""
             where = f"frame {since}" if since == until else f"frames {since} to {until}"
             have = "frames have" if count > 1 else "frame has"
-            notes.append(f"{camera.source}: {count} {have} no file ({where}{more}); nobody is seen there")
+            notes.append(f"{camera.source}: {count} {have} no file ({where}{more}); no people are seen there")
     return streams, notes
 
 
@@ -216,14 +201,10 @@ def _span(cameras: Sequence[CameraPeople]) -> tuple[int, int]:
     """Numbers of the first and last frame that any camera lists."""
     listed = [each for each in cameras if each.last >= each.first]
     if len(listed) == 0:
-        raise InputError(
-            f"{cameras[0].source}: recognised as {cameras[0].program}, where no camera lists a frame;"
-            " give detections of people"
-        )
+        problem = f"recognised as {cameras[0].program}, where no camera lists a frame"
+        raise InputError(f"{cameras[0].source}: {problem}; give detections of people")
     first, last = min(each.first for each in listed), max(each.last for each in listed)
     if last - first >= _MOST_FRAMES:
-        raise InputError(
-            f"{listed[0].source}: recognised as {listed[0].program}, whose frames would run from {first} to"
-            f" {last}; number the pictures by their frames"
-        )
+        problem = f"recognised as {listed[0].program}, whose frames would run from {first} to {last}"
+        raise InputError(f"{listed[0].source}: {problem}; number the pictures by their frames")
     return first, last

@@ -99,10 +99,11 @@ def _together(
     """The candidates of all views in some frames, and (T + 1,) where candidates and pairs of each frame begin."""
     counts = [len(view.frame) for view in views]
     offsets = np.cumsum([0, *counts[:-1]])
-    columns = [[getattr(view.seen, name) for view in views] for name in ("joint", "xy", "confidence")]
     every = Detections(
         np.repeat(np.arange(len(views)), counts),
-        *map(np.concatenate, columns),
+        np.concatenate([view.seen.joint for view in views]),
+        np.concatenate([view.seen.xy for view in views]),
+        np.concatenate([view.seen.confidence for view in views]),
         np.concatenate([view.seen.pairs + offset for view, offset in zip(views, offsets, strict=True)]),
         np.concatenate([view.seen.affinity for view in views]),
     )

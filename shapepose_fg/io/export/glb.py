@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS, SmplArrays
 from shapepose_fg.core.drawing import colour_of, vertex_normals
 from shapepose_fg.core.skeleton import SMPL_24
-from shapepose_fg.io.export.job import Job, Written
+from shapepose_fg.io.export.registry import Job, Written
 from shapepose_fg.io.export.skinned import BONES, Motion, everybody
 from shapepose_fg.io.export.take import y_up
 

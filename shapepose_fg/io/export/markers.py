@@ -17,7 +17,7 @@ from shapepose_fg.core.camera import Axis
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Known, Reconstruction
 from shapepose_fg.core.skeleton import MID_HIP, SMPL_24
-from shapepose_fg.io.export.job import Job, MarkerSet, Written, optional
+from shapepose_fg.io.export.registry import Job, MarkerSet, Written, optional
 from shapepose_fg.io.export.skinned import motion_of
 from shapepose_fg.io.export.take import Take, opensim_axes
 from shapepose_fg.io.pose2sim_project import Pose2SimProject

@@ -14,7 +14,7 @@ from shapepose_fg.body.model.smpl_file import SMPL_PARENTS
 from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.core.storage.npz import write_npz
-from shapepose_fg.io.export.job import Job, Written
+from shapepose_fg.io.export.registry import Job, Written
 from shapepose_fg.io.export.skinned import BONES, Motion, RestBody, all_segments
 from shapepose_fg.io.export.take import y_up, z_up
 

@@ -1,23 +1,103 @@
-"""The formats that a result can be exported to, and a saved result written in several of them."""
+"""The formats that a result can be exported to, what a writer is given, and a saved result in several formats."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from enum import StrEnum
+from functools import cached_property
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.body.model.smpl_file import SmplArrays
+from shapepose_fg.body.shapes import read_body
 from shapepose_fg.core.camera import Axis
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import OpenedReconstruction, Reconstruction
 from shapepose_fg.core.result_files import results_folder
 from shapepose_fg.core.run_summary import covered_frames
+from shapepose_fg.core.storage.files import write_content
 from shapepose_fg.io.calibration import read_rig
-from shapepose_fg.io.export.job import Job, MarkerSet, Written
 from shapepose_fg.io.export.take import Take
 from shapepose_fg.io.solved_setup import CAMERAS
+
+
+class MarkerSet(StrEnum):
+    """Which points are markers, and what they are called."""
+
+    OPENSIM = "opensim"
+    """The joints of the result, named as in the OpenSim models of Pose2Sim."""
+    JOINTS = "joints"
+    """The joints of the result with its own names."""
+    BODY = "body"
+    """The 24 joints of the body: smooth, and there whenever the body is."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A take, where its files go, and what was asked for."""
+
+    take: Take
+    """What is exported."""
+    folder: Path
+    """Where the files go."""
+    body_file: Path | None = None
+    """File of the body model; None for the one that the result was made with."""
+    markers: MarkerSet = MarkerSet.OPENSIM
+    """What TRC and C3D hold."""
+    fill_gaps_s: float = 0.2
+    """Holes in a body's motion up to this long are interpolated where a format can have none."""
+
+    @property
+    def body(self) -> Path | None:
+        """File of the body model; None for the one that ships."""
+        named = self.take.people.run.get("body")
+        return self.body_file if self.body_file is not None or named is None else Path(str(named))
+
+    @cached_property
+    def arrays(self) -> SmplArrays:
+        """The body model; InputError where its file is not there any more."""
+        try:
+            return read_body(self.body)
+        except InputError as error:
+            if self.body is None or self.body.exists():
+                raise
+            problem = "the body model of this result is not there any more"
+            raise InputError(f"{self.body}: {problem}; put it back, or say with --body where it is") from error
+
+
+@dataclass
+class Written:
+    """What came of a format."""
+
+    files: list[Path] = field(default_factory=list)
+    """The files, whole."""
+    notes: list[str] = field(default_factory=list)
+    """What was left out or changed, a sentence each."""
+
+    def add(self, path: Path, content: str | bytes) -> None:
+        """Write a file, whole or not at all."""
+        write_content(path, content)
+        self.files.append(path)
+
+    def at_one_rate(self, take: Take) -> Take:
+        """The take for formats that know one rate only; frames that have no place at it are noted."""
+        even, lost = take.at_one_rate()
+        if lost > 0:
+            self.notes.append(f"{lost} frames left out: at {take.fps:g} a second others are nearer to their place")
+        return even
+
+
+def optional(module: str, extra: str) -> ModuleType:
+    """A package of an extra; InputError with the command where it is not installed."""
+    try:
+        return import_module(module)
+    except ImportError:
+        package = module.partition(".")[0]
+        raise InputError(f'{package} is not installed; pip install "shapepose-fg[{extra}]"') from None
 
 
 @dataclass(frozen=True)
@@ -90,7 +170,9 @@ def export_result(
     """
     job: Job | None = None
     if not all(each.rows for each in formats):
-        needs = {name: any(getattr(each, name) for each in formats) for name in ("identities", "observations")}
+        needs: Any = {
+            name: any(getattr(each, name) for each in formats) for name in ("identities", "observations")
+        }
         job = Job(read_take(results, **options, **needs), folder, body, markers, fill_gaps_s)
     done: dict[str, Written] = {}
     for each in formats:
@@ -156,6 +238,6 @@ def chosen_rows(
     found, there = mine & (opened.frame >= frames.start) & (opened.frame < frames.stop), opened.frame[mine]
     if len(there) > 0 and not found.any():
         raise InputError(
-            f"--frames: {path} has nobody in these frames; people are in frames {there.min()} to {there.max()}"
+            f"--frames: {path} has no people in these frames; people are in frames {there.min()} to {there.max()}"
         )
     return np.flatnonzero(found)

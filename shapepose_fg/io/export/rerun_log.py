@@ -17,8 +17,8 @@ from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.drawing import bones_of, colour_of, thinned, vertex_normals
 from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import Known
-from shapepose_fg.io.export.job import optional
 from shapepose_fg.io.export.markers import sigma_m
+from shapepose_fg.io.export.registry import optional
 from shapepose_fg.io.export.skinned import rest_joints, skin
 from shapepose_fg.io.export.take import Take
 from shapepose_fg.io.footage.footage import Footage

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS, SmplArrays
-from shapepose_fg.io.export.job import Job, Written
+from shapepose_fg.io.export.registry import Job, Written
 from shapepose_fg.io.export.take import Take
 
 BONES = len(SMPL_PARENTS)

@@ -75,10 +75,10 @@ class Take:
         off, a result without time is a Take too: a person is then a number within the frame.
         """
         if len(people) == 0:
-            raise ValueError("nobody was found, so there is nothing to export")
+            raise ValueError("no people were found, so there is nothing to export")
         if identities and not people.run.get("configuration", {}).get("temporal", True):
             raise ValueError(
-                "every frame stands alone here, so nobody can be followed; reconstruct with --temporal, "
+                "this result is frame by frame, so people cannot be followed; reconstruct with --temporal, "
                 "or export csv or rrd"
             )
         people = _seen(people) if seen_only else people

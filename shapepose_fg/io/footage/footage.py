@@ -41,21 +41,15 @@ def open_footage(path: Path, progress: Progress | None = None) -> "Footage":
     return Video.open(path, progress)
 
 
-def glance(path: Path) -> tuple[tuple[int, int], float]:
+def glance(path: Path, capture: Any = None) -> tuple[tuple[int, int], float]:
     """Size (width, height) and frames a second that a video tells of itself, without looking through it.
 
-    The rate is 0 where it does not say.
+    The rate is 0 where it does not say, or cannot be. `capture` is the video, where it is open.
     """
-    capture = _capture(path)
-    size, fps = _told(capture)
-    capture.release()
-    return size, fps if 0 < fps < 1e5 else 0.0
-
-
-def _told(capture: Any) -> tuple[tuple[int, int], float]:
-    """Size and rate that a video tells of itself."""
+    capture = _capture(path) if capture is None else capture
     size = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
-    return size, float(capture.get(cv2.CAP_PROP_FPS))
+    fps = float(capture.get(cv2.CAP_PROP_FPS))
+    return size, fps if 0 < fps < 1e5 else 0.0
 
 
 @dataclass
@@ -82,7 +76,7 @@ class Video:
     def open(cls, path: Path, progress: Progress | None = None) -> "Video":
         """Look through the video at `path`: every frame is decoded once, which shows what is cut or damaged."""
         capture = _capture(path)
-        size, fps = _told(capture)
+        size, fps = glance(path, capture)
         if not (min(size) > 0 and max(size) <= _LARGEST):
             raise InputError(
                 f"{path}: the video's pictures would be {size[0]} x {size[1]}; give an undamaged video"
@@ -117,8 +111,7 @@ class Video:
                 return None
             self._next += 1
         read, picture = self._capture.retrieve()
-        fits = read and picture is not None and picture.shape[1::-1] == self.size
-        self._last = np.asarray(picture, dtype=np.uint8) if fits else None
+        self._last = _fitting(picture if read else None, self.size)
         return self._last
 
 
@@ -161,12 +154,16 @@ class PictureFiles:
     def at(self, place: int) -> Picture | None:
         """The picture of frame `place`; None where the file cannot be read, or is of another size."""
         picture = cv2.imread(str(self.files[place]), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-        fits = picture is not None and picture.shape[1::-1] == self.size
-        return np.asarray(picture, dtype=np.uint8) if fits else None
+        return _fitting(picture, self.size)
 
 
 Footage = Video | PictureFiles
 """What one camera took: N frames with numbers, of which some may have no picture."""
+
+
+def _fitting(picture: Any, size: tuple[int, int]) -> Picture | None:
+    """A picture, where it could be read and has the size."""
+    return picture if picture is not None and picture.shape[1::-1] == size else None
 
 
 def _capture(path: Path) -> Any:
@@ -196,9 +193,8 @@ def _times(path: Path, stamp_s: NDArray[np.float64], fps: float) -> tuple[NDArra
 
     The file's own times where they rise; else the rate that it names.
     """
-    known_rate = np.isfinite(fps) and 0.01 <= fps <= 1e5
     if len(stamp_s) > 1 and not (np.diff(stamp_s) > 0).all():
-        if not known_rate:
+        if fps < 0.01:
             raise InputError(
                 f"{path}: the video says neither times nor rate; give --fps CAMERA=RATE, or convert it"
             )

@@ -126,20 +126,21 @@ def align(clocks: Sequence[CameraClock], has_clock: bool) -> Lockstep:
         )
     nearest = [_nearest(each, moment) for each in clocks]
     picture = np.column_stack([place for place, _ in nearest])
-    notes = [
-        note for each, (place, _) in zip(clocks, nearest, strict=True) for note in _left_out(each, place, slowest)
-    ]
-    for each, (place, _) in zip(clocks, nearest, strict=True):
-        missing = np.flatnonzero(place < 0)
+    notes, misfits = list[str](), list[str]()
+    for each, (place, off) in zip(clocks, nearest, strict=True):
+        left_out = _left_out(each, place, slowest)
+        if left_out:
+            notes.append(
+                f"camera {each.name}: frames that another camera has no picture for were left out, {left_out}"
+            )
+        missing, misfit = np.flatnonzero(place < 0), 1e3 * off[place >= 0]
         if len(missing) > 0:
             notes.append(
                 f"camera {each.name}: no picture within half a frame of {len(missing)} of {len(moment)} moments"
-                f" (the first is frame {missing[0]}); it sees nobody there"
+                f" (the first is frame {missing[0]}); it sees no people there"
             )
-    for each, (place, off) in zip(clocks, nearest, strict=True):
-        misfit = 1e3 * off[place >= 0]
         if has_clock and misfit.max(initial=0.0) > 1e3 * _MISFIT_S:
-            notes.append(
+            misfits.append(
                 f"camera {each.name}: pictures are up to {misfit.max():.1f} ms from the moment they stand"
                 f" for ({misfit.mean():.1f} ms in the mean)"
             )
@@ -147,7 +148,7 @@ def align(clocks: Sequence[CameraClock], has_clock: bool) -> Lockstep:
     if has_clock:
         taken = [np.where(picture[:, v] >= 0, each.time[picture[:, v]], moment) for v, each in enumerate(clocks)]
         time_s = np.column_stack(taken)
-    return Lockstep(picture, time_s, tuple(notes))
+    return Lockstep(picture, time_s, (*notes, *misfits))
 
 
 def _nearest(clock: CameraClock, moment: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
@@ -161,13 +162,9 @@ def _nearest(clock: CameraClock, moment: NDArray[np.float64]) -> tuple[NDArray[n
     return np.where(off <= clock.period / 2 * (1 + 1e-3) + 1e-9, place, -1), off
 
 
-def _left_out(clock: CameraClock, place: NDArray[np.intp], moment: float) -> list[str]:
-    """What a camera took before and after the moments that all cameras saw; `moment` is from one to the next."""
+def _left_out(clock: CameraClock, place: NDArray[np.intp], moment: float) -> str:
+    """How many frames a camera took before and after the moments, which follow each other after `moment`."""
     used = place[place >= 0]
-    if len(used) == 0:
-        return []
-    ends = (int(used[0]), "at the start"), (int(len(clock.time) - 1 - used[-1]), "at the end")
+    ends = [(int(used[0]), "start"), (int(len(clock.time) - 1 - used[-1]), "end")] if len(used) > 0 else []
     # A faster camera always has frames between the moments.
-    where = " and ".join(f"{n} {at}" for n, at in ends if n > 0 and n * clock.period >= 0.99 * moment)
-    said = f"camera {clock.name}: frames that another camera has no picture for were left out, {where}"
-    return [said] if where else []
+    return " and ".join(f"{n} at the {end}" for n, end in ends if n > 0 and n * clock.period >= 0.99 * moment)

@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -47,35 +48,30 @@ class Placement:
 
     kind: PlacementKind
     """Where it comes from."""
-    scale: tuple[float, float]
-    """Pixels of the picture per calibrated pixel, x and y."""
-    shift: tuple[float, float]
-    """Where the left and upper edges of the calibrated picture are in the picture, pixels from its own edges."""
     picture_size: tuple[int, int]
     """(width, height) of the pictures."""
     calibrated_size: tuple[int, int]
     """(width, height) that the calibration is for."""
 
-    @classmethod
-    def of(
-        cls, kind: PlacementKind, picture_size: tuple[int, int], calibrated_size: tuple[int, int]
-    ) -> "Placement":
-        """The placement of a given kind."""
-        picture, calibrated = np.array(picture_size, dtype=float), np.array(calibrated_size, dtype=float)
-        scale = np.ones(2)
-        if kind is PlacementKind.SCALE:
-            scale = picture / calibrated
-        elif kind is PlacementKind.LETTERBOX:
-            scale = np.full(2, (picture / calibrated).min())
-        centred = kind in (PlacementKind.LETTERBOX, PlacementKind.CROP_CENTRE)
-        shift = (picture - scale * calibrated) / 2 if centred else np.zeros(2)
-        return cls(kind, tuple(scale.tolist()), tuple(shift.tolist()), picture_size, calibrated_size)
+    @cached_property
+    def scale(self) -> NDArray[np.float64]:
+        """(2,) pixels of the picture per calibrated pixel, x and y."""
+        scale = np.array(self.picture_size, dtype=float) / self.calibrated_size
+        if self.kind is PlacementKind.LETTERBOX:
+            return np.full(2, scale.min())
+        return scale if self.kind is PlacementKind.SCALE else np.ones(2)
+
+    @cached_property
+    def shift(self) -> NDArray[np.float64]:
+        """(2,) the left and upper edges of the calibrated picture, pixels from the picture's own edges."""
+        centred = self.kind in (PlacementKind.LETTERBOX, PlacementKind.CROP_CENTRE)
+        return (self.picture_size - self.scale * self.calibrated_size) / 2 if centred else np.zeros(2)
 
     @property
     def region(self) -> tuple[float, float, float, float]:
         """Left, top, right, bottom edge of what is calibrated and in the picture; 0 is a pixel's centre."""
         low = np.maximum(self.shift, 0.0)
-        high = np.minimum(np.array(self.shift) + np.array(self.scale) * self.calibrated_size, self.picture_size)
+        high = np.minimum(self.shift + self.scale * self.calibrated_size, self.picture_size)
         left, top, right, bottom = np.concatenate([low, high]) - 0.5
         return float(left), float(top), float(right), float(bottom)
 
@@ -146,7 +142,7 @@ def place(
             f"{sizes}; say what was done to them with --image-placement: letterbox (resized, with bars), scale"
             " (resized), crop or crop-centre (cut)"
         )
-    return Placement.of(kind, picture_size, calibrated_size), note
+    return Placement(kind, picture_size, calibrated_size), note
 
 
 @dataclass(frozen=True)
@@ -202,7 +198,7 @@ def read_used_footage(file: Path) -> list[CameraFootage]:
     """Read what `write_used_footage` wrote; InputError, one sentence, on anything else."""
     found = []
     for camera in validated(_File, read_json(file), file, "run shapepose-fg detect again").cameras:
-        placement = Placement.of(camera.placement, camera.picture_size, camera.calibrated_size)
+        placement = Placement(camera.placement, camera.picture_size, camera.calibrated_size)
         places = np.array(camera.pictures, dtype=np.intp)
         found.append(CameraFootage(camera.name, Path(camera.path), placement, places))
     return found

@@ -1,7 +1,6 @@
 """Which video or folder of pictures is which camera's."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from shapepose_fg.core.errors import InputError
@@ -13,16 +12,6 @@ PICTURES = frozenset(".jpg .jpeg .png .bmp .tif .tiff .webp".split())
 """Endings of pictures."""
 _INNER = ("videos", "images", "video", "image")
 """Folders in which other programs' projects keep their footage."""
-
-
-@dataclass(frozen=True)
-class FootagePlaces:
-    """Where each camera's footage is."""
-
-    paths: tuple[Path, ...]
-    """A video, a picture, or a folder of pictures for each camera, in their order."""
-    notes: tuple[str, ...] = ()
-    """What was taken to be what."""
 
 
 def per_camera(
@@ -52,8 +41,8 @@ def per_camera(
     return [values.get(name, rest) for name in cameras]
 
 
-def find_footage(given: Sequence[str], cameras: Sequence[str]) -> FootagePlaces:
-    """Find every camera's footage.
+def find_footage(given: Sequence[str], cameras: Sequence[str]) -> tuple[list[Path], list[str]]:
+    """A video, a picture, or a folder of pictures for each camera, and what was taken to be what.
 
     `given` is one folder that holds something named after each camera, or CAMERA=PATH for each of them.
     InputError naming the camera that is missing, or what could be meant twice.
@@ -69,10 +58,10 @@ def find_footage(given: Sequence[str], cameras: Sequence[str]) -> FootagePlaces:
             )
         if not Path(path).exists():
             raise InputError(f"{path}: there is no such file or folder; check the path")
-    return FootagePlaces(tuple(Path(path or "") for path in named.values()))
+    return [Path(path or "") for path in named.values()], []
 
 
-def _in_folder(folder: Path, cameras: Sequence[str]) -> FootagePlaces:
+def _in_folder(folder: Path, cameras: Sequence[str]) -> tuple[list[Path], list[str]]:
     """What a folder holds of each camera, told by the names: videos, pictures, and folders that hold pictures."""
     if folder.is_file():
         raise InputError(
@@ -91,20 +80,18 @@ def _in_folder(folder: Path, cameras: Sequence[str]) -> FootagePlaces:
                 f"{folder}: {what} could all be camera {camera}'s; give --videos {camera}=PATH for each"
             )
     if all(exact):
-        return FootagePlaces(tuple(found[0] for found in exact))
+        return [found[0] for found in exact], []
     if not any(exact):
         told = told_by_parts(folder, cameras, offered, names)
         if told is not None:
-            return FootagePlaces(told[0], (told[1],))
+            return told
         inner = [folder / name for name in _INNER if (folder / name).is_dir()]
         if len(inner) == 1:
             return _in_folder(inner[0], cameras)
     missing = next(camera for camera, found in zip(cameras, exact, strict=True) if len(found) == 0)
     holds = listing([path.name for path in offered], "no video, picture or folder of pictures")
-    raise InputError(
-        f"{folder}: nothing here is named after camera {missing}, it holds {holds}; name a video or a folder"
-        f" of pictures after each camera, or give --videos {missing}=PATH for each"
-    )
+    cure = f"name a video or a folder of pictures after each camera, or give --videos {missing}=PATH for each"
+    raise InputError(f"{folder}: nothing here is named after camera {missing}, it holds {holds}; {cure}")
 
 
 def _is_footage(path: Path) -> bool:

@@ -48,8 +48,8 @@ def pictures_of(
     unknown = [name for name in wanted.drawn if name not in used]
     notes: list[str] = []
     if wanted.videos is not None:
-        places = find_footage(wanted.videos, wanted.drawn)
-        paths, notes = dict(zip(wanted.drawn, places.paths, strict=True)), [*places.notes]
+        places, notes = find_footage(wanted.videos, wanted.drawn)
+        paths = dict(zip(wanted.drawn, places, strict=True))
     elif len(unknown) > 0:
         raise InputError(
             f"nothing says where the pictures of camera {unknown[0]} are; give --videos, or with --detections the"

@@ -115,7 +115,7 @@ def _shaded(camera: Camera, floor: Floor, casting: _Mesh, drawn: list[tuple[_Mes
 
 def _draw_people(panel: Picture, camera: Camera, people: Reconstruction, rows: NDArray[np.intp]) -> None:
     """The skeletons of some rows, with who they are."""
-    placement = Placement.of(PlacementKind.SAME, camera.image_size, camera.image_size)
+    placement = Placement(PlacementKind.SAME, camera.image_size, camera.image_size)
     view = PictureView(camera, placement, camera.image_size)
     draw_skeletons(panel, view, Skeletons.of(people.rows(rows)))
 

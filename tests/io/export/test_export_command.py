@@ -56,8 +56,8 @@ def test_options(copied, tmp_path, capsys):
         (["fbx"], "format fbx: there is none of this name; there are amass trc c3d bvh glb csv parquet rrd"),
         (["trc", "--markers", "skin"], "--markers skin: must be one of opensim joints body"),
         (["trc", "--frames", "9:3"], "--frames 9:3: must be A:B"),
-        (["trc", "--frames", "500:600"], "nobody in these frames; people are in frames 100 to 123"),
-        (["parquet", "--frames", "500:600"], "nobody in these frames; people are in frames 100 to 123"),
+        (["trc", "--frames", "500:600"], "no people in these frames; people are in frames 100 to 123"),
+        (["parquet", "--frames", "500:600"], "no people in these frames; people are in frames 100 to 123"),
         (["trc", "--person", "4"], "has no such person; it has 3 7"),
         (["trc", "--fps", "0"], "--fps 0: must be a number of frames a second"),
         (["bvh", "--fill-gaps", "-1"], "--fill-gaps -1: must be seconds"),
@@ -90,7 +90,9 @@ def test_people_without_a_body_have_no_skeleton_to_export(result, copied, capsys
 def test_frames_that_stand_alone_go_into_tables_only(result, copied, capsys):
     replace(result, run=result.run | {"configuration": {"temporal": False}}).save(copied)
     assert run("export", copied, "csv", "trc") == 2
-    assert "nobody can be followed; reconstruct with --temporal, or export csv or rrd" in capsys.readouterr().err
+    assert (
+        "people cannot be followed; reconstruct with --temporal, or export csv or rrd" in capsys.readouterr().err
+    )
     assert run("export", copied, "csv") == 0
 
 

@@ -11,10 +11,9 @@ import pytest
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25, COCO_17, HALPE_26, SMPL_24
-from shapepose_fg.io.export.job import Job
 from shapepose_fg.io.export.markers import Markers, MarkerSet, c3d_bytes, opensim_names, write_c3d, write_trc
 from shapepose_fg.io.export.motion_files import write_amass, write_bvh
-from shapepose_fg.io.export.registry import read_take
+from shapepose_fg.io.export.registry import Job, read_take
 from shapepose_fg.io.export.tables import COLUMNS, csv_text
 from shapepose_fg.io.export.take import Take
 

@@ -74,7 +74,7 @@ def test_seen_only_leaves_inferred_joints_out(result):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"run": {"configuration": {"temporal": False}}}, "every frame stands alone here"),
+        ({"run": {"configuration": {"temporal": False}}}, "this result is frame by frame"),
         ({"person": "same"}, "has two rows of frame 100"),
         ({"time_s": "unknown"}, "give --fps"),
         ({"time_s": "falling"}, "does not rise"),
@@ -94,7 +94,7 @@ def test_old_files_do_not_say_what_was_seen(result):
 
 
 def test_nobody_is_nothing_to_export():
-    with pytest.raises(ValueError, match="nobody was found"):
+    with pytest.raises(ValueError, match="no people were found"):
         Take.of(Reconstruction.empty(), "z")
 
 
@@ -116,7 +116,7 @@ def test_people_and_frames_can_be_chosen(saved):
         read_take(saved, persons=(5,))
     for frames, persons in ((range(1000, 1100), None), (range(AWAY.start, AWAY.stop), (7,))):
         with pytest.raises(
-            InputError, match=r"--frames: .* nobody in these frames; people are in frames 100 to 123"
+            InputError, match=r"--frames: .* no people in these frames; people are in frames 100 to 123"
         ):
             read_take(saved, frames=frames, persons=persons)
 

@@ -50,7 +50,7 @@ def test_points_lie_where_the_camera_without_its_lens_sees_them(scene, kind):
     camera = replace(scene.rig.cameras[0], distortion=BENT)
     width, height = camera.image_size
     size = (width, height) if kind == PlacementKind.SAME else (width * 3 // 4, height * 3 // 4)
-    placement = Placement.of(kind, size, (width, height))
+    placement = Placement(kind, size, (width, height))
     ends = np.array([[-1.0, 0, 0.3], [1, 0, 0.5], [0, -1, 1.6], [0, 1, 1.2], [0, 0, 1.0]])
     maps = undistorting(camera, placement)
     straight = cv2.remap(dotted(camera, placement, ends), *maps, cv2.INTER_LINEAR)
@@ -69,7 +69,7 @@ def filmed(result, scene, tmp_path):
     result.save(tmp_path)
     write_rig(rig, tmp_path / "cameras.json")
     (tmp_path / "cam0").mkdir()
-    placement = Placement.of(PlacementKind.SAME, rig.cameras[0].image_size, rig.cameras[0].image_size)
+    placement = Placement(PlacementKind.SAME, rig.cameras[0].image_size, rig.cameras[0].image_size)
     for frame in (*range(100), FIRST + 1):
         picture = dotted(rig.cameras[0], placement, result.joints[result.frame == max(frame, FIRST)][0])
         cv2.imwrite(str(tmp_path / "cam0" / f"{frame:06d}.png"), picture if frame > FIRST else picture[:, :] // 2)
