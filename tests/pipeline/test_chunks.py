@@ -125,6 +125,11 @@ def test_a_person_s_rows_are_read_from_all_windows(assembly, whole):
             np.linalg.inv(found.targets.information[known]), whole.covariance[chosen][known], rtol=1e-6, atol=1e-12
         )
         np.testing.assert_array_equal(found.time_s, whole.time_s[chosen])
+    first, last = min(assembly.people.counts), max(assembly.people.counts)
+    named = replace(assembly, names={first: 40, last: first}, bodies=None).reconstruction()
+    expected = np.where(whole.person == first, 40, np.where(whole.person == last, first, whole.person))
+    np.testing.assert_array_equal(named.person, expected)
+    np.testing.assert_array_equal(named.observations.person, expected)
     thinned = assembly.reconstruction(every=5)
     expected = whole.rows(whole.frame % 5 == 0)
     for name in whole.ROWS:
