@@ -26,7 +26,7 @@ from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.simulation import Scene, built_in_scene, simulate
-from shapepose_fg.simulation.files import cut, named_scene
+from shapepose_fg.simulation.files import named_scene
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ def _recording(arguments: argparse.Namespace) -> Timed:
     if arguments.stretch is not None:
         name, first, last = arguments.stretch.split(":")
         scene = named_scene(name, split="report", frames=int(last))
-        return _simulated(arguments.stretch, cut(scene, range(int(first), int(last))))
+        return _simulated(arguments.stretch, scene.part(range(int(first), int(last))))
     inner = arguments.data / "data" / "shelf"
     folder = inner if inner.is_dir() else arguments.data
     if arguments.scene or not (folder / "calibration.json").is_file():

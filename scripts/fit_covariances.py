@@ -23,7 +23,6 @@ from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.calibration import Calibration, Clues
 from shapepose_fg.pipeline.pipeline import reconstruct
 from shapepose_fg.simulation import built_in_scene, simulate
-from shapepose_fg.simulation.files import cut, cuts_of
 from shapepose_fg.simulation.mocap import Mocap
 from shapepose_fg.simulation.scene import Scene
 from shapepose_fg.simulation.sequences import SEQUENCES, Split, sequence
@@ -68,7 +67,7 @@ def errors(name: str, split: Split, seed: int, cameras: int, mocap: Mocap) -> It
     truly = Calibration.covariance
     with patch.object(Calibration, "covariance", lambda self, clues: seen.append(clues) or truly(self, clues)):
         times = FrameTimes.from_fps(FPS, len(detections))
-        reconstruct(detections, scene.rig, times=times, cuts=cuts_of(scene))
+        reconstruct(detections, scene.rig, times=times, cuts=scene.cuts)
     for clues in seen:
         yield clues, clues.joints - _truth_of(clues, scene.keypoints)
 
@@ -78,7 +77,7 @@ def _scene(name: str, split: Split, seed: int, cameras: int, mocap: Mocap) -> Sc
         return built_in_scene(seed, people=2, cameras=cameras, frames=FRAMES, fps=FPS)
     config = replace(SEQUENCES[name], seed=seed)
     whole = sequence(name, split, mocap, cameras=cameras, until=FRAMES, fps=FPS, config=config)
-    return cut(whole, range(FRAMES))
+    return whole.part(range(FRAMES))
 
 
 def _truth_of(clues: Clues, keypoints: np.ndarray) -> np.ndarray:

@@ -26,10 +26,21 @@ from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.provenance import versions
-from shapepose_fg.simulation.training.calibration import calibrated
-from shapepose_fg.simulation.training.motions import ACKNOWLEDGEMENT, Motions, load_motions
-from shapepose_fg.simulation.training.split import TEST_SUBJECTS, VALIDATION_SUBJECTS
-from shapepose_fg.simulation.training.train import PeopleSource, Trainer, TrainingConfig, body_points, prepared
+from shapepose_fg.simulation.training.motions import (
+    ACKNOWLEDGEMENT,
+    TEST_SUBJECTS,
+    VALIDATION_SUBJECTS,
+    Motions,
+    load_motions,
+)
+from shapepose_fg.simulation.training.train import (
+    PeopleSource,
+    Trainer,
+    TrainingConfig,
+    body_points,
+    calibrated,
+    prepared,
+)
 
 VALIDATION_PEOPLE = 2048
 
@@ -56,7 +67,7 @@ def main(
     for split in ("train", "validation"):
         if len(recorded.of(split)) == 0:
             raise InputError(
-                f"{motions}: no {split} subjects in it; add motions of more people (training/split.py)"
+                f"{motions}: no {split} subjects in it; add motions of more people (training/motions.py)"
             )
     if calibrate:
         weights = FitterWeights.load(output)

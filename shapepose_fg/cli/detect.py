@@ -112,10 +112,10 @@ def detect(
     network.check()
     if pictures.videos is None:
         raise InputError("--videos: missing; give the cameras' videos or pictures")
-    from shapepose_fg.detection2d.detector import CameraDetector, DetectionConfig
+    from shapepose_fg.detection2d.detector import CameraDetector
     from shapepose_fg.detection2d.recording import DetectionRun, run_detection
-    from shapepose_fg.io.footage.given import clocks_of, per_camera, placements_of
-    from shapepose_fg.io.footage.lockstep import align
+    from shapepose_fg.io.footage.lockstep import align, clocks_of
+    from shapepose_fg.io.footage.placement import placements_of
 
     rig = cameras.rig()
     loaded = network.load()
@@ -124,15 +124,13 @@ def detect(
     placements, concluded = placements_of(pictures.image_placement or [], sizes, rig)
     for each in concluded:
         note(each)
-    rates = per_camera("--fps", clock.fps or [], rig, one_for_all=True)
-    starts = per_camera("--start", clock.start or [], rig, one_for_all=False)
-    moments = align(*clocks_of(footage, rates, starts, rig))
+    moments = align(*clocks_of(footage, clock.fps or [], clock.start or [], rig.names))
     moments = _part(moments, frame_range(clock.frames, len(moments)))
     for each in moments.notes:
         note(each)
-    config = DetectionConfig(long_side=network.long_side)
     detectors = [
-        CameraDetector.of(camera, rig.up_vector, placements[camera.name], loaded, config) for camera in rig.cameras
+        CameraDetector.of(camera, rig.up_vector, placements[camera.name], loaded, network.long_side)
+        for camera in rig.cameras
     ]
     if loaded.only_size is not None:
         note(_shown_small(detectors, loaded.only_size))

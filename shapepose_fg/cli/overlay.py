@@ -66,18 +66,17 @@ def overlay(
     from shapepose_fg.core.reconstruction import Reconstruction
     from shapepose_fg.io.calibration import read_rig
     from shapepose_fg.io.solved_setup import CAMERAS
-    from shapepose_fg.viz.overlay.frames import Overlay, OverlayContent
-    from shapepose_fg.viz.overlay.output import write_overlay
+    from shapepose_fg.viz.overlay.frames import Overlay, write_overlay
 
     folder = results_folder(results)
     with Reconstruction.open(folder) as people:
         rig, run = read_rig(folder / CAMERAS), people.run
         names = pictures.named(rig) if drawn.cameras is None else _cameras(drawn.cameras, rig)
         shown = pictures.of_result(run, rig, names, detections)
-        content = OverlayContent(skeletons=drawn.skeletons, detections=drawn.points)
         if drawn.points and not people.observed:
             note(f"{folder}: there is no observations.npz, so no detections are drawn")
-        over = Overlay(people, rig, shown, content, _body(run) if drawn.bodies else None)
+        body = _body(run) if drawn.bodies else None
+        over = Overlay(people, rig, shown, drawn.skeletons, drawn.points, body)
         length = max(len(used.places) for used, _ in shown)
         if drawn.stills is not None:
             chosen, fps = _stills(drawn.stills, length), None

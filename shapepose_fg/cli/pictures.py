@@ -11,7 +11,7 @@ from shapepose_fg.cli.terminal import note, progress
 if TYPE_CHECKING:
     from shapepose_fg.core.camera import Rig
     from shapepose_fg.io.footage.footage import Footage
-    from shapepose_fg.io.footage.used import CameraFootage
+    from shapepose_fg.io.footage.placement import CameraFootage
 
 
 @dataclass(frozen=True, kw_only=True)

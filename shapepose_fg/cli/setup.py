@@ -21,9 +21,8 @@ def check_calibration(
     """
     from shapepose_fg.core.storage.kept_arrays import InFolder
     from shapepose_fg.io.detections import read_detections
-    from shapepose_fg.setup_check.diagnosis import diagnose
-    from shapepose_fg.setup_check.pictures import other_sizes
-    from shapepose_fg.setup_check.report import report_of
+    from shapepose_fg.setup_check.plain import other_sizes
+    from shapepose_fg.setup_check.report import check_setup
     from shapepose_fg.setup_check.table import setup_report
 
     rig = seen.rig()
@@ -32,7 +31,7 @@ def check_calibration(
         for each in recording.notes:
             note(each)
         sizes = () if pictures.videos is None else other_sizes(pictures.videos, rig)
-        report = report_of(diagnose(recording, rig, frame_range(frames, len(recording))), rig, sizes)
+        report = check_setup(recording, rig, frame_range(frames, len(recording)), sizes)
     if as_json:
         print(json.dumps(report.as_dict(), indent=2, allow_nan=False))
     else:

@@ -64,7 +64,7 @@ def simulate(
     from shapepose_fg.pipeline.workers import suitable_workers
     from shapepose_fg.simulation import DetectorConfig
     from shapepose_fg.simulation import simulate as run_detector
-    from shapepose_fg.simulation.files import check_output, cut, cuts_of, named_scene, write_simulated
+    from shapepose_fg.simulation.files import check_output, named_scene, write_simulated
     from shapepose_fg.simulation.visibility import FRAMES_WORTH_A_WORKER
 
     last = re.search(r":\s*(\d{1,6})\s*$", frames or "")
@@ -78,7 +78,7 @@ def simulate(
         mocap=scene.mocap,
     )
     span = frame_range(frames, len(made))
-    part = cut(made, span)
+    part = made.part(span)
     check_output(part, output, cast("Format", format))
     workers = suitable_workers(len(span), FRAMES_WORTH_A_WORKER) if workers is None else workers
     start = time.perf_counter()
@@ -94,7 +94,7 @@ def simulate(
     )
     for what, path in written.items():
         print(f"{what:<12}{path}")
-    timing = f"--fps {part.fps:g}" + (f" --cuts {','.join(map(str, cuts_of(part)))}" if cuts_of(part) else "")
+    timing = f"--fps {part.fps:g}" + (f" --cuts {','.join(map(str, part.cuts))}" if part.cuts else "")
     print(
         f"try: shapepose-fg reconstruct --calibration {written['cameras']} --detections {written['detections']}"
         f" {timing} --output {output / 'results'}"

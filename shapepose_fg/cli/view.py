@@ -10,7 +10,7 @@ from shapepose_fg.core.errors import InputError
 if TYPE_CHECKING:
     from shapepose_fg.io.export.take import Take
     from shapepose_fg.io.footage.footage import Footage
-    from shapepose_fg.io.footage.used import CameraFootage
+    from shapepose_fg.io.footage.placement import CameraFootage
 
 
 @grouped
@@ -29,16 +29,15 @@ def view(
 ) -> None:
     """Show a result in the rerun viewer: people, cameras, and what was used of what they saw, on a timeline."""
     from shapepose_fg.io.export.job import Job
-    from shapepose_fg.io.export.reading import body_file, read_take
+    from shapepose_fg.io.export.registry import read_take
     from shapepose_fg.io.export.rerun_app import (
         body_if_there,
-        log_take,
         new_stream,
         open_viewer,
         switch_off,
         viewer_file,
     )
-    from shapepose_fg.io.export.rerun_log import log_pictures
+    from shapepose_fg.io.export.rerun_log import log_pictures, log_take
 
     take = read_take(part.results, identities=False, **part.how())
     shown = _pictures(take, pictures) if pictures.videos else []
@@ -49,9 +48,9 @@ def view(
             "rerun's statistics of use were on and are switched off now; `rerun analytics enable` switches them on"
         )
     open_viewer(stream, take, connect)
-    arrays, missing = body_if_there(Job(take, part.results, body_file(take, part.body)))
-    if missing is not None:
-        note(missing)
+    arrays, missing = body_if_there(Job(take, part.results, part.body))
+    for each in missing:
+        note(each)
     log_take(stream, take, arrays)
     if len(shown) > 0:
         with progress("showing pictures", "pictures") as done:

@@ -276,6 +276,8 @@ class Views:
     """(V, 3, 3) intrinsic matrices of cameras that are the same for all rows, or (N, V, 3, 3), pixels."""
     cTw: NDArray[np.float64]
     """(V, 3, 4) camera from world of cameras that stand still, or (N, V, 3, 4), metres."""
+    image_sizes: NDArray[np.float64] | float = np.inf
+    """(V, 2) width and height, pixels; infinite where they are not known."""
 
     def __post_init__(self) -> None:
         K, cTw = np.asarray(self.K, dtype=np.float64), np.asarray(self.cTw, dtype=np.float64)
@@ -289,7 +291,7 @@ class Views:
     @classmethod
     def of(cls, rig: Rig) -> "Views":
         """The cameras of a rig that stands still."""
-        return cls(rig.K, rig.cTw)
+        return cls(rig.K, rig.cTw, rig.image_sizes)
 
     def __len__(self) -> int:
         """V, the number of views."""
@@ -308,7 +310,8 @@ class Views:
 
     def rows(self, index: NDArray[np.intp]) -> "Views":
         """The cameras of some of the rows."""
-        return Views(*(array[index] if array.ndim == 4 else array for array in (self.K, self.cTw)))
+        K, cTw = (array[index] if array.ndim == 4 else array for array in (self.K, self.cTw))
+        return Views(K, cTw, self.image_sizes)
 
     def project(
         self, points: NDArray[np.float64]

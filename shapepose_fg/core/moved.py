@@ -1,4 +1,4 @@
-"""Modules that have moved: their old names still work, with a warning that says the new one."""
+"""Modules that users imported and that have moved: old names still work, with a warning that says the new one."""
 
 import sys
 import warnings
@@ -12,61 +12,20 @@ _ROOMS = {
     "core": "errors camera skeleton detections observations observation_table frame_times bounds"
     " reconstruction provenance run_summary result_files",
     "core.storage": "files kept_arrays output_folder",
-    "pipeline": "engine windows workers cluster solving bodies_over_time solved_rows runs",
+    "pipeline": "engine windows workers cluster solving bodies_over_time runs",
     "cli": "options terminal stopping demo batch",
     "viz": "rendering overlay report viewer",
     "io": "export",
     "simulation": "training",
 }
 """What was in the package's root until 0.1, by where it is now."""
-_MERGED = {
-    "core.storage.npz": "npz_reader npz_writer core.storage.npz_reader core.storage.npz_writer",
-    "core.storage.schema": "columns core.columns",
-    "core.result_files": "result_options core.result_options saved_table core.storage.saved_table",
-    "pipeline.runs.manifest": "pipeline.runs.room",
-    "core.drawing": "viz.viewer.palette io.export.bones io.export.light_mesh",
-    "pipeline.runs.parts": "pipeline.runs.rows_of_people",
-    "io.export.take": "io.export.axes",
-    "io.detections.association_text": "io.detections.association_skeletons",
-    "io.export.skinned": "io.export.stretches",
-    "io.export.registry": "io.export.exporting",
-    "io.export.tables": "io.export.table io.export.parquet",
-    "io.export.marker_files": "io.export.trc io.export.c3d io.export.pose2sim_files",
-    "io.export.rerun_app": "io.export.rerun_scene io.export.rerun_statistics io.export.rrd",
-    "io.export.rerun_log": "io.export.rerun_people io.export.rerun_views io.export.rerun_pictures",
-}
-"""Modules that are others now, under whichever name."""
-_RENAMED = {
-    "pipeline_config": "pipeline.config",
-    "chunk_work": "pipeline.solved_windows",
-    "person_bodies": "pipeline.bodies_over_time",
-    "batch_command": "cli.batch.command",
-    **{f"{name}_command": f"cli.{name}" for name in "tracks detect overlay export report view setup".split()},
-    **{f"reconstruct_{name}": f"cli.reconstruct.{name}" for name in "command ending request run".split()},
-    **{f"reconstruct_{name}": "cli.reconstruct.request" for name in ("inputs", "outcome")},
-    "reconstruct_summary": "cli.reconstruct.ending",
-    **{old: new for new, names in _MERGED.items() for old in names.split()},
-}
-MOVED = {name: f"{room}.{name}" for room, names in _ROOMS.items() for name in names.split()} | _RENAMED
+MOVED = {name: f"{room}.{name}" for room, names in _ROOMS.items() for name in names.split()}
 """Old names to new ones, both within the package."""
+MOVED |= {"pipeline_config": "pipeline.config", "person_bodies": "pipeline.bodies_over_time"}
 
 
-class _Loader(Loader):
-    """Gives the module at its new place."""
-
-    def __init__(self, place: str) -> None:
-        self.place = place
-
-    def create_module(self, spec: ModuleSpec) -> None:
-        return None
-
-    def exec_module(self, module: ModuleType) -> None:
-        warnings.warn(f"{module.__name__} is {self.place} now", DeprecationWarning, stacklevel=2)
-        sys.modules[module.__name__] = import_module(self.place)
-
-
-class _Finder(MetaPathFinder):
-    """Finds modules by their old names."""
+class _Finder(MetaPathFinder, Loader):
+    """Finds modules by their old names, and gives those at their new places."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
@@ -75,8 +34,17 @@ class _Finder(MetaPathFinder):
         for n in range(1, len(parts) + 1) if package == "shapepose_fg" else ():
             new = MOVED.get(".".join(parts[:n]))
             if new is not None:
-                return ModuleSpec(fullname, _Loader(".".join([package, new, *parts[n:]])))
+                return ModuleSpec(fullname, self, loader_state=".".join([package, new, *parts[n:]]))
         return None
+
+    def create_module(self, spec: ModuleSpec) -> None:
+        return None
+
+    def exec_module(self, module: ModuleType) -> None:
+        assert module.__spec__ is not None
+        place = module.__spec__.loader_state
+        warnings.warn(f"{module.__name__} is {place} now", DeprecationWarning, stacklevel=2)
+        sys.modules[module.__name__] = import_module(place)
 
 
 def install() -> None:

@@ -102,16 +102,14 @@ class ObservationTable(Table):
         joints: NDArray[np.float64],
         gate: NDArray[np.uint8],
         rig: Rig,
-        *,
-        frame: NDArray[np.integer],
-        person: NDArray[np.integer],
         joint_names: Sequence[str],
     ) -> "ObservationTable":
         """The table of N solved rows: what they observed, and where their `joints` (N, J, 3) came to lie.
 
-        `place` (N, J, V) is each detection's place among those of its view (`place_in_view`), `gate` (N, J, V)
-        the codes of `Gate`; what was not seen is recorded as that, whatever is there, and what was not used
-        because the joint is not placed, or behind the camera, as that.
+        The rows are of the observations' `frame`, and of the person `track`. `place` (N, J, V) is each detection's
+        place among those of its view (`place_in_view`), `gate` (N, J, V) the codes of `Gate`; what was not seen is
+        recorded as that, whatever is there, and what was not used because the joint is not placed, or behind the
+        camera, as that.
         """
         seen = observations.seen
         projected, depth = (np.moveaxis(values, 0, 2) for values in rig.project(joints))
@@ -121,8 +119,8 @@ class ObservationTable(Table):
         gate = np.where(free & np.isnan(joints).any(axis=-1, keepdims=True), Gate.NOT_PLACED, gate)
         ahead = np.asarray(seen & (depth > 0))[..., None]
         return cls(
-            frame=frame,
-            person=person,
+            frame=observations.frame,
+            person=observations.track,
             joint_names=np.array(joint_names, dtype=str),
             view_names=np.array(rig.names, dtype=str),
             candidate=np.where(seen, place, -1),

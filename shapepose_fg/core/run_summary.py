@@ -14,12 +14,11 @@ _MOST_FRAMES = 10_000_000
 
 
 def merged_run(runs: Sequence[Run]) -> Run:
-    """One run of several: what they agree on, frames and counts together, and the rest listed part by part.
+    """One run of several: what they agree on, the frames of all together, and the rest listed under `parts`.
 
     `frames` becomes [start, stop], or a list of those where there are gaps, and is left out where a part does
-    not say; `seconds`, `people` are summed; `inputs` are put together. Everything else is kept where all parts
-    agree and listed under `parts` where they do not. ValueError where configurations or an input's checksum
-    differ, or two parts cover the same frame. Parts of one run, with one and the same `run`, leave it as it is.
+    not say. ValueError where configurations or an input's checksum differ, or two parts cover the same frame.
+    Parts of one run, with one and the same `run`, leave it as it is.
     """
     distinct: list[Run] = []
     for run in runs:
@@ -36,61 +35,34 @@ def merged_run(runs: Sequence[Run]) -> Run:
                 f"parts must have the same configuration, {found[0]} differs; reconstruct them with one and the"
                 " same"
             )
-    together: Run = {}
-    own: list[Run] = [{} for _ in runs]
+    inputs: Run = {}
+    for file, digest in (pair for run in runs for pair in run.get("inputs", {}).items()):
+        if inputs.setdefault(file, digest) != digest:
+            raise ValueError(f"parts must be made from the same inputs, {file} changed between two of them")
+    together: Run = {"inputs": inputs} if inputs else {}
+    if settings:
+        together["configuration"] = settings[0]
+    spans = [covered_frames(run) for run in runs]
+    if all(each is not None for each in spans):
+        together["frames"] = _joined([span for each in spans for span in each or []])
     for key in dict.fromkeys(key for run in runs for key in run):
-        values = [run.get(key) for run in runs]
-        if key == "frames":
-            together |= _frames(values)
-        elif key in ("seconds", "people"):
-            together[key] = _sum(values)
-        elif key == "inputs":
-            together[key] = _inputs(values)
-        elif all(_same(value, values[0]) for value in values):
-            together[key] = values[0]
-        else:
-            for part, run in zip(own, runs, strict=True):
-                part |= {name: run[name] for name in (key,) if name in run}
-    if any(own):
-        spans = [{"frames": run["frames"]} if "frames" in run else {} for run in runs]
-        together["parts"] = [span | part for span, part in zip(spans, own, strict=True)]
-    return together
+        if key not in (*together, "frames") and all(_same(run.get(key), runs[0].get(key)) for run in runs):
+            together[key] = runs[0][key]
+    own = [{key: value for key, value in run.items() if key not in together or key == "frames"} for run in runs]
+    return together | ({"parts": own} if any(each.keys() - {"frames"} for each in own) else {})
 
 
-def _frames(values: Sequence[Any]) -> Run:
-    """All parts' frames together; ValueError where two parts cover the same frame."""
-    if any(value is None for value in values):
-        return {}
-    ranges = [span for value in values for span in covered_frames({"frames": value}) or []]
-    spans: list[list[int]] = []
-    for span in sorted((span for span in ranges if len(span) > 0), key=lambda span: span.start):
-        if spans and span.start < spans[-1][1]:
+def _joined(spans: Sequence[range]) -> list[Any]:
+    """Frames together, as [start, stop] or a list of those; ValueError where two parts cover the same one."""
+    found: list[list[int]] = []
+    for span in sorted((span for span in spans if len(span) > 0), key=lambda span: span.start):
+        if found and span.start < found[-1][1]:
             raise ValueError(f"parts must not cover the same frame, two of them cover frame {span.start}")
-        if spans and span.start == spans[-1][1]:
-            spans[-1][1] = span.stop
+        if found and span.start == found[-1][1]:
+            found[-1][1] = span.stop
         else:
-            spans.append([span.start, span.stop])
-    return {"frames": values[0] if len(spans) == 0 else spans[0] if len(spans) == 1 else spans}
-
-
-def _sum(values: Sequence[Any]) -> Any:
-    """Numbers added up, lists put together, objects key by key; what one part lacks counts nothing."""
-    values = [value for value in values if value is not None]
-    if all(isinstance(value, dict) for value in values):
-        keys = dict.fromkeys(key for value in values for key in value)
-        return {key: _sum([value.get(key) for value in values]) for key in keys}
-    if all(isinstance(value, list) for value in values):
-        return [each for value in values for each in value]
-    return sum(values)
-
-
-def _inputs(values: Sequence[Any]) -> Run:
-    """Checksums of all inputs; ValueError where a file changed between two parts."""
-    together: Run = {}
-    for path, digest in (pair for value in values for pair in (value or {}).items()):
-        if together.setdefault(path, digest) != digest:
-            raise ValueError(f"parts must be made from the same inputs, {path} changed between two of them")
-    return together
+            found.append([span.start, span.stop])
+    return [spans[0].start, spans[0].stop] if len(found) == 0 else found[0] if len(found) == 1 else found
 
 
 def difference(one: Any, other: Any, name: str = "") -> tuple[str, Any, Any] | None:

@@ -5,30 +5,22 @@ All joints, and all pairs of candidates of all limbs, are decoded at once.
 """
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import cv2
 import numpy as np
-from annotated_types import Interval
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from shapepose_fg.core.bounds import Settings, Share
 from shapepose_fg.detection2d.networks import NetworkLayout
 
-
-@dataclass(frozen=True)
-class DecodingConfig(Settings):
-    """How candidates are read from a network's output."""
-
-    min_score: Share = 0.1
-    """Heights of peaks below this are noise."""
-    line_samples: Annotated[int, Interval(ge=2, le=1000)] = 10
-    """Places along a limb at which the affinity field is read, as in OpenPose."""
-    min_along: Share = 0.05
-    """A place supports a limb where the field has at least this component along it, as in OpenPose."""
-    min_supported: Share = 0.7
-    """The share of places that must support a limb for it to have an affinity."""
+_MIN_SCORE = 0.1
+"""Heights of peaks below this are noise."""
+_LINE_SAMPLES = 10
+"""Places along a limb at which the affinity field is read, as in OpenPose."""
+_MIN_ALONG = 0.05
+"""A place supports a limb where the field has at least this component along it, as in OpenPose."""
+_MIN_SUPPORTED = 0.7
+"""The share of places that must support a limb for it to have an affinity."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +43,12 @@ class Candidates:
     def __len__(self) -> int:
         return len(self.joint)
 
+    @classmethod
+    def none(cls) -> "Candidates":
+        """Those of a picture in which nothing is."""
+        index, number = np.zeros(0, dtype=np.intp), np.zeros(0)
+        return cls(index, number.reshape(0, 2), number, index.reshape(0, 2), index, number)
+
     def only(self, keep: NDArray[np.bool_]) -> "Candidates":
         """The candidates of the mask `keep` (D,), and the affinities between them."""
         place = np.cumsum(keep) - 1
@@ -65,9 +63,7 @@ class Candidates:
         )
 
 
-def decode(
-    output: NDArray[np.float32], layout: NetworkLayout, config: DecodingConfig = DecodingConfig()
-) -> Candidates:
+def decode(output: NDArray[np.float32], layout: NetworkLayout) -> Candidates:
     """Candidates of one picture from the network's `output` (C, H, W).
 
     Positions are in cells of the output; (0, 0) is the centre of the first. What is not finite in
@@ -75,17 +71,17 @@ def decode(
     """
     output = np.nan_to_num(output, nan=0.0, posinf=0.0, neginf=0.0)
     heat = output[layout.first_heat_map : layout.first_heat_map + len(layout.joints)]
-    joint, xy, score = peaks(heat, config.min_score)
+    joint, xy, score = peaks(heat)
     first, second, limb = _all_pairs(joint, layout)
     fields = output[layout.first_affinity : layout.first_affinity + 2 * len(layout.limbs)]
-    affinity = line_integrals(fields, xy[first], xy[second], limb, config)
+    affinity = line_integrals(fields, xy[first], xy[second], limb)
     there = affinity > 0
     pairs = np.column_stack([first, second])[there]
     return Candidates(joint, xy, score, pairs, limb[there], affinity[there])
 
 
 def peaks(
-    heat: NDArray[np.float32], min_score: float
+    heat: NDArray[np.float32], min_score: float = _MIN_SCORE
 ) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
     """Joint (D,), position (D, 2) in cells, and height (D,) of the local maxima of heat maps (J, H, W).
 
@@ -132,7 +128,6 @@ def line_integrals(
     start: NDArray[np.float64],
     end: NDArray[np.float64],
     limb: NDArray[np.intp],
-    config: DecodingConfig,
 ) -> NDArray[np.float64]:
     """(E,) the mean component of the affinity `fields` (2 L, H, W) along the lines from `start` to `end` (E, 2).
 
@@ -142,14 +137,14 @@ def line_integrals(
     along = end - start
     length = np.linalg.norm(along, axis=1)
     direction = along / np.maximum(length, 1e-9)[:, None]
-    part = np.linspace(0.0, 1.0, config.line_samples)
+    part = np.linspace(0.0, 1.0, _LINE_SAMPLES)
     x = np.clip(start[:, :1] + along[:, :1] * part, 0, width - 1)
     y = np.clip(start[:, 1:] + along[:, 1:] * part, 0, height - 1)
     component = np.zeros(x.shape)
     for axis in range(2):
         places = np.stack([np.broadcast_to(2.0 * limb[:, None] + axis, x.shape), y, x])
         component += map_coordinates(fields, places, np.float64, order=1) * direction[:, axis, None]
-    supported = (component >= config.min_along).mean(axis=1) >= config.min_supported
+    supported = (component >= _MIN_ALONG).mean(axis=1) >= _MIN_SUPPORTED
     return np.where(supported & (length > 0), np.clip(component.mean(axis=1), 0.0, 1.0), 0.0)
 
 

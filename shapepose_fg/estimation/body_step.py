@@ -7,16 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
-from shapepose_fg.estimation.draft import MODEL_SIGMA_M
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
-from shapepose_fg.estimation.linearisation import ViewEvidence
-from shapepose_fg.estimation.message import Message
+from shapepose_fg.estimation.linearisation import Message, ViewEvidence
+from shapepose_fg.estimation.window_graph import WindowGraph
 
+MODEL_SIGMA_M = 0.02
+"""How far a detector's joints lie from the body's, metres."""
 JOINT_SIGMA_M = 0.03
 """Sigma of every joint where the body is fitted to X, all joints alike, metres."""
-
-Tie = tuple[frozenset[int], NDArray[np.intp]]
-"""Joints that factors of the user's own tie to each other, and in which rows (K,)."""
 
 
 @dataclass(frozen=True)
@@ -25,8 +23,8 @@ class BodyStep:
 
     fitter: BodyFitter
     """Fits bodies."""
-    groups: NDArray[np.intp] | None
-    """(R,) a number for each row that says whose shape it has; None where every row is alone."""
+    people: Sequence[WindowGraph]
+    """Whose the rows are, one person's after the other's."""
     config: EstimatorConfig
     """How."""
 
@@ -44,7 +42,8 @@ class BodyStep:
         A group's shape is then that of those of its rows that are in `rows`: a row fitted again has another shape
         than the rest of its group. Over time results are measured so; a frame alone is a group of its own.
         """
-        groups = self.groups
+        lengths = [len(person) for person in self.people]
+        groups = np.repeat(np.arange(len(lengths)), lengths) if max(lengths, default=1) > 1 else None
         if rows is not None:
             targets = targets.rows(rows)
             last, groups = last.rows(rows), None if groups is None else groups[rows]
@@ -53,14 +52,15 @@ class BodyStep:
         fit = self.fitter.fit_whole(targets, last) if groups is None else self.fitter.fit(targets, last, groups)
         return replace(fit, prior_xyz=fit.joints, prior_covariance=fit.covariance + MODEL_SIGMA_M**2 * np.eye(3))
 
-    def message(
-        self, body: BodyFit, targets: JointTargets, pulled: NDArray[np.bool_], ties: Sequence[Tie]
-    ) -> Message:
+    def message(self, body: BodyFit, targets: JointTargets, pulled: NDArray[np.bool_]) -> Message:
         """What the bodies say of the joints `pulled` (R, J): E_shape of Eq. 3."""
         xyz, covariance = body.prior_xyz.copy(), body.prior_covariance.copy()
         ok = np.repeat(body.ok[:, None], xyz.shape[1], axis=1)
-        for joints, rows in ties if self.config.refine.leave_one_out else ():
+        tied = {each for person in self.people for each in person.coupled}
+        for joints in sorted(tied, key=sorted) if self.config.refine.leave_one_out else ():
             # Tied to each other, each would get the others' views twice: through the tie, and through the body.
+            ties = [np.full(len(person), joints in person.coupled) for person in self.people]
+            rows = np.flatnonzero(np.concatenate(ties))
             columns = np.array(sorted(joints))
             information = targets.information.copy()
             information[:, columns] = 0.0

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.estimation.in_time import near_in_time
-from shapepose_fg.estimation.message import Message
+from shapepose_fg.estimation.linearisation import Message
 from shapepose_fg.estimation.state_covariances import state_covariances
 from shapepose_fg.estimation.window_graph import WindowGraph
 
@@ -45,12 +45,12 @@ def walking(
     problem: tuple[NDArray[np.bool_], Message, Message],
     initial: NDArray[np.float64],
     lost: NDArray[np.bool_] | None,
+    feet: NDArray[np.intp],
 ) -> NDArray[np.float64] | None:
-    """(T - 1, J) `standing` of `WindowGraph.solve`, whose first arguments these are; None where there are no feet.
+    """(T - 1, J) `standing` of `WindowGraph.solve`, whose first arguments these are; None without `feet` (F,).
 
     The feet are solved by themselves, without knowing of any standing: their joints are chains of their own.
     """
-    feet = graph.feet
     if not graph.temporal or len(feet) == 0:
         return None
     alone = np.full(initial.shape, np.nan)

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from factors import kernel_weight
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.estimation.linearisation import LEAST_PROBABILITY, ObservationConfig, ViewEvidence
-from shapepose_fg.estimation.message import Message
+from shapepose_fg.estimation.linearisation import LEAST_PROBABILITY, Message, ObservationConfig, ViewEvidence
 
 Array = NDArray[np.float64]
 

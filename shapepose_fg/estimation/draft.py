@@ -1,13 +1,15 @@
-"""Roughly where joints are, without a graph: enough to give the detections out again."""
+"""Roughly where joints are, without a graph: enough to assign the detections again."""
 
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
-from shapepose_fg.estimation.linearisation import ViewEvidence
-
-MODEL_SIGMA_M = 0.02
-"""How far a detector's joints lie from the body's, metres."""
+from shapepose_fg.core.camera import Views
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.estimation.body_step import MODEL_SIGMA_M, joint_targets
+from shapepose_fg.estimation.estimator_config import EstimatorConfig
+from shapepose_fg.estimation.linearisation import ViewEvidence, linearise, observation_sigmas, triangulate
 
 NARROWING = (4.0, 2.0, 1.0, 1.0)
 """How many times as wide as in the end the kernel of a draft's body is, fit by fit. With priors that are stiff as
@@ -17,8 +19,55 @@ MOVED_M = 0.02
 """A draft's body is fitted again only where a joint's target moved by this since its last fit, as much as a
 detector's joints lie from the body's, or weighs another share: on Shelf a quarter of all fits are left."""
 
-LIMB_SIGMA_M = 0.03
-"""Sigma of an unseen joint from which on it is more the body's than its own."""
+
+def draft(
+    observations: Observations, views: Views, fitter: BodyFitter, config: EstimatorConfig
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """About where the joints of N rows are (N, J, 3), metres, and how surely (N, J, 3, 3).
+
+    What the views say, and where that is little, or contradicts the body, what the body says. Views are asked
+    around where they put the joints, and then around the body, ever nearer to it (`refine.draft_reach_m`). A
+    joint's views are in the body, too, so that these covariances are too small.
+    """
+    X = triangulate(observations, views, config.observations)
+    sigmas = observation_sigmas(observations, X, views, config.observations, config.joints)
+    evidence = linearise(observations, sigmas, X, views, config.observations)
+    enough = (evidence.sigma_m <= config.refine.max_sigma_m).sum(axis=1) >= LEAST_JOINTS
+    fitted = joint_targets(evidence, enough)
+    body = fitter.fit_whole(fitted)
+    for wider in NARROWING if config.refine.draft_reach_m > 0 else ():
+        around = np.where(body.ok[:, None, None], body.joints, X)
+        reach_m = wider * config.refine.draft_reach_m
+        evidence = linearise(observations, sigmas, around, views, config.observations, reach_m)
+        targets = joint_targets(evidence, enough)
+        rows = changed_targets(fitted, targets)
+        if len(rows) == 0:
+            continue
+        again = fitter.fit_whole(targets.rows(rows))
+        fitted = fitted.with_rows(rows, targets.rows(rows))
+        placed = np.flatnonzero(again.ok)
+        body = body.with_rows(rows[placed], again.rows(placed))
+    return drafted(evidence, body, config.refine.contradiction)
+
+
+def first_places(
+    observations: Observations, views: Views, fitter: BodyFitter, config: EstimatorConfig
+) -> NDArray[np.float64]:
+    """X_0 (N, J, 3), metres: where stage I has the joints, else where views do, and in windows of several frames
+    where a draft has them: a view that sees a joint counts from the first round on, then.
+    """
+    X = observations.initial
+    if config.refine.complete_start:
+        X = triangulate(observations, views, config.observations)
+    _, whose, rows_of = np.unique(observations.track, return_inverse=True, return_counts=True)
+    unknown = np.asarray(np.isnan(X).any(axis=2))
+    rows = np.flatnonzero(unknown.any(axis=1) & (rows_of[whose] > 1))
+    if len(rows) == 0:
+        return X
+    places, _ = draft(observations.rows(rows), views.rows(rows), fitter, config)
+    complete = X.copy()
+    complete[rows] = np.where(unknown[rows][..., None], places, X[rows])
+    return complete
 
 
 def changed_targets(before: JointTargets, now: JointTargets) -> NDArray[np.intp]:
@@ -51,32 +100,3 @@ def drafted(
     place = at + np.einsum("...ij,...j->...i", joint_covariance @ views, apart)
     place = np.where(determined[..., None], place, np.nan)
     return place, np.where(determined[..., None, None], joint_covariance, np.nan)
-
-
-def limb_steps(
-    joints: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-    unseen: NDArray[np.bool_],
-    fitter: BodyFitter,
-) -> NDArray[np.float64]:
-    """Steps (N, J, 3), metres, that take joints that no view saw, `unseen` (N, J), to where a body can have them.
-
-    Motion carries each joint by itself: elbow and wrist, both hidden, drift apart. A body is fitted to all joints
-    as they are known, and an unseen one goes towards the body's, C (C + s² I)^-1 of the way: hardly where it was
-    seen a moment ago, and wholly where its covariance C is large. s is `LIMB_SIGMA_M`. Covariances stay: what the
-    body says of the joint without its views is in them already.
-    """
-    known = np.asarray(np.isfinite(joints).all(axis=-1) & np.isfinite(covariance).all(axis=(-2, -1)))
-    moved = unseen & known
-    rows = np.flatnonzero(moved.any(axis=-1))
-    steps = np.zeros(joints.shape)
-    if len(rows) == 0:
-        return steps
-    C = np.where(known[rows][..., None, None], covariance[rows], np.eye(3))
-    information = np.where(known[rows][..., None, None], np.linalg.inv(C), 0.0)
-    targets = JointTargets(np.nan_to_num(joints[rows]), (information + information.swapaxes(2, 3)) / 2)
-    body = fitter.fit_whole(targets)
-    share = C @ np.linalg.inv(C + LIMB_SIGMA_M**2 * np.eye(3))
-    step = np.einsum("...ij,...j->...i", share, body.joints - joints[rows])
-    steps[rows] = np.where((moved[rows] & np.isfinite(step).all(axis=-1))[..., None], step, 0.0)
-    return steps

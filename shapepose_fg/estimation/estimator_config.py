@@ -6,10 +6,37 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Interval
 
-from shapepose_fg.core.bounds import Metres, MetresOrNone, Repeats, Settings
+from shapepose_fg.core.bounds import Factor, Metres, MetresOrNone, Repeats, Settings, Share
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.estimation.motion_model import MotionConfig
-from shapepose_fg.estimation.window_graph import WindowGraphConfig
+
+
+@dataclass(frozen=True)
+class WindowGraphConfig(Settings):
+    """What goes into a person's graph."""
+
+    rho_3d: Share = 1.0
+    """rho_3D of Eq. 4: joints whose mean confidence over all views is at most this are pulled by the body model.
+    The covariances are meant, so the body is evidence on every joint; the paper's 0.25 is for comparisons."""
+    weight_2d: Factor = 1.0
+    """w_2D of Eq. 5, multiplies the squared reprojection errors. With sigmas that are true, both weights are 1."""
+    weight_shape: Factor = 1.0
+    """w_shape of Eq. 5, multiplies the squared distances to the body model."""
+    shape_sigma_m: MetresOrNone = 0.0
+    """Positive: the body pulls all joints alike, with this sigma, as in Eq. 3, which has one weight for all. 0:
+    with its own covariance, which differs from joint to joint and with direction."""
+    max_iterations: Annotated[int, Interval(ge=1, le=1000)] = 20
+    """Levenberg-Marquardt steps at the most."""
+    tolerance: Factor = 1e-4
+    """Relative change of the error at which Levenberg-Marquardt stops."""
+
+    @classmethod
+    def paper(cls) -> "WindowGraphConfig":
+        """As written in Eqs. 3 to 5. The paper does not say its weights; this one is the best of 1, 3 and 10 cm on
+        `tune`.
+        """
+        return cls(rho_3d=0.25, shape_sigma_m=0.03)
 
 
 @dataclass(frozen=True)
@@ -19,7 +46,7 @@ class RefineConfig(Settings):
     alternations: Repeats = 3
     """N of Algorithm 1: how often the body is fitted and the joints are solved, at the most."""
     window_alternations: Repeats = 1
-    """The same for windows of several frames, which start from a draft of all joints (`Estimator.draft`): a second
+    """The same for windows of several frames, which start from a draft of all joints (`draft`): a second
     round, at twice the time, changed the mean error by 0.1 to 0.2 mm. Windows with factors of the user's own take
     as many as frames alone: what such a factor says may be far from what the views said."""
     settled_m: MetresOrNone = 0.002
@@ -79,3 +106,5 @@ class EstimatorConfig:
     """How joints and bodies alternate."""
     motion: MotionConfig = field(default_factory=MotionConfig)
     """How frames hang together."""
+    joints: tuple[str, ...] = BODY_25.joints
+    """What the detector calls its joints: motion, sigmas and limbs go by them."""

@@ -99,6 +99,31 @@ statistics of real ones, and these, each view of Shelf against the others, give 
 
 
 @dataclass(frozen=True)
+class Message:
+    """What is said of the joints of T frames (or of N rows), by the views or by the body, as Gaussians."""
+
+    xyz: NDArray[np.float64]
+    """(T, J, 3) where they are, metres; anything where the information is zero."""
+    information: NDArray[np.float64]
+    """(T, J, 3, 3) 1/m², positive semi-definite; zero where nothing is said."""
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """(T, J) of which joints anything is said."""
+        return np.asarray(self.information.any(axis=(2, 3)))
+
+    def rows(self, index: NDArray[np.intp] | slice) -> "Message":
+        """Some of the rows."""
+        return Message(self.xyz[index], self.information[index])
+
+
+def symmetric_roots(information: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Symmetric square roots (D, 3, 3) of positive semi-definite matrices."""
+    values, vectors = np.linalg.eigh(information)
+    return np.einsum("dik,dk,djk->dij", vectors, np.sqrt(np.maximum(values, 0.0)), vectors)
+
+
+@dataclass(frozen=True)
 class ViewEvidence:
     """What the observations say of the joints when these are at `points`."""
 
@@ -130,6 +155,11 @@ class ViewEvidence:
         inverse = np.where(certain, 1.0 / np.where(certain, values, 1.0), 0.0)
         along = np.einsum("...jk,...j->...k", vectors, self.gradient)
         return self.points - np.einsum("...ik,...k->...i", vectors, inverse * along)
+
+    @property
+    def message(self) -> Message:
+        """The same as Gaussians."""
+        return Message(self.target, self.information)
 
     @cached_property
     def sigma_m(self) -> NDArray[np.float64]:

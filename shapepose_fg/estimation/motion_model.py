@@ -21,7 +21,7 @@ class MotionConfig(Settings):
     """How the frames of a person are solved together."""
 
     model: str = ""
-    """File of the motion model, as `scripts/measure_motion.py` writes it; empty: the one that ships."""
+    """File of the motion model, with the entries of `estimation/data/motion.json`; empty: that one."""
     psd_scale: Factor = 1.0
     """Multiplies the power spectral densities of the joints' accelerations: more follows faster and smooths
     less."""
@@ -106,15 +106,17 @@ class MotionModel:
             )
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise InputError(
-                f"{path}: is not a motion model ({error}); give what scripts/measure_motion.py writes"
+                f"{path}: is not a motion model ({error}); give the entries of estimation/data/motion.json"
             ) from None
         table = np.array(list(known.values())).reshape(-1, 3)
         if len(table) == 0 or not (np.isfinite(table).all() and (table[:, 0] > 0).all() and (table >= 0).all()):
-            raise InputError(f"{path}: densities must be positive; give what scripts/measure_motion.py writes")
+            raise InputError(
+                f"{path}: densities must be positive; give the entries of estimation/data/motion.json"
+            )
         if not (views.possible and body.possible):
             raise InputError(
                 f"{path}: of views and body, white_share must be between 0 and 1, correlation_s positive and kept"
-                " 0 to 1; give what scripts/measure_motion.py writes"
+                " 0 to 1; give the entries of estimation/data/motion.json"
             )
         chosen = config.psd_scale * np.array([known.get(name, tuple(table.mean(axis=0))) for name in joints])
         still, speed, lost = np.ascontiguousarray(chosen.T)

@@ -1,17 +1,20 @@
-"""What came of a solved window: errors that last, how each joint is known, and what went wrong."""
-
-from collections.abc import Sequence
-from dataclasses import dataclass
+"""What comes of a solved window: errors that last, doubts, how each joint is known, and what went wrong."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.core.observations import Observations
-from shapepose_fg.core.reconstruction import Known
-from shapepose_fg.estimation.alternation import Solution, Window
-from shapepose_fg.estimation.in_time import carried
-from shapepose_fg.estimation.linearisation import weakest_sigma
-from shapepose_fg.estimation.motion_model import Lasting
+from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
+from shapepose_fg.core.reconstruction import Known, Status
+from shapepose_fg.estimation.calibration import Calibration, Clues, from_body, lasting_mean
+from shapepose_fg.estimation.doubt import association_spread, exchange_spread, limbs_to_exchange
+from shapepose_fg.estimation.in_time import carried, waited_s
+from shapepose_fg.estimation.limbs import limbs_kept
+from shapepose_fg.estimation.linearisation import Message, ViewEvidence, linearise, mean_confidence, weakest_sigma
+from shapepose_fg.estimation.plain_view import SPEED_M_S, elsewhere_variance, limbs_that_hide
+from shapepose_fg.estimation.state import SEEN_M, State
+from shapepose_fg.estimation.state_covariances import state_covariances
+from shapepose_fg.estimation.window_graph import WindowGraph
+from shapepose_fg.estimation.window_solution import PersonGraph, Problem, WindowSolution
 
 RUNAWAY_M = 1.0
 """A joint with a factor of the user's own that ends this far from where its views first put it has run away."""
@@ -22,30 +25,110 @@ WEAK_SCORE = 0.3
 """Detections of a lower score are weak: in simulated crowds one in 18 is not the person's, of others one in 60."""
 WEAK_PROBABILITY = 0.5
 """So are those that are as probably somebody else's."""
-SEEN_M = 0.1
-"""A joint is seen in a frame whose views leave it no less certain than this in any direction, metres."""
 
 
-@dataclass(frozen=True)
-class Problem:
-    """What went wrong with one joint of one person in one frame."""
+def outcome(state: State, fitter: BodyFitter) -> WindowSolution:
+    """What is reported of a window whose joints are solved: covariances with all doubts, codes, statuses."""
+    rows, people, shape = state.observations, state.people, state.joints.shape
+    solved, covariance, velocity_covariance = (np.full((*shape, 3), np.nan) for _ in range(3))
+    velocity = np.full(shape, np.nan)
+    for person, (of_positions, of_velocities) in zip(people, state_covariances(people), strict=True):
+        solved[person.rows] = covariance[person.rows] = of_positions
+        if person.temporal:
+            velocity[person.rows] = person.velocity()
+            velocity_covariance[person.rows] = of_velocities
+            covariance[person.rows] = with_lasting(state, person, of_positions)
+    X = limbs_kept(state, covariance, fitter) if state.config.motion.keep_limbs else state.joints
+    fit = final_bodies(state, covariance, fitter)
+    final = linearise(rows, state.sigmas, X, state.views, state.config.observations)
+    covariance = _calibrated(state, X, covariance, final)
+    reported = strong(state)
+    hiding = limbs_that_hide(state.config.joints)
+    elsewhere = elsewhere_variance(X, rows.frame, reported, state.views, hiding)
+    for person in people:
+        waited = waited_s(np.asarray(reported[person.rows].any(axis=-1)), person.times_s)
+        moved = np.minimum(elsewhere[person.rows], (SPEED_M_S * waited) ** 2)
+        covariance[person.rows] += moved[..., None, None] * np.eye(3)
+    wrong = problems(state, covariance)
+    status = np.where(fit.ok, Status.OK, np.where(state.enough, Status.BODY_UNDETERMINED, Status.TOO_FEW_VIEWS))
+    status[[problem.row for problem in wrong]] = Status.NOT_SOLVED
+    return WindowSolution(
+        observations=rows,
+        joints=X,
+        covariance=covariance,
+        velocity=velocity,
+        velocity_covariance=velocity_covariance,
+        confidence=mean_confidence(rows, state.inlier),
+        inlier=state.inlier,
+        contradicts=state.contradicts,
+        residual_px=final.residual_px,
+        known=how_known(state, covariance),
+        fit=fit,
+        status=status,
+        problems=wrong,
+        people=tuple(
+            PersonGraph(
+                person, X[person.rows], covariance[person.rows], fit.rows(person.rows), state.joints[person.rows],
+                solved[person.rows], state.motion.views,
+            )
+            for person in people
+        ),
+    )  # fmt: skip
 
-    row: int
-    """Row of the estimates."""
-    track: int
-    """Who."""
-    frame: int
-    """When."""
-    joint: int
-    """Which joint, an index into the skeleton."""
-    reason: str
-    """What happened, in words."""
+
+def final_bodies(state: State, covariance: NDArray[np.float64], fitter: BodyFitter) -> BodyFit:
+    """The bodies that are returned: where there are factors of the user's own, fitted to the joints as solved.
+
+    The bodies follow these factors so. What they say goes nowhere else: joints and covariances are done.
+    """
+    fit = state.fit
+    chosen = [
+        person.rows for person in state.people
+        if person.touched.any() and (person.temporal or fit.ok[person.rows].all())
+    ]  # fmt: skip
+    if len(chosen) == 0:
+        return fit
+    rows = np.concatenate(chosen)
+    rows = rows[fit.ok[rows]]
+    xyz, information = state.joints[rows], np.zeros((len(rows), *covariance.shape[1:]))
+    known = np.isfinite(xyz).all(axis=-1) & np.isfinite(covariance[rows]).all(axis=(2, 3))
+    information[known] = np.linalg.inv(covariance[rows][known])
+    information = (information + information.swapaxes(2, 3)) / 2
+    again = fitter.fit_whole(JointTargets(np.nan_to_num(xyz), information), fit.rows(rows))
+    return fit.with_rows(rows[again.ok], again.rows(np.flatnonzero(again.ok)))
 
 
-def reported_covariance(
-    solution: Solution, window: Window, marginal: NDArray[np.float64], views: Lasting
+def _calibrated(
+    state: State, X: NDArray[np.float64], covariance: NDArray[np.float64], final: ViewEvidence
 ) -> NDArray[np.float64]:
-    """(T, J, 3, 3) covariance of the joints, m²: `marginal` of the graph, and the errors that the graph left out.
+    """Covariances (N, J, 3, 3) with all doubts: over time as calibrated, frame by frame of the detections.
+
+    `covariance` is that of the graph, errors that last in it; `final` what the views say around the joints `X`.
+    """
+    rows, body, count, joints = state.observations, state.of_body, state.inlier.sum(axis=-1), state.config.joints
+    calibration = Calibration.load(joints)
+    of_body = from_body(state.joints, covariance, body.xyz, body.information)
+    association = association_spread(rows, state.sigmas, final, body, state.views, state.config.observations)
+    moved = np.nan_to_num(state.joints - rows.initial)
+    draft = moved[..., None] * moved[..., None, :]
+    exchange = exchange_spread(state.joints, state.fit.joints, rows.frame, limbs_to_exchange(joints))
+    alone = np.ones(len(X), dtype=bool)
+    for person in state.people:
+        mine, times_s = person.rows, person.times_s
+        alone[mine] = not person.temporal
+        association[mine] = lasting_mean(association[mine], times_s, count[mine] > 0)
+        for clue in (of_body, draft, exchange):
+            clue[mine] = lasting_mean(clue[mine], times_s)
+    clues = Clues(rows.frame, X, count, covariance, of_body, association, draft, exchange)
+    return np.where(
+        alone[:, None, None, None],
+        covariance + calibration.association * association,
+        calibration.covariance(clues),
+    )
+
+
+def with_lasting(state: State, person: WindowGraph, marginal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(T, J, 3, 3) covariance of joints, m²: `marginal` of the person's graph, and the errors that it left out.
 
     The graph of several frames holds only the share of the errors that is new in every frame. Added is the share
     that lasts, of what views and body leave in one frame, C_t; and of the share that motion smooths, that part
@@ -54,72 +137,63 @@ def reported_covariance(
     along; a view that still sees it brings its own lasting error in, through the gain that it has. Joints solved
     with offsets have it all in `marginal`.
     """
-    said = solution.views.information[window.rows]
-    information = said + solution.body.information[window.rows]
-    simple = np.broadcast_to(~window.graph.with_offsets, said.shape[:2])
+    said = state.of_views.information[person.rows]
+    information = said + state.of_body.information[person.rows]
+    simple = np.broadcast_to(~person.with_offsets, said.shape[:2])
     seen = (weakest_sigma(said) <= SEEN_M) & simple
-    f, kept = views.white_share, views.kept
+    f, kept = state.motion.views.white_share, state.motion.views.kept
     left = np.zeros(information.shape)
     left[seen] = np.linalg.inv(information[seen])
-    left = carried(left, seen, window.graph.times_s)
+    left = carried(left, seen, person.times_s)
     own = (1 - f) / f**2 * marginal @ said @ marginal
     total = np.where(seen[..., None, None], (1 - kept) * marginal, marginal + own) + (1 - f + kept * f) * left
     return np.where(simple[..., None, None], total, marginal)
 
 
-def strong(solution: Solution, observations: Observations) -> NDArray[np.bool_]:
+def strong(state: State) -> NDArray[np.bool_]:
     """(N, J, V) the observations that are used and not weak."""
+    observations = state.observations
     sure = (observations.confidence >= WEAK_SCORE) & (observations.probability > WEAK_PROBABILITY)
-    return solution.inlier & sure
+    return state.inlier & sure
 
 
-def how_known(
-    solution: Solution, observations: Observations, covariance: NDArray[np.float64]
-) -> NDArray[np.uint8]:
+def how_known(state: State, covariance: NDArray[np.float64]) -> NDArray[np.uint8]:
     """(N, J) a `Known` for each joint, `covariance` (N, J, 3, 3) being its own.
 
     It is seen where two views' detections are used that are not weak. A joint that no view saw is carried by
     motion where it is known much better (half the variance) than the body knows it.
     """
-    pulled = solution.body.known
-    information = np.where(pulled[..., None, None], solution.body.information, np.eye(3))
+    pulled = state.of_body.known
+    information = np.where(pulled[..., None, None], state.of_body.information, np.eye(3))
     said = np.trace(np.linalg.inv(information), axis1=2, axis2=3)
     moved = ~pulled | (np.trace(covariance, axis1=2, axis2=3) < 0.5 * said)
     code = np.where(moved, Known.MOTION, Known.BODY)
-    code = np.where(solution.inlier.any(axis=-1), Known.WEAK, code)
-    code = np.where(strong(solution, observations).sum(axis=-1) >= 2, Known.SEEN, code)
-    return np.where(np.isfinite(solution.joints).all(axis=-1), code, Known.UNKNOWN).astype(np.uint8)
+    code = np.where(state.inlier.any(axis=-1), Known.WEAK, code)
+    code = np.where(strong(state).sum(axis=-1) >= 2, Known.SEEN, code)
+    return np.where(np.isfinite(state.joints).all(axis=-1), code, Known.UNKNOWN).astype(np.uint8)
 
 
-def problems(
-    observations: Observations,
-    windows: Sequence[Window],
-    solution: Solution,
-    first: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-) -> tuple[Problem, ...]:
-    """Joints that could not be solved, by person, frame and joint; `first` (N, J, 3) is where views first put
-    them.
-    """
-    X = solution.joints
+def problems(state: State, covariance: NDArray[np.float64]) -> tuple[Problem, ...]:
+    """Joints that could not be solved, by person, frame and joint."""
+    X, first, observations = state.joints, state.first, state.observations
     finite = np.asarray(np.isfinite(X).all(axis=2))
     reasons = np.full(finite.shape, "", dtype=object)
-    information = solution.views.information + solution.body.information
-    pulls = _pull(solution.views, X) + _pull(solution.body, X)
+    information = state.of_views.information + state.of_body.information
+    pulls = _pull(state.of_views, X) + _pull(state.of_body, X)
     known = finite & (weakest_sigma(information) < np.inf)
     away = np.zeros(X.shape)
     away[known] = np.linalg.solve(information[known], pulls[known][..., None])[..., 0]
     sigmas = np.sqrt(np.maximum(np.einsum("...i,...i->...", away, pulls), 0.0))
     far = np.linalg.norm(away, axis=2)
     reasons[known & (far > _HALF_M) & (sigmas > RUNAWAY_SIGMA)] = "ran away from what views and body say of it"
-    for window in windows:
-        graph, rows = window.graph, window.rows
-        touched = np.ix_(rows, np.flatnonzero(graph.touched))
+    for person in state.people:
+        rows = person.rows
+        touched = np.ix_(rows, np.flatnonzero(person.touched))
         with np.errstate(invalid="ignore"):
             ran = np.linalg.norm(X[touched] - first[touched], axis=2) > RUNAWAY_M
         reasons[touched] = np.where(ran, "ran away from its views", reasons[touched])
-        if graph.failure:
-            reasons[rows] = np.where(finite[rows], graph.failure, reasons[rows])
+        if person.failure:
+            reasons[rows] = np.where(finite[rows], person.failure, reasons[rows])
     lost = finite & ~np.isfinite(covariance).all(axis=(2, 3)) & (reasons == "")
     reasons[lost] = "nothing determines it: its system is singular"
     return tuple(
@@ -128,6 +202,6 @@ def problems(
     )
 
 
-def _pull(message, X: NDArray[np.float64]) -> NDArray[np.float64]:
+def _pull(message: Message, X: NDArray[np.float64]) -> NDArray[np.float64]:
     """(N, J, 3) information times the way from `X` to where the message has the joint, 1/m."""
     return np.einsum("...ij,...j->...i", message.information, np.nan_to_num(message.xyz) - np.nan_to_num(X))

@@ -48,7 +48,6 @@ def elsewhere_variance(
     frame: NDArray[np.integer],
     strong: NDArray[np.bool_],
     views: Views,
-    image_sizes: Array,
     limbs: tuple[NDArray[np.intp], Array],
 ) -> Array:
     """(N, J) variance that is added on every axis to joints that views ought to see and do not, m².
@@ -58,7 +57,7 @@ def elsewhere_variance(
     of m, or it is elsewhere.
     """
     xy, depth, _ = views.project(joints)
-    inside = (depth > 0) & ((xy >= 0) & (xy < image_sizes)).all(axis=-1) & ~strong
+    inside = (depth > 0) & ((xy >= 0) & (xy < views.image_sizes)).all(axis=-1) & ~strong
     row, joint = np.nonzero(~strong.any(axis=-1) & (inside.sum(axis=-1) >= LEAST_VIEWS))
     missed = np.zeros(joints.shape[:2])
     for number in np.unique(frame[row]).tolist():

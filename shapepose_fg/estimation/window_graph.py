@@ -4,23 +4,20 @@ Stage II of the paper, the X step: E(X) = w_2D E_2D(X) + w_shape E_shape(X, Thet
 more than one frame, joints have velocities too, and motion factors between their states.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
-from typing import Annotated
 
 import gtsam
 import numpy as np
-from annotated_types import Interval
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from factors import (
     DEFAULT_WIDTH_SIGMA,
-    KernelName,
     body_prior_factors,
     diagonal,
     joint_keys,
     lasting_prior_factors,
+    make_camera,
     motion_factors,
     offset_factors,
     offset_keys,
@@ -30,9 +27,11 @@ from factors import (
     standing_factors,
     velocity_keys,
 )
-from shapepose_fg.core.bounds import Factor, MetresOrNone, Settings, Share
+from shapepose_fg.core.camera import Views
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.in_time import near_in_time, spanned, speeds
-from shapepose_fg.estimation.message import Message, symmetric_roots
+from shapepose_fg.estimation.linearisation import Message, symmetric_roots
 from shapepose_fg.estimation.motion_model import Lasting, MotionModel
 
 _OF_VIEWS, _OF_BODY = 0, 1
@@ -42,37 +41,9 @@ UNDETERMINED_M = 10.0
 determined."""
 
 
-@dataclass(frozen=True)
-class WindowGraphConfig(Settings):
-    """What goes into a person's graph."""
-
-    rho_3d: Share = 1.0
-    """rho_3D of Eq. 4: joints whose mean confidence over all views is at most this are pulled by the body model.
-    The covariances are meant, so the body is evidence on every joint; the paper's 0.25 is for comparisons."""
-    weight_2d: Factor = 1.0
-    """w_2D of Eq. 5, multiplies the squared reprojection errors. With sigmas that are true, both weights are 1."""
-    weight_shape: Factor = 1.0
-    """w_shape of Eq. 5, multiplies the squared distances to the body model."""
-    shape_sigma_m: MetresOrNone = 0.0
-    """Positive: the body pulls all joints alike, with this sigma, as in Eq. 3, which has one weight for all. 0:
-    with its own covariance, which differs from joint to joint and with direction."""
-    max_iterations: Annotated[int, Interval(ge=1, le=1000)] = 20
-    """Levenberg-Marquardt steps at the most."""
-    tolerance: Factor = 1e-4
-    """Relative change of the error at which Levenberg-Marquardt stops."""
-
-    @classmethod
-    def paper(cls) -> "WindowGraphConfig":
-        """As written in Eqs. 3 to 5. The paper does not say its weights; this one is the best of 1, 3 and 10 cm on
-        `tune`.
-        """
-        return cls(rho_3d=0.25, shape_sigma_m=0.03)
-
-
 class WindowGraph:
     """The graph of one person in T frames; T = 1 is a frame by itself, without velocities.
 
-    Windows compose: the keys carry person, joint and frame, so `graph` can be added to another graph as it is.
     Joints are not tied to each other but by factors of your own, which keeps marginal covariances cheap.
 
     **Errors that last.** A detector that is 2 cm off is so in the next frame too, and so is the body's guess: T
@@ -80,7 +51,7 @@ class WindowGraph:
 
     - projections and body priors count with the share of their variance that is new in every frame, so that motion
       smooths that only; `marginals` has nothing of the rest: what is reported in its place, with all of the error,
-      is `outcome.reported_covariance`;
+      is `outcome.with_lasting`;
     - where a joint is lost from sight (`lost` of `solve`) the body's prior gets an offset that decays slowly
       (`factors.motion`): the joint stays where the body puts it plus the difference that there was when it was
       seen;
@@ -90,40 +61,34 @@ class WindowGraph:
 
     def __init__(
         self,
-        cameras: Sequence[Sequence[gtsam.PinholeCameraCal3_S2]],
-        xy: NDArray[np.float64],
+        observations: Observations,
         sigmas_px: NDArray[np.float64],
-        config: WindowGraphConfig,
-        kernel: KernelName | None,
+        views: Views,
+        config: EstimatorConfig,
         motion: MotionModel,
-        *,
-        track: int,
-        frames: NDArray[np.intp],
-        times_s: NDArray[np.float64],
-        feet: ArrayLike = (),
+        rows: NDArray[np.intp] | None = None,
     ) -> None:
-        """Make the factors of all observations.
+        """Make the factors of all observations: T rows of one person, frames rising.
 
-        `cameras` are V of each of the T frames, `xy` (T, J, V, 2) undistorted pixels, `sigmas_px` (T, J, V), 0
-        where the view did not see the joint; `frames` (T,) and `times_s` (T,) seconds, both rising. `feet` are the
-        joints that may stand.
+        `sigmas_px` (T, J, V), 0 where the view did not see the joint; `views` are their cameras; `rows` (T,) says
+        which rows of a larger problem they are.
         """
-        T, J = sigmas_px.shape[:2]
-        if np.shape(frames) != (T,) or np.shape(times_s) != (T,) or np.any(np.diff(frames) <= 0):
-            raise ValueError(f"frames and times_s must be ({T},), frames rising, got {frames}")
-        self.config = config
-        self.track = track
+        T, J, V = sigmas_px.shape
+        if np.any(np.diff(observations.frame) <= 0):
+            raise ValueError(f"a person's frames must rise, got {observations.frame}")
+        self.config = config.graph
+        self.rows = np.arange(T) if rows is None else rows
+        """(T,) which rows of the whole problem these are."""
+        self.track = int(observations.track[0])
         """Who it is."""
-        self.frames = np.asarray(frames)
+        self.frames = observations.frame
         """(T,) frame of each row."""
-        self.times_s = np.asarray(times_s, dtype=np.float64)
+        self.times_s = observations.time_s.mean(axis=1)
         """(T,) time of each frame, seconds."""
-        self.feet = np.asarray(feet, dtype=np.intp)
-        """(F,) the joints that may stand."""
         joints = np.arange(J)
-        self.keys = joint_keys(track, joints, self.frames[:, None])
+        self.keys = joint_keys(self.track, joints, self.frames[:, None])
         """(T, J) key of each joint's position, `Point3`, metres."""
-        self.velocity_keys = velocity_keys(track, joints, self.frames[:, None])
+        self.velocity_keys = velocity_keys(self.track, joints, self.frames[:, None])
         """(T, J) key of each joint's velocity, `Point3`, m/s; not in the graph of a single frame."""
         self.graph = gtsam.NonlinearFactorGraph()
         """The factors of the last solution."""
@@ -132,23 +97,23 @@ class WindowGraph:
         self.failure = ""
         """Why the last solution is none; empty where it is one."""
         self._motion = motion
-        self._frame, self._joint, self._view = np.nonzero(sigmas_px > 0)
+        self._frame, self._joint, self._view = seen = np.nonzero(sigmas_px > 0)
         share = motion.views.white_share if T > 1 else 1.0
-        scale = np.sqrt(share / config.weight_2d)
+        scale = np.sqrt(share / self.config.weight_2d)
         # A lasting error is no outlier, and a weight multiplies the kernel's cost, too: in pixels the kernel is as
         # wide as before either changed the sigma.
+        kernel = config.observations.robust_kernel
         width = None if kernel is None else DEFAULT_WIDTH_SIGMA[kernel] / scale
-        V = sigmas_px.shape[2]
         self._projections = projection_factors(
-            [camera for row in cameras for camera in row],
-            self._frame * V + self._view,
+            _cameras(views),
+            self._frame * V + self._view if views.rows_known is not None else self._view,
             self.keys[self._frame, self._joint],
-            xy[self._frame, self._joint, self._view],
-            sigmas_px[self._frame, self._joint, self._view] * scale,
+            observations.xy[seen],
+            sigmas_px[seen] * scale,
             robust_kernel(kernel, width),
         )
         self._offset_keys = np.stack(
-            [offset_keys(track, joints, self.frames[:, None], source) for source in (_OF_VIEWS, _OF_BODY)]
+            [offset_keys(self.track, joints, self.frames[:, None], source) for source in (_OF_VIEWS, _OF_BODY)]
         )
         self._added: list[tuple[gtsam.NonlinearFactor, frozenset[int]]] = []
         self._touched = np.zeros(J, dtype=bool)
@@ -397,3 +362,16 @@ def is_determined(covariance: NDArray[np.float64]) -> NDArray[np.bool_]:
     known = np.asarray(np.isfinite(covariance).all(axis=(-2, -1)))
     largest = np.linalg.eigvalsh(np.where(known[..., None, None], covariance, 0.0))[..., -1]
     return np.asarray(known & (largest < UNDETERMINED_M**2))
+
+
+ExtraFactors = Callable[[WindowGraph, NDArray[np.int64]], Iterable[gtsam.NonlinearFactor]]
+"""Your own factors for a person's window, made from its keys (T, J)."""
+
+
+def _cameras(views: Views) -> list[gtsam.PinholeCameraCal3_S2]:
+    """GTSAM's cameras: V of them, or T V where they move, row by row."""
+    last = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (*views.cTw.shape[:-2], 1, 4))
+    wTc = np.linalg.inv(np.concatenate([views.cTw, last], axis=-2))
+    shape = np.broadcast_shapes(views.K.shape[:-2], wTc.shape[:-2])
+    K, wTc = np.broadcast_to(views.K, (*shape, 3, 3)), np.broadcast_to(wTc, (*shape, 4, 4))
+    return list(map(make_camera, K.reshape(-1, 3, 3), wTc.reshape(-1, 4, 4)))

@@ -1,6 +1,6 @@
-"""A person over a window of frames, solved: joints, covariances, and one graph that says all of it."""
+"""A solved window: everybody's joints, covariances and bodies, and one graph a person that says all of it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 
 import gtsam
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from factors import lasting_difference_factors, offset_factors, offset_keys, reported_keys
 from shapepose_fg.body.fitting.fitter import BodyFit
+from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.motion_model import Lasting
 from shapepose_fg.estimation.window_graph import WindowGraph
 
@@ -20,8 +21,74 @@ _OF_SOLUTION = 2
 
 
 @dataclass(frozen=True)
+class Problem:
+    """What went wrong with one joint of one person in one frame."""
+
+    row: int
+    """Row of the solution."""
+    track: int
+    """Who."""
+    frame: int
+    """When."""
+    joint: int
+    """Which joint, an index into the skeleton."""
+    reason: str
+    """What happened, in words."""
+
+
+@dataclass(frozen=True)
 class WindowSolution:
-    """One person in T frames.
+    """N rows of a window after stage II, in the order of the observations."""
+
+    observations: Observations
+    """Who, when, and from which detections, as they were assigned last."""
+    joints: NDArray[np.float64]
+    """(N, J, 3) X, metres in the world; NaN where unknown."""
+    covariance: NDArray[np.float64]
+    """(N, J, 3, 3) covariance of each joint, m², errors that last in it; NaN where unknown."""
+    velocity: NDArray[np.float64]
+    """(N, J, 3) m/s; NaN where unknown, and in rows that stand alone."""
+    velocity_covariance: NDArray[np.float64]
+    """(N, J, 3, 3) m²/s²; NaN where the velocity is."""
+    confidence: NDArray[np.float64]
+    """(N, J) w_i of Eq. 4, mean confidence over all views of the observations that were kept."""
+    inlier: NDArray[np.bool_]
+    """(N, J, V) delta_ij of Eq. 2: which observations were kept."""
+    contradicts: NDArray[np.bool_]
+    """(N, J) joints whose views the body contradicts."""
+    residual_px: NDArray[np.float64]
+    """(N, J, V, 2) projection of the joint minus observation; NaN where unseen or unknown."""
+    known: NDArray[np.uint8]
+    """(N, J) a `Known` each."""
+    fit: BodyFit
+    """Theta: the bodies, N rows."""
+    status: NDArray[np.str_]
+    """(N,) a `Status` each."""
+    problems: tuple[Problem, ...] = ()
+    """What went wrong, joint by joint; rows of these have the status `not solved`."""
+    people: "tuple[PersonGraph, ...]" = ()
+    """Everybody's graph; none where some rows were taken."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """What it took, by stage."""
+
+    def __len__(self) -> int:
+        return len(self.joints)
+
+    def rows(self, index: NDArray[np.intp]) -> "WindowSolution":
+        """Some of the rows, without graphs: plain data, which can be sent to another process."""
+        place = {row: n for n, row in enumerate(index.tolist())}
+        problems = tuple(replace(each, row=place[each.row]) for each in self.problems if each.row in place)
+        kept = {each.name: getattr(self, each.name) for each in fields(self)}
+        for name, value in kept.items():
+            if isinstance(value, np.ndarray):
+                kept[name] = value[index]
+        kept |= {name: kept[name].rows(index) for name in ("observations", "fit")}
+        return WindowSolution(**kept | {"problems": problems, "people": ()})
+
+
+@dataclass(frozen=True)
+class PersonGraph:
+    """One person in T frames, solved.
 
     The graph that is solved holds the share of all errors that is new in every frame: motion smooths no more. What
     is reported has the rest, too: detections and body err alike for a while, a detection may be another's, a limb
@@ -30,16 +97,14 @@ class WindowSolution:
     are the reported ones, and its values the reported joints.
     """
 
-    rows: NDArray[np.intp]
-    """(T,) rows of the estimates, frames rising."""
+    window: WindowGraph
+    """What the solver solved."""
     joints: NDArray[np.float64]
     """(T, J, 3) where the joints are reported, metres in the world; NaN where unknown."""
     covariance: NDArray[np.float64]
     """(T, J, 3, 3) as it is reported, m²; NaN where unknown."""
     bodies: BodyFit
     """The bodies, T rows."""
-    window: WindowGraph
-    """What the solver solved."""
     solved: NDArray[np.float64]
     """(T, J, 3) where the solver has the joints, metres."""
     solved_covariance: NDArray[np.float64]
@@ -56,6 +121,11 @@ class WindowSolution:
     def frames(self) -> NDArray[np.integer]:
         """(T,) frame of each row."""
         return self.window.frames
+
+    @property
+    def rows(self) -> NDArray[np.intp]:
+        """(T,) rows of the solution, frames rising."""
+        return self.window.rows
 
     @property
     def keys(self) -> NDArray[np.int64]:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from shapepose_fg.body.fitting.energy import BodyEnergy, robust_weight
 from shapepose_fg.body.fitting.person_frame import PersonFrame
-from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.rotation import log_so3

@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from shapepose_fg.core.camera import Axis, Camera, Rig
 from shapepose_fg.core.detections import Detections, DetectionSequence, Recording
-from shapepose_fg.setup_check.changes import Kind
-from shapepose_fg.setup_check.diagnosis import Finding
+from shapepose_fg.setup_check.findings import Finding, Kind
 
 
 @dataclass(frozen=True)

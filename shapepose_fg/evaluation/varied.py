@@ -3,8 +3,7 @@
 
 from dataclasses import dataclass, fields
 
-from shapepose_fg.estimation.estimator_config import RefineConfig
-from shapepose_fg.estimation.window_graph import WindowGraphConfig
+from shapepose_fg.estimation.estimator_config import RefineConfig, WindowGraphConfig
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.proposal.association import AssociationConfig
 from shapepose_fg.proposal.candidates import CandidateConfig

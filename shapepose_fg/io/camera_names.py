@@ -1,9 +1,14 @@
-"""Which of several names is which camera's."""
+"""What names of files say: which is which camera's, and which frame's."""
 
 import re
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
+from shapepose_fg.core.errors import InputError
+
+MOST_FRAME = 10**12
+"""No frame has a higher number."""
 _NUMBERS = re.compile(r"\d+")
 
 
@@ -48,3 +53,16 @@ def told_by_parts(
 def listing(names: Sequence[str], nothing: str = "nothing") -> str:
     """The first of some names, for a message."""
     return (" ".join(names[:8]) or nothing) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
+
+
+def in_order(files: Sequence[tuple[int, Path]]) -> list[tuple[int, Path]]:
+    """Files by the numbers of their frames, which then rise; InputError where a number is no frame's, or twice
+    there.
+    """
+    ordered = sorted(files)
+    if ordered[-1][0] >= MOST_FRAME:
+        raise InputError(f"{ordered[-1][1]}: no frame has so high a number; number them by the recording's frames")
+    for (number, file), (following, other) in pairwise(ordered):
+        if following == number:
+            raise InputError(f"{other}: frame {number} is also in {file.name}; keep one recording in a folder")
+    return ordered

@@ -1,15 +1,14 @@
 """A Pose2Sim project as it lies: which of its files are what, and where its next steps look for results."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import read_toml
-from shapepose_fg.io.calibration.content import load
-from shapepose_fg.io.calibration.reading import FORMATS
-from shapepose_fg.io.detections.frame_files import frame_files, frame_number
+from shapepose_fg.io.calibration.reading import is_calibration
+from shapepose_fg.io.camera_names import listing
+from shapepose_fg.io.detections.json_people import frame_files, frame_number
 from shapepose_fg.io.footage.footage import glance
 from shapepose_fg.io.footage.places import VIDEOS
 
@@ -81,20 +80,20 @@ def read_pose2sim_project(folder: Path) -> Pose2SimProject:
         raise InputError(
             f"{folder / CONFIG}: project must be a table; write [project] as Pose2Sim's demos have it"
         )
+    rate, span, multi_person = _checked(project, folder / CONFIG)
     calibration = _calibration(session, folder)
     entries = sorted((folder / "videos").iterdir()) if (folder / "videos").is_dir() else []
     videos = [each for each in entries if each.suffix.lower() in VIDEOS]
-    detections = _detections(folder, calibration, videos)
+    detections = _detections(folder, calibration, len(videos) > 0)
     times = detections / "times.csv"
-    rate = project.get("frame_rate", "auto")
-    fps, said = (
-        (None, f"times from {times}") if rate == "auto" and times.is_file() else _rate(rate, videos, folder)
-    )
-    multi_person = project.get("multi_person", False)
-    if not isinstance(multi_person, bool):
-        raise InputError(
-            f"{folder / CONFIG}: project.multi_person must be true or false, got {multi_person!r}; correct it"
-        )
+    if rate == "auto" and times.is_file():
+        fps, said = None, f"times from {times}"
+    else:
+        told = ((glance(video)[1], f", as {video.name} says") for video in videos)
+        assumed = _RATE, " are assumed: project.frame_rate is 'auto', and there is no video"
+        given = rate != "auto"
+        fps, origin = (rate, f", as {CONFIG} says") if given else next((e for e in told if e[0] > 0), assumed)
+        said = f"{fps:g} frames a second{origin}"
     # Results have the numbers of the files' names, 0 where they have none.
     folders = [each for each in detections.iterdir() if each.is_dir()]
     numbers = (frame_number(file) for each in folders for file in frame_files(each))
@@ -102,13 +101,32 @@ def read_pose2sim_project(folder: Path) -> Pose2SimProject:
         folder,
         calibration,
         detections,
-        fps,
+        None if fps is None else float(fps),
         times if fps is None else None,
         min(numbers, default=0),
-        _frame_range(project.get("frame_range", "auto"), folder),
+        (span[0], span[1]) if isinstance(span, list) and len(span) == 2 else None,
         multi_person,
         (f"{folder}: cameras from {calibration}, detections from {detections}", f"{folder}: {said}"),
     )
+
+
+def _checked(project: dict[str, Any], file: Path) -> tuple[Any, Any, bool]:
+    """frame_rate, frame_range and multi_person of [project]; InputError for what they cannot be."""
+
+    def wrong(key: str, wanted: str) -> InputError:
+        return InputError(f"{file}: project.{key} must be {wanted}, got {project[key]!r}; correct it")
+
+    rate, span = project.get("frame_rate", "auto"), project.get("frame_range", "auto")
+    number = isinstance(rate, int | float) and not isinstance(rate, bool)
+    if rate != "auto" and not (number and 0.01 <= rate <= 1e5):
+        raise wrong("frame_rate", "frames a second or 'auto'")
+    pair = isinstance(span, list) and [type(number) for number in span] == [int, int]
+    if span not in ("auto", "all", []) and not (pair and 0 <= span[0] < span[1]):
+        raise wrong("frame_range", "'auto', 'all', or two frame numbers such as [10, 300]")
+    multi_person = project.get("multi_person", False)
+    if not isinstance(multi_person, bool):
+        raise wrong("multi_person", "true or false")
+    return rate, span, multi_person
 
 
 def _settings(folder: Path) -> tuple[dict[str, Any], Path]:
@@ -120,10 +138,7 @@ def _settings(folder: Path) -> tuple[dict[str, Any], Path]:
         raise InputError(f"{own}: there is no such file; give the folder of a Pose2Sim project, which has one")
     trials = sorted(each.parent.name for each in folder.glob(f"*/{CONFIG}"))
     if len(trials) > 0 and not any((folder / name).is_dir() for name in (*_POSES, "videos")):
-        raise InputError(
-            f"{folder}: a session of several trials; give one of them: {' '.join(trials[:8])}"
-            + (" ..." if len(trials) > 8 else "")
-        )
+        raise InputError(f"{folder}: a session of several trials; give one of them: {listing(trials)}")
     config = read_toml(own, may_be_empty=True)
     if not above.is_file():
         return config, folder
@@ -144,12 +159,8 @@ def _calibration(session: Path, folder: Path) -> Path:
     the folder itself, where a format has several files.
     """
     places = dict.fromkeys((session.resolve(), folder.resolve()))
-    rooms = [
-        each
-        for place in places
-        for each in sorted(place.iterdir())
-        if each.is_dir() and "calib" in each.name.lower()
-    ]
+    inside = [each for place in places for each in sorted(place.iterdir()) if each.is_dir()]
+    rooms = [each for each in inside if "calib" in each.name.lower()]
     if len(rooms) == 0:
         raise InputError(
             f"{session}: no folder of the calibration here; put the cameras into {session}/calibration"
@@ -157,9 +168,9 @@ def _calibration(session: Path, folder: Path) -> Path:
     files = [each for room in rooms for each in room.iterdir() if each.is_file()]
     files.sort(key=lambda file: (file.stat().st_mtime, file.name), reverse=True)
     files.sort(key=lambda file: file.suffix != ".toml")  # the newest stays first among its kind
-    found = next((each for each in (*files, rooms[0]) if _is_calibration(each)), None)
+    found = next((each for each in (*files, rooms[0]) if is_calibration(each)), None)
     if found is None:
-        there = " ".join(sorted(each.name for each in rooms[0].iterdir())[:8]) or "nothing"
+        there = listing(sorted(each.name for each in rooms[0].iterdir()))
         raise InputError(
             f"{rooms[0]}: no calibration that is known here, only {there}; run Pose2Sim's calibration, or put one"
             " of the formats of docs/conventions.md there"
@@ -167,62 +178,23 @@ def _calibration(session: Path, folder: Path) -> Path:
     return found
 
 
-def _is_calibration(path: Path) -> bool:
-    """Whether a file or folder is of one of the formats of cameras."""
-    try:
-        content = load(path)
-    except InputError:
-        return False
-    return content.syntax != "pickle" and any(each.recognise(content) for each in FORMATS)
-
-
-def _detections(folder: Path, calibration: Path, videos: Sequence[Path]) -> Path:
+def _detections(folder: Path, calibration: Path, has_videos: bool) -> Path:
     """The folder of 2D detections; InputError with the command that makes them where there are videos only."""
-    for name in _POSES:
-        place = folder / name
-        if place.is_dir() and any(_is_pose(each) for each in place.iterdir()):
+
+    def is_pose(path: Path) -> bool:
+        there = len(frame_files(path)) > 0 if path.is_dir() else path.suffix in (".json", ".txt")
+        return there and not path.name.startswith(".")
+
+    for place in (folder / name for name in _POSES):
+        if place.is_dir() and any(map(is_pose, place.iterdir())):
             return place
-    pose = folder / "pose"
-    if len(videos) == 0:
+    pose, videos = folder / "pose", folder / "videos"
+    if not has_videos:
         raise InputError(
             f"{folder}: neither 2D detections ({' '.join(_POSES)}) nor videos here; put the videos into"
-            f" {folder / 'videos'} and detect people in them"
+            f" {videos} and detect people in them"
         )
     raise InputError(
         f"{pose}: no 2D detections yet; run Pose2Sim's poseEstimation, or shapepose-fg detect --calibration"
-        f" {calibration} --videos {folder / 'videos'} --network NETWORK --output {pose}"
+        f" {calibration} --videos {videos} --network NETWORK --output {pose}"
     )
-
-
-def _is_pose(path: Path) -> bool:
-    """Whether a file or folder may hold what a camera's detector wrote."""
-    if path.name.startswith("."):
-        return False
-    return len(frame_files(path)) > 0 if path.is_dir() else path.suffix in (".json", ".txt")
-
-
-def _rate(given: Any, videos: Sequence[Path], folder: Path) -> tuple[float, str]:
-    """Frames a second, and where that comes from."""
-    if given == "auto":
-        for video in videos:
-            _, fps = glance(video)
-            if fps > 0:
-                return fps, f"{fps:g} frames a second, as {video.name} says"
-        return _RATE, f"{_RATE:g} frames a second are assumed: project.frame_rate is 'auto', and there is no video"
-    if isinstance(given, bool) or not isinstance(given, int | float) or not 0.01 <= given <= 1e5:
-        raise InputError(
-            f"{folder / CONFIG}: project.frame_rate must be frames a second or 'auto', got {given!r}; correct it"
-        )
-    return float(given), f"{float(given):g} frames a second, as {CONFIG} says"
-
-
-def _frame_range(given: Any, folder: Path) -> tuple[int, int] | None:
-    if given in ("auto", "all") or given == []:
-        return None
-    whole = isinstance(given, list) and len(given) == 2 and all(type(number) is int for number in given)
-    if not whole or not 0 <= given[0] < given[1]:
-        raise InputError(
-            f"{folder / CONFIG}: project.frame_range must be 'auto', 'all', or two frame numbers such as [10,"
-            f" 300], got {given!r}; correct it"
-        )
-    return given[0], given[1]

@@ -11,6 +11,7 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.storage.files import read_text
+from shapepose_fg.io.validation import is_number
 
 _FRAME, _TIME = "frame", "time_s"
 """Columns with a meaning of their own; every other column is a camera's."""
@@ -31,7 +32,17 @@ def read_timestamps(path: str | Path, rig: Rig, frames: int) -> FrameTimes:
     """
     path = Path(path)
     names, numbers, lines = _table(path, rig)
-    columns = _columns(path, names, rig)
+    twice = next((name for name, count in Counter(names).items() if count > 1), None)
+    if twice is not None:
+        raise InputError(f"{path}: column {twice} occurs twice; give each its own name")
+    wanted = [_TIME] if _TIME in names else rig.names
+    missing = [name for name in wanted if name not in names]
+    if len(missing) > 0:
+        raise InputError(
+            f"{path}: no times of camera {missing[0]}, the columns are {' '.join(names)[:80]}; name a column"
+            f" {_TIME}, or one for each camera of the calibration"
+        )
+    picked = np.arange(frames)
     if _FRAME in names:
         picked = _lines_of_frames(path, numbers[:, names.index(_FRAME)], lines, frames)
     elif len(numbers) != frames:
@@ -39,25 +50,19 @@ def read_timestamps(path: str | Path, rig: Rig, frames: int) -> FrameTimes:
             f"{path}: must hold a time for each of the {frames} frames, got {len(numbers)}; add a column frame"
             " where it is of more frames than the recording"
         )
-    else:
-        picked = np.arange(frames)
-    time_s = numbers[picked][:, columns]
+    time_s = numbers[picked][:, [names.index(name) for name in wanted]]
     steps, apart = np.diff(time_s, axis=0), np.ptp(time_s, axis=1)
     if (steps <= 0).any():
         line = lines[picked][int(np.argmax((steps <= 0).any(axis=1))) + 1]
-        raise InputError(
-            f"{path}: line {line} must be later than the frame before; put frames in order of their times"
-        )
-    if len(time_s) > 1 and np.median(steps) > _LONGEST_STEP_S:
-        raise InputError(
-            f"{path}: frames would be {np.median(steps):.0f} s apart; write seconds, not milliseconds"
-        )
+        what = f"line {line} must be later than the frame before"
+        raise InputError(f"{path}: {what}; put frames in order of their times")
+    if len(time_s) > 1 and (step := np.median(steps)) > _LONGEST_STEP_S:
+        raise InputError(f"{path}: frames would be {step:.0f} s apart; write seconds, not milliseconds")
     if (apart > _SAME_CLOCK_S).any():
         frame = int(np.argmax(apart > _SAME_CLOCK_S))
-        raise InputError(
-            f"{path}: the cameras' times of frame {frame} are {apart[frame]:.3g} s apart; give times of one clock"
-        )
-    return FrameTimes(time_s[:, 0] if len(columns) == 1 else time_s, source=str(path))
+        what = f"the cameras' times of frame {frame} are {apart[frame]:.3g} s apart"
+        raise InputError(f"{path}: {what}; give times of one clock")
+    return FrameTimes(time_s[:, 0] if len(wanted) == 1 else time_s, source=str(path))
 
 
 def _table(path: Path, rig: Rig) -> tuple[list[str], NDArray[np.float64], NDArray[np.intp]]:
@@ -69,63 +74,34 @@ def _table(path: Path, rig: Rig) -> tuple[list[str], NDArray[np.float64], NDArra
             continue
         if len(names) == 0:
             # Cameras may be called by numbers; without a header there is one column.
-            header = not _is_number(words[0]) or (len(words) > 1 and set(rig.names) <= set(words))
+            header = not is_number(words[0]) or (len(words) > 1 and set(rig.names) <= set(words))
             names = words if header else [_TIME]
             if header:
                 continue
         if len(words) != len(names):
             cure = "name the columns in a first line" if names == [_TIME] else "correct the line"
             raise InputError(f"{path}: line {line} must hold {len(names)} numbers, got {len(words)}; {cure}")
-        wrong = next((word for word in words if not _is_number(word)), None)
-        if wrong is not None:
-            raise InputError(
-                f"{path}: line {line} must hold numbers, got {wrong[:20]!r}; write seconds like 0.033"
-            )
+        wrong = [word[:20] for word in words if not is_number(word)]
+        if len(wrong) > 0:
+            raise InputError(f"{path}: line {line} must hold numbers, got {wrong[0]!r}; write seconds like 0.033")
         rows.append([float(word) for word in words])
         lines.append(line)
-    return names, np.array(rows).reshape(len(rows), -1 if rows else len(names)), np.array(lines, dtype=np.intp)
-
-
-def _is_number(word: str) -> bool:
-    """Whether `word` is a finite number."""
-    try:
-        return bool(np.isfinite(float(word)))
-    except ValueError:
-        return False
-
-
-def _columns(path: Path, names: list[str], rig: Rig) -> list[int]:
-    """The columns that hold times: one for all cameras, or one for each in the rig's order."""
-    twice = next((name for name, count in Counter(names).items() if count > 1), None)
-    if twice is not None:
-        raise InputError(f"{path}: column {twice} occurs twice; give each its own name")
-    if _TIME in names:
-        return [names.index(_TIME)]
-    missing = [name for name in rig.names if name not in names]
-    if len(missing) > 0:
-        raise InputError(
-            f"{path}: no times of camera {missing[0]}, the columns are {' '.join(names)[:80]}; name a column"
-            f" {_TIME}, or one for each camera of the calibration"
-        )
-    return [names.index(name) for name in rig.names]
+    return names, np.array(rows).reshape(len(rows), len(names)), np.array(lines, dtype=np.intp)
 
 
 def _lines_of_frames(
     path: Path, numbers: NDArray[np.float64], lines: NDArray[np.intp], frames: int
 ) -> NDArray[np.intp]:
     """(T,) the row of each frame of the recording; frames that it does not have are passed over."""
-    odd = (numbers != np.round(numbers)) | (numbers < 0)
-    if odd.any():
-        row = int(np.argmax(odd))
-        raise InputError(
-            f"{path}: line {lines[row]} must name a frame, 0 or more, got {numbers[row]:g}; correct it"
-        )
+    odd = np.flatnonzero((numbers != np.round(numbers)) | (numbers < 0))
+    if len(odd) > 0:
+        line, number = lines[odd[0]], numbers[odd[0]]
+        raise InputError(f"{path}: line {line} must name a frame, 0 or more, got {number:g}; correct it")
     found, first, count = np.unique(numbers, return_index=True, return_counts=True)
     if (count > 1).any():
         raise InputError(f"{path}: frame {found[np.argmax(count > 1)]:.0f} occurs twice; keep one line of it")
     missing = np.setdiff1d(np.arange(frames), found)
     if len(missing) > 0:
-        raise InputError(
-            f"{path}: no time of frame {missing[0]}, the recording has frames 0 to {frames - 1}; add its line"
-        )
+        has = f"the recording has frames 0 to {frames - 1}"
+        raise InputError(f"{path}: no time of frame {missing[0]}, {has}; add its line")
     return first[np.searchsorted(found, np.arange(frames))]

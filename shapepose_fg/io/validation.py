@@ -75,6 +75,14 @@ def describe(value: object) -> str:
     return str(value)[:40]
 
 
+def is_number(word: str) -> bool:
+    """Whether `word` is a finite number."""
+    try:
+        return math.isfinite(float(word))
+    except ValueError:
+        return False
+
+
 _WANTED = {
     "float_type": "a number",
     "float_parsing": "a number",

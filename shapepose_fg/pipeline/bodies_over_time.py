@@ -27,7 +27,8 @@ _OVERLAP_ROWS = 32
 """Rows that a stretch has of its neighbours, on either side, when poses are fitted."""
 
 
-_COLUMNS = ("betas", "global_orient", "body_pose", "transl")
+BODY = ("betas", "global_orient", "body_pose", "transl")
+"""The columns of a result that are a body."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ class Person:
         if self.floor is not None and fitter.model is not None:
             bodies = above_floor(fitter.model, bodies, self.floor.normal, self.floor.height_m)
         shape = {"mean": found.shapes.mean, "information": found.shapes.information}
-        return {"ok": fit.ok, **dict(zip(_COLUMNS, bodies, strict=True)), **shape}
+        return {"ok": fit.ok, **dict(zip(BODY, bodies, strict=True)), **shape}
 
 
 Fits = Callable[[Iterable[Person]], Iterable[dict[str, NDArray[Any]]]]
@@ -102,7 +103,7 @@ class BodiesOverTime:
         `values` (R, ...) are the rows as they were, `person` (R,) whose they are, and `before` how many rows of
         each person there are before them. Other columns stay as they are.
         """
-        if column not in (*_COLUMNS, "status"):
+        if column not in (*BODY, "status"):
             return values
         values = values.copy()
         for number in np.unique(person).tolist():
@@ -240,9 +241,7 @@ def with_bodies_over_time(
         InMemory(),
         known,
     )
-    columns = {
-        name: bodies.filled(name, getattr(people, name), people.person, {}) for name in (*_COLUMNS, "status")
-    }
+    columns = {name: bodies.filled(name, getattr(people, name), people.person, {}) for name in (*BODY, "status")}
     return replace(people, shapes=bodies.shapes, **columns)
 
 

@@ -6,13 +6,11 @@ from typing import Annotated, ClassVar, Literal
 from annotated_types import Interval
 
 from shapepose_fg.body.fitting.fitters import BodyConfig
-from shapepose_fg.core.bounds import Count, Factor, Metres, Repeats, Seconds, Settings, Share
+from shapepose_fg.core.bounds import Count, Factor, Metres, Repeats, RepeatsOrNone, Seconds, Settings, Share
 from shapepose_fg.estimation.detector_offsets import OffsetConfig
-from shapepose_fg.estimation.estimator_config import EstimatorConfig, RefineConfig
+from shapepose_fg.estimation.estimator_config import EstimatorConfig, RefineConfig, WindowGraphConfig
 from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.estimation.motion_model import MotionConfig
-from shapepose_fg.estimation.window_graph import WindowGraphConfig
-from shapepose_fg.pipeline.windows import WindowConfig
 from shapepose_fg.proposal.association import AssociationConfig
 from shapepose_fg.proposal.candidates import CandidateConfig
 from shapepose_fg.proposal.proposals import ProposalConfig
@@ -41,6 +39,20 @@ class PeopleConfig(Settings):
     patience_s: Seconds = 0.5
     """Somebody without evidence for longer has gone. More for people who are often hidden; whoever comes back
     later is recognised by `stitching`."""
+
+
+@dataclass(frozen=True)
+class WindowConfig(Settings):
+    """How frames are cut into windows."""
+
+    overlap_s: Annotated[float, Interval(ge=0, le=60)] = 0.4
+    """What a window takes of the frames before and after its own, and does not return: smoothing reaches a few
+    frames. Windows of other lengths move joints by under 2 mm in the median (tests/pipeline/test_windows.py)."""
+    again_over_time: RepeatsOrNone = 3
+    """How often detections are reassociated around a draft of a window: fewer rounds are faster."""
+    again_alone: RepeatsOrNone = 5
+    """The same frame by frame; 0: never, as in the paper. From round to round more is asked of who stays
+    (`Survival`): who goes leaves detections to others, so the least sure goes first. Fewer rounds are faster."""
 
 
 @dataclass(frozen=True)

@@ -1,21 +1,23 @@
 """All steps from frames to rows, made of the settings: what every process that takes part needs."""
 
+from collections import Counter
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
-from shapepose_fg.body.fitting.bone_reach import longest_bones
 from shapepose_fg.body.fitting.fitter import BodyFitter
-from shapepose_fg.core.camera import Rig
+from shapepose_fg.body.fitting.priors import longest_bones
+from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.estimation.estimator import Estimator, ExtraFactors
 from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.solve_window import Assigning, solve_window
+from shapepose_fg.estimation.window_graph import ExtraFactors
+from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.runs.notes import Notebook
-from shapepose_fg.pipeline.windows import Engine, WindowSolver
+from shapepose_fg.pipeline.windows import Engine, Span
 from shapepose_fg.proposal.association import AssociationConfig, associate
 from shapepose_fg.proposal.candidates import CandidateConfig, PairPoints, triangulate_pairs, vote
 from shapepose_fg.proposal.hypotheses import Frame
@@ -29,6 +31,18 @@ FAST_M_S = 3.0
 """The tracker predicts joints as if they moved so fast: a hand that is thrown up or strikes."""
 _ON_TRIAL = 0.5
 """Share of the probability asked for otherwise that is enough in frames that stand alone: a body will tell."""
+
+
+@dataclass(frozen=True)
+class Solved:
+    """A window that is done: its own frames."""
+
+    solution: WindowSolution
+    """The rows."""
+    frames: int
+    """How many frames they are of."""
+    false_positives: tuple[int, ...]
+    """The frame of each row that was left with no detections of its own when they were reassociated."""
 
 
 @dataclass(frozen=True)
@@ -46,16 +60,30 @@ class Setup:
     extra_factors: ExtraFactors | None = None
     """The user's own factors."""
 
-    @cached_property
-    def solver(self) -> WindowSolver:
-        """Solves windows."""
-        config = self.config
-        estimator = Estimator(self.rig, self.fitter, self.skeleton.joints, config.estimator)
-        assignment = config.tracking.assignment
-        return WindowSolver(estimator, self.skeleton, assignment, config.windows, self.extra_factors)
+    def solve(self, span: Span) -> Solved:
+        """One window, in whatever process."""
+        config, given = self.config, [frame for frame, _ in span.decided]
+        rows = Observations.concatenate([part for _, part in span.decided])
+        rounds = config.windows.again_alone if span.alone else config.windows.again_over_time
+        assigning = Assigning(given, self.skeleton, config.tracking.assignment, rounds, over_time=not span.alone)
+        solution = solve_window(
+            rows,
+            Views.of(self.rig),
+            self.fitter,
+            replace(config.estimator, joints=self.skeleton.joints),
+            assigning=assigning,
+            extra_factors=self.extra_factors,
+        )
+        own = {frame.frame for frame in given[span.start : span.stop]}
+        left = Counter(rows.frame.tolist()) - Counter(solution.observations.frame.tolist())
+        return Solved(
+            solution.rows(np.flatnonzero(np.isin(solution.observations.frame, list(own)))),
+            frames=span.stop - span.start,
+            false_positives=tuple(sorted(frame for frame in left.elements() if frame in own)),
+        )
 
     def engine(self, book: Notebook) -> Engine:
-        """Follows people and solves windows; what it has to say goes into `book`."""
+        """Follows people; what it has to say goes into `book`."""
         config, skeleton, sure = self.config, self.skeleton, StageOne.of(self.config)
         # What evidence leaves over may be people whose hips two views saw: whether they are, time tells.
         hips = replace(sure.by_hips(), candidates=replace(sure.candidates, min_votes=1))
@@ -73,7 +101,7 @@ class Setup:
         tracker = Tracker(
             skeleton, scale, find, tracking, config.observations, weak_births=config.temporal, drop=book.drop_in
         )
-        return Engine(tracker, config.following, self.solver, frames=config.batch_frames)
+        return Engine(tracker, config)
 
 
 def find_people(

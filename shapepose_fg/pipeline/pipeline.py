@@ -18,8 +18,8 @@ from shapepose_fg.core.provenance import versions
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.core.storage.kept_arrays import InMemory, KeptArrays
-from shapepose_fg.estimation.estimator import ExtraFactors
 from shapepose_fg.estimation.floor import Floor
+from shapepose_fg.estimation.window_graph import ExtraFactors
 from shapepose_fg.pipeline.bodies_over_time import Person, fit_everybody
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.engine import Setup
@@ -29,8 +29,7 @@ from shapepose_fg.pipeline.offsets import estimate_offsets as estimate_offsets
 from shapepose_fg.pipeline.offsets import kept_offsets
 from shapepose_fg.pipeline.runs.assembly import Assembly
 from shapepose_fg.pipeline.runs.notes import Notebook, Notes
-from shapepose_fg.pipeline.runs.parts import Parts, RowsOfPeople
-from shapepose_fg.pipeline.runs.standing import floor_of
+from shapepose_fg.pipeline.runs.parts import Parts
 from shapepose_fg.pipeline.solved_windows import SolvedWindows
 from shapepose_fg.proposal.thinning import ThinnedFrames
 from shapepose_fg.tracking.evidence import probability
@@ -150,17 +149,17 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
                 with book.stage("follow"):
                     # Between two frames, where no rounding matters.
                     cuts_s = (times.frame_s[cuts] + times.frame_s[[cut - 1 for cut in cuts]]) / 2
-                    result = replace(result, names=_names(parts, skeleton, config, cuts_s.tolist()))
+                    result = replace(result, names=_names(result, skeleton, config, cuts_s.tolist()))
             floor: Floor | str = "frames stand alone" if not config.temporal else "not sought"
             model = setup.fitter.model
             if config.temporal and model is not None and len(result) > 0:
                 with book.stage("bodies over time"):
                     if config.motion.floor:
-                        floor = floor_of(parts, skeleton.joints, model, rig.up_vector)
+                        floor = result.floor(model, rig.up_vector)
                     known = SubjectShapes.empty(fingerprint(model)) if task.shapes is None else task.shapes
                     ground = floor if isinstance(floor, Floor) else None
                     bodies = fit_everybody(
-                        result.people.counts,
+                        result.rows_of,
                         lambda number, rows: replace(result.person(number, rows), floor=ground),
                         lambda jobs: pool.map(_fit_person, jobs),
                         kept,
@@ -181,17 +180,18 @@ def _fit_person(setup: Setup, person: Person) -> dict[str, Any]:
     return person.fitted(setup.fitter)
 
 
-def _names(parts: Parts, skeleton: Skeleton, config: PipelineConfig, cuts_s: Sequence[float]) -> dict[int, int]:
+def _names(
+    tracks: Assembly, skeleton: Skeleton, config: PipelineConfig, cuts_s: Sequence[float]
+) -> dict[int, int]:
     """What tracks are called when those of one person are joined over longer times out of sight."""
-    tracks = RowsOfPeople(parts, [parts.column(n, "person") for n in range(len(parts))])
     traces = (
         Trace.concatenate(
             [
                 Trace.of(track, time_s, joints, skeleton)
-                for time_s, joints in tracks.pieces(track, ("time_s", "joints"))
+                for time_s, joints in tracks.own_pieces(track, ("time_s", "joints"))
             ]
         )
-        for track in tracks.counts
+        for track in tracks.rows_of
     )
     return stitch(Ends.of(traces), config.stitching, cuts_s)
 

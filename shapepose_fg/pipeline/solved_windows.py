@@ -8,17 +8,18 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.core.frame_times import FrameTimes, stretches
-from shapepose_fg.core.observation_table import place_in_view
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.frame_times import FrameTimes, segments
+from shapepose_fg.core.observation_table import Gate, ObservationTable, place_in_view
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.pipeline.engine import Setup
-from shapepose_fg.pipeline.runs.borders import Border
+from shapepose_fg.estimation.window_solution import WindowSolution
+from shapepose_fg.pipeline.bodies_over_time import BODY
+from shapepose_fg.pipeline.engine import Setup, Solved
 from shapepose_fg.pipeline.runs.checkpoint import Checkpoint
-from shapepose_fg.pipeline.runs.chunks import Chunk, Identities, cut_in_chunks, windows_of
+from shapepose_fg.pipeline.runs.chunks import Border, Chunk, Identities, cut_in_chunks, windows_of
 from shapepose_fg.pipeline.runs.notes import Notebook, Notes
 from shapepose_fg.pipeline.runs.parts import Part
-from shapepose_fg.pipeline.solved_rows import result_rows
-from shapepose_fg.pipeline.windows import Solved, Span
+from shapepose_fg.pipeline.windows import Span
 from shapepose_fg.pipeline.workers import Pool
 from shapepose_fg.proposal.thinning import ThinnedFrames
 from shapepose_fg.tracking.hypotheses import Input
@@ -58,11 +59,9 @@ class SolvedWindows:
     def after(self, begin: Checkpoint | None, pool: Pool[Setup], chunk_frames: int | None) -> Iterator[Part]:
         """The windows from `begin` on, in order; in chunks of about `chunk_frames`, where that is given."""
         begin = Checkpoint(self.frames.start) if begin is None else begin
-        return (
-            self._one_by_one(begin, pool) if chunk_frames is None else self._by_chunks(begin, pool, chunk_frames)
-        )
-
-    def _one_by_one(self, begin: Checkpoint, pool: Pool[Setup]) -> Iterator[Part]:
+        if chunk_frames is not None:
+            yield from self._by_chunks(begin, pool, chunk_frames)
+            return
         waiting: deque[tuple[Notes, Checkpoint | None]] = deque()
 
         def spans() -> Iterator[Span]:
@@ -70,7 +69,7 @@ class SolvedWindows:
                 waiting.append((self.book.torn_off(), behind))
                 yield span
 
-        for solved in pool.map(_solve, spans()):
+        for solved in pool.map(Setup.solve, spans()):
             followed, behind = waiting.popleft()
             notes = self._notes(solved)
             notes.add(followed)
@@ -80,14 +79,14 @@ class SolvedWindows:
         """The windows as far as their people have been followed, and from where following goes on behind some."""
         config, engine = self.setup.config, self.setup.engine(self.book)
         next_id = begin.next_id
-        for stretch in stretches(self.frames, self.cuts):
-            if stretch.stop <= begin.frame:
+        for segment in segments(self.frames, self.cuts):
+            if segment.stop <= begin.frame:
                 continue
-            carries_on = begin.state is not None and begin.frame > stretch.start
-            state = begin.state if carries_on and begin.state is not None else engine.start(next_id)
-            for start in range(max(stretch.start, begin.frame), stretch.stop, config.batch_frames):
-                batch = range(start, min(start + config.batch_frames, stretch.stop))
-                given, last = [self.read(frame) for frame in batch], batch.stop == stretch.stop
+            state = begin.state if begin.frame > segment.start else None
+            state = engine.start(next_id) if state is None else state
+            for start in range(max(segment.start, begin.frame), segment.stop, config.batch_frames):
+                batch = range(start, min(start + config.batch_frames, segment.stop))
+                given, last = [self.read(frame) for frame in batch], batch.stop == segment.stop
                 with self.book.stage("follow"):
                     if config.temporal:
                         spans, state = engine.follow(state, given, last=last)
@@ -120,23 +119,25 @@ class SolvedWindows:
                     replace(each, track=identities.name(each.track, names)) for each in notes.problems
                 ]
                 notes.evidence = {identities.name(of, names): each for of, each in notes.evidence.items()}
-                track = [identities.name(each, names) for each in solved.observations.track.tolist()]
+                track = [identities.name(each, names) for each in solved.solution.observations.track.tolist()]
                 if last:
                     notes.add(read)
                     notes.add(found.notes)
-                rows = replace(solved.observations, track=np.array(track, dtype=np.intp))
+                rows = replace(solved.solution.observations, track=np.array(track, dtype=np.intp))
                 behind = Checkpoint(chunk.own.stop, identities.next_id, border=identities.border)
-                yield Part(self._rows(replace(solved, observations=rows)), notes, behind if last else None)
+                named = replace(solved, solution=replace(solved.solution, observations=rows))
+                yield Part(self._rows(named), notes, behind if last else None)
 
     def _notes(self, solved: Solved) -> Notes:
         """What is to be said about a window; people are tracks, or frame by frame numbers within the frame."""
-        temporal, rows, problems = self.setup.config.temporal, solved.observations, list(solved.estimates.problems)
+        temporal, solution = self.setup.config.temporal, solved.solution
+        rows, problems = solution.observations, list(solution.problems)
         if not temporal:
             problems = [
                 replace(each, track=int(((rows.frame == each.frame) & (rows.track < each.track)).sum()))
                 for each in problems
             ]
-        notes = Notes(solved.frames, dict(solved.seconds), problems=problems)
+        notes = Notes(solved.frames, Counter(solution.seconds), problems=problems)
         if len(solved.false_positives) > 0:
             notes.dropped[_FALSE_POSITIVE] = list(solved.false_positives)
         said = np.isfinite(rows.evidence)
@@ -145,13 +146,14 @@ class SolvedWindows:
                 own = rows.evidence[said & (rows.track == track)]
                 notes.evidence[track] = [float(own.sum()), len(own)]
         else:
-            notes.probable = dict(Counter(f"{tenth / 10:.1f}" for tenth in np.floor(10 * rows.evidence[said])))
+            notes.probable = Counter(f"{tenth / 10:.1f}" for tenth in np.floor(10 * rows.evidence[said]))
         return notes
 
     def _rows(self, solved: Solved) -> Reconstruction:
         """Solved rows as rows of the result, by frame and person; bodies that were not fitted are NaN there."""
-        order = np.lexsort((solved.observations.track, solved.observations.frame))
-        rows, estimates = solved.observations.rows(order), solved.estimates.rows(order)
+        rows = solved.solution.observations
+        solution = solved.solution.rows(np.lexsort((rows.track, rows.frame)))
+        rows = solution.observations
         number_in_frame = np.arange(len(rows)) - np.searchsorted(rows.frame, rows.frame)
         person = rows.track if self.setup.config.temporal else number_in_frame
         place = np.full(rows.candidate.shape, -1, dtype=np.int32)
@@ -159,12 +161,36 @@ class SolvedWindows:
             of_frame = rows.frame == frame
             own = self.detections.in_recording(frame, rows.candidate[of_frame])
             place[of_frame] = place_in_view(own, self.detections.frames[frame].view)
-        return result_rows(rows, estimates, place, self.setup.rig, self.setup.skeleton.joints, person)
+        return result_rows(solution, place, self.setup.rig, self.setup.skeleton.joints, person)
 
 
-def _solve(setup: Setup, span: Span) -> Solved:
-    """One window, in whatever process."""
-    return setup.solver.solve(span)
+def result_rows(
+    solution: WindowSolution,
+    place: NDArray[np.integer],
+    rig: Rig,
+    joint_names: Sequence[str],
+    person: NDArray[np.integer],
+) -> Reconstruction:
+    """N solved rows as a result, in their order; bodies that were not fitted are NaN there.
+
+    `place` (N, J, V) is each detection's place among those of its view (`place_in_view`), `person` (N,) who it is.
+    """
+    fit, observations = solution.fit, replace(solution.observations, track=person)
+    body = {name: getattr(fit, name).copy() for name in BODY}
+    for values in body.values():
+        values[~fit.ok] = np.nan
+    dropped = np.where(solution.contradicts[..., None], Gate.CONTRADICTS_BODY, Gate.TOO_FAR)
+    gate = np.where(solution.inlier, Gate.USED, dropped)
+    names = ("joints", "covariance", "velocity", "velocity_covariance", "known", "confidence", "status")
+    return Reconstruction(
+        frame=observations.frame,
+        person=person,
+        time_s=observations.time_s.mean(axis=1),
+        joint_names=np.array(joint_names),
+        observations=ObservationTable.of(observations, place, solution.joints, gate, rig, joint_names),
+        **{name: getattr(solution, name) for name in names},
+        **body,
+    )
 
 
 @dataclass(frozen=True)
@@ -203,7 +229,7 @@ def solve_chunk(setup: Setup, job: ChunkJob) -> SolvedChunk:
     frames = [given.frame for span in spans for given, _ in span.decided[span.start : span.stop]]
     if frames != list(job.chunk.own):
         raise RuntimeError(f"windows of {len(frames)} frames were found for a chunk of {job.chunk.own}")
-    solved = tuple(setup.solver.solve(span) for span in spans)
+    solved = tuple(map(setup.solve, spans))
     notes = book.torn_off()
     notes.dropped = {why: [each for each in of if each in job.chunk.own] for why, of in notes.dropped.items()}
     return SolvedChunk(solved, notes, Border.of(spans[0]), Border.of(spans[-1]))

@@ -10,18 +10,18 @@ from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.threads import torch_threads
-from shapepose_fg.core.camera import Rig
-from shapepose_fg.core.frame_times import stretches
-from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.frame_times import segments
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.run_summary import covered_frames
-from shapepose_fg.estimation.estimator import Estimates, Estimator, ExtraFactors
 from shapepose_fg.estimation.floor import Floor
-from shapepose_fg.estimation.window_solution import WindowSolution
+from shapepose_fg.estimation.solve_window import solve_window
+from shapepose_fg.estimation.window_graph import ExtraFactors
+from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution
 from shapepose_fg.io.solved_setup import SolvedSetup, setup_of
 from shapepose_fg.pipeline.bodies_over_time import with_bodies_over_time
 from shapepose_fg.pipeline.config import PipelineConfig
-from shapepose_fg.pipeline.solved_rows import result_rows
+from shapepose_fg.pipeline.solved_windows import result_rows
 from shapepose_fg.pipeline.windows import near_border, window_stop
 
 
@@ -55,11 +55,11 @@ def solve_rows(
     they were solved from.
     """
     parts = []
-    for window, part, estimates, observations, _ in _solved(rows, solver, extra_factors):
+    for own, part, solution in _solved(rows, solver, extra_factors):
         assert part.observations is not None
         names = tuple(part.joint_names.tolist())
-        solved = result_rows(observations, estimates, part.observations.candidate, solver.rig, names, part.person)
-        parts.append(solved.rows(_inside(part.frame, window.own)))
+        solved = result_rows(solution, part.observations.candidate, solver.rig, names, part.person)
+        parts.append(solved.rows(_inside(part.frame, own)))
     solved = replace(Reconstruction.concatenate(parts), run=rows.run) if parts else rows
     if solver.fitter.model is None or not solver.config.temporal:
         return solved
@@ -68,7 +68,7 @@ def solve_rows(
 
 def window_solutions(
     people: Reconstruction, rig: Rig, *, extra_factors: ExtraFactors | None = None
-) -> Iterator[WindowSolution]:
+) -> Iterator[PersonGraph]:
     """Every person of every window of a result as one graph, whose values and marginals are the result's.
 
     Joints and covariances are those of `people`; the graph below is solved anew from their observations, before
@@ -77,66 +77,62 @@ def window_solutions(
     does not say the settings, ValueError where there are no observations.
     """
     solver = Solver.of(setup_of(people, rig, PipelineConfig), people.joint_names)
-    for _, part, _, _, solutions in _solved(people, solver, extra_factors):
-        for solution in solutions:
-            as_reported = {"joints": part.joints[solution.rows], "covariance": part.covariance[solution.rows]}
-            yield solution if extra_factors is not None else replace(solution, **as_reported)
+    for _, part, solution in _solved(people, solver, extra_factors):
+        for person in solution.people:
+            as_reported = {"joints": part.joints[person.rows], "covariance": part.covariance[person.rows]}
+            yield person if extra_factors is not None else replace(person, **as_reported)
 
 
 def _solved(
     rows: Reconstruction, solver: Solver, extra_factors: ExtraFactors | None
-) -> Iterator[tuple["_Window", Reconstruction, Estimates, Observations, list[WindowSolution]]]:
-    """Each window of the recording: its rows and those around it, solved."""
+) -> Iterator[tuple[range, Reconstruction, WindowSolution]]:
+    """Each window of the recording: its own frames, and its rows with those around it, solved."""
     if rows.observations is None:
         raise ValueError("rows without observations cannot be solved anew; reconstruct the recording again")
-    config, names = solver.config, tuple(rows.joint_names.tolist())
-    estimator = Estimator(solver.rig, solver.fitter, names, config.estimator)
+    config, views = solver.config, Views.of(solver.rig)
+    settings = replace(config.estimator, joints=tuple(rows.joint_names.tolist()))
     with torch_threads(config.threads):
-        for window in _windows(rows, config):
-            part = rows.rows(window.rows(rows, config.windows.overlap_s))
+        for own, segment in _windows(rows, config):
+            part = rows.rows(_rows_of(rows, own, segment, config.windows.overlap_s))
             assert part.observations is not None
             # From the views: the joints as they are may be somebody else's.
             observations = part.observations.observations(np.full_like(part.joints, np.nan), part.time_s)
-            estimates, solutions = estimator.solve(observations, extra_factors)
-            yield window, part, estimates, observations, solutions
+            yield (
+                own,
+                part,
+                solve_window(observations, views, solver.fitter, settings, extra_factors=extra_factors),
+            )
 
 
-@dataclass(frozen=True)
-class _Window:
-    """A window of the recording, whoever is in it."""
-
-    own: range
-    """The frames whose rows it returns."""
-    stretch: range
-    """The frames from one cut to the next that it lies in."""
-
-    def rows(self, rows: Reconstruction, overlap_s: float) -> NDArray[np.intp]:
-        """Rows in its own frames, and in those within `overlap_s` of its borders, none beyond a cut."""
-        frame, time_s = rows.frame, rows.time_s
-        known, first = np.unique(frame, return_index=True)
-        # Where no row is in the frame at a border, its time is between those of the frames around it.
-        begin_s, end_s = np.interp([self.own.start, self.own.stop], known, time_s[first])
-        own = _inside(frame, self.own)
-        before = near_border(time_s, begin_s, overlap_s) & (frame < self.own.start)
-        after = near_border(time_s, end_s, overlap_s) & (frame >= self.own.stop)
-        return np.flatnonzero((own | before | after) & _inside(frame, self.stretch))
+def _rows_of(rows: Reconstruction, own: range, segment: range, overlap_s: float) -> NDArray[np.intp]:
+    """Rows in a window's `own` frames, and in those within `overlap_s` of its borders, none beyond a cut."""
+    frame, time_s = rows.frame, rows.time_s
+    known, first = np.unique(frame, return_index=True)
+    # Where no row is in the frame at a border, its time is between those of the frames around it.
+    begin_s, end_s = np.interp([own.start, own.stop], known, time_s[first])
+    before = near_border(time_s, begin_s, overlap_s) & (frame < own.start)
+    after = near_border(time_s, end_s, overlap_s) & (frame >= own.stop)
+    return np.flatnonzero((_inside(frame, own) | before | after) & _inside(frame, segment))
 
 
-def _windows(rows: Reconstruction, config: PipelineConfig) -> list[_Window]:
-    """The windows that have any of `rows`, as the recording was cut into them; frame by frame, each frame."""
+def _windows(rows: Reconstruction, config: PipelineConfig) -> list[tuple[range, range]]:
+    """The windows that have any of `rows`: their own frames, and those from one cut to the next around them.
+
+    As the recording was cut into them; frame by frame, each frame.
+    """
     if not config.temporal:
-        return [_Window(frames, frames) for frames in (range(t, t + 1) for t in np.unique(rows.frame).tolist())]
+        return [(frames, frames) for frames in (range(t, t + 1) for t in np.unique(rows.frame).tolist())]
     first, last = (int(rows.frame.min()), int(rows.frame.max()) + 1) if len(rows) > 0 else (0, 0)
     cuts: Sequence[int] = rows.run.get("cuts", ())
-    covered = covered_frames(rows.run) or [range(first, last)]
     windows = []
-    for stretch in (part for span in covered for part in stretches(span, cuts)):
-        start = stretch.start
-        while start < stretch.stop:
-            stop = window_stop(start, stretch.stop, config.batch_frames)
-            windows.append(_Window(range(start, stop), stretch))
-            start = stop
-    return [window for window in windows if _inside(rows.frame, window.own).any()]
+    for span in covered_frames(rows.run) or [range(first, last)]:
+        for segment in segments(span, cuts):
+            start = segment.start
+            while start < segment.stop:
+                stop = window_stop(start, segment.stop, config.batch_frames)
+                windows.append((range(start, stop), segment))
+                start = stop
+    return [(own, segment) for own, segment in windows if _inside(rows.frame, own).any()]
 
 
 def _inside(frame: NDArray[np.integer], span: range) -> NDArray[np.bool_]:

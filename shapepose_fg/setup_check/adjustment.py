@@ -23,6 +23,8 @@ PARAMETERS = ("turn x", "turn y", "turn z", "move x", "move y", "move z", "centr
 principal point (px), and the logarithm of the focal length."""
 Q = len(PARAMETERS)
 TURN, CENTRE, FOCAL, POSE = [0, 1, 2], [6, 7], [8], [0, 1, 2, 3, 4, 5]
+_MOST_ZOOM = 5.0
+"""A step of the focal length's logarithm beyond this is no camera's, and would soon be no number."""
 _WEAK = 1e-9
 """The information that a point has without any view, as a part of what it has: two rays may be parallel."""
 
@@ -93,6 +95,6 @@ def changed(views: Views, change: Array) -> Views:
     cTw = Rotation.from_rotvec(change[:, 0:3]).as_matrix() @ views.cTw
     cTw[:, :, 3] += change[:, 3:6]
     K = views.K.copy()
-    K[:, :2, :2] *= np.exp(change[:, 8])[:, None, None]
+    K[:, :2, :2] *= np.exp(np.clip(change[:, 8], -_MOST_ZOOM, _MOST_ZOOM))[:, None, None]
     K[:, :2, 2] += change[:, 6:8]
     return Views(K, cTw)

@@ -1,20 +1,21 @@
 """What is wrong with a set-up: one finding after the other, gross mistakes first."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import DetectionSequence
-from shapepose_fg.setup_check.changes import Change, Kind, gross_mistake, lag_of, lags, latest
-from shapepose_fg.setup_check.duplicates import Duplicate, duplicates
 from shapepose_fg.setup_check.evidence import Evidence, Look, Setup, gather
-from shapepose_fg.setup_check.lag import Lag
-from shapepose_fg.setup_check.people import Build, build_of
-from shapepose_fg.setup_check.small import SHIFT, SmallErrors, other_pose, small_errors, with_small_errors
+from shapepose_fg.setup_check.findings import Finding, Kind
+from shapepose_fg.setup_check.hypotheses import gross_mistake
+from shapepose_fg.setup_check.lag import Lag, lag_of, lags
+from shapepose_fg.setup_check.plain import Build, build_of, duplicates
+from shapepose_fg.setup_check.small import SHIFT, Problem, SmallErrors
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 _MOST_FINDINGS = 4
 """More mistakes than this are not told apart."""
@@ -45,30 +46,8 @@ _TURN_DEG = 0.6
 _NOBODY = 0.05
 """With fewer people than this for each sighting, cameras see no people in common."""
 _LAG_ROUNDS, _LAG_NEAR = 6, 8
-_PLAIN_TURN_DEG = 3.0
-"""A camera that is turned by more is called turned, wherever it is."""
 _SHORTEST, _TALLEST = 0.9, 2.4
 """Median statures, metres, outside of which it is the calibration's unit and not the people."""
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One thing that is wrong with a set-up."""
-
-    kind: Kind
-    """What it looks like."""
-    cameras: tuple[int, ...]
-    """Cameras that it is about; none where it is about people, all where all share it."""
-    amount: float = 0.0
-    """Degrees, frames (positive is late), the factor of a focal length or picture, the stature in metres."""
-    shift_px: tuple[tuple[float, float], ...] = ()
-    """For each camera, how far its principal point seems to be off: right and down, pixels."""
-    moved: float = 0.0
-    """How far the camera was moved, metres."""
-    axis: str = ""
-    """The axis that is up for the people."""
-    duplicate: Duplicate | None = None
-    """Which two cameras are one."""
 
 
 @dataclass(frozen=True)
@@ -80,10 +59,8 @@ class Diagnosis:
     """The set-up as it was given."""
     corrected: Look
     """The set-up with the findings put right, but for small errors."""
-    small: SmallErrors | None
-    """Small errors of all cameras that remain after that; None with too few people."""
-    lags: tuple[Lag, ...] = field(default=())
-    """Each camera's offset in time that remains."""
+    lags: tuple[Lag, ...] = ()
+    """Each camera's offset in time that remains; none with too few people."""
     build: Build | None = None
     """The people, in the corrected set-up."""
 
@@ -93,48 +70,44 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
     evidence = gather(detections, range(len(detections)) if frames is None else frames)
     given = Look(evidence, Setup.given(rig))
     findings, evidence = _twice(given, rig)
+    findings += _blind(given)
     look = Look(evidence, given.setup)
     if len(rig) < 2 or len(look.sightings) < MIN_SIGHTINGS:
-        return Diagnosis((*findings, *_blind(given)), given, look, None)
-    findings += _blind(given)
+        return Diagnosis(tuple(findings), given, look)
     rng = np.random.default_rng(0)
-    while len(findings) < _MOST_FINDINGS:
-        change = gross_mistake(look, rng)
-        if change is None:
-            break
-        findings.append(_finding(change))
+    while len(findings) < _MOST_FINDINGS and (change := gross_mistake(look, rng)) is not None:
+        findings.append(change.finding)
         look = Look(evidence, change.setup)
     if len(look.groups()) < MIN_SIGHTINGS // 2:
         none = look.cameras_used > 1 and len(look.groups()) < _NOBODY * len(look.sightings)
-        return Diagnosis((*findings, *(_nobody(look) if none else [])), given, look, None)
-    small = small_errors(look)
-    refined = with_small_errors(look, small)
-    found = lags(refined)
+        return Diagnosis((*findings, *(_nobody(look) if none else [])), given, look)
+    problem = Problem.of(look)
+    small = problem.small_errors()
+    remaining = lags(refined := look.with_views(small.views))
     for _ in range(_MOST_FINDINGS):
-        late = latest(refined, found)
-        if late is None:
+        late = [view for view, lag in enumerate(remaining) if abs(lag.frames) >= 2 and lag.is_offset]
+        if len(late) == 0:
             break
-        view, before = late.cameras[0], look.setup.lag
-        look, small, refined = _settled(look, view, int(late.amount))
-        findings = _with_late(findings, view, int(look.setup.lag[view] - before[view]))
-        found = lags(refined)
+        view = max(late, key=lambda view: remaining[view].gain)
+        before = look.setup.lag[view]
+        look, problem, small = _settled(look, view, remaining[view].frames)
+        findings = _with_late(findings, view, int(look.setup.lag[view] - before))
+        remaining = lags(refined := look.with_views(small.views))
     known = {view for finding in findings for view in finding.cameras}
-    findings += _small_findings(look, small, known)
+    findings += _small_findings(look, problem, small, known)
     findings += _unfit(look, known)
     build = build_of(refined.structure()[1].points, detections.skeleton)
     findings += _of_people(build, rig)
-    return Diagnosis(tuple(findings), given, look, small, tuple(found), build)
+    return Diagnosis(tuple(findings), given, look, tuple(remaining), build)
 
 
 def _twice(look: Look, rig: Rig) -> tuple[list[Finding], Evidence]:
     """Cameras that are listed twice, and what was seen without one of each two, which fits the others less."""
-    findings, evidence = list[Finding](), look.evidence
-    gone: set[int] = set()
-    for pair in duplicates(rig, evidence):
-        if {pair.first, pair.second} & gone:
-            continue
-        gone.add(min(pair.second, pair.first, key=lambda view: look.scores[view] - 1e-6 * view))
-        findings.append(Finding(Kind.DUPLICATE, (pair.first, pair.second), duplicate=pair))
+    findings, evidence, gone = list[Finding](), look.evidence, set[int]()
+    for found in duplicates(rig, evidence):
+        if gone.isdisjoint(found.cameras):
+            gone.add(min(found.cameras[::-1], key=lambda view: look.scores[view] - 1e-6 * view))
+            findings.append(found)
     if gone:
         seen = evidence.sightings
         evidence = replace(evidence, sightings=seen.only(~np.isin(seen.view, list(gone))))
@@ -155,53 +128,46 @@ def _nobody(look: Look) -> list[Finding]:
     return [Finding(Kind.NOBODY, (), amount=float(len(look.sightings)))]
 
 
-def _finding(change: Change) -> Finding:
-    """A change as a finding: a focal length is what the calibration has over what fits."""
-    amount = 1 / change.amount if change.kind == Kind.FOCAL else change.amount
-    cameras = tuple(sorted(change.cameras))
-    kind = Kind.TURNED if change.kind == Kind.MOVED and amount > _PLAIN_TURN_DEG else change.kind
-    return Finding(kind, cameras, amount, moved=change.moved)
-
-
-def _settled(look: Look, view: int, frames: int) -> tuple[Look, SmallErrors, Look]:
-    """The recording with a camera late by about `frames`, its small errors, and both together.
+def _settled(look: Look, view: int, frames: int) -> tuple[Look, Problem, SmallErrors]:
+    """The recording with a camera late by about `frames`, and its small errors.
 
     People who move mostly one way look as if the camera was turned, so offset and turn are found in turns.
     """
     for _ in range(_LAG_ROUNDS):
         look = Look(look.evidence, look.setup.later(view, frames))
-        small = small_errors(look)
-        refined = with_small_errors(look, small)
-        more = lag_of(refined, view, _LAG_NEAR)
+        problem = Problem.of(look)
+        small = problem.small_errors()
+        more = lag_of(look.with_views(small.views), view, _LAG_NEAR)
         frames = more.frames
         if frames == 0 or more.agreement < 0:
             break
-    return look, small, refined
+    return look, problem, small
 
 
 def _with_late(findings: list[Finding], view: int, frames: int) -> list[Finding]:
     """The findings with an offset in time; a second one of the same camera mends the first."""
-    before = sum(f.amount for f in findings if f.kind == Kind.LATE and f.cameras == (view,))
-    rest = [f for f in findings if not (f.kind == Kind.LATE and f.cameras == (view,))]
-    total = before + frames
+    same = [f for f in findings if f.kind == Kind.LATE and f.cameras == (view,)]
+    total = sum(f.amount for f in same) + frames
+    rest = [f for f in findings if f not in same]
     return [*rest, Finding(Kind.LATE, (view,), total)] if total != 0 else rest
 
 
-def _small_findings(look: Look, small: SmallErrors, known: set[int]) -> list[Finding]:
+def _small_findings(look: Look, problem: Problem, small: SmallErrors, known: set[int]) -> list[Finding]:
     """Small errors that are worth naming: of one camera, or of several."""
-    largest = float(np.hypot(small.shift_deg, small.roll_deg).max())
-    if largest < _OFF_DEG and np.abs(np.log(small.focal)).max() < _OFF_FOCAL and small.pose_gain < _LEAST_GAIN:
+    largest, log = float(np.hypot(small.shift_deg, small.roll_deg).max()), np.abs(np.log(small.focal))
+    if largest < _OFF_DEG and log.max() < _OFF_FOCAL and problem.pose_gain < _LEAST_GAIN:
         return []
-    pose, shifted = other_pose(look), small_errors(look, SHIFT)
+    pose, shifted = problem.other_pose(), problem.small_errors(SHIFT)
     if pose.cost < min(small.cost, shifted.cost) - _POSE_GAIN and pose.view not in known:
         kind = Kind.TURNED if pose.turned_deg > 1 else Kind.MOVED
         return [Finding(kind, (pose.view,), pose.turned_deg, moved=pose.moved)]
-    turned, focal = _off(small, shifted)
+    turned, focal = _off(problem, small, shifted)
     off = np.flatnonzero(turned | focal)
     if len(off) == 0:
         return []
     # Three cameras cannot tell which of their small errors belong to which.
-    if len(off) == 1 and look.cameras_used > 3:
+    tells_apart = look.cameras_used > 3
+    if len(off) == 1 and tells_apart:
         view = int(off[0])
         if view in known:
             return []
@@ -212,11 +178,11 @@ def _small_findings(look: Look, small: SmallErrors, known: set[int]) -> list[Fin
             return [found if found.amount > _TURN_DEG else replace(found, kind=Kind.PRINCIPAL_POINT)]
     if shifted.cost > _MOST_COST:
         return []
-    shift = np.where(_known(known, look), 0.0, shifted.shift_deg)
-    order = np.argsort(-shift)
-    first, second = shift[order[0]], shift[order[1]]
-    findings = []
-    if look.cameras_used > 3 and first > _OUTLIER_DEG and first > _OUTLIER_RATIO * second:
+    shift = shifted.shift_deg.copy()
+    shift[list(known)] = 0.0
+    order, findings = np.argsort(-shift), list[Finding]()
+    first, second = shift[order[:2]]
+    if tells_apart and first > _OUTLIER_DEG and first > _OUTLIER_RATIO * second:
         findings.append(_turned(shifted, int(order[0])))
         shift[order[0]] = 0.0
     rest = np.flatnonzero(shift > _NOTABLE_DEG)
@@ -226,19 +192,14 @@ def _small_findings(look: Look, small: SmallErrors, known: set[int]) -> list[Fin
     return findings
 
 
-def _off(small: SmallErrors, shifted: SmallErrors) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _off(problem: Problem, small: SmallErrors, shifted: SmallErrors) -> tuple[Mask, Mask]:
     """(V,) whether each camera is turned, and whether its focal length is wrong, beyond what people can tell."""
-    roll = np.abs(small.roll_deg)
-    sure = np.hypot(small.shift_deg / small.shift_sigma_deg, roll / (2 * small.roll_sigma_deg)) > _SURE
+    shift_sigma, roll_sigma, focal_sigma = problem.sigmas(small.views)
+    roll, log = np.abs(small.roll_deg), np.abs(np.log(small.focal))
+    sure = np.hypot(small.shift_deg / shift_sigma, roll / (2 * roll_sigma)) > _SURE
     turned = (np.hypot(small.shift_deg, roll) > _OFF_DEG) & sure
     turned |= (small.shift_deg > _OFF_DEG) & (shifted.cost < _MOST_COST)
-    log = np.abs(np.log(small.focal))
-    return turned, (log > _OFF_FOCAL) & (log > _SIGMAS * small.focal_sigma)
-
-
-def _known(known: set[int], look: Look) -> NDArray[np.bool_]:
-    """(V,) cameras of which something is said already."""
-    return np.isin(np.arange(look.view_count), list(known))
+    return turned, (log > _OFF_FOCAL) & (log > _SIGMAS * focal_sigma)
 
 
 def _turned(small: SmallErrors, view: int) -> Finding:
@@ -249,18 +210,17 @@ def _turned(small: SmallErrors, view: int) -> Finding:
 
 def _unfit(look: Look, known: set[int]) -> list[Finding]:
     """Cameras that fit nothing, without any explanation."""
-    fits = look.scores
     seen = np.bincount(look.sightings.view, minlength=look.view_count)
-    bad = [v for v in range(look.view_count) if fits[v] < _UNFIT and seen[v] >= MIN_SIGHTINGS and v not in known]
-    return [Finding(Kind.UNFIT, (view,), float(fits[view])) for view in bad]
+    bad = np.flatnonzero((look.scores < _UNFIT) & (seen >= MIN_SIGHTINGS)).tolist()
+    return [Finding(Kind.UNFIT, (view,), float(look.scores[view])) for view in bad if view not in known]
 
 
 def _of_people(build: Build, rig: Rig) -> list[Finding]:
     """What people say of the unit and of the up axis."""
-    findings = []
-    if build.count >= MIN_SIGHTINGS and not _SHORTEST <= build.stature <= _TALLEST:
-        findings.append(Finding(Kind.UNIT, (), build.stature))
-    length = float(np.linalg.norm(build.up))
-    if build.count >= MIN_SIGHTINGS and length > 0.7 and build.axis != rig.up:
+    if build.count < MIN_SIGHTINGS:
+        return []
+    right = _SHORTEST <= build.stature <= _TALLEST
+    findings = [] if right else [Finding(Kind.UNIT, (), build.stature)]
+    if (length := float(np.linalg.norm(build.up))) > 0.7 and build.axis != rig.up:
         findings.append(Finding(Kind.UP, (), length, axis=build.axis))
     return findings

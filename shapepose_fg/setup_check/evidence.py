@@ -1,5 +1,6 @@
 """What the check looks at: people seen at some frames of a recording, and the cameras as they are taken to be."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -61,15 +62,12 @@ class Setup:
         """One of the cameras."""
         return Pinhole(self.views.K[view], self.views.cTw[view])
 
-    def with_camera(self, view: int, camera: Pinhole) -> "Setup":
-        """The same with another camera in the place of one."""
+    def with_cameras(self, cameras: Mapping[int, Pinhole]) -> "Setup":
+        """The same with other cameras in the place of some."""
         K, cTw = self.views.K.copy(), self.views.cTw.copy()
-        K[view], cTw[view] = camera.K, camera.cTw
+        for view, camera in cameras.items():
+            K[view], cTw[view] = camera.K, camera.cTw
         return replace(self, views=Views(K, cTw))
-
-    def exchanged(self, first: int, second: int) -> "Setup":
-        """The same with two cameras in each other's place."""
-        return self.with_camera(first, self.camera(second)).with_camera(second, self.camera(first))
 
     def later(self, view: int, frames: int) -> "Setup":
         """The same with one camera known to be late."""
@@ -105,6 +103,10 @@ class Look:
     def __init__(self, evidence: Evidence, setup: Setup) -> None:
         self.evidence, self.setup = evidence, setup
         self._others: dict[tuple[int, ...], Others] = {}
+
+    def with_views(self, views: Views) -> "Look":
+        """The same recording with other cameras."""
+        return Look(self.evidence, replace(self.setup, views=views))
 
     @cached_property
     def shifted(self) -> Sightings:
@@ -165,12 +167,17 @@ class Look:
     @property
     def _pair_score(self) -> float:
         """How well two cameras fit each other, where there are no more."""
-        views = tuple(np.unique(self.sightings.view).tolist())
+        views = np.unique(self.sightings.view).tolist()
         if len(views) < 2:
             return 0.0
-        possible = possible_matches(*(self.seen_by(view).frame for view in views))
-        error = errors_of(self.pairs, group(self.pairs, len(self.sightings), views), *views)
+        _, error, possible = self.pair(*views)
         return float((1 - error / GATE).sum() / max(possible, 1))
+
+    def pair(self, first: int, second: int) -> tuple[Groups, Array, int]:
+        """P people that two cameras see, by how much their rays miss (P,), and how many could be matched."""
+        groups = group(self.pairs, len(self.sightings), (first, second))
+        possible = possible_matches(self.seen_by(first).frame, self.seen_by(second).frame)
+        return groups, errors_of(self.pairs, groups, first, second), possible
 
     @cached_property
     def total(self) -> float:

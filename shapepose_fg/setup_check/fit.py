@@ -1,6 +1,6 @@
 """How well one camera fits the people that the others see, and which change of it would fit them."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -24,6 +24,8 @@ _WIDTH = 0.03
 """Width of the Cauchy kernel, as a part of a person's size in the picture."""
 _STEPS = 4
 """Steps between matchings."""
+CORNER = np.array([-0.5, -0.5])
+"""The corner of a picture: pixels are counted from the middle of the first."""
 
 
 @dataclass(frozen=True)
@@ -122,39 +124,33 @@ def posed_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
 
 def zoomed_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
     """The camera with the focal length by which it sees `points` (N, 3) at `xy` (N, 2)."""
-    return _scaled_to(points, xy, camera, camera.K[:2, 2], scaled_focal)
+    return _scaled_to(points, xy, camera, camera.K[:2, 2])
 
 
 def resized_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
     """The camera of pictures that are larger or smaller, in which `points` (N, 3) lie at `xy` (N, 2)."""
-    return _scaled_to(points, xy, camera, np.zeros(2), scaled_picture)
+    return _scaled_to(points, xy, camera, CORNER)
 
 
-def _scaled_to(
-    points: Array, xy: Array, camera: Pinhole, centre: Array, scaled: Callable[[Array, float], Array]
-) -> Pinhole | None:
-    """The camera with its K `scaled` by how much farther from `centre` than it says the points are seen."""
+def _scaled_to(points: Array, xy: Array, camera: Pinhole, centre: Array) -> Pinhole | None:
+    """The camera scaled by how much farther from `centre` (2,) than it says the points are seen."""
     at = (points @ camera.cTw[:, :3].T + camera.cTw[:, 3]) @ camera.K.T
     if not (at[:, 2] > 0).all():
         return None
     direction = at[:, :2] / at[:, 2:] - centre
     factor = float((direction * (xy - centre)).sum() / (direction**2).sum())
-    return Pinhole(scaled(camera.K, factor), camera.cTw) if 0.1 < factor < 10 else None
+    return scaled(camera, factor, centre) if 0.1 < factor < 10 else None
 
 
-def scaled_focal(K: Array, factor: float) -> Array:
-    """K with another focal length."""
-    new = K.copy()
-    new[:2, :2] *= factor
-    return new
+def scaled(camera: Pinhole, factor: float, centre: Array) -> Pinhole:
+    """The camera whose pixels are `factor` times as far from `centre` (2,).
 
-
-def scaled_picture(K: Array, factor: float) -> Array:
-    """K of pictures `factor` times as large; pixels are counted from the middle of the first."""
-    new = K.copy()
-    new[:2, :2] *= factor
-    new[:2, 2] = factor * (K[:2, 2] + 0.5) - 0.5
-    return new
+    About the principal point that is another focal length, about `CORNER` pictures of another size.
+    """
+    K = camera.K.copy()
+    K[:2, :2] *= factor
+    K[:2, 2] = centre + factor * (K[:2, 2] - centre)
+    return Pinhole(K, camera.cTw)
 
 
 def refined(others: Others, seen: Sightings, camera: Pinhole, columns: tuple[int, ...]) -> Pinhole:

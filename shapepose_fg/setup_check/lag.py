@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.setup_check.evidence import Look
 from shapepose_fg.setup_check.fit import Others, Pinhole
-from shapepose_fg.setup_check.matching import GATE, residuals, same_frame
+from shapepose_fg.setup_check.matching import GATE, least_of_each, residuals, same_frame
 from shapepose_fg.setup_check.sightings import MIN_JOINTS, Sightings
 
 Array = NDArray[np.float64]
@@ -20,6 +21,9 @@ _STRIDE = 4
 """Offsets are tried at every fourth frame first."""
 _MOST_PEOPLE = 100
 """People that are enough to tell an offset by."""
+_LEAST_FRAMES = 40
+"""In fewer frames people hardly move far enough to tell a small offset in time from chance: in 20 frames of the
+built-in scene a camera that is in time looked 4 frames early."""
 
 
 @dataclass(frozen=True)
@@ -35,28 +39,38 @@ class Lag:
     none, 0 without motion. Of the half of the frames in which it is less: an offset is in both halves, while
     in one of them people may come by chance to where they were."""
 
+    @property
+    def is_offset(self) -> bool:
+        """Whether it is more than chance."""
+        return self.agreement > _MIN_AGREEMENT and self.gain > _MIN_LAG_GAIN
 
-def is_offset(lag: Lag) -> bool:
-    """Whether an offset is more than chance."""
-    return lag.agreement > _MIN_AGREEMENT and lag.gain > _MIN_LAG_GAIN
+
+NONE = Lag(0, 0.0, 0.0)
 
 
-def find_lag(others: Others, seen: Sightings, camera: Pinhole, most: int) -> Lag:
-    """The offset within `most` frames at which `seen`, the camera's sightings at all frames, fit people best."""
+def lags(look: Look) -> list[Lag]:
+    """Each camera's offset in time against the others; none is told in a short recording that fits as it is."""
+    if len(np.unique(look.evidence.sightings.frame)) < _LEAST_FRAMES:
+        return [NONE] * look.view_count
+    return [lag_of(look, view) for view in range(look.view_count)]
+
+
+def lag_of(look: Look, view: int, most: int | None = None) -> Lag:
+    """A camera's offset in time against the others, up to `most` frames: where its sightings fit people best."""
+    most = look.evidence.most_lag if most is None else min(most, look.evidence.most_lag)
+    others, seen, camera = look.others(view), look.seen_by(view, every_frame=True), look.setup.camera(view)
     step = max(1, len(others) // _MOST_PEOPLE)
     others = Others(others.frame[::step], others.points[::step])
-    size = np.append(seen.size_px, np.inf)
     still = _nearest(others, seen, camera, 0)
 
     def tried(lag: int) -> Lag:
-        moved = _nearest(others, seen, camera, lag)
-        return _compare(lag, others.frame, seen, size, still, moved)
+        return _compare(lag, others.frame, seen, still, _nearest(others, seen, camera, lag))
 
-    first = {lag: tried(lag) for lag in range(-(most // _STRIDE) * _STRIDE, most + 1, _STRIDE)}
-    best = max(first.values(), key=_worth)
+    first = [tried(lag) for lag in range(-(most // _STRIDE) * _STRIDE, most + 1, _STRIDE)]
+    best = max(first, key=_worth)
     near = [tried(best.frames + d) for d in range(1 - _STRIDE, _STRIDE) if d != 0 and abs(best.frames + d) <= most]
     best = max([best, *near], key=_worth)
-    return best if best.gain > 0 else Lag(0, 0.0, 0.0)
+    return best if best.gain > 0 else NONE
 
 
 def _worth(lag: Lag) -> float:
@@ -83,10 +97,7 @@ def _nearest(others: Others, seen: Sightings, camera: Pinhole, lag: int) -> _Nea
     both = ~np.isnan(error)
     mean = np.where(both, np.minimum(error, GATE), 0).sum(axis=1) / np.maximum(both.sum(axis=1), 1)
     mean = np.where(both.sum(axis=1) >= MIN_JOINTS, mean, GATE)
-    order = np.lexsort((mean, person))
-    first = np.ones(len(order), dtype=bool)
-    first[1:] = person[order][1:] != person[order][:-1]
-    best = order[first]
+    best = least_of_each(person, mean)
     near = best[mean[best] < 0.9 * GATE]
     found = np.full(len(others), -1, dtype=np.intp)
     found[person[near]] = sighting[near]
@@ -95,9 +106,7 @@ def _nearest(others: Others, seen: Sightings, camera: Pinhole, lag: int) -> _Nea
     return _Nearest(np.isin(others.frame + lag, seen.frame), found, errors)
 
 
-def _compare(
-    lag: int, frame: NDArray[np.integer], seen: Sightings, size: Array, still: _Nearest, moved: _Nearest
-) -> Lag:
+def _compare(lag: int, frame: NDArray[np.integer], seen: Sightings, still: _Nearest, moved: _Nearest) -> Lag:
     """How much better people fit at an offset than without: joints of people that both have, or one has."""
     usable = still.there & moved.there & ((still.sighting >= 0) | (moved.sighting >= 0))
     a, b = still.sighting[usable], moved.sighting[usable]
@@ -105,7 +114,8 @@ def _compare(
     # Who is out of the gate at one of the offsets has moved by that much.
     error_a = np.where((a < 0)[:, None] & ~np.isnan(error_b), GATE, error_a)
     error_b = np.where((b < 0)[:, None] & ~np.isnan(error_a), GATE, error_b)
-    xy = np.concatenate([seen.xy, np.full((1, *seen.xy.shape[1:]), np.inf)])
+    xy = np.concatenate([seen.xy, np.full((1, *seen.xy.shape[1:]), np.inf)])  # the last for nobody
+    size = np.append(seen.size_px, np.inf)
     with np.errstate(invalid="ignore"):
         way = np.linalg.norm(xy[a] - xy[b], axis=-1) / np.minimum(size[a], size[b])[:, None]
     way = np.where(np.isnan(way), GATE, np.minimum(way, GATE))

@@ -69,7 +69,7 @@ def centres_of(views: Views) -> Array:
 
 def pair_up(sightings: Sightings, views: Views) -> Pairs:
     """All pairs of sightings that may be one person under the cameras `views`."""
-    first, second = same_frame_pairs(sightings)
+    first, second = _pairs_of(sightings)
     error, points = _meeting(sightings, views, first, second)
     keep = error < GATE
     members = np.stack([first[keep], second[keep]], axis=1)
@@ -77,18 +77,11 @@ def pair_up(sightings: Sightings, views: Views) -> Pairs:
     return Pairs(members, sightings.view[members], error[keep], sightings.frame[members[:, 0]], third, third_error)
 
 
-def same_frame_pairs(sightings: Sightings) -> tuple[Index, Index]:
+def _pairs_of(sightings: Sightings) -> tuple[Index, Index]:
     """All pairs of sightings of one frame and two cameras, the camera that comes first in the rig first."""
-    order = np.argsort(sightings.frame, kind="stable")
-    frame = sightings.frame[order]
-    follow = np.searchsorted(frame, frame, side="right") - np.arange(len(frame)) - 1
-    first = np.repeat(np.arange(len(frame)), follow)
-    step = np.arange(len(first)) - np.repeat(np.cumsum(follow) - follow, follow)
-    first, second = order[first], order[first + 1 + step]
-    swap = sightings.view[first] > sightings.view[second]
-    first, second = np.where(swap, second, first), np.where(swap, first, second)
-    differ = sightings.view[first] != sightings.view[second]
-    return first[differ], second[differ]
+    first, second = same_frame(sightings.frame, sightings.frame)
+    apart = sightings.view[first] < sightings.view[second]
+    return first[apart], second[apart]
 
 
 def _meeting(sightings: Sightings, views: Views, first: Index, second: Index) -> tuple[Array, Array]:
@@ -129,10 +122,7 @@ def _others(sightings: Sightings, views: Views, members: Index, points: Array) -
         person, sighting, error = distances(
             frame[beside], points[beside], sightings.only(of_view), views.K[view], views.cTw[view]
         )
-        order = np.lexsort((error, person))
-        person, sighting, error = person[order], sighting[order], error[order]
-        best = np.ones(len(person), dtype=bool)
-        best[1:] = person[1:] != person[:-1]
+        best = least_of_each(person, error)
         third[beside[person[best]], view] = of_view[sighting[best]]
         third_error[beside[person[best]], view] = error[best]
     return third, third_error
@@ -163,6 +153,12 @@ def same_frame(first: Index, second: Index) -> tuple[Index, Index]:
     return i, order[start[i] + step]
 
 
+def least_of_each(key: Index, value: Array) -> Index:
+    """The row with the least `value` (N,) of each `key` (N,); the first of equal ones."""
+    order = np.lexsort((value, key))
+    return order[np.unique(key[order], return_index=True)[1]]
+
+
 def residuals(points: Array, xy: Array, K: Array, cTw: Array) -> Array:
     """Projection minus detection (N, J, 2), pixels; infinite behind the camera, NaN where nothing was seen."""
     camera = points @ cTw[:, :3].T + cTw[:, 3]
@@ -185,18 +181,11 @@ def group(pairs: Pairs, count: int, views: tuple[int, ...]) -> Groups:
     live = np.flatnonzero(allowed[pairs.views].all(axis=1))
     members, thirds = pairs.members, pairs.third
     frames, rows = [], []
-    while len(live) > 0:
-        live = live[free[members[live]].all(axis=1)]
-        if len(live) == 0:
-            break
+    while len(live := live[free[members[live]].all(axis=1)]) > 0:
         supported = free[thirds[live]] & (thirds[live] >= 0) & allowed & (pairs.third_error[live] < GATE)
         worth = 1 - pairs.error[live] / GATE
         worth = worth + np.where(supported, 1 - pairs.third_error[live] / GATE, 0).sum(axis=1)
-        order = np.lexsort((-worth, pairs.frame[live]))
-        frame = pairs.frame[live][order]
-        first = np.ones(len(order), dtype=bool)
-        first[1:] = frame[1:] != frame[:-1]
-        best = order[first]
+        best = least_of_each(pairs.frame[live], -worth)
         member = np.where(supported[best], thirds[live[best]], -1)
         chosen = live[best]
         member[np.arange(len(best))[:, None], pairs.views[chosen]] = members[chosen]

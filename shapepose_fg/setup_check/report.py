@@ -1,6 +1,5 @@
 """The check of a set-up as one value: what is wrong in words, and the figures; for run.json and the terminal."""
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import combinations
 from typing import Any
@@ -10,12 +9,11 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import DetectionSequence
-from shapepose_fg.setup_check.diagnosis import Diagnosis, Finding, diagnose
+from shapepose_fg.setup_check.diagnosis import Diagnosis, diagnose
 from shapepose_fg.setup_check.evidence import Look
-from shapepose_fg.setup_check.fit import match, possible_matches
-from shapepose_fg.setup_check.lag import is_offset
-from shapepose_fg.setup_check.matching import GATE, errors_of, group, residuals
-from shapepose_fg.setup_check.words import sentence
+from shapepose_fg.setup_check.findings import Finding, sentence
+from shapepose_fg.setup_check.fit import match
+from shapepose_fg.setup_check.matching import GATE, residuals
 
 Array = NDArray[np.float64]
 
@@ -93,82 +91,71 @@ class SetupReport:
         }
 
 
-def check_setup(detections: DetectionSequence, rig: Rig, frames: range | None = None) -> SetupReport:
+def check_setup(
+    detections: DetectionSequence, rig: Rig, frames: range | None = None, more: tuple[Finding, ...] = ()
+) -> SetupReport:
     """Whether cameras and detections of a recording fit each other, and what it looks like where they do not.
 
-    Looks at frames spread over `frames` (all by default) and needs no reconstruction; takes about a second.
+    Looks at frames spread over `frames` (all by default) and needs no reconstruction; takes about a second. `more`
+    was found by others.
     """
-    return report_of(diagnose(detections, rig, frames), rig)
-
-
-def report_of(diagnosis: Diagnosis, rig: Rig, more: tuple[Finding, ...] = ()) -> SetupReport:
-    """A diagnosis as it is said, with findings that others made."""
-    findings = (*diagnosis.findings, *more)
-    build = diagnosis.build
+    diagnosis = diagnose(detections, rig, frames)
+    findings, build = (*diagnosis.findings, *more), diagnosis.build
     return SetupReport(
         findings,
         tuple(sentence(finding, rig) for finding in findings),
-        camera_figures(diagnosis, rig),
-        pair_figures(diagnosis.look, rig.names),
+        _camera_figures(diagnosis, rig),
+        tuple(_pair_figures(diagnosis.look, rig, *pair) for pair in combinations(range(len(rig)), 2)),
         len(diagnosis.look.evidence.anchors),
         build.stature if build is not None and build.count > 0 else None,
     )
 
 
-def camera_figures(diagnosis: Diagnosis, rig: Rig) -> tuple[CameraFigures, ...]:
+def _camera_figures(diagnosis: Diagnosis, rig: Rig) -> tuple[CameraFigures, ...]:
     """One entry for every camera."""
     look = diagnosis.look
     groups, structure = look.structure(steps=5)
     px = np.linalg.norm(structure.residual, axis=-1)
     mm = 1e3 * px * structure.depth / look.setup.views.focal_px
     seen = np.bincount(look.sightings.view, minlength=len(rig))
-    left = [lag.frames if is_offset(lag) else 0 for lag in diagnosis.lags] or [0] * len(rig)
+    remaining = [lag.frames if lag.is_offset else 0 for lag in diagnosis.lags] or [0] * len(rig)
+    late = diagnosis.corrected.setup.lag + remaining  # what was found, and what remains
     found = []
     for view, name in enumerate(rig.names):
         others, mine, camera = look.others(view), look.seen_by(view), look.setup.camera(view)
         matched = match(others, mine, camera)
         points = others.points[matched.person]
         out_px = np.linalg.norm(residuals(points, mine.xy[matched.sighting], camera.K, camera.cTw), axis=-1)
-        depth = (points @ camera.cTw[:, :3].T + camera.cTw[:, 3])[..., 2]
-        out_mm = 1e3 * np.where(np.isfinite(out_px), out_px, np.nan) * depth / look.setup.views.focal_px[view]
+        depth = points @ camera.cTw[2, :3] + camera.cTw[2, 3]
+        out_px = np.where(np.isfinite(out_px), out_px, np.nan)
         figures = CameraFigures(
             name,
             int(seen[view]),
             float((groups.member[:, view] >= 0).sum() / max(seen[view], 1)),
-            _quantile(px[..., view], 0.5),
-            _quantile(px[..., view], 0.9),
-            _quantile(mm[..., view], 0.5),
-            _quantile(mm[..., view], 0.9),
-            _quantile(out_px, 0.5),
-            _quantile(out_mm, 0.5),
+            *quantiles(px[..., view], 0.5, 0.9),
+            *quantiles(mm[..., view], 0.5, 0.9),
+            *quantiles(out_px, 0.5),
+            *quantiles(1e3 * out_px * depth / look.setup.views.focal_px[view], 0.5),
             float(len(matched.person) / max(matched.possible, 1)),
-            int(diagnosis.corrected.setup.lag[view]) + left[view],  # what was found, and what remains
+            int(late[view]),
         )
         found.append(figures)
     return tuple(found)
 
 
-def pair_figures(look: Look, names: Sequence[str]) -> tuple[PairFigures, ...]:
-    """One entry for every pair of cameras."""
-    return tuple(_pair_figures(look, names, a, b) for a, b in combinations(range(len(names)), 2))
-
-
-def _pair_figures(look: Look, names: Sequence[str], first: int, second: int) -> PairFigures:
-    groups = group(look.pairs, len(look.sightings), (first, second))
-    seen = look.sightings
-    possible = possible_matches(*(seen.frame[seen.view == view] for view in (first, second)))
+def _pair_figures(look: Look, rig: Rig, first: int, second: int) -> PairFigures:
+    names = rig.names[first], rig.names[second]
+    groups, error, possible = look.pair(first, second)
     if possible == 0:
-        return PairFigures(names[first], names[second], None, None)
-    error = errors_of(look.pairs, groups, first, second)
-    miss = error * seen.size_px[groups.member[:, first]]
-    return PairFigures(
-        names[first], names[second], float((error < GATE / 2).sum() / possible), _quantile(miss, 0.5)
-    )
+        return PairFigures(*names, None, None)
+    miss = error * look.sightings.size_px[groups.member[:, first]]
+    return PairFigures(*names, float((error < GATE / 2).sum() / possible), *quantiles(miss, 0.5))
 
 
-def _quantile(values: Array, part: float) -> float | None:
+def quantiles(values: Array, *parts: float) -> list[float | None]:
+    """Of the finite ones; None where there are none."""
     values = values[np.isfinite(values)]
-    return float(np.quantile(values, part)) if len(values) > 0 else None
+    return [float(np.quantile(values, part)) if len(values) > 0 else None for part in parts]
 
 
 def rounded(value: Any) -> Any:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.camera import Views
-from shapepose_fg.setup_check.matching import Groups
+from shapepose_fg.setup_check.matching import Groups, centres_of
 from shapepose_fg.setup_check.sightings import Sightings
 
 Array = NDArray[np.float64]
@@ -83,7 +83,7 @@ def _linear(xy: Array, weight: Array, views: Views) -> Array:
     rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
     seen = weight > 0
     rays = np.where(seen[..., None], rays, 0.0)
-    centres = -np.einsum("vba,vb->va", views.cTw[:, :, :3], views.cTw[:, :, 3])
+    centres = centres_of(views)
     # Sum over views of (1 - d d') x = sum of (1 - d d') c.
     A = seen.sum(axis=-1)[..., None, None] * np.eye(3) - rays.swapaxes(-1, -2) @ rays
     along = (rays * centres).sum(axis=-1, keepdims=True)

@@ -1,14 +1,16 @@
-"""The check of a set-up on a terminal: sentences, a row for each camera, and how pairs of cameras agree."""
+"""The check of a set-up on a terminal of 80 columns: sentences, a row for each camera, how pairs agree."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from rich.console import Group, RenderableType
-from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from shapepose_fg.setup_check.camera_use import short
+from shapepose_fg.setup_check.in_result import CameraUse
 from shapepose_fg.setup_check.report import CameraFigures, PairFigures, SetupReport
+
+_WIDE = 12
+"""Longest name of a camera that is written out; of a longer one the end is, which tells cameras apart."""
 
 
 def setup_report(report: SetupReport) -> RenderableType:
@@ -17,6 +19,26 @@ def setup_report(report: SetupReport) -> RenderableType:
     if len(report.cameras) > 2:
         parts += [Text(), _pairs(report.cameras, report.pairs)]
     return Group(*parts)
+
+
+def use_table(uses: Sequence[CameraUse]) -> Table:
+    """A row for each camera of a reconstruction."""
+    return _table(
+        ("camera", "offered", "used", "error px", "mm", "used px", "left out px", "mm"),
+        (
+            (
+                _short(each.camera),
+                f"{each.offered}",
+                f"{100 * each.used / max(each.offered, 1):.0f} %",
+                _both(each.given.median_px, each.given.high_px),
+                _both(each.given.median_mm, each.given.high_mm),
+                _both(each.after_gates.median_px, each.after_gates.high_px),
+                _two(each.left_out.median_px),
+                _two(each.left_out.median_mm),
+            )
+            for each in uses
+        ),
+    )
 
 
 def _sentences(report: SetupReport) -> RenderableType:
@@ -33,53 +55,80 @@ def _sentences(report: SetupReport) -> RenderableType:
 
 def _cameras(cameras: Sequence[CameraFigures]) -> RenderableType:
     """How each camera fits."""
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
-    for name in ("camera", "people", "shared", "error px", "mm", "left out px", "mm", "fits", "late"):
-        table.add_column(name, justify="left" if name == "camera" else "right")
-    for each in cameras:
-        table.add_row(
-            short(each.camera),
-            str(each.people),
-            f"{100 * each.matched:.0f} %",
-            f"{_number(each.median_px)} / {_number(each.high_px)}",
-            f"{_number(each.median_mm)} / {_number(each.high_mm)}",
-            _number(each.left_out_px),
-            _number(each.left_out_mm),
-            Text(f"{100 * each.left_out_matched:.0f} %", style="" if each.left_out_matched > 0.5 else "yellow"),
-            f"{each.late_frames:+d}" if each.late_frames != 0 else "0",
-        )
+    table = _table(
+        ("camera", "people", "shared", "error px", "mm", "left out px", "mm", "fits", "late"),
+        (
+            (
+                _short(each.camera),
+                str(each.people),
+                f"{100 * each.matched:.0f} %",
+                f"{_two(each.median_px)} / {_two(each.high_px)}",
+                f"{_two(each.median_mm)} / {_two(each.high_mm)}",
+                _two(each.left_out_px),
+                _two(each.left_out_mm),
+                _share(each.left_out_matched),
+                f"{each.late_frames:+d}" if each.late_frames != 0 else "0",
+            )
+            for each in cameras
+        ),
+    )
     note = (
         "people: seen in the frames that were looked at; shared: with another camera; error: median / 90 % of"
         " joints, from where all cameras together put them; left out: median, from where the others alone put"
         " them; fits: people of the others who are matched so; late: frames."
     )
-    return Group(table, Padding(Text(note, style="dim"), (0, 0, 0, 0)))
+    return Group(table, Text(note, style="dim"))
 
 
 def _pairs(cameras: Sequence[CameraFigures], pairs: Sequence[PairFigures]) -> RenderableType:
     """How pairs of cameras agree: the share of the people that both see who fit."""
     of = {(pair.first, pair.second): pair for pair in pairs}
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
-    table.add_column("agree")
-    for each in cameras[1:]:
-        table.add_column(short(each.camera), justify="right")
-    for row, first in enumerate(cameras[:-1]):
-        cells = [_cell(of[first.camera, second.camera]) for second in cameras[row + 1 :]]
-        table.add_row(Text(short(first.camera)), *[Text()] * row, *cells)
+    table = _table(
+        ("agree", *(_short(each.camera) for each in cameras[1:])),
+        (
+            (
+                _short(first.camera),
+                *[""] * row,
+                *(_cell(of[first.camera, each.camera]) for each in cameras[row + 1 :]),
+            )
+            for row, first in enumerate(cameras[:-1])
+        ),
+    )
     return Group(table, Text("people seen by both at once who are one; how far rays miss, px", style="dim"))
+
+
+def _table(heads: Sequence[str], rows: Iterable[Sequence[str | Text]]) -> Table:
+    """A table without lines, its first column flush left."""
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
+    for column, name in enumerate(heads):
+        table.add_column(Text(name), justify="right" if column > 0 else "left", no_wrap=True)
+    for row in rows:
+        table.add_row(*(Text(each) if isinstance(each, str) else each for each in row))
+    return table
 
 
 def _cell(pair: PairFigures) -> Text:
     if pair.matched is None:
         return Text("-", style="dim")
-    words = f"{100 * pair.matched:.0f} %"
-    if pair.miss_px is not None and pair.matched > 0:
-        words += f" {pair.miss_px:.0f}"
-    return Text(words, style="" if pair.matched > 0.5 else "yellow")
+    return _share(pair.matched, f" {pair.miss_px:.0f}" if pair.miss_px is not None and pair.matched > 0 else "")
 
 
-def _number(value: float | None) -> str:
+def _share(part: float, more: str = "") -> Text:
+    """A share that stands out where it is small."""
+    return Text(f"{100 * part:.0f} %{more}", style="" if part > 0.5 else "yellow")
+
+
+def _short(name: str) -> str:
+    """A camera's name, its end where it is long."""
+    return name if len(name) <= _WIDE else f"…{name[1 - _WIDE :]}"
+
+
+def _both(median: float | None, high: float | None) -> str:
+    return f"{_two(median)} / {_two(high)}" if median is not None else "-"
+
+
+def _two(value: float | None) -> str:
     """A figure with two digits."""
     if value is None:
         return "-"
-    return f"{value:.1f}" if value < 10 else f"{value:.0f}"
+    return f"{value:.1f}" if value < 9.95 else f"{value:.0f}"

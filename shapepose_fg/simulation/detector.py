@@ -19,9 +19,9 @@ from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections, Recording
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.simulation.affinities import affinities
+from shapepose_fg.simulation.affinities import Candidates, affinities
 from shapepose_fg.simulation.detector_statistics import JOINT_GROUP, DetectorStatistics, measured
-from shapepose_fg.simulation.memory import FalseCandidateProcess, FalseCandidates, NoiseProcess, Table
+from shapepose_fg.simulation.memory import FalseCandidateProcess, FalseCandidates, NoiseProcess
 from shapepose_fg.simulation.scene import Scene
 from shapepose_fg.simulation.visibility import (
     Skin,
@@ -132,30 +132,14 @@ def simulate(
     return Recording(BODY_25, found)
 
 
-@dataclass(frozen=True)
-class _Found(Table):
-    """Candidates while they are made: D of them."""
-
-    view: NDArray[np.intp]
-    joint: NDArray[np.intp]
-    xy: Array
-    confidence: Array
-    owner: NDArray[np.bool_]
-    """(D, P) whose joint a candidate is; none's where it is false, two people's where two are one."""
-    reach_px: Array
-    """(D,) nearer than this to a better candidate of the same joint it is not seen as one of its own."""
-
-
 class Detector:
     """A detector that looks at one recording, frame after frame; its errors last."""
 
     def __init__(self, rig: Rig, people: int, fps: float, config: DetectorConfig, seed: int = 0) -> None:
         """Look at `people` people with the cameras of `rig`, `fps` frames a second."""
-        self._rig, self._config, self._seed = rig, config, seed
-        self._noise = NoiseProcess(len(rig), people, fps, config.statistics, seed)
-        self._false = FalseCandidateProcess(
-            len(rig), people, fps, config.statistics, config.false_candidates, seed
-        )
+        self._rig, self._config, self._table, self._seed = rig, config, config.statistics, seed
+        given = (len(rig), people, fps, config.statistics, seed)
+        self._noise, self._false = NoiseProcess(*given), FalseCandidateProcess(*given, config.false_candidates)
         self._frame = 0
 
     def skip_to(self, frame: int) -> None:
@@ -169,192 +153,170 @@ class Detector:
 
     def detect(self, joints: Array, visibility: Visibility) -> Detections:
         """The candidates of the next frame: BODY_25 `joints` (P, 25, 3), of which `visibility` is known."""
-        config, rig = self._config, self._rig
+        config = self._config
         noise, false = self._noise.next(self._frame), self._false.next(self._frame)
         rng = np.random.default_rng([self._seed, self._frame, 2])
         self._frame += 1
-        true_xy, depth = rig.project(joints)
-        found, captors = _report(rig, joints, true_xy, depth, visibility, config, noise, rng)
-        found = _merge(found.join(_invent(rig, false, true_xy, depth, config)))
+        true_xy, depth = self._rig.project(joints)
+        px_a_metre = self._rig.focal_px[:, None, None] / depth
+        found, reported = self._reported(joints, true_xy, px_a_metre, visibility, noise, rng)
+        metres_a_px = depth / self._rig.focal_px[:, None, None]
+        captors = self._captors(reported, true_xy, metres_a_px, visibility, noise)
+        found = _merge(found.join(self._invented(false, true_xy, depth)))
         found = found.take(rng.permutation(len(found.view)))
         pairs, affinity = affinities(
-            found.view, found.joint, found.xy, found.confidence, found.owner, true_xy, captors, config.statistics,
-            doubt=config.doubt, wrong=config.wrong_affinities, rng=rng,
-        )  # fmt: skip
+            found, true_xy, captors, self._table, doubt=config.doubt, wrong=config.wrong_affinities, rng=rng
+        )
         return Detections(found.view, found.joint, found.xy, found.confidence, pairs, affinity)
 
+    def _reported(
+        self,
+        joints: Array,
+        true_xy: Array,
+        px_a_metre: Array,
+        visibility: Visibility,
+        noise: Array,
+        rng: np.random.Generator,
+    ) -> tuple[Candidates, NDArray[np.bool_]]:
+        """The joints of people that are reported, each with its error; and which they are, (V, P, 25)."""
+        table, config, sizes = self._table, self._config, self._rig.image_sizes
+        seen = seen_from_the_front(visibility.seen, joints, self._rig.centres, table.facing)
+        seen = np.clip((seen - _HIDDEN) / (_SEEN - _HIDDEN), 0.0, 1.0)
+        hidden_as = np.where(visibility.hidden_by >= 0, 2, 1)
+        worse = self._worse(visibility, seen, noise)
+        quality = ndtr(noise[NoiseProcess.CONFIDENCE] - worse)
+        miss = ndtri(_between(table.miss[JOINT_GROUP, hidden_as], table.miss[JOINT_GROUP, 0], seen))
+        miss = ndtr(ndtri(np.minimum(config.misses * ndtr(miss + worse), 1.0)) - worse)
+        reported = visibility.in_image & (quality >= miss) & (miss < 1)
+        view, person, joint = np.nonzero(reported)
+        seen, hidden_as, group = seen[reported], hidden_as[reported], JOINT_GROUP[joint]
+        rank = (quality[reported] - miss[reported]) / (1.0 - miss[reported])
+        rows = _between(table.confidence[group, hidden_as].T, table.confidence[group, 0].T, seen).T
+        confidence, px_a_metre = table.quantile(rows, rank), px_a_metre[reported]
+        sigma_px = self._sigma_px(confidence, seen, hidden_as, px_a_metre, noise[NoiseProcess.SCALE, reported])
+        error = noise[:2, reported].T * sigma_px[:, None] * table.joint_scale[group]
+        limit = _LARGEST_ERROR_M * px_a_metre / np.maximum(np.linalg.norm(error, axis=1), 1e-9)
+        owner = np.zeros((len(view), len(joints)), dtype=bool)
+        owner[np.arange(len(view)), person] = True
+        gap_px = np.linalg.norm(true_xy[view, person, joint] - true_xy[view, person, _MIRROR[joint]], axis=-1)
+        apart = gap_px > _MIRROR_APART_M * px_a_metre
+        swap_rank = np.where(apart, ndtr(noise[NoiseProcess.SWAP, reported]), 1.0)
+        swapped = swap_rank < config.swaps * table.swap
+        owner[swapped] = False
+        found = Candidates(
+            view=view,
+            joint=np.where(swapped, _MIRROR[joint], joint),
+            xy=true_xy[reported] + config.noise * error * np.minimum(limit, 1.0)[:, None],
+            confidence=1.0 - config.doubt * (1.0 - confidence),
+            owner=owner,
+            reach_px=self._reach_px(ndtr(noise[NoiseProcess.SCALE, reported]), sizes[view, 1]),
+        )
+        in_sight = np.where(seen >= 0.5, swap_rank, 1.0)  # of which the share of duplicates was measured
+        found = found.join(self._duplicates(found, in_sight, px_a_metre, rng))
+        inside = np.all((found.xy >= 0) & (found.xy <= sizes[found.view] - 1), axis=1)
+        return found.take(inside), reported
 
-def _report(
-    rig: Rig,
-    joints: Array,
-    true_xy: Array,
-    depth: Array,
-    visibility: Visibility,
-    config: DetectorConfig,
-    noise: Array,
-    rng: np.random.Generator,
-) -> tuple[_Found, NDArray[np.intp]]:
-    """The joints of people that are reported, each with its error; and who captured the others (`_capture`)."""
-    table = config.statistics
-    seen = seen_from_the_front(visibility.seen, joints, rig.centres, table.facing)
-    seen = np.clip((seen - _HIDDEN) / (_SEEN - _HIDDEN), 0.0, 1.0)
-    hidden_as = np.where(visibility.hidden_by >= 0, 2, 1)
-    worse = _worse(visibility, seen, table, noise)
-    quality = ndtr(noise[NoiseProcess.CONFIDENCE] - worse)
-    miss = ndtri(_between(table.miss[JOINT_GROUP, hidden_as], table.miss[JOINT_GROUP, 0], seen))
-    miss = ndtr(ndtri(np.minimum(config.misses * ndtr(miss + worse), 1.0)) - worse)
-    reported = visibility.in_image & (quality >= miss) & (miss < 1)
-    view, person, joint = np.nonzero(reported)
-    seen, hidden_as, group = seen[reported], hidden_as[reported], JOINT_GROUP[joint]
-    rank = (quality[reported] - miss[reported]) / (1.0 - miss[reported])
-    rows = _between(table.confidence[group, hidden_as].T, table.confidence[group, 0].T, seen).T
-    confidence = table.quantile(rows, rank)
-    px_a_metre = rig.focal_px[view] / depth[reported]
-    error = _errors(
-        confidence, seen, hidden_as, group, px_a_metre, config, noise[:2, reported], noise[3, reported]
-    )
-    owner = np.zeros((len(view), len(joints)), dtype=bool)
-    owner[np.arange(len(view)), person] = True
-    captors = _capture(reported, true_xy, depth / rig.focal_px[:, None, None], visibility, config, noise)
-    gap_px = np.linalg.norm(true_xy[view, person, joint] - true_xy[view, person, _MIRROR[joint]], axis=-1)
-    apart = gap_px > _MIRROR_APART_M * px_a_metre
-    swap_rank = np.where(apart, ndtr(noise[NoiseProcess.SWAP, reported]), 1.0)
-    swapped = swap_rank < config.swaps * table.swap
-    owner[swapped] = False
-    found = _Found(
-        view=view,
-        joint=np.where(swapped, _MIRROR[joint], joint),
-        xy=true_xy[reported] + error,
-        confidence=1.0 - config.doubt * (1.0 - confidence),
-        owner=owner,
-        reach_px=_reach_px(ndtr(noise[NoiseProcess.SCALE, reported]), rig.image_sizes[view, 1], config),
-    )
-    in_sight = np.where(seen >= 0.5, swap_rank, 1.0)  # of which the share of duplicates was measured
-    found = found.join(_duplicates(found, in_sight, px_a_metre, config, rng))
-    inside = np.all((found.xy >= 0) & (found.xy <= rig.image_sizes[found.view] - 1), axis=1)
-    return found.take(inside), captors
+    def _duplicates(
+        self, found: Candidates, swap_rank: Array, px_a_metre: Array, rng: np.random.Generator
+    ) -> Candidates:
+        """False candidates under the mirror's name of joints that are found under their own."""
+        table, swaps = self._table, self._config.swaps
+        low, high = swaps * table.swap, swaps * (table.swap + table.double)
+        those = (swap_rank >= low) & (swap_rank < high)
+        first = found.take(those)
+        rank = (swap_rank[those] - low) / max(high - low, 1e-9)
+        shift_px = rng.normal(0.0, table.double_m, first.xy.shape) * px_a_metre[those, None]
+        return Candidates(
+            view=first.view,
+            joint=_MIRROR[first.joint],
+            xy=first.xy + shift_px,
+            confidence=table.quantile(table.double_confidence, rank),
+            owner=np.zeros_like(first.owner),
+            reach_px=np.zeros(len(rank)),
+        )
 
+    def _worse(self, visibility: Visibility, seen: Array, noise: Array) -> Array:
+        """How much worse than others (V, P, 25) joints are found, of people who are buried behind others, or lost.
 
-def _duplicates(
-    found: _Found, swap_rank: Array, px_a_metre: Array, config: DetectorConfig, rng: np.random.Generator
-) -> _Found:
-    """False candidates under the mirror's name of joints that are found under their own."""
-    table = config.statistics
-    low, high = config.swaps * table.swap, config.swaps * (table.swap + table.double)
-    those = (swap_rank >= low) & (swap_rank < high)
-    first = found.take(those)
-    rank = (swap_rank[those] - low) / max(high - low, 1e-9)
-    shift_px = rng.normal(0.0, table.double_m, first.xy.shape) * px_a_metre[those, None]
-    return _Found(
-        view=first.view,
-        joint=_MIRROR[first.joint],
-        xy=first.xy + shift_px,
-        confidence=table.quantile(table.double_confidence, rank),
-        owner=np.zeros_like(first.owner),
-        reach_px=np.zeros(len(rank)),
-    )
+        As a standard normal (probit). What its own body hides is no worse off when others hide the rest.
+        """
+        table, behind = self._table, visibility.hidden_by >= 0
+        share = (behind & (visibility.seen < 0.5)).mean(axis=-1, keepdims=True)
+        buried = np.interp(share, table.buried_share, table.buried) * np.where(behind, 1.0, seen)
+        if table.lost[1] <= 0:
+            return buried
+        half, wholly = -ndtri(table.lost)
+        slope = (_WHOLLY_LOST - _HALF_LOST) / (wholly - half)
+        return buried + np.maximum(_HALF_LOST + slope * (noise[NoiseProcess.LOST] - half), 0.0)
 
+    def _sigma_px(
+        self, confidence: Array, seen: Array, hidden_as: NDArray[np.intp], px_a_metre: Array, scale: Array
+    ) -> Array:
+        """Sigmas (D,) of the errors of reported joints, px, whose tails are drawn by `scale` (D,), normal."""
+        table = self._table
+        floor_m = table.floor_px / table.size_px_a_metre
+        # What the grid adds is part of the measured sigma; people of other sizes get it anew.
+        own_m = np.sqrt(np.maximum(table.sigma_m**2 - floor_m**2, (0.3 * table.sigma_m) ** 2))
+        log_sigma, tail = (
+            np.stack([np.interp(confidence, table.knots, row) for row in rows])
+            for rows in (np.log(own_m), table.tail)
+        )
+        which = hidden_as, np.arange(len(confidence))
+        sigma_px = np.hypot(np.exp(_between(log_sigma[which], log_sigma[0], seen)) * px_a_metre, table.floor_px)
+        return sigma_px * np.exp(_between(tail[which], tail[0], seen) * scale)
 
-def _worse(visibility: Visibility, seen: Array, table: DetectorStatistics, noise: Array) -> Array:
-    """How much worse than others (V, P, 25) joints are found, of people who are buried behind others, or lost.
+    def _captors(
+        self, reported: NDArray[np.bool_], true_xy: Array, metres_a_px: Array, visibility: Visibility, noise: Array
+    ) -> NDArray[np.intp]:
+        """Whose candidate stands for a joint that is missed behind another person: (2, V, P, 25).
 
-    As a standard normal (probit). What its own body hides is no worse off when others hide the rest.
-    """
-    behind = visibility.hidden_by >= 0
-    share = (behind & (visibility.seen < 0.5)).mean(axis=-1, keepdims=True)
-    buried = np.interp(share, table.buried_share, table.buried) * np.where(behind, 1.0, seen)
-    if table.lost[1] <= 0:
-        return buried
-    half, wholly = -ndtri(table.lost)
-    slope = (_WHOLLY_LOST - _HALF_LOST) / (wholly - half)
-    return buried + np.maximum(_HALF_LOST + slope * (noise[NoiseProcess.LOST] - half), 0.0)
+        The first is the person in front whose candidate the hidden joint's neighbours are joined to, the second
+        one whose candidate they are not joined to; -1 where there is none.
+        """
+        table = self._table
+        view, person, joint = np.nonzero((visibility.hidden_by >= 0) & visibility.in_image & ~reported)
+        front = visibility.hidden_by[view, person, joint]
+        gap_px = np.linalg.norm(true_xy[view, person, joint] - true_xy[view, front, joint], axis=-1)
+        gap_m = np.nan_to_num(gap_px, nan=np.inf) * metres_a_px[view, person, joint]
+        kind = np.searchsorted(table.capture_gap_m, gap_m, side="right") - 1
+        captured = self._config.captures * table.capture[kind]
+        taken = ndtr(noise[NoiseProcess.CAPTURE, view, person, joint]) < captured
+        captors = np.full((2, *reported.shape), -1)
+        captors[np.where(taken, 0, 1), view, person, joint] = front
+        return captors
 
+    def _invented(self, false: FalseCandidates, true_xy: Array, depth: Array) -> Candidates:
+        """The false candidates of this frame, where they are now."""
+        table, focal_px = self._table, self._rig.focal_px
+        near = false.person >= 0
+        size = self._rig.image_sizes[false.view]
+        xy = false.offset * (size - 1)
+        at = false.view[near], false.person[near], false.anchor[near]
+        xy[near] = true_xy[at] + false.offset[near] * (focal_px[at[0]] / depth[at])[:, None]
+        there = np.all((xy >= 0) & (xy <= size - 1), axis=1)  # NaN behind a camera compares false
+        # The others stay in the background: a person before it covers them.
+        gap_px = np.linalg.norm(true_xy[false.view] - xy[:, None, None], axis=-1)
+        gap_m = (gap_px * depth[false.view]).min(axis=(1, 2), initial=np.inf, where=np.isfinite(gap_px))
+        there &= near | (gap_m > _NEAR_M * focal_px[false.view])
+        quantiles = np.where(near[:, None], table.false_near_confidence, table.false_far_confidence)
+        found = Candidates(
+            view=false.view,
+            joint=false.joint,
+            xy=xy,
+            confidence=table.quantile(quantiles, false.rank),
+            owner=np.zeros((len(xy), true_xy.shape[1]), dtype=bool),
+            reach_px=self._reach_px(false.rank, size[:, 1]),
+        )
+        return found.take(there)
 
-def _errors(
-    confidence: Array,
-    seen: Array,
-    hidden_as: NDArray[np.intp],
-    group: NDArray[np.intp],
-    px_a_metre: Array,
-    config: DetectorConfig,
-    normal: Array,
-    scale: Array,
-) -> Array:
-    """Errors (D, 2) px of reported joints, from correlated normal draws `normal` (2, D) and `scale` (D,)."""
-    table = config.statistics
-    floor_m = table.floor_px / table.size_px_a_metre
-    # What the grid adds is part of the measured sigma; people of other sizes get it anew.
-    own_m = np.sqrt(np.maximum(table.sigma_m**2 - floor_m**2, (0.3 * table.sigma_m) ** 2))
-    log_sigma = np.stack([np.interp(confidence, table.knots, np.log(row)) for row in own_m])
-    tail = np.stack([np.interp(confidence, table.knots, row) for row in table.tail])
-    which = hidden_as, np.arange(len(confidence))
-    sigma_px = np.hypot(np.exp(_between(log_sigma[which], log_sigma[0], seen)) * px_a_metre, table.floor_px)
-    sigma_px = sigma_px * np.exp(_between(tail[which], tail[0], seen) * scale)
-    error = normal.T * sigma_px[:, None] * table.joint_scale[group]
-    length = np.linalg.norm(error, axis=1)
-    limit = _LARGEST_ERROR_M * px_a_metre / np.maximum(length, 1e-9)
-    return config.noise * error * np.minimum(limit, 1.0)[:, None]
-
-
-def _capture(
-    reported: NDArray[np.bool_],
-    true_xy: Array,
-    metres_a_px: Array,
-    visibility: Visibility,
-    config: DetectorConfig,
-    noise: Array,
-) -> NDArray[np.intp]:
-    """Whose candidate stands for a joint that is missed behind another person: (2, V, P, 25).
-
-    The first is the person in front whose candidate the hidden joint's neighbours are joined to, the second one
-    whose candidate they are not joined to; -1 where there is none.
-    """
-    table = config.statistics
-    view, person, joint = np.nonzero((visibility.hidden_by >= 0) & visibility.in_image & ~reported)
-    front = visibility.hidden_by[view, person, joint]
-    gap_px = np.linalg.norm(true_xy[view, person, joint] - true_xy[view, front, joint], axis=-1)
-    gap_m = np.nan_to_num(gap_px, nan=np.inf) * metres_a_px[view, person, joint]
-    kind = np.searchsorted(table.capture_gap_m, gap_m, side="right") - 1
-    taken = ndtr(noise[NoiseProcess.CAPTURE, view, person, joint]) < config.captures * table.capture[kind]
-    captors = np.full((2, *reported.shape), -1)
-    captors[np.where(taken, 0, 1), view, person, joint] = front
-    return captors
-
-
-def _invent(rig: Rig, false: FalseCandidates, true_xy: Array, depth: Array, config: DetectorConfig) -> _Found:
-    """The false candidates of this frame, where they are now."""
-    table = config.statistics
-    near = false.person >= 0
-    size = rig.image_sizes[false.view]
-    xy = false.offset * (size - 1)
-    at = false.view[near], false.person[near], false.anchor[near]
-    xy[near] = true_xy[at] + false.offset[near] * (rig.focal_px[at[0]] / depth[at])[:, None]
-    there = np.all((xy >= 0) & (xy <= size - 1), axis=1)  # NaN behind a camera compares false
-    # The others stay in the background: a person before it covers them.
-    gap_px = np.linalg.norm(true_xy[false.view] - xy[:, None, None], axis=-1)
-    gap_m = (gap_px * depth[false.view]).min(axis=(1, 2), initial=np.inf, where=np.isfinite(gap_px))
-    there &= near | (gap_m > _NEAR_M * rig.focal_px[false.view])
-    quantiles = np.where(near[:, None], table.false_near_confidence, table.false_far_confidence)
-    found = _Found(
-        view=false.view,
-        joint=false.joint,
-        xy=xy,
-        confidence=table.quantile(quantiles, false.rank),
-        owner=np.zeros((len(xy), true_xy.shape[1]), dtype=bool),
-        reach_px=_reach_px(false.rank, size[:, 1], config),
-    )
-    return found.take(there)
+    def _reach_px(self, probability: Array, height_px: Array) -> Array:
+        """How near (D,) to a better one of its joint a candidate is lost: logistic, in proportion to the image."""
+        table, drawn = self._table, np.clip(probability, 1e-6, 1 - 1e-6)
+        reach = table.merge_px + table.merge_width_px * np.log(drawn / (1 - drawn))
+        return self._config.merging * np.maximum(reach, 0.0) * height_px / table.merge_height_px
 
 
-def _reach_px(probability: Array, height_px: Array, config: DetectorConfig) -> Array:
-    """How near (D,) to a better one of its joint a candidate is lost: logistic, in proportion to the image."""
-    table = config.statistics
-    drawn = np.clip(probability, 1e-6, 1 - 1e-6)
-    reach = table.merge_px + table.merge_width_px * np.log(drawn / (1 - drawn))
-    return config.merging * np.maximum(reach, 0.0) * height_px / table.merge_height_px
-
-
-def _merge(found: _Found) -> _Found:
+def _merge(found: Candidates) -> Candidates:
     """Keep of near candidates of one joint and view the most confident, which then belongs to all of them."""
     if len(found.view) == 0 or found.reach_px.max() <= 0:
         return found

@@ -1,13 +1,12 @@
 """How a real detector errs, as tables measured on the Shelf recording (docs/simulation.md).
 
-The shipped file was written at commit 059d6f0; the code that measures is `simulation/measurement` of 77ab725.
+The code that measures is `simulation/measurement` of commit 77ab725.
 """
 
 import json
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,23 +121,10 @@ class DetectorStatistics:
 
     @classmethod
     def read(cls, path: Path) -> "DetectorStatistics":
-        """From a file like the shipped one: what is `drawn` takes the place of what was `measured`."""
+        """From a file like the shipped one: an entry for each field."""
         content = json.loads(path.read_text(encoding="utf-8"))
-        measured = content["measured"]
-
-        def value(name: str) -> Any:
-            if name in content["drawn"]:
-                return content["drawn"][name]
-            if name in measured and name not in _KEYS:
-                return measured[name]
-            group, key = _KEYS.get(name, name.replace("_", ".", 1)).split(".")
-            return measured[group][key]
-
-        values: dict[str, Any] = {}
-        for name in [each.name for each in fields(cls) if each.name != "provenance"]:
-            found = value(name)
-            values[name] = np.array(found, dtype=np.float64) if isinstance(found, list) else float(found)
-        return cls(**values, provenance=content["provenance"]["recording"])
+        tables = {name: content[name] for name in cls.__dataclass_fields__}
+        return cls(**{k: np.array(v, dtype=np.float64) if isinstance(v, list) else v for k, v in tables.items()})
 
     def quantile(self, table: Array, probability: Array) -> Array:
         """Values (...,) at `probability` (...,) of quantile tables (..., K), or of one table (K,)."""
@@ -163,24 +149,3 @@ class DetectorStatistics:
 def measured() -> DetectorStatistics:
     """The shipped file, read once."""
     return DetectorStatistics.read(_FILE)
-
-
-_KEYS = {
-    "error_memory": "memory.error",
-    "confidence_memory": "memory.confidence",
-    "error_correlation": "joint_correlation.error",
-    "confidence_correlation": "joint_correlation.confidence",
-    "lost_memory": "memory.lost",
-    "lost_correlation": "joint_correlation.lost",
-    "swap": "swap.instead",
-    "double": "swap.besides",
-    "double_m": "swap.double_m",
-    "double_confidence": "swap.double_confidence",
-    "capture": "capture.share",
-    "merge_px": "merge.half_px",
-    "merge_height_px": "merge.image_height_px",
-    "false_near": "false.others_per_person",
-    "false_far": "false.far_per_view",
-    "detours": "affinity.detours",
-}
-"""Where fields stand in the file, if not under their own name or like `merge_width_px` in `merge.width_px`."""

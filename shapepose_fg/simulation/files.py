@@ -1,20 +1,22 @@
-"""Simulated recordings as files: what `shapepose-fg simulate` makes, for this program and for any other."""
+"""Scenes by name, their truth as a result, and simulated recordings as files for this program and any other."""
 
 import os
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args
+
+import numpy as np
 
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.provenance import versions
+from shapepose_fg.core.reconstruction import Reconstruction, Status
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.write_detections import refuse_leftovers, write_association, write_openpose
 from shapepose_fg.simulation import Scene, built_in_scene
 from shapepose_fg.simulation.mocap import Mocap
 from shapepose_fg.simulation.room import SequenceConfig
-from shapepose_fg.simulation.sequences import SEQUENCES, Sequence, Split, sequence
-from shapepose_fg.simulation.truth import truth_of
+from shapepose_fg.simulation.sequences import SEQUENCES, Split, sequence
 
 Format = Literal["association", "openpose"]
 """What detections are written as."""
@@ -67,21 +69,28 @@ def named_scene(
     return sequence(name, split, motions, cameras=cameras, until=until, config=config, **rate)  # type: ignore[arg-type]
 
 
-def cut(scene: Scene, span: range) -> Scene:
-    """Some consecutive frames of `scene`."""
-    part = scene.motion[span.start : span.stop]
-    if not isinstance(scene, Sequence):
-        return replace(scene, motion=part)
-    # Segments that reach into the span, each from its cut (the first from frame 0) to the next.
-    segments = zip((0, *scene.cuts), (*scene.cuts, len(scene)), scene.clips, strict=False)
-    clips = tuple(names for start, stop, names in segments if start < span.stop and stop > span.start)
-    cuts = tuple(first - span.start for first in scene.cuts if span.start < first < span.stop)
-    return replace(scene, motion=part, cuts=cuts, clips=clips)
+def truth_of(scene: Scene) -> Reconstruction:
+    """Everybody in every frame of `scene`, row by row as `person` 0 to P - 1, frame 0 first.
 
-
-def cuts_of(scene: Scene) -> tuple[int, ...]:
-    """First frames of what follows a cut in `scene`; a built-in scene has none."""
-    return scene.cuts if isinstance(scene, Sequence) else ()
+    Joints and bodies are exact: covariances are zero and confidences one. Velocities and how joints are known are
+    not given: nothing says what was visible.
+    """
+    T, P = scene.motion.transl.shape[:2]
+    N = T * P
+    return Reconstruction(
+        frame=np.repeat(np.arange(T), P),
+        person=np.tile(np.arange(P), T),
+        time_s=np.repeat(np.arange(T) / scene.fps, P),
+        joint_names=np.array(BODY_25.joints),
+        joints=scene.keypoints.reshape(N, len(BODY_25), 3),
+        covariance=np.zeros((N, len(BODY_25), 3, 3)),
+        confidence=np.ones((N, len(BODY_25))),
+        betas=np.tile(scene.motion.betas, (T, 1)),
+        global_orient=scene.motion.global_orient.reshape(N, 3),
+        body_pose=scene.motion.body_pose.reshape(N, 23, 3),
+        transl=scene.motion.transl.reshape(N, 3),
+        status=np.full(N, str(Status.OK)),
+    )
 
 
 def check_output(scene: Scene, folder: Path, format: Format) -> None:
@@ -107,7 +116,7 @@ def write_simulated(
         place = folder / _OPENPOSE
         write_openpose(detections, scene.rig, place)
     about = {"fps": scene.fps, "frames": len(scene), "people": scene.people, "cameras": len(scene.rig)}
-    about |= {"cuts": list(cuts_of(scene)), **run}
+    about |= {"cuts": list(scene.cuts), **run}
     truth_of(scene).with_run(simulated=about, versions=versions()).save(folder / "truth")
     return {"cameras": folder / "rig.json", "detections": place, "truth": folder / "truth" / "people.npz"}
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +16,6 @@ from shapepose_fg.simulation.performance import Figure
 from shapepose_fg.simulation.scene import Scene
 
 Array = NDArray[np.float64]
-AnyScene = TypeVar("AnyScene", bound=Scene)
 
 DETECTOR_S_OWN = KeypointOffsets.symmetric(
     {
@@ -164,7 +162,7 @@ def people_of(kind: str, count: int, seed: int = 0) -> list[Proportions]:
     return kinds[kind]
 
 
-def recast(scene: AnyScene, proportions: Sequence[Proportions]) -> AnyScene:
+def recast(scene: Scene, proportions: Sequence[Proportions]) -> Scene:
     """The same motions by people of other `proportions` (one for each): every bone turns as it did.
 
     They stand where they stood, on the same floor. Steps and reaches are those of the adults: a child's feet

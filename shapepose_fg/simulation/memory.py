@@ -88,11 +88,14 @@ class FalseCandidateProcess:
     """False candidates: some go along with a person, some stay where they are; some flicker, some last."""
 
     def __init__(
-        self, views: int, people: int, fps: float, statistics: DetectorStatistics, rate: float, seed: int
+        self, views: int, people: int, fps: float, statistics: DetectorStatistics, seed: int, rate: float
     ) -> None:
         self._views, self._people, self._statistics, self._seed = views, people, statistics, seed
         near, far = statistics.false_near * people * views * rate, statistics.false_far * views * rate
         share, seconds = statistics.false_memory.T
+        # A group's share over its members.
+        claims = statistics.false_joints[JOINT_GROUP] / np.bincount(JOINT_GROUP)[JOINT_GROUP]
+        self._claims = claims / claims.sum()
         self._stays = np.append(np.exp(-1.0 / (fps * seconds)), 0.0)
         # Of those that are there at any time: born as often as they go.
         self._present = np.append(share, max(1.0 - share.sum(), 0.0))[:, None] * np.array([near, far])
@@ -120,17 +123,11 @@ class FalseCandidateProcess:
             view=rng.integers(0, self._views, count),
             person=np.where(far, -1, rng.integers(0, max(self._people, 1), count)),
             anchor=rng.integers(0, 25, count),
-            joint=rng.choice(25, count, p=_joint_shares(self._statistics)),
+            joint=rng.choice(25, count, p=self._claims),
             offset=np.where(far[:, None], rng.random((count, 2)), around),
             rank=rng.random(count),
             stays=stays,
         )
-
-
-def _joint_shares(statistics: DetectorStatistics) -> Array:
-    """(25,) how often a false candidate claims to be each joint: a group's share over its members."""
-    share = statistics.false_joints[JOINT_GROUP] / np.bincount(JOINT_GROUP)[JOINT_GROUP]
-    return share / share.sum()
 
 
 def _root(correlation: Array) -> Array:

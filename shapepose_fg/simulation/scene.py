@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,10 @@ class Scene:
     """P people in T frames."""
     fps: float
     """Frames a second."""
+    cuts: tuple[int, ...] = ()
+    """First frames of what follows a cut: there everybody may be somewhere else."""
+    clips: tuple[tuple[str, ...], ...] = ()
+    """Where people perform recordings: for each segment the name of each person's."""
 
     def __len__(self) -> int:
         """Count of frames, T."""
@@ -47,9 +51,17 @@ class Scene:
         """(T, P, 25, 3) true BODY_25 keypoints."""
         return keypoints_of(self.body, self.motion)
 
-    def with_keypoint_offsets(self, offsets: KeypointOffsets) -> Self:
+    def with_keypoint_offsets(self, offsets: KeypointOffsets) -> "Scene":
         """The same people, their true keypoints where a detector with these offsets puts them."""
         return replace(self, body=self.body.with_keypoint_offsets(offsets))
+
+    def part(self, span: range) -> "Scene":
+        """Some consecutive frames."""
+        # Segments that reach into the span, each from its cut (the first from frame 0) to the next.
+        segments = zip((0, *self.cuts), (*self.cuts, len(self)), self.clips, strict=False)
+        clips = tuple(names for start, stop, names in segments if start < span.stop and stop > span.start)
+        cuts = tuple(first - span.start for first in self.cuts if span.start < first < span.stop)
+        return replace(self, motion=self.motion[span.start : span.stop], cuts=cuts, clips=clips)
 
     def truth_at(self, frame: int) -> NDArray[np.float64]:
         """(P, 25, 3) true BODY_25 keypoints of one frame."""

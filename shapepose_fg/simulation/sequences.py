@@ -6,7 +6,6 @@ in the room comes from other subjects. Room of 4 x 4 m, world z up, floor at z =
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -56,20 +55,6 @@ SEQUENCES: dict[str, SequenceConfig] = {
 """A pair among three who stand and three who walk; mostly walkers, through and between; two pairs and others."""
 
 
-@dataclass(frozen=True)
-class Sequence(Scene):
-    """A scene made of recorded motions, and what it is made of."""
-
-    name: str = ""
-    """Which of `SEQUENCES`."""
-    split: str = ""
-    """"tune" or "report"."""
-    cuts: tuple[int, ...] = ()
-    """First frames of what follows a cut: there everybody may be somewhere else."""
-    clips: tuple[tuple[str, ...], ...] = ()
-    """For each segment the name of the recording that each person performs."""
-
-
 def sequence(
     name: str,
     split: Split,
@@ -81,7 +66,7 @@ def sequence(
     until: int | None = None,
     fps: float = 30.0,
     config: SequenceConfig | None = None,
-) -> Sequence:
+) -> Scene:
     """Interaction sequence `name` of `SEQUENCES` from the takes of `split`, before `cameras` cameras.
 
     `config` takes the place of the named one's; `frames` of its length. With `until` no segment
@@ -106,15 +91,26 @@ def sequence(
         height_m=config.camera_height_m,
         focal_px=config.focal_px,
     )
-    betas = _shapes(config, rng)
+    betas, without = _shapes(config, rng), DANCERS | config.without
     dances = _dances(mocap, takes, config, fps, rng)
     parts, clips, starts = [Motion.still(betas, 0)], [], [0]
     while starts[-1] < (frames if until is None else min(until, frames)):
-        room = _segment(mocap, body, betas, config, rng, fps, frames - starts[-1], dances)
+        # Everybody from one cut to the next: first the pairs, then who stands, then who walks around them.
+        dancing = [next(dances) for _ in range(config.pairs)]
+        longest = max(1, round(config.segment_frames * fps / 30.0))
+        length = min([frames - starts[-1], longest, *(len(lead) for lead, _ in dancing)])
+        room = Room(body, config, length, fps, rng)
+        for number, pair in enumerate(dancing):
+            lead, follow = (clip.between(0, length) for clip in pair)
+            room.add_pair(betas[2 * number : 2 * number + 2], (lead, follow))
+        for index in _drawn(standing_clips(mocap, without=without), config.standing, rng):
+            room.add_standing(betas[len(room.names)], mocap.clip(index))
+        for index in _drawn(walking_clips(mocap, without=without), config.walking, rng):
+            room.add_walking(betas[len(room.names)], mocap.clip(index))
         parts.append(together(betas, room.performed, room.frames))
         clips.append(tuple(room.names))
         starts.append(starts[-1] + room.frames)
-    return Sequence(rig, body, Motion.joined(parts), fps, name, split, tuple(starts[1:-1]), tuple(clips))
+    return Scene(rig, body, Motion.joined(parts), fps, tuple(starts[1:-1]), tuple(clips))
 
 
 def salsa_takes(mocap: Mocap, split: Split) -> list[tuple[int, int]]:
@@ -147,30 +143,6 @@ def _together_in(
     parts = max(1, int(np.ceil((last - first) / (config.segment_frames * fps / 30.0))))
     edges = np.linspace(first, last, parts + 1).astype(int)
     return [(lead.between(a, b), follow.between(a, b)) for a, b in pairwise(edges.tolist())]
-
-
-def _segment(
-    mocap: Mocap,
-    body: BodyModel,
-    betas: Array,
-    config: SequenceConfig,
-    rng: np.random.Generator,
-    fps: float,
-    most: int,
-    dances: Iterator[tuple[Clip, Clip]],
-) -> Room:
-    """Everybody from one cut to the next: first the pairs, then who stands, then who walks around them."""
-    dancing = [next(dances) for _ in range(config.pairs)]
-    longest = max(1, round(config.segment_frames * fps / 30.0))
-    frames = min([most, longest, *(len(lead) for lead, _ in dancing)])
-    room = Room(body, config, frames, fps, rng)
-    for number, (lead, follow) in enumerate(dancing):
-        room.add_pair(betas[2 * number : 2 * number + 2], (lead.between(0, frames), follow.between(0, frames)))
-    for index in _drawn(standing_clips(mocap, without=DANCERS | config.without), config.standing, rng):
-        room.add_standing(betas[len(room.names)], mocap.clip(index))
-    for index in _drawn(walking_clips(mocap, without=DANCERS | config.without), config.walking, rng):
-        room.add_walking(betas[len(room.names)], mocap.clip(index))
-    return room
 
 
 def _shapes(config: SequenceConfig, rng: np.random.Generator) -> Array:

@@ -9,10 +9,9 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.fitting import body_sequence, optimisers
-from shapepose_fg.body.fitting.fitter import FitStatus, JointTargets, SequenceFit, Shapes
+from shapepose_fg.body.fitting.fitter import BodyConfig, FitStatus, JointTargets, SequenceFit, Shapes
 from shapepose_fg.body.fitting.fitters import SmplFitter, make_fitter
-from shapepose_fg.body.fitting.pose_prior import PosePrior
-from shapepose_fg.body.fitting.settings import BodyConfig
+from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 

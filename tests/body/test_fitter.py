@@ -4,10 +4,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.fitting import optimisers
-from shapepose_fg.body.fitting.fitter import BodyFit, FitStatus, JointTargets, check_fitter
+from shapepose_fg.body.fitting.fitter import BodyConfig, BodyFit, FitStatus, JointTargets, check_fitter
 from shapepose_fg.body.fitting.fitters import SmplFitter
-from shapepose_fg.body.fitting.pose_prior import PosePrior
-from shapepose_fg.body.fitting.settings import BodyConfig
+from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.core.skeleton import BODY_25
 

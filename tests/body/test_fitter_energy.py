@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 from shapepose_fg.body.fitting import evidence
 from shapepose_fg.body.fitting.energy import (
     BodyEnergy,
-    PoseEnergy,
+    Held,
     WhitenedTargets,
     robust_cost,
     robust_weight,
@@ -15,7 +15,7 @@ from shapepose_fg.body.fitting.energy import (
 from shapepose_fg.body.fitting.evidence import determine_pose, weigh
 from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.body.fitting.person_frame import PersonFrame
-from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 
@@ -97,9 +97,7 @@ def test_hessian_is_information_and_priors(energy, free, targets):
     J = jacobian.unflatten(1, (25, 3))
     expected = torch.einsum("bkip,bkij,bkjq->bpq", J, information, J)
     expected[:, :10, :10] += torch.eye(10)
-    expected[:, 13:-3, 13:-3] += (
-        PoseEnergy(PosePrior.default(), energy.angles, torch.float64).pull(free[:, 13:-3]).hessian
-    )
+    expected[:, 13:-3, 13:-3] += torch.from_numpy(PosePrior.default().marginal_precision(energy.angles))
     torch.testing.assert_close(energy.linearise(free, targets, wide).hessian, expected)
 
 
@@ -130,18 +128,23 @@ def test_invisible_joints_are_where_the_prior_expects_them(model, apart):
     np.testing.assert_allclose(pose[:, hidden], mean[hidden] + (S[np.ix_(hidden, seen)] @ pull).T, atol=1e-9)
 
 
-def test_pose_energy_is_the_squared_distance_of_the_visible_angles(energy, apart):
+def test_pose_energy_is_the_squared_distance_of_the_visible_angles(model, apart):
+    energy = BodyEnergy(model, apart)
     error = np.random.default_rng(0).normal(0, 0.4, (4, energy.num_angles))
     P = np.linalg.inv(apart.covariance[np.ix_(energy.angles, energy.angles)])
-    pose = PoseEnergy(apart, energy.angles, torch.float64)
+    nothing = WhitenedTargets(torch.zeros(4, 25, 3).double(), torch.zeros(4, 25, 3, 3).double())
+    scale = torch.ones(4, 1).double()
     anchor = torch.from_numpy(np.tile(apart.mean[energy.angles] + 1.0, (4, 1)))
-    for pull in (
-        pose.pull(torch.from_numpy(apart.mean[energy.angles] + error)),
-        pose.pull(anchor + torch.from_numpy(error), anchor),
+    for around, held in (
+        (torch.from_numpy(apart.mean[energy.angles]), None),
+        (anchor, Held(torch.zeros(10), torch.ones(1), anchor)),
     ):
-        np.testing.assert_allclose(pull.energy, np.einsum("bi,ij,bj->b", error, P, error))
-        np.testing.assert_allclose(pull.gradient, error @ P, atol=1e-9)
-        np.testing.assert_allclose(pull.hessian, np.broadcast_to(P, (4, *P.shape)))
+        free = torch.zeros(4, energy.num_free).double()
+        free[:, 13:-3] = around + torch.from_numpy(error)
+        here = energy.linearise(free, nothing, scale, held)
+        np.testing.assert_allclose(here.prior, np.einsum("bi,ij,bj->b", error, P, error))
+        np.testing.assert_allclose(here.gradient[:, 13:-3], error @ P, atol=1e-9)
+        np.testing.assert_allclose(here.hessian[:, 13:-3, 13:-3], np.broadcast_to(P, (4, *P.shape)))
 
 
 def test_orientation_moves_on_the_sphere_of_rotations(energy, free):

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from shapepose_fg.body.fitting.energy import SETTLED, BodyEnergy, Held, WhitenedTargets
-from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel
 
 ROWS = 3
@@ -85,7 +85,7 @@ def test_a_step_moves_rows_and_keeps_their_linearisation(energy, targets, free, 
     body = energy.evaluate(free, targets, SCALE, held)
     here = energy.linearise(free, targets, SCALE, held)
     np.testing.assert_array_equal(body.here.hessian.numpy(), here.hessian.numpy())
-    np.testing.assert_array_equal(body.xyz.numpy(), energy.keypoints_with_jacobian(free)[0].numpy())
+    np.testing.assert_array_equal(body.here.xyz.numpy(), energy.keypoints_with_jacobian(free)[0].numpy())
     factor = body.factor.numpy()
     added = factor @ factor.swapaxes(1, 2) - here.hessian.numpy()
     root = np.isin(np.arange(energy.num_free), [10, 11, 12, *range(energy.num_free - 3, energy.num_free)])

@@ -10,10 +10,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.body.fitting.fitter import BodyFit, FitStatus, JointTargets
+from shapepose_fg.body.fitting.fitter import BodyConfig, BodyFit, FitStatus, JointTargets
 from shapepose_fg.body.fitting.fitters import SmplFitter
-from shapepose_fg.body.fitting.pose_prior import PosePrior
-from shapepose_fg.body.fitting.settings import BodyConfig
+from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, TARGET_SKELETONS

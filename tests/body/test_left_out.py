@@ -12,8 +12,8 @@ from shapepose_fg.body.fitting.evidence import weigh
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
 from shapepose_fg.body.fitting.fitters import SmplFitter, evenly, make_fitter
 from shapepose_fg.body.fitting.left_out import left_out_sets, plan_passes
-from shapepose_fg.body.fitting.pose_prior import PosePrior
 from shapepose_fg.body.fitting.posterior import LIMB_M, joint_covariance
+from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.target_skeletons import TARGET_SKELETONS
 from shapepose_fg.core.skeleton import BODY_25

@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from shapepose_fg.body.fitting.energy import Held
-from shapepose_fg.body.fitting.shared_shape import check_groups, pooled_betas, shape_precision, shared
+from shapepose_fg.body.fitting.fitter import check_groups
+from shapepose_fg.body.fitting.posterior import pooled_betas, shape_precision, shared
 
 BETAS, REST = 10, 6
 

@@ -12,7 +12,8 @@ import pytest
 
 from shapepose_fg.cli.batch.table import read_table
 from shapepose_fg.cli.main import main
-from shapepose_fg.cli.reconstruct.command import carry_out
+from shapepose_fg.cli.reconstruct.request import prepare
+from shapepose_fg.cli.reconstruct.run import carry_out
 from shapepose_fg.cli.stopping import Stopped
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
@@ -87,7 +88,7 @@ def stopped_behind_a_chunk(archive: Path, folder: Path) -> None:
             raise Stopped(signal.SIGTERM)
 
     with pytest.raises(Stopped):
-        carry_out(asked, folder, Execution(progress=stop), restart=True)
+        carry_out(prepare(asked, folder), Execution(progress=stop), restart=True)
     assert frames_done(folder) == 12
 
 

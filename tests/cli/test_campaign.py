@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 from shapepose_fg.cli.batch import campaign as module
-from shapepose_fg.cli.batch.campaign import Campaign
+from shapepose_fg.cli.batch.campaign import Assignment, Campaign, Failed, Leader
 from shapepose_fg.cli.batch.command import _standings
-from shapepose_fg.cli.batch.leader import Assignment, Failed, Leader
 from shapepose_fg.cli.batch.standing import Standing, Standings, read_standings
 from shapepose_fg.cli.batch.table import Entry
-from shapepose_fg.cli.reconstruct.request import Ended, Request
+from shapepose_fg.cli.reconstruct.request import Request
+from shapepose_fg.cli.reconstruct.run import Ended
 from shapepose_fg.cli.stopping import Stopped
 from shapepose_fg.core.errors import InputError
 

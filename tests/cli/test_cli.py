@@ -161,7 +161,7 @@ def test_shapes_are_kept_from_one_recording_to_the_next(recording, pipeline, tmp
     def with_shapes(kept, task, execution):
         result, shapes = fake(kept, task, execution), task.shapes
         found = SubjectShapes(np.array(["0"]), np.full((1, 10), 0.5), np.eye(10)[None], shapes.body)
-        rows = result.people.counts
+        rows = result.rows_of
         nobody = {"ok": np.zeros(1, dtype=bool), "betas": np.zeros((1, 10)), "transl": np.zeros((1, 3))}
         nobody |= {"global_orient": np.zeros((1, 3)), "body_pose": np.zeros((1, 23, 3))}
         for number in rows:
@@ -432,7 +432,7 @@ def test_a_reader_that_stops_reading_is_no_error():
 
 
 def test_settings_are_looked_at_before_the_recording(recording, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("shapepose_fg.io.detections.read_detections", lambda *_: pytest.fail("it is read"))
+    monkeypatch.setattr("shapepose_fg.cli.reconstruct.run.read_detections", lambda *_: pytest.fail("it is read"))
     (tmp_path / "typo.toml").write_text("batch_frame = 3\n")
     for words, said in (
         (("--config", str(tmp_path / "typo.toml")), "typo.toml: batch_frame"),

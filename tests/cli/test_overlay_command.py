@@ -11,8 +11,7 @@ from shapepose_fg.cli.main import main
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.io.calibration import write_rig
-from shapepose_fg.io.footage.placement import Placement, PlacementKind
-from shapepose_fg.io.footage.used import CameraFootage, write_used_footage
+from shapepose_fg.io.footage.placement import CameraFootage, Placement, PlacementKind, write_used_footage
 from shapepose_fg.pipeline.pipeline import reconstruct
 from shapepose_fg.simulation import built_in_scene, simulate
 

@@ -7,7 +7,8 @@ from rich.progress import TextColumn
 from rich.table import Table
 
 from shapepose_fg.cli.terminal import progress, show
-from shapepose_fg.setup_check.camera_use import CameraUse, Distances, use_table
+from shapepose_fg.setup_check.in_result import CameraUse, Distances
+from shapepose_fg.setup_check.table import use_table
 
 
 @pytest.mark.parametrize("name", ["cam[left]", "a[/b]", ":cat:", "[red]"])

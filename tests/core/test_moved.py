@@ -18,10 +18,10 @@ def test_what_has_moved_is_found_by_its_old_name(old, monkeypatch):
 
 
 def test_files_in_a_folder_that_has_moved(monkeypatch):
-    monkeypatch.delitem(sys.modules, "shapepose_fg.report.elements", raising=False)
-    with pytest.warns(DeprecationWarning, match="viz.report.elements now"):
-        found = import_module("shapepose_fg.report.elements")
-    assert found is import_module("shapepose_fg.viz.report.elements")
+    monkeypatch.delitem(sys.modules, "shapepose_fg.report.scene", raising=False)
+    with pytest.warns(DeprecationWarning, match="viz.report.scene now"):
+        found = import_module("shapepose_fg.report.scene")
+    assert found is import_module("shapepose_fg.viz.report.scene")
 
 
 def test_the_pipeline_is_still_the_pipeline():

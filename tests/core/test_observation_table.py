@@ -132,7 +132,7 @@ def test_the_table_of_solved_rows(five_cameras, two_people, seen_exactly):
                 xy = five_cameras.project(two_people[person, joint][None])[0][view, 0]
                 candidate[person, joint, view] = rows[np.linalg.norm(seen.xy[rows] - xy, axis=1).argmin()]
     candidate[0, 3, 2] = -1
-    observations = Observations.of(candidate, seen, two_people)
+    observations = replace(Observations.of(candidate, seen, two_people), frame=np.array([7, 7]))
     joints = two_people.copy()
     joints[0, 4] += 0.1
     joints[1, 5] = np.nan
@@ -146,9 +146,7 @@ def test_the_table_of_solved_rows(five_cameras, two_people, seen_exactly):
         joints,
         gate,
         five_cameras,
-        frame=np.array([7, 7]),
-        person=np.array([0, 1]),
-        joint_names=[f"joint {index}" for index in range(25)],
+        [f"joint {index}" for index in range(25)],
     )
     assert solved.gate[0, 3, 2] == Gate.NOT_SEEN and solved.candidate[0, 3, 2] == -1
     assert solved.gate[0, 4].tolist() == [1, 2, 1, 1, 1]

@@ -12,7 +12,7 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.reconstruction import Known, Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.io.export.reading import read_take
+from shapepose_fg.io.export.registry import read_take
 from shapepose_fg.tracking.listing import list_saved_tracks, list_tracks
 from shapepose_fg.viz.report.writing import report_of
 

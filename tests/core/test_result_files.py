@@ -15,7 +15,7 @@ from shapepose_fg.core.result_files import write_result
 from shapepose_fg.core.storage.files import write_together
 from shapepose_fg.core.storage.npz import Pieces, write_npz
 from shapepose_fg.simulation import built_in_scene
-from shapepose_fg.simulation.truth import truth_of
+from shapepose_fg.simulation.files import truth_of
 
 
 def written(columns) -> bytes:

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from shapepose_fg.detection2d.decoding import DecodingConfig, decode, line_integrals, peaks
+from shapepose_fg.detection2d.decoding import decode, line_integrals, peaks
 from shapepose_fg.detection2d.networks import NetworkLayout, layouts
 
 LAYOUT = layouts()["tf-pose"]
@@ -81,7 +81,7 @@ def test_a_line_across_the_field_has_no_affinity():
     fields[0] = 1.0
     limb = np.zeros(3, dtype=np.intp)
     start, end = np.array([[2.0, 5], [5, 2], [15, 5]]), np.array([[15.0, 5], [5, 15], [2, 5]])
-    np.testing.assert_allclose(line_integrals(fields, start, end, limb, DecodingConfig()), [1, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(line_integrals(fields, start, end, limb), [1, 0, 0], atol=1e-6)
 
 
 def test_what_is_no_number_and_an_empty_output_give_nobody():

@@ -10,13 +10,12 @@ import pytest
 import shapepose_fg.detection2d.recording as recording
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.detection2d.detector import CameraDetector, DetectionConfig
+from shapepose_fg.detection2d.detector import CameraDetector
 from shapepose_fg.detection2d.recording import DetectionRun, run_detection
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.io.footage.footage import open_footage
 from shapepose_fg.io.footage.lockstep import CameraClock, align
-from shapepose_fg.io.footage.placement import Placement, PlacementKind
-from shapepose_fg.io.footage.used import FOOTAGE, read_used_footage
+from shapepose_fg.io.footage.placement import FOOTAGE, Placement, PlacementKind, read_used_footage
 from shapepose_fg.io.timestamps import read_timestamps
 from tests.detection2d.conftest import paint
 
@@ -57,9 +56,8 @@ def pictures(rolled_rig, apart, tmp_path_factory) -> Path:
 def run_of(rig: Rig, pictures: Path, output: Path, network, long_side: int = 640) -> DetectionRun:
     footage = [open_footage(pictures / name) for name in rig.names]
     placements = [Placement.of(PlacementKind.SAME, each.size, each.size) for each in footage]
-    config = DetectionConfig(long_side=long_side)
     detectors = [
-        CameraDetector.of(camera, rig.up_vector, placement, network, config)
+        CameraDetector.of(camera, rig.up_vector, placement, network, long_side)
         for camera, placement in zip(rig.cameras, placements, strict=True)
     ]
     clocks = [CameraClock(name, np.arange(FRAMES) / 25, 1 / 25) for name in rig.names]

@@ -15,11 +15,12 @@ from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Status
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.estimation.estimator import Estimates, Estimator
-from shapepose_fg.estimation.estimator_config import EstimatorConfig, RefineConfig
+from shapepose_fg.estimation.estimator_config import EstimatorConfig, RefineConfig, WindowGraphConfig
 from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas, triangulate
-from shapepose_fg.estimation.window_graph import WindowGraph, WindowGraphConfig
-from shapepose_fg.pipeline.solved_rows import result_rows
+from shapepose_fg.estimation.solve_window import solve_window
+from shapepose_fg.estimation.window_graph import WindowGraph
+from shapepose_fg.estimation.window_solution import WindowSolution
+from shapepose_fg.pipeline.solved_windows import result_rows
 
 WRIST, ELBOW, KNEE = 4, 3, 13
 
@@ -85,7 +86,7 @@ def run(
     extra_factors=None,
     settled_m=0.0,
     rho_3d=0.25,
-) -> Estimates:
+) -> WindowSolution:
     """Refine to the end of every X step and of all rounds, by the paper's rho_3D; a warning of NaN is an error."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -94,7 +95,7 @@ def run(
             WindowGraphConfig(rho_3d=rho_3d, max_iterations=100, tolerance=1e-12),
             RefineConfig(alternations=alternations, settled_m=settled_m),
         )
-        return Estimator(rig, fitter, BODY_25.joints, config).estimate(observations, extra_factors)
+        return solve_window(observations, Views.of(rig), fitter, config, extra_factors=extra_factors)
 
 
 @pytest.fixture
@@ -242,7 +243,7 @@ def test_views_that_contradict_the_body_are_gated_anew_around_it(five_cameras, t
     assert np.argwhere(~result.inlier.any(axis=-1)).tolist() == [[0, KNEE]]
     assert result.confidence[0, KNEE] == 0
     place = np.zeros(seen.confidence.shape, dtype=np.int32)
-    rows = result_rows(seen, result, place, five_cameras, BODY_25.joints, np.arange(2))
+    rows = result_rows(result, place, five_cameras, BODY_25.joints, np.arange(2))
     assert rows.observations is not None
     dropped = np.argwhere(rows.observations.gate == Gate.CONTRADICTS_BODY)
     assert dropped.tolist() == [[0, KNEE, 0], [0, KNEE, 1]] and rows.observations.reasons()["too far"] == 0
@@ -383,7 +384,7 @@ def test_the_alternation_helps_on_the_built_in_scene():
     )
     truth = scene.keypoints.reshape(-1, 25, 3)
     rows = replace(seen, track=np.arange(len(seen)))
-    result = Estimator(scene.rig, SmplFitter(), BODY_25.joints).estimate(rows)
+    result = solve_window(rows, Views.of(scene.rig), SmplFitter(), EstimatorConfig())
     assert (result.status == Status.OK).all() and np.isfinite(result.joints).all()
     before, after = (np.linalg.norm(X - truth, axis=-1) for X in (seen.initial, result.joints))
     low, both = result.confidence < 0.25, np.isfinite(before)

@@ -5,8 +5,7 @@ import numpy as np
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.doubt import association_spread, exchange_spread, limbs_to_exchange
-from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas
-from shapepose_fg.estimation.message import Message
+from shapepose_fg.estimation.linearisation import Message, ObservationConfig, linearise, observation_sigmas
 
 PLAIN = ObservationConfig(kernel="none", rho_2d_m=1.0)
 NAMES = ("RWrist",)

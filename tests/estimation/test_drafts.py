@@ -7,10 +7,10 @@ import pytest
 
 from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.fitting.fitters import BodyConfig, make_fitter
+from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation import draft
-from shapepose_fg.estimation.estimator import Estimator
 from shapepose_fg.estimation.estimator_config import EstimatorConfig, RefineConfig
 from shapepose_fg.simulation import built_in_scene
 
@@ -45,7 +45,7 @@ def ankle_errors(fitter, reach_m: float, alone: bool) -> np.ndarray:
     """Distance (N,) of the right ankle's draft from the truth, metres."""
     config = EstimatorConfig(refine=RefineConfig(draft_reach_m=reach_m))
     rows, truth = with_a_neighbour_s_leg(alone)
-    joints, covariance = Estimator(SCENE.rig, fitter, BODY_25.joints, config).draft(rows)
+    joints, covariance = draft.draft(rows, Views.of(SCENE.rig), fitter, config)
     assert np.isfinite(joints).all() and (np.linalg.eigvalsh(covariance) > 0).all()
     return np.linalg.norm(joints - truth, axis=-1)[:, LEG[1]]
 
@@ -84,7 +84,7 @@ def test_bodies_are_fitted_again_only_where_their_targets_have_changed(fitter, m
     for moved_m in (draft.MOVED_M, -1.0):
         monkeypatch.setattr(draft, "MOVED_M", moved_m)
         counting = Counting(fitter)
-        drafts.append(Estimator(SCENE.rig, counting, BODY_25.joints).draft(rows)[0])
+        drafts.append(draft.draft(rows, Views.of(SCENE.rig), counting, EstimatorConfig())[0])
         fitted.append(counting.rows)
     assert fitted[1] == [2 * count] * (1 + len(draft.NARROWING))
     # Measured: every disturbed row each time, a clean one never.

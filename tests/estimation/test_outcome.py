@@ -7,12 +7,12 @@ import pytest
 
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter
 from shapepose_fg.core.reconstruction import Known
-from shapepose_fg.estimation.draft import drafted, limb_steps
+from shapepose_fg.estimation.draft import drafted
 from shapepose_fg.estimation.in_time import smoothed_in_time
-from shapepose_fg.estimation.limb_lengths import with_lengths
+from shapepose_fg.estimation.limbs import limb_steps, with_lengths
 from shapepose_fg.estimation.linearisation import ViewEvidence
 from shapepose_fg.estimation.motion_model import Lasting
-from shapepose_fg.estimation.outcome import how_known, problems, reported_covariance
+from shapepose_fg.estimation.outcome import how_known, problems, with_lasting
 
 I3 = np.eye(3)
 
@@ -38,21 +38,21 @@ def test_a_joint_is_seen_or_the_body_s_or_carried_by_motion():
     confidence, probability = np.full((1, 8, 3), 0.8), np.ones((1, 8, 3))
     confidence[0, 5, 0], probability[0, 6, 0] = 0.2, 0.4
     observations = SimpleNamespace(confidence=confidence, probability=probability)
-    solution = SimpleNamespace(body=body, inlier=inlier, joints=joints)
-    found = how_known(solution, observations, covariance)
+    state = SimpleNamespace(of_body=body, inlier=inlier, joints=joints, observations=observations)
+    found = how_known(state, covariance)
     unseen = [Known.MOTION, Known.BODY, Known.MOTION, Known.UNKNOWN]
     assert found.tolist() == [[Known.WEAK, *unseen, Known.WEAK, Known.WEAK, Known.SEEN]]
     assert found.dtype == np.uint8
 
 
 def window(times_s, with_offsets):
-    graph = SimpleNamespace(
+    return SimpleNamespace(
         times_s=np.asarray(times_s),
         with_offsets=np.asarray(with_offsets),
         touched=np.zeros(len(with_offsets), bool),
+        rows=np.arange(len(times_s)),
+        failure="",
     )
-    graph.failure = ""
-    return SimpleNamespace(graph=graph, rows=np.arange(len(times_s)))
 
 
 def test_errors_that_last_are_added_to_what_the_graph_knows():
@@ -66,12 +66,13 @@ def test_errors_that_last_are_added_to_what_the_graph_knows():
     sigma = np.full((4, 3), 0.02)
     sigma[[0, 2], 1] = 0.15  # over 10 cm: not seen, but a little
     body = np.full((4, 3), 0.05)
-    solution = SimpleNamespace(views=message(sigma), body=message(body))
+    motion = SimpleNamespace(views=Lasting(f, 1.0, kept))
+    state = SimpleNamespace(of_views=message(sigma), of_body=message(body), motion=motion)
     rng = np.random.default_rng(0)
     root = rng.normal(0, 0.01, (4, 3, 3, 3))
     marginal = root @ root.swapaxes(2, 3) + 1e-4 * I3
     here = window([0.0, 0.1, 0.4, 0.5], [False, False, True])
-    found = reported_covariance(solution, here, marginal, Lasting(f, 1.0, kept))
+    found = with_lasting(state, here, marginal)
     left = I3 / (0.02**-2 + 0.05**-2)
     for frame in range(4):
         lasting = (1 - f + kept * f) * left
@@ -90,9 +91,9 @@ def test_the_nearest_frame_in_which_it_was_seen_is_carried_along():
     nobody = message(np.full((4, 1), np.inf))
     marginal = np.broadcast_to(0.03**2 * I3, (4, 1, 3, 3))
     here = window([0.0, 0.1, 0.2, 1.0], [False])
-    found = reported_covariance(
-        SimpleNamespace(views=message(sigma), body=nobody), here, marginal, Lasting(0.5, 1.0)
-    )
+    motion = SimpleNamespace(views=Lasting(0.5, 1.0))
+    state = SimpleNamespace(of_views=message(sigma), of_body=nobody, motion=motion)
+    found = with_lasting(state, here, marginal)
     extra = np.sqrt(np.diagonal(found - marginal, axis1=2, axis2=3))[:, 0, 0]
     np.testing.assert_allclose(extra, np.sqrt(0.5) * np.array([0.01, 0.01, 0.01, 0.08]), rtol=1e-6)
 
@@ -103,15 +104,16 @@ def solved(away_m, sigma_m=0.02, body_sigma_m=np.inf):
     joints = np.zeros((1, len(away), 3))
     joints[0, :, 0] = away
     shape = np.ones((1, len(away)))
-    return SimpleNamespace(joints=joints, views=message(sigma_m * shape), body=message(body_sigma_m * shape))
+    said = {"of_views": message(sigma_m * shape), "of_body": message(body_sigma_m * shape)}
+    observations = SimpleNamespace(track=np.array([7]), frame=np.array([12]))
+    return SimpleNamespace(joints=joints, observations=observations, **said)
 
 
 def reasons(solution, here, covariance=None, first=None):
     count = solution.joints.shape[1]
-    observations = SimpleNamespace(track=np.array([7]), frame=np.array([12]))
     covariance = np.broadcast_to(I3, (1, count, 3, 3)) if covariance is None else covariance
-    first = np.zeros((1, count, 3)) if first is None else first
-    found = problems(observations, [here], solution, first, covariance)
+    solution.first, solution.people = np.zeros((1, count, 3)) if first is None else first, [here]
+    found = problems(solution, covariance)
     assert all((each.row, each.track, each.frame) == (0, 7, 12) for each in found)
     return {each.joint: each.reason for each in found}
 
@@ -129,7 +131,7 @@ def test_a_joint_far_from_all_that_is_said_of_it_ran_away():
 
 def test_a_joint_with_a_factor_of_one_s_own_ran_away_after_a_metre():
     here = window([0.0], [False, False, False])
-    here.graph.touched = np.array([True, True, False])
+    here.touched = np.array([True, True, False])
     first = np.array([[[1.01, 0, 0], [0.99, 0, 0], [5.0, 0, 0]]])
     assert reasons(solved([0.0, 0.0, 0.0]), here, first=first) == {0: "ran away from its views"}
 
@@ -139,9 +141,9 @@ def test_what_nothing_determines_and_what_the_solver_says():
     covariance = np.full((1, 2, 3, 3), np.nan)
     covariance[0, 1] = I3
     assert reasons(solved([0.0, 0.0]), here, covariance) == {0: "nothing determines it: its system is singular"}
-    here.graph.failure = "the solver left the finite numbers"
+    here.failure = "the solver left the finite numbers"
     solution = solved([0.0, np.nan])
-    assert reasons(solution, here, covariance) == {0: here.graph.failure}, "who is not placed has no problem"
+    assert reasons(solution, here, covariance) == {0: here.failure}, "who is not placed has no problem"
 
 
 def evidence(points, sigma_m) -> ViewEvidence:

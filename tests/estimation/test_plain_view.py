@@ -11,9 +11,8 @@ WRIST = BODY_25.index("RWrist")
 
 
 def variance(rig, people, strong):
-    sizes = rig.image_sizes
     frame = np.zeros(len(people), dtype=int)
-    return elsewhere_variance(people, frame, strong, Views.of(rig), sizes, limbs_that_hide(BODY_25.joints))
+    return elsewhere_variance(people, frame, strong, Views.of(rig), limbs_that_hide(BODY_25.joints))
 
 
 def raised(two_people):

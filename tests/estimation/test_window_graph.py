@@ -6,12 +6,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from factors import DEFAULT_WIDTH_SIGMA, make_camera, split_key
-from shapepose_fg.core.camera import Rig
+from factors import DEFAULT_WIDTH_SIGMA, split_key
+from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.estimation.message import Message
+from shapepose_fg.estimation.estimator_config import EstimatorConfig, WindowGraphConfig
+from shapepose_fg.estimation.linearisation import Message, ObservationConfig
 from shapepose_fg.estimation.motion_model import MotionModel
-from shapepose_fg.estimation.window_graph import WindowGraph, WindowGraphConfig
+from shapepose_fg.estimation.window_graph import WindowGraph
 
 EXACT = WindowGraphConfig(max_iterations=100, tolerance=1e-12)
 """Solved to the end, so that the comparison is with the minimum and not with the stopping rule."""
@@ -34,14 +36,26 @@ def message(known, xyz, covariance) -> Message:
     return Message(np.array(xyz), information)
 
 
+def window_of(rig: Rig, xy, sigmas, config, kernel, frames, person=0) -> WindowGraph:
+    """A person's graph of observations (T, 25, V, 2) in some frames, 0.1 s apart."""
+    frame, V = np.array(frames), len(rig)
+    seen = Observations(
+        xy,
+        np.full(sigmas.shape, 0.8),
+        np.full((*sigmas.shape[:2], 3), np.nan),
+        np.full(len(frame), person),
+        frame,
+        np.repeat(0.1 * np.arange(len(frame))[:, None], V, axis=1),
+    )
+    settings = EstimatorConfig(ObservationConfig(kernel=kernel or "none"), config)
+    return WindowGraph(seen, sigmas, Views.of(rig), settings, MOTION)
+
+
 class OneFrame:
     """A window of one frame, gates and priors set one after the other, arrays without the frame's axis."""
 
     def __init__(self, rig: Rig, xy, sigmas, config, kernel, person, frame) -> None:
-        cameras = [[make_camera(camera.K, camera.wTc) for camera in rig.cameras]]
-        self.window = WindowGraph(
-            cameras, xy[None], sigmas[None], config, kernel, MOTION, track=person, frames=[frame], times_s=[0.0]
-        )
+        self.window = window_of(rig, xy[None], sigmas[None], config, kernel, [frame], person)
         self.inlier = np.ones(sigmas.shape, dtype=bool)
         self.body = message(NO_PRIOR, np.zeros((25, 3)), np.zeros((25, 3, 3)))
         self.keys = self.window.keys[0]
@@ -235,13 +249,11 @@ def test_the_weight_of_the_views_multiplies_their_cost_kernel_and_all(five_camer
     truth, xy, sigmas = person
     xy = xy.copy()
     xy[:, 2, 0] += 60.0
-    cameras = [[make_camera(camera.K, camera.wTc) for camera in five_cameras.cameras]] * frames
     costs = []
     for weight in (1.0, 4.0):
-        times = {"frames": np.arange(frames), "times_s": 0.1 * np.arange(frames)}
         observed = np.tile(xy, (frames, 1, 1, 1)), np.tile(sigmas, (frames, 1, 1))
         config = WindowGraphConfig(weight_2d=weight, max_iterations=1)
-        window = WindowGraph(cameras, *observed, config, kernel, MOTION, track=0, **times)
+        window = window_of(five_cameras, *observed, config, kernel, range(frames))
         none = Message(np.zeros((frames, 25, 3)), np.zeros((frames, 25, 3, 3)))
         window.solve(observed[1] > 0, none, none, np.tile(truth, (frames, 1, 1)))
         values = gtsam.Values()
@@ -252,25 +264,20 @@ def test_the_weight_of_the_views_multiplies_their_cost_kernel_and_all(five_camer
 
 
 @pytest.mark.parametrize(
-    ("frames", "times_s"),
-    [([1, 0], [0.0, 0.1]), ([3, 3], [0.0, 0.1]), ([0], [0.0, 0.1]), ([0, 1], [0.0]), ([0, 1, 2], [0.0, 0.1, 0.2])],
+    "frames",
+    [[1, 0], [3, 3]],
 )
-def test_frames_that_do_not_rise_or_fit_are_refused(five_cameras, person, frames, times_s):
+def test_frames_that_do_not_rise_are_refused(five_cameras, person, frames):
     _, xy, sigmas = person
-    cameras = [[make_camera(camera.K, camera.wTc) for camera in five_cameras.cameras]] * 2
-    both = np.stack([xy, xy]), np.stack([sigmas, sigmas])
-    with pytest.raises(ValueError, match=r"frames and times_s must be \(2,\), frames rising"):
-        WindowGraph(
-            cameras, *both, EXACT, None, MOTION, track=0, frames=np.array(frames), times_s=np.array(times_s)
-        )
+    with pytest.raises(ValueError, match="frames must rise"):
+        window_of(five_cameras, np.stack([xy, xy]), np.stack([sigmas, sigmas]), EXACT, None, frames)
 
 
 def test_a_factor_added_late_counts(five_cameras, person):
     """What was asked of the graph before does not matter."""
     _, xy, sigmas = person
-    cameras = [[make_camera(camera.K, camera.wTc) for camera in five_cameras.cameras]] * 2
     both = np.stack([xy, xy]), np.stack([sigmas, sigmas])
-    window = WindowGraph(cameras, *both, EXACT, None, MOTION, track=0, frames=[0, 1], times_s=[0.0, 0.1])
+    window = window_of(five_cameras, *both, EXACT, None, [0, 1])
     assert not window.touched.any() and not window.with_offsets.any() and window.coupled == []
     noise = gtsam.noiseModel.Isotropic.Sigma(1, 0.01)
     for frame in range(2):

@@ -9,7 +9,7 @@ import pytest
 from factors import isotropic
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.estimation.window_solution import WindowSolution
+from shapepose_fg.estimation.window_solution import PersonGraph
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.pipeline.solving import window_solutions
 from shapepose_fg.simulation import built_in_scene, simulate
@@ -27,11 +27,11 @@ def people(scene):
     return reconstruct(simulate(scene), scene.rig)
 
 
-def solutions(people, scene, extra_factors=None) -> list[WindowSolution]:
+def solutions(people, scene, extra_factors=None) -> list[PersonGraph]:
     return list(window_solutions(people, scene.rig, extra_factors=extra_factors))
 
 
-def ratios(solution: WindowSolution) -> np.ndarray:
+def ratios(solution: PersonGraph) -> np.ndarray:
     """(K,) sigmas of the graph's marginals over the reported ones, of all known joints."""
     found = gtsam.Marginals(solution.graph, solution.values)
     known = np.isfinite(solution.covariance).all(axis=(2, 3))

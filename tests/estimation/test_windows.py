@@ -10,17 +10,20 @@ import pytest
 from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus
+from shapepose_fg.core.camera import Views
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Known, Status
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.estimation.estimator import Estimates, Estimator, window_rows
 from shapepose_fg.estimation.estimator_config import EstimatorConfig, RefineConfig
 from shapepose_fg.estimation.in_time import interpolated, near_in_time
-from shapepose_fg.estimation.message import symmetric_roots
+from shapepose_fg.estimation.linearisation import symmetric_roots
 from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
+from shapepose_fg.estimation.solve_window import solve_window
+from shapepose_fg.estimation.state import window_rows
 from shapepose_fg.estimation.state_covariances import Chains, state_covariances
 from shapepose_fg.estimation.window_graph import WindowGraph
+from shapepose_fg.estimation.window_solution import WindowSolution
 
 FPS = 25.0
 FRAMES = 30
@@ -97,11 +100,13 @@ def one_view_less(observations: Observations, rows, joint: int, view: int) -> Ob
     return replace(observations, confidence=confidence, xy=xy)
 
 
-def solve(observations: Observations, rig, fitter, extra_factors=None, *, temporal=True, **motion) -> Estimates:
+def solve(
+    observations: Observations, rig, fitter, extra_factors=None, *, temporal=True, **motion
+) -> WindowSolution:
     if not temporal:
         observations = replace(observations, track=np.arange(len(observations)))
     config = EstimatorConfig(motion=MotionConfig(**motion))
-    return Estimator(rig, fitter, BODY_25.joints, config).estimate(observations, extra_factors)
+    return solve_window(observations, Views.of(rig), fitter, config, extra_factors=extra_factors)
 
 
 def test_a_row_without_others_of_its_track_stands_alone(walk, five_cameras, two_people):
@@ -133,10 +138,10 @@ def test_a_start_that_is_not_complete_is_for_frames_alone(walk, five_cameras, tw
     """Nothing placed by stage I and no triangulation: alone there is nobody, a window has its draft."""
     observations, truth = walk
     config = EstimatorConfig(refine=RefineConfig(complete_start=False))
-    estimator = Estimator(five_cameras, NobodyFitter(), BODY_25.joints, config)
-    alone = estimator.estimate(replace(observations, track=np.arange(len(observations))))
+    asked = Views.of(five_cameras), NobodyFitter(), config
+    alone = solve_window(replace(observations, track=np.arange(len(observations))), *asked)
     assert (alone.status == Status.TOO_FEW_VIEWS).all() and np.isnan(alone.joints).all()
-    np.testing.assert_allclose(estimator.estimate(observations).joints, truth, atol=0.03)
+    np.testing.assert_allclose(solve_window(observations, *asked).joints, truth, atol=0.03)
 
 
 @pytest.mark.parametrize("views_left", [0, 1])

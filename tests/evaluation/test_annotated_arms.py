@@ -16,7 +16,7 @@ from shapepose_fg.evaluation.annotated_arms import (
 from shapepose_fg.evaluation.footage import single_footage
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.simulation import built_in_scene
-from shapepose_fg.simulation.truth import truth_of
+from shapepose_fg.simulation.files import truth_of
 
 JOINTS = [BODY_25.index(name) for name in ARMS]
 

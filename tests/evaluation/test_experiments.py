@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.evaluation.experiments import ablation, fitters, runner, scenes, stretches
 from shapepose_fg.evaluation.experiments.experiment import Case, Column, Experiment
@@ -20,8 +20,7 @@ from shapepose_fg.evaluation.experiments.runner import Kept, measured
 from shapepose_fg.evaluation.experiments.stretches import Scale, Stretch
 from shapepose_fg.evaluation.varied import varied
 from shapepose_fg.pipeline.pipeline import PipelineConfig
-from shapepose_fg.simulation.sequences import Sequence
-from shapepose_fg.simulation.training.split import split_of
+from shapepose_fg.simulation.training.motions import split_of
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
 QUICK = {each.name: each for each in experiments(Scale(quick=True)) if each.name not in ("scenes", "time off")}
@@ -176,7 +175,7 @@ def test_nothing_was_learnt_from_anybody_who_is_held_back(shared_data):
     """By the clips that each sequence says it is made of: 60 and 61 dance, all others are test subjects."""
     for stretch in scenes.held_back_stretches(shared_data / "cmu_mocap" / "cmu_smpl24.npz"):
         scene = stretch.scene
-        assert isinstance(scene, Sequence) and scene.cuts == () and len(scene) == 300
+        assert scene.cuts == () and len(scene) == 300
         subjects = {clip.split("_")[0] for clips in scene.clips for clip in clips}
         assert len(subjects) > 2 and {split_of(subject) for subject in subjects} == {"test"}
     assert len(scenes.held_back(Scale(data=shared_data.parent)).cases) == 6
@@ -190,8 +189,10 @@ def test_a_case_is_drawn_by_its_seed_at_its_rate():
 
 
 def test_after_a_cut_everybody_is_somebody_else(monkeypatch):
-    monkeypatch.setattr(stretches, "cuts_of", lambda _: (2, 4))
-    truth = Stretch("demo", range(6), cameras=2, people=2).truth
+    stretch = Stretch("demo", range(6), cameras=2, people=2)
+    scene = replace(stretch.scene, cuts=(2, 4))
+    monkeypatch.setattr(stretches, "_scene", lambda _: scene)
+    truth = stretch.truth
     people = [np.unique(truth.person[truth.frame == frame]).tolist() for frame in range(6)]
     assert people == [[0, 1], [0, 1], [2, 3], [2, 3], [4, 5], [4, 5]]
 

@@ -11,8 +11,7 @@ from shapepose_fg.evaluation.other_results.reading import read_people
 from shapepose_fg.evaluation.other_results.skeleton_text import SHELF_JOINTS, SKEL_15, SKEL_17, SKEL_19
 from shapepose_fg.evaluation.other_results.trc import read_trc
 from shapepose_fg.evaluation.shelf import shelf_joints
-from shapepose_fg.io.export.marker_files import trc_text
-from shapepose_fg.io.export.markers import Markers, opensim_names
+from shapepose_fg.io.export.markers import Markers, opensim_names, trc_text
 from tests.conftest import STANDING
 
 

@@ -17,7 +17,7 @@ from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.simulation import built_in_scene
-from shapepose_fg.simulation.truth import truth_of
+from shapepose_fg.simulation.files import truth_of
 
 RWRIST, RSHOULDER = BODY_25.index("RWrist"), BODY_25.index("RShoulder")
 

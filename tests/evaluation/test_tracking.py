@@ -14,7 +14,7 @@ from shapepose_fg.evaluation.matching import match_people
 from shapepose_fg.evaluation.tracking import frame_index, joints_by_frame, score_tracks
 from shapepose_fg.evaluation.trajectories import acceleration_errors, fast_joint_errors, frames_unseen
 from shapepose_fg.simulation import built_in_scene
-from shapepose_fg.simulation.truth import truth_of
+from shapepose_fg.simulation.files import truth_of
 
 FPS = 30.0
 J = 25

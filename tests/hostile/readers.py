@@ -26,10 +26,9 @@ from shapepose_fg.io.calibration import read_rig, write_rig
 from shapepose_fg.io.config import read_config, toml_text
 from shapepose_fg.io.corrections import correct, read_corrections, take_back
 from shapepose_fg.io.detections import read_detections
-from shapepose_fg.io.export.marker_files import trc_text
-from shapepose_fg.io.export.markers import Markers, opensim_names
+from shapepose_fg.io.export.markers import Markers, opensim_names, trc_text
 from shapepose_fg.io.export.registry import chosen, export_result
-from shapepose_fg.io.footage.used import read_used_footage
+from shapepose_fg.io.footage.placement import read_used_footage
 from shapepose_fg.io.pose2sim_project import read_pose2sim_project
 from shapepose_fg.io.skeleton_file import read_skeleton
 from shapepose_fg.io.timestamps import read_timestamps

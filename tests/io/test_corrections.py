@@ -12,7 +12,7 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.io.corrections import correct, read_corrections, refuse_corrected, take_back
 from shapepose_fg.simulation import built_in_scene
-from shapepose_fg.simulation.truth import truth_of
+from shapepose_fg.simulation.files import truth_of
 from shapepose_fg.tracking.edits import Action, Edit
 
 

@@ -8,10 +8,16 @@ import pytest
 
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.footage.footage import PictureFiles, Video, open_footage
-from shapepose_fg.io.footage.given import _rate, _start
-from shapepose_fg.io.footage.placement import Placement, PlacementKind, place
+from shapepose_fg.io.footage.lockstep import _rate, _start
+from shapepose_fg.io.footage.placement import (
+    CameraFootage,
+    Placement,
+    PlacementKind,
+    place,
+    read_used_footage,
+    write_used_footage,
+)
 from shapepose_fg.io.footage.places import find_footage
-from shapepose_fg.io.footage.used import CameraFootage, read_used_footage, write_used_footage
 
 
 def video(
@@ -104,7 +110,7 @@ def test_pictures_without_frames_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"one\.png: no number in its name says which frame"):
         open_footage(tmp_path / "cam")
     (tmp_path / "cam" / "one.png").rename(tmp_path / "cam" / "02.png")
-    with pytest.raises(InputError, match=r"02\.png and 2\.png are both frame 2"):
+    with pytest.raises(InputError, match=r"2\.png: frame 2 is also in 02\.png"):
         open_footage(tmp_path / "cam")
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="no pictures in this folder"):
@@ -159,7 +165,7 @@ def test_footage_that_is_not_found_is_named(tmp_path):
         ([f"cam1={folder}/cam1.mp4"], "nothing is given for camera cam2; add --videos cam2=PATH"),
         (["cam1=x.mp4", "cam1=y.mp4"], "camera cam1 is given twice"),
         (["cam1=x.mp4", "cam2=y.mp4"], "x.mp4: there is no such file or folder"),
-        ([folder, "cam2=y.mp4"], "give one folder, or CAMERA=PATH for each camera, not both"),
+        ([folder, "cam2=y.mp4"], "must be CAMERA=VALUE, such as --videos cam1=VALUE"),
     ):
         with pytest.raises(InputError, match=problem):
             find_footage(given, CAMERAS)
@@ -222,10 +228,13 @@ def test_what_was_used_is_read_back(tmp_path):
     for spoilt, problem in (
         (
             text.replace("footage 1", "footage 7"),
-            "format must be 'shapepose-fg footage 1', got 'shapepose-fg footage 7'",
+            "format must be 'shapepose-fg footage 1', got text",
         ),
         (text.replace('"letterbox"', '"folded"'), r"cameras\[0\]\.placement must be"),
-        (text.replace("960", "0"), "camera c: sizes must be positive"),
+        (
+            text.replace("960", "0"),
+            r"cameras\[0\]\.picture_size\[0\] is refused: input should be greater than or equal to 1",
+        ),
         (text[:50], "is not JSON"),
     ):
         file.write_text(spoilt)

@@ -12,7 +12,7 @@ from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25, COCO_17, COCO_18, COCO_133, HALPE_26, SKELETONS, Skeleton
 from shapepose_fg.io.detection_table import DetectionTable
-from shapepose_fg.io.detections import formats, read_detections
+from shapepose_fg.io.detections import read_detections, reading
 from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock
 from shapepose_fg.io.skeleton_file import read_skeleton
 from shapepose_fg.proposal.people_2d import group_people
@@ -485,7 +485,7 @@ def test_mmpose_pictures_that_do_not_fit(tmp_path, rig):
     mmpose_pictures(tmp_path, people_of(COCO_17))
     file = tmp_path / "left" / "000001.json"
     file.write_text('[{"keypoints": [[1, 2]], "keypoint_scores": [1, 1]}]')
-    with pytest.raises(InputError, match=r"000001\.json: \[0\]\.keypoints must hold x and y for each of the 2"):
+    with pytest.raises(InputError, match=r"000001\.json: \[0\]: 1 keypoints have 2 keypoint_scores"):
         read_detections(tmp_path, rig)
 
 
@@ -528,12 +528,12 @@ def test_a_format_of_the_user_s_own(tmp_path, rig):
         block = PeopleBlock(rows[:, 0].astype(np.intp), rows[:, 1:].reshape(len(rows), -1, 3))
         return CameraPeople(file, "our CSV", iter([block]), 0, 2)
 
-    ours = formats.Format("our CSV", ("{}.csv",), lambda place: place.suffix == ".csv", read)
-    formats.FORMATS.insert(0, ours)
+    ours = reading.Format("our CSV", ("{}.csv",), lambda place: place.suffix == ".csv", read)
+    reading.FORMATS.insert(0, ours)
     try:
         table = read_detections(tmp_path, rig)
     finally:
-        formats.FORMATS.remove(ours)
+        reading.FORMATS.remove(ours)
     coco(tmp_path, people)
     expected = read_detections(tmp_path, rig)
     assert table.skeleton is COCO_17 and len(table) == len(expected) == 3

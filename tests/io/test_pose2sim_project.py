@@ -12,7 +12,7 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Known, Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.io.calibration import write_rig
-from shapepose_fg.io.export.marker_files import write_pose2sim_files
+from shapepose_fg.io.export.markers import write_pose2sim_files
 from shapepose_fg.io.pose2sim_project import read_pose2sim_project
 
 CONFIG = """

@@ -13,7 +13,7 @@ from shapepose_fg.core.storage import files
 from shapepose_fg.core.storage.kept_arrays import InFolder
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections import read_detections
-from shapepose_fg.io.detections.one_file import read_one_file
+from shapepose_fg.io.detections.json_people import read_one_file
 from shapepose_fg.io.write_detections import write_association
 from shapepose_fg.simulation import Scene, built_in_scene, simulate
 

@@ -22,7 +22,7 @@ from shapepose_fg.pipeline.bodies_over_time import (
     with_bodies_over_time,
 )
 from shapepose_fg.simulation import Scene, built_in_scene
-from shapepose_fg.simulation.truth import truth_of
+from shapepose_fg.simulation.files import truth_of
 
 SIGMA_M = 0.003
 """Joints known so well tell shapes apart in two dozen frames."""

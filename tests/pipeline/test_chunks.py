@@ -1,7 +1,6 @@
 """Chunks of a recording, reconstructed side by side: the same people, the same joints, the same names."""
 
 from dataclasses import dataclass, replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,8 +19,7 @@ from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.pipeline import PipelineConfig, Task, reconstruct, reconstruct_parts
 from shapepose_fg.pipeline.runs import chunks
 from shapepose_fg.pipeline.runs.assembly import Assembly
-from shapepose_fg.pipeline.runs.borders import Border, same_people
-from shapepose_fg.pipeline.runs.chunks import Chunk, cut_in_chunks, windows_of
+from shapepose_fg.pipeline.runs.chunks import Border, Chunk, cut_in_chunks, same_people, windows_of
 from shapepose_fg.pipeline.solved_windows import ChunkJob, solve_chunk
 from shapepose_fg.pipeline.windows import Engine, WindowConfig
 from shapepose_fg.simulation import built_in_scene, simulate
@@ -114,7 +112,7 @@ def test_every_row_is_of_its_frame_and_its_person(scene, whole):
 
 def test_a_person_s_rows_are_read_from_all_windows(assembly, whole):
     rows = [range(3, 8), range(18, 23), range(10, 14)]
-    for number, count in assembly.people.counts.items():
+    for number, count in assembly.rows_of.items():
         mine = np.flatnonzero(whole.person == number)
         assert len(mine) == count
         chosen = mine[np.concatenate(rows)]
@@ -125,7 +123,7 @@ def test_a_person_s_rows_are_read_from_all_windows(assembly, whole):
             np.linalg.inv(found.targets.information[known]), whole.covariance[chosen][known], rtol=1e-6, atol=1e-12
         )
         np.testing.assert_array_equal(found.time_s, whole.time_s[chosen])
-    first, last = min(assembly.people.counts), max(assembly.people.counts)
+    first, last = min(assembly.rows_of), max(assembly.rows_of)
     named = replace(assembly, names={first: 40, last: first}, bodies=None).reconstruction()
     expected = np.where(whole.person == first, 40, np.where(whole.person == last, first, whole.person))
     np.testing.assert_array_equal(named.person, expected)
@@ -225,8 +223,7 @@ def test_every_chunk_gives_its_own_frames_and_whole_windows(fps, views, batch):
         return Input(frame, of_views[frame], Detections.empty(), range(views))  # type: ignore[arg-type]
 
     def spans(chunk: Chunk) -> list[tuple[list[int], int, int]]:
-        solver = SimpleNamespace(windows=config.windows)
-        engine = Engine(NobodyIsThere(), config.following, solver, frames=batch)  # type: ignore[arg-type]
+        engine = Engine(NobodyIsThere(), config)  # type: ignore[arg-type]
         found = windows_of(engine, chunk, read)
         return [([given.frame for given, _ in span.decided], span.start, span.stop) for span in found]
 
@@ -248,8 +245,7 @@ def test_every_chunk_gives_its_own_frames_and_whole_windows(fps, views, batch):
 def test_windows_take_the_frames_that_overlap_them():
     """By default 0.4 s on either side: nine frames of 24 a second; the last takes what is left."""
     times = FrameTimes.from_fps(24.0, 70).of_views(3)
-    solver, config = SimpleNamespace(windows=PipelineConfig().windows), PipelineConfig().following
-    engine = Engine(NobodyIsThere(), config, solver, frames=20)  # type: ignore[arg-type]
+    engine = Engine(NobodyIsThere(), PipelineConfig(batch_frames=20))  # type: ignore[arg-type]
     given = [Input(frame, times[frame], Detections.empty(), range(3)) for frame in range(70)]  # type: ignore[arg-type]
     spans, _ = engine.follow(engine.start(), given, last=True)
     own, taken = [], []

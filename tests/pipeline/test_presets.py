@@ -11,11 +11,10 @@ from shapepose_fg.core.camera import Views
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.estimation.body_step import JOINT_SIGMA_M, BodyStep, joint_targets
-from shapepose_fg.estimation.draft import MODEL_SIGMA_M
-from shapepose_fg.estimation.estimator import Estimator
+from shapepose_fg.estimation.body_step import JOINT_SIGMA_M, MODEL_SIGMA_M, BodyStep, joint_targets
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.linearisation import linearise, observation_sigmas
+from shapepose_fg.estimation.solve_window import solve_window
 from shapepose_fg.io.config import read_config
 from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people
 from shapepose_fg.proposal.candidates import triangulate_pairs, vote
@@ -88,7 +87,7 @@ def test_e_shape_has_one_weight(five_cameras, two_people):
     body = OneBody(two_people + np.array([0.0, 0.06, 0.0]))
     config = replace(STAGE_II, refine=replace(STAGE_II.refine, alternations=1))
     config = replace(config, graph=replace(config.graph, max_iterations=100, tolerance=1e-12))
-    found = Estimator(five_cameras, body, BODY_25.joints, config).estimate(observations)
+    found = solve_window(observations, Views.of(five_cameras), body, config)
     views = Views.of(five_cameras)
     sigmas = observation_sigmas(observations, two_people, views, config.observations, BODY_25.joints)
     at = linearise(observations, sigmas, found.joints, views, config.observations)
@@ -106,7 +105,7 @@ def test_the_body_is_fitted_to_x_and_its_prior_has_seen_the_joint(five_cameras, 
     observations.initial[1, KNEE] = np.nan
     moved = observations.initial + 0.01
     body = OneBody(two_people)
-    step = BodyStep(body, None, STAGE_II)
+    step = BodyStep(body, (), STAGE_II)
     views = Views.of(five_cameras)
     sigmas = observation_sigmas(observations, two_people, views, PAPER.observations, BODY_25.joints)
     evidence = linearise(observations, sigmas, moved, views, PAPER.observations)
@@ -122,7 +121,7 @@ def test_the_body_is_fitted_to_x_and_its_prior_has_seen_the_joint(five_cameras, 
     np.testing.assert_array_equal(fit.prior_xyz, body.joints)
     expected = (body.sigma_m**2 + MODEL_SIGMA_M**2) * np.eye(3)
     np.testing.assert_allclose(fit.prior_covariance, np.broadcast_to(expected, fit.prior_covariance.shape))
-    ours = BodyStep(body, None, EstimatorConfig())
+    ours = BodyStep(body, (), EstimatorConfig())
     np.testing.assert_array_equal(ours.fit(targets, nothing).prior_xyz, body.joints + 0.05)
     np.testing.assert_array_equal(
         ours.targets(evidence, np.array([True, False])).information,
@@ -136,7 +135,7 @@ def test_the_paper_makes_n_rounds_and_starts_from_stage_i_alone(five_cameras, tw
     observations.initial[1, KNEE] = np.nan
     observations.confidence[:, KNEE] = 0.1
     body = OneBody(two_people)
-    found = Estimator(five_cameras, body, BODY_25.joints, STAGE_II).estimate(observations)
+    found = solve_window(observations, Views.of(five_cameras), body, STAGE_II)
     assert len(body.targets) == 10
     known = [targets.information[1, KNEE].any() for targets in body.targets]
     assert known == [False] + 9 * [True]

@@ -7,8 +7,8 @@ from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Known, Status
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.estimation.estimator import Estimates
-from shapepose_fg.pipeline.solved_rows import result_rows
+from shapepose_fg.estimation.window_solution import WindowSolution
+from shapepose_fg.pipeline.solved_windows import result_rows
 
 N, J, V = 4, 25, 5
 
@@ -30,10 +30,6 @@ def test_every_column_is_of_the_same_row(five_cameras, two_people):
     )  # fmt: skip
     known = rng.choice([Known.SEEN, Known.WEAK, Known.BODY, Known.MOTION], (N, J)).astype(np.uint8)
     status = np.array([Status.OK, Status.BODY_UNDETERMINED, Status.NOT_SOLVED, Status.OK])
-    estimates = Estimates(
-        joints, spread(J), rng.normal(size=(N, J, 3)), spread(J), rng.random((N, J)), inlier & seen,
-        contradicts, rng.normal(size=(N, J, V, 2)), known, fit, status,
-    )  # fmt: skip
     observations = Observations(
         xy=rng.uniform(0, 900, (N, J, V, 2)),
         confidence=np.where(seen, rng.uniform(0.1, 1, seen.shape), 0),
@@ -43,13 +39,17 @@ def test_every_column_is_of_the_same_row(five_cameras, two_people):
         time_s=np.array([0.7, 0.7, 0.8, 0.8])[:, None] + 0.01 * np.arange(V),
         probability=rng.random((N, J, V)),
     )
+    solution = WindowSolution(
+        observations, joints, spread(J), rng.normal(size=(N, J, 3)), spread(J), rng.random((N, J)), inlier & seen,
+        contradicts, rng.normal(size=(N, J, V, 2)), known, fit, status,
+    )  # fmt: skip
     place, person = rng.integers(0, 9, (N, J, V)), np.array([0, 1, 0, 1])
-    rows = result_rows(observations, estimates, place, five_cameras, BODY_25.joints, person)
+    rows = result_rows(solution, place, five_cameras, BODY_25.joints, person)
 
     assert rows.frame.tolist() == [7, 7, 8, 8] and rows.person.tolist() == [0, 1, 0, 1]
     np.testing.assert_allclose(rows.time_s, [0.72, 0.72, 0.82, 0.82])
     for name in ("joints", "covariance", "velocity", "velocity_covariance", "known", "confidence", "status"):
-        np.testing.assert_array_equal(getattr(rows, name), getattr(estimates, name), err_msg=name)
+        np.testing.assert_array_equal(getattr(rows, name), getattr(solution, name), err_msg=name)
     for name in ("betas", "global_orient", "body_pose", "transl"):
         found, expected = getattr(rows, name), getattr(fit, name)
         np.testing.assert_array_equal(found[[0, 2, 3]], expected[[0, 2, 3]], err_msg=name)
@@ -57,9 +57,9 @@ def test_every_column_is_of_the_same_row(five_cameras, two_people):
 
     table = rows.observations
     assert table.frame.tolist() == rows.frame.tolist() and table.person.tolist() == rows.person.tolist()
-    np.testing.assert_array_equal(table.used, estimates.inlier)
+    np.testing.assert_array_equal(table.used, solution.inlier)
     np.testing.assert_array_equal(table.gate == Gate.NOT_SEEN, ~seen)
-    out, placed = seen & ~estimates.inlier, np.isfinite(joints).all(axis=2)[..., None]
+    out, placed = seen & ~solution.inlier, np.isfinite(joints).all(axis=2)[..., None]
     np.testing.assert_array_equal(table.gate == Gate.CONTRADICTS_BODY, out & placed & contradicts[..., None])
     np.testing.assert_array_equal(table.gate == Gate.TOO_FAR, out & placed & ~contradicts[..., None])
     np.testing.assert_array_equal(table.gate == Gate.NOT_PLACED, out & ~placed)

@@ -14,9 +14,9 @@ from shapepose_fg.cli.main import main
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.estimation.estimator import Estimator
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.solved_setup import CAMERAS, read_setup
+from shapepose_fg.pipeline import engine, solving
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.pipeline.solving import Solver, solve_rows
 from shapepose_fg.pipeline.windows import WindowConfig
@@ -70,14 +70,15 @@ LONG = PipelineConfig(batch_frames=6, windows=WindowConfig(overlap_s=0.1))
 
 def solved_frames(work: Callable[[], Reconstruction]) -> tuple[list[list[int]], Reconstruction]:
     """The frames of each window that is solved meanwhile, and what comes of it."""
-    frames, solve = [], Estimator.solve
+    frames, solve = [], engine.solve_window
 
-    def noted(self, observations, *others):
+    def noted(observations, *others, **more):
         frames.append(sorted(set(observations.frame.tolist())))
-        return solve(self, observations, *others)
+        return solve(observations, *others, **more)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Estimator, "solve", noted)
+        for module in (engine, solving):
+            patch.setattr(module, "solve_window", noted)
         return frames, work()
 
 

@@ -27,8 +27,15 @@ from shapepose_fg.estimation.detector_offsets import OffsetConfig
 from shapepose_fg.io.config import toml_text
 from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.pipeline import PipelineConfig, Task, reconstruct, reconstruct_parts
-from shapepose_fg.pipeline.runs.known_people import checksum_at_start, people_at_start, write_people
-from shapepose_fg.pipeline.runs.manifest import check_room, end_run, expected_bytes, open_run
+from shapepose_fg.pipeline.runs.manifest import (
+    check_room,
+    checksum_at_start,
+    end_run,
+    expected_bytes,
+    open_run,
+    people_at_start,
+    write_people,
+)
 from shapepose_fg.pipeline.windows import WindowConfig
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.files import write_simulated

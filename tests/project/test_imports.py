@@ -31,8 +31,9 @@ LEVELS = (
     "proposal",
     "estimation",
     "tracking",
-    "pipeline.windows pipeline.bodies_over_time pipeline.solved_rows",
-    "pipeline.config pipeline.cluster",
+    "estimation.solve_window",
+    "pipeline.config pipeline.cluster pipeline.bodies_over_time",
+    "pipeline.windows",
     "pipeline.runs",
     "pipeline.engine",
     "pipeline.execution pipeline.offsets pipeline.solved_windows",
@@ -159,7 +160,7 @@ LIGHT = {
     "the package": "import shapepose_fg; dir(shapepose_fg)",
     "readers": "from shapepose_fg import InputError, Reconstruction, read_detections, read_rig, write_rig",
     "stage I": "import shapepose_fg.proposal.association",
-    "stage II": "import shapepose_fg.estimation.alternation",
+    "stage II": "import shapepose_fg.estimation.solve_window",
     "processes that look": "import shapepose_fg.simulation.visibility",
     "help": (
         "from shapepose_fg.cli.main import main\n"

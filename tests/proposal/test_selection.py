@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shapepose_fg.body.fitting.bone_reach import longest_bones
+from shapepose_fg.body.fitting.priors import longest_bones
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import BODY_25

@@ -22,9 +22,8 @@ from shapepose_fg.evaluation.spoiled_setups import (
 )
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
-from shapepose_fg.setup_check.changes import Kind
 from shapepose_fg.setup_check.diagnosis import diagnose
-from shapepose_fg.setup_check.words import sentence
+from shapepose_fg.setup_check.findings import Kind, sentence
 
 
 def only_finding(recording, rig):

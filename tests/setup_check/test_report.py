@@ -13,11 +13,9 @@ from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.evaluation.spoiled_setups import turned, zoomed
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.write_detections import write_openpose
-from shapepose_fg.setup_check.camera_use import Distances, camera_use
-from shapepose_fg.setup_check.changes import Kind
-from shapepose_fg.setup_check.diagnosis import Finding
+from shapepose_fg.setup_check.findings import Finding, Kind, sentence
+from shapepose_fg.setup_check.in_result import Distances, camera_use
 from shapepose_fg.setup_check.report import check_setup
-from shapepose_fg.setup_check.words import sentence
 
 
 @pytest.fixture(scope="module")

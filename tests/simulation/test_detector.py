@@ -3,7 +3,6 @@
 import json
 from dataclasses import fields, replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from scipy.special import ndtr, ndtri
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.simulation import DetectorConfig, Scene, built_in_scene, detector_statistics, simulate
+from shapepose_fg.simulation import DetectorConfig, Scene, built_in_scene, simulate
 from shapepose_fg.simulation.detector import Detector
 from shapepose_fg.simulation.detector_statistics import JOINT_GROUP, LIMB_GROUP, DetectorStatistics, measured
 from shapepose_fg.simulation.visibility import FACE, Visibility, facing
@@ -421,13 +420,3 @@ def test_the_shipped_statistics_are_whole():
     probability = np.array([0.03, 0.3, 0.97])
     rows = np.broadcast_to(table.confidence[0, 0], (3, len(table.levels)))
     np.testing.assert_allclose(table.probability(rows, table.quantile(rows, probability)), probability, atol=1e-9)
-
-
-def test_what_is_drawn_takes_the_place_of_what_was_measured(tmp_path: Path):
-    content = json.loads((Path(detector_statistics.__file__).parent / "data" / "detector.json").read_text())
-    content["drawn"] = {"swap": 0.5, "miss": np.full((14, 3), 0.25).tolist(), "double": 0.125}
-    (tmp_path / "other.json").write_text(json.dumps(content))
-    other = DetectorStatistics.read(tmp_path / "other.json")
-    assert other.swap == 0.5 and (other.miss == 0.25).all() and other.double == 0.125
-    assert other.false_far == content["measured"]["false"]["far_per_view"] != measured().false_far
-    assert other.floor_px == measured().floor_px

@@ -1,6 +1,7 @@
 """Simulated recordings as files: whoever reads them finds the scene, and the truth beside it."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,7 @@ from shapepose_fg.evaluation.metrics import joint_metrics
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.simulation import built_in_scene, simulate
-from shapepose_fg.simulation.files import cut, named_scene, write_simulated
-from shapepose_fg.simulation.sequences import Sequence
+from shapepose_fg.simulation.files import named_scene, write_simulated
 
 
 def run(*arguments: str) -> int:
@@ -59,7 +59,7 @@ def test_the_same_seed_gives_the_same_files(tmp_path: Path, format: str):
 
 @pytest.mark.parametrize(("people", "cameras"), [(1, 2), (4, 3), (12, 6), (4, 12), (12, 12), (0, 6)])
 def test_any_number_of_people_and_cameras(tmp_path: Path, people: int, cameras: int):
-    scene = cut(named_scene("demo", people=people, cameras=cameras), range(2))
+    scene = named_scene("demo", people=people, cameras=cameras).part(range(2))
     written = write_simulated(scene, simulate(scene), tmp_path, "association")
     rig = read_rig(written["cameras"])
     assert len(rig) == cameras
@@ -119,11 +119,11 @@ def test_a_sequence_of_recorded_motions(shared_data: Path, tmp_path: Path, monke
 def test_cuts_are_listed_counted_from_the_first_frame_that_is_written(tmp_path: Path):
     scene = built_in_scene(frames=10)
     names = tuple((f"clip {segment}",) for segment in range(4))
-    whole = Sequence(scene.rig, scene.body, scene.motion, 25.0, "salsa", "tune", (2, 5, 8), names)
-    part = cut(whole, range(2, 8))
-    assert isinstance(part, Sequence) and part.cuts == (3,) and part.clips == names[1:3] and len(part) == 6
+    whole = replace(scene, cuts=(2, 5, 8), clips=names)
+    part = whole.part(range(2, 8))
+    assert part.cuts == (3,) and part.clips == names[1:3] and len(part) == 6
     np.testing.assert_array_equal(part.keypoints, scene.keypoints[2:8])
-    written = write_simulated(cut(whole, range(4, 9)), simulate(cut(scene, range(4, 9))), tmp_path, "association")
+    written = write_simulated(whole.part(range(4, 9)), simulate(scene.part(range(4, 9))), tmp_path, "association")
     truth = Reconstruction.load(written["truth"])
     assert truth.run["simulated"]["cuts"] == [1, 4] and truth.run["simulated"]["fps"] == 25.0
     np.testing.assert_allclose(truth.time_s, truth.frame / 25.0)

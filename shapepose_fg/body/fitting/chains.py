@@ -1,4 +1,4 @@
-"""Rows of people over time as chains, the motion prior along them, and the linear systems of chains."""
+"""Rows of people over time as chains: how they are cut, the motion prior along them, their linear systems."""
 
 from dataclasses import dataclass
 
@@ -53,28 +53,19 @@ def cut_segments(
     return segments
 
 
-@dataclass(frozen=True)
-class MotionTerm:
-    """The motion prior of G chains of up to T rows at some parameters, as a part of a least-squares problem."""
+class Motion:
+    """`MotionPrior` along G chains of up to T rows of N numbers, as a part of a least-squares problem.
 
-    energy: Tensor
-    """(G,) squared standard deviations."""
-    gradient: Tensor
-    """(T, G, N) half the gradient."""
+    The root's rotation moves in tangents of the world, exp(delta) R, in which its coupling is as diagonal as that
+    of the other numbers, up to the turn from frame to frame; its gradient is exact.
+    """
+
     diagonal: Tensor
     """(T, G, N) of half the Hessian: couplings of one number with itself only."""
     next_one: Tensor
     """(T, G, N) coupling of a row with the next."""
     next_two: Tensor
     """(T, G, N) coupling of a row with the one after."""
-
-
-class Motion:
-    """`MotionPrior` along G chains.
-
-    The root's rotation moves in tangents of the world, exp(delta) R, in which its coupling is as diagonal as that
-    of the other numbers, up to the turn from frame to frame; its gradient is exact.
-    """
 
     def __init__(self, acceleration: Array, velocity: Array, step_s: Tensor):
         """Densities (N,) as in `MotionPrior`; `step_s` (T - 1, G) seconds from row to row, infinite past the end.
@@ -87,19 +78,32 @@ class Motion:
         pair = torch.where(real[1:], (step_s[1:] + step_s[:-1]) / 2, 1.0)[..., None]
         smooth = real[1:, :, None] / (pair * torch.from_numpy(acceleration))
         edge = torch.zeros_like(slow[:1])
-        # In velocities the prior is tridiagonal: slow v² + smooth (v_next - v)².
+        # In velocities the prior is tridiagonal, slow v² + smooth (v_next - v)²; in rows it is V^T M V, with their
+        # differences V.
         self._own = slow + torch.cat((edge, smooth)) + torch.cat((smooth, edge))
-        self._slow, self._smooth, self._next = slow, smooth, -smooth
+        self._slow, self._smooth = slow, smooth
+        own = self._rate.square() * self._own
+        across = self._rate[:-1] * self._rate[1:] * -smooth  # v_k with v_k+1
+        self.diagonal = torch.cat((edge, own)) + torch.cat((own, edge))
+        self.diagonal[1:-1] -= 2 * across
+        one = -own.clone()
+        one[1:] += across
+        one[:-1] += across
+        self.next_one = torch.cat((one, edge))
+        self.next_two = torch.cat((-across, edge, edge))[: len(self.diagonal)]
 
-    def at(self, root: Tensor, others: Tensor) -> MotionTerm:
-        """At rotations of the root (T, G, 3, 3) and everything else (T, G, N - 3), double precision."""
+    def at(self, root: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
+        """Energy (G,) in squared standard deviations, and half its gradient (T, G, N).
+
+        At rotations of the root (T, G, 3, 3) and everything else (T, G, N - 3), double precision.
+        """
         turn = log_so3(root[1:] @ root[:-1].mT)
         v = self._rate * torch.cat((turn, others[1:] - others[:-1]), -1)
         change = v[1:] - v[:-1]
         energy = (self._slow * v.square()).sum((0, 2)) + (self._smooth * change.square()).sum((0, 2))
         force = self._own * v
-        force[:-1] += self._next * v[1:]
-        force[1:] += self._next * v[:-1]
+        force[:-1] += -self._smooth * v[1:]
+        force[1:] += -self._smooth * v[:-1]
         force = self._rate * force
         after, before = force.clone(), force.clone()
         inverse = right_jacobian_inverse(turn)
@@ -107,21 +111,7 @@ class Motion:
         after[..., :3] = (inverse @ force[..., :3, None]).squeeze(-1)
         before[..., :3] = (inverse.mT @ force[..., :3, None]).squeeze(-1)
         edge = torch.zeros_like(v[:1])
-        gradient = torch.cat((edge, after)) - torch.cat((before, edge))
-        return MotionTerm(energy, gradient, *self._couplings(edge))
-
-    def _couplings(self, edge: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """H = V^T M V with V the differences of rows, M tridiagonal: diagonal, next and next but one (T, G, N)."""
-        rate, none = self._rate, edge
-        own = rate.square() * self._own
-        across = rate[:-1] * rate[1:] * self._next  # v_k with v_k+1
-        diagonal = torch.cat((none, own)) + torch.cat((own, none))
-        diagonal[1:-1] -= 2 * across
-        one = -own.clone()
-        one[1:] += across
-        one[:-1] += across
-        two = -across
-        return diagonal, torch.cat((one, none)), torch.cat((two, none, none))[: len(diagonal)]
+        return energy, torch.cat((edge, after)) - torch.cat((before, edge))
 
 
 def solve_banded(diagonal: Tensor, next_one: Tensor, next_two: Tensor, right: Tensor) -> Tensor:

@@ -8,12 +8,13 @@ with S_iᵀ S_i the information of target z_i, rho a robust kernel, p the pose p
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from shapepose_fg.body.fitting.pose_prior import NUM_ANGLES, PosePrior
+from shapepose_fg.body.fitting.priors import NUM_ANGLES, PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters, accumulate
 from shapepose_fg.body.model.rotation import exp_so3, log_so3, right_jacobian
 
@@ -48,20 +49,16 @@ class Held:
     """(B, A) free angles, held as tightly as the pose prior holds there; None: where it expects them."""
 
     @classmethod
-    def by_priors(cls) -> "Held":
-        """By nothing else than the priors."""
-        return cls(torch.zeros(10), torch.ones(1))
-
-    def for_rows(self, count: int) -> "Held":
-        """The same with one row of everything for each of `count` rows."""
-        return Held(self.betas.expand(count, 10).clone(), self.stiffness.expand(count, 1).clone(), self.angles)
+    def by_priors(cls, rows: int | None = None) -> "Held":
+        """By nothing else than the priors: one for all, or one for each of so many rows."""
+        lead = () if rows is None else (rows,)
+        return cls(torch.zeros(*lead, 10), torch.ones(*lead, 1))
 
     @staticmethod
     def concatenated(parts: "list[Held]") -> "Held":
         """The rows of all, in order; all hold the same."""
-        betas, stiffness = (torch.cat([getattr(part, name) for part in parts]) for name in ("betas", "stiffness"))
-        angles = [part.angles for part in parts if part.angles is not None]
-        return Held(betas, stiffness, torch.cat(angles) if angles else None)
+        columns = zip(*((part.betas, part.stiffness, part.angles) for part in parts), strict=True)
+        return Held(*(None if column[0] is None else torch.cat(column) for column in columns))  # type: ignore[arg-type]
 
     def __getitem__(self, rows: "Tensor | slice") -> "Held":
         return Held(self.betas[rows], self.stiffness[rows], None if self.angles is None else self.angles[rows])
@@ -70,36 +67,6 @@ class Held:
         """The same, but next to immovable at shapes `betas` (B, 10) in the rows that are `settled` (B,)."""
         rows = settled[:, None]
         return Held(torch.where(rows, betas, self.betas), torch.where(rows, SETTLED, self.stiffness), self.angles)
-
-
-@dataclass(frozen=True)
-class Linearisation:
-    """The energy around a point: gradient and Hessian in the tangent of the free parameters."""
-
-    squared: Tensor
-    """(B, K) squared Mahalanobis distance of every joint to its target."""
-    prior: Tensor
-    """(B,) what betas and pose prior add to the energy."""
-    gradient: Tensor
-    """(B, P) half the gradient."""
-    hessian: Tensor
-    """(B, P, P) half the Gauss-Newton Hessian, robust weights included."""
-
-    def energy(self, kernel_scale: Tensor) -> Tensor:
-        """(B,) the energy with the kernel's scale (B, 1)."""
-        return robust_cost(self.squared, kernel_scale).sum(-1) + self.prior
-
-    def __getitem__(self, rows: Tensor) -> "Linearisation":
-        return Linearisation(*(value[rows] for value in vars(self).values()))
-
-    def replaced(self, where: Tensor, other: "Linearisation") -> "Linearisation":
-        """The same, but with the rows `where` (B,) taken from another."""
-        if bool(where.all()):
-            return other
-        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
-        return Linearisation(
-            *(torch.where(where.view(-1, *(1,) * (mine.ndim - 1)), new, mine) for mine, new in pairs)
-        )
 
 
 def robust_cost(squared: Tensor, scale: Tensor) -> Tensor:
@@ -114,9 +81,14 @@ def robust_weight(squared: Tensor, scale: Tensor) -> Tensor:
     return (c2 / (c2 + squared)).square()
 
 
+def _chosen(where: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    """The rows `where` (B,) of `new`, the others of `old`."""
+    return torch.where(where.view(-1, *(1,) * (old.ndim - 1)), new, old)
+
+
 @dataclass(frozen=True)
 class Slope:
-    """Bodies and the slope of the energy: what `linearise` gives, at 40 % of the cost, without the Hessian."""
+    """Bodies and the slope of their energy, at 40 % of the cost of a `Linearisation`."""
 
     xyz: Tensor
     """(B, K, 3) keypoints, metres."""
@@ -125,7 +97,7 @@ class Slope:
     prior: Tensor
     """(B,) what betas and pose prior add to the energy."""
     gradient: Tensor
-    """(B, P) half the gradient."""
+    """(B, P) half the gradient, in the tangent of the free parameters."""
 
     def energy(self, kernel_scale: Tensor) -> Tensor:
         """(B,) the energy with the kernel's scale (B, 1)."""
@@ -133,13 +105,26 @@ class Slope:
 
 
 @dataclass(frozen=True)
+class Linearisation(Slope):
+    """Bodies, and gradient and Hessian of their energy."""
+
+    hessian: Tensor
+    """(B, P, P) half the Gauss-Newton Hessian, robust weights included."""
+
+    def __getitem__(self, rows: Tensor) -> Self:
+        return type(self)(*(value[rows] for value in vars(self).values()))
+
+    def replaced(self, where: Tensor, other: Slope) -> "Linearisation":
+        """The same, but with the rows `where` (B,) taken from another, if that is a slope all but the Hessian."""
+        return replace(self, **{name: _chosen(where, new, vars(self)[name]) for name, new in vars(other).items()})
+
+
+@dataclass(frozen=True)
 class Evaluated:
-    """Bodies, their keypoints and the energy around them."""
+    """Bodies, the Jacobian of their keypoints and the energy around them."""
 
     free: Tensor
     """(B, P) free parameters."""
-    xyz: Tensor
-    """(B, K, 3) keypoints, metres."""
     jacobian: Tensor
     """(B, 3 K, P) of the keypoints by the free parameters."""
     here: Linearisation
@@ -160,22 +145,13 @@ class Evaluated:
 
     def moved(self, where: Tensor, free: Tensor, slope: Slope) -> "Evaluated":
         """Rows `where` (B,) at `free` (B, P) with the slope there; Jacobian and Hessian stay as they were."""
-        old, rows = self.here, where[:, None]
-        here = Linearisation(
-            torch.where(rows, slope.squared, old.squared),
-            torch.where(where, slope.prior, old.prior),
-            torch.where(rows, slope.gradient, old.gradient),
-            old.hessian,
-        )
-        xyz = torch.where(rows[..., None], slope.xyz, self.xyz)
-        return replace(self, free=torch.where(rows, free, self.free), xyz=xyz, here=here)
+        return replace(self, free=_chosen(where, free, self.free), here=self.here.replaced(where, slope))
 
     def put(self, index: Tensor, other: "Evaluated") -> None:
         """Write the rows of `other` over the rows `index` (R,)."""
-        for own, new in ((self, other), (self.here, other.here)):
-            for name, value in vars(own).items():
-                if name != "here":
-                    value.index_copy_(0, index, getattr(new, name))
+        own, new = ({**vars(body), **vars(body.here)} for body in (self, other))
+        for name in own.keys() - {"here"}:
+            own[name].index_copy_(0, index, new[name])
 
 
 def factored(hessian: Tensor) -> Tensor:
@@ -187,43 +163,6 @@ def factored(hessian: Tensor) -> Tensor:
     added = hessian.new_zeros(hessian.shape[-1])
     added[10:13] = added[-3:] = 1.0
     return torch.linalg.cholesky_ex(hessian + torch.diag(added))[0]
-
-
-@dataclass(frozen=True)
-class PosePull:
-    """The pose prior's energy at the angles of B rows, and how it pulls them."""
-
-    energy: Tensor
-    """(B,) squared Mahalanobis distance."""
-    gradient: Tensor
-    """(B, A) half the gradient."""
-    hessian: Tensor
-    """(B, A, A) half the Hessian."""
-
-
-class PoseEnergy:
-    """-2 log of the prior's marginal density over the visible angles, but for a constant."""
-
-    def __init__(self, prior: PosePrior, angles: np.ndarray, dtype: torch.dtype):
-        """For the visible `angles` (A,), places among the 69, computing in `dtype`."""
-        hidden = np.setdiff1d(np.arange(NUM_ANGLES), angles)
-
-        def tensor(array: np.ndarray) -> Tensor:
-            return torch.from_numpy(np.ascontiguousarray(array)).to(dtype)
-
-        self._mean, self._precision = tensor(prior.mean[angles]), tensor(prior.marginal_precision(angles))
-        gain = prior.regression(angles, hidden)
-        self._gain, self._at_zero = tensor(gain), tensor(prior.mean[hidden] - gain @ prior.mean[angles])
-
-    def pull(self, angles: Tensor, anchor: Tensor | None = None) -> PosePull:
-        """At visible angles (B, A), around `anchor` (B, A) or where the prior expects them."""
-        error = angles - (self._mean if anchor is None else anchor)
-        gradient = error @ self._precision
-        return PosePull((gradient * error).sum(-1), gradient, self._precision.expand(len(angles), -1, -1))
-
-    def hidden(self, angles: Tensor) -> Tensor:
-        """(B, M) what the prior expects of the invisible angles."""
-        return angles @ self._gain.T + self._at_zero
 
 
 class BodyEnergy:
@@ -239,22 +178,25 @@ class BodyEnergy:
         visible = visible_joints(model, prior)
         self.angles = (visible[:, None] * 3 + np.arange(3)).ravel()
         """(A,) places of the visible angles among the 69."""
+        hidden = np.setdiff1d(np.arange(NUM_ANGLES), self.angles)
         self.num_angles = len(self.angles)
         self.num_free = 10 + 3 + self.num_angles + 3
-        self._angle_slice = slice(13, 13 + self.num_angles)
-        self._hidden = torch.from_numpy(np.setdiff1d(np.arange(NUM_ANGLES), self.angles))
-        self._visible = torch.from_numpy(self.angles)
-        self._pose = PoseEnergy(prior, self.angles, self.dtype)
-        columns = 13 + self._visible
-        self._columns = torch.cat((torch.arange(13), columns, torch.arange(-3, 0) + 85))
+        gain = prior.regression(self.angles, hidden)
+        self._mean, self.precision, self._gain, self._at_zero = (
+            torch.from_numpy(np.ascontiguousarray(array)).to(self.dtype)
+            for array in (prior.mean[self.angles], prior.marginal_precision(self.angles), gain,
+                          prior.mean[hidden] - gain @ prior.mean[self.angles])
+        )  # fmt: skip
+        self._hidden, self._visible = torch.from_numpy(hidden), torch.from_numpy(self.angles)
+        self._columns = torch.cat((torch.arange(13), 13 + self._visible, torch.arange(-3, 0) + 85))
         self._visible_joints = 1 + torch.from_numpy(visible)
 
     def complete(self, free: Tensor) -> BodyParameters:
         """The body (B rows) of free parameters (B, P); invisible joints are where the prior expects them."""
-        angles = free[:, self._angle_slice]
+        angles = free[:, 13:-3]
         pose = free.new_empty(len(free), NUM_ANGLES)
         pose[:, self._visible] = angles
-        pose[:, self._hidden] = self._pose.hidden(angles)
+        pose[:, self._hidden] = angles @ self._gain.T + self._at_zero
         return BodyParameters(free[:, :10], free[:, 10:13], pose.unflatten(1, (23, 3)), free[:, -3:])
 
     def retract(self, free: Tensor, step: Tensor) -> Tensor:
@@ -269,29 +211,29 @@ class BodyEnergy:
     def keypoints_with_jacobian(self, free: Tensor) -> tuple[Tensor, Tensor]:
         """Keypoints (B, K, 3) and their Jacobian by the free parameters (B, 3 K, P)."""
         tangents = torch.eye(3, dtype=self.dtype).repeat(len(free), 24, 1, 1)
-        tangents[:, self._visible_joints] = right_jacobian(free[:, self._angle_slice].unflatten(1, (-1, 3)))
+        tangents[:, self._visible_joints] = right_jacobian(free[:, 13:-3].unflatten(1, (-1, 3)))
         xyz, jacobian = self.model.keypoints_with_jacobian(self.complete(free), tangents)
         return xyz, jacobian.flatten(1, 2).index_select(2, self._columns)
 
     def evaluate(
-        self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor, held: "Held | None" = None
+        self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor, held: Held | None = None
     ) -> Evaluated:
         """Bodies, and the energy around them, at free parameters (B, P); the kernel has the scale (B, 1).
 
         What is `held` stays around there instead of where the priors expect it.
         """
-        xyz, jacobian, here = self._linearised(free, targets, kernel_scale, held)
-        return Evaluated(free, xyz, jacobian, here, factored(here.hessian))
+        jacobian, here = self._linearised(free, targets, kernel_scale, held)
+        return Evaluated(free, jacobian, here, factored(here.hessian))
 
     def linearise(
-        self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor, held: "Held | None" = None
+        self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor, held: Held | None = None
     ) -> Linearisation:
         """The energy alone, see `evaluate`."""
-        return self._linearised(free, targets, kernel_scale, held)[2]
+        return self._linearised(free, targets, kernel_scale, held)[1]
 
     def _linearised(
-        self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor, held: "Held | None"
-    ) -> tuple[Tensor, Tensor, Linearisation]:
+        self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor, held: Held | None
+    ) -> tuple[Tensor, Linearisation]:
         xyz, jacobian = self.keypoints_with_jacobian(free)
         residual = (targets.root @ (xyz - targets.xyz)[..., None]).squeeze(-1)
         squared = residual.square().sum(-1)
@@ -300,16 +242,15 @@ class BodyEnergy:
         rows = (root @ jacobian.unflatten(1, xyz.shape[1:])).flatten(1, 2)
         gradient = (rows.mT @ (weight * residual).flatten(1)[..., None]).squeeze(-1)
         hessian = rows.mT @ rows
-        stiffness, away, pose = self._pulls(free, held)
-        gradient[:, :10] += stiffness * away
-        gradient[:, self._angle_slice] += pose.gradient
+        prior, by_betas, by_angles, stiffness = self._pulls(free, held)
+        gradient[:, :10] += by_betas
+        gradient[:, 13:-3] += by_angles
         torch.diagonal(hessian, dim1=-2, dim2=-1)[:, :10] += stiffness
-        hessian[:, self._angle_slice, self._angle_slice] += pose.hessian
-        prior = (stiffness * away.square()).sum(-1) + pose.energy
-        return xyz, jacobian, Linearisation(squared, prior, gradient, hessian)
+        hessian[:, 13:-3, 13:-3] += self.precision
+        return jacobian, Linearisation(xyz, squared, prior, gradient, hessian)
 
     def slope(
-        self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor, held: "Held | None" = None
+        self, free: Tensor, targets: WhitenedTargets, kernel_scale: Tensor, held: Held | None = None
     ) -> Slope:
         """Keypoints, energy and gradient at free parameters (B, P), with the kernel's scale (B, 1)."""
 
@@ -322,7 +263,7 @@ class BodyEnergy:
         return self.slope_of(free, pull, held)
 
     def slope_of(
-        self, free: Tensor, pull: Callable[[Tensor], tuple[Tensor, Tensor]], held: "Held | None" = None
+        self, free: Tensor, pull: Callable[[Tensor], tuple[Tensor, Tensor]], held: Held | None = None
     ) -> Slope:
         """The slope where something else than targets pulls the keypoints.
 
@@ -335,20 +276,22 @@ class BodyEnergy:
         xyz, arms = points.positions_with_arms(rotations, body.betas, body.transl, points.feature(local))
         squared, forces = pull(xyz)
         by_column = points.pull_back(forces, arms, rotations, local)
-        angles = free[:, self._angle_slice]
-        stiffness, away, pose = self._pulls(free, held)
+        prior, by_betas, by_angles, _ = self._pulls(free, held)
         torques = by_column[:, 13 + self._visible].unflatten(1, (-1, 3))
-        turned = (right_jacobian(angles.unflatten(1, (-1, 3))).mT @ torques[..., None]).flatten(1)
-        by_betas = by_column[:, :10] + stiffness * away
-        by_angles = turned + pose.gradient
-        gradient = torch.cat((by_betas, by_column[:, 10:13], by_angles, by_column[:, -3:]), 1)
-        return Slope(xyz, squared, (stiffness * away.square()).sum(-1) + pose.energy, gradient)
+        turned = (right_jacobian(free[:, 13:-3].unflatten(1, (-1, 3))).mT @ torques[..., None]).flatten(1)
+        parts = (by_column[:, :10] + by_betas, by_column[:, 10:13], turned + by_angles, by_column[:, -3:])
+        return Slope(xyz, squared, prior, torch.cat(parts, 1))
 
-    def _pulls(self, free: Tensor, held: "Held | None") -> tuple[Tensor, Tensor, PosePull]:
-        """How stiffly betas are held, how far away they are, and what pulls the angles."""
-        angles = free[:, self._angle_slice]
+    def _pulls(self, free: Tensor, held: Held | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Of what holds the rows: energy (B,), half its gradient by betas (B, 10) and angles (B, A), stiffness."""
         held = Held.by_priors() if held is None else held
-        return held.stiffness, free[:, :10] - held.betas, self._pose.pull(angles, held.angles)
+        away, error = (
+            free[:, :10] - held.betas,
+            free[:, 13:-3] - (self._mean if held.angles is None else held.angles),
+        )
+        by_angles = error @ self.precision
+        energy = (held.stiffness * away.square()).sum(-1) + (by_angles * error).sum(-1)
+        return energy, held.stiffness * away, by_angles, held.stiffness
 
 
 def visible_joints(model: BodyModel, prior: PosePrior) -> np.ndarray:

@@ -35,6 +35,11 @@ class Evidence:
     centre: Array
     """(B, 3) mean of the joints with full information, metres."""
 
+    @property
+    def total_information(self) -> Array:
+        """(B,) of all joints of a row, mean over the axes, 1/m²."""
+        return np.square(self.root).sum(axis=(1, 2, 3)) / 3
+
     def rows(self, index: NDArray[np.intp]) -> "Evidence":
         """The rows `index` (R,)."""
         return Evidence(*(value[index] for value in vars(self).values()))

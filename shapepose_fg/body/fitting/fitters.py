@@ -9,16 +9,28 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from shapepose_fg.body.fitting.body_sequence import SequenceFitter
-from shapepose_fg.body.fitting.energy import BodyEnergy, Held, WhitenedTargets
+from shapepose_fg.body.fitting.energy import BodyEnergy, Held
 from shapepose_fg.body.fitting.evidence import Evidence, weigh
-from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus, JointTargets, SequenceFit, Shapes
+from shapepose_fg.body.fitting.fitter import (
+    BodyConfig,
+    BodyFit,
+    BodyFitter,
+    FitStatus,
+    JointTargets,
+    SequenceFit,
+    Shapes,
+    check_groups,
+)
 from shapepose_fg.body.fitting.left_out import Passes, left_out_sets, plan_passes
-from shapepose_fg.body.fitting.motion_prior import MotionPrior
 from shapepose_fg.body.fitting.optimisers import LevenbergMarquardt, NetworkDescent
-from shapepose_fg.body.fitting.pose_prior import PosePrior
-from shapepose_fg.body.fitting.posterior import JointPosterior, left_out_places
-from shapepose_fg.body.fitting.settings import BodyConfig
-from shapepose_fg.body.fitting.shared_shape import check_groups, pooled_betas, shape_precision, shared
+from shapepose_fg.body.fitting.posterior import (
+    JointPosterior,
+    left_out_places,
+    pooled_betas,
+    shape_precision,
+    shared,
+)
+from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.fitting.weights import FitterWeights, fingerprint
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
@@ -35,7 +47,7 @@ _CONVERGED = 9.0
 NOT_CONVERGED; with one, `BodyConfig.unfinished` says so after the plain optimiser has tried."""
 _SPREAD = {"RWrist": 2.0, "LWrist": 2.0}
 """Multiplies the variance of joints without their own target. Elbows bend farther from their mean than a Gaussian
-says: without it, 85 % of the wrists of the validation subjects (training.split) lay in their 90 % ellipsoids."""
+says: without it, 85 % of the wrists of the validation subjects (training.motions) lay in their 90 % ellipsoids."""
 
 
 def make_fitter(config: BodyConfig | None = None, model: BodyModel | None = None) -> "SmplFitter":
@@ -122,7 +134,7 @@ class SmplFitter(BodyFitter):
         fixed_shapes: bool = False,
     ) -> SequenceFit:
         """See `BodyFitter`."""
-        sequence = SequenceFitter(self.energy, self._starts, MotionPrior.default(), self.config)
+        sequence = SequenceFitter(self.energy, self._starts, self.config)
         return sequence.fit(targets, groups, time_s, shapes, fixed_shapes=fixed_shapes)
 
     def _fit(
@@ -139,126 +151,101 @@ class SmplFitter(BodyFitter):
         fit = BodyFit.failed(evidence.status, count)
         rows = np.flatnonzero(evidence.status == FitStatus.OK)
         if len(rows) > 0:
-            start = None if initial is None else self._start(initial.rows(rows), evidence.centre[rows])
-            usable, groups = evidence.rows(rows), groups[rows]
-            passes = plan_passes(usable, self.sets, groups) if leave_out else Passes.whole(groups, count)
+            evidence, groups = evidence.rows(rows), groups[rows]
+            start = None if initial is None else self._start(initial.rows(rows), evidence.centre)
+            passes = plan_passes(evidence, self.sets, groups) if leave_out else Passes.whole(evidence, groups)
             passes = replace(passes, votes=passes.votes & evenly(groups, _VOTERS)[passes.row])
-            self._fill(fit, rows, passes, self._posteriors(usable, passes, start), usable)
+            self._fill(fit, rows, passes, self._posteriors(passes, start))
         return fit
 
-    def _posteriors(self, evidence: Evidence, passes: Passes, start: Tensor | None) -> list[JointPosterior]:
+    def _posteriors(self, passes: Passes, start: Tensor | None) -> list[JointPosterior]:
         """What all passes say: those with all targets, then those without some, if any."""
-        # Single precision is a micrometre off at 10 m from the origin: each row gets its own origin.
-        inside = evidence.xyz - evidence.centre[:, None]
         together = bool(shared(passes.pool, passes.votes).any())
-        free, held = self._shapes(inside, evidence, passes, start) if together else (None, Held.by_priors())
+        shaped = self._shapes(passes, start) if together else None
         parts: list[JointPosterior] = []
-        for index in (np.arange(passes.num_rows), np.arange(passes.num_rows, len(passes))):
+        for chunks in passes.chunks(_CHUNK):
             found: list[JointPosterior] = []
-            for chunk in _chunks(index):
-                targets = passes.targets(inside, evidence.root, chunk)
-                if free is None:
-                    variance = passes.variance(evidence.variance_m2, chunk)
+            for chunk in chunks:
+                targets, variance = passes.given(chunk)
+                if shaped is None:
                     body, _ = self.optimiser.first(targets, variance, _part(start, chunk))
                 else:
-                    body = self.optimiser.again(free[chunk], targets, held[torch.from_numpy(chunk)])
+                    rows = torch.from_numpy(chunk)
+                    body = self.optimiser.again(shaped[0][rows], targets, shaped[1][rows])
                 found.append(JointPosterior.of(body, passes.asked(chunk)))
-            if len(found) == 0:
-                continue
             part = JointPosterior.concatenated(found)
             # Each pass by itself: what a target does to another pass must not decide which optimiser this one has.
             unsettled = np.flatnonzero(~(part.left < self._unfinished))  # NaN is unsettled
             if self._fallback is not None and len(unsettled) > 0:
-                chunk = index[unsettled]
-                targets = passes.targets(inside, evidence.root, chunk)
-                body, _ = self._fallback.first(targets, passes.variance(evidence.variance_m2, chunk), None)
+                chunk = np.concatenate(chunks)[unsettled]
+                body, _ = self._fallback.first(*passes.given(chunk), None)
                 part.put(unsettled, JointPosterior.of(body, passes.asked(chunk)))
             parts.append(part)
         return parts
 
-    def _shapes(
-        self, inside: Array, evidence: Evidence, passes: Passes, start: Tensor | None
-    ) -> tuple[Tensor, Held]:
+    def _shapes(self, passes: Passes, start: Tensor | None) -> tuple[Tensor, Held]:
         """Where all passes start with the shapes at which those of each pool agree: (M, P), and what holds them.
 
         The shapes are agreed upon by the passes that vote, each of which is fitted by itself first.
         """
         bodies, holds, places, precisions, settled = [], [], [], [], []
-        for index in (np.arange(passes.num_rows), np.arange(passes.num_rows, len(passes))):
-            for chunk in _chunks(index):
-                targets = passes.targets(inside, evidence.root, chunk)
-                variance = passes.variance(evidence.variance_m2, chunk)
-                free, held = self.optimiser.arrive(targets, variance, _part(start, chunk))
-                held = held.for_rows(len(free))
-                voting = torch.from_numpy(np.flatnonzero(passes.votes[chunk]))
-                if len(voting) > 0:
-                    body = self.optimiser.again(free[voting], targets[voting], held[voting])
-                    free[voting] = body.free
-                    places.append(chunk[voting.numpy()])
-                    precisions.append(shape_precision(body.factor))
-                    settled.append(body.left < self._unfinished)
-                bodies.append(free)
-                holds.append(held)
-        free, held = torch.cat(bodies), Held.concatenated(holds)
-        place = np.concatenate(places)
+        for chunk in (chunk for chunks in passes.chunks(_CHUNK) for chunk in chunks):
+            targets, variance = passes.given(chunk)
+            free, held = self.optimiser.arrive(targets, variance, _part(start, chunk))
+            voting = np.flatnonzero(passes.votes[chunk])
+            if len(voting) > 0:
+                rows = torch.from_numpy(voting)
+                body = self.optimiser.again(free[rows], targets[rows], held[rows])
+                free[rows] = body.free
+                places.append(chunk[voting])
+                precisions.append(shape_precision(body.factor))
+                settled.append(body.left < self._unfinished)
+            bodies.append(free)
+            holds.append(held)
+        free, held, place = torch.cat(bodies), Held.concatenated(holds), np.concatenate(places)
         precision, votes = free.new_zeros(len(free), 10, 10), np.zeros(len(free), dtype=bool)
         precision[torch.from_numpy(place)], votes[place] = torch.cat(precisions), torch.cat(settled).numpy()
         betas = pooled_betas(free[:, :10], precision, passes.pool, votes, held)
         return torch.cat((betas, free[:, 10:]), 1), held.at_shape(betas, shared(passes.pool, votes))
 
-    def _fill(
-        self,
-        fit: BodyFit,
-        rows: NDArray[np.intp],
-        passes: Passes,
-        parts: list[JointPosterior],
-        evidence: Evidence,
-    ) -> None:
-        """Fill `fit`'s `rows` (R,) with what the passes found; `evidence` is that of the rows.
+    def _fill(self, fit: BodyFit, rows: NDArray[np.intp], passes: Passes, parts: list[JointPosterior]) -> None:
+        """Fill `fit`'s `rows` (R,) with what the passes found.
 
         Rows whose energy a Newton step would still lower, or that are not finite, become NOT_CONVERGED.
         """
-        wider, found = self._spread[:, None, None], parts[0]
+        wider, found, evidence = self._spread[:, None, None], parts[0], passes.evidence
         unseen = np.all(evidence.root == 0, axis=(-1, -2))[..., None, None]
         prior_xyz, prior_covariance = left_out_places(passes, *parts)
-        information = np.square(evidence.root).sum(axis=(1, 2, 3)) / 3
         done = found.left < self._unfinished  # NaN is not
         done &= np.isfinite(prior_xyz).all(axis=(1, 2)) & np.isfinite(prior_covariance).all(axis=(1, 2, 3))
-        whole = self.energy.complete(torch.from_numpy(found.free[done]).to(self.energy.dtype))
         fit.status[rows[~done]] = FitStatus.NOT_CONVERGED
         rows, origin = rows[done], evidence.centre[done]
-        for name in ("betas", "global_orient", "body_pose"):
-            getattr(fit, name)[rows] = getattr(whole, name).double().numpy()
-        fit.transl[rows] = whole.transl.double().numpy() + origin
+        fit.put(rows, self.energy.complete(torch.from_numpy(found.free[done]).to(self.energy.dtype)), origin)
         fit.joints[rows] = found.xyz[done] + origin[:, None]
         fit.covariance[rows] = np.where(unseen, wider * found.covariance, found.covariance)[done]
         fit.prior_xyz[rows] = prior_xyz[done] + origin[:, None]
         fit.prior_covariance[rows] = wider * prior_covariance[done] + self.config.model_sigma_m**2 * np.eye(3)
-        fit.residual_m[rows] = np.sqrt(found.squared.sum(axis=1) / information)[done]
+        fit.residual_m[rows] = np.sqrt(found.squared.sum(axis=1) / evidence.total_information)[done]
 
-    def _starts(self, evidence: Evidence) -> tuple[Tensor, Held, NDArray[np.bool_]]:
+    def _starts(self, evidence: Evidence) -> tuple[Tensor, Tensor | None, NDArray[np.bool_]]:
         """Bodies of rows (R) with all their targets, nothing left out, each with a shape of its own.
 
-        Returns their parameters (R, P) around `evidence.centre`, what holds them, and which (R,) are finished.
+        Returns their parameters (R, P) around `evidence.centre`, around which angles (R, A) they are held (None:
+        those that the prior expects), and which (R,) are finished.
         """
-        inside = torch.from_numpy(evidence.xyz - evidence.centre[:, None]).float()
-        targets, found, holds = WhitenedTargets(inside, torch.from_numpy(evidence.root).float()), [], []
-        for at in range(0, len(inside), _CHUNK):
-            part = slice(at, at + _CHUNK)
-            body, held = self.optimiser.first(targets[part], evidence.variance_m2[part], None)
-            found.append(torch.cat((body.free, (body.left < self._unfinished)[:, None]), 1))
-            holds.append(held.for_rows(len(body.free)))
-        free, held = torch.cat(found), Held.concatenated(holds)
-        free, done = free[:, :-1], free[:, -1].bool().numpy()
-        unsettled = np.flatnonzero(~done)
+        passes, parts = Passes.whole(evidence, np.arange(len(evidence.xyz))), []
+        for chunk in passes.chunks(_CHUNK)[0]:
+            body, held = self.optimiser.first(*passes.given(chunk), None)
+            parts.append((body.free, body.left < self._unfinished, held.angles))
+        free, done, angles = (
+            None if column[0] is None else torch.cat(column) for column in zip(*parts, strict=True)
+        )
+        unsettled = np.flatnonzero(~done.numpy())
         if self._fallback is not None and len(unsettled) > 0:
-            seen = targets[torch.from_numpy(unsettled)]
-            body, _ = self._fallback.first(seen, evidence.variance_m2[unsettled], None)
-            free[unsettled], done[unsettled] = body.free, (body.left < self._unfinished).numpy()
-            held.betas[unsettled] = body.free[:, :10]
-            if held.angles is not None:
-                held.angles[unsettled] = body.free[:, 13:-3]
-        return free, held, done
+            body, _ = self._fallback.first(*passes.given(unsettled), None)
+            free[unsettled], done[unsettled] = body.free, body.left < self._unfinished
+            angles[unsettled] = body.free[:, 13:-3]
+        return free, angles, done.numpy()
 
     def _start(self, initial: BodyFit, centre: Array) -> Tensor:
         """Free parameters (R, P) of bodies around their origins (R, 3); NaN where there is none."""
@@ -266,10 +253,6 @@ class SmplFitter(BodyFitter):
         parts = (initial.betas, initial.global_orient, angles, initial.transl - centre)
         start = np.where(initial.ok[:, None], np.concatenate(parts, axis=1), np.nan)
         return torch.from_numpy(start).float()
-
-
-def _chunks(index: NDArray[np.intp]) -> list[NDArray[np.intp]]:
-    return [index[at : at + _CHUNK] for at in range(0, len(index), _CHUNK)]
 
 
 def evenly(groups: NDArray[np.intp], count: int) -> NDArray[np.bool_]:

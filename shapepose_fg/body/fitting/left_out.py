@@ -6,10 +6,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from shapepose_fg.body.fitting.energy import BodyEnergy, Held, WhitenedTargets
+from shapepose_fg.body.fitting.energy import BodyEnergy, WhitenedTargets
 from shapepose_fg.body.fitting.evidence import Evidence, determine_pose
-from shapepose_fg.body.fitting.pose_prior import PosePrior
-from shapepose_fg.body.fitting.settings import BodyConfig
+from shapepose_fg.body.fitting.fitter import BodyConfig
+from shapepose_fg.body.fitting.priors import PosePrior
 
 Array = NDArray[np.float64]
 
@@ -29,6 +29,8 @@ class Passes:
     construction, not to first order.
     """
 
+    evidence: Evidence
+    """(R) the targets."""
     row: NDArray[np.intp]
     """(M,) whose targets; the first R are 0 to R - 1."""
     without: NDArray[np.bool_]
@@ -41,20 +43,18 @@ class Passes:
     """(R, J) the pass from which each joint's prior is taken."""
 
     @classmethod
-    def whole(cls, groups: NDArray[np.intp], joints: int) -> "Passes":
+    def whole(cls, evidence: Evidence, groups: NDArray[np.intp]) -> "Passes":
         """One pass with all targets for each row of `groups` (R,), and nothing left out."""
-        row = np.arange(len(groups))
-        without = np.zeros((len(row), joints), dtype=bool)
-        return cls(row, without, groups, np.ones(len(row), dtype=bool), np.repeat(row[:, None], joints, axis=1))
+        R, J = evidence.xyz.shape[:2]
+        row = np.arange(R)
+        source = np.repeat(row[:, None], J, axis=1)
+        return cls(evidence, row, np.zeros((R, J), dtype=bool), groups, np.ones(R, dtype=bool), source)
 
-    def __len__(self) -> int:
-        """Count of passes, M."""
-        return len(self.row)
-
-    @property
-    def num_rows(self) -> int:
-        """Count of rows, R."""
-        return len(self.source)
+    def chunks(self, size: int) -> list[list[NDArray[np.intp]]]:
+        """Passes with all targets, and those without some if there are any, in parts of at most `size`."""
+        R, M = len(self.source), len(self.row)
+        ends = [(0, R), (R, M)] if M > R else [(0, R)]
+        return [[np.arange(at, min(at + size, end)) for at in range(start, end, size)] for start, end in ends]
 
     def asked(self, index: NDArray[np.intp]) -> NDArray[np.intp]:
         """(B, N) joints that some passes are for: all, or those left out, of some sets others too."""
@@ -63,15 +63,16 @@ class Passes:
             return np.broadcast_to(np.arange(without.shape[1]), without.shape)
         return np.argsort(~without, axis=1, kind="stable")[:, : self.without.sum(axis=1).max()]
 
-    def targets(self, xyz: Array, root: Array, index: NDArray[np.intp]) -> WhitenedTargets:
-        """The targets of some passes, single precision, from those of the rows: (R, J, 3) and (R, J, 3, 3)."""
-        kept, row = ~self.without[index], self.row[index]
-        parts = (xyz[row], root[row] * kept[..., None, None])
-        return WhitenedTargets(*(torch.from_numpy(part).float() for part in parts))
+    def given(self, index: NDArray[np.intp]) -> tuple[WhitenedTargets, Array]:
+        """The targets of some passes around their rows' centres, in single precision, and the variance of each.
 
-    def variance(self, variance: Array, index: NDArray[np.intp]) -> Array:
-        """(B, J) variance of each target of some passes, infinite where it is left out, from that of the rows."""
-        return np.where(self.without[index], np.inf, variance[self.row[index]])
+        The variances (B, J) are infinite where a target is left out. Single precision is a micrometre off at 10 m
+        from the origin: so each row has its own.
+        """
+        evidence, row, without = self.evidence, self.row[index], self.without[index]
+        xyz, root = evidence.xyz[row] - evidence.centre[row, None], evidence.root[row] * ~without[..., None, None]
+        targets = WhitenedTargets(torch.from_numpy(xyz).float(), torch.from_numpy(root).float())
+        return targets, np.where(without, np.inf, evidence.variance_m2[row])
 
 
 def plan_passes(evidence: Evidence, sets: NDArray[np.intp], groups: NDArray[np.intp]) -> Passes:
@@ -99,7 +100,7 @@ def plan_passes(evidence: Evidence, sets: NDArray[np.intp], groups: NDArray[np.i
         [np.zeros((R, J), dtype=bool), member[together[:, 1]], np.eye(J, dtype=bool)[singly[:, 1]]]
     )
     votes = np.arange(len(row)) < R + len(together)
-    return Passes(row, without, group[row] * (S + 1) + of_set + 1, votes, source)
+    return Passes(evidence, row, without, group[row] * (S + 1) + of_set + 1, votes, source)
 
 
 def left_out_sets(energy: BodyEnergy, prior: PosePrior) -> NDArray[np.intp]:
@@ -139,7 +140,7 @@ def _coupling(energy: BodyEnergy, prior: PosePrior) -> Array:
     free[:, 13:-3] = torch.from_numpy(poses[:, energy.angles]).to(energy.dtype)
     count = len(energy.model.keypoint_names)
     nothing = WhitenedTargets(free.new_zeros(_POSES, count, 3), free.new_zeros(_POSES, count, 3, 3))
-    body = energy.evaluate(free, nothing, free.new_ones(1), Held.by_priors())
+    body = energy.evaluate(free, nothing, free.new_ones(1))
     H, J = body.here.hessian.double().numpy(), body.jacobian.double().numpy()
     root = [10, 11, 12, -3, -2, -1]
     H[:, root, root] += _ROOT_INFORMATION

@@ -18,12 +18,10 @@ from shapepose_fg.body.fitting.energy import (
 )
 from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.body.fitting.person_frame import PersonFrame
-from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.fitting.weights import FitterWeights
-from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.rotation import log_so3
-from shapepose_fg.body.model.skinned_points import SkinnedPoints
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, slots
 
 Array = NDArray[np.float64]
@@ -67,17 +65,38 @@ class NetworkDescent:
         model = energy.model
         self._energy, self._frame, self._polish_steps = energy, weights.frame, polish_steps
         self._scale, self._slots = torch.tensor(kernel_scale), slots(model.keypoint_names)
+        # The body's own points where there are no targets; offsets are the detector's.
+        rest = [place for place in range(len(BODY_POINTS)) if place not in self._slots]
+        moved = model.keypoint_offsets.xyz_m.any()
+        body = model.with_keypoint_offsets(KeypointOffsets.identity()) if moved else model
         self._descent = LearnedDescent(
             model.keypoint_points, self._slots, weights.network, kernel_scale,
-            others=_other_points(model, self._slots), offsets=model.offsets_of_keypoints,
+            others=body.points.part(rest) if rest else None, offsets=model.offsets_of_keypoints,
         )  # fmt: skip
 
     def arrive(
         self, targets: WhitenedTargets, variance: Array, start: Tensor | None = None
     ) -> tuple[Tensor, Held]:
-        """See `Optimiser`: where the network arrives, and held there."""
-        arrived = self._descend(targets, torch.from_numpy(variance).float())
-        return arrived, Held(arrived[:, :10], torch.ones(len(arrived), 1), arrived[:, 13:-3].clone())
+        """See `Optimiser`: where the network arrives from the closed form on, and held there."""
+        frame, count, sigma2 = self._frame, len(targets.xyz), torch.from_numpy(variance).float()
+        rotation, origin = frame.place(targets.xyz, sigma2, self._slots)
+        inside = (targets.xyz - origin[:, None]) @ rotation
+        # What is hardly seen is left to the polish: the pull of a guess that had seen it would count it twice.
+        well_seen = sigma2 < WELL_SEEN_M**2
+        well_seen |= (well_seen.sum(1) < LEAST_JOINTS)[:, None]
+        root = targets.root @ rotation[:, None] * well_seen[..., None, None]
+        state = BodyState(
+            torch.zeros(count, 10), frame.local.expand(count, 24, 3, 3), frame.transl.expand(count, 3)
+        )
+        *_, arrived = self._descent.unroll(state, DescentTargets(inside, root.mT @ root))
+        # From the person's frame to that of the targets.
+        orient = log_so3(rotation @ arrived.local[:, 0])
+        angles = log_so3(arrived.local[:, 1:]).flatten(1)[:, self._energy.angles]
+        # The root turns about the pelvis: R (v - p) + p + transl, with p where betas put it in the T-pose.
+        pelvis = self._energy.model.rest_pelvis(arrived.betas)
+        transl = (rotation @ (pelvis + arrived.transl)[..., None]).squeeze(-1) + origin - pelvis
+        free = torch.cat((arrived.betas, orient, angles, transl), 1)
+        return free, Held(arrived.betas, torch.ones(count, 1), angles)
 
     def first(
         self, targets: WhitenedTargets, variance: Array, start: Tensor | None = None
@@ -106,34 +125,6 @@ class NetworkDescent:
                 body.put(stale, energy.evaluate(body.free[stale], targets[stale], scale, held[stale]))
         return body
 
-    def _descend(self, targets: WhitenedTargets, variance: Tensor) -> Tensor:
-        """Free parameters (M, P) of `BodyEnergy` where the network arrives, from the closed form on."""
-        frame, count = self._frame, len(targets.xyz)
-        rotation, origin = frame.place(targets.xyz, variance, self._slots)
-        inside = (targets.xyz - origin[:, None]) @ rotation
-        # What is hardly seen is left to the polish: the pull of a guess that had seen it would count it twice.
-        well_seen = variance < WELL_SEEN_M**2
-        well_seen |= (well_seen.sum(1) < LEAST_JOINTS)[:, None]
-        root = targets.root @ rotation[:, None] * well_seen[..., None, None]
-        state = BodyState(
-            torch.zeros(count, 10), frame.local.expand(count, 24, 3, 3), frame.transl.expand(count, 3)
-        )
-        *_, arrived = self._descent.unroll(state, DescentTargets(inside, root.mT @ root))
-        # From the person's frame to that of the targets.
-        orient = log_so3(rotation @ arrived.local[:, 0])
-        angles = log_so3(arrived.local[:, 1:]).flatten(1)[:, self._energy.angles]
-        # The root turns about the pelvis: R (v - p) + p + transl, with p where betas put it in the T-pose.
-        pelvis = self._energy.model.rest_pelvis(arrived.betas)
-        transl = (rotation @ (pelvis + arrived.transl)[..., None]).squeeze(-1) + origin - pelvis
-        return torch.cat((arrived.betas, orient, angles, transl), 1)
-
-
-def _other_points(model: BodyModel, targets: tuple[int, ...]) -> SkinnedPoints | None:
-    """The body's own points at the places (K,) where there are no `targets`; None where there are no such."""
-    rest = [place for place in range(len(BODY_POINTS)) if place not in targets]
-    body = model.with_keypoint_offsets(KeypointOffsets.identity()) if model.keypoint_offsets.xyz_m.any() else model
-    return body.points.part(rest) if rest else None
-
 
 class LevenbergMarquardt:
     """The optimum of the energy from a closed form: no training, any body."""
@@ -142,42 +133,35 @@ class LevenbergMarquardt:
         self._energy, self._kernel_scale = energy, kernel_scale
         self._slots = slots(energy.model.keypoint_names)
         self._frame = PersonFrame.of_angles(energy.model, prior.mean, prior.covariance)
-        self._mean_angles = prior.mean[energy.angles]
+        self._mean_angles = torch.from_numpy(prior.mean[energy.angles])
 
     def arrive(
         self, targets: WhitenedTargets, variance: Array, start: Tensor | None = None
     ) -> tuple[Tensor, Held]:
         """See `Optimiser`: the optimum, with each row's own shape, held by the priors."""
-        free, warm = self._start(targets.xyz, variance), np.zeros(len(variance), dtype=bool)
+        rotation, pelvis = self._frame.place(targets.xyz.double(), torch.from_numpy(variance), self._slots)
+        angles = self._mean_angles.expand(len(variance), -1)
+        parts = (angles.new_zeros(len(variance), 10), log_so3(rotation), angles, pelvis + self._frame.transl)
+        free, warm = torch.cat(parts, 1).float(), np.zeros(len(variance), dtype=bool)
         if start is not None:
             warm = ~start.isnan().any(1).numpy()
             free = torch.where(start.isnan(), free, start)
-        return self.solve(free, targets, warm), Held.by_priors()
+        held = Held.by_priors(len(free))
+        return self.solve(free, targets, warm, held), held
 
     def first(
         self, targets: WhitenedTargets, variance: Array, start: Tensor | None = None
     ) -> tuple[Evaluated, Held]:
         """See `Optimiser`."""
         free, held = self.arrive(targets, variance, start)
-        return self._evaluated(free, targets, held), held
+        return self._energy.evaluate(free, targets, torch.tensor(self._kernel_scale), held), held
 
     def again(self, free: Tensor, targets: WhitenedTargets, held: Held) -> Evaluated:
         """See `Optimiser`."""
-        return self._evaluated(self.solve(free, targets, np.ones(len(free), dtype=bool), held), targets, held)
-
-    def _evaluated(self, free: Tensor, targets: WhitenedTargets, held: Held) -> Evaluated:
+        free = self.solve(free, targets, np.ones(len(free), dtype=bool), held)
         return self._energy.evaluate(free, targets, torch.tensor(self._kernel_scale), held)
 
-    def _start(self, xyz: Tensor, variance: Array) -> Tensor:
-        """Free parameters (B, P) from the closed form, for targets (B, J, 3) of these variances (B, J)."""
-        rotation, pelvis = self._frame.place(xyz.double(), torch.from_numpy(variance), self._slots)
-        angles = torch.from_numpy(self._mean_angles).expand(len(xyz), -1)
-        parts = (angles.new_zeros(len(xyz), 10), log_so3(rotation), angles, pelvis + self._frame.transl)
-        return torch.cat(parts, 1).float()
-
-    def solve(
-        self, free: Tensor, targets: WhitenedTargets, warm: NDArray[np.bool_], held: Held | None = None
-    ) -> Tensor:
+    def solve(self, free: Tensor, targets: WhitenedTargets, warm: NDArray[np.bool_], held: Held) -> Tensor:
         """Minimise from `free` (B, P); rows leave the batch as they finish. Returns (B, P)."""
         energy, kernel_scale = self._energy, self._kernel_scale
         result, rows = free.clone(), torch.arange(len(free))
@@ -200,8 +184,7 @@ class LevenbergMarquardt:
                 continue
             result[rows[~going]] = free[~going]
             rows, free, damping, widening = rows[going], free[going], damping[going], widening[going]
-            here, targets = here[going], targets[going]
-            held = None if held is None else held[going]
+            here, targets, held = here[going], targets[going], held[going]
             if len(rows) == 0:
                 break
         result[rows] = free

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.body.model.pickle_records import RefusedPickle
 from shapepose_fg.body.model.plausible_body import implausible
-from shapepose_fg.body.model.smpl_pickle import as_array, read_smpl_pickle
+from shapepose_fg.body.model.smpl_pickle import RefusedPickle, as_array, read_smpl_pickle
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.core.storage.npz import read_npz

@@ -1,22 +1,54 @@
 """Reads the official SMPL `.pkl` without running anything that it names.
 
-The few names that SMPL's files need (numpy arrays, scipy sparse matrices, chumpy arrays) stand for records of what
-the file says (`pickle_records`); arrays are made from those records here.
+A pickle is a program for a small machine: loading one from the internet can do whatever Python can, a few bytes of
+it fill the memory or never end. Python's machine in Python (`pickle._Unpickler`) runs here with the instructions
+that arrays need and no others, for so many steps; it looks up no name and calls nothing: a name is a name, an
+object a `Record` of what the file says of it. The few names that SMPL's files need (numpy arrays, scipy sparse
+matrices, chumpy arrays) become arrays here.
 """
 
+import io
+import pickle
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.body.model.pickle_records import Name, Record, RefusedPickle, read_records
 from shapepose_fg.core.storage.files import read_bytes
 
+_MOST_STEPS = 200_000
+"""SMPL's files take a few thousand."""
 _MOST_BYTES = 2**30
 """SMPL's own files have 40 to 250 MB."""
 _MOST_DENSE = 2**23
 """Entries of a sparse matrix when it is written out: 24 joints from 350,000 vertices."""
+
+
+class RefusedPickle(Exception):
+    """The pickle asks for something that a body model does not need."""
+
+
+@dataclass(frozen=True)
+class Name:
+    """A class or function that the pickle names; nothing of that kind is ever looked up."""
+
+    module: str
+    name: str
+
+
+@dataclass
+class Record:
+    """What the pickle says of one object: which name was called with which arguments, and its state."""
+
+    name: Name
+    arguments: tuple[Any, ...]
+    state: Any = None
+
+
 _CORES = ("core", "_core")
 _RECONSTRUCT = {Name(f"numpy.{core}.multiarray", "_reconstruct") for core in _CORES}
 _SCALAR = {Name(f"numpy.{core}.multiarray", "scalar") for core in _CORES}
@@ -25,7 +57,9 @@ _DTYPE = {Name("numpy", "dtype")}
 _BYTES = {Name("_codecs", "encode")}
 _COLUMNS = {Name(f"scipy.sparse{part}", "csc_matrix") for part in ("", ".csc", "._csc")}
 _ROWS = {Name(f"scipy.sparse{part}", "csr_matrix") for part in ("", ".csr", "._csr")}
-_OTHERS = {Name("numpy", "ndarray"), Name("__builtin__", "object"), Name("builtins", "object")}
+_REBUILDS = {Name("copy_reg", "_reconstructor"), Name("copyreg", "_reconstructor")}
+"""Functions that make an object of the class that is their first argument."""
+_OTHERS = {Name("numpy", "ndarray"), Name("__builtin__", "object"), Name("builtins", "object")} | _REBUILDS
 _KNOWN = _RECONSTRUCT | _SCALAR | _FROM_BUFFER | _DTYPE | _BYTES | _COLUMNS | _ROWS | _OTHERS
 
 
@@ -33,12 +67,101 @@ def _is_chumpy(name: Name) -> bool:
     return name.module == "chumpy" or name.module.startswith("chumpy.")
 
 
+_INSTRUCTIONS = (
+    "PROTO FRAME STOP MARK POP NONE NEWTRUE NEWFALSE INT BININT BININT1 BININT2 LONG LONG1 LONG4 FLOAT BINFLOAT"
+    " STRING BINSTRING SHORT_BINSTRING UNICODE BINUNICODE SHORT_BINUNICODE BINUNICODE8 BINBYTES SHORT_BINBYTES"
+    " BINBYTES8 BYTEARRAY8 EMPTY_LIST EMPTY_DICT EMPTY_TUPLE LIST TUPLE TUPLE1 TUPLE2 TUPLE3 DICT APPEND APPENDS"
+    " SETITEM SETITEMS PUT BINPUT LONG_BINPUT MEMOIZE GET BINGET LONG_BINGET GLOBAL STACK_GLOBAL REDUCE NEWOBJ"
+    " BUILD"
+).split()
+
+
+def _counted(step: Callable[[Any], None]) -> Callable[[Any], None]:
+    def run(reader: Any) -> None:
+        reader.steps += 1
+        if reader.steps > _MOST_STEPS:
+            raise RefusedPickle(f"it takes over {_MOST_STEPS} steps, and a body model a few thousand")
+        step(reader)
+
+    return run
+
+
+class _Instructions(dict[int, Callable[[Any], None]]):
+    """What a reader can do."""
+
+    def __missing__(self, code: int) -> None:
+        raise RefusedPickle(f"it has the instruction {bytes([code])!r}, which no array needs")
+
+
+class _Reader(pickle._Unpickler):  # type: ignore[name-defined]
+    """Python's machine, on a short leash; text of Python 2 is read as Latin-1."""
+
+    dispatch: ClassVar[_Instructions]
+
+    def __init__(self, content: bytes):
+        super().__init__(io.BytesIO(content), encoding="latin1")
+        self.steps = 0
+
+    def find_class(self, module: str, name: str) -> Name:
+        found = Name(module, name)
+        if found not in _KNOWN and not _is_chumpy(found):
+            raise RefusedPickle(f"it asks for {module}.{name}, which no body model needs")
+        return found
+
+    def call(self) -> None:
+        arguments, made = self.stack.pop(), self.stack.pop()
+        if not isinstance(made, Name) or not isinstance(arguments, tuple):
+            raise RefusedPickle("it calls what is no name")
+        if made in _REBUILDS:
+            made, arguments = arguments[0], ()
+        if not isinstance(made, Name) or made in _REBUILDS:
+            raise RefusedPickle("it makes an object of something that is not an array")
+        self.append(Record(made, arguments))
+
+    def build(self) -> None:
+        state = self.stack.pop()
+        if not isinstance(self.stack[-1], Record):
+            raise RefusedPickle("it gives a state to something that is not an array")
+        self.stack[-1].state = state
+
+    def fill(self, values: list[Any]) -> None:
+        """Entries of a dict; keys that are no text could take for ever to be told apart."""
+        if not isinstance(self.stack[-1], dict) or not all(isinstance(key, str | int) for key in values[::2]):
+            raise RefusedPickle("it has keys that are no text")
+        self.stack[-1].update(zip(values[::2], values[1::2], strict=True))
+
+    def filled(self) -> None:
+        values = self.pop_mark()
+        self.append({})
+        self.fill(values)
+
+    def byte_array(self) -> None:
+        (size,) = struct.unpack("<Q", self.read(8))
+        self.append(bytearray(self.read(size)))  # no longer than what there is
+
+
+_OWN: dict[str, Callable[[Any], None]] = {
+    "REDUCE": _Reader.call,
+    "NEWOBJ": _Reader.call,
+    "BUILD": _Reader.build,
+    "DICT": _Reader.filled,
+    "SETITEM": lambda reader: reader.fill([reader.stack.pop() for _ in range(2)][::-1]),
+    "SETITEMS": lambda reader: reader.fill(reader.pop_mark()),
+    "BYTEARRAY8": _Reader.byte_array,
+}
+_Reader.dispatch = _Instructions(
+    (code, _counted(_OWN.get(name, pickle._Unpickler.dispatch[code])))  # type: ignore[attr-defined]
+    for name in _INSTRUCTIONS
+    for code in getattr(pickle, name)
+)
+
+
 def read_smpl_pickle(path: Path) -> dict[str, Any]:
-    """The entries of a pickled dict; those that are arrays or sparse matrices are undone by `as_array`.
+    """The entries of a pickled dict; those that are arrays or sparse matrices are made by `as_array`.
 
     Raises RefusedPickle where the file asks for anything but data, and whatever a damaged pickle raises.
     """
-    content = read_records(read_bytes(path, _MOST_BYTES), lambda name: name in _KNOWN or _is_chumpy(name))
+    content = _Reader(read_bytes(path, _MOST_BYTES)).load()
     if not isinstance(content, dict):
         raise RefusedPickle(f"it holds a {type(content).__name__} where SMPL's files hold a dict")
     return {str(name): value for name, value in content.items()}

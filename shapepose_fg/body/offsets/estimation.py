@@ -21,10 +21,9 @@ from torch import Tensor
 
 from shapepose_fg.body.fitting.energy import BodyEnergy, WhitenedTargets, robust_weight
 from shapepose_fg.body.fitting.evidence import Evidence, weigh
-from shapepose_fg.body.fitting.fitter import BodyFit, JointTargets
+from shapepose_fg.body.fitting.fitter import BodyConfig, BodyFit, JointTargets
 from shapepose_fg.body.fitting.fitters import SmplFitter
-from shapepose_fg.body.fitting.pose_prior import PosePrior
-from shapepose_fg.body.fitting.settings import BodyConfig
+from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import LARGEST_M, RIDES_ON, KeypointOffsets
 from shapepose_fg.core.bounds import Metres, Repeats, Settings
@@ -146,7 +145,7 @@ def _eliminate(
     """
     scale = torch.tensor(kernel_scale, dtype=free.dtype)
     body = energy.evaluate(free, targets, scale)
-    xyz, jacobian, here = body.xyz, body.jacobian, body.here
+    xyz, jacobian, here = body.here.xyz, body.jacobian, body.here
     root = robust_weight(here.squared, scale).sqrt()[..., None, None] * targets.root
     rotations = energy.model.bone_rotations(energy.complete(free))[:, torch.from_numpy(RIDES_ON)]
     by_offset = root @ rotations  # (R, 25, 3, 3), whitened

@@ -1,20 +1,64 @@
-"""Recordings, some at a time: who is next, who failed and is tried again, who is given up."""
+"""Recordings, some at a time, each led by a process of its own: it reads, hands out work, and writes the results.
 
+A process and not a thread, so that one recording's error, memory or crash is no other's, and none waits for
+Python's lock.
+"""
+
+import os
+import signal
+import sys
+import threading
+import time
+import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from multiprocessing.connection import wait
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from time import monotonic
+from typing import Any
 
-from shapepose_fg.cli.batch.leader import Assignment, Leader
-from shapepose_fg.cli.batch.standing import Standing, Standings
-from shapepose_fg.cli.batch.summary import Bars
-from shapepose_fg.cli.batch.table import Entry
-from shapepose_fg.cli.reconstruct.request import Ended
+from shapepose_fg.cli.batch.standing import Bars, Standings
+from shapepose_fg.cli.batch.table import LOG, Entry
+from shapepose_fg.cli.reconstruct.request import Request, prepare
+from shapepose_fg.cli.reconstruct.run import Ended, carry_out
+from shapepose_fg.cli.stopping import Stopped, stoppable
+from shapepose_fg.cli.terminal import use_any_streams
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.runs.manifest import PARTS
+from shapepose_fg.pipeline.workers import end_with, processes, what_workers_inherit
 
 ATTEMPTS = 2
 """A recording that has failed so often is left, and the others go on."""
+_PATIENCE_S = 20.0
+"""So long a leader may take to let go of its work."""
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """What a leader is to do; plain data."""
+
+    name: str
+    """The recording's."""
+    request: Request
+    """What is wanted."""
+    folder: Path
+    """Of its results."""
+    cluster: str
+    """Address of the scheduler."""
+    sharing: int = 1
+    """How many recordings are led at a time."""
+    resume: bool = False
+    """Go on with what a run that was stopped left."""
+    restart: bool = False
+    """Remove it."""
+
+
+@dataclass(frozen=True)
+class Failed:
+    """A recording is not reconstructed."""
+
+    reason: str
+    """In a sentence."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +79,8 @@ class Campaign:
     def run(self, standings: Standings, watcher: Bars) -> None:
         """Do what is not done; `standings` has how each ended.
 
-        The largest come first, so that none is alone at the end; whoever failed comes again after all others.
+        The largest come first, so that none is left over at the end; those that failed come again after all
+        others.
         """
         leaders: list[Leader] = []
         try:
@@ -55,10 +100,10 @@ class Campaign:
             for leader in leaders:
                 found = leader.end()
                 if found is not None:  # it was done when it was asked to stop
-                    standings.set(leader.assignment.name, self._done(leader, found, standings))
+                    self._done(leader, found, standings)
 
-    def _next(self, standings: Standings, leaders: Sequence[Leader]) -> Entry | None:
-        """Who is begun next; those whose turn cannot come are given up."""
+    def _next(self, standings: Standings, leaders: "Sequence[Leader]") -> Entry | None:
+        """The recording that is begun next; those whose turn cannot come are given up."""
         led = {leader.assignment.name for leader in leaders}
         found: list[Entry] = []
         for entry in self.entries:
@@ -71,9 +116,8 @@ class Campaign:
                 standings.set(entry.name, own.failed(reason, 0.0, 0))
             elif before in (None, "done"):
                 found.append(entry)
-        return min(
-            found, key=lambda each: (standings.of[each.name].attempts, -self.sizes[each.name]), default=None
-        )
+        turn = {each.name: (standings.of[each.name].attempts, -self.sizes[each.name]) for each in found}
+        return min(found, key=lambda each: turn[each.name], default=None)
 
     def _assignment(self, entry: Entry, standings: Standings) -> Assignment:
         """What its leader is to do."""
@@ -81,7 +125,7 @@ class Campaign:
         resume = not restart and (folder / PARTS).exists()
         return Assignment(entry.name, entry.request, folder, self.cluster, self.at_once, resume, restart)
 
-    def _heard(self, leader: Leader, standings: Standings, watcher: Bars) -> bool:
+    def _heard(self, leader: "Leader", standings: Standings, watcher: Bars) -> bool:
         """Take in what a leader tells; whether it has ended."""
         name, told = leader.assignment.name, leader.next()
         if isinstance(told, tuple):
@@ -91,14 +135,95 @@ class Campaign:
             return False
         leader.end()
         if isinstance(told, Ended):
-            standings.set(name, self._done(leader, told, standings))
+            self._done(leader, told, standings)
             watcher.ended(name, failed=None, again=False)
         else:
-            now = standings.of[name].failed(told.reason, monotonic() - leader.began, ATTEMPTS)
+            now = standings.of[name].failed(told.reason, time.monotonic() - leader.began, ATTEMPTS)
             standings.set(name, now)
             watcher.ended(name, failed=told.reason, again=now.status == "waiting")
         return True
 
-    def _done(self, leader: Leader, found: Ended, standings: Standings) -> Standing:
-        """How a recording stands that is done."""
-        return standings.of[leader.assignment.name].done(found, monotonic() - leader.began)
+    def _done(self, leader: "Leader", found: Ended, standings: Standings) -> None:
+        """Note down that a recording is done."""
+        name = leader.assignment.name
+        standings.set(name, standings.of[name].done(found, time.monotonic() - leader.began))
+
+
+class Leader:
+    """The process that leads a recording, seen from the one that started it."""
+
+    def __init__(self, assignment: Assignment) -> None:
+        """Start it."""
+        context = processes("shapepose_fg.cli.reconstruct.run")
+        self.assignment = assignment
+        self.began = time.monotonic()
+        """When it was started, by the clock of `time.monotonic`."""
+        self.told, tell = context.Pipe(duplex=False)
+        """What it tells: (frames done, all frames), in the end `Ended` or `Failed`."""
+        held, self._lifeline = context.Pipe(duplex=False)
+        self._process = context.Process(target=_lead, args=(assignment, tell, held), name=assignment.name)
+        with what_workers_inherit():
+            self._process.start()
+        tell.close()
+        held.close()
+
+    def next(self) -> tuple[int, int] | Ended | Failed:
+        """What it tells next; `Failed` too where it has died."""
+        try:
+            return self.told.recv()
+        except (EOFError, OSError):
+            self._process.join(_PATIENCE_S)
+            code = self._process.exitcode
+            how = f"was killed by signal {-code}" if code is not None and code < 0 else f"ended with code {code}"
+            return Failed(f"its process {how}; there may be too little memory")
+
+    def end(self) -> Ended | None:
+        """Wait for its end, or bring it about where it does not come; what it `Ended` with after all."""
+        self._process.join(_PATIENCE_S)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+        found = None
+        try:
+            while self.told.poll():
+                told = self.told.recv()
+                found = told if isinstance(told, Ended) else found
+        except (EOFError, OSError):
+            pass
+        self.told.close()
+        self._lifeline.close()
+        return found
+
+    def ask_to_stop(self) -> None:
+        """Have it keep what is done and end; `end` waits for it."""
+        if self._process.is_alive():
+            self._process.terminate()
+
+
+def _lead(assignment: Assignment, tell: Connection, lifeline: Connection) -> None:
+    """All that the process does; what is said, by libraries too, is added to a log."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=end_with, args=(lifeline,), daemon=True).start()
+    use_any_streams()
+    log = assignment.folder / LOG
+    with log.open("ab", buffering=0) as stream:
+        stream.write(f"--- {time.strftime('%Y-%m-%d %H:%M:%S')}\n".encode())
+        for descriptor in (1, 2):
+            os.dup2(stream.fileno(), descriptor)
+    for stream in (sys.stdout, sys.stderr):
+        reconfigure: Any = getattr(stream, "reconfigure", lambda **_: None)
+        reconfigure(encoding="utf-8", line_buffering=True)
+    execution = Execution(None, assignment.cluster, assignment.sharing, progress=lambda *told: tell.send(told))
+    try:
+        with stoppable():
+            known = prepare(assignment.request, assignment.folder)
+            tell.send(carry_out(known, execution, resume=assignment.resume, restart=assignment.restart))
+    except Stopped as stop:
+        print(f"stopped: {stop.message}", flush=True)
+    except InputError as error:
+        print(f"error: {error}", flush=True)
+        tell.send(Failed(" ".join(str(error).split())))
+    except Exception as error:
+        traceback.print_exc()
+        words = " ".join(str(error).split())[:300]
+        tell.send(Failed(f"{type(error).__name__}: {words} (all of it in {log})"))

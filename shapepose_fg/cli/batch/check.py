@@ -6,19 +6,17 @@ from pathlib import Path
 
 from rich.filesize import decimal
 
-from shapepose_fg.cli.batch.table import Entry
+from shapepose_fg.cli.batch.table import LOG, Entry
 from shapepose_fg.cli.reconstruct.request import OUTPUTS, prepare
 from shapepose_fg.cli.terminal import note
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import open_regular
 from shapepose_fg.core.storage.output_folder import prepare_output
 from shapepose_fg.io.corrections import refuse_corrected
-from shapepose_fg.io.detections.places import find_places
+from shapepose_fg.io.detections.reading import find_places
 from shapepose_fg.io.skeleton_file import find_skeleton
 from shapepose_fg.pipeline.runs.manifest import PARTS
 
-LOG = "log.txt"
-"""What was said about a recording, in its folder."""
 _LEAST, _USUAL = 0.1, 2.0
 """Bytes of results for each byte of detections: many cameras whose files hold hands and faces, and others."""
 
@@ -57,7 +55,7 @@ def _look_at(entry: Entry, folder: Path, begun: bool) -> int:
     """Bytes of a recording's detections."""
     known = prepare(entry.request, folder, tell=lambda _: None)
     asked = known.request
-    places = find_places(known.detections, asked.rig())
+    places, _ = find_places(known.detections, asked.rig())
     find_skeleton(asked.skeleton)
     settings = known.settings()
     source = settings.offsets.source
@@ -73,7 +71,7 @@ def _look_at(entry: Entry, folder: Path, begun: bool) -> int:
         raise InputError(
             f"{folder / PARTS}: a run was stopped here; go on with --resume, or begin anew with --restart"
         )
-    return sum(_bytes(path) for path in places.paths)
+    return sum(_bytes(path) for path in places)
 
 
 def _bytes(path: Path) -> int:

@@ -11,12 +11,16 @@ from shapepose_fg.cli.options import RESULT, RUN, RunOptions, grouped, option
 from shapepose_fg.cli.stopping import Stopped
 from shapepose_fg.cli.terminal import note, show, warn
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.result_files import PEOPLE
+from shapepose_fg.core.result_files import RUN as RUN_FILE
 from shapepose_fg.core.storage.output_folder import only_run_in
 
 if TYPE_CHECKING:
     from shapepose_fg.cli.batch.standing import Standing
     from shapepose_fg.cli.batch.table import Entry
     from shapepose_fg.pipeline.cluster import Scheduler
+
+BATCH = "batch.json"
 
 # Everything else is imported inside the command: `--help` must not wait for torch.
 
@@ -40,8 +44,6 @@ def batch(
     if at_once is not None and not 1 <= at_once <= 64:
         raise InputError(f"--at-once {at_once}: must be 1 to 64; leave it out for as many as keep all busy")
     entries = read_table(table)
-    from shapepose_fg.cli.batch.standing import BATCH
-
     with only_run_in(output, [BATCH]):
         _run(table, entries, output, running, at_once)
 
@@ -50,25 +52,28 @@ def _run(table: Path, entries: "list[Entry]", output: Path, running: RunOptions,
     """The batch, in a folder that no other process writes to."""
     from shapepose_fg.cli.batch.campaign import Campaign
     from shapepose_fg.cli.batch.check import look_at_all
-    from shapepose_fg.cli.batch.standing import BATCH, Standings
-    from shapepose_fg.cli.batch.summary import bars, failures, table_of
+    from shapepose_fg.cli.batch.standing import Standings, bars
     from shapepose_fg.pipeline.cluster import local_cluster, look_at
     from shapepose_fg.pipeline.workers import cores
 
     begin = time.monotonic()
-    standings = Standings(output / BATCH, str(table))
-    standings.of = _standings(entries, output, resume=running.resume, restart=running.restart)
+    of = _standings(entries, output, resume=running.resume, restart=running.restart)
+    standings = Standings(output / BATCH, str(table), of)
     todo = [entry for entry in entries if standings.of[entry.name].status == "waiting"]
     sizes = look_at_all(table, todo, output, begun=running.resume or running.restart)
     if len(todo) > 0:
         with ExitStack() as opened:
-            address = None if running.cluster == "local" else running.cluster
-            if address is None:
+            here = running.cluster in (None, "local")
+            if here:
                 scheduler = opened.enter_context(local_cluster(running.workers or cores(), dashboard=True))
             else:
-                scheduler = look_at(address)
-            count = min(at_once or _at_once(scheduler.processes, cores()), len(todo))
-            _say(scheduler, len(entries), len(todo), count, here=address is None)
+                scheduler = look_at(str(running.cluster))
+            # One leader keeps five processes busy where it follows people itself, and ten where it does not; and
+            # while one recording is read or written another fills the queue.
+            most = max(2, min(1 + scheduler.processes // 6, cores()))
+            count = min(at_once or most, len(todo))
+            done = "" if len(todo) == len(entries) else f", {len(entries) - len(todo)} of them done before"
+            _say(scheduler, f"{len(entries)} recordings{done}", count, here=here)
             standings.write()
             campaign = Campaign(entries, sizes, output, scheduler.address, count)
             try:
@@ -78,19 +83,18 @@ def _run(table: Path, entries: "list[Entry]", output: Path, running: RunOptions,
                 done = len(standings.names("done"))
                 where = f"{done} of {len(entries)} recordings are done in {output}; go on with --resume"
                 raise Stopped(stop.number, where) from None
-    show(table_of(standings, time.monotonic() - begin))
+    show(standings.summary(time.monotonic() - begin))
     print(f"written  {output / BATCH}")
-    for sentence in failures(standings):
+    for sentence in standings.failures():
         warn(sentence)
     if len(standings.names("failed")) > 0:
         raise typer.Exit(1)
 
 
 def _standings(entries: "list[Entry]", output: Path, *, resume: bool, restart: bool) -> "dict[str, Standing]":
-    """How far every recording is, and who begins anew: by `restart`, or with something else wanted."""
-    from shapepose_fg.cli.batch.standing import BATCH, Standing, read_standings
+    """How far every recording is, and which begin anew: by `restart`, or with something else wanted."""
+    from shapepose_fg.cli.batch.standing import Standing, read_standings
     from shapepose_fg.cli.batch.table import asked
-    from shapepose_fg.core.result_files import PEOPLE, RUN
 
     file = output / BATCH
     if file.exists() and not (resume or restart):
@@ -102,7 +106,7 @@ def _standings(entries: "list[Entry]", output: Path, *, resume: bool, restart: b
     for entry in entries:
         wanted = asked(entry.request)
         old = before.get(entry.name, Standing(wanted, anew=restart))
-        there = all((output / entry.name / name).is_file() for name in (PEOPLE, RUN))
+        there = all((output / entry.name / name).is_file() for name in (PEOPLE, RUN_FILE))
         changed = old.asked != wanted
         if changed:
             note(f"{entry.name}: something else is wanted of it than before; it begins anew")
@@ -111,23 +115,10 @@ def _standings(entries: "list[Entry]", output: Path, *, resume: bool, restart: b
     return found
 
 
-def _at_once(processes: int, cores: int) -> int:
-    """Recordings that are led side by side.
-
-    One leader keeps five processes busy where it follows people itself, and ten where it does not; and while one
-    recording is read or written another fills the queue.
-    """
-    return max(2, min(1 + processes // 6, cores))
-
-
-def _say(scheduler: "Scheduler", count: int, todo: int, at_once: int, *, here: bool) -> None:
+def _say(scheduler: "Scheduler", what: str, at_once: int, *, here: bool) -> None:
     """What is going to be done, and where to look at it."""
-    done = "" if todo == count else f", {count - todo} of them done before"
     place = "here" if here else f"at {scheduler.address}"
-    print(
-        f"{count} recordings{done}; {scheduler.processes} processes {place}, {at_once} recordings at once",
-        flush=True,
-    )
+    print(f"{what}; {scheduler.processes} processes {place}, {at_once} recordings at once", flush=True)
     if scheduler.processes == 0:
         note(f"no process has come to {scheduler.address} yet; the work waits for one (`dask worker`)")
     if scheduler.dashboard is not None:

@@ -1,20 +1,28 @@
-"""batch.json: which recordings of an archive are done, which failed and why."""
+"""How far the recordings of an archive are: batch.json, and what `shapepose-fg batch` says of them."""
 
 import json
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
 
-from shapepose_fg.cli.reconstruct.request import Ended
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.provenance import versions
-from shapepose_fg.core.storage.files import read_json, write_atomically
+from shapepose_fg.core.storage.files import read_json, write_content
 from shapepose_fg.io.validation import first_problem, key_text
 
-BATCH = "batch.json"
+if TYPE_CHECKING:
+    from shapepose_fg.cli.reconstruct.run import Ended
+
 _FORMAT = "shapepose-fg batch 1"
+_STYLES = {"done": "green", "failed": "bold red", "waiting": "yellow"}
 
 
 @dataclass(frozen=True)
@@ -39,22 +47,16 @@ class Standing:
     people: int | None = None
     warnings: tuple[str, ...] = ()
 
-    def done(self, found: Ended, seconds: float) -> "Standing":
+    def done(self, found: "Ended", seconds: float) -> "Standing":
         """After it was done, in so many seconds."""
         attempts, seconds = self.attempts + 1, self.seconds + seconds
         return replace(self, status="done", attempts=attempts, anew=False, seconds=seconds, **asdict(found))
 
     def failed(self, reason: str, seconds: float, most: int) -> "Standing":
         """After another attempt failed; the last of `most`?"""
-        attempts = self.attempts + 1
+        attempts, seconds = self.attempts + 1, self.seconds + seconds
         status = "failed" if attempts >= most else "waiting"
-        return replace(
-            self,
-            status=status,
-            attempts=attempts,
-            seconds=self.seconds + seconds,
-            reasons=(*self.reasons, reason),
-        )
+        return replace(self, status=status, attempts=attempts, seconds=seconds, reasons=(*self.reasons, reason))
 
 
 @dataclass
@@ -75,20 +77,38 @@ class Standings:
 
     def write(self) -> None:
         """Write the file, whole or not at all."""
-        counts = {status: self.names(status) for status in ("done", "failed", "waiting")}
         content = {
             "format": _FORMAT,
             "table": self.table,
             "versions": versions(),
-            **{status: len(names) for status, names in counts.items()},
+            **{status: len(self.names(status)) for status in ("done", "failed", "waiting")},
             "recordings": {name: asdict(each) for name, each in self.of.items()},
         }
-        text = json.dumps(content, indent=2, allow_nan=False) + "\n"
-        write_atomically(self.file, lambda stream: stream.write(text.encode()))
+        write_content(self.file, json.dumps(content, indent=2, allow_nan=False) + "\n")
 
     def names(self, status: str) -> list[str]:
-        """Who is that far."""
+        """The recordings that are that far."""
         return [name for name, each in self.of.items() if each.status == status]
+
+    def summary(self, seconds: float) -> Table:
+        """How each recording ended, frames, people and time; under it what all of them took."""
+        table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
+        for name in ("recording", "", "frames", "people", "rows", "time", "warnings"):
+            table.add_column(name, justify="left" if name in ("recording", "") else "right", overflow="fold")
+        for name, each in self.of.items():
+            numbers = ["" if number is None else str(number) for number in (each.frames, each.people, each.rows)]
+            numbers.append(clock(each.seconds) if each.attempts > 0 else "")
+            warnings = str(len(each.warnings)) if len(each.warnings) > 0 else ""
+            table.add_row(Text(name), Text(each.status, style=_STYLES[each.status]), *numbers, warnings)
+        counts = [f"{len(self.names(each))} {each}" for each in _STYLES if len(self.names(each)) > 0]
+        frames = sum(each.frames or 0 for each in self.of.values())
+        table.caption = f"{', '.join(counts)}; {frames} frames; this time {clock(seconds)}"
+        table.caption_justify = "left"
+        return table
+
+    def failures(self) -> Sequence[str]:
+        """A sentence for each recording that failed."""
+        return [f"{name}: {self.of[name].reasons[-1]}" for name in self.names("failed")]
 
 
 def read_standings(file: Path) -> dict[str, Standing]:
@@ -103,3 +123,57 @@ def read_standings(file: Path) -> dict[str, Standing]:
     except ValidationError as error:
         place, problem = first_problem(error)
         raise InputError(f"{file}: recordings.{key_text(place)} {problem}; {cure}") from None
+
+
+class Bars:
+    """A line for all recordings, and one for each that is under way; nothing where stderr is no terminal."""
+
+    def __init__(self, bars: Progress, standings: Standings) -> None:
+        self._bars, self._standings = bars, standings
+        self._whole = bars.add_task("recordings", total=len(standings.of))
+        self._tasks: dict[str, TaskID] = {}
+        self._count()
+
+    def began(self, name: str) -> None:
+        """A recording is being read."""
+        self._tasks[name] = self._bars.add_task(name, total=None)
+
+    def frames(self, name: str, done: int, count: int) -> None:
+        """So many of its frames are done."""
+        self._bars.update(self._tasks[name], completed=done, total=count)
+
+    def ended(self, name: str, *, failed: str | None, again: bool) -> None:
+        """It is done, or has `failed` for a reason; `again` if it will be tried again."""
+        self._bars.remove_task(self._tasks.pop(name))
+        self._count()
+        each = self._standings.of[name]
+        if failed is None:
+            people = "" if each.people is None else f"{each.people} people, "
+            words = ("done: ", "green"), f"{name}, {each.frames} frames, {people}{clock(each.seconds)}"
+        else:
+            more = " (it is tried once more, after the others)" if again else ""
+            words = ("failed: ", "bold red"), f"{name}: {failed}{more}"
+        self._bars.console.print(Text.assemble(*words), soft_wrap=True)
+
+    def _count(self) -> None:
+        ended = len(self._standings.of) - len(self._standings.names("waiting"))
+        self._bars.update(self._whole, completed=ended)
+
+
+@contextmanager
+def bars(standings: Standings) -> Iterator[Bars]:
+    """`Bars` on stderr while the block runs."""
+    console, text = Console(stderr=True), TextColumn("{task.description}", markup=False)
+    columns = (text, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(compact=True))
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        yield Bars(progress, standings)
+
+
+def clock(seconds: float) -> str:
+    """A time in words: 12 s, 3 min 20 s, 5 h 10 min."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60} s"
+    return f"{whole // 3600} h {whole % 3600 // 60} min"

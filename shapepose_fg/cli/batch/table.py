@@ -12,6 +12,8 @@ from shapepose_fg.core.storage.files import read_toml
 from shapepose_fg.io.config import config_from
 from shapepose_fg.io.validation import describe
 
+LOG = "log.txt"
+"""What was said about a recording, in its folder."""
 _NAME = re.compile(r"\w[\w.-]{0,99}")
 _MOST = 10_000
 """Recordings of one table."""
@@ -51,10 +53,12 @@ def read_table(path: Path) -> list[Entry]:
     entries = []
     for name, own in recordings.items():
         place = f"recordings.{name}"
-        values = _over(defaults, _table(own, path, place))
-        entries.append(
-            Entry(name, _located(config_from(values, Request, path, place=place, cure=_CURE), path, place))
-        )
+        own = _table(own, path, place)
+        # When frames were taken is said in one way only.
+        less = {"fps", "timestamps"} if own.keys() & {"fps", "timestamps"} else set()
+        values = {key: value for key, value in defaults.items() if key not in less} | own
+        request = config_from(values, Request, path, place=place, cure=_CURE)
+        entries.append(Entry(name, _located(request, path, place)))
     return _in_turn(entries, path)
 
 
@@ -66,24 +70,17 @@ def _table(value: Any, path: Path, place: str) -> dict[str, Any]:
 
 def _check_names(names: list[str], path: Path) -> None:
     """Refuse names that are no folders' names, or the same one on some systems."""
-    seen: dict[str, str] = {}
+    seen = {"batch.json": "batch.json"}
     for name in names:
         if _NAME.fullmatch(name) is None:
             raise InputError(
                 f"{path}: recordings.{name[:100]}: a name has up to 100 letters, digits, dots, - and _, and begins"
                 " with a letter or digit, because a folder is called so; rename it"
             )
-        if name.lower() in ("batch.json", *seen):
-            other = seen.get(name.lower(), "batch.json")
+        if name.lower() in seen:
+            other = seen[name.lower()]
             raise InputError(f"{path}: recordings.{name}: {other} has this name on some systems, too; rename it")
         seen[name.lower()] = name
-
-
-def _over(defaults: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
-    """A recording's own words over those for all; when frames were taken is said in one way only."""
-    if own.keys() & {"fps", "timestamps"}:
-        defaults = {key: value for key, value in defaults.items() if key not in ("fps", "timestamps")}
-    return defaults | own
 
 
 def _located(request: Request, path: Path, place: str) -> Request:
@@ -117,13 +114,12 @@ def _in_turn(entries: list[Entry], path: Path) -> list[Entry]:
     for each in entries:
         shapes, project = each.request.shapes, each.request.project
         if project is not None:
-            key = project.resolve(), each.request.frames
-            if key in projects:
+            other = projects.setdefault((project.resolve(), each.request.frames), each.name)
+            if other != each.name:
                 raise InputError(
-                    f"{path}: recordings.{each.name}: {project} is that of {projects[key]}, too, and TRC of"
-                    " one would be written over those of the other; leave one out"
+                    f"{path}: recordings.{each.name}: {project} is that of {other}, too, and TRC of one would be"
+                    " written over those of the other; leave one out"
                 )
-            projects[key] = each.name
         if shapes is not None:
             each = replace(each, after=last.get(shapes.resolve()))
             last[shapes.resolve()] = each.name
@@ -133,11 +129,9 @@ def _in_turn(entries: list[Entry], path: Path) -> list[Entry]:
 
 def asked(request: Request) -> dict[str, Any]:
     """What is wanted, as plain values: equal where the same is wanted."""
-    values = {field.name: getattr(request, field.name) for field in fields(request)}
-    plain = {name: str(value) if isinstance(value, Path) else value for name, value in values.items()}
-    default = Request()
-    return {
-        name: list(value) if isinstance(value, tuple) else value
-        for name, value in plain.items()
-        if value != getattr(default, name)
-    }
+    default, found = Request(), {}
+    for name in (field.name for field in fields(request)):
+        value = getattr(request, name)
+        if value != getattr(default, name):
+            found[name] = str(value) if isinstance(value, Path) else list(value) if name == "cuts" else value
+    return found

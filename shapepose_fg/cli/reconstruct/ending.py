@@ -13,11 +13,10 @@ from shapepose_fg.core.frame_times import rate_words
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.pipeline.pipeline import Task
 from shapepose_fg.pipeline.runs.assembly import Assembly
-from shapepose_fg.setup_check.camera_use import use_table
-from shapepose_fg.setup_check.diagnosis import diagnose
 from shapepose_fg.setup_check.in_result import ResultCheck, result_check
-from shapepose_fg.setup_check.pictures import other_sizes
-from shapepose_fg.setup_check.report import report_of
+from shapepose_fg.setup_check.plain import other_sizes
+from shapepose_fg.setup_check.report import check_setup as check_detections
+from shapepose_fg.setup_check.table import use_table
 
 _SURE = 0.9
 """Whoever is less probable is named."""
@@ -40,7 +39,7 @@ def check_setup(known: Prepared, task: Task, people: Reconstruction) -> ResultCh
             sizes = other_sizes([str(videos)], task.rig) if videos.is_dir() else ()
         except InputError as error:  # the result does not need them
             note(f"{error}; their sizes are not checked")
-    report = report_of(diagnose(task.detections, task.rig, frames), task.rig, sizes)
+    report = check_detections(task.detections, task.rig, frames, sizes)
     return result_check(report, people, task.detections, task.rig, frames)
 
 
@@ -49,14 +48,14 @@ def summary_table(result: Assembly, people: Reconstruction, span: range, cameras
 
     `people` are rows of the `result` that say how sure the joints are.
     """
-    frame, run, counts = result.columns()["frame"].array(), result.run, result.counts()
-    per_frame = np.bincount(frame - span.start, minlength=len(span))
+    run, counts = result.run, result.counts()
+    per_frame = np.bincount(result.columns()["frame"].array() - span.start, minlength=len(span))
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     table.add_column(style="bold")
     table.add_column(overflow="fold")
     table.add_row("frames", f"{len(span)} ({span.start}:{span.stop}) of {cameras} cameras{rate_words(run)}")
     over_time = run.get("configuration", {}).get("temporal", False)
-    count = f"{len(result.people.counts)} people over time" if over_time else "no identities"
+    count = f"{len(result.rows_of)} people over time" if over_time else "no identities"
     table.add_row("people", f"{count}, {per_frame.mean():.1f} a frame ({per_frame.min()} to {per_frame.max()})")
     table.add_row("rows", f"{len(result)} in all")
     for status, count in sorted(counts["status"].items()):
@@ -72,9 +71,9 @@ def summary_table(result: Assembly, people: Reconstruction, span: range, cameras
         table.add_row("joints", _joints(counts["joints"], people))
     # Loading torch and the body takes a second or two, once; it says nothing about the time of a frame.
     stages = {name: spent for name, spent in run.get("seconds", {}).items() if name != "load"}
-    per_stage = "  ".join(f"{name} {1e3 * spent / len(span):.1f}" for name, spent in stages.items())
     table.add_row("time", f"{1e3 * sum(stages.values()) / len(span):.1f} ms a frame, {seconds:.1f} s in all")
-    table.add_row("", per_stage, style="dim")
+    words = (f"{name} {1e3 * spent / len(span):.1f}" for name, spent in stages.items())
+    table.add_row("", "  ".join(words), style="dim")
     return table
 
 
@@ -91,8 +90,7 @@ def _doubtful(run: dict[str, Any]) -> str:
 def _frames_words(spans: list[list[int]]) -> str:
     """In which frames, as far as there is room: run.json has all."""
     told = [f"{start}" if stop == start + 1 else f"{start}-{stop - 1}" for start, stop in spans[:4]]
-    more = " ..." if len(spans) > len(told) else ""
-    return f" (frames {' '.join(told)}{more})" if told else ""
+    return f" (frames {' '.join(told)}{' ...' * (len(spans) > 4)})" if told else ""
 
 
 def _joints(count: dict[str, int], people: Reconstruction) -> str:

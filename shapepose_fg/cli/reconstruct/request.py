@@ -1,6 +1,5 @@
 """What a reconstruction is asked for, by the command line or in a table of recordings."""
 
-import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,20 +32,6 @@ OUTPUTS = (PEOPLE, RUN_FILE, OBSERVATIONS, "cameras.json", "report.html")
 """The files that are left in the folder of results."""
 
 # Everything else is imported inside the functions: `--help` must not wait for torch.
-
-
-@dataclass(frozen=True)
-class Ended:
-    """What came of a recording that was reconstructed; plain data, which processes tell each other."""
-
-    frames: int
-    """How many frames were reconstructed."""
-    rows: int
-    """Rows of people.npz."""
-    people: int | None
-    """How many there are over time; None frame by frame."""
-    warnings: tuple[str, ...]
-    """What looks wrong with cameras and detections."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,8 +81,7 @@ class Prepared:
     """A request whose places are known, and whose options are sound."""
 
     request: Request
-    """What is asked for; cameras, detections, rate and file of times are those of the project where it is of
-    one."""
+    """What is asked for; cameras, detections and times are those of the project where it is of one."""
     project: "Pose2SimProject | None"
     """The project that it is of."""
     calibration: Path
@@ -106,13 +90,6 @@ class Prepared:
     """The folder of detections."""
     output: Path
     """The folder of results."""
-
-    @property
-    def changes_settings(self) -> bool:
-        """Whether anything is asked for that `settings` might refuse; looking at it loads torch, some seconds."""
-        asked = self.request
-        given = (asked.config, asked.temporal, asked.shapes, asked.chunk_frames, self.project)
-        return any(each is not None for each in given)
 
     def settings(self) -> "PipelineConfig":
         """The settings; InputError where they do not go with the rest."""
@@ -166,8 +143,7 @@ class Prepared:
 def prepare(request: Request, output: Path | None, tell: Callable[[str], None] = note) -> Prepared:
     """Find a request's places, and look at its options, before any large file is read.
 
-    `tell` is given what a project's files were taken to be. InputError, one sentence, where something is missing
-    or wrong.
+    `tell` is given what a project's files were taken to be. InputError where something is missing or wrong.
     """
     project = None
     if request.project is not None:
@@ -177,11 +153,8 @@ def prepare(request: Request, output: Path | None, tell: Callable[[str], None] =
         for each in project.notes:
             tell(each)
         output = output or project.output
-        request = replace(
-            request,
-            calibration=request.calibration or project.calibration,
-            detections=request.detections or project.detections,
-        )
+        calibration, detections = request.calibration or project.calibration, request.detections
+        request = replace(request, calibration=calibration, detections=detections or project.detections)
         if request.fps is None and request.timestamps is None:
             request = replace(request, fps=project.fps, timestamps=project.times)
     calibration, detections = request.calibration, request.detections
@@ -196,13 +169,3 @@ def prepare(request: Request, output: Path | None, tell: Callable[[str], None] =
     if request.frames is not None:
         ends(request.frames)
     return Prepared(request, project, calibration, detections, output)
-
-
-def cuts_of(text: str | None) -> tuple[int, ...]:
-    """The frames that `A,B,...` names."""
-    try:
-        return () if text is None else tuple(int(word) for word in re.split(r"[,\s]+", text.strip()))
-    except ValueError:
-        raise InputError(
-            f"--cuts {text}: must be rising frame numbers with commas between, such as 300,600"
-        ) from None

@@ -2,42 +2,114 @@
 
 import hashlib
 import json
+import shutil
 import time
-from contextlib import nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.fitting.weights import fingerprint
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.shapes import SubjectShapes
 from shapepose_fg.cli.reconstruct.ending import check_setup, show_check, summary_table
-from shapepose_fg.cli.reconstruct.request import Ended, Prepared
+from shapepose_fg.cli.reconstruct.request import OUTPUTS, Prepared
 from shapepose_fg.cli.stopping import Stopped
 from shapepose_fg.cli.terminal import note, progress, show
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.frame_times import FrameTimes
-from shapepose_fg.core.provenance import program_digest, versions
+from shapepose_fg.core.provenance import ReadInputs, checksums, program_digest, versions
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.core.storage.kept_arrays import KeptArrays
-from shapepose_fg.core.storage.output_folder import prepare_output
+from shapepose_fg.core.run_summary import plain
+from shapepose_fg.core.storage.kept_arrays import InFolder
+from shapepose_fg.core.storage.output_folder import only_run_in, prepare_output
 from shapepose_fg.io.calibration import write_rig
+from shapepose_fg.io.corrections import refuse_corrected
 from shapepose_fg.io.detection_table import DetectionTable
-from shapepose_fg.io.export.marker_files import write_pose2sim_files
+from shapepose_fg.io.detections import read_detections
+from shapepose_fg.io.export.markers import write_pose2sim_files
 from shapepose_fg.io.solved_setup import CAMERAS
-from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.pipeline import Task, reconstruct_parts
 from shapepose_fg.pipeline.runs.assembly import Assembly
-from shapepose_fg.pipeline.runs.known_people import checksum_at_start, people_at_start, write_people
-from shapepose_fg.pipeline.runs.manifest import PARTS, check_room, end_run, expected_bytes, frames_done, open_run
+from shapepose_fg.pipeline.runs.manifest import (
+    PARTS,
+    check_room,
+    checksum_at_start,
+    end_run,
+    expected_bytes,
+    frames_done,
+    open_run,
+    people_at_start,
+    write_people,
+)
+from shapepose_fg.pipeline.workers import get_ready
 from shapepose_fg.viz.report.writing import MOST_ROWS, REPORT, th, write_report
 
 
 @dataclass(frozen=True)
-class Run:
+class Ended:
+    """What came of a recording that was reconstructed; plain data, which processes tell each other."""
+
+    frames: int
+    """How many frames were reconstructed."""
+    rows: int
+    """Rows of people.npz."""
+    people: int | None
+    """How many there are over time; None frame by frame."""
+    warnings: tuple[str, ...]
+    """What looks wrong with cameras and detections."""
+
+
+def carry_out(known: Prepared, execution: Execution, *, resume: bool = False, restart: bool = False) -> Ended:
+    """Reconstruct what is asked for into its folder, and say how it went.
+
+    `resume` and `restart` are the command's options; `execution` without `progress` shows a bar. InputError, one
+    sentence, for what cannot be used; `Stopped`, with where it stands, on Ctrl-C or a request to end.
+    """
+    asked, output = known.request, known.output
+    files = (known.calibration, asked.config, asked.body, asked.timestamps)
+    reading = ReadInputs((*files, known.detections))
+    rig = asked.rig()
+    refuse_corrected(output)
+    settings = known.settings()  # what is wrong with them is said before the whole recording is read
+    with only_run_in(output, OUTPUTS), _recording_folder(output / ".detections") as kept:
+        recording = read_detections(known.detections, rig, asked.skeleton, kept)
+        for each in recording.notes:
+            note(each)
+        count = len(recording)
+        span, times, cuts = known.span(count), known.times(rig, count), known.cuts(count)
+        execution = replace(execution, chunk_frames=asked.chunk_frames).worth(len(span))
+        if execution.workers != 1 and execution.cluster is None:
+            get_ready("shapepose_fg.pipeline.pipeline")
+        fitter = None
+        if asked.body is not None:
+            model = BodyModel.load(asked.body).with_keypoints(recording.skeleton.joints)
+            fitter = make_fitter(settings.body, model)
+        task = Task(recording, rig, settings, span, times, cuts, fitter=fitter)
+        inputs = reading.checksums((known.calibration, *recording.sources, *files[1:]))
+        if settings.offsets.source not in ("recording", "none"):
+            inputs |= checksums([settings.offsets.source])
+        del reading  # of half a million files it is large
+        return _Run(task, recording, known, inputs, execution).carried_out(resume=resume, restart=restart)
+
+
+@contextmanager
+def _recording_folder(folder: Path) -> Iterator[InFolder]:
+    """Where what the cameras saw is kept while the block runs: in files, because it may be larger than memory.
+
+    What a killed run left there is removed.
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    try:
+        yield InFolder(folder)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@dataclass(frozen=True)
+class _Run:
     """A reconstruction into a folder, whose input is read and checked."""
 
     task: Task
@@ -49,51 +121,35 @@ class Run:
     inputs: dict[str, str]
     """Checksums of the files that were read."""
     execution: Execution
-    """What runs it; without `progress` a bar is shown."""
-
-    @property
-    def frames(self) -> range:
-        """Those that are reconstructed."""
-        return self.task.whole()[0]
+    """What runs it."""
 
     def begun(self) -> dict[str, Any]:
         """All that the result depends on, as plain values: equal for a run that goes on."""
-        task, asked = self.task, self.known.request
-        times = FrameTimes.assumed(len(self.recording)) if task.times is None else task.times
-        skeleton = self.recording.skeleton
-        cameras = [
-            (
-                camera.name,
-                camera.image_size,
-                camera.lens,
-                *(array.tolist() for array in (camera.K, camera.distortion, camera.wTc)),
-            )
-            for camera in task.rig.cameras
-        ]
+        task, asked, skeleton = self.task, self.known.request, self.recording.skeleton
+        frames, times, cuts = task.whole()
         return {
             "inputs": self.inputs,
             "configuration": asdict(task.config),
-            "frames": [self.frames.start, self.frames.stop],
-            "time": {**times.as_dict(), "sha256": _digest(times.time_s.tolist())},
-            "cuts": list(task.cuts),
+            "frames": [frames.start, frames.stop],
+            "time": {**times.as_dict(), "sha256": _digest(times.time_s)},
+            "cuts": cuts,
             "chunk_frames": self.execution.chunk_frames,
             "body": None if asked.body is None else str(asked.body),
             "shapes": None if asked.shapes is None else str(asked.shapes),
             "skeleton": {"name": skeleton.name, "sha256": _digest(asdict(skeleton))},
-            "cameras": _digest([task.rig.up, cameras]),
+            "cameras": _digest(asdict(task.rig)),
             "versions": versions(),
             "program": program_digest(),
         }
 
     def carried_out(self, *, resume: bool, restart: bool) -> Ended:
-        """Reconstruct, and leave the results in the folder, where the caller is the only one.
+        """Reconstruct, and leave the results in the folder; `carry_out` says what is raised.
 
-        Whatever stops it, what is done is kept there, and the next call with `resume` goes on. InputError where
-        that cannot be, or the disk is full; `Stopped`, with where it stands, on Ctrl-C or a request to end.
+        Whatever stops it, what is done is kept there, and the next call with `resume` goes on.
         """
         output = self.known.output
         if not (output / PARTS).is_dir():
-            check_room(output, expected_bytes(self.recording, self.task.rig, self.frames))
+            check_room(output, expected_bytes(self.recording, self.task.rig, self.task.whole()[0]))
             if resume:
                 note(f"{output}: no run was stopped here; this one begins anew")
         kept = open_run(output, self.begun(), resume=resume, restart=restart)
@@ -105,9 +161,9 @@ class Run:
             place = f"{error.filename}: " if error.filename is not None else ""
             raise InputError(f"{place}{error.strerror or error}; {self._standing()}") from None
 
-    def _finished(self, kept: KeptArrays) -> Ended:
+    def _finished(self, kept: InFolder) -> Ended:
         """The reconstruction, its files, and what is said of it."""
-        asked, output, rig = self.known.request, self.known.output, self.task.rig
+        asked, output, rig, frames = self.known.request, self.known.output, self.task.rig, self.task.whole()[0]
         file, inputs = asked.shapes, dict(self.inputs)
         known = None if file is None else people_at_start(kept, file, lambda: _known_people(file, asked.body))
         start = time.perf_counter()
@@ -130,7 +186,7 @@ class Run:
         # What the observations were seen with: to solve or draw them anew.
         if not (output / CAMERAS).exists() or not (output / CAMERAS).samefile(self.known.calibration):
             write_rig(rig, output / CAMERAS)
-        summary = summary_table(result, people, self.frames, len(rig), seconds)
+        summary = summary_table(result, people, frames, len(rig), seconds)
         for n, written in enumerate(self._written(result, people, every)):
             summary.add_row("" if n > 0 else "written", written)
         if file is not None and known is not None and result.shapes is not None:
@@ -140,8 +196,8 @@ class Run:
         show(summary)
         if checked is not None:
             show_check(checked)
-        count = len(result.people.counts) if self.task.config.temporal else None
-        return Ended(len(self.frames), len(result), count, () if checked is None else tuple(checked.warnings))
+        count = len(result.rows_of) if self.task.config.temporal else None
+        return Ended(len(frames), len(result), count, () if checked is None else tuple(checked.warnings))
 
     def _written(self, result: Assembly, people: Reconstruction, every: int) -> list[str]:
         """Report and files for other programs are left; what there is now."""
@@ -169,14 +225,7 @@ class Run:
             return str(error)
         if done == 0:
             return "nothing is kept: no frame was done"
-        return f"{done} of {len(self.frames)} frames are kept in {output / PARTS}; go on with --resume"
-
-
-def fitter_of(body: Path | None, settings: PipelineConfig, joints: tuple[str, ...]) -> BodyFitter | None:
-    """The body fitter with the model of the file `body`; without one, the pipeline takes its own."""
-    if body is None:
-        return None
-    return make_fitter(settings.body, BodyModel.load(body).with_keypoints(joints))
+        return f"{done} of {len(self.task.whole()[0])} frames are kept in {output / PARTS}; go on with --resume"
 
 
 def _known_people(file: Path, body: Path | None) -> SubjectShapes:
@@ -189,5 +238,5 @@ def _known_people(file: Path, body: Path | None) -> SubjectShapes:
 
 
 def _digest(value: Any) -> str:
-    """sha256 of plain values."""
-    return hashlib.sha256(json.dumps(value, default=list).encode()).hexdigest()
+    """sha256 of plain values and arrays."""
+    return hashlib.sha256(json.dumps(value, default=plain).encode()).hexdigest()

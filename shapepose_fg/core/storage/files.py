@@ -6,12 +6,12 @@ import json
 import os
 import re
 import stat
-import tempfile
 import tomllib
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from secrets import token_hex
 from typing import Any, BinaryIO
 
 from shapepose_fg.core.errors import InputError
@@ -50,6 +50,13 @@ def open_regular(path: Path, cure: str = "check the path") -> BinaryIO:
     return stream
 
 
+def _refuse_irregular(path: Path, mode: int) -> None:
+    if stat.S_ISDIR(mode):
+        raise InputError(f"{path}: this is a folder; give the file inside it")
+    if not stat.S_ISREG(mode):
+        raise InputError(f"{path}: this is a pipe or a device, no file; write it into a file first")
+
+
 def read_bytes(path: Path, most: int = LARGE) -> bytes:
     """What is in the file at `path`; InputError as of `open_regular`, and where it has more than `most` bytes."""
     with open_regular(path) as stream:
@@ -74,7 +81,7 @@ def read_text(path: Path, *, may_be_empty: bool = False, most: int = LARGE) -> s
     except UnicodeDecodeError as error:
         raise not_text(path, error.start) from None
     if not may_be_empty and not text.strip():
-        raise InputError(f"{path}: the file is empty; write or copy it again")
+        raise _empty(path)
     return text
 
 
@@ -83,21 +90,24 @@ def text_pieces(path: Path) -> Iterator[str]:
     decoder, at, empty = codecs.getincrementaldecoder("utf-8-sig")(), 0, True
     with open_regular(path) as stream:
         check_size(path, os.fstat(stream.fileno()).st_size, LARGE)
-        while True:
+        ended = False
+        while not ended:
             read = stream.read(PIECE)
             check_size(path, at + len(read), LARGE)
-            waiting = len(decoder.getstate()[0])
+            waiting, ended = len(decoder.getstate()[0]), len(read) == 0
             try:
-                text = decoder.decode(read, final=len(read) == 0)
+                text = decoder.decode(read, final=ended)
             except UnicodeDecodeError as error:
                 raise not_text(path, at - waiting + error.start) from None
             at, empty = at + len(read), empty and not text.strip()
             if len(text) > 0:
                 yield text
-            if len(read) == 0:
-                break
     if empty:
-        raise InputError(f"{path}: the file is empty; write or copy it again")
+        raise _empty(path)
+
+
+def _empty(path: Path) -> InputError:
+    return InputError(f"{path}: the file is empty; write or copy it again")
 
 
 def read_json(path: Path, *, most: int = LARGE) -> Any:
@@ -180,13 +190,6 @@ def bounded(value: Any, path: Path, *, numbers: bool = True) -> Any:
     return value
 
 
-def _refuse_irregular(path: Path, mode: int) -> None:
-    if stat.S_ISDIR(mode):
-        raise InputError(f"{path}: this is a folder; give the file inside it")
-    if not stat.S_ISREG(mode):
-        raise InputError(f"{path}: this is a pipe or a device, no file; write it into a file first")
-
-
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
     """Let `write` fill a temporary file beside `path`, then put it in place in one step.
 
@@ -209,13 +212,11 @@ def write_together(files: Mapping[Path, Callable[[BinaryIO], object]]) -> None:
         for path, write in files.items():
             with _naming(path):
                 path.parent.mkdir(parents=True, exist_ok=True)
-                handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=_PART)
-                temporary[path] = Path(name)
-                with os.fdopen(handle, "wb") as stream:
+                temporary[path] = path.with_name(f".{path.name}.{token_hex(4)}{_PART}")
+                with temporary[path].open("xb") as stream:
                     write(stream)
                     stream.flush()
                     os.fsync(stream.fileno())
-                Path(name).chmod(0o666 & ~_umask())  # mkstemp makes files that only their owner reads
         for path in files:
             with _naming(path):
                 temporary[path].replace(path)
@@ -223,8 +224,12 @@ def write_together(files: Mapping[Path, Callable[[BinaryIO], object]]) -> None:
     finally:
         for left in temporary.values():
             left.unlink(missing_ok=True)
-    for folder in {path.parent for path in files}:
-        _sync_folder(folder)
+    # The new names themselves survive a power cut, where the system can do that; some network file systems cannot.
+    for folder in {path.parent for path in files} if os.name == "posix" else ():
+        descriptor = os.open(folder, os.O_RDONLY)
+        with suppress(OSError):
+            os.fsync(descriptor)
+        os.close(descriptor)
 
 
 def sweep(folder: Path, name: str | None = None) -> None:
@@ -258,23 +263,3 @@ def unique_keys(pairs: list[tuple[str, Any]], path: Path) -> dict[str, Any]:
         twice = next(key for key, count in Counter(key for key, _ in pairs).items() if count > 1)
         raise InputError(f'{path}: key "{twice}" occurs twice in one object; give each its own name')
     return members
-
-
-def _umask() -> int:
-    """The process's file mode mask; it can only be read by setting it."""
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
-
-
-def _sync_folder(folder: Path) -> None:
-    """Make the new name itself survive a power cut, where the system can."""
-    if os.name != "posix":
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    except OSError:  # some network file systems cannot
-        pass
-    finally:
-        os.close(descriptor)

@@ -1,6 +1,6 @@
 """The body fitters that ship, on bodies that are known: their joints made worse step by step.
 
-Bodies of random shapes in recorded poses of people who were not used for learning or choosing (`training.split`),
+Bodies of random shapes in recorded poses of people not used for learning or choosing (`training.motions`),
 half of them dancers, anywhere in a room; the same targets for every fitter. Times are of whole fits, and the
 processor's, of one thread.
 """

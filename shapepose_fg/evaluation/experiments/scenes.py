@@ -13,7 +13,7 @@ from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.simulation.foreign import PEOPLE
 from shapepose_fg.simulation.mocap import Mocap
 from shapepose_fg.simulation.sequences import SEQUENCES
-from shapepose_fg.simulation.training.split import split_of
+from shapepose_fg.simulation.training.motions import split_of
 
 OVER_TIME = PipelineConfig()
 FRAME_BY_FRAME = replace(OVER_TIME, temporal=False)

@@ -11,11 +11,10 @@ from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.simulation import DetectorConfig, Scene, simulate
-from shapepose_fg.simulation.files import cut, cuts_of, named_scene
+from shapepose_fg.simulation.files import named_scene, truth_of
 from shapepose_fg.simulation.foreign import DETECTOR_S_OWN, people_of, recast
 from shapepose_fg.simulation.room import SequenceConfig
 from shapepose_fg.simulation.sequences import Split
-from shapepose_fg.simulation.truth import truth_of
 
 STRETCHES: dict[Split, dict[str, tuple[range, ...]]] = {
     "report": {
@@ -81,14 +80,14 @@ class Stretch:
     def truth(self) -> Reconstruction:
         """The people as a result, in which everybody is somebody else after a cut."""
         truth = truth_of(self.scene)
-        segment = np.searchsorted(cuts_of(self.scene), truth.frame, side="right")
+        segment = np.searchsorted(self.scene.cuts, truth.frame, side="right")
         return replace(truth, person=truth.person + segment * (int(truth.person.max(initial=0)) + 1))
 
     def reconstruct(self, config: PipelineConfig | None = None) -> Reconstruction:
         """Reconstructed at the scene's rate."""
         scene = self.scene
         times = FrameTimes.from_fps(scene.fps, len(self.span))
-        return reconstruct(self.detections, scene.rig, config, times=times, cuts=cuts_of(scene))
+        return reconstruct(self.detections, scene.rig, config, times=times, cuts=scene.cuts)
 
 
 @dataclass(frozen=True)
@@ -160,7 +159,7 @@ def _scene(stretch: Stretch) -> Scene:
         fps=stretch.fps,
         **own,
     )
-    scene = cut(whole, stretch.span)
+    scene = whole.part(stretch.span)
     return scene if stretch.bodies is None else recast(scene, people_of(stretch.bodies, scene.people))
 
 

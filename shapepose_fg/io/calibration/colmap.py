@@ -1,5 +1,6 @@
 """COLMAP's text model: cameras.txt and images.txt. Camera from world; no unit and no up axis of its own."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
@@ -10,6 +11,7 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import LARGE, read_text
 from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.calibration.written import Format, WrittenCamera, WrittenRig, intrinsics, pose, rotation_of
+from shapepose_fg.io.validation import is_number
 
 _FILES = ("cameras.txt", "images.txt")
 _BINARY = ("cameras.bin", "images.bin")
@@ -26,8 +28,7 @@ _MODELS: dict[str, tuple[str, Lens]] = {
     "RADIAL_FISHEYE": ("f cx cy k1 k2", "fisheye"),
     "OPENCV_FISHEYE": ("fx fy cx cy k1 k2 k3 k4", "fisheye"),
 }
-"""COLMAP's camera models that are lenses of OpenCV, and their parameters in order."""
-_ORDER: dict[str, str] = {"perspective": "k1 k2 p1 p2 k3 k4 k5 k6", "fisheye": "k1 k2 k3 k4"}
+"""COLMAP's camera models that are lenses of OpenCV, and their parameters: of the distortion, OpenCV's in order."""
 _CURES = {
     "unit": "pass --unit (a model is to no scale until colmap model_aligner or the cameras' known distances"
     " gave it one)",
@@ -35,14 +36,14 @@ _CURES = {
 }
 
 
-def recognise(content: Content) -> bool:
+def _recognise(content: Content) -> bool:
     """Whether this is one of the two files, or a folder with COLMAP's model."""
     if content.syntax == "folder":
         return any(path.name in (*_FILES, *_BINARY) for path in content.value)
     return content.syntax == "text" and content.path.name in _FILES
 
 
-def read(content: Content) -> WrittenRig:
+def _read(content: Content) -> WrittenRig:
     """A camera per image, in the order of images.txt; called after the image, or its folder."""
     folder = content.path if content.syntax == "folder" else content.path.parent
     for name, binary in zip(_FILES, _BINARY, strict=True):
@@ -64,19 +65,16 @@ def _lenses(path: Path) -> dict[str, WrittenCamera]:
         place = f"{path}: line {number}"
         model = words[1] if len(words) > 1 else ""
         if model not in _MODELS:
-            raise InputError(
-                f"{place}: camera model {model or 'missing'} is not read; use one of {' '.join(_MODELS)}"
-            )
-        names, lens = _MODELS[model]
-        values = _numbers(words[2:], 2 + len(names.split()), place)
-        given = dict(zip(names.split(), values[2:], strict=True))
-        fx, fy = given.get("fx", given.get("f", 0.0)), given.get("fy", given.get("f", 0.0))
+            known = " ".join(_MODELS)
+            raise InputError(f"{place}: camera model {model or 'missing'} is not read; use one of {known}")
+        parameters, lens = _MODELS[model]
+        names = parameters.split()
+        width, height, *values = _numbers(words[2:], 2 + len(names), place)
+        given = dict(zip(names, values, strict=True))
+        fx, fy = (given.get(focal, given.get("f", 0.0)) for focal in ("fx", "fy"))
         K = intrinsics(fx, fy, given["cx"] - _HALF_PIXEL, given["cy"] - _HALF_PIXEL)
-        distortion = [given.get(name, 0.0) for name in _ORDER[lens].split()]
-        while len(distortion) > 5 and distortion[-1] == 0:
-            distortion.pop()
-        size = round(values[0]), round(values[1])
-        lenses[words[0]] = WrittenCamera("", K, np.eye(4), size, distortion, lens)
+        distortion = values[names.index("cy") + 1 :]
+        lenses[words[0]] = WrittenCamera("", K, np.eye(4), (round(width), round(height)), distortion, lens)
     return lenses
 
 
@@ -88,7 +86,12 @@ def _images(path: Path, lenses: dict[str, WrittenCamera]) -> list[WrittenCamera]
     for number, line in lines:
         if line.strip():
             rows.append((number, line.split(maxsplit=9)))
-            _check_points(*next(lines, (0, "")), path)
+            points, text = next(lines, (0, ""))
+            if len(text.split()) % 3 != 0 or not all(is_number(word) for word in text.split()):
+                raise InputError(
+                    f"{path}: line {points}: must hold the points of the image before it, three numbers each;"
+                    " leave an empty line there where it has none"
+                )
     names = _names([words[9] if len(words) == 10 else "" for _, words in rows])
     cameras = []
     for (number, words), name in zip(rows, names, strict=True):
@@ -103,21 +106,7 @@ def _images(path: Path, lenses: dict[str, WrittenCamera]) -> list[WrittenCamera]
     return cameras
 
 
-def _check_points(number: int, line: str, path: Path) -> None:
-    """InputError where the line after an image's is not that of its points, X, Y, POINT3D_ID each, or empty."""
-    words = line.split()
-    try:
-        triples = len([float(word) for word in words]) % 3 == 0
-    except ValueError:
-        triples = False
-    if not triples:
-        raise InputError(
-            f"{path}: line {number}: must hold the points of the image before it, three numbers each; leave an"
-            " empty line there where it has none"
-        )
-
-
-def _names(files: list[str]) -> list[str]:
+def _names(files: Sequence[str]) -> list[str]:
     """Names of cameras from names of images: the folders where they tell them apart, else the files."""
     folders = [str(PurePosixPath(file).parent) for file in files]
     if "." not in folders and len(set(folders)) == len(folders):
@@ -125,16 +114,12 @@ def _names(files: list[str]) -> list[str]:
     return [str(PurePosixPath(file).with_suffix("")) if file else "" for file in files]
 
 
-def _numbers(words: list[str], count: int, place: str) -> list[float]:
-    try:
-        values = [float(word) for word in words]
-    except ValueError:
-        values = []
-    if len(values) != count or not np.isfinite(values).all():
+def _numbers(words: Sequence[str], count: int, place: str) -> list[float]:
+    if len(words) != count or not all(map(is_number, words)):
         raise InputError(
             f"{place}: must hold {count} finite numbers here, got {len(words)} words; export it again"
         )
-    return values
+    return [float(word) for word in words]
 
 
-COLMAP = Format("COLMAP's cameras.txt and images.txt", recognise, read)
+COLMAP = Format("COLMAP's cameras.txt and images.txt", _recognise, _read)

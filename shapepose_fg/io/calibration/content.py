@@ -1,20 +1,39 @@
-"""What lies at a path, told by its first characters and parsed: JSON, TOML, XML, YAML, text, or a folder."""
+"""What lies at a path, told by its first characters and parsed: JSON, TOML, XML, YAML, text, or a folder.
+
+YAML and XML of OpenCV's FileStorage become plain values and arrays. Not by cv2.FileStorage: it corrupts memory on
+files that are cut or faulty (OpenCV 5.0, found by mutating files).
+"""
 
 import re
+import xml.etree.ElementTree as ET
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from shapepose_fg.core.storage.files import MIDDLE, parse_toml, read_bytes, read_json, read_text
-from shapepose_fg.io.calibration.filestorage import load_storage, parse_xml, parse_yaml
+import numpy as np
+import yaml
+
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import MIDDLE, bounded, parse_toml, read_bytes, read_json, read_text
 
 Syntax = Literal["JSON", "TOML", "XML", "OpenCV", "YAML", "text", "folder", "pickle"]
 """How a file is written; "OpenCV" is the YAML or XML of its FileStorage."""
 
 _TOML_LINE = re.compile(r"""\s*(\[\[?\s*[\w."' -]*[A-Za-z_."'][\w."' -]*\]\]?\s*(#.*)?$|[\w."'-]+\s*=)""")
+_YAML_LINE = re.compile(r"\s*(- )?[\w/.\"' -]+:(\s|$)")
 _MOST_OF_A_LINE = 1000
 """Characters that tell how a file is written; these patterns take the square of a line's length."""
-_YAML_LINE = re.compile(r"\s*(- )?[\w/.\"' -]+:(\s|$)")
+_XML_DECLARATION = re.compile(r"<!(DOCTYPE|ENTITY)")
+_YAML_VERSION = re.compile(r"\A%YAML[^\n]*\n")
+_ARRAY_TAGS = ("opencv-matrix", "opencv-nd-matrix")
+_MOST_CHARACTERS = 2**23
+"""A camera has a thousand."""
+_MOST_DEPTH = 64
+"""Nodes in nodes: libyaml's loader calls itself and crashes the interpreter on very deep ones."""
+_MOST_DIGITS = 100
+"""Of a number: YAML's base 60 takes the square of them."""
 
 
 @dataclass(frozen=True)
@@ -39,15 +58,139 @@ def load(path: Path) -> Content:
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     first = lines[0][:_MOST_OF_A_LINE] if lines else ""
     if first.lstrip().startswith("<"):
-        root = parse_xml(path, text)
+        root = _parse_xml(path, text)
         storage = root.tag == "opencv_storage"
-        return Content(path, "OpenCV", load_storage(path, text)) if storage else Content(path, "XML", root)
+        return Content(path, "OpenCV", _named(path, _of_xml(root))) if storage else Content(path, "XML", root)
     if first.startswith("%YAML:") or "!!opencv-" in text:
-        return Content(path, "OpenCV", load_storage(path, text))
+        return Content(path, "OpenCV", _named(path, _parse_yaml(path, text)))
     if _TOML_LINE.match(first):
         return Content(path, "TOML", parse_toml(path, text))
     if first.lstrip()[:1] in ("{", "["):
         return Content(path, "JSON", read_json(path, most=MIDDLE))
     if _YAML_LINE.match(first) or first.startswith(("%YAML", "---")):
-        return Content(path, "YAML", parse_yaml(path, text))
+        return Content(path, "YAML", _parse_yaml(path, text))
     return Content(path, "text", text)
+
+
+def _named(path: Path, value: Any) -> dict[str, Any]:
+    """Every node of a FileStorage by name."""
+    if not isinstance(value, dict):
+        raise InputError(f"{path}: OpenCV's FileStorage has named values, here is none; write the file again")
+    return {str(key): each for key, each in value.items()}
+
+
+def _parse_yaml(path: Path, text: str) -> Any:
+    """The first document that is not empty, by a loader that makes plain values and OpenCV's matrices only."""
+    text = _YAML_VERSION.sub("\n", text)  # OpenCV's first line, %YAML:1.0, is no YAML
+    _refuse_long(path, text)
+    try:
+        _refuse_hostile(path, text)
+        documents = [each for each in yaml.load_all(text, _Loader) if each is not None]
+    except InputError:
+        raise
+    except (yaml.YAMLError, RecursionError, ValueError, TypeError, OverflowError) as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f"line {mark.line + 1} column {mark.column + 1}" if mark is not None else "the file"
+        raise InputError(f"{path}: {line} is not YAML; correct it there or write the file again") from None
+    return bounded(documents[0], path) if documents else None
+
+
+def _refuse_long(path: Path, text: str) -> None:
+    if len(text) > _MOST_CHARACTERS:
+        raise InputError(f"{path}: {len(text)} characters are too many for cameras; check that this is the file")
+
+
+def _refuse_hostile(path: Path, text: str) -> None:
+    """InputError where nodes are very deep, or named again: a few names can stand for more than fits memory."""
+    depth = 0
+    for event in yaml.parse(text, _Safe):
+        line = f"{path}: line {event.start_mark.line + 1}"
+        if isinstance(event, yaml.AliasEvent):
+            raise InputError(f"{line} repeats a node by *name; write it out")
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > _MOST_DEPTH:
+            raise InputError(f"{line}: nodes are over {_MOST_DEPTH} deep; write the file again")
+
+
+def _parse_xml(path: Path, text: str) -> ET.Element:
+    """The root of XML without a document type: entities could make it read other files, or grow without end."""
+    if _XML_DECLARATION.search(text):
+        raise InputError(f"{path}: XML with a document type or entities is not read; delete the <!DOCTYPE")
+    _refuse_long(path, text)
+    try:
+        root = ET.fromstring(text)
+    except ET.ParseError as error:
+        line, column = error.position
+        cure = "correct it there or write the file again"
+        raise InputError(f"{path}: line {line} column {column + 1} is not XML; {cure}") from None
+    except ValueError as error:
+        raise InputError(f"{path}: cannot be read as XML ({error}); write the file again") from None
+    level = [root]
+    for _ in range(_MOST_DEPTH):
+        level = [child for each in level for child in each]
+    if len(level) > 0:
+        raise InputError(f"{path}: elements are over {_MOST_DEPTH} deep; write the file again")
+    return root
+
+
+_Safe: type[yaml.SafeLoader] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+class _Loader(_Safe):
+    """A safe loader that knows OpenCV's matrices, and numbers as Python prints them (1e-05)."""
+
+
+def _array_of_yaml(loader: Any, node: yaml.Node) -> Any:
+    return _array(loader.construct_mapping(node, deep=True))
+
+
+def _short_number(loader: Any, node: yaml.ScalarNode) -> Any:
+    if len(node.value) > _MOST_DIGITS:
+        raise yaml.constructor.ConstructorError(problem="a number is too long", problem_mark=node.start_mark)
+    make = loader.construct_yaml_int if node.tag.endswith("int") else loader.construct_yaml_float
+    return make(node)
+
+
+def _unique_keys(loader: Any, node: yaml.MappingNode) -> Iterator[dict[Any, Any]]:
+    keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+    if max(Counter(keys).values(), default=0) > 1:
+        raise yaml.constructor.ConstructorError(problem="a key occurs twice", problem_mark=node.start_mark)
+    yield from loader.construct_yaml_map(node)
+
+
+for _tag in _ARRAY_TAGS:
+    _Loader.add_constructor(f"tag:yaml.org,2002:{_tag}", _array_of_yaml)
+for _tag in ("int", "float"):
+    _Loader.add_constructor(f"tag:yaml.org,2002:{_tag}", _short_number)
+_Loader.add_constructor("tag:yaml.org,2002:map", _unique_keys)
+_PRINTED = re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+$")
+_Loader.add_implicit_resolver("tag:yaml.org,2002:float", _PRINTED, list("-+0123456789"))
+
+
+def _of_xml(node: ET.Element) -> Any:
+    """A node and all below it: a matrix, a map, a list, text or a number."""
+    if node.get("type_id") in _ARRAY_TAGS:
+        return _array({child.tag: _of_xml(child) for child in node})
+    if len(node) > 0:
+        if all(child.tag == "_" for child in node):
+            return [_of_xml(child) for child in node]
+        return {child.tag: _of_xml(child) for child in node}
+    words = (node.text or "").split()
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        return " ".join(words).strip('"')
+    return numbers[0] if len(numbers) == 1 else numbers
+
+
+def _array(node: dict[str, Any]) -> np.ndarray:
+    """The matrix of a node; NaN, which is no number of any camera, where its numbers do not fill its shape."""
+    data = node.get("data")
+    sizes = node.get("sizes", [node.get("rows"), node.get("cols")])
+    try:
+        values = np.array(data if isinstance(data, list) else [data], dtype=np.float64)
+        shape = [int(float(size)) for size in (sizes if isinstance(sizes, list) else [sizes])]
+        # The numbers of several channels stand beside each other.
+        return values.reshape(shape if values.size == np.prod(shape) else [*shape, -1])
+    except (TypeError, ValueError, OverflowError):
+        return np.full(1, np.nan)

@@ -5,31 +5,16 @@ from typing import get_args
 
 from shapepose_fg.core.camera import Axis, Rig
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.io.calibration.camera_tables import CAMERA_TABLES
 from shapepose_fg.io.calibration.colmap import COLMAP
 from shapepose_fg.io.calibration.content import Content, load
-from shapepose_fg.io.calibration.json_files import ASSOCIATION, PANOPTIC, VOXELPOSE
-from shapepose_fg.io.calibration.opencv_storage import EASYMOCAP, MULTIVIEW, ONE_NODE_EACH
-from shapepose_fg.io.calibration.rig_file import RIG_FILE
-from shapepose_fg.io.calibration.ros import ROS
-from shapepose_fg.io.calibration.written import METRES, Format, Unit, finished
+from shapepose_fg.io.calibration.json_and_toml import JSON_AND_TOML
+from shapepose_fg.io.calibration.opencv_and_ros import OPENCV, ROS
+from shapepose_fg.io.calibration.written import METRES, Format, Unit
 from shapepose_fg.io.calibration.xml_files import QUALISYS, VICON
+from shapepose_fg.io.camera_names import listing
 from shapepose_fg.io.validation import describe
 
-FORMATS: tuple[Format, ...] = (
-    RIG_FILE,
-    PANOPTIC,
-    VOXELPOSE,
-    ASSOCIATION,
-    *CAMERA_TABLES,
-    QUALISYS,
-    VICON,
-    EASYMOCAP,
-    MULTIVIEW,
-    ONE_NODE_EACH,
-    COLMAP,
-    ROS,
-)
+FORMATS: tuple[Format, ...] = (*JSON_AND_TOML, QUALISYS, VICON, *OPENCV, COLMAP, ROS)
 """All formats that are known; the first that recognises a file reads it."""
 
 _MISSING = {
@@ -54,10 +39,9 @@ def read_rig(
     the file nor the caller says is an InputError: one sentence that names the file, the key and the cure.
     """
     path = Path(path)
-    if up is not None and up not in get_args(Axis):
-        raise InputError(f"up must be one of {' '.join(get_args(Axis))}, got {up!r}")
-    if unit is not None and unit not in METRES:
-        raise InputError(f"unit must be one of {' '.join(METRES)}, got {unit!r}")
+    for name, value, known in (("up", up, get_args(Axis)), ("unit", unit, METRES)):
+        if value is not None and value not in known:
+            raise InputError(f"{name} must be one of {' '.join(known)}, got {value!r}")
     content = load(path)
     if content.syntax == "pickle":
         raise InputError(
@@ -75,30 +59,33 @@ def read_rig(
     given = {"unit": unit, "up": up, "image_size": image_size if sizes_missing else True}
     missing = [name for name, value in given.items() if value is None]
     if up is None or unit is None or missing:
-        cures = [written.cures.get(name, _MISSING[name]) for name in missing]
-        names = " and ".join(missing)
-        raise InputError(
-            f"{path}: recognised as {form.name}, where {names} {'is' if len(missing) == 1 else 'are'} missing;"
-            f" {' and '.join(cures)}"
-        )
-    size = (0, 0) if image_size is None else image_size
+        cures = " and ".join(written.cures.get(name, _MISSING[name]) for name in missing)
+        names = f"{' and '.join(missing)} {'is' if len(missing) == 1 else 'are'}"
+        raise InputError(f"{path}: recognised as {form.name}, where {names} missing; {cures}")
     try:
-        return Rig(tuple(finished(camera, METRES[unit], size, path, form.cure) for camera in written.cameras), up)
+        return Rig(tuple(camera.finished(METRES[unit], image_size, path) for camera in written.cameras), up)
     except InputError:
         raise
     except ValueError as error:
         raise InputError(f"{path}: {error}") from None
 
 
+def is_calibration(path: Path) -> bool:
+    """Whether a file or folder is of one of the formats."""
+    try:
+        content = load(path)
+    except InputError:
+        return False
+    return content.syntax != "pickle" and any(each.recognise(content) for each in FORMATS)
+
+
 def _unknown(content: Content) -> str:
     """What was found instead of a calibration, and what is known."""
     value = content.value
     if content.syntax == "folder":
-        names = [path.name for path in value]
-        listing = " ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
         return (
             f"{content.path}: this is a folder; give the file inside it, or the folder with the files of"
-            f" EasyMocap, COLMAP or ROS; here is {listing or 'nothing'}"
+            f" EasyMocap, COLMAP or ROS; here is {listing([path.name for path in value])}"
         )
     about = f"<{value.tag}>" if hasattr(value, "tag") else describe(value)
     if isinstance(value, dict):

@@ -1,18 +1,18 @@
 """A calibration as its file says it: poses in the file's own unit, and what the file does not say left open."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field, FiniteFloat
 
 from shapepose_fg.core.camera import Axis, Camera, Lens, padded_distortion
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.calibration.content import Content
+from shapepose_fg.io.validation import describe
 
 Unit = Literal["m", "cm", "mm"]
 """The unit of lengths in a calibration file."""
@@ -21,17 +21,9 @@ METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 _ROTATION_TOLERANCE = 1e-3
 """How far R Rᵀ may be from the identity: calibrations are printed with four to six digits."""
-_MOST_PIXELS = 1_000_000
 _EXACT = 1e-12
 """Below this a rotation is left as written, so that a rig that is written and read stays the same."""
-
-Row3 = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
-Matrix33 = Annotated[list[Row3], Field(min_length=3, max_length=3)]
-Pixels = Annotated[int, Field(gt=0, strict=False)]
-ImageSize = Annotated[list[Pixels], Field(min_length=2, max_length=2)]
-
-ONE_CAMERA = "give the calibration of the whole rig, intrinsics and poses"
-"""The cure for a file that holds the intrinsics of one camera alone."""
+_MOST_COEFFICIENTS = 14
 
 
 @dataclass(frozen=True)
@@ -50,6 +42,16 @@ class WrittenCamera:
     """In OpenCV's order; coefficients at the end may be left out."""
     lens: Lens = "perspective"
     """Which lens the coefficients belong to."""
+
+    def finished(self, metres: float, image_size: tuple[int, int] | None, path: Path) -> Camera:
+        """The camera in metres; InputError where its numbers are those of no camera."""
+        wTc = self.wTc.copy()
+        wTc[:3, 3] *= metres
+        size = self.image_size or image_size or (0, 0)
+        try:
+            return Camera(self.name, self.K, wTc, size, padded_distortion(self.distortion, self.lens), self.lens)
+        except ValueError as error:
+            raise InputError(f"{path}: {error}; correct it in the file") from None
 
 
 @dataclass(frozen=True)
@@ -76,26 +78,121 @@ class Format:
     """Whether a content is meant to be of this format, though it may be faulty."""
     read: Callable[[Content], WrittenRig]
     """The cameras; InputError naming file, place and cure where it is faulty."""
-    cure: str = "correct it in the file"
-    """What to do where the numbers are those of no camera."""
+
+
+@dataclass(frozen=True)
+class Node:
+    """Values that a file gives under names. Whatever is wrong with one is an InputError: place, name and cure."""
+
+    values: Mapping[str, Any]
+    """Numbers, lists of them, arrays, and other things; None is as good as nothing."""
+    place: str
+    """The file, and the camera in it."""
+    cures: Mapping[str, str] = field(default_factory=dict)
+    """What to do, by name; for others under the empty name."""
+
+    def refuse(self, name: str, problem: str) -> InputError:
+        """An error about one of the values."""
+        cure = self.cures.get(name.partition("[")[0], self.cures.get("", "correct it in the file"))
+        return InputError(f"{self.place}: {name} {problem}; {cure}")
+
+    def named(self, names: str | Sequence[str]) -> str | None:
+        """The first of several names, apart by spaces, under which there is a value."""
+        every = names.split() if isinstance(names, str) else names
+        return next((name for name in every if self.values.get(name) is not None), None)
+
+    def numbers(self, names: str | Sequence[str], *counts: int, most: int = -1) -> NDArray[np.float64] | None:
+        """The numbers, flat, under the first of `names` that there is; None where there is none.
+
+        They are finite, and as many as one of `counts`, or at most `most` of them.
+        """
+        name = self.named(names)
+        if name is None:
+            return None
+        value = self.values[name]
+        wanted = (" or ".join(map(str, counts)) or f"at most {most}") + (
+            " numbers" if counts != (1,) else " number"
+        )
+        if counts != (1,) and not isinstance(value, list | np.ndarray):
+            raise self.refuse(name, f"must hold {wanted}, got {describe(value)}")
+        found = np.array(list(self._flat(name, value)))
+        if len(found) not in counts and not len(found) <= most:
+            raise self.refuse(name, f"must hold {wanted}, got {len(found)}")
+        try:
+            np.array(value, dtype=np.float64)
+        except ValueError:
+            raise self.refuse(name, "must have rows of one length") from None
+        return found
+
+    def needed(self, names: str | Sequence[str], *counts: int, most: int = -1) -> NDArray[np.float64]:
+        """The same of numbers that must be there."""
+        found = self.numbers(names, *counts, most=most)
+        if found is None:
+            raise self.refuse(names.split()[0] if isinstance(names, str) else names[0], "is missing")
+        return found
+
+    def camera(
+        self,
+        name: str,
+        K: str | Sequence[str],
+        wTc: NDArray[np.float64],
+        size: Sequence[str | Sequence[str]],
+        distortion: str | Sequence[str],
+        lens: Lens = "perspective",
+        most: int = _MOST_COEFFICIENTS,
+    ) -> WrittenCamera:
+        """A camera at `wTc`; its intrinsics by their names, `size` by that of a list of two numbers, or by two."""
+        sides = [self.numbers(each, 2 if len(size) == 1 else 1) for each in size]
+        given = [round(side) for each in sides if each is not None for side in each]
+        K_flat, coefficients = self.needed(K, 9), self.numbers(distortion, most=most)
+        listed = [] if coefficients is None else coefficients.tolist()
+        image_size = (given[0], given[1]) if len(given) == 2 else None
+        return WrittenCamera(name, K_flat.reshape(3, 3), wTc, image_size, listed, lens)
+
+    def pose(self, R: str, t: str, *, centre: bool = False) -> NDArray[np.float64]:
+        """World from camera (4, 4), of a rotation (9 numbers, or axis times angle) and a translation from the
+        world; or instead of that the camera's centre.
+        """
+        turn, shift = self.needed(R, 9, 3), self.needed(t, 3)
+        shift = -turn.reshape(3, 3) @ shift if centre else shift
+        return pose(turn, shift, self.named(R) or R, self.place)
+
+    def pose_of_rows(self, name: str) -> NDArray[np.float64]:
+        """The same of camera from world, 3 x 4 numbers."""
+        cTw = self.needed(name, 12).reshape(3, 4)
+        return pose(cTw[:, :3], cTw[:, 3], name, self.place)
+
+    def pose_of_matrix(self, name: str) -> NDArray[np.float64]:
+        """The same as it is written, 4 x 4 numbers."""
+        wTc = self.needed(name, 16).reshape(4, 4)
+        if np.any(wTc[3] != (0, 0, 0, 1)):
+            raise self.refuse(name, "must have the last row 0 0 0 1")
+        return pose(wTc[:3, :3], wTc[:3, 3], name, self.place, world_from_camera=True)
+
+    def _flat(self, name: str, value: Any) -> Iterator[float]:
+        """All numbers of a value; `name` says where it is."""
+        if isinstance(value, list | np.ndarray):
+            for index, each in enumerate(value.tolist() if isinstance(value, np.ndarray) else value):
+                yield from self._flat(f"{name}[{index}]", each)
+        elif isinstance(value, bool) or not isinstance(value, int | float):
+            raise self.refuse(name, f"must be a number, got {describe(value)}")
+        elif not np.isfinite(value):
+            raise self.refuse(name, f"must be a finite number, got {describe(value)}")
+        else:
+            yield float(value)
 
 
 def pose(
     R: ArrayLike, t: ArrayLike, key: str, place: str, *, world_from_camera: bool = False
 ) -> NDArray[np.float64]:
-    """The world-from-camera matrix (4, 4) of a rotation and a translation.
+    """The world-from-camera matrix (4, 4) of a rotation and a translation (3).
 
     They are camera-from-world unless said otherwise. `R` is a matrix (nine numbers in any shape, row by row) or
     a rotation vector (three, axis times angle). InputError where it is no rotation: `key` is its name in the
     file, `place` the file and the camera.
     """
-    R, t = np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64).ravel()
-    if R.size not in (3, 9) or len(t) != 3:
-        raise InputError(
-            f"{place}: {key} must hold 9 numbers (or 3, axis times angle) and its translation 3, got {R.size} and"
-            f" {len(t)}; write both again"
-        )
-    R = np.asarray(cv2.Rodrigues(R.ravel())[0], dtype=np.float64) if R.size == 3 else R.reshape(3, 3)
+    R, t = np.asarray(R, dtype=np.float64).ravel(), np.asarray(t, dtype=np.float64).ravel()
+    R = np.asarray(cv2.Rodrigues(R)[0], dtype=np.float64) if R.size == 3 else R.reshape(3, 3)
     with np.errstate(over="ignore", invalid="ignore"):  # of numbers like 1e300, which are refused here
         off = np.abs(R @ R.T - np.eye(3)).max()
     if not off <= _ROTATION_TOLERANCE:
@@ -119,37 +216,14 @@ def pose(
 
 def rotation_of(quaternion: ArrayLike, key: str, place: str) -> NDArray[np.float64]:
     """The rotation matrix (3, 3) of a quaternion x y z w; InputError where it is not of length 1."""
-    x, y, z, w = np.asarray(quaternion, dtype=np.float64)
-    length = float(np.sqrt(x * x + y * y + z * z + w * w))
+    length = float(np.sqrt(np.square(quaternion).sum()))
     if not abs(length - 1) <= _ROTATION_TOLERANCE:
         raise InputError(f"{place}: the quaternion {key} must have length 1, got {length:.4g}; write it again")
-    x, y, z, w = (value / length for value in (x, y, z, w))
+    x, y, z, w = np.asarray(quaternion, dtype=np.float64) / length
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + 2 * w * cross + 2 * cross @ cross
-
-
-def picture_size(width: Any, height: Any, place: str) -> tuple[int, int] | None:
-    """Width and height in pixels, None where neither is there; InputError where they are no numbers of pixels."""
-    if width is None and height is None:
-        return None
-    sides = [side for side in (width, height) if isinstance(side, int | float) and 1 <= side <= _MOST_PIXELS]
-    if len(sides) < 2:
-        raise InputError(f"{place}: the picture's size must be pixels, got {width} x {height}; correct it")
-    return round(sides[0]), round(sides[1])
 
 
 def intrinsics(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
     """The intrinsic matrix (3, 3)."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-
-
-def finished(written: WrittenCamera, metres: float, image_size: tuple[int, int], path: Path, cure: str) -> Camera:
-    """The camera in metres; InputError with `cure` where its numbers are those of no camera."""
-    wTc = written.wTc.copy()
-    wTc[:3, 3] *= metres
-    size = image_size if written.image_size is None else written.image_size
-    try:
-        distortion = padded_distortion(written.distortion, written.lens)
-        return Camera(written.name, written.K, wTc, size, distortion, written.lens)
-    except ValueError as error:
-        raise InputError(f"{path}: {error}; {cure}") from None

@@ -2,12 +2,22 @@
 
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.calibration.content import Content
-from shapepose_fg.io.calibration.written import Format, WrittenCamera, WrittenRig, intrinsics, pose, rotation_of
+from shapepose_fg.io.calibration.written import (
+    Format,
+    Node,
+    WrittenCamera,
+    WrittenRig,
+    intrinsics,
+    pose,
+    rotation_of,
+)
 
 _QTM, _NEXUS = "export the calibration from QTM again", "export the calibration from Nexus or Shogun again"
 _SUBPIXEL = 64.0
@@ -17,7 +27,9 @@ _LINES = {"1080p": 1080, "720p": 720, "540p": 540, "480p": 480}
 """Lines of a picture of the whole sensor by `video_resolution`."""
 _TO_OPENCV = np.diag([1.0, -1.0, -1.0])
 """QTM's cameras have y up and look along -z."""
-_DISTORTION = "radialDistortion1 radialDistortion2 tangentalDistortion1 tangentalDistortion2 radialDistortion3"
+_NO_DISTORTION = dict.fromkeys(
+    (f"{kind}Distortion{n}" for kind in ("radial", "tangental") for n in (1, 2, 3)), 0.0
+)
 
 
 def _cameras(
@@ -26,23 +38,40 @@ def _cameras(
     """The video cameras where the file tells them by `model` from marker cameras, else all of them."""
     every = content.value.findall(path)
     chosen = [camera for camera in every if "video" in camera.get(model, "").lower()] or every
-    cameras = []
     for number, camera in enumerate(chosen):
-        place = f"{content.path}: camera {number}"
         if not camera.get(name):
-            raise InputError(f"{place}: {name} is missing; {cure}")
-        cameras.append(read(camera, f'{place} "{camera.get(name)}"'))
-    return WrittenRig(cameras, "mm", "z")
+            raise InputError(f"{content.path}: camera {number}: {name} is missing; {cure}")
+    places = [f'{content.path}: camera {number} "{camera.get(name)}"' for number, camera in enumerate(chosen)]
+    return WrittenRig([read(*each) for each in zip(chosen, places, strict=True)], "mm", "z")
+
+
+def _node(element: ET.Element | None, place: str, cure: str) -> Node:
+    """The attributes of an element, of which those that can be are numbers."""
+
+    def parsed(text: str) -> Any:
+        try:
+            values = [float(word) for word in text.split()]
+        except ValueError:
+            return text
+        return values[0] if len(values) == 1 else values
+
+    if element is None:
+        raise InputError(f"{place} is missing; {cure}")
+    return Node({name: parsed(text) for name, text in element.attrib.items()}, place, {"": cure})
 
 
 def _qualisys(camera: ET.Element, place: str) -> WrittenCamera:
-    window = _attributes(camera, "fov_video", "left top right bottom", place)
-    values = _attributes(camera, "transform", "r11 r12 r13 r21 r22 r23 r31 r32 r33 x y z", place)
+    def values(tag: str, names: str, missing: dict[str, float] | None = None) -> NDArray[np.float64]:
+        node = _node(camera.find(tag), f"{place}: <{tag}>", _QTM)
+        node = Node({**(missing or {}), **node.values}, node.place, node.cures)
+        return np.concatenate([node.needed(name, 1) for name in names.split()])
+
+    window = values("fov_video", "left top right bottom")
+    turn = values("transform", "r11 r12 r13 r21 r22 r23 r31 r32 r33").reshape(3, 3)
     # R = diag(1, -1, -1) M, and the centre is x y z.
-    R = _TO_OPENCV @ values[:9].reshape(3, 3)
-    wTc = pose(R, -R @ values[9:], "transform", place)
-    names = "focalLengthU focalLengthV centerPointU centerPointV"
-    fx, fy, cx, cy = _attributes(camera, "intrinsic", names, place) / _SUBPIXEL
+    R = _TO_OPENCV @ turn
+    wTc = pose(R, -R @ values("transform", "x y z"), "transform", place)
+    fx, fy, cx, cy = values("intrinsic", "focalLengthU focalLengthV centerPointU centerPointV") / _SUBPIXEL
     # The numbers are of the whole sensor; smaller pictures are resized, as Pose2Sim's read_qca has it.
     resolution = camera.get("video_resolution", _FULL)
     if resolution not in _LINES:
@@ -52,73 +81,42 @@ def _qualisys(camera: ET.Element, place: str) -> WrittenCamera:
         )
     scale = _LINES[resolution] / _LINES[_FULL]
     K = intrinsics(fx * scale, fy * scale, (cx - window[0]) * scale, (cy - window[1]) * scale)
-    distortion = _attributes(camera, "intrinsic", _DISTORTION, place, missing=0.0)
+    names = "radialDistortion1 radialDistortion2 tangentalDistortion1 tangentalDistortion2 radialDistortion3"
+    distortion = values("intrinsic", names, _NO_DISTORTION).tolist()
     width, height = (window[2:] - window[:2] + 1) * scale
-    return WrittenCamera(camera.attrib["serial"], K, wTc, (round(width), round(height)), distortion.tolist())
-
-
-def _attributes(camera: ET.Element, tag: str, names: str, place: str, missing: float | None = None) -> np.ndarray:
-    """Attributes of the element `tag` of a camera, finite."""
-    element = camera.find(tag)
-    if element is None:
-        raise InputError(f"{place}: <{tag}> is missing; {_QTM}")
-    values = []
-    for name in names.split():
-        text = element.get(name)
-        try:
-            value = float(text) if text is not None else missing
-        except ValueError:
-            value = None
-        if value is None or not np.isfinite(value):
-            got = "is missing" if text is None else f"must be a finite number, got {text[:20]!r}"
-            raise InputError(f"{place}: {name} of <{tag}> {got}; {_QTM}")
-        values.append(value)
-    return np.array(values)
+    return WrittenCamera(camera.attrib["serial"], K, wTc, (round(width), round(height)), distortion)
 
 
 def _vicon(camera: ET.Element, place: str) -> WrittenCamera:
     """By the first key frame. ORIENTATION x y z w turns the world's axes into the camera's; POSITION is the
     centre.
     """
-    frame = camera.find("KeyFrames/KeyFrame")
-    if frame is None:
+    key_frame = camera.find("KeyFrames/KeyFrame")
+    if key_frame is None:
         raise InputError(f"{place}: it has no <KeyFrame>, so it is not calibrated; calibrate it, or delete it")
-    width, height = _numbers(camera, "SENSOR_SIZE", 2, place)
-    aspect = _numbers(camera, "PIXEL_ASPECT_RATIO", 1, place)[0] if camera.get("PIXEL_ASPECT_RATIO") else 1.0
+    whole, frame = _node(camera, place, _NEXUS), _node(key_frame, place, _NEXUS)
+    width, height = whole.needed("SENSOR_SIZE", 2)
+    ratio = whole.numbers("PIXEL_ASPECT_RATIO", 1)
+    aspect = 1.0 if ratio is None else float(ratio[0])
     if aspect <= 0:
-        raise InputError(f"{place}: PIXEL_ASPECT_RATIO must be above 0, got {aspect:g}; {_NEXUS}")
-    focal = _numbers(frame, "FOCAL_LENGTH", 1, place)[0]
-    K = intrinsics(focal, focal / aspect, *_numbers(frame, "PRINCIPAL_POINT", 2, place))
-    R = rotation_of(_numbers(frame, "ORIENTATION", 4, place), "ORIENTATION", place)
-    wTc = pose(R, -R @ _numbers(frame, "POSITION", 3, place), "ORIENTATION", place)
+        raise whole.refuse("PIXEL_ASPECT_RATIO", f"must be above 0, got {aspect:g}")
+    focal = float(frame.needed("FOCAL_LENGTH", 1)[0])
+    K = intrinsics(focal, focal / aspect, *frame.needed("PRINCIPAL_POINT", 2))
+    R = rotation_of(frame.needed("ORIENTATION", 4), "ORIENTATION", place)
+    wTc = pose(R, -R @ frame.needed("POSITION", 3), "ORIENTATION", place)
     distortion = list[float]()
     # VICON_RADIAL2 is a name, a centre and three radial coefficients, those of OpenCV; the older VICON_RADIAL
     # counts in pixels and runs the other way, so that it is read only where it is zero.
-    if frame.get("VICON_RADIAL2"):
-        k1, k2, k3 = _numbers(frame, "VICON_RADIAL2", 6, place, skip=1)[2:5]
-        distortion = [k1, k2, 0.0, 0.0, k3]
-    elif frame.get("VICON_RADIAL") and np.any(_numbers(frame, "VICON_RADIAL", 2, place, last=True)):
+    name, _, radial = key_frame.get("VICON_RADIAL2", "").strip().partition(" ")
+    if name:
+        numbers = _node(ET.Element("", VICON_RADIAL2=radial), place, _NEXUS).needed("VICON_RADIAL2", 5)
+        distortion = [*numbers[2:4], 0.0, 0.0, numbers[4]]
+    elif any(word.strip("0.") for word in key_frame.get("VICON_RADIAL", "").split()[-2:]):
         raise InputError(
             f"{place}: VICON_RADIAL without VICON_RADIAL2 is not read; calibrate with Nexus 2 or newer, or"
             " undistort the pictures and write 0 0"
         )
     return WrittenCamera(camera.attrib["DEVICEID"], K, wTc, (round(width), round(height)), distortion)
-
-
-def _numbers(
-    element: ET.Element, name: str, count: int, place: str, *, skip: int = 0, last: bool = False
-) -> list[float]:
-    """The numbers of an attribute: `count` words without the first `skip`, or the last `count`."""
-    words = element.get(name, "").split()
-    words = words[-count:] if last else words
-    try:
-        values = [float(word) for word in words[skip:]]
-    except ValueError:
-        values = []
-    if len(words) < count or len(values) == 0 or not np.isfinite(values).all():
-        got = f"got {element.get(name)!r}" if element.get(name) is not None else "it is missing"
-        raise InputError(f"{place}: {name} must hold {count - skip} finite numbers, {got}; {_NEXUS}")
-    return values[: count - skip]
 
 
 def _has(content: Content, tag: str, child: str) -> bool:

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.camera import Camera
-from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25, COCO_18, Skeleton
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections.number_stream import NumberStream
@@ -84,7 +83,7 @@ def _blocks(
         frames = range(start, min(start + BLOCK_FRAMES, frame_count))
         counts, starts, position = _layout(numbers, kind, frames, frame_count, position)
         view = _candidates(numbers, kind, counts, starts - numbers.first, start, camera)
-        yield with_middles(view, kind) if kind.skeleton.middles else view
+        yield with_middles(view, kind.skeleton) if kind.skeleton.middles else view
     if numbers.reaches(position + 1):
         more = numbers.count() - position
         raise numbers.refuse(
@@ -107,17 +106,26 @@ def _candidates(
     frame, joint = np.divmod(block, counts.shape[1])
     rows, values = starts[:, :-1].ravel()[block] + within, numbers.values  # of x
     n = counts[frame, joint]
-    fractions = np.column_stack([values[rows], values[rows + n]])
-    _check(numbers, rows, fractions, values[rows + 2 * n], n)
+    fractions, scores = np.column_stack([values[rows], values[rows + n]]), values[rows + 2 * n]
+    bad = (scores < 0) | (scores > OVERSHOOT)
+    if bad.any():
+        index = int(np.argmax(bad))
+        raise numbers.refuse(
+            numbers.first + int(rows[index] + 2 * n[index]),
+            f"a candidate's score must lie between 0 and 1, got {scores[index]:g}",
+            "write the detections again: scores are the third row of each joint",
+        )
+    bad = np.any(np.abs(fractions) > 2, axis=1)
+    if bad.any():
+        index = int(np.argmax(bad))
+        raise numbers.refuse(
+            numbers.first + int(rows[index]),
+            f"a candidate lies at ({fractions[index, 0]:g}, {fractions[index, 1]:g}) of the picture's size",
+            "divide x by width - 1 and y by height - 1",
+        )
+    xy = fractions * (np.array(camera.image_size) - 1.0)
     pairs, affinity = _pairs(values, kind, counts, starts)
-    return ViewCandidates(
-        frame=start + frame,
-        joint=joint,
-        xy=fractions * (np.array(camera.image_size) - 1.0),
-        confidence=np.minimum(values[rows + 2 * n], 1.0),
-        pairs=pairs,
-        affinity=affinity,
-    )
+    return ViewCandidates.of(start + frame, joint, xy, np.minimum(scores, 1.0), pairs, affinity)
 
 
 def _header(numbers: NumberStream) -> tuple[TextSkeleton, int]:
@@ -148,12 +156,17 @@ def _layout(
     when the one before has been passed, so this is a loop, over blocks; everything inside the blocks is done in
     arrays.
     """
+
+    def reach(count: int, frame: int, what: str) -> None:
+        if not numbers.reaches(count):
+            problem = f"the file ends in frame {frame} of {frame_count}, where {what} should be"
+            raise numbers.refuse(None, problem, "copy or write it again whole")
+
     counts, starts = [], []
     for frame in frames:
         frame_counts, frame_starts = [], []
         for name in kind.joints:
-            if not numbers.reaches(position + 1):
-                raise _cut(numbers, frame, f"the number of candidates of {name}", frame_count)
+            reach(position + 1, frame, f"the number of candidates of {name}")
             n = numbers.values[position - numbers.first]
             if n < 0 or n != int(n):
                 raise numbers.refuse(
@@ -164,26 +177,14 @@ def _layout(
             frame_counts.append(int(n))
             frame_starts.append(position + 1)
             position += 1 + 3 * int(n)
-            if not numbers.reaches(position):
-                raise _cut(numbers, frame, f"the candidates of {name}", frame_count)
+            reach(position, frame, f"the candidates of {name}")
         frame_starts.append(position)
         for first, second in kind.limbs:
             position += frame_counts[first] * frame_counts[second]
-            if not numbers.reaches(position):
-                limb = f"{kind.joints[first]}-{kind.joints[second]}"
-                raise _cut(numbers, frame, f"the affinities of {limb}", frame_count)
+            reach(position, frame, f"the affinities of {kind.joints[first]}-{kind.joints[second]}")
         counts.append(frame_counts)
         starts.append(frame_starts)
     return np.array(counts, dtype=np.intp), np.array(starts, dtype=np.intp), position
-
-
-def _cut(numbers: NumberStream, frame: int, what: str, frame_count: int) -> InputError:
-    """The file ends too early."""
-    return numbers.refuse(
-        None,
-        f"the file ends in frame {frame} of {frame_count}, where {what} should be",
-        "copy or write it again whole",
-    )
 
 
 def _pairs(
@@ -210,33 +211,7 @@ def _expand(sizes: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]
     return block, np.arange(len(block)) - (np.cumsum(sizes) - sizes)[block]
 
 
-def _check(
-    numbers: NumberStream,
-    rows: NDArray[np.intp],
-    fractions: NDArray[np.float64],
-    scores: NDArray[np.float64],
-    n: NDArray[np.intp],
-) -> None:
-    """Refuse scores that are no scores and positions that are no parts of the picture."""
-    bad = (scores < 0) | (scores > OVERSHOOT)
-    if bad.any():
-        index = int(np.argmax(bad))
-        raise numbers.refuse(
-            numbers.first + int(rows[index] + 2 * n[index]),
-            f"a candidate's score must lie between 0 and 1, got {scores[index]:g}",
-            "write the detections again: scores are the third row of each joint",
-        )
-    bad = np.any(np.abs(fractions) > 2, axis=1)
-    if bad.any():
-        index = int(np.argmax(bad))
-        raise numbers.refuse(
-            numbers.first + int(rows[index]),
-            f"a candidate lies at ({fractions[index, 0]:g}, {fractions[index, 1]:g}) of the picture's size",
-            "divide x by width - 1 and y by height - 1",
-        )
-
-
-def with_middles(view: ViewCandidates, kind: TextSkeleton) -> ViewCandidates:
+def with_middles(view: ViewCandidates, skeleton: Skeleton) -> ViewCandidates:
     """`view` of a file's joints as candidates of the whole skeleton: its middle joints are made.
 
     A middle belongs to two candidates (hips) that share a neighbour (the neck) by affinity. Each candidate makes
@@ -244,42 +219,45 @@ def with_middles(view: ViewCandidates, kind: TextSkeleton) -> ViewCandidates:
     A middle is as sure as the less sure of its two, has affinity 1 to them, and to every neighbour that both are
     linked to the mean of their affinities. Pairs that no limb of the skeleton joins are left out.
     """
-    for middle, first, second in kind.skeleton.middles:
-        view = _with_middle(view, kind.skeleton, middle, first, second)
-    known = np.zeros((len(kind.skeleton), len(kind.skeleton)), dtype=bool)
-    known[tuple(np.array(kind.skeleton.limbs).T)] = True
-    there = known[tuple(view.joint[view.pairs].T)]
-    return _sorted(replace(view, pairs=view.pairs[there], affinity=view.affinity[there]))
+    for middle, first, second in skeleton.middles:
+        view = _with_middle(view, middle, first, second)
+    order = np.lexsort((view.seen.joint, view.frame))
+    seen = view.seen.rows(order)
+    known = np.zeros((len(skeleton), len(skeleton)), dtype=bool)
+    known[tuple(np.array(skeleton.limbs).T)] = True
+    there = np.flatnonzero(known[tuple(seen.joint[seen.pairs].T)])
+    there = there[np.argsort(seen.pairs[there, 0], kind="stable")]
+    return ViewCandidates(view.frame[order], replace(seen, pairs=seen.pairs[there], affinity=seen.affinity[there]))
 
 
-def _with_middle(view: ViewCandidates, skeleton: Skeleton, middle: int, first: int, second: int) -> ViewCandidates:
+def _with_middle(view: ViewCandidates, middle: int, first: int, second: int) -> ViewCandidates:
     """`view` with candidates of the joint `middle` between `first` and `second` at its end."""
-    one, other = view.joint[view.pairs].T
+    frame, seen = view.frame, view.seen
+    one, other = seen.joint[seen.pairs].T
     to_first, to_second = (np.flatnonzero(np.asarray(other == end) & (one != middle)) for end in (first, second))
     # A neighbour's links to one end, times its links to the other.
-    left, right = _equal_pairs(view.pairs[to_first, 0], view.pairs[to_second, 0])
+    left, right = _equal_pairs(seen.pairs[to_first, 0], seen.pairs[to_second, 0])
     left, right = to_first[left], to_second[right]
-    neighbour, a, b = view.pairs[left, 0], view.pairs[left, 1], view.pairs[right, 1]
-    lesser = np.minimum(view.affinity[left], view.affinity[right])
+    neighbour, a, b = seen.pairs[left, 0], seen.pairs[left, 1], seen.pairs[right, 1]
+    lesser = np.minimum(seen.affinity[left], seen.affinity[right])
     picked = match_best_first(a, b, lesser)
     picked = picked[np.argsort(a[picked], kind="stable")]
     a_made, b_made = a[picked], b[picked]
-    made = len(view.frame) + np.arange(len(picked))
+    made = len(frame) + np.arange(len(picked))
     # Who else is linked to both ends of a middle.
-    made_at = np.full(len(view.frame), -1, dtype=np.intp)
+    made_at = np.full(len(frame), -1, dtype=np.intp)
     made_at[a_made] = np.arange(len(picked))
     linked = np.flatnonzero(np.append(b_made, -1)[made_at[a]] == b)
     starts = np.concatenate([made, made, neighbour[linked]])
     ends = np.concatenate([a_made, b_made, made[made_at[a[linked]]]])
-    means = (view.affinity[left] + view.affinity[right])[linked] / 2
-    return replace(
-        view,
-        frame=np.concatenate([view.frame, view.frame[a_made]]),
-        joint=np.concatenate([view.joint, np.full(len(made), middle)]),
-        xy=np.concatenate([view.xy, (view.xy[a_made] + view.xy[b_made]) / 2]),
-        confidence=np.concatenate([view.confidence, np.minimum(view.confidence[a_made], view.confidence[b_made])]),
-        pairs=np.concatenate([view.pairs, np.column_stack([starts, ends])]),
-        affinity=np.concatenate([view.affinity, np.ones(2 * len(made)), means]),
+    means = (seen.affinity[left] + seen.affinity[right])[linked] / 2
+    return ViewCandidates.of(
+        np.concatenate([frame, frame[a_made]]),
+        np.concatenate([seen.joint, np.full(len(made), middle)]),
+        np.concatenate([seen.xy, (seen.xy[a_made] + seen.xy[b_made]) / 2]),
+        np.concatenate([seen.confidence, np.minimum(seen.confidence[a_made], seen.confidence[b_made])]),
+        np.concatenate([seen.pairs, np.column_stack([starts, ends])]),
+        np.concatenate([seen.affinity, np.ones(2 * len(made)), means]),
     )
 
 
@@ -289,21 +267,3 @@ def _equal_pairs(left: NDArray[np.intp], right: NDArray[np.intp]) -> tuple[NDArr
     low, high = (np.searchsorted(right[order], left, side=side) for side in ("left", "right"))
     i, within = _expand(high - low)
     return i, order[low[i] + within]
-
-
-def _sorted(view: ViewCandidates) -> ViewCandidates:
-    """`view` in the order of its frames and joints, pairs in that of their frames."""
-    order = np.lexsort((view.joint, view.frame))
-    place = np.empty_like(order)
-    place[order] = np.arange(len(order))
-    pairs = place[view.pairs]
-    by_frame = np.argsort(pairs[:, 0], kind="stable")
-    return replace(
-        view,
-        frame=view.frame[order],
-        joint=view.joint[order],
-        xy=view.xy[order],
-        confidence=view.confidence[order],
-        pairs=pairs[by_frame],
-        affinity=view.affinity[by_frame],
-    )

@@ -1,6 +1,6 @@
 """The numbers of a text file, read piece by piece, so that the file may be larger than memory."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import text_pieces
+from shapepose_fg.io.validation import is_number
 
 _LONGEST_WORD = 2**20
 """No number is as long."""
@@ -42,16 +43,11 @@ class NumberStream:
         self._pieces = _whole_words(path)
         self._most = path.stat().st_size // 2 + 1
 
-    @property
-    def read(self) -> int:
-        """How many numbers were read, forgotten ones too."""
-        return self.first + len(self.values)
-
     def reaches(self, count: int) -> bool:
         """Whether the file has so many numbers; they are in memory then."""
         if count > self._most:  # no room in the file: it is not read to its end for that
             return False
-        parts, known = [self.values], self.read
+        parts, known = [self.values], self.first + len(self.values)
         while known < count and (text := next(self._pieces, None)) is not None:
             parts.append(self._numbers(text, known))
             known += len(parts[-1])
@@ -65,10 +61,10 @@ class NumberStream:
 
     def count(self) -> int:
         """How many numbers the file has; all are forgotten."""
-        self.forget(self.read)
-        while self.reaches(self.read + 1):
-            self.forget(self.read)
-        return self.first
+        while True:
+            self.forget(self.first + len(self.values))
+            if not self.reaches(self.first + 1):
+                return self.first
 
     def refuse(self, index: int | None, problem: str, cure: str) -> InputError:
         """An error about number `index`; None is what should be behind the last."""
@@ -79,10 +75,10 @@ class NumberStream:
         tokens = text.split()
         try:
             values = np.array(tokens, dtype=np.float64)
-            bad = int(np.argmin(np.isfinite(values))) if not np.isfinite(values).all() else None
         except ValueError:
-            values, bad = np.zeros(0), _first_bad(tokens)
-        if bad is not None:
+            values = np.full(1, np.nan)
+        if not np.isfinite(values).all():
+            bad = next(index for index, token in enumerate(tokens) if not is_number(token))
             problem = f"{tokens[bad][:20]!r} is not a finite number"
             raise self.refuse(first + bad, problem, "write the detections again")
         return values
@@ -100,13 +96,3 @@ class NumberStream:
             # A line that goes on in the next piece is not over.
             lines += len((text + "|").splitlines()) - 1
         return last
-
-
-def _first_bad(tokens: Sequence[str]) -> int:
-    """The first token that is no number."""
-    for index, token in enumerate(tokens):
-        try:
-            np.float64(token)
-        except ValueError:
-            return index
-    raise AssertionError("one of the tokens is no number")

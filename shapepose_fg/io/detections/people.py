@@ -1,6 +1,4 @@
-"""People of one camera as detectors write them: kept, given scores from 0 to 1, and taken apart into
-candidates.
-"""
+"""People of one camera as detectors write them: kept, given scores from 0 to 1, taken apart into candidates."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -152,34 +150,30 @@ def candidates_of(people: KeptPeople, rule: ScoreRule, skeleton: Skeleton, first
     that the skeleton makes are the middles of two that were seen, as sure as the less sure of them.
     """
     count = last - first + 1
-    return ViewStream(people.camera.source, count, _blocks(people, rule, skeleton, first, count), first)
+
+    def blocks() -> Iterator[ViewCandidates]:
+        """In blocks of `BLOCK_FRAMES` frames, of people in blocks of any length."""
+        waiting = PeopleBlock(np.zeros(0, dtype=np.intp), np.zeros((0, skeleton.keypoint_count, 3)))
+        given = people.blocks(last_time=True)
+        for start in range(0, count, BLOCK_FRAMES):
+            end = first + min(start + BLOCK_FRAMES, count)
+            parts = [waiting] if len(waiting.frame) > 0 else []
+            while (len(parts) == 0 or parts[-1].frame[-1] < end) and (part := next(given, None)):
+                parts.append(part)
+            frame = np.concatenate([part.frame for part in parts] or [waiting.frame])
+            keypoints = np.concatenate([part.keypoints for part in parts] or [waiting.keypoints])
+            own = int(np.searchsorted(frame, end))
+            yield _candidates(frame[:own] - first, keypoints[:own], rule, skeleton)
+            waiting = PeopleBlock(frame[own:], keypoints[own:])
+
+    return ViewStream(people.camera.source, count, blocks(), first)
 
 
-def _blocks(
-    people: KeptPeople, rule: ScoreRule, skeleton: Skeleton, first: int, count: int
-) -> Iterator[ViewCandidates]:
-    """Candidates in blocks of `BLOCK_FRAMES` frames, of people in blocks of any length."""
-    blocks = people.blocks(last_time=True)
-    waiting = PeopleBlock(np.zeros(0, dtype=np.intp), np.zeros((0, skeleton.keypoint_count, 3)))
-    for start in range(0, count, BLOCK_FRAMES):
-        end = first + min(start + BLOCK_FRAMES, count)
-        parts = [waiting]
-        while (len(parts[-1].frame) == 0 or parts[-1].frame[-1] < end) and (part := next(blocks, None)):
-            score = rule.applied(part.keypoints[..., 2])
-            parts.append(
-                PeopleBlock(part.frame, np.concatenate([part.keypoints[..., :2], score[..., None]], axis=-1))
-            )
-        filled = [part for part in parts if len(part.frame) > 0] or parts[:1]
-        frame = np.concatenate([part.frame for part in filled])
-        keypoints = np.concatenate([part.keypoints for part in filled])
-        own = int(np.searchsorted(frame, end))
-        yield _candidates(frame[:own] - first, keypoints[:own], skeleton)
-        waiting = PeopleBlock(frame[own:], keypoints[own:])
-
-
-def _candidates(frame: NDArray[np.intp], keypoints: NDArray[np.float64], skeleton: Skeleton) -> ViewCandidates:
+def _candidates(
+    frame: NDArray[np.intp], keypoints: NDArray[np.float64], rule: ScoreRule, skeleton: Skeleton
+) -> ViewCandidates:
     """The joints of the people of some frames."""
-    joints = _joints(keypoints, skeleton)
+    joints = _joints(keypoints, rule, skeleton)
     person, joint = np.nonzero(joints[..., 2] > 0)
     order = np.lexsort((person, joint, frame[person]))
     person, joint = person[order], joint[order]
@@ -189,14 +183,15 @@ def _candidates(frame: NDArray[np.intp], keypoints: NDArray[np.float64], skeleto
     pairs = row[:, np.array(skeleton.limbs)].reshape(-1, 2)
     pairs = pairs[np.all(pairs >= 0, axis=1)]
     xy, score = joints[person, joint, :2], joints[person, joint, 2]
-    return ViewCandidates(frame[person], joint, xy, score, pairs, np.ones(len(pairs)))
+    return ViewCandidates.of(frame[person], joint, xy, score, pairs, np.ones(len(pairs)))
 
 
-def _joints(keypoints: NDArray[np.float64], skeleton: Skeleton) -> NDArray[np.float64]:
-    """(N, J, 3) the skeleton's joints, 0 0 0 where not seen."""
+def _joints(keypoints: NDArray[np.float64], rule: ScoreRule, skeleton: Skeleton) -> NDArray[np.float64]:
+    """(N, J, 3) the skeleton's joints with scores from 0 to 1, 0 0 0 where not seen."""
     target = np.arange(len(skeleton)) if skeleton.keypoints is None else np.array(skeleton.keypoints)
     joints = np.zeros((len(keypoints), len(skeleton), 3))
     joints[:, target[target >= 0]] = keypoints[:, target >= 0]
+    joints[..., 2] = rule.applied(joints[..., 2])
     joints[~(np.isfinite(joints).all(axis=2) & (joints[..., 2] > 0))] = 0
     for middle, first, second in skeleton.middles:
         ends = joints[:, [first, second]]

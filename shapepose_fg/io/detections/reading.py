@@ -1,22 +1,61 @@
-"""2D detections of every camera, from a folder: which files are whose, which format they are, one table of all."""
+"""2D detections of every camera, from a folder: which files are whose, which format they are, one table of all.
 
-from collections.abc import Sequence
-from dataclasses import replace
+A format of your own is an entry in `FORMATS` and a function that reads it.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25, SKELETONS, Skeleton
 from shapepose_fg.core.storage.kept_arrays import InMemory, KeptArrays
+from shapepose_fg.io.camera_names import listing, told_by_parts
 from shapepose_fg.io.detection_table import DetectionTable
-from shapepose_fg.io.detections.formats import FORMATS
+from shapepose_fg.io.detections.association_text import read_association_text
+from shapepose_fg.io.detections.json_people import is_one_file, read_frame_files, read_one_file
 from shapepose_fg.io.detections.people import CameraPeople, KeptPeople, ScoreRule, candidates_of
-from shapepose_fg.io.detections.places import find_places
 from shapepose_fg.io.detections.view_streams import ViewStream, assemble
 from shapepose_fg.io.skeleton_file import find_skeleton
 
 _MOST_FRAMES = 2_000_000
 """No recording is as long: ids of pictures that are not frames' numbers."""
+
+
+@dataclass(frozen=True)
+class Format:
+    """One way in which detections are written: a file or folder per camera."""
+
+    name: str
+    """For messages and documents."""
+    names: tuple[str, ...]
+    """What a camera's file, or without an ending its folder, is called; {} is the camera."""
+    recognise: Callable[[Path], bool]
+    """Whether a file or folder that is called so is meant to be of this format, though it may be faulty."""
+    read: Callable[[Path, Camera], CameraPeople | ViewStream]
+    """What a camera saw: people, or candidates with affinities; InputError naming file, place and cure."""
+
+
+_JSON = (
+    "{}", "{}_json", "{}.json", "results_{}.json", "{}_results.json", "alphapose-results_{}.json",
+)  # fmt: skip
+FORMATS = [
+    Format("4D Association's text", ("{}.txt",), lambda place: place.suffix == ".txt", read_association_text),
+    Format(
+        "COCO's keypoint results, AlphaPose's JSON, MMPose's JSON of a video",
+        _JSON,
+        is_one_file,
+        lambda place, camera: read_one_file(place),
+    ),
+    Format(
+        "a JSON file per frame of OpenPose, Pose2Sim or MMPose",
+        _JSON,
+        Path.is_dir,
+        lambda place, camera: read_frame_files(place),
+    ),
+]
+"""The first that recognises a camera's file or folder reads it."""
 
 
 def read_detections(
@@ -31,10 +70,10 @@ def read_detections(
     sentence that names file, place and cure.
     """
     kept = InMemory() if kept is None else kept
-    places = find_places(Path(path), rig)
+    places, notes = find_places(Path(path), rig)
     wanted = find_skeleton(skeleton)
     streams, people = list[ViewStream](), list[KeptPeople]()
-    for n, (place, camera) in enumerate(zip(places.paths, rig.cameras, strict=True)):
+    for n, (place, camera) in enumerate(zip(places, rig.cameras, strict=True)):
         read = next(each for each in FORMATS if each.recognise(place)).read(place, camera)
         if isinstance(read, CameraPeople):
             people.append(KeptPeople(read, kept, f"camera-{n:04d}"))
@@ -42,14 +81,65 @@ def read_detections(
             streams.append(read)
     if len(people) > 0 and len(streams) > 0:
         raise InputError(f"{path}: some cameras have people and some candidates; give one format for all cameras")
-    table = _of_people(people, rig, wanted, kept) if len(people) > 0 else _of_streams(streams, rig, wanted, kept)
-    return replace(table, notes=(*places.notes, *table.notes))
+    if len(people) > 0:
+        skeleton, how = _skeleton_of_people(people, wanted), "made as middles, where a person's two ends were seen"
+        streams, said = _streams_of(people, skeleton)
+        notes += said
+    else:
+        skeleton, how = _skeleton_of_streams(streams, wanted), "made between the two that one neighbour links"
+    made = [skeleton.joints[joint] for joint, _, _ in skeleton.middles]
+    notes += [f"{skeleton.name} has no {' and no '.join(made)}: {how}"] if made else []
+    table = assemble(streams, rig, skeleton, kept)
+    return replace(table, notes=(*notes, *table.notes))
 
 
-def _of_streams(
-    streams: Sequence[ViewStream], rig: Rig, wanted: Skeleton | None, kept: KeptArrays
-) -> DetectionTable:
-    """Candidates of every camera."""
+def find_places(path: Path, rig: Rig) -> tuple[list[Path], list[str]]:
+    """Every camera's file or folder in the folder `path`, in the rig's order, and what was taken to be what.
+
+    InputError naming the camera that is missing.
+    """
+    if path.is_file():
+        raise InputError(f"{path}: this is a file; give the folder that holds the detections of all cameras")
+    if not path.is_dir():
+        raise InputError(f"{path}: there is no such folder; check the path of the detections")
+    folder = path / "detection" if (path / "detection").is_dir() else path
+    entries = sorted(each for each in folder.iterdir() if not each.name.startswith("."))
+    holds = listing([each.name for each in entries])
+    for patterns in dict.fromkeys(each.names for each in FORMATS):
+        found = [_named(folder, name, patterns) for name in rig.names]
+        there = [place for place in found if place is not None]
+        if len(there) == len(rig):
+            return there, []
+        if len(there) > 0:
+            missing = rig.names[found.index(None)]
+            raise InputError(
+                f'{folder / patterns[0].format(missing)}: the detections of camera "{missing}" are missing,'
+                f" {folder} holds {holds}; add them, or take the camera out of the calibration"
+            )
+    # `walk_Miqus_1_23087_json` of camera `23087`, `cam01_json` of camera `int_cam1`.
+    offered = [each for each in entries if each.is_dir() or each.suffix == ".json"]
+    names = [each.name.removesuffix(".json").removesuffix("_json") for each in offered]
+    told = told_by_parts(folder, rig.names, offered, names)
+    if told is None:
+        raise InputError(
+            f"{folder}: no detections of the cameras {' '.join(rig.names)} here, only {holds}; give the folder"
+            " with <camera>.txt (4D Association), <camera>/ or <camera>_json/ with a JSON file per frame"
+            " (OpenPose, Pose2Sim, MMPose), or <camera>.json (COCO's results, AlphaPose, MMPose)"
+        )
+    return list(told[0]), [told[1]]
+
+
+def _named(folder: Path, name: str, patterns: Sequence[str]) -> Path | None:
+    """What is called after a camera: a file, or a folder where the pattern has no ending."""
+    for pattern in patterns:
+        place = folder / pattern.format(name)
+        if place.is_file() if Path(pattern).suffix else place.is_dir():
+            return place
+    return None
+
+
+def _skeleton_of_streams(streams: Sequence[ViewStream], wanted: Skeleton | None) -> Skeleton:
+    """The skeleton that all candidates have."""
     first = streams[0]
     skeleton = first.skeleton or wanted or BODY_25
     for each in streams[1:]:
@@ -61,73 +151,11 @@ def _of_streams(
             )
     if wanted is not None and wanted.joints != skeleton.joints:
         raise InputError(f"{first.source}: these are joints of {skeleton.name}, not of {wanted.name}")
-    table = assemble(streams, rig, skeleton, kept)
-    return replace(table, notes=(*_made(skeleton, "made between the two that one neighbour links"), *table.notes))
+    return skeleton
 
 
-def _of_people(
-    people: Sequence[KeptPeople], rig: Rig, wanted: Skeleton | None, kept: KeptArrays
-) -> DetectionTable:
-    """People of every camera."""
-    skeleton = _skeleton_of(people, wanted)
-    first, last = _span([each.camera for each in people])
-    rule = ScoreRule.of(people)
-    for each in people:
-        if each.farthest is not None and each.farthest <= 1:
-            raise InputError(
-                f"{each.camera.source}: recognised as {each.camera.program}, but all keypoints lie between -1"
-                f" and 1, and pixels were expected; {each.camera.rerun}"
-            )
-    notes = [] if rule.note is None else [rule.note]
-    if first > 0 and not all(each.camera.every_frame for each in people):
-        notes.append(f"frame 0 is number {first} of the files")
-    streams = []
-    for each in people:
-        # A camera that lists every one of its frames must list those of the others.
-        span = (each.camera.first, each.camera.last) if each.camera.every_frame else (first, last)
-        streams.append(candidates_of(each, rule, skeleton, *span))
-        notes += _gaps(each.camera)
-    notes += _made(skeleton, "made as middles, where a person's two ends were seen")
-    table = assemble(streams, rig, skeleton, kept)
-    return replace(table, notes=(*notes, *table.notes))
-
-
-def _span(cameras: Sequence[CameraPeople]) -> tuple[int, int]:
-    """Numbers of the first and last frame that any camera lists."""
-    listed = [each for each in cameras if each.last >= each.first]
-    if len(listed) == 0:
-        raise InputError(
-            f"{cameras[0].source}: recognised as {cameras[0].program}, where no camera lists a frame;"
-            " give detections of people"
-        )
-    first, last = min(each.first for each in listed), max(each.last for each in listed)
-    if last - first >= _MOST_FRAMES:
-        raise InputError(
-            f"{listed[0].source}: recognised as {listed[0].program}, whose frames would run from {first} to"
-            f" {last}; number the pictures by their frames"
-        )
-    return first, last
-
-
-def _gaps(camera: CameraPeople) -> list[str]:
-    """Which frames in between a camera lacks."""
-    if len(camera.gaps) == 0:
-        return []
-    count = sum(last - first + 1 for first, last in camera.gaps)
-    (first, last), more = camera.gaps[0], ", and others" if len(camera.gaps) > 1 else ""
-    where = f"frame {first}" if first == last else f"frames {first} to {last}"
-    have = "frames have" if count > 1 else "frame has"
-    return [f"{camera.source}: {count} {have} no file ({where}{more}); nobody is seen there"]
-
-
-def _made(skeleton: Skeleton, how: str) -> list[str]:
-    """Which joints the reader made itself."""
-    made = [skeleton.joints[joint] for joint, _, _ in skeleton.middles]
-    return [f"{skeleton.name} has no {' and no '.join(made)}: {how}"] if made else []
-
-
-def _skeleton_of(people: Sequence[KeptPeople], wanted: Skeleton | None) -> Skeleton:
-    """The skeleton that all files have, by the number of keypoints."""
+def _skeleton_of_people(people: Sequence[KeptPeople], wanted: Skeleton | None) -> Skeleton:
+    """The skeleton that all people have, by the number of keypoints."""
     counts: dict[int, CameraPeople] = {}
     for each in people:
         if each.keypoint_count is not None:
@@ -148,9 +176,54 @@ def _skeleton_of(people: Sequence[KeptPeople], wanted: Skeleton | None) -> Skele
         )
     found = wanted or next((each for each in SKELETONS.values() if each.keypoint_count == count), None)
     if found is None:
-        listing = ", ".join(f"{known.keypoint_count} ({known.name})" for known in SKELETONS.values())
+        known = ", ".join(f"{each.keypoint_count} ({each.name})" for each in SKELETONS.values())
         what = "MPI's: run OpenPose with --model_pose BODY_25" if count == 15 else "not known here"
         raise InputError(
-            f"{place}, which is {what}, or describe them in a skeleton file (--skeleton); known are {listing}"
+            f"{place}, which is {what}, or describe them in a skeleton file (--skeleton); known are {known}"
         )
     return found
+
+
+def _streams_of(people: Sequence[KeptPeople], skeleton: Skeleton) -> tuple[list[ViewStream], list[str]]:
+    """The people of every camera as candidates, and what was made of their scores and frames."""
+    cameras = [each.camera for each in people]
+    first, last = _span(cameras)
+    rule = ScoreRule.of(people)
+    for each, camera in zip(people, cameras, strict=True):
+        if each.farthest is not None and each.farthest <= 1:
+            raise InputError(
+                f"{camera.source}: recognised as {camera.program}, but all keypoints lie between -1"
+                f" and 1, and pixels were expected; {camera.rerun}"
+            )
+    notes = [] if rule.note is None else [rule.note]
+    if first > 0 and not all(camera.every_frame for camera in cameras):
+        notes.append(f"frame 0 is number {first} of the files")
+    streams = []
+    for each, camera in zip(people, cameras, strict=True):
+        # A camera that lists every one of its frames must list those of the others.
+        span = (camera.first, camera.last) if camera.every_frame else (first, last)
+        streams.append(candidates_of(each, rule, skeleton, *span))
+        if len(camera.gaps) > 0:
+            count = sum(until - since + 1 for since, until in camera.gaps)
+            (since, until), more = camera.gaps[0], ", and others" if len(camera.gaps) > 1 else ""
+            where = f"frame {since}" if since == until else f"frames {since} to {until}"
+            have = "frames have" if count > 1 else "frame has"
+            notes.append(f"{camera.source}: {count} {have} no file ({where}{more}); nobody is seen there")
+    return streams, notes
+
+
+def _span(cameras: Sequence[CameraPeople]) -> tuple[int, int]:
+    """Numbers of the first and last frame that any camera lists."""
+    listed = [each for each in cameras if each.last >= each.first]
+    if len(listed) == 0:
+        raise InputError(
+            f"{cameras[0].source}: recognised as {cameras[0].program}, where no camera lists a frame;"
+            " give detections of people"
+        )
+    first, last = min(each.first for each in listed), max(each.last for each in listed)
+    if last - first >= _MOST_FRAMES:
+        raise InputError(
+            f"{listed[0].source}: recognised as {listed[0].program}, whose frames would run from {first} to"
+            f" {last}; number the pictures by their frames"
+        )
+    return first, last

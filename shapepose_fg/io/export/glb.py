@@ -1,6 +1,7 @@
-"""GLB, binary glTF 2.0: every person's skinned mesh with its motion, by pygltflib; y up, metres, seconds."""
+"""GLB, binary glTF 2.0: every person's skinned mesh with its motion; y up, metres, seconds."""
 
-from dataclasses import dataclass
+import json
+import struct
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS, SmplArrays
 from shapepose_fg.core.drawing import colour_of, vertex_normals
 from shapepose_fg.core.skeleton import SMPL_24
-from shapepose_fg.io.export.job import Job, Written, optional
+from shapepose_fg.io.export.job import Job, Written
 from shapepose_fg.io.export.skinned import BONES, Motion, everybody
 from shapepose_fg.io.export.take import y_up
 
@@ -17,7 +18,7 @@ _SET = 4
 """Bones in a set of influences. Every program reads the first set, Blender all of them."""
 _ARRAY, _ELEMENTS = 34962, 34963
 """glTF's targets: what vertices have, and which vertices make triangles."""
-_COMPONENTS = {"uint8": 5121, "uint16": 5123, "uint32": 5125, "float32": 5126}
+_COMPONENTS = {"uint8": 5121, "uint32": 5125, "float32": 5126}
 _TYPES = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 
 
@@ -40,28 +41,66 @@ def glb_bytes(motions: dict[int, Motion], arrays: SmplArrays, times_s: NDArray[n
     is scaled to zero, glTF's way to hide things. Rotations are interpolated along the sphere, the pelvis on a
     line.
     """
-    gltf = optional("pygltflib", "export")
-    file, buffers = gltf.GLTF2(), Buffers()
-    sets: dict[str, int] = {}
+    file = _File()
+    shared: dict[str, int] = {}
     for number, (joints, weights) in enumerate(influences(arrays.weights)):
-        sets[f"JOINTS_{number}"] = buffers.vertices(joints)
-        sets[f"WEIGHTS_{number}"] = buffers.vertices(weights)
-    skin = _Skin(buffers.indices(arrays.faces.reshape(-1).astype(np.uint32)), sets)
-    animation = gltf.Animation(name="motion")
-    times = times_s - times_s[0]
+        shared[f"JOINTS_{number}"] = file.array(joints, _ARRAY)
+        shared[f"WEIGHTS_{number}"] = file.array(weights, _ARRAY)
+    triangles = file.array(arrays.faces.reshape(-1).astype(np.uint32), _ELEMENTS)
     roots = []
     for who, motion in motions.items():
-        first = len(file.nodes)
-        _add_person(gltf, file, buffers, who, motion, skin)
-        _animate(gltf, animation, buffers, first, motion, times)
-        roots.append(first)
-    file.asset = gltf.Asset(version="2.0", generator="shapepose-fg")
-    file.scene, file.scenes = 0, [gltf.Scene(name="people", nodes=roots)]
-    file.animations = [animation]
-    file.accessors, file.bufferViews = buffers.accessors, buffers.views
-    file.buffers = [gltf.Buffer(byteLength=len(buffers.data))]
-    file.set_binary_blob(buffers.data)
-    return b"".join(file.save_to_bytes())
+        roots.append(_add_person(file, who, motion, shared, triangles))
+        _animate(file, roots[-1], motion, times_s - times_s[0])
+    return file.content(roots)
+
+
+class _File:
+    """glTF's lists, and its binary part: arrays one after the other, each described by an accessor."""
+
+    def __init__(self) -> None:
+        names = "nodes meshes materials skins accessors bufferViews".split()
+        self.lists: dict[str, list[Any]] = {name: [] for name in names}
+        self.samplers, self.channels = list[Any](), list[Any]()
+        self._binary = bytearray()
+
+    def add(self, kind: str, **what: Any) -> int:
+        """Add to one of the lists; the number in it."""
+        self.lists[kind].append(what)
+        return len(self.lists[kind]) - 1
+
+    def array(self, values: NDArray[Any], target: int | None = None, *, bounds: bool = False) -> int:
+        """The accessor of an array; positions and times need `bounds`."""
+        flat = np.ascontiguousarray(values.mT if values.ndim == 3 else values)  # matrices go column by column
+        self._binary += bytes(-len(self._binary) % 4)  # each array begins at a multiple of 4 bytes
+        place = {"buffer": 0, "byteOffset": len(self._binary), "byteLength": flat.nbytes}
+        self._binary += flat.tobytes()
+        limits = {"min": np.atleast_1d(flat.min(0)).tolist(), "max": np.atleast_1d(flat.max(0)).tolist()}
+        return self.add(
+            "accessors",
+            bufferView=self.add("bufferViews", **place, **({} if target is None else {"target": target})),
+            componentType=_COMPONENTS[flat.dtype.name],
+            count=len(flat),
+            type=_TYPES[values.shape[1:]],
+            **(limits if bounds else {}),
+        )
+
+    def content(self, roots: list[int]) -> bytes:
+        """The whole file, whose scene are the nodes `roots`."""
+        binary = bytes(self._binary) + bytes(-len(self._binary) % 4)
+        tree = {
+            "asset": {"version": "2.0", "generator": "shapepose-fg"},
+            "scene": 0,
+            "scenes": [{"name": "people", "nodes": roots}],
+            "animations": [{"name": "motion", "samplers": self.samplers, "channels": self.channels}],
+            "buffers": [{"byteLength": len(binary)}],
+            **self.lists,
+        }
+        text = json.dumps(tree, allow_nan=False).encode()
+        text += b" " * (-len(text) % 4)
+        parts = b"".join(
+            struct.pack("<I4s", len(part), kind) + part for kind, part in ((b"JSON", text), (b"BIN\0", binary))
+        )
+        return struct.pack("<4sII", b"glTF", 2, 12 + len(parts)) + parts
 
 
 def influences(weights: NDArray[np.float64]) -> list[tuple[NDArray[np.uint8], NDArray[np.float32]]]:
@@ -82,81 +121,62 @@ def influences(weights: NDArray[np.float64]) -> list[tuple[NDArray[np.uint8], ND
     return sets
 
 
-@dataclass(frozen=True)
-class _Skin:
-    """What the skins of all people share: numbers of accessors."""
+def _add_person(file: _File, who: int, motion: Motion, shared: dict[str, int], triangles: int) -> int:
+    """Nodes of a person in the pose of its first frame, with mesh, material and skin; the number of the first.
 
-    triangles: int
-    influences: dict[str, int]
-
-
-def _add_person(gltf: Any, file: Any, buffers: "Buffers", who: int, motion: Motion, skin: "_Skin") -> None:
-    """Nodes of a person in the pose of its first frame, with mesh, material and skin."""
-    first, rest = len(file.nodes), motion.rest
-    name = f"person_{who}"
-    children: list[list[int]] = [[] for _ in range(BONES)]
-    for joint, parent in enumerate(SMPL_PARENTS[1:], start=1):
-        children[parent].append(first + 1 + joint)
-    mesh_node = first + 1 + BONES
-    file.nodes.append(gltf.Node(name=name, children=[first + 1, mesh_node]))
+    All people have the same `triangles` and `shared` attributes of vertices, which are accessors.
+    """
+    first, rest, name = len(file.lists["nodes"]), motion.rest, f"person_{who}"
+    file.add("nodes", name=name, children=[first + 1, first + 1 + BONES])
     for joint in range(BONES):
         place = motion.pelvis[0] if joint == 0 else rest.offsets[joint]
-        file.nodes.append(
-            gltf.Node(
-                name=f"{name}_{SMPL_24[joint]}",
-                children=children[joint],
-                translation=place.tolist(),
-                rotation=motion.rotations[0, joint].tolist(),
-            )
+        children = [first + 1 + child for child in range(1, BONES) if SMPL_PARENTS[child] == joint]
+        file.add(
+            "nodes",
+            name=f"{name}_{SMPL_24[joint]}",
+            translation=place.tolist(),
+            rotation=motion.rotations[0, joint].tolist(),
+            **({"children": children} if children else {}),
         )
-    file.nodes.append(gltf.Node(name=f"{name}_skin", mesh=len(file.meshes), skin=len(file.skins)))
-    normals = vertex_normals(rest.vertices, rest.arrays.faces)
-    attributes = gltf.Attributes(
-        POSITION=buffers.vertices(rest.vertices.astype(np.float32), bounds=True),
-        NORMAL=buffers.vertices(normals.astype(np.float32)),
-        **skin.influences,
+    normals = vertex_normals(rest.vertices, rest.arrays.faces).astype(np.float32)
+    attributes = {
+        "POSITION": file.array(rest.vertices.astype(np.float32), _ARRAY, bounds=True),
+        "NORMAL": file.array(normals, _ARRAY),
+        **shared,
+    }
+    surface = {"baseColorFactor": [*_linear(colour_of(who)), 1.0], "metallicFactor": 0.0}
+    material = file.add("materials", name=name, pbrMetallicRoughness=surface)
+    mesh = file.add(
+        "meshes", name=name, primitives=[{"attributes": attributes, "indices": triangles, "material": material}]
     )
-    primitive = gltf.Primitive(attributes=attributes, indices=skin.triangles, material=len(file.materials))
-    file.meshes.append(gltf.Mesh(name=name, primitives=[primitive]))
-    surface = gltf.PbrMetallicRoughness(baseColorFactor=[*_linear(colour_of(who)), 1.0], metallicFactor=0.0)
-    file.materials.append(gltf.Material(name=name, pbrMetallicRoughness=surface))
     # A bone's frame in the T-pose is the body's own, moved to the joint.
     inverse = np.tile(np.eye(4, dtype=np.float32), (BONES, 1, 1))
     inverse[:, :3, 3] = -rest.joints
-    file.skins.append(
-        gltf.Skin(
-            name=name,
-            inverseBindMatrices=buffers.values(inverse),
-            skeleton=first + 1,
-            joints=list(range(first + 1, first + 1 + BONES)),
-        )
-    )
+    bones = list(range(first + 1, first + 1 + BONES))
+    skin = file.add("skins", name=name, inverseBindMatrices=file.array(inverse), skeleton=first + 1, joints=bones)
+    file.add("nodes", name=f"{name}_skin", mesh=mesh, skin=skin)
+    return first
 
 
-def _animate(
-    gltf: Any, animation: Any, buffers: "Buffers", first: int, motion: Motion, times: NDArray[np.float64]
-) -> None:
+def _animate(file: _File, first: int, motion: Motion, times: NDArray[np.float64]) -> None:
     """The channels of a person whose node is number `first`."""
 
-    def channel(node: int, path: str, at: int, values: NDArray[np.float64], interpolation: str) -> None:
-        sampler = gltf.AnimationSampler(
-            input=at, output=buffers.values(values.astype(np.float32)), interpolation=interpolation
-        )
-        animation.samplers.append(sampler)
-        target = gltf.AnimationChannelTarget(node=node, path=path)
-        animation.channels.append(gltf.AnimationChannel(sampler=len(animation.samplers) - 1, target=target))
+    def channel(node: int, path: str, at: int, values: NDArray[np.float64], interpolation: str = "LINEAR") -> None:
+        output = file.array(values.astype(np.float32))
+        file.samplers.append({"input": at, "output": output, "interpolation": interpolation})
+        file.channels.append({"sampler": len(file.samplers) - 1, "target": {"node": node, "path": path}})
 
-    at = buffers.values(times[motion.index].astype(np.float32), bounds=True)
-    channel(first + 1, "translation", at, motion.pelvis, "LINEAR")
+    at = file.array(times[motion.index].astype(np.float32), bounds=True)
+    channel(first + 1, "translation", at, motion.pelvis)
     rotations = _shortest(motion.rotations)
     for joint in range(BONES):
-        channel(first + 1 + joint, "rotation", at, rotations[:, joint], "LINEAR")
+        channel(first + 1 + joint, "rotation", at, rotations[:, joint])
     there = np.zeros(len(times), dtype=bool)
     there[motion.index] = True
     if not there.all():
         turns = np.flatnonzero(np.diff(there, prepend=not there[0]))
         scale = np.repeat(there[turns].astype(np.float64)[:, None], 3, axis=1)
-        channel(first, "scale", buffers.values(times[turns].astype(np.float32), bounds=True), scale, "STEP")
+        channel(first, "scale", file.array(times[turns].astype(np.float32), bounds=True), scale, "STEP")
 
 
 def _shortest(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -170,52 +190,3 @@ def _linear(colour: tuple[float, float, float]) -> list[float]:
     """A colour as glTF's factors have it: linear light, from sRGB (IEC 61966-2-1)."""
     srgb = np.array(colour)
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4).tolist()
-
-
-class Buffers:
-    """glTF's binary part: arrays one after the other, each described by an accessor."""
-
-    def __init__(self) -> None:
-        self._gltf = optional("pygltflib", "export")
-        self.accessors: list[Any] = []
-        self.views: list[Any] = []
-        self._parts: list[bytes] = []
-        self._length = 0
-
-    def vertices(self, values: NDArray[Any], *, bounds: bool = False) -> int:
-        """Number of the accessor of a vertex attribute; `bounds` are asked for of positions."""
-        return self._add(values, _ARRAY, bounds)
-
-    def indices(self, values: NDArray[Any]) -> int:
-        """Number of the accessor of triangles' vertices, flat."""
-        return self._add(values, _ELEMENTS, False)
-
-    def values(self, values: NDArray[Any], *, bounds: bool = False) -> int:
-        """Number of the accessor of anything else; `bounds` are asked for of an animation's times."""
-        return self._add(values, None, bounds)
-
-    @property
-    def data(self) -> bytes:
-        """All arrays."""
-        return b"".join(self._parts)
-
-    def _add(self, values: NDArray[Any], target: int | None, bounds: bool) -> int:
-        flat = np.ascontiguousarray(values.mT if values.ndim == 3 else values)  # matrices go column by column
-        content = flat.tobytes()
-        self.views.append(
-            self._gltf.BufferView(buffer=0, byteOffset=self._length, byteLength=len(content), target=target)
-        )
-        limits = {"min": np.atleast_1d(flat.min(0)).tolist(), "max": np.atleast_1d(flat.max(0)).tolist()}
-        self.accessors.append(
-            self._gltf.Accessor(
-                bufferView=len(self.views) - 1,
-                componentType=_COMPONENTS[flat.dtype.name],
-                count=len(flat),
-                type=_TYPES[values.shape[1:]],
-                **(limits if bounds else {}),
-            )
-        )
-        padding = -len(content) % 4  # each array begins at a multiple of 4 bytes
-        self._parts.append(content + bytes(padding))
-        self._length += len(content) + padding
-        return len(self.accessors) - 1

@@ -13,9 +13,6 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import write_content
 from shapepose_fg.io.export.take import Take
 
-_VISIBLE_M = 1e-3
-"""Smaller differences are not told of."""
-
 
 class MarkerSet(StrEnum):
     """Which points are markers, and what they are called."""
@@ -37,29 +34,30 @@ class Job:
     folder: Path
     """Where the files go."""
     body_file: Path | None = None
-    """File of the body model; None for the one that ships."""
+    """File of the body model; None for the one that the result was made with."""
     markers: MarkerSet = MarkerSet.OPENSIM
     """What TRC and C3D hold."""
     fill_gaps_s: float = 0.2
     """Holes in a body's motion up to this long are interpolated where a format can have none."""
 
+    @property
+    def body(self) -> Path | None:
+        """File of the body model; None for the one that ships."""
+        named = self.take.people.run.get("body")
+        return self.body_file if self.body_file is not None or named is None else Path(str(named))
+
     @cached_property
     def arrays(self) -> SmplArrays:
         """The body model; InputError where its file is not there any more."""
         try:
-            return read_body(self.body_file)
+            return read_body(self.body)
         except InputError as error:
-            if self.body_file is None or self.body_file.exists():
+            if self.body is None or self.body.exists():
                 raise
             raise InputError(
-                f"{self.body_file}: the body model of this result is not there any more; put it back, "
-                "or say with --body where it is"
+                f"{self.body}: the body model of this result is not there any more; put it back, or say with"
+                " --body where it is"
             ) from error
-
-    @property
-    def marker_body(self) -> SmplArrays | None:
-        """The body model where markers need it."""
-        return self.arrays if self.markers == MarkerSet.BODY else None
 
 
 @dataclass
@@ -82,14 +80,6 @@ class Written:
         if lost > 0:
             self.notes.append(f"{lost} frames left out: at {take.fps:g} a second others are nearer to their place")
         return even
-
-    def note_shape(self, kind: str, who: int, spread_m: float) -> None:
-        """Say where a person has several shapes, of which a file can have one."""
-        if spread_m > _VISIBLE_M:
-            self.notes.append(
-                f"{kind}: person {who} has several shapes, and the mean of them in the file: joints are up to"
-                f" {1e3 * spread_m:.0f} mm from where they were"
-            )
 
 
 def optional(module: str, extra: str) -> ModuleType:

@@ -1,15 +1,30 @@
-"""Points with names, for files of markers: TRC and C3D."""
+"""Points with names as files of markers: TRC (OpenSim, Pose2Sim: text, metres), C3D (laboratories: binary, mm).
 
-from dataclasses import dataclass
+Both are y up. A missing marker is NaN in TRC (its other notation is a blank, but OpenSim 4.6 refuses a row whose
+last marker is blank), and has the residual -1 in C3D, which ezc3d writes.
+"""
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.model.smpl_file import SmplArrays
+from shapepose_fg.core.camera import Axis
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.reconstruction import Known, Reconstruction
 from shapepose_fg.core.skeleton import MID_HIP, SMPL_24
-from shapepose_fg.io.export.job import MarkerSet
+from shapepose_fg.io.export.job import Job, MarkerSet, Written, optional
 from shapepose_fg.io.export.skinned import motion_of
 from shapepose_fg.io.export.take import Take, opensim_axes
+from shapepose_fg.io.pose2sim_project import Pose2SimProject
+
+_MOST = 65_535
+"""The number of a frame, and how many there are, have 16 bits in a C3D file."""
+_TRC_HEAD = "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames"
 
 
 @dataclass(frozen=True)
@@ -64,3 +79,169 @@ def sigma_m(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
     variance = np.trace(covariance, axis1=-2, axis2=-1) / 3
     with np.errstate(invalid="ignore"):
         return np.sqrt(np.where(variance >= 0, variance, np.nan))
+
+
+def write_trc(job: Job) -> Written:
+    """A file per person, with a row for each frame in which the person has a marker."""
+
+    def write(who: int, markers: Markers, take: Take, written: Written) -> None:
+        path = job.folder / f"person_{who}.trc"
+        written.add(path, trc_text(markers, take.frames, take.times_s, take.fps, path.name))
+
+    return _each(job, job.take, "trc", Written(), write)
+
+
+def write_c3d(job: Job) -> Written:
+    """A file per person, or several of 65,535 frames, from the first to the last with a marker, at one rate."""
+    optional("ezc3d", "export")
+
+    def write(who: int, markers: Markers, take: Take, written: Written) -> None:
+        def name(span: tuple[int, int] | None) -> str:
+            return f"person_{who}" + ("" if span is None else f"_frames_{span[0]}-{span[1]}")
+
+        _write_c3d(markers, take, job.folder, name, written)
+
+    written = Written()
+    return _each(job, written.at_one_rate(job.take), "c3d", written, write)
+
+
+def _each(
+    job: Job, take: Take, kind: str, written: Written, write: Callable[[int, Markers, Take, Written], None]
+) -> Written:
+    """Write everybody with a marker; who has none is noted."""
+    for person, who in enumerate(take.persons.tolist()):
+        markers = markers_of(take, person, job.markers, job.arrays if job.markers == MarkerSet.BODY else None)
+        if len(markers.frames) > 0:
+            write(who, markers, take, written)
+        else:
+            written.notes.append(f"{kind}: person {who} has no marker in any frame")
+    return written
+
+
+def trc_text(
+    markers: Markers, frames: NDArray[np.integer], times_s: NDArray[np.float64], fps: float, name: str
+) -> str:
+    """A TRC file, metres to 6 digits; `name` stands in its first line.
+
+    A frame without any marker has no row, for OpenSim's inverse kinematics stops at one. The rows' own numbers and
+    times say what is missing; `fps` is for readers that want a rate. ValueError where no frame has a marker.
+    """
+    rows = markers.frames
+    if len(rows) == 0:
+        raise ValueError(f"{name}: no frame has a marker")
+    frames, words = frames[rows], np.where(markers.there[..., None], np.char.mod("%.6f", markers.xyz), "NaN")[rows]
+    rate, count = f"{fps:.6g}", len(markers.names)
+    lines = [
+        f"PathFileType\t4\t(X/Y/Z)\t{name}",
+        _TRC_HEAD,
+        f"{rate}\t{rate}\t{len(frames)}\t{count}\tm\t{rate}\t{frames[0]}\t{len(frames)}",
+        "Frame#\tTime\t" + "".join(f"{marker}\t\t\t" for marker in markers.names),
+        "\t\t" + "".join(f"X{n}\tY{n}\tZ{n}\t" for n in range(1, count + 1)),
+    ]
+    every = zip(frames.tolist(), times_s[rows].tolist(), words.reshape(len(rows), -1).tolist(), strict=True)
+    lines += ["\t".join((str(frame), f"{time:.6f}", *row)) for frame, time, row in every]
+    return "\n".join(lines) + "\n"
+
+
+def _write_c3d(
+    markers: Markers, take: Take, folder: Path, name: Callable[[tuple[int, int] | None], str], written: Written
+) -> None:
+    """One person's file from the first to the last frame with a marker; several of 65,535 frames.
+
+    `take` is at one rate. `name` gives a file's name without ending: of all frames (None), or of the first to the
+    last frame in it.
+    """
+    first, stop = int(markers.frames[0]), int(markers.frames[-1]) + 1
+    for start in range(first, stop, _MOST):
+        part = slice(start, min(start + _MOST, stop))
+        span = int(take.frames[part][0]), int(take.frames[part][-1])
+        path = folder / f"{name(None if stop - first <= _MOST else span)}.c3d"
+        fits = span[1] < _MOST
+        if not fits:
+            written.notes.append(
+                f"{path.name} counts its frames from 1, not {span[0] + 1}: numbers in C3D end at {_MOST}"
+            )
+        written.add(path, c3d_bytes(markers, span[0] if fits else 0, take.fps, part))
+
+
+def c3d_bytes(markers: Markers, first_frame: int, fps: float, part: slice = slice(None)) -> bytes:
+    """A C3D file of the frames `part`; `first_frame`, counted from 0, is in its header, where frames count from 1.
+    `part` has at most 65,535 frames, and the last is number 65,535 at most.
+
+    A point's residual is the standard deviation of its place in whole millimetres, which the format keeps in a
+    byte: 1 to 255, where 255 is more, too. It is 0 where it is not known (C3D's word for a point that was
+    computed), and -1 where the point is missing.
+    """
+    ezc3d = optional("ezc3d", "export")
+    xyz, sigma, there = markers.xyz[part], markers.sigma_m[part], markers.there[part]
+    file = ezc3d.c3d()
+    file["header"]["points"]["first_frame"] = first_frame
+    point = file["parameters"]["POINT"]
+    point["RATE"]["value"] = [fps]
+    point["LABELS"]["value"] = list(markers.names)
+    point["UNITS"]["value"] = ["mm"]
+    # The axes as Pose2Sim's files have them: up on the screen is y.
+    file.add_parameter("POINT", "X_SCREEN", "+Z")
+    file.add_parameter("POINT", "Y_SCREEN", "+Y")
+    points = np.ones((4, xyz.shape[1], len(xyz)))
+    points[:3] = 1e3 * np.where(there[..., None], xyz, 0).transpose(2, 1, 0)
+    residuals = np.nan_to_num(np.clip(np.rint(1e3 * sigma), 1, 255), nan=0.0)
+    file["data"]["points"] = points
+    file["data"]["meta_points"]["residuals"] = np.where(there, residuals, -1).T[None]
+    file["data"]["meta_points"]["camera_masks"] = np.zeros((7, xyz.shape[1], len(xyz)), dtype=bool)
+    with tempfile.TemporaryDirectory() as folder:  # ezc3d writes to a path only
+        path = Path(folder) / "person.c3d"
+        file.write(str(path))
+        return path.read_bytes()
+
+
+def write_pose2sim_files(people: Reconstruction, up: Axis, project: Pose2SimProject) -> Written:
+    """A TRC and a C3D file per person into pose-3d/, where Pose2Sim's next steps look for NAME_A-B.trc; of one
+    person only, where the project is of one: who has most joints in the detections of most frames.
+
+    Frames have the project's numbers. A note says why there is no C3D, or nothing at all: this comes at the end of
+    a run, which must not fail here.
+    """
+    written, folder = Written(), project.pose_3d
+    try:
+        take = Take.of(people, up)
+    except ValueError as error:
+        written.notes.append(f"no TRC and no C3D: {error}")
+        return written
+    first = project.first_number
+    take = replace(take, frames=take.frames + first, times_s=take.times_s + first / take.fps)
+    even = None
+    try:
+        optional("ezc3d", "export")
+        even = written.at_one_rate(take)
+    except InputError as error:
+        written.notes.append(f"no C3D: {error}")
+    before = {each.name for each in folder.glob("*.trc")} if folder.is_dir() else set()
+    seen = Known.observed(take.people.known)
+    chosen = list(range(len(take.persons)))
+    if not project.multi_person:
+        chosen = [int(np.argmax([seen[rows[rows >= 0]].sum() for rows in take.rows]))]
+    for number, person in enumerate(chosen):
+        markers = markers_of(take, person, MarkerSet.OPENSIM)
+        if len(markers.frames) == 0:
+            written.notes.append(f"person {take.persons[person]} has no joint in any frame")
+            continue
+
+        def name(span: tuple[int, int] | None, number: int = number, markers: Markers = markers) -> str:
+            first, last = take.frames[markers.frames[[0, -1]]].tolist() if span is None else span
+            return project.name_of(number if project.multi_person else None, first, last)
+
+        path = folder / f"{name(None)}.trc"
+        written.add(path, trc_text(markers, take.frames, take.times_s, take.fps, path.name))
+        holes = int(np.ptp(markers.frames)) + 1 - len(markers.frames)
+        if holes > 0:
+            written.notes.append(f"{path.name} leaves out {holes} frames in which nothing is known of the person")
+        if even is not None:
+            _write_c3d(markers_of(even, person, MarkerSet.OPENSIM), even, folder, name, written)
+    left = sorted(before - {each.name for each in written.files})
+    if len(left) > 0:
+        written.notes.append(
+            f"{folder} also has {' '.join(left[:4])}{' ...' if len(left) > 4 else ''} of before; take"
+            " out what the next steps are not to read"
+        )
+    return written

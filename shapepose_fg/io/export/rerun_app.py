@@ -18,16 +18,12 @@ from shapepose_fg.body.model.smpl_file import SmplArrays
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.io.export.job import Job, Written, optional
-from shapepose_fg.io.export.rerun_log import camera_path, log_cameras, log_observations, log_people, person_path
-from shapepose_fg.io.export.take import Take
+from shapepose_fg.io.export.rerun_log import camera_path, log_take, person_path
+from shapepose_fg.io.export.take import Take, y_up
 
 APPLICATION = "shapepose-fg"
 _CONNECT_S, _PATIENCE_S = 10.0, 30
 """How long a viewer that runs, and one that is started, may take to answer."""
-_UP = {
-    "x": "RIGHT_HAND_X_UP", "-x": "RIGHT_HAND_X_DOWN", "y": "RIGHT_HAND_Y_UP",
-    "-y": "RIGHT_HAND_Y_DOWN", "z": "RIGHT_HAND_Z_UP", "-z": "RIGHT_HAND_Z_DOWN",
-}  # fmt: skip
 
 
 def new_stream() -> Any:
@@ -63,37 +59,19 @@ def viewer_file() -> str | None:
     return shutil.which("rerun", path=sysconfig.get_path("scripts")) or shutil.which("rerun")
 
 
-def body_if_there(job: Job) -> tuple[SmplArrays | None, str | None]:
-    """The body model, or a sentence where its file is not there any more: the rest can be looked at without it."""
+def body_if_there(job: Job) -> tuple[SmplArrays | None, list[str]]:
+    """The body model, or a note where its file is not there any more: the rest can be looked at without it."""
     try:
-        return job.arrays, None
+        return job.arrays, []
     except InputError as error:
-        return None, f"no bodies are drawn ({error})"
-
-
-def log_take(stream: Any, take: Take, arrays: SmplArrays | None) -> None:
-    """Log everything of a take on the timelines `frame` and `time` (seconds).
-
-    Cameras and what they saw where they are known; bodies where `arrays`, the body model, is given.
-    """
-    rr = optional("rerun", "view")
-    stream.log("world", getattr(rr.ViewCoordinates, _UP[take.up]), static=True)
-    if take.rig is not None:
-        log_cameras(rr, stream, take.rig)
-        log_observations(rr, stream, take)
-    log_people(rr, stream, take, arrays)
-    stream.reset_time()
+        return None, [f"no bodies are drawn ({error})"]
 
 
 def write_rrd(job: Job) -> Written:
     """`people.rrd`; without bodies where the body model is not there any more."""
-    written, take = Written(), job.take
-    stream = new_stream()
-    arrays, note = body_if_there(job)
-    written.notes += [] if note is None else [f"rrd: {note}"]
-    if take.rig is None:
-        written.notes.append("rrd: no cameras, for there is no cameras.json")
-    path = job.folder / "people.rrd"
+    stream, take, path = new_stream(), job.take, job.folder / "people.rrd"
+    arrays, notes = body_if_there(job)
+    notes += ["no cameras, for there is no cameras.json"] if take.rig is None else []
     with tempfile.TemporaryDirectory() as folder:  # rerun writes to a path only
         draft = Path(folder) / "people.rrd"
         stream.save(draft, default_blueprint=layout(take))
@@ -102,8 +80,7 @@ def write_rrd(job: Job) -> Written:
         stream.disconnect()
         with draft.open("rb") as source:
             write_atomically(path, lambda target: shutil.copyfileobj(source, target))
-    written.files.append(path)
-    return written
+    return Written([path], [f"rrd: {note}" for note in notes])
 
 
 def layout(take: Take) -> Any:
@@ -122,23 +99,18 @@ def layout(take: Take) -> Any:
     plots = [rrb.TimeSeriesView(origin="plots/sigma", name="median sigma, mm")]
     if len(cameras) > 0:
         plots.append(rrb.TimeSeriesView(origin="plots/residual", name="median residual, px"))
-    bones = [f"{person_path(who)}/bones" for who in take.persons.tolist()]
     views = [
         rrb.Spatial2DView(
             origin=camera_path(camera.name),
             name=camera.name,
-            contents=["$origin/**", *bones],
+            contents=["$origin/**", *(f"{person_path(who)}/bones" for who in take.persons.tolist())],
             visual_bounds=rrb.VisualBounds2D(x_range=[0, camera.image_size[0]], y_range=[0, camera.image_size[1]]),
         )
         for camera in cameras
     ]
-    beside = (
-        rrb.Vertical(rrb.Grid(*views), rrb.Horizontal(*plots), row_shares=[3, 1])
-        if views
-        else rrb.Vertical(*plots)
-    )
+    rows = [rrb.Grid(*views), rrb.Horizontal(*plots)] if views else plots
     return rrb.Blueprint(
-        rrb.Horizontal(world, beside, column_shares=[1, 1]),
+        rrb.Horizontal(world, rrb.Vertical(*rows, row_shares=[3, 1] if views else None), column_shares=[1, 1]),
         rrb.TimePanel(timeline="time", state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
@@ -151,10 +123,9 @@ def _eye(rrb: Any, take: Take) -> Any:
     joints = joints[np.isfinite(joints).all(axis=1)]
     low, high = np.quantile(joints, [0.02, 0.98], axis=0) if len(joints) > 0 else (np.zeros(3), np.ones(3))
     middle, reach = (low + high) / 2, max(float(np.linalg.norm(high - low)), 2.0)
-    up = np.zeros(3)
-    up["xyz".index(take.up[-1])] = -1 if take.up.startswith("-") else 1
+    up = y_up(take.up)[1]
     side = np.roll(up, 1) + 0.6 * np.roll(up, 2)
-    place = middle + reach * (1.0 * side / np.linalg.norm(side) + 0.45 * up)
+    place = middle + reach * (side / np.linalg.norm(side) + 0.45 * up)
     return rrb.EyeControls3D(position=place, look_target=middle, eye_up=up)
 
 
@@ -164,11 +135,22 @@ def switch_off(viewer: str) -> bool:
     For this and all later uses of rerun, as its manual says; True where they were on. InputError where they cannot
     be: nothing is sent unasked.
     """
+
+    def says(command: str) -> str:
+        words = [viewer, "analytics", command]
+        done = subprocess.run(words, capture_output=True, text=True, timeout=_PATIENCE_S, check=True)
+        return done.stdout
+
+    def on() -> bool:
+        """Whether they are sent; where the variable CI is set, rerun has none and prints `null`."""
+        settings = json.loads(says("config"))
+        return settings is not None and settings.get("analytics_enabled", True)
+
     try:
-        if not _on(viewer):
+        if not on():
             return False
-        _said_by(viewer, "disable")
-        if not _on(viewer):
+        says("disable")
+        if not on():
             return True
         problem = "they are still on"
     except (OSError, ValueError, AttributeError, subprocess.SubprocessError) as error:
@@ -177,16 +159,3 @@ def switch_off(viewer: str) -> bool:
         f"rerun's statistics of use cannot be switched off ({problem}); run `rerun analytics disable`, "
         "or give --statistics if they may be sent"
     )
-
-
-def _on(viewer: str) -> bool:
-    """Whether they are sent; where the variable CI is set, rerun has none and prints `null`."""
-    settings = json.loads(_said_by(viewer, "config"))
-    return settings is not None and settings.get("analytics_enabled", True)
-
-
-def _said_by(viewer: str, command: str) -> str:
-    """What `rerun analytics COMMAND` prints."""
-    words = [viewer, "analytics", command]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=_PATIENCE_S, check=True)
-    return done.stdout

@@ -22,11 +22,10 @@ from shapepose_fg.io.export.markers import sigma_m
 from shapepose_fg.io.export.skinned import rest_joints, skin
 from shapepose_fg.io.export.take import Take
 from shapepose_fg.io.footage.footage import Footage
-from shapepose_fg.io.footage.placement import Placement
-from shapepose_fg.io.footage.used import CameraFootage
+from shapepose_fg.io.footage.placement import CameraFootage, Placement
 
-PEOPLE, CAMERAS = "world/people", "world/cameras"
-"""Where people and cameras are in the recording."""
+_CAMERAS = "world/cameras"
+"""Where cameras are in the recording."""
 _REGION = float(np.sqrt(chi2.ppf(0.95, 3)))
 """Standard deviations at which an ellipsoid holds 95 % of a Gaussian."""
 _JOINT_M, _GUESSED_M, _BONE_M = 0.016, 0.010, 0.007
@@ -49,16 +48,12 @@ _QUALITY = 75
 
 def person_path(who: int) -> str:
     """Where a person is in the recording."""
-    return f"{PEOPLE}/{who}"
+    return f"world/people/{who}"
 
 
 def camera_path(name: str) -> str:
     """Where a camera is in the recording, whatever its name."""
-    return f"{CAMERAS}/{_escaped(name)}"
-
-
-def _escaped(name: str) -> str:
-    return optional("rerun", "view").escape_entity_path_part(name)
+    return f"{_CAMERAS}/{optional('rerun', 'view').escape_entity_path_part(name)}"
 
 
 def _set_time(stream: Any, take: Take, index: int) -> None:
@@ -67,30 +62,32 @@ def _set_time(stream: Any, take: Take, index: int) -> None:
     stream.set_time("time", duration=float(take.times_s[index]))
 
 
-def log_people(rr: ModuleType, stream: Any, take: Take, arrays: SmplArrays | None) -> None:
-    """All people of a take in all its frames; bodies where there is a body model."""
-    bones = bones_of(tuple(take.people.joint_names.tolist()))
+def log_take(stream: Any, take: Take, arrays: SmplArrays | None) -> None:
+    """Log everything of a take on the timelines `frame` and `time` (seconds).
+
+    Cameras and what they saw where they are known; bodies where `arrays`, the body model, is given.
+    """
+    rr = optional("rerun", "view")
+    up = f"RIGHT_HAND_{take.up[-1].upper()}_{'DOWN' if take.up[0] == '-' else 'UP'}"
+    stream.log("world", getattr(rr.ViewCoordinates, up), static=True)
+    if take.rig is not None:
+        _log_cameras(rr, stream, take.rig)
+        _log_observations(rr, stream, take, take.rig)
     mesh = None if arrays is None else thinned(arrays.template, arrays.faces)
-    for person, who in enumerate(take.persons.tolist()):
-        colour = np.array(colour_of(who))
-        if mesh is not None:
-            albedo = [*_rgb8(colour).tolist(), round(255 * 0.55)]
-            surface = rr.Mesh3D.from_fields(triangle_indices=mesh[1], albedo_factor=albedo)
-            stream.log(f"{person_path(who)}/body", surface, static=True)
-        line = rr.SeriesLines(colors=_rgb8(colour[None]), names=f"person {who}")
-        stream.log(f"plots/sigma/person_{who}", line, static=True)
-        _log_person(rr, stream, take, person, colour, bones)
+    for person in range(len(take.persons)):
+        _log_person(rr, stream, take, person)
         if arrays is not None and mesh is not None:
             _log_bodies(rr, stream, take, person, arrays, mesh)
+    stream.reset_time()
 
 
-def _log_person(
-    rr: ModuleType, stream: Any, take: Take, person: int, colour: NDArray[np.float64], bones: NDArray[np.intp]
-) -> None:
+def _log_person(rr: ModuleType, stream: Any, take: Take, person: int) -> None:
     """Joints, bones, ellipsoids and sigma of one person, frame by frame; what ends is cleared."""
     who, people, there_before = int(take.persons[person]), take.people, False
-    path, plot = person_path(who), f"plots/sigma/person_{who}"
-    sigma = 1e3 * sigma_m(people.covariance)
+    path, plot, colour = person_path(who), f"plots/sigma/person_{who}", np.array(colour_of(who))
+    line = rr.SeriesLines(colors=_rgb8(colour[None]), names=f"person {who}")
+    stream.log(plot, line, static=True)
+    bones, sigma = bones_of(tuple(people.joint_names.tolist())), 1e3 * sigma_m(people.covariance)
     for index, row in enumerate(take.rows[person].tolist()):
         if row < 0 and not there_before:
             continue
@@ -100,7 +97,7 @@ def _log_person(
             for gone in (path, plot):
                 stream.log(gone, rr.Clear(recursive=True))
             continue
-        joints = people.joints[row]
+        joints, known = people.joints[row], sigma[row][np.isfinite(sigma[row])]
         placed = np.flatnonzero(np.isfinite(joints).all(axis=1))
         seen = people.known[row][placed] == Known.SEEN
         shades = np.where(seen[:, None], colour, colour + _PALE * (1 - colour))
@@ -116,7 +113,6 @@ def _log_person(
         lines = lines[np.isfinite(lines).all(axis=(1, 2))]
         stream.log(f"{path}/bones", rr.LineStrips3D(lines, colors=_rgb8(colour[None]), radii=_BONE_M))
         stream.log(f"{path}/uncertainty", _ellipsoids(rr, joints[placed], people.covariance[row][placed], colour))
-        known = sigma[row][np.isfinite(sigma[row])]
         if len(known) > 0:
             stream.log(plot, rr.Scalars(float(np.median(known))))
 
@@ -146,16 +142,18 @@ def _log_bodies(
     mesh: tuple[NDArray[np.intp], NDArray[np.int32]],
 ) -> None:
     """The body of one person where there is one; of its skin the vertices and triangles `mesh`."""
-    (kept, faces), people, rows = mesh, take.people, take.rows[person]
-    path = f"{person_path(int(take.persons[person]))}/body"
-    parts = [getattr(people, name) for name in ("betas", "global_orient", "body_pose", "transl")]
+    (kept, faces), who = mesh, int(take.persons[person])
+    path, colour = f"{person_path(who)}/body", _rgb8(np.array(colour_of(who))).tolist()
+    surface = rr.Mesh3D.from_fields(triangle_indices=faces, albedo_factor=[*colour, round(255 * 0.55)])
+    stream.log(path, surface, static=True)
+    parts = [take.column(name, person) for name in ("betas", "global_orient", "body_pose", "transl")]
     whole = np.all([np.isfinite(part).reshape(len(part), -1).all(axis=1) for part in parts], axis=0)
-    for index in np.flatnonzero((rows >= 0) & ~whole[rows]).tolist():
+    for index in np.flatnonzero((take.rows[person] >= 0) & ~whole).tolist():
         _set_time(stream, take, index)
         stream.log(path, rr.Clear(recursive=False))
-    index = np.flatnonzero((rows >= 0) & whole[rows])
+    index = np.flatnonzero(whole)
     for chunk in (index[start : start + _CHUNK] for start in range(0, len(index), _CHUNK)):
-        betas, orient, pose, transl = (part[rows[chunk]] for part in parts)
+        betas, orient, pose, transl = (part[chunk] for part in parts)
         vectors = np.concatenate([orient[:, None], pose], axis=1).reshape(-1, 3)
         rotations = Rotation.from_rotvec(vectors).as_quat().reshape(len(chunk), -1, 4)
         pelvis = rest_joints(arrays, betas)[:, 0] + transl
@@ -166,7 +164,7 @@ def _log_bodies(
             stream.log(path, rr.Mesh3D.from_fields(vertex_positions=vertices[place], vertex_normals=normals))
 
 
-def log_cameras(rr: ModuleType, stream: Any, rig: Rig) -> None:
+def _log_cameras(rr: ModuleType, stream: Any, rig: Rig) -> None:
     """The cameras, which stand still; their pictures are those of cameras without distortion."""
     for camera in rig.cameras:
         pose = rr.Transform3D(translation=camera.centre, mat3x3=camera.wTc[:3, :3])
@@ -177,17 +175,15 @@ def log_cameras(rr: ModuleType, stream: Any, rig: Rig) -> None:
             image_plane_distance=0.4,
         )
         stream.log(camera_path(camera.name), pose, lens, static=True)
-    reasons = [
-        rr.AnnotationInfo(id=int(gate), label=gate.name.lower().replace("_", " "), color=colour)
-        for gate, colour in _GATES.items()
-    ]
-    stream.log(CAMERAS, rr.AnnotationContext(reasons), static=True)
+    words = {gate: gate.name.lower().replace("_", " ") for gate in _GATES}
+    reasons = [rr.AnnotationInfo(id=int(gate), label=words[gate], color=_GATES[gate]) for gate in _GATES]
+    stream.log(_CAMERAS, rr.AnnotationContext(reasons), static=True)
 
 
-def log_observations(rr: ModuleType, stream: Any, take: Take) -> None:
+def _log_observations(rr: ModuleType, stream: Any, take: Take, rig: Rig) -> None:
     """What each camera saw of the people: used in their colours, not used in that of the reason; and residuals."""
-    table, rig = take.people.observations, take.rig
-    if table is None or rig is None or tuple(table.view_names.tolist()) != rig.names:
+    table = take.people.observations
+    if table is None or tuple(table.view_names.tolist()) != rig.names:
         return
     row_frame = np.searchsorted(take.frames, take.people.frame)
     colours = _rgb8(np.array([colour_of(who) for who in take.people.person.tolist()]))
@@ -196,8 +192,7 @@ def log_observations(rr: ModuleType, stream: Any, take: Take) -> None:
     for index in range(len(take.frames)):
         _set_time(stream, take, index)
         rows = np.flatnonzero(row_frame == index)
-        for view, name in enumerate(rig.names):
-            path = f"{camera_path(name)}/seen"
+        for view, path in enumerate(map(camera_path, rig.names)):
             row, joint = np.nonzero(used[rows, :, view])
             points = rr.Points2D(
                 table.xy[rows[row], joint, view],
@@ -206,13 +201,14 @@ def log_observations(rr: ModuleType, stream: Any, take: Take) -> None:
                 labels=take.people.joint_names[joint].tolist(),
                 show_labels=False,
             )
-            stream.log(f"{path}/used", points)
+            stream.log(f"{path}/seen/used", points)
             row, joint = np.nonzero(seen[rows, :, view] & ~used[rows, :, view])
             xy, gate = table.xy[rows[row], joint, view], table.gate[rows[row], joint, view]
-            stream.log(f"{path}/not_used", rr.Points2D(xy, class_ids=gate, radii=_UNUSED_DOT))
+            stream.log(f"{path}/seen/not_used", rr.Points2D(xy, class_ids=gate, radii=_UNUSED_DOT))
             errors = residual[rows, :, view]
             if np.isfinite(errors).any():
-                stream.log(f"plots/residual/{_escaped(name)}", rr.Scalars(float(np.nanmedian(errors))))
+                plot = path.replace(_CAMERAS, "plots/residual", 1)
+                stream.log(plot, rr.Scalars(float(np.nanmedian(errors))))
 
 
 def log_pictures(

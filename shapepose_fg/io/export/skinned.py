@@ -1,8 +1,9 @@
 """The bodies of a take as bones and a skin, in NumPy: what BVH, glTF, AMASS and marker files are made of."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,8 @@ from shapepose_fg.io.export.job import Job, Written
 from shapepose_fg.io.export.take import Take
 
 BONES = len(SMPL_PARENTS)
+_VISIBLE_M = 1e-3
+"""Smaller differences between shapes are not told of."""
 
 
 @dataclass(frozen=True)
@@ -65,91 +68,84 @@ class Motion:
     """(F, 24, 4) each bone against its parent, the pelvis against the world; quaternions x y z w."""
     pelvis: NDArray[np.float64]
     """(F, 3) the pelvis in the world, metres."""
-    spread_m: float
+    spread_m: float = 0.0
     """How far a joint lies at most from where it is with the frame's own shape; 0 where all have one shape."""
+    filled: NDArray[np.bool_] | None = None
+    """(F,) frames that lie in a hole, between those before and after it; None where no hole was filled."""
 
     def joints(self) -> NDArray[np.float64]:
         """(F, 24, 3) the joints in the world, metres."""
         return pose_joints(self.rest.offsets[None], self.rotations, self.pelvis)
 
+    def segments(self, longest_hole: int) -> Iterator["Motion"]:
+        """The motion in parts without holes; a hole of up to `longest_hole` frames is interpolated.
+
+        Rotations turn at a constant rate from the one before the hole to the one after it, the pelvis moves on a
+        line.
+        """
+        cuts = np.flatnonzero(np.diff(self.index) > longest_hole + 1) + 1
+        for part in np.split(np.arange(len(self.index)), cuts):
+            given, rotations, pelvis = self.index[part], self.rotations[part], self.pelvis[part]
+            index = np.arange(given[0], given[-1] + 1)
+            if len(index) > len(given):
+                turns = [Slerp(given, Rotation.from_quat(bone)) for bone in rotations.swapaxes(0, 1)]
+                rotations = np.stack([turn(index).as_quat() for turn in turns], axis=1)
+                pelvis = np.stack([np.interp(index, given, axis) for axis in pelvis.T], axis=1)
+            yield Motion(self.rest, index, rotations, pelvis, filled=~np.isin(index, given))
+
 
 def motion_of(take: Take, person: int, arrays: SmplArrays, axes: NDArray[np.float64]) -> Motion | None:
     """The body of one person in the world turned by `axes` (3, 3); None for somebody without a body."""
-    betas = take.column("betas", person)
-    orient, pose = take.column("global_orient", person), take.column("body_pose", person)
-    transl = take.column("transl", person)
-    whole = np.concatenate([betas, orient, pose.reshape(len(pose), -1), transl], axis=1)
-    index = np.flatnonzero(np.isfinite(whole).all(axis=1))
+    parts = [take.column(name, person) for name in ("betas", "global_orient", "body_pose", "transl")]
+    index = np.flatnonzero(
+        np.all([np.isfinite(part).reshape(len(part), -1).all(axis=1) for part in parts], axis=0)
+    )
     if len(index) == 0:
         return None
-    betas = betas[index]
-    vectors = np.concatenate([orient[index, None], pose[index]], axis=1)
+    betas, orient, pose, transl = (part[index] for part in parts)
     own = rest_joints(arrays, betas)
-    rotations = Rotation.from_rotvec(vectors.reshape(-1, 3))
-    quaternions = rotations.as_quat().reshape(-1, BONES, 4)
+    vectors = np.concatenate([orient[:, None], pose], axis=1)
+    quaternions = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_quat().reshape(-1, BONES, 4)
     quaternions[:, 0] = (Rotation.from_matrix(axes) * Rotation.from_quat(quaternions[:, 0])).as_quat()
-    pelvis = (own[:, 0] + transl[index]) @ axes.T
-    rest = RestBody(arrays, betas.mean(axis=0))
-    motion = Motion(rest, index, quaternions, pelvis, 0.0)
+    pelvis = (own[:, 0] + transl) @ axes.T
+    motion = Motion(RestBody(arrays, betas.mean(axis=0)), index, quaternions, pelvis)
     if (betas == betas[0]).all():
         return motion
     apart = np.linalg.norm(pose_joints(_offsets(own), quaternions, pelvis) - motion.joints(), axis=-1)
-    return Motion(rest, index, quaternions, pelvis, float(apart.max()))
+    return replace(motion, spread_m=float(apart.max()))
 
 
 def everybody(
     job: Job, take: Take, kind: str, axes: NDArray[np.float64], written: Written
 ) -> Iterator[tuple[int, Motion]]:
-    """Who has a body, and how it moves in the world turned by `axes` (3, 3); who has none is noted in
-    `written`.
+    """Who has a body, and how it moves in the world turned by `axes` (3, 3).
+
+    Who has none, or several shapes, is noted in `written`.
     """
     for person, who in enumerate(take.persons.tolist()):
         motion = motion_of(take, person, job.arrays, axes)
         if motion is None:
             written.notes.append(f"{kind}: person {who} has no body in any frame")
-        else:
-            written.note_shape(kind, who, motion.spread_m)
-            yield who, motion
-
-
-@dataclass(frozen=True)
-class Segment:
-    """Frames of a motion without a hole."""
-
-    index: NDArray[np.intp]
-    """(F,) frames of the take, one after the other."""
-    rotations: NDArray[np.float64]
-    """(F, 24, 4) as in `Motion`."""
-    pelvis: NDArray[np.float64]
-    """(F, 3) as in `Motion`."""
-    filled: NDArray[np.bool_]
-    """(F,) frames that lie in a hole, between those before and after it."""
-
-
-def segments(motion: Motion, longest_hole: int) -> Iterator[Segment]:
-    """The motion in parts without holes; a hole of up to `longest_hole` frames is interpolated.
-
-    Rotations turn at a constant rate from the one before the hole to the one after it, the pelvis moves on a line.
-    """
-    cuts = np.flatnonzero(np.diff(motion.index) > longest_hole + 1) + 1
-    for part in np.split(np.arange(len(motion.index)), cuts):
-        given, rotations, pelvis = motion.index[part], motion.rotations[part], motion.pelvis[part]
-        index = np.arange(given[0], given[-1] + 1)
-        if len(index) > len(given):
-            turns = [Slerp(given, Rotation.from_quat(bone)) for bone in rotations.swapaxes(0, 1)]
-            rotations = np.stack([turn(index).as_quat() for turn in turns], axis=1)
-            pelvis = np.stack([np.interp(index, given, axis) for axis in pelvis.T], axis=1)
-        yield Segment(index, rotations, pelvis, ~np.isin(index, given))
+            continue
+        if motion.spread_m > _VISIBLE_M:
+            written.notes.append(
+                f"{kind}: person {who} has several shapes, and the mean of them in the file: joints are up to"
+                f" {1e3 * motion.spread_m:.0f} mm from where they were"
+            )
+        yield who, motion
 
 
 def all_segments(
     job: Job, kind: str, axes: NDArray[np.float64], written: Written
-) -> Iterator[tuple[int, RestBody, Segment, Take]]:
-    """Everybody's motion at one rate in parts without long holes, with the take that these are frames of."""
+) -> Iterator[tuple[Path, Motion, Take]]:
+    """Everybody's motion at one rate in parts without long holes, with the take that these are frames of; and the
+    name of each one's file, without ending.
+    """
     take = written.at_one_rate(job.take)
     for who, motion in everybody(job, take, kind, axes, written):
-        for segment in segments(motion, int(job.fill_gaps_s * take.fps + 1e-6)):
-            yield who, motion.rest, segment, take
+        for segment in motion.segments(int(job.fill_gaps_s * take.fps + 1e-6)):
+            first, last = take.frames[segment.index[[0, -1]]].tolist()
+            yield job.folder / f"person_{who}_frames_{first}-{last}", segment, take
 
 
 def rest_joints(arrays: SmplArrays, betas: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -39,37 +39,35 @@ def write_csv(job: Job) -> Written:
 
 def csv_text(take: Take) -> str:
     """All joints that are placed: a joint that is not known has no line. What else is not known is empty."""
+
+    def words(values: NDArray[np.float64], digits: str = "%.6f") -> list[str]:
+        return np.where(np.isfinite(values), np.char.mod(digits, values), "").tolist()
+
     people = take.people
     row, joint = np.nonzero(np.isfinite(people.joints).all(axis=2))
     order = np.lexsort((joint, people.person[row], people.frame[row]))
     row, joint = row[order], joint[order]
-    times = take.times_s[np.searchsorted(take.frames, people.frame)]
     covariance = people.covariance[row, joint]
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     with np.errstate(invalid="ignore"):
         axes = np.sqrt(np.where(variance >= 0, variance, np.nan))
     columns = [
         people.frame[row].tolist(),
-        _words(times[row]),
+        words(take.times_s[np.searchsorted(take.frames, people.frame[row])]),
         people.person[row].tolist(),
         people.joint_names[joint].tolist(),
-        *map(_words, people.joints[row, joint].T),
-        _words(sigma_m(covariance)),
-        *map(_words, axes.T),
-        *map(_words, people.velocity[row, joint].T),
+        *map(words, people.joints[row, joint].T),
+        words(sigma_m(covariance)),
+        *map(words, axes.T),
+        *map(words, people.velocity[row, joint].T),
         code_names(Known)[people.known[row, joint]].tolist(),
-        _words(people.confidence[row, joint], "%.4f"),
+        words(people.confidence[row, joint], "%.4f"),
     ]
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(COLUMNS)
     writer.writerows(zip(*columns, strict=True))
     return stream.getvalue()
-
-
-def _words(values: np.ndarray, digits: str = "%.6f") -> list[str]:
-    """Numbers as text; empty where they are not known."""
-    return np.where(np.isfinite(values), np.char.mod(digits, values), "").tolist()
 
 
 def write_parquet(opened: OpenedReconstruction, rows: NDArray[np.intp] | None, folder: Path) -> Written:
@@ -82,25 +80,35 @@ def write_parquet(opened: OpenedReconstruction, rows: NDArray[np.intp] | None, f
     """
     arrow, parquet = optional("pyarrow", "archive"), optional("pyarrow.parquet", "archive")
     rows = np.arange(len(opened)) if rows is None else rows
-    path = folder / "people.parquet"
+
+    def kind(values: NDArray[Any]) -> Any:
+        own = arrow.string() if values.dtype.kind == "U" else arrow.from_numpy_dtype(values.dtype)
+        return own if values.ndim == 1 else arrow.list_(own, int(np.prod(values.shape[1:])))
+
     # Without a row there are columns too.
     first, about = _columns(opened, rows[:1])
     fields = [
-        arrow.field(name, _type(arrow, values), metadata={"shape": json.dumps(values.shape[1:])})
+        arrow.field(name, kind(values), metadata={"shape": json.dumps(values.shape[1:])})
         for name, values in first.items()
     ]
     schema = arrow.schema(fields, metadata={name: json.dumps(value) for name, value in about.items()})
+
+    def array(values: NDArray[Any], kind: Any) -> Any:
+        if values.ndim == 1:
+            return arrow.array(values, type=kind)
+        return arrow.FixedSizeListArray.from_arrays(arrow.array(values.ravel()), type=kind)
 
     def write(stream: Any) -> None:
         with parquet.ParquetWriter(stream, schema, compression="zstd") as writer:
             for start in range(0, len(rows), _GROUP_ROWS):
                 columns, _ = _columns(opened, rows[start : start + _GROUP_ROWS])
-                pairs = zip(columns.values(), schema, strict=True)
-                arrays = [_array(arrow, values, field.type) for values, field in pairs]
+                arrays = [
+                    array(values, field.type) for values, field in zip(columns.values(), schema, strict=True)
+                ]
                 writer.write_table(arrow.Table.from_arrays(arrays, schema=schema))
 
-    write_atomically(path, write)
-    return Written([path])
+    write_atomically(folder / "people.parquet", write)
+    return Written([folder / "people.parquet"])
 
 
 def _columns(
@@ -117,16 +125,3 @@ def _columns(
         about |= {"view_names": table.view_names.tolist()}
         about |= {name: words.tolist() for name, words in table.meanings().items()}
     return columns, about | {"run": opened.run}
-
-
-def _type(arrow: Any, values: NDArray[Any]) -> Any:
-    """The type of a column."""
-    own = arrow.string() if values.dtype.kind == "U" else arrow.from_numpy_dtype(values.dtype)
-    return own if values.ndim == 1 else arrow.list_(own, int(np.prod(values.shape[1:])))
-
-
-def _array(arrow: Any, values: NDArray[Any], kind: Any) -> Any:
-    """A column of some rows."""
-    if values.ndim == 1:
-        return arrow.array(values, type=kind)
-    return arrow.FixedSizeListArray.from_arrays(arrow.array(values.ravel()), type=kind)

@@ -30,6 +30,8 @@ _LONGEST = 1_000_000
 """Frames of a file with one rate: nine hours at 30 a second. Beyond, times are in another unit or have a hole."""
 _BODY_BYTES = 2_000
 """What one person's body takes in a frame while it is written, about."""
+_OF_JOINTS, _OF_BODIES = "joints covariance velocity velocity_covariance", "betas global_orient body_pose transl"
+"""Columns of a result that are NaN where no view saw a joint, or a person."""
 _SHORTEST_S, _LONGEST_S = 1e-6, 1e5
 """From frame to frame: outside of this times are in another unit."""
 
@@ -80,16 +82,18 @@ class Take:
                 "or export csv or rrd"
             )
         people = _seen(people) if seen_only else people
-        frames = _frames(people)
+        # All frames that were reconstructed, those without people too.
+        spans = [np.arange(span.start, span.stop) for span in covered_frames(people.run) or []]
+        frames = np.unique(np.concatenate([people.frame, *spans])).astype(np.int64)
         persons, person = np.unique(people.person, return_inverse=True)
         _check_memory(len(persons), len(frames))
         rows = np.full((len(persons), len(frames)), -1, dtype=np.intp)
         place = np.searchsorted(frames, people.frame)
         rows[person, place] = np.arange(len(people))
-        if (rows >= 0).sum() < len(people):
-            lost = next(row for row in range(len(people)) if rows[person[row], place[row]] != row)
+        lost = np.flatnonzero(rows[person, place] != np.arange(len(people)))
+        if len(lost) > 0:
             raise ValueError(
-                f"person {people.person[lost]} has two rows of frame {people.frame[lost]}; "
+                f"person {people.person[lost[0]]} has two rows of frame {people.frame[lost[0]]}; "
                 "correct that with `shapepose-fg tracks`"
             )
         times = _times(people, frames, fps)
@@ -126,9 +130,9 @@ class Take:
         _check_memory(len(self.persons), count)
         rows = np.full((len(self.persons), count), -1, dtype=np.intp)
         rows[:, place[kept]] = self.rows[:, kept]
-        numbers = np.arange(count)
-        times = self.times_s[0] + numbers / self.fps
-        return replace(self, rows=rows, frames=self.frames[0] + numbers, times_s=times), len(place) - len(kept)
+        numbers, start = np.arange(count), self.times_s[0]
+        even = replace(self, rows=rows, frames=self.frames[0] + numbers, times_s=start + numbers / self.fps)
+        return even, len(place) - len(kept)
 
 
 def _check_memory(persons: int, frames: int) -> None:
@@ -147,20 +151,11 @@ def _seen(people: Reconstruction) -> Reconstruction:
         raise ValueError("people.npz does not say how joints are known; leave out --seen-only")
     seen = Known.observed(people.known)
     columns: dict[str, Any] = {"known": np.where(seen, people.known, Known.UNKNOWN).astype(np.uint8)}
-    for name in ("joints", "covariance", "velocity", "velocity_covariance"):
-        value = getattr(people, name)
-        columns[name] = np.where(seen.reshape(*seen.shape, *[1] * (value.ndim - 2)), value, np.nan)
-    for name in ("betas", "global_orient", "body_pose", "transl"):
-        value = getattr(people, name)
-        columns[name] = np.where(seen.any(axis=1).reshape(-1, *[1] * (value.ndim - 1)), value, np.nan)
+    for names, kept in ((_OF_JOINTS, seen), (_OF_BODIES, seen.any(axis=1))):
+        for name in names.split():
+            value = getattr(people, name)
+            columns[name] = np.where(kept.reshape(*kept.shape, *[1] * (value.ndim - kept.ndim)), value, np.nan)
     return replace(people, **columns)
-
-
-def _frames(people: Reconstruction) -> NDArray[np.int64]:
-    """All frames that were reconstructed, those without people too."""
-    spans = covered_frames(people.run) or []
-    given = np.concatenate([people.frame, *(np.arange(span.start, span.stop) for span in spans)])
-    return np.unique(given).astype(np.int64)
 
 
 def _times(people: Reconstruction, frames: NDArray[np.int64], fps: float | None) -> NDArray[np.float64]:
@@ -176,8 +171,7 @@ def _times(people: Reconstruction, frames: NDArray[np.int64], fps: float | None)
         raise ValueError("time_s does not rise from frame to frame; give --fps")
     rate = (known[-1] - known[0]) / (times[-1] - times[0]) if len(known) > 1 else _fps_of(people)
     between = np.interp(frames, known, times)
-    before, after = np.minimum(frames - known[0], 0), np.maximum(frames - known[-1], 0)
-    return between + (before + after) / rate
+    return between + (np.minimum(frames - known[0], 0) + np.maximum(frames - known[-1], 0)) / rate
 
 
 def _fps_of(people: Reconstruction) -> float:

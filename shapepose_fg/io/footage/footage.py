@@ -4,15 +4,15 @@ import os
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.io.camera_names import in_order
 from shapepose_fg.io.footage.places import PICTURES
 
 Picture = NDArray[np.uint8]
@@ -31,32 +31,7 @@ _LARGEST = 16384
 _LAST_NUMBER = re.compile(r"\d+(?=\D*$)")
 
 
-class Footage(Protocol):
-    """What one camera took: frames with numbers, of which some may have no picture."""
-
-    path: Path
-    """The video or the folder."""
-    size: tuple[int, int]
-    """(width, height) of the pictures."""
-    notes: tuple[str, ...]
-    """What is wrong with the files, a sentence each."""
-
-    @property
-    def number(self) -> NDArray[np.intp]:
-        """(N,) number of each frame, rising."""
-        ...
-
-    @property
-    def time_s(self) -> NDArray[np.float64] | None:
-        """(N,) when each frame was taken, seconds after the first; None where the files do not say."""
-        ...
-
-    def at(self, place: int) -> Picture | None:
-        """The picture of frame `place` of the N; None where it cannot be read. Fastest in rising order."""
-        ...
-
-
-def open_footage(path: Path, progress: Progress | None = None) -> Footage:
+def open_footage(path: Path, progress: Progress | None = None) -> "Footage":
     """The footage at `path`: a video (looked through once, for its frames and times), a folder, or a picture.
 
     InputError where nothing in it can be read.
@@ -72,10 +47,15 @@ def glance(path: Path) -> tuple[tuple[int, int], float]:
     The rate is 0 where it does not say.
     """
     capture = _capture(path)
-    size = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
-    fps = float(capture.get(cv2.CAP_PROP_FPS))
+    size, fps = _told(capture)
     capture.release()
     return size, fps if 0 < fps < 1e5 else 0.0
+
+
+def _told(capture: Any) -> tuple[tuple[int, int], float]:
+    """Size and rate that a video tells of itself."""
+    size = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+    return size, float(capture.get(cv2.CAP_PROP_FPS))
 
 
 @dataclass
@@ -84,9 +64,11 @@ class Video:
 
     path: Path
     size: tuple[int, int]
+    """(width, height) of the pictures."""
     time_s: NDArray[np.float64]
     """(N,) the frames' own times in the file, seconds after the first."""
     notes: tuple[str, ...] = ()
+    """What is wrong with the file, a sentence each."""
     _capture: Any = field(default=None, repr=False)
     _next: int = 0
     _last: Picture | None = None
@@ -100,13 +82,12 @@ class Video:
     def open(cls, path: Path, progress: Progress | None = None) -> "Video":
         """Look through the video at `path`: every frame is decoded once, which shows what is cut or damaged."""
         capture = _capture(path)
-        size = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        size, fps = _told(capture)
         if not (min(size) > 0 and max(size) <= _LARGEST):
             raise InputError(
                 f"{path}: the video's pictures would be {size[0]} x {size[1]}; give an undamaged video"
             )
         announced = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
-        fps = float(capture.get(cv2.CAP_PROP_FPS))
         stamps = []
         while capture.grab():
             stamps.append(float(capture.get(cv2.CAP_PROP_POS_MSEC)) / 1e3)
@@ -147,49 +128,45 @@ class PictureFiles:
 
     path: Path
     size: tuple[int, int]
+    """(width, height) of the pictures."""
     files: tuple[Path, ...]
     """(N,) the files in the order of their numbers."""
     number: NDArray[np.intp]
+    """(N,) number of each frame, rising."""
     notes: tuple[str, ...] = ()
+    """What is wrong with the files, a sentence each."""
     time_s: NDArray[np.float64] | None = None
+    """Files do not say when they were taken."""
 
     @classmethod
     def open(cls, path: Path) -> "PictureFiles":
         """The pictures at `path`; the last number in a file's name is its frame's."""
-        if path.is_file():
-            return cls(path, _size(path), (path,), np.zeros(1, dtype=np.intp))
-        files = [each for each in path.iterdir() if each.suffix.lower() in PICTURES and each.name[0] != "."]
+        files = [path]
+        if path.is_dir():
+            files = [each for each in path.iterdir() if each.suffix.lower() in PICTURES and each.name[0] != "."]
         if len(files) == 0:
             raise InputError(f"{path}: no pictures in this folder; known are {' '.join(sorted(PICTURES))}")
         found = [_LAST_NUMBER.search(each.stem) for each in files]
-        if len(files) == 1 and found[0] is None:
+        if path.is_file() or (len(files) == 1 and found[0] is None):
             return cls(path, _size(files[0]), tuple(files), np.zeros(1, dtype=np.intp))
-        numbered = list[tuple[int, Path]]()
-        for each, match in zip(files, found, strict=True):
-            if match is None:
-                raise InputError(f"{each}: no number in its name says which frame this is; number the pictures")
-            numbered.append((int(match[0]), each))
-        numbered.sort()
-        first, last = numbered[0][0], numbered[-1][0]
-        if last > np.iinfo(np.int64).max // 2:
-            raise InputError(f"{path}: a number with {len(str(last))} digits is no frame's; number the frames")
-        for (one, file), (two, other) in pairwise(numbered):
-            if one == two:
-                raise InputError(f"{path}: {file.name} and {other.name} are both frame {one}; leave one of them")
-        count = last - first + 1
+        if None in found:
+            unnumbered = files[found.index(None)]
+            raise InputError(f"{unnumbered}: no number in its name says which frame this is; number the pictures")
+        pairs = zip(found, files, strict=True)
+        numbers, paths = zip(*in_order([(int(match[0]), file) for match, file in pairs if match]), strict=True)
+        count = numbers[-1] - numbers[0] + 1
         notes = (f"{path}: {count - len(files)} of {count} pictures are missing",) if count > len(files) else ()
-        number, paths = (
-            np.array([each for each, _ in numbered], dtype=np.intp),
-            tuple(each for _, each in numbered),
-        )
-        return cls(path, _size(paths[0]), paths, number, notes)
+        return cls(path, _size(paths[0]), paths, np.array(numbers, dtype=np.intp), notes)
 
     def at(self, place: int) -> Picture | None:
         """The picture of frame `place`; None where the file cannot be read, or is of another size."""
         picture = cv2.imread(str(self.files[place]), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-        if picture is None or picture.shape[1::-1] != self.size:
-            return None
-        return np.asarray(picture, dtype=np.uint8)
+        fits = picture is not None and picture.shape[1::-1] == self.size
+        return np.asarray(picture, dtype=np.uint8) if fits else None
+
+
+Footage = Video | PictureFiles
+"""What one camera took: N frames with numbers, of which some may have no picture."""
 
 
 def _capture(path: Path) -> Any:

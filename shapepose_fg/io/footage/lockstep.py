@@ -1,5 +1,6 @@
 """Which pictures of several cameras belong to one moment: the nearest, at most half a frame away."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -7,6 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.io.footage.footage import Footage
+from shapepose_fg.io.footage.places import per_camera
+from shapepose_fg.io.validation import is_number
 
 _SAME_RATE = 0.01
 """Rates that differ by less than this share are the same."""
@@ -46,6 +50,59 @@ class Lockstep:
         return self.time_s is None or bool(np.ptp(self.time_s, axis=1).max(initial=0.0) <= _MISFIT_S)
 
 
+def clocks_of(
+    footage: Sequence[Footage], fps: Sequence[str], start: Sequence[str], cameras: Sequence[str]
+) -> tuple[list[CameraClock], bool]:
+    """When each camera took its frames, and whether in seconds: without any rate frames are counted.
+
+    `fps` and `start` are options, as `per_camera` reads them.
+    """
+    rates = [_rate(text) for text in per_camera("--fps", fps, cameras, one_for_all=True)]
+    starts = per_camera("--start", start, cameras)
+    timed = [rate is not None or each.time_s is not None for rate, each in zip(rates, footage, strict=True)]
+    has_clock = any(timed)
+    if has_clock and not all(timed):
+        name = cameras[timed.index(False)]
+        raise InputError(f"camera {name}: pictures do not say when they were taken; give --fps {name}=RATE")
+    # Pictures of one number belong together: all are counted from the first number that any camera has.
+    first = min((each.number[0] for each in footage if each.time_s is None), default=0)
+    clocks = []
+    for name, each, rate, text in zip(cameras, footage, rates, starts, strict=True):
+        number = each.number - (first if each.time_s is None else 0)
+        if rate is not None:
+            taken, period = number / rate, 1 / rate
+        elif each.time_s is not None:
+            taken = each.time_s
+            period = float(np.median(np.diff(taken))) if len(taken) > 1 else 1 / 30
+        else:
+            taken, period = number.astype(np.float64), 1.0
+        clocks.append(CameraClock(name, taken + _start(text, period, has_clock), period))
+    return clocks, has_clock
+
+
+def _rate(text: str | None) -> float | None:
+    """Frames a second."""
+    if text is None:
+        return None
+    if not is_number(text) or not 0.01 <= float(text) <= 1e5:
+        raise InputError(f"--fps {text}: must be a number of frames a second, such as 25")
+    return float(text)
+
+
+def _start(text: str | None, period: float, has_clock: bool) -> float:
+    """When a camera's first frame was taken, in seconds, or in frames where there is no clock."""
+    if text is None:
+        return 0.0
+    match = re.fullmatch(r"([-+]?(?:\d+\.?\d*|\.\d+))\s*([sf])", text.strip())
+    if match is None:
+        raise InputError(f"--start {text}: must be seconds such as 0.2s, or the camera's own frames such as 12f")
+    if match[2] == "s" and not has_clock:
+        raise InputError(
+            f"--start {text}: nothing says how many frames a second there are; give --fps, or frames (12f)"
+        )
+    return float(match[1]) * (1.0 if match[2] == "s" else period)
+
+
 def align(clocks: Sequence[CameraClock], has_clock: bool) -> Lockstep:
     """The moments that all cameras saw.
 
@@ -67,22 +124,24 @@ def align(clocks: Sequence[CameraClock], has_clock: bool) -> Lockstep:
             f"camera {early.name} ends at {early.time[-1]:.6g}{unit} and camera {late.name} starts at"
             f" {late.time[0]:.6g}{unit}: they have no moment in common; check --start"
         )
-    places, off = zip(*(_nearest(each, moment) for each in clocks), strict=True)
-    picture = np.column_stack(places)
-    notes = [note for v, each in enumerate(clocks) for note in _left_out(each, picture[:, v], slowest)]
-    for v, each in enumerate(clocks):
-        missing = np.flatnonzero(picture[:, v] < 0)
+    nearest = [_nearest(each, moment) for each in clocks]
+    picture = np.column_stack([place for place, _ in nearest])
+    notes = [
+        note for each, (place, _) in zip(clocks, nearest, strict=True) for note in _left_out(each, place, slowest)
+    ]
+    for each, (place, _) in zip(clocks, nearest, strict=True):
+        missing = np.flatnonzero(place < 0)
         if len(missing) > 0:
             notes.append(
                 f"camera {each.name}: no picture within half a frame of {len(missing)} of {len(moment)} moments"
                 f" (the first is frame {missing[0]}); it sees nobody there"
             )
-    for v, each in enumerate(clocks if has_clock else ()):
-        misfit = off[v][picture[:, v] >= 0]
-        if misfit.max(initial=0.0) > _MISFIT_S:
+    for each, (place, off) in zip(clocks, nearest, strict=True):
+        misfit = 1e3 * off[place >= 0]
+        if has_clock and misfit.max(initial=0.0) > 1e3 * _MISFIT_S:
             notes.append(
-                f"camera {each.name}: pictures are up to {1e3 * misfit.max():.1f} ms from the moment they stand"
-                f" for ({1e3 * misfit.mean():.1f} ms in the mean)"
+                f"camera {each.name}: pictures are up to {misfit.max():.1f} ms from the moment they stand"
+                f" for ({misfit.mean():.1f} ms in the mean)"
             )
     time_s = None
     if has_clock:

@@ -1,12 +1,26 @@
-"""Where the calibrated picture lies in the pictures of the footage, if these have another size."""
+"""Where the calibrated picture lies in the pictures of the footage, if these have another size; and which pictures
+detections were made from: footage.json beside them, for who draws on the pictures.
+"""
 
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
 
+from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import read_json, write_content
+from shapepose_fg.io.footage.places import per_camera
+from shapepose_fg.io.validation import validated
+
+FOOTAGE = "footage.json"
+"""The file beside the detections."""
 
 _BLOCK = 16
 """Video coders work in blocks of this many pixels: a few columns or rows come and go with them."""
@@ -55,8 +69,7 @@ class Placement:
             scale = np.full(2, (picture / calibrated).min())
         centred = kind in (PlacementKind.LETTERBOX, PlacementKind.CROP_CENTRE)
         shift = (picture - scale * calibrated) / 2 if centred else np.zeros(2)
-        (scale_x, scale_y), (shift_x, shift_y) = scale.tolist(), shift.tolist()
-        return cls(kind, (scale_x, scale_y), (shift_x, shift_y), picture_size, calibrated_size)
+        return cls(kind, tuple(scale.tolist()), tuple(shift.tolist()), picture_size, calibrated_size)
 
     @property
     def region(self) -> tuple[float, float, float, float]:
@@ -75,6 +88,25 @@ class Placement:
         return (xy + 0.5 - self.shift) / self.scale - 0.5
 
 
+def placements_of(
+    given: Sequence[str], sizes: Mapping[str, tuple[int, int]], rig: Rig
+) -> tuple[dict[str, Placement], list[str]]:
+    """Where calibrated pixels lie in the pictures of cameras, `sizes` (width, height), and what was concluded.
+
+    `given` are kinds of placement, for all cameras or CAMERA=KIND.
+    """
+    words = per_camera("--image-placement", given, rig.names, one_for_all=True)
+    placements, notes = {}, []
+    for camera, word in zip(rig.cameras, words, strict=True):
+        if word is not None and word not in set(PlacementKind):
+            raise InputError(f"--image-placement {word}: must be one of {' '.join(PlacementKind)}")
+        if camera.name in sizes:
+            wanted = None if word is None else PlacementKind(word)
+            placements[camera.name], concluded = place(camera.name, sizes[camera.name], camera.image_size, wanted)
+            notes += [] if concluded is None else [concluded]
+    return placements, notes
+
+
 def place(
     name: str, picture_size: tuple[int, int], calibrated_size: tuple[int, int], wanted: PlacementKind | None
 ) -> tuple[Placement, str | None]:
@@ -88,27 +120,89 @@ def place(
     sizes = (
         f"camera {name}: the pictures are {width} x {height}, the calibration is for {full_width} x {full_height}"
     )
-    if wanted is not None:
-        if wanted is PlacementKind.SAME and picture_size != calibrated_size:
-            raise InputError(f"{sizes}: not the same size; give another --image-placement")
-        return Placement.of(wanted, picture_size, calibrated_size), None
-    if picture_size == calibrated_size:
-        return Placement.of(PlacementKind.SAME, picture_size, calibrated_size), None
-    if max(abs(width - full_width), abs(height - full_height)) <= _BLOCK:
-        cropped = Placement.of(PlacementKind.CROP, picture_size, calibrated_size)
-        return cropped, (
-            f"{sizes}: the first column and row are taken to be the calibrated ones (--image-placement"
-            f" {name}=crop); if it was cut on both sides, give {name}=crop-centre; if it was resized, {name}=scale"
+    kind, note = wanted, None
+    if wanted is PlacementKind.SAME and picture_size != calibrated_size:
+        raise InputError(f"{sizes}: not the same size; give another --image-placement")
+    if wanted is not None or picture_size == calibrated_size:
+        kind = wanted or PlacementKind.SAME
+    elif max(abs(width - full_width), abs(height - full_height)) <= _BLOCK:
+        kind, note = (
+            PlacementKind.CROP,
+            (
+                f"{sizes}: the first column and row are taken to be the calibrated ones (--image-placement"
+                f" {name}=crop); if it was cut on both sides, give {name}=crop-centre; if resized, {name}=scale"
+            ),
         )
     # Of one shape, to within the rounding of both sides to whole pixels.
-    if abs(width / full_width - height / full_height) <= 1 / full_width + 1 / full_height:
-        scaled = Placement.of(PlacementKind.SCALE, picture_size, calibrated_size)
-        return scaled, f"{sizes}, of the same shape: taken as resized (--image-placement {name}=scale)"
-    if (height, width) == calibrated_size:
+    elif abs(width / full_width - height / full_height) <= 1 / full_width + 1 / full_height:
+        kind = PlacementKind.SCALE
+        note = f"{sizes}, of the same shape: taken as resized (--image-placement {name}=scale)"
+    elif (height, width) == calibrated_size:
         raise InputError(
             f"{sizes}: the pictures lie on their side; turn the video by 90 degrees, or calibrate it as it is"
         )
-    raise InputError(
-        f"{sizes}; say what was done to them with --image-placement: letterbox (resized, with bars), scale"
-        " (resized), crop or crop-centre (cut)"
-    )
+    else:
+        raise InputError(
+            f"{sizes}; say what was done to them with --image-placement: letterbox (resized, with bars), scale"
+            " (resized), crop or crop-centre (cut)"
+        )
+    return Placement.of(kind, picture_size, calibrated_size), note
+
+
+@dataclass(frozen=True)
+class CameraFootage:
+    """The pictures of one camera that detections were made from."""
+
+    name: str
+    """The camera."""
+    path: Path
+    """The video, picture, or folder of pictures."""
+    placement: Placement
+    """Where calibrated pixels lie in the pictures."""
+    places: NDArray[np.intp]
+    """(T,) the picture of each frame, counted from 0 in the file; -1 where there is none."""
+
+
+_Size = tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]]
+
+
+class _Camera(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+    name: str
+    path: str
+    placement: PlacementKind
+    picture_size: _Size
+    calibrated_size: _Size
+    pictures: list[int] = Field(max_length=10_000_000)
+
+
+class _File(BaseModel):
+    format: Literal["shapepose-fg footage 1"]
+    cameras: list[_Camera]
+
+
+def write_used_footage(file: Path, cameras: Sequence[CameraFootage], about: dict[str, Any]) -> None:
+    """Write `file`; `about` is kept with it."""
+    entries = [
+        {
+            "name": each.name,
+            "path": str(each.path),
+            "placement": str(each.placement.kind),
+            "picture_size": list(each.placement.picture_size),
+            "calibrated_size": list(each.placement.calibrated_size),
+            "pictures": each.places.tolist(),
+        }
+        for each in cameras
+    ]
+    content = {"format": "shapepose-fg footage 1", **about, "cameras": entries}
+    write_content(file, json.dumps(content, indent=1, allow_nan=False))
+
+
+def read_used_footage(file: Path) -> list[CameraFootage]:
+    """Read what `write_used_footage` wrote; InputError, one sentence, on anything else."""
+    found = []
+    for camera in validated(_File, read_json(file), file, "run shapepose-fg detect again").cameras:
+        placement = Placement.of(camera.placement, camera.picture_size, camera.calibrated_size)
+        places = np.array(camera.pictures, dtype=np.intp)
+        found.append(CameraFootage(camera.name, Path(camera.path), placement, places))
+    return found

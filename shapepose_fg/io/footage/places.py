@@ -25,37 +25,51 @@ class FootagePlaces:
     """What was taken to be what."""
 
 
+def per_camera(
+    option: str, given: Sequence[str], cameras: Sequence[str], *, one_for_all: bool = False
+) -> list[str | None]:
+    """(V,) what an option says of each camera: CAMERA=VALUE, or where it may be one VALUE for all.
+
+    InputError for other cameras, and for what is said twice.
+    """
+    values: dict[str, str] = {}
+    rest: str | None = None
+    for text in given:
+        cuts = [place for place, letter in enumerate(text) if letter == "="]
+        cut = next((place for place in cuts if text[:place] in cameras), cuts[0] if cuts else None)
+        if cut is None and one_for_all and rest is None:
+            rest = text
+            continue
+        if cut is None:
+            raise InputError(f"{option} {text}: must be CAMERA=VALUE, such as {option} {cameras[0]}=VALUE")
+        name = text[:cut]
+        if name not in cameras:
+            there = " ".join(cameras)
+            raise InputError(f"{option} {text}: the calibration has no camera {name!r}; it has {there}")
+        if name in values:
+            raise InputError(f"{option} {text}: camera {name} is given twice; give it once")
+        values[name] = text[cut + 1 :]
+    return [values.get(name, rest) for name in cameras]
+
+
 def find_footage(given: Sequence[str], cameras: Sequence[str]) -> FootagePlaces:
     """Find every camera's footage.
 
     `given` is one folder that holds something named after each camera, or CAMERA=PATH for each of them.
     InputError naming the camera that is missing, or what could be meant twice.
     """
-    named: dict[str, Path] = {}
-    for text in given:
-        name, separator, path = text.partition("=")
-        name = name.strip()
-        if not separator or Path(text).exists():
-            if len(given) == 1:
-                return _in_folder(Path(text), cameras)
-            raise InputError(f"--videos {text}: give one folder, or CAMERA=PATH for each camera, not both")
-        if name not in cameras:
+    if len(given) == 1 and ("=" not in given[0] or Path(given[0]).exists()):
+        return _in_folder(Path(given[0]), cameras)
+    named = dict(zip(cameras, per_camera("--videos", given, cameras), strict=True))
+    for name, path in named.items():
+        if path is None:
             raise InputError(
-                f"--videos {text}: the calibration has no camera {name!r}; it has {' '.join(cameras)}"
+                f"--videos: nothing is given for camera {name}; add --videos {name}=PATH, or take the camera out"
+                " of the calibration"
             )
-        if name in named:
-            raise InputError(f"--videos {text}: camera {name} is given twice; give each its own")
-        named[name] = Path(path)
-    missing = [name for name in cameras if name not in named]
-    if len(missing) > 0:
-        raise InputError(
-            f"--videos: nothing is given for camera {missing[0]}; add --videos {missing[0]}=PATH, or take the"
-            " camera out of the calibration"
-        )
-    for path in named.values():
-        if not path.exists():
+        if not Path(path).exists():
             raise InputError(f"{path}: there is no such file or folder; check the path")
-    return FootagePlaces(tuple(named[name] for name in cameras))
+    return FootagePlaces(tuple(Path(path or "") for path in named.values()))
 
 
 def _in_folder(folder: Path, cameras: Sequence[str]) -> FootagePlaces:

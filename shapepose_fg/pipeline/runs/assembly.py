@@ -10,14 +10,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.body.model.soles import lowest_of_feet
 from shapepose_fg.core.observation_table import ObservationTable
-from shapepose_fg.core.reconstruction import Reconstruction, count_rows
+from shapepose_fg.core.reconstruction import Known, Reconstruction, Status, count_rows
 from shapepose_fg.core.result_files import write_result
 from shapepose_fg.core.shapes import SubjectShapes
 from shapepose_fg.core.storage.npz import Pieces
 from shapepose_fg.core.storage.schema import Table
-from shapepose_fg.pipeline.bodies_over_time import BodiesOverTime, Person
-from shapepose_fg.pipeline.runs.parts import OBSERVED, Parts, RowsOfPeople
+from shapepose_fg.estimation.contact import feet_of
+from shapepose_fg.estimation.floor import LOOK_S, Floor, find_floor
+from shapepose_fg.pipeline.bodies_over_time import BODY, BodiesOverTime, Person
+from shapepose_fg.pipeline.runs.parts import OBSERVED, Parts
+
+_FLOOR_ROWS = 4000
+"""About so many rows, of every so many frames, a floor is found from."""
+_STANDS_M_S = 0.1
+"""A foot stands where its heel or a toe is seen and slower, and the speed is known to within this per axis."""
 
 
 @dataclass(frozen=True)
@@ -52,16 +61,36 @@ class Assembly:
         return [np.array([self.names.get(each, each) for each in track], dtype=np.int64) for track in tracks]
 
     @cached_property
-    def people(self) -> RowsOfPeople:
-        """Everybody's rows."""
-        return RowsOfPeople(self.parts, self.persons)
+    def rows_of(self) -> dict[int, int]:
+        """How many rows everybody has, by number."""
+        return {number: sum(places.values()) for number, places in sorted(self._places.items())}
+
+    @cached_property
+    def _places(self) -> dict[int, dict[int, int]]:
+        """In which parts everybody is, and in how many rows of each."""
+        places: dict[int, dict[int, int]] = {}
+        for n, person in enumerate(self.persons):
+            for number, count in Counter(person.tolist()).items():
+                places.setdefault(number, {})[n] = count
+        return places
+
+    def own_pieces(
+        self, number: int, columns: Sequence[str], rows: range | None = None
+    ) -> Iterator[tuple[NDArray[Any], ...]]:
+        """`columns` of somebody's rows, part by part; `rows` counts among somebody's own, None for all."""
+        wanted = range(self.rows_of[number]) if rows is None else rows
+        before = 0
+        for n, count in self._places[number].items():
+            first, last = max(wanted.start - before, 0), min(wanted.stop - before, count)
+            before += count
+            if first < last:
+                mine = np.flatnonzero(self.persons[n] == number)[first:last]
+                yield tuple(self.parts.column(n, name)[mine] for name in columns)
 
     def person(self, number: int, rows: Sequence[range]) -> Person:
         """What somebody's bodies are fitted to, in some of somebody's own rows, one range after the other."""
         columns = ("joints", "covariance", "time_s")
-        pieces = [
-            piece for part in rows for piece in self.people.pieces(number, columns, slice(part.start, part.stop))
-        ]
+        pieces = [piece for part in rows for piece in self.own_pieces(number, columns, part)]
         return Person.of(number, *(np.concatenate(column) for column in zip(*pieces, strict=True)))
 
     def pieces(self, name: str) -> Iterator[NDArray[Any]]:
@@ -92,11 +121,9 @@ class Assembly:
         """
         chosen = [np.flatnonzero(frame % every == 0) for frame in self.pieces("frame")]
         empty = Reconstruction.empty(self.joint_names)
-        unseen = ObservationTable.empty(self.joint_names, self.view_names) if len(self) > 0 else None
         columns = {name: each for name, each in self.columns().items() if name in empty.ROWS}
-        if unseen is not None:
-            table = self._columns(unseen, OBSERVED)
-            columns |= {OBSERVED + name: table[name] for name in unseen.ROWS}
+        seen = self.observation_columns() or {}
+        columns |= {OBSERVED + name: each for name, each in seen.items() if name in ObservationTable.ROWS}
         count = sum(map(len, chosen))
         rows = {name: np.empty((count, *each.shape[1:]), each.dtype) for name, each in columns.items()}
         before: Counter[int] = Counter()
@@ -108,14 +135,14 @@ class Assembly:
             before.update(person.tolist())
             if consume:
                 self.parts.drop(n)
-        if unseen is not None:
-            unseen = replace(unseen, **{name: rows.pop(OBSERVED + name) for name in unseen.ROWS})
-        return replace(empty, **rows, run=self.run, observations=unseen, shapes=self.shapes)
+        table = None
+        if len(self) > 0:
+            table = ObservationTable.empty(self.joint_names, self.view_names)
+            table = replace(table, **{name: rows.pop(OBSERVED + name) for name in table.ROWS})
+        return replace(empty, **rows, run=self.run, observations=table, shapes=self.shapes)
 
     def save(self, folder: Path) -> None:
-        """Write people.npz, observations.npz and run.json as `Reconstruction.save` does; it is never all in
-        memory.
-        """
+        """Write what `Reconstruction.save` writes; it is never all in memory."""
         write_result(folder, self.columns(), self.observation_columns(), self.run)
 
     def with_run(self, **entries: Any) -> "Assembly":
@@ -137,3 +164,30 @@ class Assembly:
             else each
             for name, each in empty.columns().items()
         }
+
+    def floor(self, model: BodyModel, up: NDArray[np.float64]) -> Floor | str:
+        """Where the soles of everybody's bodies stand, or in words why no floor was found; `up` (3,) points up."""
+        joints, parts = tuple(self.joint_names), self.parts
+        # Ankles alone do not say where the sole is: unseen feet hang as the body's prior has them.
+        soles = [n for n in feet_of(joints).tolist() if not joints[n].endswith("Ankle")]
+        sides = [[n for n in soles if joints[n].startswith(side)] for side in "RL"]
+        if len(soles) == 0:
+            return "the detector has no heels and toes"
+        points, looks = [], []
+        every = 1 + (len(self) - 1) // _FLOOR_ROWS
+        for n in range(len(parts)):
+            speed, spread = parts.column(n, "velocity"), parts.column(n, "velocity_covariance")
+            with np.errstate(invalid="ignore"):
+                still = np.linalg.norm(speed, axis=2) < _STANDS_M_S
+                still &= np.trace(spread, axis1=2, axis2=3) < 3 * _STANDS_M_S**2
+            still &= parts.column(n, "known") == Known.SEEN
+            stands = np.stack([still[:, side].any(axis=1) for side in sides], axis=1)
+            stands &= (parts.column(n, "frame") % every == 0)[:, None]
+            stands &= (parts.column(n, "status") == Status.OK)[:, None]
+            rows, side = np.nonzero(stands)
+            betas, orient, pose, transl = (parts.column(n, name)[rows] for name in BODY)
+            points.append(lowest_of_feet(model, (betas, orient, pose, transl), up)[np.arange(len(rows)), side])
+            look = (parts.column(n, "time_s")[rows] // LOOK_S).astype(np.int64)
+            looks.append(np.stack([parts.column(n, "person")[rows], side, look], axis=1))
+        whose = np.unique(np.concatenate(looks), axis=0, return_inverse=True)[1]
+        return find_floor(np.concatenate(points), whose.ravel(), up)

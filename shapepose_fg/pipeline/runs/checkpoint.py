@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.pipeline.runs.borders import Border
+from shapepose_fg.pipeline.runs.chunks import Border
 from shapepose_fg.pipeline.windows import StreamState
 from shapepose_fg.tracking.following import FollowState
 from shapepose_fg.tracking.hypotheses import Input
@@ -25,7 +25,7 @@ class Checkpoint:
     next_id: int = 0
     """The identity of the next new person."""
     state: StreamState | None = None
-    """What is carried on; None where nothing is: after the last frame before a cut or of a chunk, without time."""
+    """What is carried on; None where nothing is: before a cut, at the end of a chunk, frame by frame."""
     border: Border | None = None
     """Between chunks: who was where at the end of the last."""
 
@@ -70,11 +70,11 @@ def checkpoint_of(
     next_track, before = array("numbers").tolist()
     pending, frames = array("pending.frames").tolist(), array("decided.frames").tolist()
     given = {frame: read(frame) for frame in (*pending, *frames)}
-    cuts = np.cumsum(array("decided.counts"))[:-1]
-    columns = [np.split(array(f"decided.{name}"), cuts) for name in Observations.ROWS] if frames else []
-    decided = [
-        (given[frame], Observations(**dict(zip(Observations.ROWS, parts, strict=True))))
-        for frame, *parts in zip(frames, *columns, strict=True)
-    ]
+    decided = []
+    if len(frames) > 0:
+        rows = Observations(**{name: array(f"decided.{name}") for name in Observations.ROWS})
+        cuts = np.cumsum(array("decided.counts"))[:-1]
+        parts = [rows.rows(index) for index in np.split(np.arange(len(rows)), cuts)]
+        decided = [(given[frame], part) for frame, part in zip(frames, parts, strict=True)]
     follow = FollowState(people, next_track, tuple(given[frame] for frame in pending))
     return Checkpoint(following, next_id, StreamState(follow, tuple(decided), before), border)

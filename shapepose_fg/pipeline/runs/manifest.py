@@ -1,7 +1,10 @@
 """The folder of a run that is not finished: room for it, what it was begun from, and what it has done so far."""
 
+import hashlib
 import json
 import shutil
+from collections.abc import Callable
+from io import BytesIO
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -15,18 +18,21 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observation_table import ObservationTable
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.run_summary import difference
-from shapepose_fg.core.storage.files import read_json, sweep, write_atomically
-from shapepose_fg.core.storage.kept_arrays import InFolder
+from shapepose_fg.core.shapes import SubjectShapes
+from shapepose_fg.core.storage.files import read_json, sweep, write_content
+from shapepose_fg.core.storage.kept_arrays import InFolder, KeptArrays
 from shapepose_fg.pipeline.runs.parts import Parts
 
 PARTS = "parts"
 """The folder of an unfinished run, beside its results."""
 _GONE = ".parts-gone"
-"""What that folder is called while it is removed."""
+"""What that folder is called while it is removed: after a kill on the way it is no half of a run."""
 _MANIFEST = "manifest.json"
 _FORMAT = "shapepose-fg unfinished run 1"
 _LOOKED_AT = 200
 """Frames, spread over the run, by which people are counted."""
+_WORDS = {"program": "version of this program", "cameras": "set of cameras", "skeleton": "skeleton"}
+"""What differs, where a key would not say it."""
 
 
 def open_run(output: Path, begun: dict[str, Any], *, resume: bool = False, restart: bool = False) -> InFolder:
@@ -40,12 +46,14 @@ def open_run(output: Path, begun: dict[str, Any], *, resume: bool = False, resta
     manifest = folder / _MANIFEST
     shutil.rmtree(output / _GONE, ignore_errors=True)  # what a kill left of a run that was being removed
     begun = json.loads(json.dumps({"format": _FORMAT, **begun}))
-    if folder.exists() and not manifest.is_file() and not _only_ours(folder):
+    # A run that was killed at its very beginning leaves the manifest's temporary file alone.
+    left = [folder] if folder.is_file() else folder.iterdir() if folder.is_dir() else ()
+    if not manifest.is_file() and any(not file.name.startswith(f".{_MANIFEST}.") for file in left):
         raise InputError(f"{folder}: not of a run of this program; move it away, or give another --output")
     kept = InFolder(folder)
     if manifest.is_file() and not restart:
         sweep(folder)
-        done = Parts(kept).notes().frames
+        done = frames_done(output)
         if resume:
             _refuse_other(folder, read_json(manifest), begun)
             return kept
@@ -54,8 +62,8 @@ def open_run(output: Path, begun: dict[str, Any], *, resume: bool = False, resta
                 f"{folder}: a run was stopped here after {done} frames; go on with --resume, or begin anew with"
                 " --restart"
             )
-    _remove(output)
-    write_atomically(manifest, lambda stream: stream.write(json.dumps(begun, indent=1).encode()))
+    end_run(output)
+    write_content(manifest, json.dumps(begun, indent=1))
     return kept
 
 
@@ -66,25 +74,11 @@ def frames_done(output: Path) -> int:
 
 def end_run(output: Path) -> None:
     """Remove what a run kept: its results are written."""
-    _remove(output)
-
-
-def _remove(output: Path) -> None:
-    """Remove what a run kept, under another name: after a kill on the way it is no half of a run."""
     gone = output / _GONE
     shutil.rmtree(gone, ignore_errors=True)
     if (output / PARTS).exists():
         (output / PARTS).rename(gone)
         shutil.rmtree(gone)
-
-
-def _only_ours(folder: Path) -> bool:
-    """Whether a folder holds nothing but what a run leaves that was killed at its very beginning."""
-    return folder.is_dir() and all(file.name.startswith(f".{_MANIFEST}.") for file in folder.iterdir())
-
-
-_WORDS = {"program": "version of this program", "cameras": "set of cameras", "skeleton": "skeleton"}
-"""What differs, where a key would not say it."""
 
 
 def _refuse_other(folder: Path, before: Any, now: dict[str, Any]) -> None:
@@ -125,3 +119,39 @@ def check_room(folder: Path, needed: int) -> None:
             f"{folder}: about {decimal(needed)} are needed here, and {decimal(free)} are free; make room, give"
             " another --output, or take a part with --frames"
         )
+
+
+_KNOWN, _WRITTEN, _ARRAYS = "known-people", "known-people-written", ("betas", "information")
+
+
+def people_at_start(kept: KeptArrays, file: Path, load: Callable[[], SubjectShapes]) -> SubjectShapes:
+    """Who was known when the run began; `load` reads them from `file`, a file of shapes, when it begins.
+
+    InputError where the file has changed since, but for what this run itself wrote into it.
+    """
+    now = hashlib.sha256(file.read_bytes()).hexdigest() if file.exists() else None
+    if _KNOWN not in kept.names(_KNOWN):
+        known = load()
+        about = {"names": known.names.tolist(), "body": known.body, "sha256": now}
+        kept.keep(_KNOWN, {name: getattr(known, name) for name in _ARRAYS}, about)
+        return known
+    about = kept.about(_KNOWN)
+    if now not in (about["sha256"], *map(kept.about, kept.names(_WRITTEN))):
+        raise InputError(
+            f"{file}: this has changed since the run was stopped; begin anew with --restart to use what it holds"
+        )
+    betas, information = (kept.array(_KNOWN, name) for name in _ARRAYS)
+    return SubjectShapes(np.array(about["names"], dtype=str), betas, information, about["body"])
+
+
+def checksum_at_start(kept: KeptArrays) -> str:
+    """Of the file that `people_at_start` read, sha256."""
+    return kept.about(_KNOWN)["sha256"]
+
+
+def write_people(kept: KeptArrays, file: Path, people: SubjectShapes) -> None:
+    """Bring `file` up to date; a run that is stopped right behind it knows its own doing."""
+    content = BytesIO()
+    people.write(content)
+    kept.keep(_WRITTEN, {}, hashlib.sha256(content.getvalue()).hexdigest())
+    write_content(file, content.getvalue())

@@ -3,13 +3,13 @@ could not be solved.
 """
 
 import time
-from collections import defaultdict
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from shapepose_fg.estimation.outcome import Problem
+from shapepose_fg.estimation.window_solution import Problem
 from shapepose_fg.tracking.hypotheses import Input
 
 
@@ -19,12 +19,12 @@ class Notes:
 
     frames: int = 0
     """How many frames it is of."""
-    seconds: dict[str, float] = field(default_factory=dict)
+    seconds: Counter[str] = field(default_factory=Counter)
     """Time per stage, over all processes."""
     evidence: dict[int, list[float]] = field(default_factory=dict)
     """Of each track the sum of its rows' evidence (`Observations.evidence`), and how many rows that is."""
-    probable: dict[str, int] = field(default_factory=dict)
-    """Without time how many rows are so probable, by tenths rounded down."""
+    probable: Counter[str] = field(default_factory=Counter)
+    """Frame by frame how many rows are so probable, by tenths rounded down."""
     dropped: dict[str, list[int]] = field(default_factory=dict)
     """The frames in which people were none, or too little is seen of, for each reason; a person, a frame."""
     thinned_frames: dict[str, list[int]] = field(default_factory=dict)
@@ -35,10 +35,8 @@ class Notes:
     def add(self, other: "Notes") -> None:
         """Take in the notes of what comes next."""
         self.frames += other.frames
-        sums: Any = ((self.seconds, other.seconds), (self.probable, other.probable))
-        for mine, more in sums:
-            for name, amount in more.items():
-                mine[name] = mine.get(name, 0) + amount
+        for mine, more in ((self.seconds, other.seconds), (self.probable, other.probable)):
+            mine.update(more)
         for mine, more in ((self.dropped, other.dropped), (self.thinned_frames, other.thinned_frames)):
             for name, frames in more.items():
                 mine.setdefault(name, []).extend(frames)
@@ -49,32 +47,30 @@ class Notes:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values; `from_dict` reads them back."""
-        return asdict(self)
+        return {**vars(self), "problems": [asdict(each) for each in self.problems]}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Notes":
         """What `as_dict` gave."""
-        evidence = {int(track): each for track, each in values["evidence"].items()}
-        return cls(
-            **{**values, "evidence": evidence, "problems": [Problem(**each) for each in values["problems"]]}
-        )
+        made = {"evidence": {int(track): each for track, each in values["evidence"].items()}}
+        made |= {name: Counter(values[name]) for name in ("seconds", "probable")}
+        return cls(**{**values, **made, "problems": [Problem(**each) for each in values["problems"]]})
 
 
 class Notebook:
     """Notes that are being taken."""
 
     def __init__(self) -> None:
-        self._seconds: defaultdict[str, float] = defaultdict(float)
+        self._notes = Notes()
         self._inner = 0.0
-        self._dropped: defaultdict[str, list[int]] = defaultdict(list)
-        self._thinned_frames: defaultdict[str, list[int]] = defaultdict(list)
         self._frame: int | None = None
 
     def thin(self, what: str, is_thinned: bool, frame: int | None = None) -> None:
         """Note down that some of a frame's detections, points or candidates were too many and left out."""
         frame = self._frame if frame is None else frame
-        if is_thinned and frame is not None and frame not in self._thinned_frames[what][-1:]:
-            self._thinned_frames[what].append(frame)
+        if is_thinned and frame is not None:
+            noted = self._notes.thinned_frames.setdefault(what, [])
+            noted += [frame] if frame not in noted[-1:] else []
 
     def drop(self, reason: str, count: int) -> None:
         """Note down people of the present frame who were none, or too little is seen of.
@@ -86,7 +82,7 @@ class Notebook:
 
     def drop_in(self, reason: str, frames: Sequence[int]) -> None:
         """Note down somebody who was not kept, in all of these frames."""
-        self._dropped[reason] += frames
+        self._notes.dropped.setdefault(reason, []).extend(frames)
 
     def watched(self, given: Sequence[Input]) -> Iterator[Input]:
         """The same frames; while one is worked on, it is the present frame."""
@@ -100,17 +96,10 @@ class Notebook:
         start, outside, self._inner = time.perf_counter(), self._inner, 0.0
         yield
         whole = time.perf_counter() - start
-        self._seconds[name] += whole - self._inner
+        self._notes.seconds[name] += whole - self._inner  # type: ignore[assignment]
         self._inner = outside + whole
 
     def torn_off(self) -> Notes:
         """What was noted since the last time, which is forgotten here."""
-        notes = Notes(
-            seconds=dict(self._seconds),
-            dropped=dict(self._dropped),
-            thinned_frames={what: frames for what, frames in self._thinned_frames.items() if frames},
-        )
-        self._seconds.clear()
-        self._dropped.clear()
-        self._thinned_frames.clear()
+        notes, self._notes = self._notes, Notes()
         return notes

@@ -1,8 +1,7 @@
 """Solved windows, kept one after the other: what a run has done so far, and from where it can go on."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -26,7 +25,7 @@ class Part:
     """One window, solved."""
 
     rows: Reconstruction
-    """Its rows; a person is a track there, or without time a number within the frame."""
+    """Its rows; a person is a track there, or frame by frame a number within the frame."""
     notes: Notes
     """What is to be said about it."""
     checkpoint: Checkpoint | None = None
@@ -59,9 +58,8 @@ class Parts:
         n, rows, table = len(self), part.rows, part.rows.observations
         if table is None:
             raise ValueError("the rows of a part need their observations")
-        arrays = {
-            OBSERVED + name: getattr(table, name) for name in table.ROWS[2:]
-        }  # frame and person are those of rows
+        # Frame and person are those of the rows.
+        arrays = {OBSERVED + name: getattr(table, name) for name in table.ROWS[2:]}
         arrays |= {name: getattr(rows, name) for name in rows.ROWS}
         arrays["status"] = np.argmax(rows.status[:, None] == _STATUS, axis=1).astype(np.uint8)
         self.kept.keep(_name(n), arrays, part.notes.as_dict())
@@ -99,41 +97,3 @@ class Parts:
 
 def _name(n: int) -> str:
     return f"part-{n:06d}"
-
-
-@dataclass(frozen=True)
-class RowsOfPeople:
-    """The rows of one person, or track, out of all parts of a run: read when they are asked for."""
-
-    parts: Parts
-    """The solved windows."""
-    whose: Sequence[NDArray[np.integer]]
-    """For each part (R,) whose its rows are."""
-
-    @cached_property
-    def counts(self) -> dict[int, int]:
-        """How many rows everybody has, by number."""
-        return {number: sum(count for _, count in places) for number, places in sorted(self._places.items())}
-
-    def pieces(
-        self, number: int, columns: Sequence[str], rows: slice = slice(None)
-    ) -> Iterator[tuple[NDArray[Any], ...]]:
-        """`columns` of somebody's rows, part by part; `rows` counts among somebody's own."""
-        start, stop, _ = rows.indices(self.counts[number])
-        before = 0
-        for n, count in self._places[number]:
-            first, last = max(start - before, 0), min(stop - before, count)
-            before += count
-            if first < last:
-                mine = np.flatnonzero(self.whose[n] == number)[first:last]
-                yield tuple(self.parts.column(n, name)[mine] for name in columns)
-
-    @cached_property
-    def _places(self) -> dict[int, list[tuple[int, int]]]:
-        """In which parts everybody is, and in how many rows of each."""
-        places: dict[int, list[tuple[int, int]]] = {}
-        for n, whose in enumerate(self.whose):
-            numbers, counts = np.unique(whose, return_counts=True)
-            for number, count in zip(numbers.tolist(), counts.tolist(), strict=True):
-                places.setdefault(number, []).append((n, count))
-        return places

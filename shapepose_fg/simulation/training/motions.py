@@ -1,7 +1,9 @@
-"""Poses of recorded people, frame by frame: from CMU's .npz or a folder of AMASS files, split by subject."""
+"""Poses of recorded people, frame by frame: CMU's .npz or a folder of AMASS files, split by subject for good."""
 
+import hashlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +14,20 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.core.storage.npz import read_npz
 from shapepose_fg.simulation.mocap import Clip, Mocap
-from shapepose_fg.simulation.shoulder import COLLARS, shoulder_rhythm
-from shapepose_fg.simulation.training.split import SPLITS, Split, split_of
+from shapepose_fg.simulation.shoulder import shoulder_rhythm
+
+Split = Literal["train", "validation", "test"]
+
+SPLITS: tuple[Split, ...] = get_args(Split)
+"""The three parts: learn from the first, choose by the second, report the third."""
+
+TEST_SUBJECTS = ("60", "61", "02", "08", "16", "43", "94", "139")
+"""CMU subjects for reported figures only: salsa (both partners), sports and chores, walks, runs and jumps, a bar,
+Indian dance, getting up."""
+VALIDATION_SUBJECTS = ("06", "12", "127", "140")
+"""CMU subjects on which settings are chosen: basketball, walks, runs and ducks, getting up from the floor."""
+UNKNOWN_SUBJECT = "?"
+"""A recording without a subject: used for training, never for what is reported."""
 
 ACKNOWLEDGEMENT = (
     "The data used in this project was obtained from mocap.cs.cmu.edu. "
@@ -41,6 +55,23 @@ _NOT_MOTIONS = ("shape.npz", "_stagei.npz")
 """Files that AMASS lays beside its motions."""
 
 
+def split_of(subject: str) -> Split:
+    """Which part a `subject` belongs to.
+
+    CMU's subjects are known by their numbers, written as CMU writes them ("02", "139"): a copy of the same
+    recordings in another collection keeps its place. Everybody else goes by a stable hash of the name, 8 : 1 : 1.
+    """
+    if subject in TEST_SUBJECTS:
+        return "test"
+    if subject in VALIDATION_SUBJECTS:
+        return "validation"
+    cmu = subject.isascii() and subject.isdigit() and len(subject) >= 2 and int(subject) <= 144
+    tenth = hashlib.sha256(subject.encode()).digest()[0] % 10
+    if subject == UNKNOWN_SUBJECT or cmu or tenth < 8:
+        return "train"
+    return "validation" if tenth == 8 else "test"
+
+
 @dataclass(frozen=True)
 class Motions:
     """Poses of many people in SMPL's structure: N frames of S recordings.
@@ -51,8 +82,6 @@ class Motions:
 
     poses: NDArray[np.float32]
     """(N, 24, 3) axis-angle, rad: the root's in the world, the other joints' relative to their parents."""
-    observed: NDArray[np.bool_]
-    """(N, 24) whether the rotation was recorded; else it is a guess or zero."""
     weight: NDArray[np.float64]
     """(N,) how many frames this one counts for, at most 1: recordings, subjects and walking are capped within
     their split."""
@@ -61,7 +90,7 @@ class Motions:
 
     def __post_init__(self) -> None:
         N = len(self.poses)
-        expected = {"poses": (N, 24, 3), "observed": (N, 24), "weight": (N,), "subject": (N,)}
+        expected = {"poses": (N, 24, 3), "weight": (N,), "subject": (N,)}
         for name, shape in expected.items():
             if getattr(self, name).shape != shape:
                 raise ValueError(f"{name} must be {shape}, got {getattr(self, name).shape}")
@@ -84,14 +113,8 @@ class Motions:
         return self.rows(np.array([split_of(str(name)) == split for name in subjects], dtype=bool)[place])
 
 
-@dataclass(frozen=True)
-class _Recording:
-    """One recording as it is read."""
-
-    subject: str
-    walking: bool
-    poses: NDArray[np.float32]
-    observed: NDArray[np.bool_]
+_Recording = tuple[str, bool, NDArray[np.float32]]
+"""Who was recorded, whether it is walking, poses (T, 24, 3)."""
 
 
 def load_motions(path: str | Path) -> Motions:
@@ -102,14 +125,19 @@ def load_motions(path: str | Path) -> Motions:
     its subject.
     """
     path = Path(path)
-    recordings = _read_amass_folder(path) if path.is_dir() else _read_cmu(path)
-    length = np.array([len(recording.poses) for recording in recordings])
-    subject = np.array([recording.subject for recording in recordings])
-    walking = np.array([recording.walking for recording in recordings])
+    if path.is_dir():
+        files = [file for file in sorted(path.rglob("*.npz")) if not file.name.endswith(_NOT_MOTIONS)]
+        recordings = [_read_amass(file) for file in files]
+    else:
+        mocap = Mocap.load(path)
+        recordings = [_of_clip(mocap.clip(index)) for index in range(len(mocap))]
+    if len(recordings) == 0:
+        raise InputError(f"{path}: holds no recordings, or no .npz; give CMU's file or a folder of AMASS motions")
+    subject, walking, poses = zip(*recordings, strict=True)
+    length = np.array([len(each) for each in poses])
     return Motions(
-        poses=np.concatenate([recording.poses for recording in recordings]),
-        observed=np.repeat(np.stack([recording.observed for recording in recordings]), length, axis=0),
-        weight=np.repeat(frame_weights(length, subject, walking), length),
+        poses=np.concatenate(poses),
+        weight=np.repeat(frame_weights(length, np.array(subject), np.array(walking)), length),
         subject=np.repeat(subject, length),
     )
 
@@ -133,30 +161,17 @@ def frame_weights(
     return total / length
 
 
-def _read_cmu(path: Path) -> list[_Recording]:
-    """The clips of CMU's file, collars that follow the arms put in."""
-    mocap = Mocap.load(path)
-    if len(mocap) == 0:
-        raise InputError(f"{path}: holds no recordings; give a file that has some")
-    return [_of_clip(mocap.clip(index)) for index in range(len(mocap))]
+def _walks(action: str) -> bool:
+    return "walk" in action.lower()
 
 
 def _of_clip(clip: Clip) -> _Recording:
-    observed = np.ones(24, dtype=bool)
-    observed[[*COLLARS, *_HANDS]] = False
-    observed[list(_WRISTS)], observed[list(_TOES)] = clip.wrist_valid, clip.toe_valid
     rotations = shoulder_rhythm(clip.rotations)
     vectors = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_rotvec().reshape(-1, 24, 3)
-    vectors[:, 1:][:, ~observed[1:] & ~np.isin(np.arange(1, 24), COLLARS)] = 0.0
-    return _Recording(clip.subject, "walk" in clip.action.lower(), vectors.astype(np.float32), observed)
-
-
-def _read_amass_folder(folder: Path) -> list[_Recording]:
-    """Every motion below the folder, in the order of the paths."""
-    paths = [path for path in sorted(folder.rglob("*.npz")) if not path.name.endswith(_NOT_MOTIONS)]
-    if len(paths) == 0:
-        raise InputError(f"{folder}: there is no .npz in it; give a folder of AMASS motions")
-    return [_read_amass(path) for path in paths]
+    for joints, recorded in ((_HANDS, False), (_WRISTS, clip.wrist_valid), (_TOES, clip.toe_valid)):
+        if not recorded:
+            vectors[:, list(joints)] = 0.0
+    return clip.subject, _walks(clip.action), vectors.astype(np.float32)
 
 
 def _read_amass(path: Path) -> _Recording:
@@ -166,8 +181,7 @@ def _read_amass(path: Path) -> _Recording:
     kept = np.zeros((len(poses[::step]), 24, 3))
     kept[:, :22] = poses[::step, :_BODY_COLUMNS].reshape(-1, 22, 3)
     kept[:, 0] = (_Y_UP * Rotation.from_rotvec(kept[:, 0])).as_rotvec()
-    walking = "walk" in path.stem.lower()
-    return _Recording(path.parent.name, walking, kept.astype(np.float32), np.arange(24) < 22)
+    return path.parent.name, _walks(path.stem), kept.astype(np.float32)
 
 
 def _amass_arrays(path: Path) -> tuple[NDArray[np.float64], float]:

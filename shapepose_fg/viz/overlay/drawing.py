@@ -1,19 +1,22 @@
-"""Bodies, skeletons, detections and names on a picture."""
+"""Bodies, skeletons, detections and names on a picture as the camera took it: through the lens, at any size."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.core.drawing import colour_of
+from shapepose_fg.core.camera import Camera
+from shapepose_fg.core.drawing import bones_of, colour_of
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Known, Reconstruction
-from shapepose_fg.core.skeleton import BODY_25, SKELETONS
+from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.io.footage.footage import Picture
+from shapepose_fg.io.footage.placement import Placement
 from shapepose_fg.viz.bodies import joined
-from shapepose_fg.viz.overlay.picture_view import PictureView
-from shapepose_fg.viz.rendering import rasterise
+from shapepose_fg.viz.rendering import NEAR_M, rasterise
 
 Colour = tuple[int, int, int]
 """Blue, green, red, 0 to 255."""
@@ -28,23 +31,52 @@ _OPACITY = 0.45
 """Of bodies: what is under them stays visible."""
 _FINE = 8
 """Bits of a pixel's fraction in OpenCV's drawing."""
-_NOT_BONES = {("RShoulder", "REar"), ("LShoulder", "LEar")}
-"""Links of detectors that are no bones."""
+_REACH = 0.5
+"""Points farther outside the picture than this share of its size are not placed: no lens was calibrated there, and
+its polynomial may fold them back into the picture."""
+
+
+@dataclass(frozen=True)
+class PictureView:
+    """A camera's pictures, drawn at a size of their own."""
+
+    camera: Camera
+    """The camera, with its lens."""
+    placement: Placement
+    """Where calibrated pixels lie in its pictures."""
+    size: tuple[int, int]
+    """(width, height) of what is drawn on: the picture, enlarged or made smaller."""
+
+    @property
+    def scale(self) -> NDArray[np.float64]:
+        """(2,) drawn pixels per pixel of the picture, x and y."""
+        return np.array(self.size) / self.placement.picture_size
+
+    def project(self, points: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Drawn pixels (..., 2) and depths (...,) in metres of `points` (..., 3) in the world.
+
+        Pixels are NaN behind the camera, and far outside the picture.
+        """
+        xy, depth = self.camera.project(np.asarray(points, dtype=np.float64))
+        xy[~(depth > NEAR_M)] = np.nan
+        return self.through_lens(xy), depth
+
+    def through_lens(self, xy: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Drawn pixels (..., 2) from undistorted ones, as observations have them."""
+        flat = np.asarray(xy, dtype=np.float64).reshape(-1, 2)
+        size = np.array(self.camera.image_size)
+        with np.errstate(invalid="ignore"):
+            near = np.all((flat > -_REACH * size) & (flat < (1 + _REACH) * size), axis=1)
+        drawn = np.full(flat.shape, np.nan)
+        on_picture = self.placement.to_picture(self.camera.distort(flat[near]))
+        drawn[near] = (on_picture + 0.5) * self.scale - 0.5
+        return drawn.reshape(np.shape(xy))
 
 
 def blue_green_red(person: int) -> Colour:
     """The colour of an identity: the same in all that draws the result."""
     red, green, blue = (round(255 * part) for part in colour_of(person))
     return blue, green, red
-
-
-def bones_of(joint_names: Sequence[str]) -> NDArray[np.intp]:
-    """(B, 2) joints that bones join: those of the known skeleton with these joints, else BODY_25's among them."""
-    names = list(joint_names)
-    known = next((each for each in SKELETONS.values() if list(each.joints) == names), None)
-    pairs = [(each.joints[a], each.joints[b]) for each in (known or BODY_25,) for a, b in each.limbs]
-    bones = [pair for pair in pairs if pair not in _NOT_BONES and pair[0] in names and pair[1] in names]
-    return np.array([(names.index(a), names.index(b)) for a, b in bones], dtype=np.intp).reshape(-1, 2)
 
 
 def stroke_of(size: tuple[int, int]) -> int:
@@ -99,7 +131,7 @@ class Skeletons:
         return cls(
             joints=people.joints,
             seen=np.isin(people.known, (Known.SEEN, Known.UNKNOWN)),
-            bones=bones_of(people.joint_names.tolist()),
+            bones=bones_of(tuple(people.joint_names.tolist())),
             colours=[blue_green_red(each) for each in numbers],
             labels=[f"person {each}" for each in numbers],
         )
@@ -185,3 +217,12 @@ def draw_label(
 def _fine(xy: NDArray[np.float64]) -> NDArray[np.int32]:
     """Pixels as OpenCV's drawing takes them with fractions."""
     return np.round(np.clip(xy, -30000, 30000) * (1 << _FINE)).astype(np.int32)
+
+
+def write_picture(path: Path, picture: Picture) -> None:
+    """Write a picture; the ending, .png or .jpg, says how."""
+    quality = [cv2.IMWRITE_JPEG_QUALITY, 90] if path.suffix == ".jpg" else []
+    done, content = cv2.imencode(path.suffix, picture, quality)
+    if not done:
+        raise InputError(f"{path}: the picture cannot be written in this format; use .png or .jpg")
+    write_atomically(path, lambda stream: stream.write(content.tobytes()))

@@ -1,43 +1,39 @@
-"""A result drawn over the pictures of all cameras, frame by frame."""
+"""A result drawn over the pictures of all cameras, frame by frame: videos or still images, whole or not at all."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
 from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import OpenedReconstruction, Reconstruction
 from shapepose_fg.io.footage.footage import Footage, Picture
-from shapepose_fg.io.footage.used import CameraFootage
+from shapepose_fg.io.footage.placement import CameraFootage
 from shapepose_fg.viz.bodies import surfaces
 from shapepose_fg.viz.overlay.drawing import (
     Colour,
+    PictureView,
     Skeletons,
     blue_green_red,
     draw_bodies,
     draw_detections,
     draw_label,
     draw_skeletons,
+    write_picture,
 )
-from shapepose_fg.viz.overlay.picture_view import PictureView
 
 if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel
 
 _INK: Colour = (45, 45, 45)
-
-
-@dataclass(frozen=True)
-class OverlayContent:
-    """What is drawn."""
-
-    skeletons: bool = True
-    """Bones and joints, with the person's number."""
-    detections: bool = True
-    """2D detections that were used, and in another colour those that were not."""
+_GRID = "grid"
+"""What the file with all cameras is called."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +46,10 @@ class Overlay:
     """Its cameras."""
     cameras: Sequence[tuple[CameraFootage, Footage]]
     """The pictures of the cameras that are drawn."""
-    content: OverlayContent = OverlayContent()
-    """What is drawn."""
+    skeletons: bool = True
+    """Whether bones and joints are drawn, with the person's number."""
+    detections: bool = True
+    """Whether 2D detections are drawn that were used, and in another colour those that were not."""
     body: "BodyModel | None" = None
     """The model of the bodies; None where they are not drawn."""
 
@@ -70,27 +68,84 @@ class Overlay:
             view = PictureView(camera, used.placement, size)
             picture = _picture(used, footage, frame, size)
             if body is not None:
-                colours = [blue_green_red(person) for person in people.person[list(rows)].tolist()]
+                colours = [blue_green_red(int(people.person[row])) for row in rows]
                 picture = draw_bodies(picture, view, vertices, body.faces, colours)
-            if self.content.detections:
-                self._draw_detections(picture, view, people)
-            if self.content.skeletons:
+            if self.detections:
+                _draw_detections(picture, view, people)
+            if self.skeletons:
                 draw_skeletons(picture, view, Skeletons.of(people))
             draw_label(picture, f"camera {used.name}, frame {frame}", (0, 0), _INK, centred=False)
             drawn.append(picture)
         return drawn
 
-    def _draw_detections(self, picture: Picture, view: PictureView, people: Reconstruction) -> None:
-        """What this camera saw of the people of one frame."""
-        table = people.observations
-        if table is None or view.camera.name not in table.view_names.tolist():
-            return
-        v = table.view_names.tolist().index(view.camera.name)
-        gate = table.gate[..., v]
-        row, joint = np.nonzero(gate != Gate.NOT_SEEN)
-        xy = view.through_lens(table.xy[row, joint, v])
-        colours = np.array([blue_green_red(person) for person in table.person[row].tolist()]).reshape(-1, 3)
-        draw_detections(picture, xy, gate[row, joint] == Gate.USED, colours)
+
+def write_overlay(
+    over: Overlay,
+    frames: Sequence[int],
+    folder: Path,
+    width: int | None,
+    fps: float | None,
+    done: Callable[[int, int], None],
+) -> list[Path]:
+    """Draw `frames` and write them into `folder`: a video of `fps` frames a second, or without a rate still
+    pictures.
+
+    All cameras are in a grid `width` pixels wide, or each has a file of its own where that is None. `done` is told
+    how many frames are. Returns the files.
+    """
+    # Videos want even sides.
+    own = [(footage.size[0] // 2 * 2, footage.size[1] // 2 * 2) for _, footage in over.cameras]
+    columns, cells = (1, own) if width is None else grid_shape(own, width)
+    names = [used.name for used, _ in over.cameras] if width is None else [_GRID]
+    paths: list[Path] = []
+    videos: list[cv2.VideoWriter] = []
+    with ExitStack() as stack:
+        for at, frame in enumerate(frames):
+            drawn = over.draw(frame, cells)
+            pictures = drawn if width is None else [grid(drawn, columns)]
+            for index, (name, picture) in enumerate(zip(names, pictures, strict=True)):
+                if fps is None:
+                    paths.append(folder / f"{name}_{frame:06d}.jpg")
+                    write_picture(paths[-1], picture)
+                    continue
+                if at == 0:
+                    paths.append(folder / f"{name}.mp4")
+                    videos.append(stack.enter_context(_video(paths[-1], picture.shape[1::-1], fps)))
+                videos[index].write(np.ascontiguousarray(picture))
+            done(at + 1, len(frames))
+    return paths
+
+
+@contextmanager
+def _video(path: Path, size: Sequence[int], fps: float) -> Iterator[cv2.VideoWriter]:
+    """An mp4 video that is put in place when it is complete."""
+    part = path.with_name(f".{path.stem}.part.mp4")  # OpenCV tells the container by the ending
+    path.parent.mkdir(parents=True, exist_ok=True)
+    writer = cv2.VideoWriter(str(part), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
+    try:
+        if not writer.isOpened():
+            raise InputError(
+                f"{path}: a video of {size[0]} x {size[1]} cannot be written here; check space and rights"
+            )
+        yield writer
+        writer.release()
+        part.replace(path)
+    finally:
+        writer.release()
+        part.unlink(missing_ok=True)
+
+
+def _draw_detections(picture: Picture, view: PictureView, people: Reconstruction) -> None:
+    """Draw what the camera of `view` saw of the people of one frame."""
+    table = people.observations
+    if table is None or view.camera.name not in table.view_names.tolist():
+        return
+    v = table.view_names.tolist().index(view.camera.name)
+    gate = table.gate[..., v]
+    row, joint = np.nonzero(gate != Gate.NOT_SEEN)
+    xy = view.through_lens(table.xy[row, joint, v])
+    colours = np.array([blue_green_red(person) for person in table.person[row].tolist()]).reshape(-1, 3)
+    draw_detections(picture, xy, gate[row, joint] == Gate.USED, colours)
 
 
 def _picture(used: CameraFootage, footage: Footage, frame: int, size: tuple[int, int]) -> Picture:

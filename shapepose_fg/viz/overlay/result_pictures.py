@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.footage.footage import Footage, open_footage
-from shapepose_fg.io.footage.given import placements_of
-from shapepose_fg.io.footage.placement import Placement
+from shapepose_fg.io.footage.placement import FOOTAGE, CameraFootage, Placement, placements_of, read_used_footage
 from shapepose_fg.io.footage.places import find_footage
-from shapepose_fg.io.footage.used import FOOTAGE, CameraFootage, read_used_footage
 
 
 @dataclass(frozen=True)

@@ -4,13 +4,53 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from typing import Any
 
+from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.pipeline.config import PipelineConfig
-from shapepose_fg.viz.report.figures import number
 
 Run = Mapping[str, Any]
 
 
-def changed_settings(run: Run) -> list[tuple[str, str, str]]:
+def told_by(run: Run) -> dict[str, Any]:
+    """The entries of a run that the page shows, by the names that its template uses."""
+    people, time = objects(run.get("people")), objects(run.get("time"))
+    problems, spans = people.get("problems"), covered_frames(run) or []
+    return {
+        "warnings": _texts(objects(run.get("setup")).get("warnings")),
+        "notes": _texts(run.get("notes")),
+        "problems": [
+            ", ".join(f"{key} {value}" for key, value in objects(each).items())
+            for each in (problems if isinstance(problems, list) else [])
+        ],
+        "dropped": _dropped(objects(people.get("dropped")), objects(run.get("dropped_frames"))),
+        "probabilities": _probabilities(run.get("probability")),
+        "fps": number(time.get("fps")),
+        "source": str(time.get("source", "")),
+        "frames": ", ".join(f"{span.start}–{span.stop - 1}" for span in spans if len(span) > 0),
+        "cuts": ", ".join(map(str, run.get("cuts", []))),
+        "body": run.get("body"),
+        "time": _time(objects(run.get("seconds"))),
+        "configured": isinstance(run.get("configuration"), dict),
+        "changed": _changed_settings(run),
+        **{
+            key: [(str(name), _text(value)) for name, value in objects(run.get(key)).items()]
+            for key in ("versions", "inputs")
+        },
+    }
+
+
+def number(value: object) -> float | None:
+    """A finite number of run.json; None for anything else."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:
+        return None
+    return float(value)
+
+
+def objects(value: object) -> Mapping[str, Any]:
+    """An object of run.json; an empty one for anything else."""
+    return value if isinstance(value, dict) else {}
+
+
+def _changed_settings(run: Run) -> list[tuple[str, str, str]]:
     """Settings that are not the default: dotted name, value, default; a dash where there is none any more.
 
     Tables of an older program, of which everything was written down, are left out.
@@ -24,10 +64,8 @@ def changed_settings(run: Run) -> list[tuple[str, str, str]]:
     ]
 
 
-def dropped(run: Run) -> list[tuple[str, int, str]]:
+def _dropped(reasons: Run, frames: Run) -> list[tuple[str, int, str]]:
     """Why somebody was left out: reason, how many, and in which frames, as far as there is room."""
-    reasons = _object(_object(run.get("people")).get("dropped"))
-    frames = _object(run.get("dropped_frames"))
     counts = {reason: number(count) for reason, count in reasons.items()}
     return [
         (reason, int(count), _frames_words(frames.get(reason)))
@@ -36,50 +74,19 @@ def dropped(run: Run) -> list[tuple[str, int, str]]:
     ]
 
 
-def probabilities(run: Run) -> dict[int, float]:
+def _probabilities(listed: object) -> dict[int, float]:
     """How probable it is that each person was there, by number; empty frame by frame."""
-    listed = run.get("probability")
-    entries = [_object(each) for each in (listed if isinstance(listed, list) else [])]
+    entries = [objects(each) for each in (listed if isinstance(listed, list) else [])]
     found = {number(each.get("person")): number(each.get("probability")) for each in entries}
     return {int(who): value for who, value in found.items() if who is not None and value is not None}
 
 
-def problems(run: Run) -> list[str]:
-    """What could not be solved: person, frame, joint and reason."""
-    listed = _object(run.get("people")).get("problems")
-    entries = listed if isinstance(listed, list) else []
-    return [", ".join(f"{key} {value}" for key, value in _object(each).items()) for each in entries]
-
-
-def warnings(run: Run) -> list[str]:
-    """What the check of the set-up says, a sentence each."""
-    return _texts(_object(run.get("setup")).get("warnings"))
-
-
-def notes(run: Run) -> list[str]:
-    """What the reader made of the detections, a sentence each."""
-    return _texts(run.get("notes"))
-
-
-def rate(run: Run) -> tuple[float | None, str]:
-    """Frames a second, and where the times come from."""
-    time = _object(run.get("time"))
-    return number(time.get("fps")), str(time.get("source", ""))
-
-
-def stages(run: Run) -> list[tuple[str, float]]:
-    """Seconds of each stage."""
-    spent = {name: number(value) for name, value in _object(run.get("seconds")).items()}
-    return [(name, value) for name, value in spent.items() if value is not None]
-
-
-def pairs(run: Run, key: str) -> list[tuple[str, str]]:
-    """The entries of an object such as `versions` or `inputs`, as texts."""
-    return [(str(name), _text(value)) for name, value in _object(run.get(key)).items()]
-
-
-def _object(value: object) -> Mapping[str, Any]:
-    return value if isinstance(value, dict) else {}
+def _time(seconds: Run) -> str:
+    """How long the stages took, the longest first; empty where that is not said."""
+    spent = {name: value for name, each in seconds.items() if (value := number(each)) is not None}
+    longest = sorted((each for each in spent.items() if each[1] >= 0.05), key=lambda each: -each[1])
+    listed = ", ".join(f"{name} {value:.1f}" for name, value in longest)
+    return f"{sum(spent.values()):.1f} s of processors: {listed}" if len(spent) > 0 else ""
 
 
 def _texts(value: object) -> list[str]:
@@ -88,7 +95,7 @@ def _texts(value: object) -> list[str]:
 
 def _flat(table: object, prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Dotted names and values of nested tables."""
-    for key, value in _object(table).items():
+    for key, value in objects(table).items():
         if isinstance(value, dict):
             yield from _flat(value, f"{prefix}{key}.")
         else:
@@ -111,4 +118,4 @@ def _frames_words(spans: object) -> str:
         if len(ends) == 2 and None not in ends:
             start, stop = int(ends[0] or 0), int(ends[1] or 0)
             told.append(f"{start}" if stop == start + 1 else f"{start}–{stop - 1}")
-    return ", ".join(told[:12]) + (f" and {len(told) - 12} stretches more" if len(told) > 12 else "")
+    return ", ".join(told[:12]) + (f" and {len(told) - 12} segments more" if len(told) > 12 else "")

@@ -1,6 +1,6 @@
-"""The figures of a report: what became of each camera's detections, and how joints are known."""
+"""The figures of a report: what became of each camera's detections, how joints are known, and the first five."""
 
-from collections.abc import Mapping
+from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.reconstruction import Known, Reconstruction
+from shapepose_fg.io.export.markers import sigma_m
+from shapepose_fg.viz.report.facts import number, objects
 
 _BINS = 60
 """Points of a line over time: as many as can be told apart in a cell of a table."""
 KINDS = (Known.SEEN, Known.WEAK, Known.BODY, Known.MOTION, Known.UNKNOWN)
 """The ways in which joints are known, the surest first."""
-REASONS = tuple(gate for gate in Gate if gate not in (Gate.NOT_SEEN, Gate.USED))
-"""Why a detection may not be used."""
 
 
 @dataclass(frozen=True)
@@ -31,10 +31,7 @@ class Residual:
     def of(cls, px: NDArray[np.floating]) -> "Residual":
         """Of all finite distances in `px`."""
         px = px[np.isfinite(px)]
-        if len(px) == 0:
-            return cls(None, None)
-        median, high = np.quantile(px, [0.5, 0.9]).tolist()
-        return cls(median, high)
+        return cls(*np.quantile(px, [0.5, 0.9]).tolist()) if len(px) > 0 else cls(None, None)
 
 
 @dataclass(frozen=True)
@@ -52,7 +49,7 @@ class CameraFigures:
     used: Residual
     """Of those that were used."""
     trend_px: list[float | None]
-    """Median over time of all that were given to people: equal stretches of the recording."""
+    """Median over time of all that were given to people: equal segments of the recording."""
     offered: float | None = None
     """Detections in all, given to people or not; None where run.json does not say."""
     left_out_px: float | None = None
@@ -66,23 +63,23 @@ def camera_figures(people: Reconstruction) -> list[CameraFigures]:
     table = people.observations
     if table is None:
         return []
-    px = np.linalg.norm(table.residual_px, axis=-1)
-    stretch = _stretches(table)
-    told = _told_cameras(people.run)
+    px, segment = np.linalg.norm(table.residual_px, axis=-1), _segments(table)
+    listed = people.run.get("cameras")
+    entries = [objects(each) for each in (listed if isinstance(listed, list) else [])]
+    told = {str(each.get("camera")): each for each in entries}
     made = []
     for view, name in enumerate(table.view_names.tolist()):  # a handful of cameras
         gate, error = table.gate[..., view], px[..., view]
         more = told.get(name, {})
-        left_out = more.get("left_out")
-        left_out = left_out if isinstance(left_out, dict) else {}
+        left_out = objects(more.get("left_out"))
         made.append(
             CameraFigures(
                 name,
                 int((gate != Gate.NOT_SEEN).sum()),
-                {each: int((gate == each).sum()) for each in (Gate.USED, *REASONS)},
+                {each: int((gate == each).sum()) for each in Gate if each != Gate.NOT_SEEN},
                 Residual.of(error),
                 Residual.of(error[gate == Gate.USED]),
-                [Residual.of(error[stretch == index]).median_px for index in range(stretch.max(initial=-1) + 1)],
+                [Residual.of(error[segment == index]).median_px for index in range(segment.max(initial=-1) + 1)],
                 number(more.get("offered")),
                 number(left_out.get("median_px")),
                 number(left_out.get("median_mm")),
@@ -91,11 +88,22 @@ def camera_figures(people: Reconstruction) -> list[CameraFigures]:
     return made
 
 
-def number(value: object) -> float | None:
-    """A finite number of run.json; None for anything else."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:
-        return None
-    return float(value)
+def overall(people: Reconstruction) -> dict[str, Any]:
+    """The figures by which a result is judged first, by the template's names; shares 0 to 1, None of nothing."""
+    table, known = people.observations, people.known[people.known != Known.UNKNOWN]
+    sigma = sigma_m(people.covariance)
+    sigma = sigma[np.isfinite(sigma)]
+    gate = np.zeros(0) if table is None else table.gate[table.gate != Gate.NOT_SEEN]
+    return {
+        "placed": bool(np.isfinite(people.joints).all(axis=-1).any()),
+        "seen": _share(known == Known.SEEN),
+        "error": Residual.of(np.zeros(0) if table is None else np.linalg.norm(table.residual_px, axis=-1)),
+        "used": _share(gate == Gate.USED),
+        "sigma_mm": 1e3 * float(np.median(sigma)) if len(sigma) > 0 else None,
+        "solved": _share(people.status == "ok"),
+        "rows": len(people),
+        "status": ", ".join(f"{count} {name}" for name, count in Counter(people.status.tolist()).items()),
+    }
 
 
 def known_counts(people: Reconstruction, by: NDArray[np.integer] | None = None) -> NDArray[np.int64]:
@@ -108,17 +116,14 @@ def known_counts(people: Reconstruction, by: NDArray[np.integer] | None = None) 
     return counts
 
 
-def _stretches(table: ObservationTable) -> NDArray[np.intp]:
-    """(N,) which stretch of the recording each row is in."""
+def _share(true: NDArray[np.bool_]) -> float | None:
+    return float(true.mean()) if true.size > 0 else None
+
+
+def _segments(table: ObservationTable) -> NDArray[np.intp]:
+    """(N,) which segment of the recording each row is in."""
     if len(table) == 0:
         return np.zeros(0, dtype=np.intp)
     first, last = int(table.frame.min()), int(table.frame.max())
     bins = min(_BINS, last - first + 1)
     return np.asarray((table.frame - first) * bins // (last - first + 1), dtype=np.intp)
-
-
-def _told_cameras(run: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """What run.json says of the cameras, by name; anything that is not such a list says nothing."""
-    told = run.get("cameras", [])
-    entries = [each for each in told if isinstance(each, dict)] if isinstance(told, list) else []
-    return {str(each.get("camera")): each for each in entries}

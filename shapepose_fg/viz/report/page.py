@@ -1,19 +1,21 @@
-"""The page of a report: head, key figures, scene, sections; one text with everything in it."""
+"""The page of a report: data/page.html filled in; one text with everything in it."""
 
 import base64
 import hashlib
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.resources import files
 
+import numpy as np
+
+from shapepose_fg.core.drawing import PALETTE
+from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.tracking.listing import TrackSummary
-from shapepose_fg.viz.report.elements import Element, asset, asset_element, element, html
-from shapepose_fg.viz.report.figures import CameraFigures
-from shapepose_fg.viz.report.overview import header, key_figures, over_time, warnings
-from shapepose_fg.viz.report.run_section import run_section
+from shapepose_fg.viz.report.facts import told_by
+from shapepose_fg.viz.report.figures import KINDS, camera_figures, known_counts, overall
 from shapepose_fg.viz.report.scene import Scene
-from shapepose_fg.viz.report.sections import cameras_section, joints_section, people_section, unused_section
 
 _SCRIPTS = ("geometry.js", "skin.js", "drawing.js", "page.js")
 """In the order in which they are loaded."""
@@ -29,8 +31,6 @@ class Content:
     """The result."""
     tracks: Sequence[TrackSummary]
     """Its identities."""
-    cameras: Sequence[CameraFigures]
-    """What became of each camera's detections; none where that is not recorded."""
     scene: Scene | None
     """What is drawn; None where there are no people."""
     remarks: Sequence[str] = ()
@@ -42,66 +42,104 @@ def page_text(content: Content) -> str:
 
     Texts of the input are escaped, and the page's own policy forbids every script but those that are part of it.
     """
-    scripts = [asset(name) for name in _SCRIPTS] if content.scene is not None else []
+    from jinja2 import Environment, StrictUndefined
+
+    people, tracks = content.people, content.tracks
+    page = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, extensions=["jinja2.ext.do"])
+    page.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
+    page.filters |= {"dash": _dash, "share": _share, "percent": _percent, "count": _count, "path": _path}
+    scripts = [_asset(name) for name in _SCRIPTS] if content.scene is not None else []
     hashes = " ".join(f"'sha256-{_sha256(text)}'" for text in scripts) or "'none'"
-    policy = f"default-src 'none'; style-src 'unsafe-inline'; script-src {hashes}; img-src data:"
-    head = element(
-        "head",
-        element("meta", charset="utf-8"),
-        element("meta", http_equiv="Content-Security-Policy", content=policy),
-        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        element("meta", name="color-scheme", content="light dark"),
-        element("meta", name="referrer", content="no-referrer"),
-        element("title", f"{content.title} – shapepose-fg report"),
-        element("style", asset("report.css")),
+    cameras, run, over_time = camera_figures(people), told_by(people.run), _over_time(people)
+    by_person = known_counts(people, np.searchsorted([each.person for each in tracks], people.person))
+    by_joint, kinds = known_counts(people), [kind.name.lower() for kind in KINDS]
+    return page.from_string(_asset("page.html")).render(
+        Gate=Gate,
+        policy=f"default-src 'none'; style-src 'unsafe-inline'; script-src {hashes}; img-src data:",
+        title=content.title,
+        style=_asset("report.css"),
+        scripts=scripts,
+        scene=content.scene,
+        remarks=[*content.remarks],
+        run=run,
+        summary=_sentence(people, len(cameras), run, over_time),
+        over_time=over_time,
+        overall=overall(people),
+        cameras=cameras,
+        tracks=[
+            (each, dict(zip(kinds, counts, strict=True)), PALETTE[each.person % len(PALETTE)])
+            for each, counts in zip(tracks, by_person.tolist(), strict=True)
+        ],
+        known=dict(zip(kinds, by_joint.sum(axis=0).tolist(), strict=True)),
+        joints=[
+            (name, dict(zip(kinds, counts, strict=True)))
+            for name, counts in zip(people.joint_names.tolist(), by_joint.tolist(), strict=True)
+        ],
     )
-    main = element(
-        "main",
-        warnings(content.people),
-        key_figures(content.people),
-        None if content.scene is None else _scene_section(content.scene),
-        people_section(content.people, content.tracks, over_time(content.people)),
-        cameras_section(content.cameras),
-        joints_section(content.people),
-        unused_section(content.people, content.cameras),
-        run_section(content.people, content.remarks),
-    )
-    body = element("body", header(content.title, content.people, len(content.cameras)), main)
-    if content.scene is not None:
-        body.append(element("script", _json(content.scene.data), type="application/json", id="scene-data"))
-    for text in scripts:
-        body.append(element("script", text))
-    return "<!DOCTYPE html>\n" + html(element("html", head, body, lang="en")) + "\n"
 
 
-def _scene_section(scene: Scene) -> Element:
-    """The canvas with what moves it, as the page's script fills it."""
-    root = asset_element("scene.html")
-    tools = next(each for each in root if each.get("class") == "tools")
-    cameras = scene.data["cameras"]
-    absent = {"show-bodies": "mesh" not in scene.data, "show-cameras": len(cameras) == 0, "through": not cameras}
-    for each in [*tools]:
-        name = each.get("id") or next((within.get("id") for within in each), None)
-        if name is not None and absent.get(name):
-            tools.remove(each)
-    for menu in tools.findall("select"):
-        menu.extend(
-            element("option", f"camera {camera['name']}", value=str(n)) for n, camera in enumerate(cameras)
-        )
-    root.find(".//input[@id='frame']").set("max", str(max(scene.kept - 1, 0)))  # type: ignore[union-attr]
-    if scene.every > 1:
-        words = (
-            f"Drawn here is one frame in {scene.every} ({scene.kept} of {scene.frames}), so that the page stays"
-            " small; all figures below are of every frame."
-        )
-        root.append(element("p", words, class_="lead"))
-    return root
+def _over_time(people: Reconstruction) -> bool:
+    """Whether a person's number is an identity."""
+    return bool(people.run.get("configuration", {}).get("temporal", True))
+
+
+def _sentence(people: Reconstruction, cameras: int, run: dict, over_time: bool) -> str:
+    """How many people in how many frames, those without people too."""
+    spans = covered_frames(people.run) or []
+    frames = len(np.unique(np.concatenate([people.frame, *(np.arange(span.start, span.stop) for span in spans)])))
+    who = _plural(len(np.unique(people.person)), "person", "people")
+    if not over_time:
+        who = f"{_plural(len(people), 'person', 'people')}, frame by frame,"
+    told = ""
+    if run["fps"] is not None and run["fps"] > 0:
+        assumed = ", a rate that is assumed because none was given" if run["source"] == "assumed" else ""
+        told = f", {frames / run['fps']:.1f}\u00a0s at {run['fps']:.4g} a second{assumed}"
+    by = f" of {cameras} cameras" if cameras > 0 else ""
+    return f"{who if len(people) > 0 else 'Nobody was found'} in {_plural(frames, 'frame', 'frames')}{by}{told}."
+
+
+def _plural(count: int, one: str, several: str) -> str:
+    return f"{count} {one if count == 1 else several}"
+
+
+def _dash(value: float | None, text: str, none: str = "–") -> str:
+    """`value` as `text` formats it; a dash where it is None or NaN."""
+    return none if value is None or value != value else text % value
+
+
+def _share(count: int, total: int) -> str:
+    """A share that is neither 0 nor 1 is not shown as if it were; a dash of nothing."""
+    if count in (0, total):
+        return "–" if total == 0 else f"{100 * count / total:.0f} %"
+    percent = 100 * count / total
+    return "under 0.1 %" if percent < 0.05 else f"{min(percent, 99.9):.1f} %"
+
+
+def _percent(share: float | None) -> str:
+    """A share of 0 to 1 in three digits; one that is under 1 is not shown as if it were all."""
+    return "–" if share is None else f"{min(100 * share, 99.9) if share < 1 else 100:.3g} %"
+
+
+def _count(value: float | None) -> str:
+    """Whole numbers with a thin space between thousands."""
+    return "–" if value is None else f"{value:,.0f}".replace(",", "\u202f")
+
+
+def _path(values: list[float | None], most: float) -> str:
+    """A line over time in a box of 120 x 22, from 0 to `most`, as SVG draws it; None is a gap."""
+    step, drawn, pen_down = 120 / max(len(values) - 1, 1), list[str](), False
+    for index, value in enumerate(values):
+        if value is not None:
+            at = f"{index * step:.1f} {21 - 20 * min(value / most, 1.0) if most > 0 else 21:.1f}"
+            drawn.append(f"L{at}" if pen_down else f"M{at}h.8v0h-.8M{at}")
+        pen_down = value is not None
+    return "".join(drawn) or "M0 0"
+
+
+def _asset(name: str) -> str:
+    """Text of a file that ships beside this one."""
+    return (files("shapepose_fg.viz.report") / "data" / name).read_text(encoding="utf-8")
 
 
 def _sha256(script: str) -> str:
     return base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii")
-
-
-def _json(value: object) -> str:
-    """JSON that no name in it can end."""
-    return json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")

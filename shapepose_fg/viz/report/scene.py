@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.body.model.smpl_file import SmplArrays
+from shapepose_fg.body.model.smpl_file import SMPL_PARENTS, SmplArrays
 from shapepose_fg.core.camera import Camera
-from shapepose_fg.core.drawing import PALETTE, bones_of
+from shapepose_fg.core.drawing import PALETTE, bones_of, thinned
 from shapepose_fg.core.reconstruction import Known
 from shapepose_fg.io.export.markers import sigma_m
+from shapepose_fg.io.export.skinned import BONES, motion_of
 from shapepose_fg.io.export.take import Take, z_up
-from shapepose_fg.viz.report.skins import ROW_BYTES, TURN, Skins, skins_of
 
 _MISSING = -32768
 """In place of a coordinate that is not known."""
@@ -23,6 +23,14 @@ _OCTAVE, _LEVELS = 8, 63
 """Sigma is one of 63 levels, eight to each doubling, from 1 mm on: 9 % apart, in six bits."""
 _FLOOR_M = 0.3
 """The floor is drawn at height 0 where people's feet are within this of it."""
+CELL_M = 0.05
+"""A body has a vertex per so many metres: 860 of the open body's 12,488, which a page can draw in every frame."""
+_ROW_BYTES = 8 * BONES + 6
+"""A body in a frame: quaternions and the pelvis."""
+_MOST_BONES = 4
+"""Bones that bend a vertex, the strongest."""
+_TURN = 32767
+"""A quaternion's entries are whole numbers of one part in so many."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +53,7 @@ def scene_of(take: Take, arrays: SmplArrays | None, most_bytes: int) -> Scene:
     The page's axes are those of the world turned so that z is up. Bodies where `arrays`, the body model, is given.
     """
     J = len(take.people.joint_names)
-    row_bytes = 4 / 3 * (6 * J + J + 2 + (ROW_BYTES if arrays is not None else 0))
+    row_bytes = 4 / 3 * (6 * J + J + 2 + (_ROW_BYTES if arrays is not None else 0))
     every = max(1, int(np.ceil(len(take.people) * row_bytes / most_bytes)))
     index = np.arange(0, len(take.frames), every)
     axes = z_up(take.up)
@@ -55,11 +63,11 @@ def scene_of(take: Take, arrays: SmplArrays | None, most_bytes: int) -> Scene:
     joints = take.people.joints[rows] @ axes.T
     cameras = () if take.rig is None else take.rig.cameras
     centres = np.array([camera.centre for camera in cameras]).reshape(-1, 3) @ axes.T
-    pack, unit = _packing(joints)
+    pack = _packing(joints)
     sigma = sigma_m(take.people.covariance[rows])
     counts = np.bincount(frame, minlength=len(index))
     scene = {
-        "unit": unit,
+        "unit": pack.unit_m,
         "origin": pack.origin.tolist(),
         "axes": axes.T.tolist(),
         "frames": _base64(take.frames[index], "<i4"),
@@ -76,7 +84,7 @@ def scene_of(take: Take, arrays: SmplArrays | None, most_bytes: int) -> Scene:
         "view": _view(joints, centres),
     }
     if arrays is not None:
-        scene |= _bodies(skins_of(take, arrays, axes, index[frame], person), pack)
+        scene |= _bodies(take, arrays, axes, index[frame], person, pack)
     return Scene(scene, every, len(index), len(take.frames))
 
 
@@ -96,15 +104,15 @@ class _Packing:
         return np.where(near, steps, _MISSING)
 
 
-def _packing(joints: NDArray[np.float64]) -> tuple[_Packing, float]:
-    """How places are rounded, and the unit in metres."""
+def _packing(joints: NDArray[np.float64]) -> _Packing:
+    """How places are rounded."""
     placed = joints[np.isfinite(joints).all(axis=-1)]
     if len(placed) == 0:
-        return _Packing(np.zeros(3), 1e-3 * _FINEST_MM), 1e-3 * _FINEST_MM
+        return _Packing(np.zeros(3), 1e-3 * _FINEST_MM)
     low, high = placed.min(axis=0), placed.max(axis=0)
     # Bodies reach a little farther than joints.
-    unit = 1e-3 * max(_FINEST_MM, float(np.ceil(1e3 * (np.ptp(placed, axis=0).max() + 2.0) / 2 / 32000)))
-    return _Packing((low + high) / 2, unit), unit
+    coarse = float(np.ceil(1e3 * ((high - low).max() + 2.0) / 2 / 32000))
+    return _Packing((low + high) / 2, 1e-3 * max(_FINEST_MM, coarse))
 
 
 def _known_and_sigma(known: NDArray[np.uint8], sigma: NDArray[np.float64]) -> NDArray[np.uint8]:
@@ -158,17 +166,48 @@ def _camera(camera: Camera, axes: NDArray[np.float64]) -> dict[str, Any]:
     }
 
 
-def _bodies(skins: Skins, pack: _Packing) -> dict[str, Any]:
-    """People's bodies as the page's script reads them."""
+def _bodies(
+    take: Take,
+    arrays: SmplArrays,
+    axes: NDArray[np.float64],
+    frame: NDArray[np.intp],
+    person: NDArray[np.intp],
+    pack: _Packing,
+) -> dict[str, Any]:
+    """The bodies of N rows, each a `person` (N,) of the take in a `frame` (N,), for the page's script to bend.
+
+    All share one light `mesh`: faces (F, 3), and each vertex's bones (M, 4) with their weights of 255. `rest`
+    (P, M, 3) and `rest_joints` (P, 24, 3) are people in the T-pose; `turns` (N, 24, 4) are quaternions x y z w of
+    bones against their parents, and `pelvis` (N, 3) is where it is. Rows without a body are missing in them.
+    """
+    kept, faces = thinned(arrays.template, arrays.faces, CELL_M)
+    order = np.argsort(-arrays.weights[kept], axis=1, kind="stable")[:, :_MOST_BONES]
+    weights = np.take_along_axis(arrays.weights[kept], order, axis=1)
+    weights = np.rint(255 * weights / weights.sum(axis=1, keepdims=True))
+    P, N = len(take.persons), len(frame)
+    rest, joints = np.full((P, len(kept), 3), np.nan), np.full((P, BONES, 3), np.nan)
+    turns, pelvis = np.full((N, BONES, 4), np.nan), np.full((N, 3), np.nan)
+    for each in range(P):
+        motion = motion_of(take, each, arrays, axes)
+        if motion is None:
+            continue
+        rest[each], joints[each] = motion.rest.vertices[kept], motion.rest.joints
+        place = np.full(len(take.frames), -1)
+        place[motion.index] = np.arange(len(motion.index))
+        mine = np.flatnonzero((person == each) & (place[frame] >= 0))
+        turns[mine], pelvis[mine] = motion.rotations[place[frame[mine]]], motion.pelvis[place[frame[mine]]]
     millimetres = _Packing(np.zeros(3), 1e-3)
     return {
         "mesh": {
-            name: _base64(values, "u1" if name == "weights" else "<i2") for name, values in skins.mesh.items()
+            "faces": _base64(faces, "<i2"),
+            "bones": _base64(order, "<i2"),
+            "weights": _base64(weights, "u1"),
+            "parents": _base64(np.array(SMPL_PARENTS), "<i2"),
         },
-        "rest": _base64(millimetres(skins.rest), "<i2"),
-        "rest_joints": _base64(millimetres(skins.joints), "<i2"),
-        "turns": _base64(np.rint(TURN * np.nan_to_num(skins.turns)), "<i2"),
-        "pelvis": _base64(pack(skins.pelvis), "<i2"),
+        "rest": _base64(millimetres(rest), "<i2"),
+        "rest_joints": _base64(millimetres(joints), "<i2"),
+        "turns": _base64(np.rint(_TURN * np.nan_to_num(turns)), "<i2"),
+        "pelvis": _base64(pack(pelvis), "<i2"),
     }
 
 

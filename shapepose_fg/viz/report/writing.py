@@ -16,7 +16,6 @@ from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.export.take import Take
 from shapepose_fg.io.solved_setup import CAMERAS
 from shapepose_fg.tracking.listing import list_tracks
-from shapepose_fg.viz.report.figures import camera_figures
 from shapepose_fg.viz.report.page import Content, page_text
 from shapepose_fg.viz.report.scene import Scene, scene_of
 
@@ -63,8 +62,7 @@ def write_report(
         except ValueError as error:
             remarks.append(f"there is no scene: {error}")
     title = folder.resolve().name or str(folder)
-    tracks = list_tracks(people, arrays, every)
-    text = page_text(Content(title, people, tracks, camera_figures(people), scene, remarks))
+    text = page_text(Content(title, people, list_tracks(people, arrays, every), scene, remarks))
     file = folder / REPORT
     # A name may hold half of a pair of surrogates, which no file can.
     write_atomically(file, lambda stream: stream.write(text.encode("utf-8", "replace")))

@@ -15,9 +15,7 @@ from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.io.footage.footage import Picture
 from shapepose_fg.io.footage.placement import Placement, PlacementKind
 from shapepose_fg.viz.bodies import joined, surfaces
-from shapepose_fg.viz.overlay.drawing import Skeletons, draw_label, draw_skeletons
-from shapepose_fg.viz.overlay.output import write_picture
-from shapepose_fg.viz.overlay.picture_view import PictureView
+from shapepose_fg.viz.overlay.drawing import PictureView, Skeletons, draw_label, draw_skeletons, write_picture
 from shapepose_fg.viz.rendering import look_at, render_depth, render_shaded, zoom
 from shapepose_fg.viz.viewer.floor import Floor, floor_picture
 

@@ -9,11 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.core.skeleton import SMPL_24
-from shapepose_fg.io.export.amass import write_amass
-from shapepose_fg.io.export.bvh import write_bvh
 from shapepose_fg.io.export.glb import influences, write_glb
 from shapepose_fg.io.export.job import Job
-from shapepose_fg.io.export.reading import read_take
+from shapepose_fg.io.export.motion_files import write_amass, write_bvh
+from shapepose_fg.io.export.registry import read_take
 from shapepose_fg.io.export.skinned import motion_of
 from shapepose_fg.io.export.take import Take, y_up
 

@@ -11,12 +11,10 @@ import pytest
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25, COCO_17, HALPE_26, SMPL_24
-from shapepose_fg.io.export.amass import write_amass
-from shapepose_fg.io.export.bvh import write_bvh
 from shapepose_fg.io.export.job import Job
-from shapepose_fg.io.export.marker_files import c3d_bytes, write_c3d, write_trc
-from shapepose_fg.io.export.markers import Markers, MarkerSet, opensim_names
-from shapepose_fg.io.export.reading import read_take
+from shapepose_fg.io.export.markers import Markers, MarkerSet, c3d_bytes, opensim_names, write_c3d, write_trc
+from shapepose_fg.io.export.motion_files import write_amass, write_bvh
+from shapepose_fg.io.export.registry import read_take
 from shapepose_fg.io.export.tables import COLUMNS, csv_text
 from shapepose_fg.io.export.take import Take
 

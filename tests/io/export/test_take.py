@@ -8,7 +8,7 @@ import pytest
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Known, Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.io.export.reading import read_take
+from shapepose_fg.io.export.registry import read_take
 from shapepose_fg.io.export.take import Take, opensim_axes, y_up, z_up
 
 from .conftest import AWAY, FIRST, FPS, FRAMES, GUESSED

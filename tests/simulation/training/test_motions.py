@@ -7,8 +7,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.simulation.training.motions import SUBJECT_CAP, WALK_CAP, Motions, frame_weights, load_motions
-from shapepose_fg.simulation.training.split import SPLITS, TEST_SUBJECTS, VALIDATION_SUBJECTS, split_of
+from shapepose_fg.simulation.training.motions import (
+    SPLITS,
+    SUBJECT_CAP,
+    TEST_SUBJECTS,
+    VALIDATION_SUBJECTS,
+    WALK_CAP,
+    Motions,
+    frame_weights,
+    load_motions,
+    split_of,
+)
 
 Z_UP = Rotation.from_rotvec([np.pi / 2, 0.0, 0.0])
 
@@ -83,8 +92,7 @@ def test_poses_of_cmu_are_the_recorded_ones_with_collars_that_follow_the_arms(cm
         turned = arm.inv() * Rotation.from_rotvec(recorded[:, shoulder])
         assert np.quantile(turned.magnitude(), 0.97) < 1e-6  # single precision here
     assert np.linalg.norm(ours[:, 13], axis=1).max() > 0.05  # they do move
-    assert not cmu.observed[:, [13, 14, 22, 23]].any() and cmu.observed[:, legs_and_trunk].all()
-    assert not cmu.poses[~cmu.observed].reshape(-1, 3)[:, 0].all()
+    assert not cmu.poses[:, 22:].any()
 
 
 def test_a_folder_of_amass_is_read_thinned_and_turned_upright(tmp_path):
@@ -98,7 +106,6 @@ def test_a_folder_of_amass_is_read_thinned_and_turned_upright(tmp_path):
     assert set(motions.subject[:30]) == {"s1"} and set(motions.subject[30:]) == {"s2"}
     np.testing.assert_allclose(motions.poses[:30, 1:22], poses[::4, 3:66].reshape(-1, 21, 3), atol=1e-6)
     assert not motions.poses[:, 22:].any()
-    assert motions.observed[:, :22].all() and not motions.observed[:, 22:].any()
     upright = Rotation.from_rotvec(motions.poses[:30, 0].astype(float))
     assert ((Z_UP * upright).inv() * Rotation.from_rotvec(poses[::4, :3])).magnitude().max() < 1e-6
 
@@ -142,8 +149,8 @@ def test_what_is_no_npz_is_refused(tmp_path):
 def test_shapes_are_checked_and_frames_must_be_finite(cmu):
     some = cmu.rows(np.arange(5))
     fields = vars(some)
-    with pytest.raises(ValueError, match=r"observed must be \(5, 24\)"):
-        Motions(**(fields | {"observed": some.observed[:3]}))
+    with pytest.raises(ValueError, match=r"weight must be \(5,\)"):
+        Motions(**(fields | {"weight": some.weight[:3]}))
     with pytest.raises(ValueError, match="finite"):
         Motions(**(fields | {"poses": some.poses * np.float32(np.nan)}))
     with pytest.raises(ValueError, match="split must be one of"):

@@ -10,15 +10,23 @@ from scipy.stats import chi2
 from shapepose_fg.body.fitting.descent import LearnedDescent, gradient_scale
 from shapepose_fg.body.fitting.network import NetworkConfig, UpdateNetwork
 from shapepose_fg.body.fitting.person_frame import PersonFrame
-from shapepose_fg.body.fitting.pose_prior import PosePrior
+from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.fitting.weights import FitterWeights, fingerprint
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.core.skeleton import SMPL_24
-from shapepose_fg.simulation.training.calibration import INSIDE, calibrated, left_out_squared
 from shapepose_fg.simulation.training.motions import MIRROR_JOINTS, Motions
-from shapepose_fg.simulation.training.train import PeopleSource, Trainer, TrainingConfig, body_points, prepared
+from shapepose_fg.simulation.training.train import (
+    INSIDE,
+    PeopleSource,
+    Trainer,
+    TrainingConfig,
+    body_points,
+    calibrated,
+    left_out_squared,
+    prepared,
+)
 
 ALL = tuple(range(len(BODY_POINTS)))
 SMALL = TrainingConfig(
@@ -45,8 +53,8 @@ def motions(count: int = 200, seed: int = 0) -> Motions:
     root = np.zeros((count, 1, 3))
     root[:, 0, 1] = rng.uniform(-np.pi, np.pi, count)
     poses = np.concatenate((root, PosePrior.default().sample(rng, count)), axis=1).astype(np.float32)
-    ones, subject = np.ones(count), np.full(count, "01")
-    return Motions(poses, np.ones((count, 24), dtype=bool), ones, subject)
+    subject = np.full(count, "01")
+    return Motions(poses, np.ones(count), subject)
 
 
 @pytest.fixture(scope="module")

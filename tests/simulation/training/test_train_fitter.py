@@ -11,10 +11,9 @@ import pytest
 import torch
 from safetensors import safe_open
 
-from shapepose_fg.body.fitting.fitter import JointTargets
+from shapepose_fg.body.fitting.fitter import BodyConfig, JointTargets
 from shapepose_fg.body.fitting.fitters import SmplFitter
-from shapepose_fg.body.fitting.pose_prior import PosePrior
-from shapepose_fg.body.fitting.settings import BodyConfig
+from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.fitting.weights import FitterWeights
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.core.errors import InputError

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from shapepose_fg.core.drawing import thinned
-from shapepose_fg.viz.report.skins import CELL_M
+from shapepose_fg.viz.report.scene import CELL_M
 from tests.io.export.conftest import BARE, FIRST, FPS, FRAMES
 
 from .browser import Browser, chromium

@@ -3,7 +3,7 @@
 import numpy as np
 
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.estimation.limb_lengths import limb_lengths, limbs_of, with_lengths
+from shapepose_fg.estimation.limbs import limb_lengths, limbs_of, with_lengths
 
 SHOULDER, ELBOW, WRIST = (BODY_25.index(name) for name in ("RShoulder", "RElbow", "RWrist"))
 LIMBS = limbs_of(BODY_25.joints)

@@ -1,10 +1,19 @@
-"""Limbs keep their length: joints that views hardly determine, beside neighbours that they do."""
+"""Where a body can have the joints that views hardly determine: with the body, and limbs as long as its own."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.body.fitting.fitter import BodyFitter, JointTargets
+from shapepose_fg.estimation.in_time import near_in_time, smoothed_in_time, waited_s
+from shapepose_fg.estimation.linearisation import weakest_sigma
+from shapepose_fg.estimation.state import SEEN_M, State
+
+LIMB_SIGMA_M = 0.03
+"""Sigma of an unseen joint from which on it is more the body's than its own."""
+STEP_S = 0.1
+"""Time over which what a body changes of unseen joints is averaged, seconds, one sigma."""
 LENGTH_SIGMA_M = 0.1
 """How far a limb of a detector's joints may be from its length, metres, in one sweep: as far as the views may
 leave open a joint that counts as seen (`outcome.SEEN_M`). With `_SWEEPS` sweeps the length counts about four
@@ -19,6 +28,60 @@ _LIMBS = (
 _SWEEPS = 4
 """How often all limbs are gone through, each time with the covariances of before the first: a wrist follows the
 elbow that the shoulder holds."""
+
+
+def limbs_kept(state: State, covariance: NDArray[np.float64], fitter: BodyFitter) -> NDArray[np.float64]:
+    """Joints (N, J, 3): those that no view saw, in windows of several frames, where a body can have them, and
+    limbs as long as the body's where views leave an end open. `covariance` (N, J, 3, 3) is the joints' own.
+
+    Not those with factors of the user's own. Steps are averaged over time: bodies are fitted frame by frame.
+    """
+    X, limbs = state.joints, limbs_of(state.config.joints)
+    unseen = ~np.asarray(state.inlier.any(axis=-1))
+    for person in state.people:
+        unseen[person.rows] &= person.temporal & ~person.touched
+    steps = limb_steps(X, covariance, unseen, fitter)
+    weak, placed = weakest_sigma(state.of_views.information) > SEEN_M, X.copy()
+    for person in state.people:
+        rows, times_s = person.rows, person.times_s
+        if not person.temporal:
+            continue
+        moved = near_in_time(weak[rows], times_s, STEP_S) & ~person.touched
+        lengths = limb_lengths(state.fit.joints[rows], limbs)
+        stepped = smoothed_in_time(steps[rows], times_s, STEP_S)
+        into = np.minimum(waited_s(~unseen[rows], times_s) / STEP_S, 1.0)
+        stepped = X[rows] + into[..., None] * stepped
+        placed[rows] = with_lengths(stepped, covariance[rows], moved, lengths, limbs)
+    return placed
+
+
+def limb_steps(
+    joints: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+    unseen: NDArray[np.bool_],
+    fitter: BodyFitter,
+) -> NDArray[np.float64]:
+    """Steps (N, J, 3), metres, that take joints that no view saw, `unseen` (N, J), to where a body can have them.
+
+    Motion carries each joint by itself: elbow and wrist, both hidden, drift apart. A body is fitted to all joints
+    as they are known, and an unseen one goes towards the body's, C (C + s² I)^-1 of the way: hardly where it was
+    seen a moment ago, and wholly where its covariance C is large. s is `LIMB_SIGMA_M`. Covariances stay: what the
+    body says of the joint without its views is in them already.
+    """
+    known = np.asarray(np.isfinite(joints).all(axis=-1) & np.isfinite(covariance).all(axis=(-2, -1)))
+    moved = unseen & known
+    rows = np.flatnonzero(moved.any(axis=-1))
+    steps = np.zeros(joints.shape)
+    if len(rows) == 0:
+        return steps
+    C = np.where(known[rows][..., None, None], covariance[rows], np.eye(3))
+    information = np.where(known[rows][..., None, None], np.linalg.inv(C), 0.0)
+    targets = JointTargets(np.nan_to_num(joints[rows]), (information + information.swapaxes(2, 3)) / 2)
+    body = fitter.fit_whole(targets)
+    share = C @ np.linalg.inv(C + LIMB_SIGMA_M**2 * np.eye(3))
+    step = np.einsum("...ij,...j->...i", share, body.joints - joints[rows])
+    steps[rows] = np.where((moved[rows] & np.isfinite(step).all(axis=-1))[..., None], step, 0.0)
+    return steps
 
 
 def limbs_of(joints: Sequence[str]) -> list[tuple[int, int]]:

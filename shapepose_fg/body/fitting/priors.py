@@ -1,0 +1,164 @@
+"""What bodies do: the poses that people take, how fast these change, how far joints can be apart.
+
+Both priors were learnt from motion capture (`body/data/*.md`).
+"""
+
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
+from shapepose_fg.body.model.target_skeletons import BODY_POINTS
+from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.core.storage.npz import read_npz
+
+Array = NDArray[np.float64]
+
+NUM_ANGLES = 69
+"""The 23 local rotations below the root, axis-angle, in SMPL's order."""
+NUM_MOVING = 3 + NUM_ANGLES + 3
+"""Rotation of the root, the other 69 angles, the root's place."""
+
+_DATA = Path(__file__).parents[1] / "data"
+_CURE = "install the package again"
+_SAMPLES = 2000
+_MARGIN, _NOISE_M = 1.25, 0.05
+"""Other people than the body model knows, and the errors of two joints (3 cm each, one and a half sigma)."""
+_UNKNOWN_M = 0.75
+"""No bone is longer: the trunk of a tall adult, hip to neck, is about 0.65 m."""
+
+
+@dataclass(frozen=True)
+class PosePrior:
+    """A Gaussian over the axis-angle of every joint but the root, and limits for drawing from it.
+
+    Angles are relative to the T-pose, in radians. Fits do not need the limits: with them as a penalty, no error
+    changed on held-out motions, noisy or seen by one view only.
+    """
+
+    mean: Array
+    """(69,) mean angles, rad."""
+    covariance: Array
+    """(69, 69) covariance, rad², positive definite."""
+    lower: Array
+    """(69,) angles under which a joint is bent the wrong way, rad; -inf where there is no limit."""
+    upper: Array
+    """(69,) angles over which a joint is bent the wrong way, rad; inf where there is no limit."""
+    provenance: str
+    """Where the motions came from and how the prior was made."""
+
+    def __post_init__(self) -> None:
+        for name in ("mean", "covariance", "lower", "upper"):
+            shape = (NUM_ANGLES,) * (2 if name == "covariance" else 1)
+            value = np.asarray(getattr(self, name), dtype=np.float64)
+            if value.shape != shape:
+                raise ValueError(f"the pose prior's {name} must be {shape}, got {value.shape}")
+            if np.isnan(value).any():
+                raise ValueError(f"the pose prior's {name} holds NaN: fit it again")
+            object.__setattr__(self, name, value)
+        if np.abs(self.covariance - self.covariance.T).max() > 1e-9:
+            raise ValueError("the pose prior's covariance must be symmetric")
+        if np.linalg.eigvalsh(self.covariance).min() <= 0:
+            raise ValueError("the pose prior's covariance must be positive definite: regularise it")
+        if (self.lower >= self.upper).any():
+            raise ValueError("the pose prior's lower limits must be below the upper ones")
+
+    @staticmethod
+    @cache
+    def default() -> "PosePrior":
+        """The prior that ships with the package (read once)."""
+        data = read_npz(_DATA / "pose_prior.npz", ("means", "covariances", "lower", "upper", "provenance"), _CURE)
+        arrays = (data["means"][0], data["covariances"][0], data["lower"], data["upper"])
+        return PosePrior(*(value.astype(np.float64) for value in arrays), provenance=str(data["provenance"]))
+
+    def widened(self, factor: float) -> "PosePrior":
+        """The same with standard deviations `factor` times as large."""
+        return replace(self, covariance=factor**2 * self.covariance)
+
+    def marginal_precision(self, angles: NDArray[np.intp]) -> Array:
+        """(A, A) inverse covariance of some `angles` (A,), the others free, 1/rad²."""
+        precision = np.linalg.inv(self.covariance[angles[:, None], angles])
+        return np.asarray((precision + precision.T) / 2, dtype=np.float64)
+
+    def regression(self, given: NDArray[np.intp], asked: NDArray[np.intp]) -> Array:
+        """Matrix G (M, A) that predicts angles `asked` (M,) from `given` ones (A,).
+
+        E[asked | given] = mean[asked] + G (given - mean[given]).
+        """
+        S = self.covariance
+        G = np.linalg.solve(S[given[:, None], given], S[given[:, None], asked])
+        return np.asarray(G.T, dtype=np.float64)
+
+    def sample(self, rng: np.random.Generator, count: int) -> Array:
+        """Draw `count` poses (count, 23, 3), rad; angles past a limit are brought back to it."""
+        rng.random(count)  # once chose between Gaussians: what a seed gives stays what it was
+        white = rng.normal(size=(count, NUM_ANGLES))
+        factor = np.broadcast_to(np.linalg.cholesky(self.covariance), (count, NUM_ANGLES, NUM_ANGLES))
+        draw = self.mean + np.einsum("nij,nj->ni", factor, white)
+        return np.clip(draw, self.lower, self.upper).reshape(count, 23, 3)
+
+
+@dataclass(frozen=True)
+class MotionPrior:
+    """Power spectral densities of the 75 numbers that move, in the order root, angles, place.
+
+    Between rows at the times t_k, with h_k = t_k+1 - t_k and v_k = (q_k+1 - q_k) / h_k:
+
+        v_k ~ N(0, velocity / h_k),   v_k+1 - v_k ~ N(0, acceleration (h_k + h_k+1) / 2)
+
+    the second for smooth motion, the first so that what nothing shows does not drift away.
+    """
+
+    acceleration: Array
+    """(75,) of the acceleration: rad²/s³, of the place m²/s³."""
+    velocity: Array
+    """(75,) of the velocity: rad²/s, of the place m²/s."""
+    provenance: str
+    """Where the motions came from and how the prior was made."""
+
+    def __post_init__(self) -> None:
+        for name in ("acceleration", "velocity"):
+            value = np.asarray(getattr(self, name), dtype=np.float64)
+            if value.shape != (NUM_MOVING,):
+                raise ValueError(f"the motion prior's {name} must be ({NUM_MOVING},), got {value.shape}")
+            if not (np.isfinite(value) & (value > 0)).all():
+                raise ValueError(f"the motion prior's {name} must be positive numbers: fit it again")
+            object.__setattr__(self, name, value)
+
+    @staticmethod
+    @cache
+    def default() -> "MotionPrior":
+        """The prior that ships with the package (read once)."""
+        data = read_npz(_DATA / "motion_prior.npz", ("acceleration", "velocity", "provenance"), _CURE)
+        return MotionPrior(data["acceleration"], data["velocity"], str(data["provenance"]))
+
+    def part(self, angles: NDArray[np.intp]) -> tuple[Array, Array]:
+        """Acceleration and velocity (N,) of the root, some of the `angles` (A,) and the place."""
+        kept = np.concatenate([np.arange(3), 3 + angles, np.arange(-3, 0) + NUM_MOVING])
+        return self.acceleration[kept], self.velocity[kept]
+
+
+@cache
+def longest_bones(skeleton: Skeleton) -> Array:
+    """(J,) metres from each joint to its parent that hardly anybody exceeds; infinite for the root.
+
+    The 99.9 % quantile over bodies within three standard deviations of shape, in poses drawn from the pose prior,
+    with a margin. Joints that the body does not have get the longest of all.
+    """
+    known = [j for j, name in enumerate(skeleton.joints) if name in BODY_POINTS]
+    model = BodyModel.default().with_keypoints(tuple(skeleton.joints[j] for j in known))
+    rng = np.random.default_rng(0)
+    pose = torch.from_numpy(PosePrior.default().sample(rng, _SAMPLES)).to(model.dtype)
+    betas = torch.from_numpy(rng.standard_normal((_SAMPLES, 10)).clip(-3, 3)).to(model.dtype)
+    still = pose.new_zeros(_SAMPLES, 3)
+    xyz = np.full((_SAMPLES, len(skeleton), 3), np.nan)
+    with torch.inference_mode():
+        xyz[:, known] = model.keypoints(BodyParameters(betas, still, pose, still)).numpy()
+    parents = np.array(skeleton.parents)
+    length = np.quantile(np.linalg.norm(xyz - xyz[:, parents], axis=-1), 0.999, axis=0)
+    longest = np.where(np.isfinite(length), _MARGIN * length + _NOISE_M, _UNKNOWN_M)
+    return np.where(parents < 0, np.inf, longest)

@@ -1,0 +1,173 @@
+"""Stage II on one page: a window of frames, from whose detections are whose to joints, bodies and graphs."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
+from shapepose_fg.body.fitting.fitter import BodyFitter
+from shapepose_fg.core.camera import Views
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.estimation.body_step import BodyStep, disagreement
+from shapepose_fg.estimation.contact import feet_of, walking
+from shapepose_fg.estimation.draft import draft, first_places
+from shapepose_fg.estimation.estimator_config import EstimatorConfig
+from shapepose_fg.estimation.in_time import interpolated
+from shapepose_fg.estimation.linearisation import (
+    Message,
+    ViewEvidence,
+    linearise,
+    mean_confidence,
+    observation_sigmas,
+)
+from shapepose_fg.estimation.motion_model import LOST_M, MotionModel
+from shapepose_fg.estimation.outcome import outcome
+from shapepose_fg.estimation.smoothing import smoothed
+from shapepose_fg.estimation.state import State
+from shapepose_fg.estimation.window_graph import ExtraFactors, WindowGraph
+from shapepose_fg.estimation.window_solution import WindowSolution
+from shapepose_fg.tracking.hypotheses import Input
+from shapepose_fg.tracking.reassociation import Survival, reassociate
+from shapepose_fg.tracking.view_assignment import AssignmentConfig
+
+
+@dataclass(frozen=True)
+class Assigning:
+    """What detections are assigned again from, around drafts."""
+
+    frames: Sequence[Input]
+    """All detections of the window's frames, before cameras that stand still."""
+    skeleton: Skeleton
+    """The detector's joints."""
+    config: AssignmentConfig
+    """How."""
+    rounds: int
+    """How often."""
+    over_time: bool
+    """Whether people are the same from frame to frame. If not, each round asks more of who stays (`Survival`)."""
+
+
+def solve_window(
+    observations: Observations,
+    views: Views,
+    fitter: BodyFitter,
+    config: EstimatorConfig,
+    *,
+    assigning: Assigning | None = None,
+    extra_factors: ExtraFactors | None = None,
+) -> WindowSolution:
+    """Joints, covariances, bodies and graphs of N rows, sorted in any way; (track, frame) must differ.
+
+    Rows of one track at several frames are a window, one factor graph; a row whose track has no other is the
+    frame-by-frame method, and with `EstimatorConfig` of the paper its Algorithm 1. `views` are the cameras, row by
+    row if they move. `extra_factors` adds factors of your own to every window. Without `assigning` detections stay
+    with whom they are.
+
+    In each round the body is fitted to what the views alone say of all joints, and then pulls the joints. What it
+    says of a joint leaves that joint's own views out (`BodyFit.prior_xyz`), so that nothing is counted twice and
+    the covariances stay honest. Motion acts on the joints, never on what the body is fitted to. `config.refine`
+    switches to what the paper does in place of it.
+    """
+    if len(views) != observations.confidence.shape[2] or views.rows_known not in (None, len(observations)):
+        raise ValueError(
+            f"views must be of the {len(observations)} rows' {observations.confidence.shape[2]} views"
+        )
+    began = time.perf_counter()
+    motion = MotionModel.load(config.joints, config.motion)
+
+    # Assign: detections go to whom a draft of joints and bodies puts near them, round by round.
+    for n in range(assigning.rounds if assigning is not None and len(observations) > 0 else 0):
+        assert assigning is not None
+        places, covariance = draft(observations, views, fitter, config)
+        if assigning.over_time:
+            times_s = observations.time_s.mean(axis=1)
+            places, covariance = smoothed(places, covariance, observations.track, times_s, motion)
+        survival = None if assigning.over_time else Survival().at(n / max(assigning.rounds - 1, 1))
+        observations = reassociate(
+            assigning.frames, observations, places, covariance, assigning.skeleton, assigning.config, survival
+        )
+    assigned = time.perf_counter()
+
+    # Draft: X_0, the observations' sigmas there, and everybody's graph.
+    first = first_places(observations, views, fitter, config)
+    sigmas = observation_sigmas(observations, first, views, config.observations, config.joints)
+    state = State.start(observations, views, sigmas, first, config, motion, extra_factors)
+    moving = state.people
+    for n in range(config.refine.alternations if len(moving) > 0 else 0):  # Algorithm 1
+        rows = np.concatenate([person.rows for person in moving])
+        observed, sigma, cameras, X = observations.rows(rows), sigmas[rows], views.rows(rows), state.joints[rows]
+
+        # Gate: what the views say around X, delta of Eq. 2.
+        evidence = linearise(observed, sigma, X, cameras, config.observations)
+        if n == 0:
+            placed = evidence.sigma_m <= config.refine.max_sigma_m
+            state.enough[rows] = placed.sum(axis=1) >= LEAST_JOINTS
+
+        # Bodies: the Theta step.
+        step = BodyStep(fitter, moving, config)
+        targets = step.targets(evidence, state.enough[rows])
+        body, fitted = step.fit(targets, state.fit.rows(rows)), evidence.target
+        wrong = disagreement(evidence, body) > config.refine.contradiction
+        if wrong.any():
+            # Gated anew around the body's place; and the body is fitted again, without what was thrown away.
+            there = np.where(wrong[..., None], body.prior_xyz, X)
+            evidence = linearise(observed, sigma, there, cameras, config.observations)
+            again = np.flatnonzero(wrong.any(axis=-1))
+            targets = step.targets(evidence, state.enough[rows])
+            body = body.with_rows(again, step.fit(targets, body, again))
+        # delta of Eq. 4; and what its views do not determine needs the body however sure its one view is.
+        pulled = mean_confidence(observed, evidence.inlier) <= config.graph.rho_3d
+        pulled |= evidence.sigma_m > config.refine.max_sigma_m
+        of_body = step.message(body, targets, pulled)
+
+        # Joints: the X step.
+        X_new = np.full(X.shape, np.nan)
+        for person, part in _parts(moving):
+            X_new[part] = _solved(person, evidence, of_body, part, config)
+        state.put(rows, X_new, evidence, wrong, of_body, body)
+
+        # Settled: the body was fitted to where the joints are now, and pulled joints stay where they were.
+        before = np.where((of_body.known | wrong)[..., None], X, fitted)
+        still = np.linalg.norm(X_new - before, axis=-1) < config.refine.settled_m
+        settled = (still | np.isnan(X_new).any(axis=-1)).all(axis=1)
+        more = n + 1 < config.refine.window_alternations
+        moving = [
+            person
+            for person, part in _parts(moving)
+            if not settled[part].all() and (more or not person.temporal or person.touched.any())
+        ]
+        if len(moving) == 0:
+            break
+    solution = outcome(state, fitter)
+    solution.seconds.update({"associate again": assigned - began, "solve": time.perf_counter() - assigned})
+    return solution
+
+
+def _parts(people: Sequence[WindowGraph]) -> list[tuple[WindowGraph, slice]]:
+    """Everybody with their place among the rows of all."""
+    ends = np.cumsum([len(person) for person in people]).tolist()
+    return [(person, slice(end - len(person), end)) for person, end in zip(people, ends, strict=True)]
+
+
+def _solved(
+    person: WindowGraph, evidence: ViewEvidence, of_body: Message, part: slice, config: EstimatorConfig
+) -> NDArray[np.float64]:
+    """X (T, J, 3) of one person, whose rows are a `part` of those of views and body."""
+    views, body = evidence.message.rows(part), of_body.rows(part)
+    inlier, sigma_m, points = evidence.inlier[part], evidence.sigma_m[part], evidence.points[part]
+    placed = sigma_m <= config.refine.max_sigma_m
+    initial = np.where(placed[..., None], points, np.where(body.known[..., None], body.xyz, np.nan))
+    if not person.temporal:
+        return person.solve(inlier & (placed | body.known)[..., None], views, body, initial)
+    initial = interpolated(np.where(np.isfinite(points), points, initial), person.times_s)
+    # X_0 alone is no evidence: a joint that nobody says anything of has nothing that determines it.
+    mentioned = (inlier.any(axis=-1) | body.known).any(axis=0) | person.touched
+    initial[:, ~mentioned] = np.nan
+    lost = sigma_m > LOST_M
+    feet = feet_of(config.joints if config.motion.contact else ())
+    standing = walking(person, (inlier, views, body), initial, lost, feet)
+    return person.solve(inlier, views, body, initial, lost, standing)

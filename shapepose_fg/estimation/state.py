@@ -1,0 +1,108 @@
+"""People of a window on their way through Algorithm 1."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.body.fitting.fitter import BodyFit, FitStatus
+from shapepose_fg.core.camera import Views
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.estimation.estimator_config import EstimatorConfig
+from shapepose_fg.estimation.linearisation import Message, ViewEvidence
+from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.window_graph import ExtraFactors, WindowGraph
+
+SEEN_M = 0.1
+"""A joint is seen in a frame whose views leave it no less certain than this in any direction, metres."""
+
+
+@dataclass
+class State:
+    """N rows: what is given, and what each round changes."""
+
+    observations: Observations
+    """Which detections each row has."""
+    views: Views
+    """The cameras."""
+    sigmas: NDArray[np.float64]
+    """(N, J, V) of the observations, pixels; 0 where there are none."""
+    first: NDArray[np.float64]
+    """(N, J, 3) X_0, metres; NaN where unknown."""
+    config: EstimatorConfig
+    """How."""
+    motion: MotionModel
+    """How joints move, and how long errors last."""
+    people: list[WindowGraph]
+    """Everybody's factors."""
+    joints: NDArray[np.float64]
+    """(N, J, 3) X, metres; NaN where unknown."""
+    inlier: NDArray[np.bool_]
+    """(N, J, V) delta_ij of Eq. 2: which observations were kept."""
+    contradicts: NDArray[np.bool_]
+    """(N, J) joints whose views the body contradicts (`disagreement`): gated anew from the body's place."""
+    of_views: Message
+    """What the views alone say of N rows, all of the error in it."""
+    of_body: Message
+    """What the body says of each joint without the joint's own views; zero where it does not pull."""
+    enough: NDArray[np.bool_]
+    """(N,) rows whose views place enough joints to place a person."""
+    fit: BodyFit
+    """Theta: the bodies, N rows."""
+
+    @classmethod
+    def start(
+        cls,
+        observations: Observations,
+        views: Views,
+        sigmas: NDArray[np.float64],
+        first: NDArray[np.float64],
+        config: EstimatorConfig,
+        motion: MotionModel,
+        extra_factors: ExtraFactors | None,
+    ) -> "State":
+        """Nothing but X_0, and a graph for everybody, with the user's factors in it."""
+        people = list[WindowGraph]()
+        for rows in window_rows(observations):
+            person = WindowGraph(observations.rows(rows), sigmas[rows], views.rows(rows), config, motion, rows)
+            for factor in extra_factors(person, person.keys) if extra_factors is not None else ():
+                person.add(factor)
+            people.append(person)
+        N, J, V = sigmas.shape
+        of_views, of_body = (Message(np.full((N, J, 3), np.nan), np.zeros((N, J, 3, 3))) for _ in range(2))
+        return cls(
+            observations, views, sigmas, first, config, motion, people, first.copy(),
+            np.zeros((N, J, V), dtype=bool), np.zeros((N, J), dtype=bool), of_views, of_body,
+            np.zeros(N, dtype=bool),
+            BodyFit.failed(np.full(N, FitStatus.TOO_FEW_JOINTS), J),
+        )  # fmt: skip
+
+    def put(
+        self,
+        rows: NDArray[np.intp],
+        joints: NDArray[np.float64],
+        evidence: ViewEvidence,
+        wrong: NDArray[np.bool_],
+        of_body: Message,
+        fit: BodyFit,
+    ) -> None:
+        """What a round found of some `rows` (R,)."""
+        self.joints[rows], self.inlier[rows] = joints, evidence.inlier
+        self.contradicts[rows] |= wrong
+        for kept, new in ((self.of_views, evidence.message), (self.of_body, of_body)):
+            kept.xyz[rows], kept.information[rows] = new.xyz, new.information
+        self.fit = self.fit.with_rows(rows, fit)
+
+
+def window_rows(observations: Observations) -> list[NDArray[np.intp]]:
+    """Rows of each window, frames rising: those of one track.
+
+    ValueError where a person is twice in a frame, or views of a frame are not taken at one time.
+    """
+    if np.any(np.ptp(observations.time_s, axis=1) > 1e-3):
+        raise ValueError("views of one frame must be exposed within 1 ms of each other: synchronise them first")
+    order = np.lexsort((observations.frame, observations.track))
+    track, frame = observations.track[order], observations.frame[order]
+    if np.any((np.diff(track) == 0) & (np.diff(frame) == 0)):
+        raise ValueError("a track may have one row a frame: tell people apart by their track")
+    return np.split(order, np.flatnonzero(np.diff(track)) + 1) if len(order) else []

@@ -1,0 +1,228 @@
+"""Calibrations in JSON and TOML: our own rig file, 4D Association's, CMU Panoptic's, VoxelPose's; and a table per
+camera, as AniPose began it and Pose2Sim, FreeMoCap and Caliscope write it.
+"""
+
+import json
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from shapepose_fg.core.camera import Axis, Lens, Rig
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import write_content
+from shapepose_fg.io.calibration.content import Content
+from shapepose_fg.io.calibration.written import Format, Node, Unit, WrittenCamera, WrittenRig, intrinsics
+from shapepose_fg.io.validation import describe, validated
+
+RIG_FORMAT = "shapepose-fg rig 1"
+"""The tag by which a rig file of our own is known."""
+
+_FIVE = "write at most k1 k2 p1 p2 k3, as OpenCV orders them"
+_MATRIX = "write the 3x3 intrinsic matrix row by row, in pixels"
+_CAMERA_FROM_WORLD = "write the 3x4 camera-from-world matrix row by row"
+_ROTATION = "write the 3x3 camera-from-world rotation row by row"
+_EXTRINSICS = "calibrate the extrinsics of this camera too, or delete its table"
+_SIZE = "write width and height in pixels"
+_CURES = {
+    **{"K": _MATRIX, "matrix": _MATRIX, "RT": _CAMERA_FROM_WORLD, "cTw": _CAMERA_FROM_WORLD, "R": _ROTATION},
+    **{"T": "write the 3 numbers of the translation", "wTc": "write the 4x4 world-from-camera matrix row by row"},
+    **dict.fromkeys(("rotation", "translation"), _EXTRINSICS),
+    **dict.fromkeys(("imgSize", "resolution", "size", "image_size"), _SIZE),
+    **dict.fromkeys(("distCoeff", "dist", "distortion", "distCoef", "distortions"), _FIVE),
+    "lens": "write perspective or fisheye",
+}
+"""What to do about a value, by its name in any of the formats."""
+
+
+def write_rig(rig: Rig, path: str | Path) -> None:
+    """Write `rig` as a rig file of our own, which `read_rig` reads back to the last digit."""
+    cameras = [
+        {
+            "name": camera.name,
+            "image_size": list(camera.image_size),
+            "K": camera.K.tolist(),
+            "lens": camera.lens,
+            "distortion": camera.distortion.tolist(),
+            "wTc": camera.wTc.tolist(),
+        }
+        for camera in rig.cameras
+    ]
+    content = {"format": RIG_FORMAT, "unit": "m", "up": rig.up, "cameras": cameras}
+    write_content(Path(path), json.dumps(content, indent=1, allow_nan=False))
+
+
+class _Camera(BaseModel):
+    """A camera of a rig file; its numbers are checked as those of all formats."""
+
+    model_config = ConfigDict(strict=True, extra="forbid")
+    name: Annotated[str, Field(min_length=1)]
+    image_size: Any
+    K: Any
+    lens: Lens = "perspective"
+    distortion: Any = None
+    wTc: Any = None
+    cTw: Any = None
+
+
+class _Rig(BaseModel):
+    model_config = ConfigDict(strict=True, extra="forbid")
+    format: Literal["shapepose-fg rig 1"]
+    unit: Unit | None = None
+    up: Axis | None = None
+    cameras: list[_Camera]
+
+
+def _members(content: Content) -> dict[str, Any]:
+    """The object that a JSON file holds; without members where it is none."""
+    return content.value if content.syntax == "JSON" and isinstance(content.value, dict) else {}
+
+
+def _read_rig_file(content: Content) -> WrittenRig:
+    """Our own file: all that a `Rig` is."""
+    if content.value["format"] != RIG_FORMAT:
+        got = describe(content.value["format"])
+        raise InputError(f'{content.path}: format must be "{RIG_FORMAT}", got {got}; this version reads no other')
+    rig = validated(_Rig, content.value, content.path, _CURES)
+    cures = {
+        "up": 'say which axis points up, "up": "z", or pass --up z',
+        "unit": 'say what lengths are in, "unit": "m", or pass --unit m',
+    }
+    cameras = []
+    for camera in rig.cameras:
+        node = Node(vars(camera), f'{content.path}: camera "{camera.name}"', _CURES)
+        if (camera.wTc is None) == (camera.cTw is None):
+            raise InputError(f"{node.place}: give exactly one of wTc and cTw; {_CURES['wTc']}")
+        wTc = node.pose_of_rows("cTw") if camera.wTc is None else node.pose_of_matrix("wTc")
+        cameras.append(node.camera(camera.name, "K", wTc, ["image_size"], "distortion", camera.lens))
+    return WrittenRig(cameras, rig.unit, rig.up, cures)
+
+
+def _is_association(content: Content) -> bool:
+    """An object of objects, at least one of which has something of a camera."""
+    members = _members(content).values()
+    known = {"K", "RT", "R", "T", "imgSize"}
+    return all(isinstance(each, dict) for each in members) and any(known & each.keys() for each in members)
+
+
+def _read_association(content: Content) -> WrittenRig:
+    """Zhang et al., CVPR 2020: metres, z up; keys of other tools are passed over."""
+    cameras = []
+    for name, value in content.value.items():
+        node = Node(value, f'{content.path}: camera "{name}"', _CURES)
+        turned = node.named("RT") is None and node.named("R") is not None
+        wTc = node.pose("R", "T") if turned else node.pose_of_rows("RT")
+        cameras.append(node.camera(name, "K", wTc, ["imgSize"], "distCoeff dist distortion", most=5))
+    return WrittenRig(cameras, "m", "z")
+
+
+def _is_panoptic(content: Content) -> bool:
+    """An object with a list of cameras."""
+    listed = _members(content).get("cameras")
+    if not isinstance(listed, list):
+        return False
+    return all(isinstance(each, dict) and {"K", "R", "t"} & each.keys() for each in listed)
+
+
+def _read_panoptic(content: Content) -> WrittenRig:
+    """The CMU studio's own file: centimetres, y down, camera from world."""
+    cameras = []
+    for index, value in enumerate(content.value["cameras"]):
+        node = Node(value, f"{content.path}: cameras[{index}]", _CURES)
+        if not isinstance(value.get("name"), str):
+            raise node.refuse("name", f"must be text, got {describe(value.get('name'))}")
+        wTc = node.pose("R", "t")
+        cameras.append(node.camera(value["name"], "K", wTc, ["resolution"], "distCoef", most=5))
+    return WrittenRig(cameras, "cm", "-y")
+
+
+def _voxelpose(content: Content) -> dict[str, Any]:
+    """The cameras of a VoxelPose file by name: an object of them, a list, or a list under a sequence's name."""
+    value = content.value
+    if content.syntax != "JSON":
+        return {}
+    if isinstance(value, dict) and len(value) == 1 and isinstance(next(iter(value.values())), list):
+        value = next(iter(value.values()))
+    if isinstance(value, list):
+        value = {str(index): camera for index, camera in enumerate(value)}
+    if not isinstance(value, dict) or not all(isinstance(each, dict) for each in value.values()):
+        return {}
+    return value if any("fx" in each and "R" in each for each in value.values()) else {}
+
+
+def _read_voxelpose(content: Content) -> WrittenRig:
+    """Millimetres, z up, R (X - T), distortion in two parts, K for pictures whose size is not written."""
+    cameras = []
+    for name, value in _voxelpose(content).items():
+        node = Node(value, f'{content.path}: camera "{name}"', {"": "write it as VoxelPose does"})
+        fx, fy, cx, cy = (float(node.needed(key, 1)[0]) for key in ("fx", "fy", "cx", "cy"))
+        (k1, k2, k3), (p1, p2) = node.needed("k", 3).tolist(), node.needed("p", 2).tolist()
+        wTc = node.pose("R", "T", centre=True)
+        cameras.append(WrittenCamera(name, intrinsics(fx, fy, cx, cy), wTc, None, [k1, k2, p1, p2, k3]))
+    return WrittenRig(cameras, "mm", "z")
+
+
+def _tables(content: Content) -> dict[str, dict[str, Any]]:
+    """The tables of cameras, by their keys; none where this is another TOML."""
+    if content.syntax != "TOML":
+        return {}
+    inner = content.value.get("cameras")
+    tables = inner if isinstance(inner, dict) else content.value
+    return {key: table for key, table in tables.items() if isinstance(table, dict) and "matrix" in table}
+
+
+def _is_caliscope(content: Content) -> bool:
+    return any("cam_id" in table or "port" in table for table in _tables(content).values())
+
+
+def _is_freemocap(content: Content) -> bool:
+    metadata = content.value.get("metadata", {}) if len(_tables(content)) > 0 else {}
+    return isinstance(metadata, dict) and any(key.startswith(("charuco_", "freemocap")) for key in metadata)
+
+
+def _is_pose2sim(content: Content) -> bool:
+    """Pose2Sim says of every camera that it is no fisheye; AniPose says it of fisheyes only."""
+    tables = _tables(content)
+    return len(tables) > 0 and all(table.get("fisheye") is False for table in tables.values())
+
+
+def _read_tables(content: Content, unit: Unit | None, up: Axis | None, cures: Mapping[str, str]) -> WrittenRig:
+    """The cameras that are not to be ignored: camera from world; keys of single programs are passed over."""
+    cameras = []
+    for key, table in _tables(content).items():
+        if table.get("ignore") is True:
+            continue
+        node = Node(table, f'{content.path}: camera "{key}"', _CURES)
+        # Caliscope's videos are called cam_0.mp4, those of its older versions port_0.mp4.
+        numbered = next(
+            (f"{kind}_{table[k]}" for kind, k in (("port", "port"), ("cam", "cam_id")) if k in table), key
+        )
+        fisheye, wTc = table.get("fisheye", False), node.pose("rotation", "translation")
+        if not isinstance(fisheye, bool):
+            raise node.refuse("fisheye", f"must be true or false, got {describe(fisheye)}")
+        name, lens = str(table.get("name") or numbered), "fisheye" if fisheye else "perspective"
+        cameras.append(node.camera(name, "matrix", wTc, ["size"], "distortions", lens))
+    return WrittenRig(cameras, unit, up, cures)
+
+
+_UP = "pass the axis of the world that points up with --up; it is often -y of a first camera that stood level"
+_FREEMOCAP = {"unit": "pass --unit (FreeMoCap works in mm)", "up": _UP}
+_ANIPOSE = {"unit": "pass --unit, that of the board's squares", "up": _UP}
+JSON_AND_TOML = (
+    Format("our own rig file", lambda content: "format" in _members(content), _read_rig_file),
+    Format("CMU Panoptic's JSON", _is_panoptic, _read_panoptic),
+    Format("VoxelPose's JSON", lambda content: len(_voxelpose(content)) > 0, _read_voxelpose),
+    Format("4D Association's calibration.json", _is_association, _read_association),
+    Format("Caliscope's TOML", _is_caliscope, partial(_read_tables, unit="m", up=None, cures={"up": _UP})),
+    Format("FreeMoCap's TOML", _is_freemocap, partial(_read_tables, unit=None, up=None, cures=_FREEMOCAP)),
+    Format("Pose2Sim's TOML", _is_pose2sim, partial(_read_tables, unit="m", up="z", cures={})),
+    Format(
+        "AniPose's TOML",
+        lambda content: len(_tables(content)) > 0,
+        partial(_read_tables, unit=None, up=None, cures=_ANIPOSE),
+    ),
+)
+"""The first that recognises a file reads it. AniPose's world is one that nothing levels, in the unit of the board;
+FreeMoCap's is the first camera."""

@@ -1,0 +1,259 @@
+"""YAML and XML of OpenCV's FileStorage (OpenCV's own multi-view calibration, files with a node per camera,
+EasyMocap's), and ROS' camera_info.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.core.camera import Lens
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.io.calibration.content import Content, load
+from shapepose_fg.io.calibration.written import Format, Node, WrittenCamera, WrittenRig, pose, rotation_of
+
+_FISHEYE = 1
+"""OpenCV's CALIB_MODEL_FISHEYE."""
+_MOST = 2**20
+"""Numbers of all cameras together."""
+_ASK = {
+    "unit": "pass --unit, that of the board's squares",
+    "up": "pass --up (a board's z points up or down where it lay; -y of a level first camera)",
+}
+_ONE_CAMERA = "give the calibration of the whole rig, intrinsics and poses"
+_AGAIN = {"": "save it with OpenCV's calibration again"}
+_STORAGE = {"": "write it with OpenCV's FileStorage"}
+_EASYMOCAP = {"": "write it with EasyMocap again"}
+
+_K, _R, _T = "camera_matrix K intrinsic_matrix", "R rvec rotation_matrix rotation", "T t tvec translation"
+_DISTORTION = "distortion_coefficients dist_coeffs distortion_vector dist D"
+_SIZE = "image_width img_width width", "image_height img_height height"
+_POSE = "camera_pose_matrix"
+"""Names that programs give to the parts of a camera; `camera_pose_matrix` is MC-Calib's world from camera."""
+
+
+def _loaded(content: Content, suffixes: str) -> dict[Path, Content]:
+    """The files of a folder with these endings."""
+    return {path: load(path) for path in content.value if path.suffix in suffixes.split() and path.is_file()}
+
+
+def _is_multiview(content: Content) -> bool:
+    """Whether this is what OpenCV's multiview_calibration.py saves."""
+    return content.syntax == "OpenCV" and {"Rs", "Ts", "Ks"} <= content.value.keys()
+
+
+def _read_multiview(content: Content) -> WrittenRig:
+    """Camera from the first camera, in the unit of the board."""
+    nodes = Node(content.value, str(content.path), _AGAIN)
+    flat = nodes.needed("Ks", most=_MOST)
+    count = len(flat) // 9
+    if count == 0 or len(flat) != 9 * count:
+        raise nodes.refuse("Ks", "must hold 9 numbers for each camera")
+    Ks = flat.reshape(count, 3, 3)
+    Rs, Ts = nodes.needed("Rs", 9 * count, 3 * count).reshape(count, -1), nodes.needed("Ts", 3 * count)
+    sizes = nodes.needed("image_sizes", 2 * count).reshape(count, 2)
+    models, ids = nodes.numbers("models", count), content.value.get("cam_ids")
+    fisheye = np.zeros(count, dtype=bool) if models is None else models == _FISHEYE
+    numbers = nodes.needed("distortions", most=_MOST)
+    # The coefficients stand one after the other: four of a fisheye, equally many of every other camera.
+    plain = (len(numbers) - 4 * fisheye.sum()) / max(1, (~fisheye).sum())
+    if plain != int(plain) or plain < 0:
+        raise nodes.refuse("distortions", f"must hold equally many numbers for every camera, got {len(numbers)}")
+    ends = np.cumsum(np.where(fisheye, 4, int(plain)))
+    names = ids.split(",") if isinstance(ids, str) else []
+    names = names if len(names) == count else [str(index) for index in range(count)]
+    cameras = []
+    for index, coefficients in enumerate(np.split(numbers, ends[:-1])):
+        lens: Lens = "fisheye" if fisheye[index] else "perspective"
+        wTc = pose(Rs[index], Ts.reshape(count, 3)[index], "Rs", f'{content.path}: camera "{names[index]}"')
+        width, height = sizes[index].tolist()
+        size = round(width), round(height)
+        cameras.append(WrittenCamera(names[index], Ks[index], wTc, size, coefficients.tolist(), lens))
+    return WrittenRig(cameras, None, None, _ASK)
+
+
+def _nodes(content: Content) -> dict[str, dict[str, Any]]:
+    """The nodes of cameras by name, of a file or of the files of a folder; none where one is of something else."""
+    nodes = content.value
+    if content.syntax == "folder":
+        files = _loaded(content, ".yml .yaml .xml").values()
+        nodes = {each.path.stem: each.value if each.syntax == "OpenCV" else None for each in files}
+        if not all(isinstance(node, dict) and Node(node, "").named(_K) for node in nodes.values()):
+            return {}
+    return {name: node for name, node in nodes.items() if isinstance(node, dict) and Node(node, "").named(_K)}
+
+
+def _is_of_nodes(content: Content) -> bool:
+    """Whether every camera has a node, or a file, of its own; also the intrinsics of one camera alone."""
+    return content.syntax == "OpenCV" or (content.syntax == "folder" and len(_nodes(content)) > 0)
+
+
+def _read_nodes(content: Content) -> WrittenRig:
+    """Cameras by name, of MC-Calib or of hand-written files: K, distortion, picture size and pose."""
+    cameras = []
+    for name, values in _nodes(content).items():
+        node = Node(values, f'{content.path}: camera "{name}"', _STORAGE)
+        if node.named(_POSE) is not None:
+            wTc = node.pose_of_matrix(_POSE)
+        elif node.named(_R) is None or node.named(_T) is None:
+            raise InputError(f"{node.place}: R and T are missing, the camera's pose; {_ONE_CAMERA}")
+        else:
+            wTc = node.pose(_R, _T)
+        fisheye = values.get("distortion_type") == 1 or values.get("fisheye") in (1, "true")
+        lens: Lens = "fisheye" if fisheye else "perspective"
+        cameras.append(node.camera(name, _K, wTc, _SIZE, _DISTORTION, lens))
+    if len(cameras) == 0:
+        named = " ".join(list(content.value)[:5]) or "nothing"
+        raise InputError(f"{content.path}: no camera with a pose here, only {named}; {_ONE_CAMERA}")
+    return WrittenRig(cameras, None, None, _ASK)
+
+
+def _is_half(name: str) -> bool:
+    return name.endswith((".yml", ".yaml")) and ("intri" in name or "extri" in name)
+
+
+def _is_easymocap(content: Content) -> bool:
+    """Whether this is one of the two files, or the folder of both."""
+    if content.syntax == "folder":
+        return any(_is_half(path.name) for path in content.value)
+    there = content.syntax == "OpenCV" and _is_half(content.path.name)
+    return there and isinstance(content.value.get("names"), list)
+
+
+def _read_easymocap(content: Content) -> WrittenRig:
+    """EasyMocap's intri.yml and extri.yml, metres, z up: the cameras in the order of the names in the first."""
+    folder = content.syntax == "folder"
+    one = next(path for path in content.value if _is_half(path.name)) if folder else content.path
+    halves = []
+    for path in (
+        one.with_name(one.name.replace("extri", "intri")),
+        one.with_name(one.name.replace("intri", "extri")),
+    ):
+        if not path.is_file():
+            raise InputError(
+                f"{path}: this half of EasyMocap's calibration is missing; put both files into one folder"
+            )
+        value = load(path).value
+        halves.append(Node(value if isinstance(value, dict) else {}, str(path), _EASYMOCAP))
+    inner, outer = halves
+    names = inner.values.get("names")
+    if not isinstance(names, list) or not all(isinstance(name, str | int) for name in names):
+        raise inner.refuse("names", "must be a list of the cameras' names")
+    cameras = []
+    for number, name in enumerate(map(str, names), 1):
+        # EasyMocap writes K_<name>; Pose2Sim's writer numbers them from 1.
+        def tagged(kind: str, name: str = name, number: int = number) -> list[str]:
+            return [f"{kind}_{name}", f"{kind}_{number}"]
+
+        R = outer.numbers(tagged("Rot"), 9)
+        R = outer.needed(tagged("R"), 3) if R is None else R
+        wTc = pose(R, outer.needed(tagged("T"), 3), f"R_{name}", outer.place)
+        inner.needed(tagged("dist"), most=14)
+        size = [[f"W_{name}"], [f"H_{name}"]]
+        cameras.append(inner.camera(name, tagged("K"), wTc, size, tagged("dist")))
+    return WrittenRig(cameras, "m", "z")
+
+
+_LENSES: dict[str, Lens] = {
+    **dict.fromkeys(("", "plumb_bob", "rational_polynomial"), "perspective"),
+    **dict.fromkeys(("equidistant", "fisheye"), "fisheye"),
+}
+"""ROS' distortion models that are lenses of OpenCV."""
+_POSE_CURE = (
+    "write <camera>_pose.yaml with translation x y z and rotation x y z w of the optical frame in the world"
+)
+
+
+def _is_info(value: Any) -> bool:
+    """Whether this is what ROS' camera_calibration writes, or an echoed CameraInfo message."""
+    known = isinstance(value, dict)
+    return known and ("camera_matrix" in value or {"distortion_model", "height", "width"} <= value.keys())
+
+
+def _is_ros(content: Content) -> bool:
+    """Whether this is a camera_info file, or a folder in which there is one."""
+    if content.syntax == "folder":
+        return any(
+            each.syntax == "YAML" and _is_info(each.value) for each in _loaded(content, ".yaml .yml").values()
+        )
+    return content.syntax == "YAML" and (_is_info(content.value) or _message_of(content.value) is not None)
+
+
+def _read_ros(content: Content) -> WrittenRig:
+    """The cameras in the order of their files' names, metres, z up (REP 103).
+
+    `<camera>.yaml` is camera_info. `<camera>_pose.yaml` is a Pose, PoseStamped, Transform or TransformStamped: the
+    camera's optical frame in the world, so world from camera.
+    """
+    if content.syntax != "folder":
+        what = "the intrinsics" if _is_info(content.value) else "the pose"
+        raise InputError(
+            f"{content.path}: this is {what} of one camera of ROS; give the folder with <camera>.yaml and"
+            " <camera>_pose.yaml of every camera"
+        )
+    files = _loaded(content, ".yaml .yml")
+    values = {path: each.value if each.syntax == "YAML" else None for path, each in files.items()}
+    poses = {path.stem.removesuffix("_pose"): path for path, value in values.items() if not _is_info(value)}
+    cameras = []
+    for path, value in values.items():
+        if not _is_info(value):
+            continue
+        name = path.stem.removesuffix("_camera_info").removesuffix("_info")
+        if name not in poses:
+            missing = path.with_name(f"{name}_pose.yaml")
+            raise InputError(f'{missing}: the pose of camera "{name}" is missing; {_POSE_CURE}')
+        wTc = _ros_pose(poses[name], values[poses[name]])
+        model = str(value.get("distortion_model", ""))
+        if model not in _LENSES:
+            raise InputError(
+                f"{path}: distortion_model {model} is not read; use plumb_bob, rational_polynomial or equidistant"
+            )
+        # A matrix is a list of numbers, or has one under `data`.
+        plain = {key: each.get("data") if isinstance(each, dict) else each for key, each in value.items()}
+        node = Node(plain, str(path), {"": "run the calibration again"})
+        size = "image_width width", "image_height height"
+        found = node.camera(name, "camera_matrix k K", wTc, size, "distortion_coefficients d D", _LENSES[model])
+        cameras.append(found)
+    return WrittenRig(cameras, "m", "z")
+
+
+def _ros_pose(path: Path, value: Any) -> NDArray[np.float64]:
+    """World from camera, of a message with translation and rotation."""
+    message = _message_of(value)
+    if message is None:
+        raise InputError(f"{path}: neither a camera_info nor a pose of ROS; {_POSE_CURE}")
+    child = str(value.get("child_frame_id", ""))
+    if child and "optical" not in child:
+        raise InputError(
+            f"{path}: child_frame_id {child} is no optical frame (z forward, x right, y down); give the pose of"
+            f" {child}_optical_frame, or whatever the camera's optical frame is called"
+        )
+
+    def of(part: Any, word: str, axes: str) -> list[float]:
+        node = Node(part if isinstance(part, Mapping) else {}, f"{path}: {word}", {"": _POSE_CURE})
+        return [float(node.needed(axis, 1)[0]) for axis in axes]
+
+    t, q = of(message[0], "translation", "xyz"), of(message[1], "rotation", "xyzw")
+    return pose(rotation_of(q, "rotation", str(path)), t, "rotation", str(path), world_from_camera=True)
+
+
+def _message_of(value: Any) -> tuple[Any, Any] | None:
+    """Translation and rotation of a pose, however deep its message is stamped."""
+    if isinstance(value, dict) and isinstance(value.get("transforms"), list):
+        value = value["transforms"][0] if len(value["transforms"]) == 1 else None
+    while isinstance(value, dict):
+        for translation, rotation in (("position", "orientation"), ("translation", "rotation")):
+            if translation in value and rotation in value:
+                return value[translation], value[rotation]
+        value = value.get("pose", value.get("transform"))
+    return None
+
+
+OPENCV = (
+    Format("EasyMocap's intri.yml and extri.yml", _is_easymocap, _read_easymocap),
+    Format("OpenCV's multi-view calibration", _is_multiview, _read_multiview),
+    Format("OpenCV's FileStorage with a node or file per camera", _is_of_nodes, _read_nodes),
+)
+ROS = Format("ROS' camera_info and pose YAML", _is_ros, _read_ros)

@@ -1,0 +1,340 @@
+"""People in JSON: a file per frame (OpenPose, Pose2Sim, MMPose of pictures), or one file per camera with all its
+frames (COCO's keypoint results, AlphaPose, MMPose of a video).
+
+Pose2Sim (RTMLib's people written in OpenPose's way) leaves `_keypoints` out of the names, writes NaN for people
+that it dropped, and `{}` for people that a camera does not see.
+"""
+
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import chain, islice, pairwise
+from math import inf
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter
+
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import MIDDLE, read_json, read_text
+from shapepose_fg.io.camera_names import MOST_FRAME, in_order
+from shapepose_fg.io.detection_table import BLOCK_FRAMES
+from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock
+from shapepose_fg.io.json_items import JsonItems
+from shapepose_fg.io.validation import describe, validated, validated_list
+
+_OPENPOSE, _POSE2SIM, _PICTURES = "OpenPose's JSON", "Pose2Sim's JSON", "MMPose's JSON of pictures"
+_COCO, _ALPHAPOSE, _VIDEO = "COCO's keypoint results", "AlphaPose's JSON", "MMPose's JSON of a video"
+_RERUN = {
+    _OPENPOSE: "run OpenPose again with --write_json --keypoint_scale 0",
+    _POSE2SIM: "run Pose2Sim's pose estimation again",
+    _PICTURES: "run MMPose again with --pred-out-dir",
+    _COCO: "write the results again, in pixels",
+    _ALPHAPOSE: "run AlphaPose again with --format coco",
+    _VIDEO: "run MMPose again with --save-predictions or --pred-out-dir",
+}
+_LONGEST_GAP = 1000
+"""Frames that may be missing, and as many as there are: more are numbers of something else."""
+_LONGEST_NAME = 4096
+"""Characters of a picture's path: the search takes the square of them."""
+_FRAME_FILE = re.compile(r"(\d+)(_keypoints)?\.json$")
+"""How the file of a frame is named."""
+_FRAME_NUMBER = re.compile(r"(\d+)\D*$")
+"""The last number in the name of a picture."""
+_LISTS = ("annotations", "instance_info")
+"""Keys of the list where the file is an object: those of COCO's data sets and of MMPose."""
+_AT_ONCE = 1024
+"""Items that are checked together: as Python's numbers they take several times the memory of an array."""
+
+
+class _Person(BaseModel):
+    """A person of a frame of OpenPose; hands and face are passed over."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+    pose_keypoints_2d: list[float] | None = None
+
+
+class _Frame(BaseModel):
+    model_config = ConfigDict(strict=True)
+    people: list[_Person]
+
+
+class _Instance(BaseModel):
+    """A person of MMPose."""
+
+    model_config = ConfigDict(strict=True)
+    keypoints: list[Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]]
+    keypoint_scores: list[FiniteFloat]
+
+    def flat(self, place: str, program: str) -> list[float]:
+        """x, y and score of each keypoint."""
+        if len(self.keypoints) != len(self.keypoint_scores):
+            raise InputError(
+                f"{place}: {len(self.keypoints)} keypoints have {len(self.keypoint_scores)} keypoint_scores;"
+                f" {_RERUN[program]}"
+            )
+        pairs = zip(self.keypoints, self.keypoint_scores, strict=True)
+        return [number for (x, y), score in pairs for number in (x, y, score)]
+
+
+class _VideoFrame(BaseModel):
+    """A frame of MMPose."""
+
+    model_config = ConfigDict(strict=True)
+    frame_id: Annotated[int, Field(ge=0, lt=MOST_FRAME)]
+    instances: list[_Instance]
+
+
+class _Result(BaseModel):
+    """A person of COCO's results."""
+
+    model_config = ConfigDict(strict=True)
+    image_id: int | str
+    keypoints: Annotated[list[float], Field(min_length=1)]
+
+
+_INSTANCES = TypeAdapter(list[_Instance])
+_RESULTS, _FRAMES = TypeAdapter(list[_Result]), TypeAdapter(list[_VideoFrame])
+
+
+def _checked(values: list[float], place: str, program: str) -> list[float]:
+    """Flat keypoints; a joint that was not seen may be NaN."""
+    if len(values) % 3 != 0:
+        problem = f"must hold x, y and score of each keypoint, got {len(values)} numbers"
+        raise InputError(f"{place} {problem}; {_RERUN[program]}")
+    if inf in values or -inf in values:
+        raise InputError(f"{place} holds Infinity; {_RERUN[program]}")
+    return values
+
+
+def _of_one_model(known: set[int], people: Iterable[list[float]], source: Path, program: str) -> None:
+    """Take numbers of keypoints into `known`; InputError where there are several."""
+    known |= {len(person) // 3 for person in people}
+    if len(known) > 1:
+        counts = " and ".join(map(str, sorted(known)))
+        what = f"recognised as {program}, with people of {counts} keypoints"
+        raise InputError(f"{source}: {what}; give the detections of one model")
+
+
+# A file per frame.
+
+
+def frame_files(folder: Path) -> list[Path]:
+    """Files of a folder that are named after a frame, in order of their names."""
+    # macOS leaves ._000000_keypoints.json beside each file that it copies.
+    found = [each for each in folder.iterdir() if _FRAME_FILE.search(each.name) and not each.name.startswith(".")]
+    return sorted(each for each in found if each.is_file())
+
+
+def frame_number(file: Path) -> int:
+    """The number of the frame that one of `frame_files` is named after."""
+    match = _FRAME_FILE.search(file.name)
+    assert match is not None
+    return int(match[1])
+
+
+def read_frame_files(folder: Path) -> CameraPeople:
+    """The frames that one camera saw; InputError naming file, key and cure.
+
+    A frame's number is in its file's name. No people are seen in frames whose files are missing in between
+    (`gaps`).
+    """
+    files = frame_files(folder)
+    if len(files) == 0:
+        lists = sorted(each.name for each in _lists(folder))
+        what = "no *_keypoints.json (OpenPose) or *_000000.json (Pose2Sim) in this folder; run one of them into it"
+        if len(lists) > 1:
+            names = " ".join(lists[:4])
+            what = f"several JSON files without frame numbers ({names}); leave the one to be read"
+        raise InputError(f"{folder}: {what}")
+    program = _OPENPOSE
+    if not files[0].name.endswith("_keypoints.json"):
+        program = _PICTURES if read_text(files[0], most=MIDDLE).lstrip()[:1] == "[" else _POSE2SIM
+    numbered = in_order([(frame_number(file), file) for file in files])
+    first, last = numbered[0][0], numbered[-1][0]
+    if last - first + 1 > 2 * len(numbered) + _LONGEST_GAP:
+        raise InputError(
+            f"{folder}: {len(numbered)} files are numbered from {first} to {last}; number them"
+            f" by the frames of the recording, or {_RERUN[program]}"
+        )
+    gaps = tuple((one + 1, other - 1) for (one, _), (other, _) in pairwise(numbered) if other > one + 1)
+    blocks = _frame_blocks(folder, program, numbered)
+    return CameraPeople(folder, program, blocks, first, last, gaps=gaps, rerun=_RERUN[program])
+
+
+def _frame_blocks(folder: Path, program: str, numbered: list[tuple[int, Path]]) -> Iterator[PeopleBlock]:
+    """The people of the files, block by block."""
+    counts = set[int]()
+    for start in range(0, len(numbered), BLOCK_FRAMES):
+        frames, people = list[int](), list[list[float]]()
+        for number, file in numbered[start : start + BLOCK_FRAMES]:
+            found = _people_of_frame(file, program)
+            people += found
+            frames += [number] * len(found)
+        _of_one_model(counts, people, folder, program)
+        yield PeopleBlock.of(frames, people)
+
+
+def _people_of_frame(file: Path, program: str) -> list[list[float]]:
+    """Flat keypoints of the people of a frame; people without keypoints are left out."""
+    content, rerun, found = read_json(file, most=MIDDLE), _RERUN[program], list[list[float]]()
+    if program == _PICTURES:
+        instances = validated_list(_INSTANCES, content, file, rerun)
+        return [person.flat(f"{file}: [{number}]", program) for number, person in enumerate(instances)]
+    for number, person in enumerate(validated(_Frame, content, file, rerun).people):
+        values, place = person.pose_keypoints_2d, f"{file}: people[{number}].pose_keypoints_2d"
+        if values is None and person.model_extra:
+            raise InputError(f"{place} is missing; {rerun}")
+        if values:
+            found.append(_checked(values, place, program))
+    return found
+
+
+# One file with all frames.
+
+
+def is_one_file(path: Path) -> bool:
+    """Whether all frames of one camera are in a JSON file, or in the only one of a folder."""
+    if not path.is_dir():
+        return path.is_file()
+    lists = _lists(path)
+    if len(lists) != 1:
+        return False
+    items = JsonItems(lists[0], _LISTS)
+    return items.key is not None or (items.found and _known(next(iter(items), {"image_id": None})))
+
+
+def _lists(folder: Path) -> list[Path]:
+    return [each for each in folder.glob("*.json") if not each.name.startswith(".")]
+
+
+def _known(item: Any) -> bool:
+    """Whether this is an item of one of the programs' lists."""
+    return isinstance(item, dict) and ("image_id" in item or "instances" in item)
+
+
+def read_one_file(path: Path) -> CameraPeople:
+    """Read all frames that one camera saw; InputError naming file, key and cure."""
+    path = _lists(path)[0] if path.is_dir() else path
+    items = JsonItems(path, _LISTS)
+    if items.key is not None and not items.found:
+        raise InputError(f"{path}: the file must be a list, got {describe(items.value)}; {_RERUN[_COCO]}")
+    every = iter(items)
+    first = next(every, None)
+    if not items.found or (items.key is None and first is not None and not _known(first)):
+        found = "a list" if items.found else describe(items.value)
+        raise InputError(
+            f"{path}: recognised as JSON ({found}), expected a list of people with image_id (COCO,"
+            " AlphaPose) or of frames with instances (MMPose); give one of these"
+        )
+    again = every if first is None else chain([first], every)
+    if items.key == "instance_info" or (isinstance(first, dict) and "instances" in first):
+        return _video(_Collected(path, _VIDEO), again)
+    program = _ALPHAPOSE if isinstance(first, dict) and isinstance(first.get("image_id"), str) else _COCO
+    return _results(_Collected(path, program), again, items.others)
+
+
+class _Collected:
+    """People of one file as they are read, in arrays."""
+
+    def __init__(self, path: Path, program: str) -> None:
+        self.path, self.program = path, program
+        self._keypoints, self._counts = list[NDArray[np.float64]](), set[int]()
+
+    def valid(self, kind: TypeAdapter[list[Any]], items: Iterable[Any]) -> Iterator[tuple[int, list[Any]]]:
+        """The items, some at a time, and the index of the first of them."""
+        items, start = iter(items), 0
+        while len(some := list(islice(items, _AT_ONCE))) > 0:
+            yield start, validated_list(kind, some, self.path, _RERUN[self.program], start)
+            start += len(some)
+
+    def add(self, rows: list[list[float]]) -> None:
+        """Take in people with flat keypoints."""
+        _of_one_model(self._counts, rows, self.path, self.program)
+        if len(rows) > 0:
+            self._keypoints.append(np.array(rows, dtype=np.float64).reshape(len(rows), len(rows[0]) // 3, 3))
+
+    def camera(self, frames: list[int], listed: tuple[int, int]) -> CameraPeople:
+        """All of them, who are in these `frames` (N); `listed` are the first and last that the file knows."""
+        blocks, rerun = self._in_order(np.array(frames, dtype=np.intp)), _RERUN[self.program]
+        return CameraPeople(self.path, self.program, blocks, *listed, every_frame=False, rerun=rerun)
+
+    def _in_order(self, frames: NDArray[np.intp]) -> Iterator[PeopleBlock]:
+        """People in the order of their frames (N,), some frames at a time."""
+        if len(frames) == 0:
+            return
+        order, parts = np.argsort(frames, kind="stable"), self._keypoints
+        cuts = np.flatnonzero(np.diff(frames[order] // BLOCK_FRAMES)) + 1
+        starts = np.cumsum([0, *map(len, parts)])
+        for index in np.split(order, cuts):
+            part = np.searchsorted(starts, index, side="right") - 1
+            keypoints = np.empty((len(index), *parts[0].shape[1:]))
+            for n in np.unique(part).tolist():
+                keypoints[part == n] = parts[n][index[part == n] - starts[n]]
+            yield PeopleBlock(frames[index], keypoints)
+
+
+def _results(people: _Collected, items: Iterable[Any], others: Mapping[str, Any]) -> CameraPeople:
+    """A list of people, each with the picture that it is of. Pictures without people are not in it.
+
+    `others` has the pictures' names when all items have been read.
+    """
+    path, program, images = people.path, people.program, list[int | str]()
+    for start, results in people.valid(_RESULTS, items):
+        images += [person.image_id for person in results]
+        places = (f"{path}: [{index}].keypoints" for index in range(start, start + len(results)))
+        pairs = zip(results, places, strict=True)
+        people.add([_checked(person.keypoints, place, program) for person, place in pairs])
+    names = _names(others, path, program)
+    frames: dict[int | str, int] = {}
+    known = [(image, f"[{index}].image_id") for index, image in enumerate(images)]
+    known += [(image, f"images[{index}]") for index, image in enumerate(names)]
+    for image, place in known:
+        if image not in frames:
+            frames[image] = _number(image, names.get(image), f"{path}: {place}", program)
+    first: dict[int, int | str] = {}
+    for image, frame in frames.items():
+        if first.setdefault(frame, image) != image:
+            raise InputError(
+                f"{path}: the pictures {str(first[frame])[:40]!r} and {str(image)[:40]!r} are both frame {frame};"
+                f" {_RERUN[program]}, of one camera with a number for each picture"
+            )
+    return people.camera([frames[image] for image in images], (min(first), max(first)) if first else (0, -1))
+
+
+def _names(others: Mapping[str, Any], path: Path, program: str) -> dict[int | str, str | None]:
+    """The files of the pictures of a COCO data set by their ids, also of those without people."""
+    names, images = {}, others.get("images")
+    for index, image in enumerate(images if isinstance(images, list) else []):
+        one = image.get("id") if isinstance(image, dict) else None
+        if type(one) not in (int, str):
+            raise InputError(f"{path}: images[{index}].id must be a whole number or text; {_RERUN[program]}")
+        names[one] = str(image["file_name"]) if "file_name" in image else None
+    return names
+
+
+def _number(image: int | str, name: str | None, place: str, program: str) -> int:
+    """The frame of a picture: the last number in its name, or its id where that is a number and it has no name."""
+    if name is None and isinstance(image, int):
+        if 0 <= image < MOST_FRAME:
+            return image
+        raise InputError(f"{place} '{image}' is no frame's number; {_RERUN[program]}, of numbered pictures")
+    name = str(image) if name is None else name
+    match = _FRAME_NUMBER.search(Path(name).stem) if len(name) <= _LONGEST_NAME else None
+    if match is None or len(match[1]) > len(str(MOST_FRAME)):
+        raise InputError(f"{place} {name[:40]!r} has no frame number; {_RERUN[program]}, of numbered pictures")
+    return int(match[1])
+
+
+def _video(people: _Collected, items: Iterable[Any]) -> CameraPeople:
+    """A list of frames, each with its people."""
+    frames, first, last = list[int](), MOST_FRAME, -1
+    for start, found in people.valid(_FRAMES, items):
+        rows = list[list[float]]()
+        for index, frame in enumerate(found, start):
+            first, last = min(first, frame.frame_id), max(last, frame.frame_id)
+            frames += [frame.frame_id] * len(frame.instances)
+            rows += [each.flat(f"{people.path}: [{index}].instances", _VIDEO) for each in frame.instances]
+        people.add(rows)
+    return people.camera(frames, (first, last) if last >= 0 else (0, -1))

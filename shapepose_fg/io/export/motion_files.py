@@ -1,0 +1,147 @@
+"""Bodies in motion as files: AMASS-style npz, as learning code reads it (z up, metres, radians), and BVH, as
+Blender and other animation programs read it (y up, metres).
+"""
+
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from shapepose_fg.body.model.smpl_file import SMPL_PARENTS
+from shapepose_fg.core.skeleton import SMPL_24
+from shapepose_fg.core.storage.files import write_atomically
+from shapepose_fg.core.storage.npz import write_npz
+from shapepose_fg.io.export.job import Job, Written
+from shapepose_fg.io.export.skinned import BONES, Motion, RestBody, all_segments
+from shapepose_fg.io.export.take import y_up, z_up
+
+_SMPL_H = 156
+"""Numbers of a pose of SMPL-H: pelvis, 21 joints of the body, 15 of each hand."""
+_SHARED = 22
+"""Joints, from the pelvis on, that SMPL and SMPL-H have alike."""
+_AMASS_BETAS = 16
+"""Shape components in AMASS."""
+OPEN_BODY = "shapepose-fg open body"
+"""What the body that ships is called in a file."""
+
+
+def write_amass(job: Job) -> Written:
+    """A file per person and segment of frames without a long hole, named by its first and last frame."""
+    written = Written()
+    body = OPEN_BODY if job.body is None else job.body.name
+    for name, segment, take in all_segments(job, "amass", z_up(job.take.up), written):
+        columns = amass_columns(segment, take.fps) | {
+            "times": take.times_s[segment.index],
+            "frames": take.frames[segment.index],
+            "body": np.array(body),
+            "gender": np.array(_gender(body)),
+        }
+        path = name.with_name(f"{name.name}_amass.npz")
+        write_atomically(path, lambda stream, columns=columns: write_npz(stream, columns))
+        written.files.append(path)
+    if job.body is None and len(written.files) > 0:
+        written.notes.append("amass: betas are those of the open body that ships, not SMPL's; poses fit both")
+    return written
+
+
+def amass_columns(segment: Motion, fps: float) -> dict[str, NDArray[Any]]:
+    """The arrays of AMASS for one segment of one person.
+
+    `poses` (F, 156) are SMPL-H's: pelvis and body are ours; SMPL's two hand joints have no counterpart there, so
+    the fingers are zero, which is SMPL-H's flat hand. `poses_smpl` (F, 72) are all 24 joints of SMPL.
+    """
+    frames, rest = len(segment.index), segment.rest
+    vectors = Rotation.from_quat(segment.rotations.reshape(-1, 4)).as_rotvec().reshape(frames, -1)
+    poses = np.zeros((frames, _SMPL_H))
+    poses[:, : 3 * _SHARED] = vectors[:, : 3 * _SHARED]
+    return {
+        "trans": segment.pelvis - rest.joints[0],
+        "poses": poses,
+        "poses_smpl": vectors,
+        "betas": np.pad(rest.betas, (0, _AMASS_BETAS - len(rest.betas))),
+        "num_betas": np.array(len(rest.betas)),
+        # Older and newer files of AMASS spell it differently.
+        "mocap_framerate": np.array(fps),
+        "mocap_frame_rate": np.array(fps),
+        "filled": np.asarray(segment.filled),
+    }
+
+
+def _gender(body: str) -> str:
+    """The gender of a body model by the name of its file, as SMPL's are called; neutral where it says nothing."""
+    name = body.lower().replace("-", "_")
+    words = name.replace(".", "_").split("_")
+    if "female" in words or "f" in words:
+        return "female"
+    return "male" if "male" in words or "m" in words else "neutral"
+
+
+def write_bvh(job: Job) -> Written:
+    """A file per person and segment of frames without a long hole, named by its first and last frame."""
+    written = Written()
+    for name, segment, take in all_segments(job, "bvh", y_up(job.take.up), written):
+        written.add(name.with_name(f"{name.name}.bvh"), bvh_text(segment, take.fps))
+    return written
+
+
+def bvh_text(motion: Motion, fps: float) -> str:
+    """A BVH file: the T-pose, and per frame the place of the pelvis and the rotations.
+
+    The pelvis' own offset is zero: some programs add it to the place of a frame, others do not.
+    """
+    count = len(motion.index)
+    lines = ["HIERARCHY", *_joint(0, motion.rest, ""), "MOTION", f"Frames: {count}", f"Frame Time: {1 / fps:.9f}"]
+    angles = _zxy_degrees(motion.rotations[:, _ORDER]).reshape(count, -1)
+    # The rounding is a hundredth of a millimetre at the end of the longest chain.
+    rows = np.concatenate([np.char.mod("%.6f", motion.pelvis), np.char.mod("%.5f", angles)], axis=1).tolist()
+    return "\n".join([*lines, *(" ".join(row) for row in rows)]) + "\n"
+
+
+def _zxy_degrees(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(F, B, 3) angles about z, then the turned x, then the turned y, degrees, of quaternions (F, B, 4).
+
+    From frame to frame no angle jumps by a full turn: programs that draw between frames go along the line.
+    """
+    with warnings.catch_warnings():
+        # With x at 90 degrees z and y are one turn; any split of it will do.
+        warnings.filterwarnings("ignore", message="Gimbal lock")
+        angles = Rotation.from_quat(rotations.reshape(-1, 4)).as_euler("ZXY", degrees=True)
+    return np.unwrap(angles.reshape(*rotations.shape[:2], 3), axis=0, period=360)
+
+
+_CHILDREN = [[child for child in range(BONES) if SMPL_PARENTS[child] == joint] for joint in range(BONES)]
+
+
+def _tree(joint: int) -> Iterator[int]:
+    """A joint and all below it, as they stand in the file."""
+    yield joint
+    for child in _CHILDREN[joint]:
+        yield from _tree(child)
+
+
+_ORDER = np.array(list(_tree(0)))
+"""SMPL's joints in the order of the file: channels follow the hierarchy."""
+
+
+def _joint(joint: int, rest: RestBody, indent: str) -> Iterator[str]:
+    """The lines of a joint and of all below it."""
+    yield f"{indent}{'ROOT' if joint == 0 else 'JOINT'} {SMPL_24[joint]}"
+    yield indent + "{"
+    inside, place = indent + "\t", "6 Xposition Yposition Zposition" if joint == 0 else "3"
+    yield f"{inside}OFFSET {_vector(np.zeros(3) if joint == 0 else rest.offsets[joint])}"
+    yield f"{inside}CHANNELS {place} Zrotation Xrotation Yrotation"
+    for child in _CHILDREN[joint]:
+        yield from _joint(child, rest, inside)
+    if len(_CHILDREN[joint]) == 0:
+        yield f"{inside}End Site"
+        yield inside + "{"
+        yield f"{inside}\tOFFSET {_vector(rest.tips()[joint])}"
+        yield inside + "}"
+    yield indent + "}"
+
+
+def _vector(xyz: NDArray[np.float64]) -> str:
+    return " ".join(f"{value:.6f}" for value in xyz)

@@ -1,0 +1,215 @@
+"""What may be wrong with a set-up, and how it is said: which camera, what it looks like, and what to do."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from shapepose_fg.core.camera import Rig
+
+
+class Kind(StrEnum):
+    """What a mistake looks like."""
+
+    TURNED = "turned"
+    MOVED = "moved"
+    LATE = "late"
+    EXCHANGED = "exchanged"
+    INVERTED = "inverted extrinsics"
+    TRANSPOSED = "transposed rotation"
+    AXES = "other camera axes"
+    FOCAL = "focal length"
+    RESIZED = "picture size"
+    PRINCIPAL_POINT = "principal point"
+    DUPLICATE = "duplicate"
+    UNIT = "unit"
+    UP = "up axis"
+    NOBODY = "nobody"
+    UNFIT = "does not fit"
+    PICTURE_SIZE = "size of the pictures"
+
+
+@dataclass(frozen=True)
+class Duplicate:
+    """In what two cameras are one."""
+
+    same_pose: bool
+    same_detections: bool
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is wrong with a set-up."""
+
+    kind: Kind
+    """What it looks like."""
+    cameras: tuple[int, ...]
+    """Cameras that it is about; none where it is about people, all where all share it."""
+    amount: float = 0.0
+    """Degrees, frames (positive is late), the factor of a focal length or picture, the stature in metres."""
+    shift_px: tuple[tuple[float, float], ...] = ()
+    """For each camera, how far its principal point seems to be off: right and down, pixels."""
+    moved: float = 0.0
+    """How far the camera was moved, metres."""
+    axis: str = ""
+    """The axis that is up for the people."""
+    duplicate: Duplicate | None = None
+    """In what two cameras are one."""
+
+
+def sentence(finding: Finding, rig: Rig) -> str:
+    """What was found, as it is printed."""
+    words, amount = _WORDS[finding.kind], finding.amount
+    names = [rig.names[view] for view in finding.cameras]
+    all_of_them = len(names) == len(rig) > 2
+    width, height = rig.cameras[finding.cameras[0] if names else 0].image_size
+    shifts = [_shift(x, y) for x, y in finding.shift_px]
+    count = abs(round(amount))
+    said = (words if isinstance(words, str) else words(finding, max(width, height))).format(
+        who="all cameras" if all_of_them else " and ".join(filter(None, (", ".join(names[:-1]), *names[-1:]))),
+        first=names[0] if names else "",
+        second=names[-1] if names else "",
+        sees="sees" if len(names) == 1 else "see",
+        amount=amount,
+        degrees=f"{amount:.1f}" if amount < 10 else f"{amount:.0f}",
+        percent=100 * abs(amount - 1),
+        frames=f"{count} frame{'s' if count != 1 else ''}",
+        at=100 + round(amount),
+        moved=_length(finding.moved),
+        stature=_length(amount),
+        shift="".join(shifts[:1]),
+        shifts=", ".join(f"{by} in {name}" for by, name in zip(shifts, names, strict=False)),
+        found="{:.0f} x {:.0f}".format(*finding.shift_px[0]) if shifts else "",
+        calibrated=f"{width} x {height}",
+        resized=f"{width * amount:.0f} x {height * amount:.0f}",
+        axis=finding.axis,
+        up=rig.up,
+    )
+    return said if said.startswith(rig.names) else f"{said[0].upper()}{said[1:]}"
+
+
+def _turned(finding: Finding, side_px: int) -> str:
+    turned = "{who} looks turned by about {degrees} degrees"
+    if len(finding.shift_px) == 0:
+        return f"{turned}{' and moved by {moved}' if finding.moved > 0.1 else ''}; calibrate its pose again"
+    if np.hypot(*finding.shift_px[0]) < 0.002 * side_px:
+        return f"{turned} about its axis; calibrate its pose again"
+    instead = "(or its principal point should lie {shift}, which people hardly tell from a turn)"
+    return f"{turned} {instead}; calibrate it again"
+
+
+def _late(finding: Finding, side_px: int) -> str:
+    if finding.amount > 0:
+        late, rest = "late", "its first {frames}"
+    else:
+        late, rest = "early", "the first {frames} of all others"
+    words = "what the others show at frame 100 it shows at frame {at}; leave out"
+    return f"{{who}} looks about {{frames}} {late}: {words} {rest}"
+
+
+def _focal(finding: Finding, side_px: int) -> str:
+    what = "long" if finding.amount > 1 else "short"
+    by, more = (
+        ("{percent:.0f} %", "")
+        if 0.8 < finding.amount < 1.25
+        else (
+            "{amount:.2g} times what fits,",
+            " and the size of its pictures",
+        )
+    )
+    return f"{{who}} has a focal length in the calibration that looks {by} too {what}; check its intrinsics{more}"
+
+
+def _duplicate(finding: Finding, side_px: int) -> str:
+    pair = finding.duplicate
+    if pair is None or (pair.same_pose and pair.same_detections):
+        return "{first} and {second} are one camera listed twice; take one of them out"
+    same, others = (
+        ("the same detections", "files") if pair.same_detections else ("one and the same pose", "calibration")
+    )
+    return f"{{first}} and {{second}} have {same}; one of them has the other's {others}: give its own"
+
+
+_ADULT_M = 1.7
+_UNITS = (
+    (1e-3, "m", "mm"),
+    (1e3, "mm", "m"),
+    (1e-2, "m", "cm"),
+    (1e2, "cm", "m"),
+    (0.1, "cm", "mm"),
+    (10, "mm", "cm"),
+)
+"""What a length that comes out so many times too large was in truth, and what it was read as."""
+
+
+def _unit(finding: Finding, side_px: int) -> str:
+    factor = finding.amount / _ADULT_M
+    for times, truth, taken in _UNITS:
+        if 0.55 < factor / times < 1.45:
+            unit = f"the calibration is probably in {truth}, and was read as {taken}; say its unit with --unit"
+            return f"people come out {{stature}} tall: {unit}"
+    off = f"{1 / factor:.2g} times too small" if factor < 1 else f"{factor:.2g} times too large"
+    return (
+        f"people come out {{stature}} tall: lengths in the calibration are about {off}; check its unit, and the"
+        " size of the squares of the board that it was made with"
+    )
+
+
+def _nobody(finding: Finding, side_px: int) -> str:
+    if len(finding.cameras) > 0:
+        return "{who} {sees} nobody in the frames that were looked at; check the detections"
+    if finding.amount < 1:
+        return "no camera sees a person in the frames that were looked at; check the detections"
+    return (
+        "nobody is seen by two cameras that agree, although cameras saw {amount:.0f} people; check that"
+        " calibration and detections are of one recording, and that the cameras are in the same order"
+    )
+
+
+_WORDS: dict[Kind, str | Callable[[Finding, int], str]] = {
+    Kind.TURNED: _turned,
+    Kind.MOVED: "{who} looks moved by about {moved} and turned by {amount:.1f} degrees; calibrate its pose again",
+    Kind.LATE: _late,
+    Kind.EXCHANGED: "{who} look exchanged: each sees what the other should see; exchange their names in the"
+    " calibration, or their detections",
+    Kind.INVERTED: "the extrinsics of {who} look inverted: camera from world was taken for world from camera, or"
+    " the other way round; write the inverse",
+    Kind.TRANSPOSED: "the rotation of {who} looks transposed, with the translation as it is; transpose it",
+    Kind.AXES: "the camera axes of {who} look like those of OpenGL or Blender, y up and z backwards; turn y and z"
+    " round",
+    Kind.FOCAL: _focal,
+    Kind.RESIZED: "the detections of {who} look as if they were made on pictures {amount:.2g} times the calibrated"
+    " size ({resized} instead of {calibrated}); give detections on pictures of the calibrated size, or the"
+    " calibration of these",
+    Kind.PRINCIPAL_POINT: "principal points look off, they should lie {shifts} (at most a turn of {amount:.1f}"
+    " degrees); check that pictures have the calibrated sizes and are not cropped, or calibrate the intrinsics"
+    " again",
+    Kind.DUPLICATE: _duplicate,
+    Kind.UNIT: _unit,
+    Kind.UP: "people stand along {axis}, and the calibration says that {up} is up; give --up {axis}"
+    " unless they lie",
+    Kind.NOBODY: _nobody,
+    Kind.UNFIT: "{who} fits the others in nothing that was tried; check that its calibration and its detections"
+    " are its own",
+    Kind.PICTURE_SIZE: "the pictures of {first} are {found} pixels, and the calibration says {calibrated}; say how"
+    " the one became the other, or calibrate the pictures as they are",
+}
+"""What is said of each: words that `sentence` fills in, or what chooses them by the finding and the longer side of
+its camera's picture."""
+
+
+def _shift(x: float, y: float) -> str:
+    """A shift in a picture, in words."""
+    parts = [(abs(x), "right" if x > 0 else "left"), (abs(y), "down" if y > 0 else "up")]
+    told = [f"{size:.0f} px {way}" for size, way in parts if size >= 0.5]
+    return " and ".join(told) or "under a pixel"
+
+
+def _length(metres: float) -> str:
+    """A length in a unit that suits it."""
+    if metres < 0.01:
+        return f"{1e3 * metres:.2g} mm"
+    if metres < 1:
+        return f"{100 * metres:.0f} cm"
+    return f"{metres:.1f} m" if metres < 100 else f"{metres:,.0f} m"
