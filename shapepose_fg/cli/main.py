@@ -97,7 +97,7 @@ def evaluate_shelf_command(
     as_json: JsonOption = False,
 ) -> None:
     """PCP per limb and actor, MPJPE and recall on the Shelf recording."""
-    from shapepose_fg.evaluation.other_results.reading import read_people
+    from shapepose_fg.evaluation.other_results import read_people
     from shapepose_fg.evaluation.shelf import evaluate_shelf, read_shelf_ground_truth
 
     score = evaluate_shelf(read_people(results), read_shelf_ground_truth(ground_truth))

@@ -51,9 +51,6 @@ def before_refinement(
     config = PipelineConfig() if config is None else config
     found = [find_people(detections[t], rig, detections.skeleton, config) for t in range(len(detections))]
     frame = np.repeat(np.arange(len(found)), [len(people) for people in found])
-    if len(frame) == 0:
-        J = len(detections.skeleton)
-        return BeforeRefinement(frame, np.zeros((0, J, 3)), np.zeros((0, J)))
     observations = Observations.concatenate(found)
     joints = triangulate(observations, Views.of(rig), config.observations)
     return BeforeRefinement(frame, joints, observations.confidence.mean(axis=-1))
@@ -68,19 +65,13 @@ def alternation_errors(
     others than stage I did.
     """
     true = np.asarray(truth, dtype=np.float64)
-    tables = []
-    for rows in (before, people):
+    row = np.full((2, *true.shape[:2]), -1)
+    for table, rows in zip(row, (before, people), strict=True):
         matches = match_people(rows.frame, rows.joints, true)
-        row = np.full(true.shape[:2], -1)
-        row[matches.frame, matches.person] = matches.row
-        tables.append(row)
-    both = (tables[0] >= 0) & (tables[1] >= 0)
-    first, last = (row[both] for row in tables)
+        table[matches.frame, matches.person] = matches.row
+    both = (row >= 0).all(axis=0)
+    first, last = row[:, both]
     known = np.isfinite(true[both].sum(axis=-1))
-
-    def error_mm(joints: NDArray[np.float64]) -> NDArray[np.float64]:
-        return 1e3 * np.linalg.norm(joints - true[both], axis=-1)[known]
-
-    return JointErrors(
-        before.confidence[first][known], error_mm(before.joints[first]), error_mm(people.joints[last])
-    )
+    off = (joints - true[both] for joints in (before.joints[first], people.joints[last]))
+    before_mm, after_mm = (1e3 * np.linalg.norm(each, axis=-1)[known] for each in off)
+    return JointErrors(before.confidence[first][known], before_mm, after_mm)

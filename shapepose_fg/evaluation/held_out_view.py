@@ -75,28 +75,27 @@ def compare_view(
         raise ValueError("people come without observations: give what `reconstruct` returns, or load its folder")
     table = people.observations
     xy, confidence = (values[:, :, view].astype(np.float64) for values in (table.xy, table.confidence))
-    there = np.isfinite(xy).all(axis=-1) & (table.used[:, :, view] | _near(camera, xy, people.joints))
-    squared = [np.zeros(0)]
+    projected, depth = camera.project(people.joints)
+    near = np.linalg.norm(projected - xy, axis=-1) * depth / _focal(camera) < NEAR_M
+    there = np.isfinite(xy).all(axis=-1) & (table.used[:, :, view] | near)
+    pairs = [np.zeros((0, 2), dtype=np.intp)]
     for frame in np.unique(people.frame).tolist():
         ours, theirs = np.flatnonzero(people.frame == frame), np.flatnonzero(without.frame == frame)
-        matches = match_people(
-            np.zeros(len(theirs), dtype=np.intp), without.joints[theirs], people.joints[ours][None]
-        )
-        ours, theirs = ours[matches.person], theirs[matches.row]
-        pair, joint = np.nonzero(there[ours] & np.isfinite(without.joints[theirs]).all(axis=-1))
-        ours, theirs = ours[pair], theirs[pair]
-        squared.append(
-            squared_distances(
-                camera,
-                xy[ours, joint],
-                confidence[ours, joint],
-                without.joints[theirs, joint],
-                without.covariance[theirs, joint],
-                config.scatter(people.joint_names.tolist())[joint],
-                config,
-            )
-        )
-    found = np.concatenate(squared)
+        none = np.zeros(len(theirs), dtype=np.intp)
+        matches = match_people(none, without.joints[theirs], people.joints[ours][None])
+        pairs.append(np.stack([ours[matches.person], theirs[matches.row]], axis=1))
+    ours, theirs = np.concatenate(pairs).T
+    pair, joint = np.nonzero(there[ours] & np.isfinite(without.joints[theirs]).all(axis=-1))
+    ours, theirs = ours[pair], theirs[pair]
+    found = squared_distances(
+        camera,
+        xy[ours, joint],
+        confidence[ours, joint],
+        without.joints[theirs, joint],
+        without.covariance[theirs, joint],
+        config.scatter(people.joint_names.tolist())[joint],
+        config,
+    )
     known = found[np.isfinite(found)]
     return HeldOut(known, int(there.sum()) - len(known))
 
@@ -116,27 +115,19 @@ def squared_distances(
     has the joint's uncertainty in the image and the noise that the graph gives a detection of that `confidence`
     (M,) and of a joint with that `scatter` (M,). NaN behind the camera.
     """
-    count = len(points)
     projected, depth, J = project_with_jacobian(points, camera.K, camera.cTw)
-    ahead = depth >= MIN_DEPTH_M
-    sigma = np.full(count, np.nan)
-    sigma[ahead] = sigma_px(
-        config.weight(confidence[ahead]) / scatter[ahead] ** 2,
-        depth[ahead],
-        np.full(ahead.sum(), _focal(camera)),
+    ahead, focal = depth >= MIN_DEPTH_M, _focal(camera)
+    sigma = sigma_px(
+        config.weight(confidence) / scatter**2,
+        np.where(ahead, depth, 1.0),
+        np.full(len(points), focal),
         sigma_m=config.sigma_m,
-        floor_px=config.floor_rad * _focal(camera),
+        floor_px=config.floor_rad * focal,
     )
     S = J @ covariance @ J.transpose(0, 2, 1) + sigma[:, None, None] ** 2 * np.eye(2)
     apart = np.where(ahead[:, None], projected - xy, np.nan)
     safe = np.where(ahead[:, None, None], S, np.eye(2))
     return np.einsum("mi,mi->m", apart, np.linalg.solve(safe, apart[..., None])[..., 0])
-
-
-def _near(camera: Camera, xy: Array, joints: Array) -> NDArray[np.bool_]:
-    """(N, J) which detections lie within 0.3 m of the joint, as a length at its depth."""
-    projected, depth = camera.project(joints)
-    return np.linalg.norm(projected - xy, axis=-1) * depth / _focal(camera) < NEAR_M
 
 
 def _focal(camera: Camera) -> float:

@@ -1,12 +1,14 @@
 """Who is who: predicted people matched with true ones, frame by frame, so that the joint errors are least."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
+
+from shapepose_fg.core.skeleton import BODY_25
 
 MAX_DISTANCE_M = 0.5
 """Metres. A prediction this far from a person, in the mean over joints, is not that person."""
@@ -18,12 +20,24 @@ class People(Protocol):
     @property
     def frame(self) -> NDArray[np.integer]:
         """(N,) frame of each row."""
-        ...
 
     @property
     def joints(self) -> NDArray[np.floating]:
         """(N, J, 3) joints of each row, metres, NaN where unknown."""
-        ...
+
+
+@dataclass(frozen=True)
+class PlainPeople:
+    """N rows, one per person and frame, of which nothing but joints is known; implements `People`."""
+
+    frame: NDArray[np.int64]
+    """(N,) frame of each row."""
+    joints: NDArray[np.float64]
+    """(N, J, 3) joints of each row, metres in the world, NaN where unknown."""
+    person: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    """(N,) identity, or the number within the frame; empty where there is none."""
+    joint_names: tuple[str, ...] = BODY_25.joints
+    """(J,) names."""
 
 
 @dataclass(frozen=True)
@@ -49,15 +63,12 @@ def match_people(
     joints: NDArray[np.floating],
     truth: NDArray[np.floating],
     frames: Sequence[int] | range | None = None,
-    *,
-    max_distance_m: float = MAX_DISTANCE_M,
 ) -> Matches:
     """Match predictions `joints` (N, J, 3) of `frame` (N,) with `truth` (T, P, J, 3), all in metres.
 
     `frames` (T,) numbers the frames of the truth, 0 to T - 1 by default; predictions of other frames are left
-    out, as are predictions and true people without any joint. The cost of a pair is its mean joint distance
-    over the joints that the truth knows, a joint missing (NaN) in the prediction counting `max_distance_m`;
-    the assignment is the best one of each frame (Hungarian), pairs of `max_distance_m` or more are none.
+    out, as are predictions and true people without any joint. The cost of a pair is its `mean_distance`; the
+    assignment is the best one of each frame (Hungarian), pairs of 0.5 m or more are none.
     """
     predicted, true = np.asarray(joints, dtype=np.float64), np.asarray(truth, dtype=np.float64)
     if true.ndim != 4 or true.shape[3] != 3:
@@ -68,69 +79,33 @@ def match_people(
     if len(numbers) != len(true):
         raise ValueError(f"frames must number the {len(true)} frames of the truth, got {len(numbers)}")
     has_joint = np.isfinite(predicted.sum(axis=2)).any(axis=1)
-    parts = [
-        _match_frame(
-            index, np.flatnonzero((np.asarray(frame) == number) & has_joint), predicted, true, max_distance_m
-        )
-        for index, number in enumerate(numbers)
-    ]
-    pairs, duplicated, invented, missed = (
-        np.concatenate([part[i] for part in parts]) if parts else empty for i, empty in enumerate(_NOTHING)
-    )
-    return Matches(pairs[:, 0], pairs[:, 1], pairs[:, 2], duplicated, invented, missed)
+    is_there = np.isfinite(true.sum(axis=3)).any(axis=2)
+    pairs, missed = list[tuple[int, int, int]](), list[tuple[int, int]]()
+    duplicated, invented = list[int](), list[int]()
+    for index, number in enumerate(numbers):
+        rows, people = np.flatnonzero((np.asarray(frame) == number) & has_joint), np.flatnonzero(is_there[index])
+        cost = mean_distance(predicted[rows, None], true[index, people])
+        # Beyond the bound all pairs are equally none: a far one must not decide about the near ones.
+        at_row, at_person = linear_sum_assignment(np.minimum(cost, MAX_DISTANCE_M))
+        near = cost[at_row, at_person] < MAX_DISTANCE_M
+        at_row, at_person = at_row[near], at_person[near]
+        pairs += [(row, index, who) for row, who in zip(rows[at_row], people[at_person], strict=True)]
+        missed += [(index, who) for who in np.setdiff1d(people, people[at_person])]
+        for left in np.setdiff1d(np.arange(len(rows)), at_row):
+            (duplicated if (cost[left] < MAX_DISTANCE_M).any() else invented).append(int(rows[left]))
+    row, at, who = np.array(pairs, dtype=np.intp).reshape(-1, 3).T
+    twice, nowhere = (np.array(each, dtype=np.intp) for each in (duplicated, invented))
+    return Matches(row, at, who, twice, nowhere, np.array(missed, dtype=np.intp).reshape(-1, 2))
 
 
-def mean_distance(
-    predicted: NDArray[np.float64], truth: NDArray[np.float64], missing_m: float = MAX_DISTANCE_M
-) -> NDArray[np.float64]:
-    """Mean joint distance (N, P) in metres between N predictions (N, J, 3) and P people (P, J, 3).
+def mean_distance(predicted: NDArray[np.float64], truth: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean joint distance (...) in metres of pairs of people: `predicted` and `truth` (..., J, 3) broadcast.
 
-    A joint that only the prediction lacks counts `missing_m`, one that the truth lacks counts nothing; infinite
-    for a person without joints.
+    A joint that only the prediction lacks counts 0.5 m, one that the truth lacks counts nothing; infinite for a
+    person without joints.
     """
-    return pair_distance(predicted[:, None], truth[None], missing_m)
-
-
-def pair_distance(
-    predicted: NDArray[np.float64], truth: NDArray[np.float64], missing_m: float = MAX_DISTANCE_M
-) -> NDArray[np.float64]:
-    """The `mean_distance` (...) of pairs that are named: `predicted` and `truth` (..., J, 3) broadcast."""
     distance = np.linalg.norm(predicted - truth, axis=-1)
     known = np.isfinite(truth).all(axis=-1)
-    distance = np.where(known, np.where(np.isfinite(distance), distance, missing_m), 0.0).sum(axis=-1)
+    distance = np.where(known, np.where(np.isfinite(distance), distance, MAX_DISTANCE_M), 0.0).sum(axis=-1)
     count = known.sum(axis=-1)
     return np.where(count > 0, distance / np.maximum(count, 1), np.inf)
-
-
-_NOTHING = (
-    np.zeros((0, 3), dtype=np.intp),
-    np.zeros(0, dtype=np.intp),
-    np.zeros(0, dtype=np.intp),
-    np.zeros((0, 2), dtype=np.intp),
-)
-"""Pairs, duplicated, invented and missed of no frames."""
-
-
-def _match_frame(
-    index: int,
-    rows: NDArray[np.intp],
-    predicted: NDArray[np.float64],
-    truth: NDArray[np.float64],
-    max_distance_m: float,
-) -> tuple[NDArray[np.intp], ...]:
-    """Pairs (row, frame, person), duplicated rows, invented rows, missed (frame, person) of one frame."""
-    people = np.flatnonzero(np.isfinite(truth[index].sum(axis=2)).any(axis=1))
-    cost = mean_distance(predicted[rows], truth[index, people], max_distance_m)
-    # Beyond the bound all pairs are equally none: a far one must not decide about the near ones.
-    at_row, at_person = linear_sum_assignment(np.minimum(cost, max_distance_m))
-    near = cost[at_row, at_person] < max_distance_m
-    at_row, at_person = at_row[near], at_person[near]
-    left = np.setdiff1d(np.arange(len(rows)), at_row)
-    duplicate = (cost[left] < max_distance_m).any(axis=1)
-    missing = np.setdiff1d(people, people[at_person])
-    return (
-        np.stack([rows[at_row], np.full(len(at_row), index), people[at_person]], axis=1),
-        rows[left[duplicate]],
-        rows[left[~duplicate]],
-        np.stack([np.full(len(missing), index), missing], axis=1),
-    )

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
-from shapepose_fg.evaluation.matching import Matches, People, match_people
+from shapepose_fg.evaluation.matching import Matches, People, PlainPeople, match_people
 
 CORRECT_M = 0.2
 """A joint is correct if it is at most this far from the true one (the protocol of Zhang et al.), metres."""
@@ -42,17 +42,17 @@ class JointMetrics:
     @property
     def precision(self) -> float:
         """Share of the predicted joints that are correct; NaN if none was predicted."""
-        return _share(self.joints_correct, self.joints_predicted)
+        return share(self.joints_correct, self.joints_predicted)
 
     @property
     def recall(self) -> float:
         """Share of the true joints that were predicted correctly; NaN if there are none."""
-        return _share(self.joints_correct, self.joints_true)
+        return share(self.joints_correct, self.joints_true)
 
     @property
     def f1(self) -> float:
         """Harmonic mean of precision and recall."""
-        return _share(2 * self.joints_correct, self.joints_predicted + self.joints_true)
+        return share(2 * self.joints_correct, self.joints_predicted + self.joints_true)
 
     @property
     def people_missed(self) -> int:
@@ -86,11 +86,15 @@ def joint_metrics(
     """
     truth = np.asarray(truth, dtype=np.float64)
     if isinstance(predicted, Sequence):
-        frame, joints = _rows(predicted, truth)
-        matches = match_people(frame, joints, truth)
-    else:
-        joints = np.asarray(predicted.joints, dtype=np.float64)
-        matches = match_people(predicted.frame, joints, truth, frames)
+        if len(predicted) != len(truth):
+            raise ValueError(
+                f"give one array for each of the {len(truth)} frames of the truth, got {len(predicted)}"
+            )
+        frame = np.repeat(np.arange(len(predicted)), [len(people) for people in predicted])
+        rows = np.concatenate([np.zeros((0, *truth.shape[2:])), *predicted])
+        predicted = PlainPeople(frame, rows.astype(np.float64))
+    joints = np.asarray(predicted.joints, dtype=np.float64)
+    matches = match_people(predicted.frame, joints, truth, frames)
     return metrics_of(matches, joints, truth, correct_m=correct_m)
 
 
@@ -158,27 +162,13 @@ def covariance_calibration(
     except np.linalg.LinAlgError:
         raise ValueError("a covariance is not positive definite") from None
     nees = np.sum(np.linalg.solve(root, error[..., None])[..., 0] ** 2, axis=1)
-    inside = {level: _share((nees <= _chi_squared_3(level)).sum(), len(nees)) for level in COVERAGE_LEVELS}
+    # `2 gammaincinv(1.5, level)`: what chi-squared with 3 degrees of freedom is under with that probability.
+    inside = {level: share((nees <= 2 * gammaincinv(1.5, level)).sum(), len(nees)) for level in COVERAGE_LEVELS}
     density = -0.5 * (nees + 3 * np.log(2 * np.pi)) - np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
     score = float(np.maximum(density, _LEAST_LOG_SCORE).mean()) if len(nees) > 0 else float("nan")
     return CovarianceCalibration(nees, inside, score)
 
 
-def _rows(
-    predicted: Sequence[NDArray[np.floating]], truth: NDArray[np.float64]
-) -> tuple[NDArray[np.integer], NDArray[np.float64]]:
-    """Frame (N,) and joints (N, J, 3) of one array of people for each frame."""
-    if len(predicted) != len(truth):
-        raise ValueError(f"give one array for each of the {len(truth)} frames of the truth, got {len(predicted)}")
-    parts = [np.asarray(part, dtype=np.float64) for part in predicted]
-    frame = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    return frame, np.concatenate([np.zeros((0, *truth.shape[2:])), *parts])
-
-
-def _chi_squared_3(level: float) -> float:
-    """What a chi-squared variable with 3 degrees of freedom is under with probability `level`."""
-    return float(2 * gammaincinv(1.5, level))
-
-
-def _share(part: float, whole: float) -> float:
+def share(part: float, whole: float) -> float:
+    """`part` of `whole`; NaN of nothing."""
     return float(part / whole) if whole > 0 else float("nan")

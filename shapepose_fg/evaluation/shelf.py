@@ -5,6 +5,7 @@ No precision: not everyone in view is annotated, so a prediction without an anno
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,38 +16,49 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.matching import People
-from shapepose_fg.evaluation.other_results.skeleton_text import SHELF_JOINTS
-from shapepose_fg.evaluation.shelf_ground_truth import (
-    ShelfGroundTruth,
-    read_shelf_ground_truth,
-    shelf_joints,
-)
+from shapepose_fg.evaluation.other_results import SHELF_JOINTS, read_skeleton_text
 
-__all__ = ["ShelfGroundTruth", "ShelfScore", "evaluate_shelf", "read_shelf_ground_truth", "shelf_joints"]
-
-LIMBS = ((9, 10), (8, 7), (10, 11), (7, 6), (3, 4), (2, 1), (4, 5), (1, 0), (12, 13), (12, 14))
-"""The 10 scored limbs, as pairs of `SHELF_JOINTS`."""
-LIMB_NAMES = (
-    "left upper arm",
-    "right upper arm",
-    "left lower arm",
-    "right lower arm",
-    "left upper leg",
-    "right upper leg",
-    "left lower leg",
-    "right lower leg",
-    "head",
-    "torso",
-)
+_LIMBS = {
+    "left upper arm": ("LShoulder", "LElbow"),
+    "right upper arm": ("RShoulder", "RElbow"),
+    "left lower arm": ("LElbow", "LWrist"),
+    "right lower arm": ("RElbow", "RWrist"),
+    "left upper leg": ("LHip", "LKnee"),
+    "right upper leg": ("RHip", "RKnee"),
+    "left lower leg": ("LKnee", "LAnkle"),
+    "right lower leg": ("RKnee", "RAnkle"),
+    "head": ("Neck", "HeadTop"),
+    "torso": ("Neck", "MidHip"),
+}
+LIMB_NAMES = tuple(_LIMBS)
+"""The 10 scored limbs."""
+LIMBS = np.array([[SHELF_JOINTS.index(joint) for joint in ends] for ends in _LIMBS.values()])
+"""(10, 2) their ends in `SHELF_JOINTS`."""
 ACTORS = (0, 1, 2)
 """The scored ids of the annotation: actors 1, 2 and 3."""
+MISSING_JOINT_M, RECALL_M = 0.5, 0.2
+"""What a missing joint counts in the choice of a prediction; a joint is recalled when it is at most so far off."""
 
-MISSING_JOINT_M = 0.5
-"""What a missing joint counts in the choice of a prediction, metres."""
-RECALL_M = 0.2
-"""A joint is recalled when it is at most this far from the annotated one, metres."""
 
-_A, _B = np.array(LIMBS).T
+@dataclass(frozen=True)
+class ShelfGroundTruth:
+    """Annotated people, one row per person and frame."""
+
+    frame: NDArray[np.int64]
+    """(G,) frame of the recording, counted from 0 in the file."""
+    actor: NDArray[np.int64]
+    """(G,) id as written: 0, 1, 2 are the actors 1, 2, 3; others are not scored."""
+    joints: NDArray[np.float64]
+    """(G, 15, 3) metres in the world, in the order of `SHELF_JOINTS`."""
+
+
+def read_shelf_ground_truth(path: Path | str) -> ShelfGroundTruth:
+    """Read annotated people from the text format of the 4D Association Graph's Shelf data.
+
+    InputError that names file and line for a missing, malformed or truncated file.
+    """
+    text = read_skeleton_text(Path(path), shelf=True)
+    return ShelfGroundTruth(text.frame, text.person, text.joints)
 
 
 @dataclass(frozen=True)
@@ -89,13 +101,11 @@ class ShelfScore:
     def as_dict(self) -> dict[str, Any]:
         """The figures under plain names, for JSON; None where there is nothing to score."""
         by_limb = _percent(self.limbs_right, self.limbs_all)
+        limbs = {f"actor {a + 1}": dict(zip(LIMB_NAMES, map(_plain, by_limb[a]), strict=True)) for a in ACTORS}
         return {
             "pcp_average": _plain(self.pcp_average),
             "pcp_actor": {f"actor {a + 1}": _plain(self.pcp[a]) for a in ACTORS},
-            "pcp_limb": {
-                f"actor {a + 1}": {name: _plain(by_limb[a, i]) for i, name in enumerate(LIMB_NAMES)}
-                for a in ACTORS
-            },
+            "pcp_limb": limbs,
             "limbs_right": int(self.limbs_right.sum()),
             "limbs": int(self.limbs_all.sum()),
             "mpjpe_mm": _plain(self.mpjpe_mm),
@@ -110,10 +120,8 @@ class ShelfScore:
         """PCP by limb and actor, for a terminal."""
         table = Table(title=f"Shelf, {self.frames} of {self.frames_annotated} annotated frames: PCP@0.5, %")
         table.add_column("limb")
-        for actor in ACTORS:
-            table.add_column(f"actor {actor + 1}", justify="right")
-        table.add_column("pooled", justify="right")
-        table.add_column("right / all", justify="right")
+        for heading in (*(f"actor {actor + 1}" for actor in ACTORS), "pooled", "right / all"):
+            table.add_column(heading, justify="right")
         by_actor = _percent(self.limbs_right, self.limbs_all)
         right, count = self.limbs_right.sum(axis=0), self.limbs_all.sum(axis=0)
         for i, name in enumerate(LIMB_NAMES):
@@ -140,93 +148,84 @@ def evaluate_shelf(
     whose run says which frames it covered (`run["frames"]`, [start, stop] or several) is scored on those.
     InputError if no annotated frame is left to score.
     """
-    matched = match_actors(people, ground_truth, frames)
-    member = matched.actor[:, None] == np.array(ACTORS)
-    known = np.isfinite(matched.distance) & matched.found[:, None]
-    return ShelfScore(
-        limbs_right=member.T.astype(np.int64) @ matched.limbs_right,
-        limbs_all=np.repeat(member.sum(axis=0)[:, None], len(LIMBS), axis=1),
-        mpjpe_mm=1e3 * float(matched.distance[known].mean()) if known.any() else float("nan"),
-        recall=float((matched.distance <= RECALL_M).mean()),
-        people_found=int(matched.found.sum()),
-        people=len(matched.frame),
-        frames=len(np.unique(matched.frame)),
-        frames_annotated=len(np.unique(ground_truth.frame[np.isin(ground_truth.actor, ACTORS)])),
-    )
-
-
-@dataclass(frozen=True)
-class MatchedActors:
-    """The G annotated actors of the scored frames, and what each of them takes."""
-
-    frame: NDArray[np.int64]
-    """(G,) frame."""
-    actor: NDArray[np.int64]
-    """(G,) one of `ACTORS`."""
-    row: NDArray[np.intp]
-    """(G,) row of the people that is taken; -1 where the frame has none."""
-    distance: NDArray[np.float64]
-    """(G, 15) distance of its joints to the annotated ones, metres; NaN where it lacks one."""
-    limbs_right: NDArray[np.bool_]
-    """(G, 10) PCP@0.5 of `LIMBS`."""
-
-    @property
-    def found(self) -> NDArray[np.bool_]:
-        """(G,) whether the mean joint distance is under 0.5 m."""
-        distance = np.where(np.isfinite(self.distance), self.distance, MISSING_JOINT_M)
-        return distance.mean(axis=1) < MISSING_JOINT_M
-
-
-def match_actors(
-    people: People, ground_truth: ShelfGroundTruth, frames: Iterable[int] | None = None
-) -> MatchedActors:
-    """What each annotated actor takes of `people`, by the rules of `evaluate_shelf`; it raises the same errors."""
-    actor = np.isin(ground_truth.actor, ACTORS)
-    scored = actor & _covered(ground_truth.frame, _frames_run(people) if frames is None else frames)
+    scored = acted = np.isin(ground_truth.actor, ACTORS)
+    frames = _frames_run(people) if frames is None else frames
+    if frames is not None:
+        scored = acted & np.isin(ground_truth.frame, np.fromiter(frames, dtype=np.int64))
     if not scored.any():
         raise InputError(
             "none of the reconstructed frames is annotated; reconstruct frames that the ground truth covers: "
-            f"{_spans(np.unique(ground_truth.frame[actor]))}"
+            f"{_spans(np.unique(ground_truth.frame[acted]))}"
         )
     truth, frame = ground_truth.joints[scored], ground_truth.frame[scored]
-    row, chosen = _choose(truth, frame, people)
-    distance = np.linalg.norm(chosen - truth, axis=2)
-    return MatchedActors(frame, ground_truth.actor[scored], row, distance, _limbs_right(distance, truth))
+    distance = _distances(truth, frame, people)
+    found = np.where(np.isfinite(distance), distance, MISSING_JOINT_M).mean(axis=1) < MISSING_JOINT_M
+    length = np.linalg.norm(truth[:, LIMBS[:, 0]] - truth[:, LIMBS[:, 1]], axis=2)
+    right = distance[:, LIMBS].mean(axis=2) <= 0.5 * length  # a missing end (NaN) makes it false
+    member = ground_truth.actor[scored, None] == np.array(ACTORS)
+    known = np.isfinite(distance) & found[:, None]
+    return ShelfScore(
+        limbs_right=member.T.astype(np.int64) @ right,
+        limbs_all=np.repeat(member.sum(axis=0)[:, None], len(LIMBS), axis=1),
+        mpjpe_mm=1e3 * float(distance[known].mean()) if known.any() else float("nan"),
+        recall=float((distance <= RECALL_M).mean()),
+        people_found=int(found.sum()),
+        people=len(frame),
+        frames=len(np.unique(frame)),
+        frames_annotated=len(np.unique(ground_truth.frame[acted])),
+    )
 
 
-def _choose(
-    truth: NDArray[np.float64], frame: NDArray[np.int64], people: People
-) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Row (G,) and joints (G, 15, 3) that each annotated person takes; -1 and NaN where its frame has none."""
-    joints = _shelf15(people)
+def _distances(truth: NDArray[np.float64], frame: NDArray[np.int64], people: People) -> NDArray[np.float64]:
+    """(G, 15) distances of the joints that annotated people (G, 15, 3) take, metres; NaN where there is none."""
+    joints, names = (
+        np.asarray(people.joints, dtype=np.float64),
+        tuple(getattr(people, "joint_names", BODY_25.joints)),
+    )
+    if names not in (SHELF_JOINTS, BODY_25.joints):
+        raise InputError("the people's joints are not those of BODY_25, which this protocol maps to Shelf's 15")
+    joints = joints if names == SHELF_JOINTS else shelf_joints(joints)
     person, row = np.nonzero(frame[:, None] == np.asarray(people.frame)[None, :])
     distance = np.linalg.norm(joints[row] - truth[person], axis=2)
     cost = np.where(np.isfinite(distance), distance, MISSING_JOINT_M).mean(axis=1)
     order = np.lexsort((cost, person))
     first, where = np.unique(person[order], return_index=True)
-    taken, chosen = np.full(len(truth), -1), np.full_like(truth, np.nan)
-    taken[first] = row[order[where]]
-    chosen[first] = joints[taken[first]]
-    return taken, chosen
+    taken = np.full(truth.shape[:2], np.nan)
+    taken[first] = distance[order[where]]
+    return taken
 
 
-def _shelf15(people: People) -> NDArray[np.float64]:
-    """The joints (N, 15, 3) of `people`, who have BODY_25's or Shelf's own; InputError for any others."""
-    names, joints = (
-        tuple(getattr(people, "joint_names", BODY_25.joints)),
-        np.asarray(people.joints, dtype=np.float64),
-    )
-    if names == SHELF_JOINTS:
-        return joints
-    if names != BODY_25.joints:
-        raise InputError("the people's joints are not those of BODY_25, which this protocol maps to Shelf's 15")
-    return shelf_joints(joints)
+def shelf_joints(body25: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Map BODY_25 joints (N, 25, 3), metres, z up, to Shelf's (N, 15, 3); NaN stays NaN.
+
+    The hips, limbs and MidHip are the joints of the same name. With s and e the middles of shoulders and
+    ears, Neck is s + 0.5 (e - s) and HeadTop is Neck + 0.125 f + 0.145 z, f the unit vector of
+    (neck - midhip) x (RShoulder - LShoulder). The mapping is fixed: tuning it on the annotation would lift the
+    figure in sample only. Where one ear is unknown, e is the other ear brought into the plane halfway between
+    the shoulders, which is where the middle of two mirrored ears lies.
+    """
+    body25 = np.asarray(body25, dtype=np.float64)
+    if body25.ndim != 3 or body25.shape[1:] != (25, 3):
+        raise ValueError(f"body25 must be (N, 25, 3), got {body25.shape}")
+    named = ("RShoulder", "LShoulder", "MidHip", "Neck", "REar", "LEar")
+    right, left, midhip, neck, right_ear, left_ear = (body25[:, BODY_25.index(name)] for name in named)
+    shoulders, across = 0.5 * (right + left), _unit(right - left)
+    ear = np.where(np.isfinite(right_ear), right_ear, left_ear)
+    mirrored = ear - np.sum((ear - shoulders) * across, axis=1, keepdims=True) * across
+    middle = 0.5 * (right_ear + left_ear)
+    middle = np.where(np.isfinite(middle), middle, mirrored)
+    result = np.empty((len(body25), 15, 3))
+    result[:, :12] = body25[:, [BODY_25.index(name) for name in SHELF_JOINTS[:12]]]
+    result[:, 12] = shoulders + 0.5 * (middle - shoulders)
+    result[:, 13] = result[:, 12] + 0.125 * _unit(np.cross(neck - midhip, right - left)) + [0.0, 0.0, 0.145]
+    result[:, 14] = midhip
+    return result
 
 
-def _limbs_right(distance: NDArray[np.float64], truth: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """(G, 10) which limbs are right: PCP@0.5. A missing end (NaN) makes the comparison false."""
-    length = np.linalg.norm(truth[:, _A] - truth[:, _B], axis=2)
-    return (distance[:, _A] + distance[:, _B]) / 2 <= 0.5 * length
+def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Vectors (N, 3) of length one; NaN for one of no length."""
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return vectors / np.where(length > 0, length, np.nan)
 
 
 def _frames_run(people: People) -> Iterable[int] | None:
@@ -236,12 +235,6 @@ def _frames_run(people: People) -> Iterable[int] | None:
     except ValueError as error:
         raise InputError(f"run.json: {error}; restore the file") from None
     return None if spans is None else [frame for span in spans for frame in span]
-
-
-def _covered(frame: NDArray[np.int64], frames: Iterable[int] | None) -> NDArray[np.bool_]:
-    if frames is None:
-        return np.ones(len(frame), dtype=bool)
-    return np.isin(frame, np.fromiter(frames, dtype=np.int64))
 
 
 def _spans(frames: NDArray[np.int64]) -> str:

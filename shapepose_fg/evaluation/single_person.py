@@ -1,45 +1,57 @@
-"""Footage without a truth: what a man on a treadmill and a bystander must look like (Pose2Sim's demo recording).
+"""Pose2Sim's demo recording: what its people must look like, and a man's arms against marks made by hand.
 
 One man exercises in the middle of four cameras; a bystander stands still where only two of them look.
 """
 
+import csv
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.core.camera import Rig
+from factors import project_with_jacobian
+from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.evaluation.footage import SINGLE_FPS
-from shapepose_fg.evaluation.trajectories import WRISTS
+from shapepose_fg.estimation.linearisation import ObservationConfig, triangulate
 from shapepose_fg.proposal.candidates import CandidateConfig, triangulate_pairs
 
 Array = NDArray[np.float64]
 
+SINGLE_FPS = 60.0
 MIDDLE_M = 1.5
 """Whoever is within this of the middle of the cameras, on the floor, is the man; metres."""
-BYSTANDER_M = np.array([-4.4, 0.4])
-"""Where the bystander stands on the floor: the middle of what views 1 and 2 see there, over all frames."""
-AROUND_M = 1.0
-"""How far from there a point or a person may be."""
+BYSTANDER_M, AROUND_M = np.array([-4.4, 0.4]), 1.0
+"""Where the bystander stands on the floor (the middle of what views 1 and 2 see there, over all frames), and how
+far from there a point or a person may be."""
 FIVE_JOINTS = 5
 """So many of a person's joints in two views are enough to be found."""
 ARM_UP = range(16, 31)
 """Frames in which the man raises his right arm: from 0.16 m below the shoulder to 0.1 m above."""
 LIMB_LIMIT = 1.25
 """A limb longer than this times its own median is counted as torn."""
-LIMBS = np.array(
-    [
-        [BODY_25.index(side + joint) for joint in pair]
-        for side in "RL"
-        for pair in (("Elbow", "Wrist"), ("Shoulder", "Elbow"), ("Hip", "Knee"), ("Knee", "Ankle"))
-    ]
-)
+_PAIRS = (("Elbow", "Wrist"), ("Shoulder", "Elbow"), ("Hip", "Knee"), ("Knee", "Ankle"))
+LIMBS = np.array([[BODY_25.index(side + joint) for joint in pair] for side in "RL" for pair in _PAIRS])
 """Upper and lower arms and legs: what does not change its length."""
 FOREARMS = [0, 4]
-ARMS = (*WRISTS, BODY_25.index("RElbow"), BODY_25.index("LElbow"))
+ANNOTATION = Path(__file__).with_name("pose2sim_single_arms.csv")
+"""The marks; its head says how they were made. Part of the repository, not of what is installed."""
+ARMS = ("RElbow", "RWrist", "LElbow", "LWrist")
+"""The annotated joints."""
+_ARM_JOINTS = np.array([BODY_25.index(name) for name in ARMS])
+SIGMA_PX = 10.0
+"""Of a mark: the median distance of the marks from their own triangulation is 9 px; 4 px if each camera may shift,
+as the rig does not match these videos."""
+AGREE_M, WRONG_M = 0.1, 0.2
+"""A mark further than the first from where the marks meet, as a length at the joint's depth, is left out; a joint
+further than the second from its annotation is wrong."""
+INSIDE_50, INSIDE_95 = 2.366, 7.815
+"""A chi-squared variable with 3 degrees of freedom is under these in 50 and 95 of 100 cases."""
 
 
 def measure_single_person(
@@ -59,22 +71,24 @@ def measure_single_person(
     up = his.joints @ rig.up_vector
     below = (up[:, BODY_25.index("RShoulder")] - up[:, BODY_25.index("RWrist")])[np.isin(his.frame, ARM_UP)]
     there = _one_a_frame(people, np.linalg.norm(_places(people, rig) - BYSTANDER_M, axis=1), AROUND_M)
-    seen = bystander_seen(recording, rig)
-    with np.errstate(invalid="ignore"):
-        figures = {
-            "forearm_spread": 100 * np.mean(np.nanstd(forearms, axis=0) / np.nanmean(forearms, axis=0))
-            if np.isfinite(forearms).any()
-            else np.nan,
-            "wrist_acceleration": accelerations.mean() if len(accelerations) > 0 else np.nan,
-            "largest_acceleration": accelerations.max(initial=0.0),
-            "lowest_wrist_m": np.nanmax(below) if np.isfinite(below).any() else np.nan,
-            "residual_px": residual_to_nearest(his, recording, rig),
-            "bystander_found": 100 * seen[people.frame[there]].sum() / max(seen.sum(), 1),
-        }
+    seen, known = bystander_seen(recording, rig), bool(np.isfinite(forearms).any())
+    figures = {
+        "forearm_spread": 100 * np.mean(np.nanstd(forearms, axis=0) / np.nanmean(forearms, axis=0))
+        if known
+        else None,
+        "wrist_acceleration": accelerations.mean() if len(accelerations) > 0 else None,
+        "largest_acceleration": accelerations.max() if len(accelerations) > 0 else None,
+        "lowest_wrist_m": np.nanmax(below) if np.isfinite(below).any() else None,
+        "residual_px": residual_to_nearest(his, recording, rig),
+        "bystander_found": 100 * seen[people.frame[there]].sum() / max(seen.sum(), 1),
+    }
     torn = lengths > LIMB_LIMIT * np.nanmedian(lengths, axis=0) if len(his) > 0 else np.zeros(0)
-    counts = {"frames": len(recording), "man_found": len(his), "torn_limbs": int(torn.sum())}
-    counts["bystander_seen"] = int(seen.sum())
-    return counts | {name: float(value) if np.isfinite(value) else None for name, value in figures.items()}
+    counts = {"frames": len(recording), "man_found": len(his), "bystander_seen": int(seen.sum())}
+    return (
+        counts
+        | {"torn_limbs": int(torn.sum())}
+        | {name: None if value is None else float(value) for name, value in figures.items()}
+    )
 
 
 def man_of(people: Reconstruction, rig: Rig) -> NDArray[np.intp]:
@@ -93,22 +107,21 @@ def bystander_seen(recording: DetectionSequence, rig: Rig) -> NDArray[np.bool_]:
     return seen
 
 
-def residual_to_nearest(people: Reconstruction, recording: DetectionSequence, rig: Rig) -> float:
+def residual_to_nearest(people: Reconstruction, recording: DetectionSequence, rig: Rig) -> float | None:
     """Median distance in pixels of projected elbows and wrists from the nearest detection of them in each view.
 
-    It knows nothing of gates: joints that leave what the views saw pay here.
+    It knows nothing of gates: joints that leave what the views saw pay here. None where nothing is to measure.
     """
-    nearest = []
+    nearest = [np.nan]
     for row, frame in enumerate(people.frame.tolist()):
         seen = recording[frame]
         xy, _ = rig.project(people.joints[row])
-        for joint in ARMS:
+        for joint in _ARM_JOINTS:
             for view in range(len(rig)):
                 mine = seen.xy[(seen.joint == joint) & (seen.view == view)]
-                if len(mine) > 0:
-                    nearest.append(np.linalg.norm(mine - xy[view, joint], axis=1).min())
-    known = np.array(nearest)[np.isfinite(nearest)]
-    return float(np.median(known)) if len(known) > 0 else float("nan")
+                nearest.append(np.linalg.norm(mine - xy[view, joint], axis=1).min(initial=np.inf))
+    known = np.isfinite(nearest)
+    return float(np.median(np.array(nearest)[known])) if known.any() else None
 
 
 def _floor(rig: Rig) -> Array:
@@ -134,7 +147,99 @@ def _one_a_frame(people: Reconstruction, distance: Array, limit: float) -> NDArr
 
 def _accelerations(people: Reconstruction, fps: float) -> Array:
     """Lengths over wrists and consecutive frames, m/s²."""
-    wrists = people.joints[:, list(WRISTS)]
+    wrists = people.joints[:, _ARM_JOINTS[[1, 3]]]
     second = np.linalg.norm(wrists[2:] - 2 * wrists[1:-1] + wrists[:-2], axis=-1) * fps**2
     second = second[people.frame[2:] - people.frame[:-2] == 2]
     return second[np.isfinite(second)]
+
+
+@dataclass(frozen=True)
+class AnnotatedArms:
+    """A annotated joints in space."""
+
+    frame: NDArray[np.intp]
+    """(A,) frame of the recording."""
+    joint: NDArray[np.intp]
+    """(A,) index into `ARMS`."""
+    xyz: Array
+    """(A, 3) position, metres, where the marks of two views or more meet."""
+    covariance: Array
+    """(A, 3, 3) its covariance, m²."""
+    residual_px: Array
+    """(A, V) distance of each view's mark from the projected position; NaN where none is used."""
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def only(self, frames: range) -> "AnnotatedArms":
+        """Those of `frames`."""
+        there = np.isin(self.frame, frames)
+        return AnnotatedArms(*(values[there] for values in vars(self).values()))
+
+
+@dataclass(frozen=True)
+class ArmErrors:
+    """What `measure_arms` found, joint by joint; a joint that has no place is infinitely far away."""
+
+    joint: NDArray[np.intp]
+    """(A,) index into `ARMS`."""
+    error_m: Array
+    """(A,) distance from the annotation, metres."""
+    squared: Array
+    """(A,) squared Mahalanobis distance under both covariances together."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Medians in millimetres, shares in per cent; None where there is nothing to measure."""
+        medians = {}
+        for number, name in enumerate(ARMS):
+            mine = self.error_m[self.joint == number]
+            middle = 1e3 * float(np.median(mine)) if len(mine) > 0 else np.inf
+            medians[f"{name}_mm"] = middle if np.isfinite(middle) else None
+        shares = {"arms_wrong": self.error_m > WRONG_M, "arms_inside_50": self.squared <= INSIDE_50}
+        shares["arms_inside_95"] = self.squared <= INSIDE_95
+        some = len(self.joint) > 0
+        per_cent = {name: 100 * float(each.mean()) if some else None for name, each in shares.items()}
+        return {"arms": len(self.joint)} | medians | per_cent
+
+
+def read_annotated_arms(file: Path, rig: Rig) -> AnnotatedArms:
+    """Read marks, in raw pixels, and triangulate the clear ones. InputError where the file has no such marks."""
+    try:
+        lines = [line for line in file.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+        rows = [row for row in csv.DictReader(lines) if row["flag"] == "clear"]
+        keys = [(int(row["frame"]), ARMS.index(row["joint"])) for row in rows]
+        view = np.array([rig.names.index(row["view"]) for row in rows], dtype=np.intp)
+        raw = np.array([(row["x"], row["y"]) for row in rows], dtype=np.float64).reshape(-1, 2)
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(f"{file}: no annotation of arms in views {' '.join(rig.names)}: {error}") from error
+    key, place = np.unique(np.array(keys, dtype=np.intp).reshape(-1, 2), axis=0, return_inverse=True)
+    xy, seen = np.zeros((len(key), len(rig), 2)), np.zeros((len(key), len(rig)))
+    for index, camera in enumerate(rig.cameras):
+        xy[place[view == index], index] = camera.undistort(raw[view == index])
+        seen[place[view == index], index] = 1.0
+    for _ in range(2):  # of all marks, and of those that agree
+        marks = Observations(xy[:, None], seen[:, None], np.full((len(key), 1, 3), np.nan))
+        xyz = triangulate(marks, Views.of(rig), ObservationConfig())[:, 0]
+        projected, depth, J = project_with_jacobian(xyz[:, None], rig.K, rig.cTw)
+        residual = np.linalg.norm(xy - projected, axis=-1)
+        seen = np.where(residual * depth / rig.focal_px < AGREE_M, seen, 0.0)
+    # Of points: the inverse of their information in the views that are used, each mark with `SIGMA_PX`.
+    placed = seen.sum(axis=1) >= 2
+    J = np.where(seen[..., None, None] > 0, J, 0.0)[placed] / SIGMA_PX
+    covariance = np.linalg.inv(np.einsum("avki,avkj->aij", J, J))
+    residual = np.where(seen > 0, residual, np.nan)[placed]
+    return AnnotatedArms(key[placed, 0], key[placed, 1], xyz[placed], covariance, residual)
+
+
+def measure_arms(his: Reconstruction, arms: AnnotatedArms) -> ArmErrors:
+    """Compare one man's rows, at most one a frame, with his annotated joints."""
+    row_of = dict(zip(his.frame.tolist(), range(len(his)), strict=True))
+    row = np.array([row_of.get(frame, -1) for frame in arms.frame.tolist()], dtype=np.intp)
+    joint, placed = _ARM_JOINTS[arms.joint], row >= 0
+    placed[placed] = np.isfinite(his.joints[row[placed], joint[placed]]).all(axis=-1)
+    off = his.joints[row[placed], joint[placed]] - arms.xyz[placed]
+    both = his.covariance[row[placed], joint[placed]] + arms.covariance[placed]
+    error_m, squared = np.full(len(arms), np.inf), np.full(len(arms), np.inf)
+    error_m[placed] = np.linalg.norm(off, axis=-1)
+    squared[placed] = np.einsum("ai,ai->a", off, np.linalg.solve(both, off[..., None])[..., 0])
+    return ArmErrors(arms.joint, error_m, squared)

@@ -33,9 +33,9 @@ TORSO = ("Neck", "RShoulder", "LShoulder", "MidHip", "RHip", "LHip")
 """What the root is found by."""
 _MOMENTUM, _MEMORY, _TINY = 0.8, 0.95, 1e-8
 """Adam's averages."""
-_MIN_DEPTH_M = 0.2
-_START_SIGMA_M = 0.05
-_MIN_START_JOINTS = 3
+_STEP_BETA, _STEP_RAD, _STEP_M = 0.5, 0.2, 0.03
+"""Lengths of the first steps along betas, angles and translation; they fall to zero as half a cosine."""
+_MIN_DEPTH_M, _START_SIGMA_M, _MIN_START_JOINTS = 0.2, 0.05, 3
 
 
 @dataclass(frozen=True)
@@ -52,14 +52,6 @@ class SmplifyConfig:
     """Where the Geman-McClure kernel has cut a detection's weight to a quarter, sigmas."""
     prior_start: float = 10.0
     """How many times as stiff the priors begin; they loosen to 1 by the middle of the steps."""
-    prior: float = 1.0
-    """How stiff the priors are in the end, against detections that were independent."""
-    step_rad: float = 0.2
-    """Length of the first steps along each angle; it falls to zero as half a cosine."""
-    step_beta: float = 0.5
-    """The same along each beta."""
-    step_m: float = 0.03
-    """The same along the axes of the translation, metres."""
 
 
 @dataclass(frozen=True)
@@ -72,8 +64,6 @@ class SmplifyPeople:
     """(N, J, 3) the bodies' joints, where the detector puts them, metres; NaN where nothing placed the body."""
     parameters: BodyParameters
     """The bodies, NaN where there is none."""
-    iterations: int
-    """Steps that each body took."""
 
 
 @dataclass(frozen=True)
@@ -109,16 +99,13 @@ def smpl_only(people: Reconstruction, rig: Rig, config: ObservationConfig) -> Sm
 class MultiViewSmplify:
     """Fits bodies to the views' detections of rows that have nothing to do with each other, all at once."""
 
-    def __init__(
-        self, model: BodyModel | None = None, prior: PosePrior | None = None, config: SmplifyConfig | None = None
-    ):
-        model = BodyModel.default() if model is None else model
-        prior = PosePrior.default() if prior is None else prior
+    def __init__(self, model: BodyModel | None = None, config: SmplifyConfig | None = None):
+        model, prior = BodyModel.default() if model is None else model, PosePrior.default()
         self.config = SmplifyConfig() if config is None else config
         self.model = model.to(torch.float32)
         self._frame = PersonFrame.of_angles(model, prior.mean, prior.covariance)
         self._slots = slots(model.keypoint_names)
-        self._energy = BodyEnergy(self.model, prior.widened(1 / math.sqrt(self.config.prior)))
+        self._energy = BodyEnergy(self.model, prior)
         self._mean_angles = torch.from_numpy(prior.mean[self._energy.angles]).float()
         self._torso = torch.tensor([name in TORSO for name in model.keypoint_names])
 
@@ -143,17 +130,16 @@ class MultiViewSmplify:
             )
             solved[:, -3:] += pelvis.float()
             free[torch.from_numpy(rows)] = solved
-        return SmplifyPeople(observations.frame, joints, self._energy.complete(free), self.config.iterations)
+        return SmplifyPeople(observations.frame, joints, self._energy.complete(free))
 
     def _root(self, start: Array, placed: NDArray[np.bool_]) -> tuple[Tensor, Tensor]:
         """Rotations (B, 3, 3) and places (B, 3) of the root, by the torso's joints, or by all if these are few."""
         torso = placed & self._torso.numpy()
         used = np.where(torso.sum(axis=1, keepdims=True) >= _MIN_START_JOINTS, torso, placed)
         variance = np.where(used, _START_SIGMA_M**2, 1e6)
-        xyz = torch.from_numpy(np.where(used[..., None], start, 0.0))
         # Nothing of a joint that is not used: its place is that of those that are.
         centre = np.nanmean(np.where(used[..., None], start, np.nan), axis=1, keepdims=True)
-        xyz = torch.where(torch.from_numpy(used)[..., None], xyz, torch.from_numpy(centre))
+        xyz = torch.from_numpy(np.where(used[..., None], start, centre))
         return self._frame.place(xyz, torch.from_numpy(variance), self._slots)
 
     def _solve(self, rotation: Tensor, views: "_ViewTargets") -> Tensor:
@@ -163,30 +149,25 @@ class MultiViewSmplify:
         angles = self._mean_angles.expand(B, -1)
         transl = self._frame.transl.float().expand(B, -1)
         free = torch.cat((torch.zeros(B, 10), log_so3(rotation).float(), angles, transl), 1)
-        lengths = torch.full((energy.num_free,), config.step_rad)
-        lengths[:10], lengths[-3:] = config.step_beta, config.step_m
-        first, second = torch.zeros_like(free), torch.zeros_like(free)
-        for n in range(config.iterations):
-            root_only = n < config.root_iterations
-            if n == config.root_iterations:
-                first, second = torch.zeros_like(free), torch.zeros_like(free)
-            stage = (n - config.root_iterations) / max(config.iterations - config.root_iterations, 1)
-            done = n / max(config.root_iterations, 1) if root_only else stage
-            looser = 1.0 if root_only else max(0.0, 1.0 - 2.0 * stage)
-            stiff, scale = config.prior_start**looser, config.kernel_scale * 4.0**looser
+        lengths = torch.full((energy.num_free,), _STEP_RAD)
+        lengths[:10], lengths[-3:] = _STEP_BETA, _STEP_M
+        for root_only in (True, False):
+            steps = config.root_iterations if root_only else config.iterations - config.root_iterations
             only = self._torso if root_only else None
-            # The priors are the energy's own; stiffer ones are detections that weigh less.
-            slope = energy.slope_of(free, lambda xyz: views.pull(xyz, scale, 1 / stiff, only))  # noqa: B023
-            gradient = slope.gradient.clone()
-            if root_only:
-                gradient[:, :10] = 0.0
-                gradient[:, 13:-3] = 0.0
-            first = _MOMENTUM * first + (1 - _MOMENTUM) * gradient
-            second = _MEMORY * second + (1 - _MEMORY) * gradient.square()
-            age = n + 1 if root_only else n + 1 - config.root_iterations
-            unbiased = math.sqrt(1 - _MEMORY**age) / (1 - _MOMENTUM**age)
-            length = 0.5 * (1 + math.cos(math.pi * done)) * unbiased * lengths
-            free = energy.retract(free, -length * first / (second.sqrt() + _TINY))
+            first, second = torch.zeros_like(free), torch.zeros_like(free)
+            for n in range(steps):
+                looser = 1.0 if root_only else max(0.0, 1.0 - 2.0 * n / steps)
+                stiff, scale = config.prior_start**looser, config.kernel_scale * 4.0**looser
+                # The priors are the energy's own; stiffer ones are detections that weigh less.
+                slope = energy.slope_of(free, lambda xyz: views.pull(xyz, scale, 1 / stiff, only))  # noqa: B023
+                gradient = slope.gradient.clone()
+                if root_only:
+                    gradient[:, :10] = gradient[:, 13:-3] = 0.0
+                first = _MOMENTUM * first + (1 - _MOMENTUM) * gradient
+                second = _MEMORY * second + (1 - _MEMORY) * gradient.square()
+                unbiased = math.sqrt(1 - _MEMORY ** (n + 1)) / (1 - _MOMENTUM ** (n + 1))
+                length = 0.5 * (1 + math.cos(math.pi * n / steps)) * unbiased * lengths
+                free = energy.retract(free, -length * first / (second.sqrt() + _TINY))
         return free
 
 

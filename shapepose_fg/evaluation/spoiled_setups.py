@@ -69,43 +69,40 @@ def spoiled(detections: DetectionSequence, rig: Rig, seed: int = 0) -> Iterator[
 
 def turned(rig: Rig, view: int, degrees: float, axis: NDArray[np.float64]) -> Rig:
     """One camera turned about an axis (3,) of its own, where it stands."""
-    wTc = rig.cameras[view].wTc.copy()
-    wTc[:3, :3] = wTc[:3, :3] @ Rotation.from_rotvec(np.deg2rad(degrees) * axis / np.linalg.norm(axis)).as_matrix()
-    return _with(rig, view, wTc=wTc)
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_rotvec(np.deg2rad(degrees) * axis / np.linalg.norm(axis)).as_matrix()
+    return _changed(rig, (view,), lambda camera: replace(camera, wTc=camera.wTc @ turn))
 
 
 def exchanged(rig: Rig, first: int, second: int) -> Rig:
     """Two cameras under each other's names."""
     a, b = rig.cameras[first], rig.cameras[second]
-    return _put(_put(rig, first, replace(b, name=a.name)), second, replace(a, name=b.name))
+    rig = _changed(rig, (first,), lambda _: replace(b, name=a.name))
+    return _changed(rig, (second,), lambda _: replace(a, name=b.name))
 
 
 def same_pose(rig: Rig, view: int, other: int) -> Rig:
     """The calibration of `view` also under the name of `other`."""
-    return _put(rig, other, replace(rig.cameras[view], name=rig.cameras[other].name))
+    return _changed(rig, (other,), lambda camera: replace(rig.cameras[view], name=camera.name))
 
 
 def zoomed(rig: Rig, view: int, factor: float) -> Rig:
     """One camera with another focal length."""
-    K = rig.cameras[view].K.copy()
-    K[:2, :2] *= factor
-    return _with(rig, view, K=K)
+    focal = np.ones((3, 3))
+    focal[:2, :2] = factor
+    return _changed(rig, (view,), lambda camera: replace(camera, K=camera.K * focal))
 
 
 def inverted(rig: Rig, views: tuple[int, ...]) -> Rig:
     """Cameras whose pose is read as its inverse."""
-    for view in views:
-        rig = _with(rig, view, wTc=np.linalg.inv(rig.cameras[view].wTc))
-    return rig
+    return _changed(rig, views, lambda camera: replace(camera, wTc=np.linalg.inv(camera.wTc)))
 
 
 def scaled(rig: Rig, factor: float) -> Rig:
     """The rig in another unit."""
-    for view, camera in enumerate(rig.cameras):
-        wTc = camera.wTc.copy()
-        wTc[:3, 3] *= factor
-        rig = _with(rig, view, wTc=wTc)
-    return rig
+    unit = np.ones((4, 4))
+    unit[:3, 3] = factor
+    return _changed(rig, tuple(range(len(rig))), lambda camera: replace(camera, wTc=camera.wTc * unit))
 
 
 def resized(detections: DetectionSequence, views: tuple[int, ...], factor: float) -> Recording:
@@ -162,11 +159,5 @@ def _each(detections: DetectionSequence, change: Callable[[Detections], Detectio
     return Recording(detections.skeleton, [change(detections[frame]) for frame in range(len(detections))])
 
 
-def _put(rig: Rig, view: int, camera: Camera) -> Rig:
-    cameras = list(rig.cameras)
-    cameras[view] = camera
-    return Rig(tuple(cameras), rig.up)
-
-
-def _with(rig: Rig, view: int, **change: object) -> Rig:
-    return _put(rig, view, replace(rig.cameras[view], **change))
+def _changed(rig: Rig, views: tuple[int, ...], change: Callable[[Camera], Camera]) -> Rig:
+    return Rig(tuple(change(each) if v in views else each for v, each in enumerate(rig.cameras)), rig.up)

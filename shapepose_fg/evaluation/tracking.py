@@ -1,32 +1,60 @@
 """How good a reconstruction over time is against a known truth: joints, identities, motion, covariances."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 
+from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
+from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.evaluation.bodies import TWIST_JUMP, body_joints, bone_rotations, statures, twists
-from shapepose_fg.evaluation.identities import IdentityMetrics, identity_metrics
-from shapepose_fg.evaluation.matching import match_people
+from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.evaluation.matching import MAX_DISTANCE_M, Matches, match_people, mean_distance
 from shapepose_fg.evaluation.metrics import (
     CovarianceCalibration,
     JointMetrics,
     covariance_calibration,
     metrics_of,
-)
-from shapepose_fg.evaluation.trajectories import (
-    LONG_UNSEEN,
-    Chains,
-    acceleration_errors,
-    fast_joint_errors,
-    frames_unseen,
-    velocities,
+    share,
 )
 
 Array = NDArray[np.float64]
+
+WRISTS = [BODY_25.index("RWrist"), BODY_25.index("LWrist")]
+FAST_M_S = 1.5
+"""A wrist faster than this is where a smoother that is too stiff shows, metres a second."""
+LONG_UNSEEN = 10
+"""A joint is long unseen when no view has seen it in this frame and the nine before it."""
+UNMATCHED = np.iinfo(np.int64).min
+"""Stands for no identity: any other number may be one."""
+
+
+@dataclass(frozen=True)
+class IdentityMetrics:
+    """What `identity_metrics` found, over all frames."""
+
+    true_positives: int
+    """IDTP: rows that are the person whom their identity is assigned to for the whole recording."""
+    rows: int
+    """Rows of the scored frames that have a joint."""
+    people_true: int
+    """People in frames in which they have a joint."""
+    switches: int
+    """Times that a person is matched with another identity than the last time."""
+    tracks: int
+    """Identities."""
+    false_tracks: int
+    """Identities at most half of whose rows are matched with a person."""
+    longest_false_positive: int
+    """The most rows of one identity that are matched with no person."""
+
+    @property
+    def idf1(self) -> float:
+        """2 IDTP / (rows + true people); NaN where there is neither (Ristani et al., 2016)."""
+        return share(2 * self.true_positives, self.rows + self.people_true)
 
 
 @dataclass(frozen=True)
@@ -53,10 +81,6 @@ class TrackingScore:
     """The motion of the joints."""
     bodies: MotionScore
     """The motion of the bodies' own joints."""
-    stature_spread_m: float
-    """Tallest minus smallest body of an identity, metres: the largest over the identities."""
-    twist_jumps: int
-    """Bones of bodies that turn about their own axis by 20 degrees more from a frame to the next than in truth."""
     velocity_error: float
     """Mean length of the difference between a joint's velocity and the true one, m/s; NaN without velocities."""
     calibration: dict[str, CovarianceCalibration]
@@ -65,18 +89,12 @@ class TrackingScore:
 
     def as_dict(self) -> dict[str, Any]:
         """The figures under plain names, for tables and JSON; None where there is nothing to measure."""
-        figures = {
-            "f1": 100 * self.joints.f1,
-            "precision": 100 * self.joints.precision,
-            "recall": 100 * self.joints.recall,
-            "idf1": np.nan if self.identities is None else 100 * self.identities.idf1,
-            "stature_spread_cm": 100 * self.stature_spread_m,
-            "velocity_error": self.velocity_error,
-        }
+        figures = {name: 100 * getattr(self.joints, name) for name in ("f1", "precision", "recall")}
+        figures["idf1"] = np.nan if self.identities is None else 100 * self.identities.idf1
+        figures["velocity_error"] = self.velocity_error
         for prefix, motion in {"": self.motion, "body_": self.bodies}.items():
             figures |= {f"{prefix}{name}": value for name, value in vars(motion).items()}
         counts = {"false_positives": self.joints.false_positives, "people_missed": self.joints.people_missed}
-        counts |= {"twist_jumps": self.twist_jumps}
         for name, calibration in self.calibration.items():
             figures |= {f"{name}_inside_{100 * level:.0f}": 100 * s for level, s in calibration.coverage.items()}
             figures[f"{name}_log_score"] = calibration.log_score
@@ -88,69 +106,108 @@ class TrackingScore:
 
 
 def score_tracks(
-    people: Reconstruction,
-    truth: Reconstruction,
-    fps: float,
-    *,
-    identities: bool = True,
-    frames: Sequence[int] | range | None = None,
+    people: Reconstruction, truth: Reconstruction, fps: float, *, identities: bool = True
 ) -> TrackingScore:
     """Compare `people` with the `truth` of a recording of `fps` frames a second (`truth_of`, or any result).
 
-    `frames` are the frame numbers that are scored, by default those from the truth's first to its last. Without
-    `identities` the column `person` only counts the people of a frame; what asks for one and the same person then
-    goes by the person of the truth with whom a row is matched. ValueError for an identity twice in one frame.
+    Scored are the frames from the truth's first to its last. Without `identities` the column `person` only counts
+    the people of a frame; what asks for one and the same person then goes by the person of the truth with whom a
+    row is matched. ValueError for an identity twice in one frame.
     """
-    numbers = _span(truth) if frames is None else np.asarray(frames, dtype=np.int64)
-    true = joints_by_frame(truth, numbers)
-    matches = match_people(people.frame, people.joints, true, numbers.tolist())
-    chains = Chains.of(
-        matches, numbers, true.shape[1], people.person[matches.row] if identities else matches.person
-    )
-    found, index = people.rows(matches.row), frame_index(people.frame, numbers)
-    views = views_used(found)
-    error = found.joints - true[matches.frame, matches.person]
-    moving = found.velocity - velocities(true, numbers, fps)[matches.frame, matches.person]
+    true, first = joints_by_frame(truth), int(truth.frame.min()) if len(truth) > 0 else 0
+    frames = range(first, first + len(true))
+    matches = match_people(people.frame, people.joints, true, frames)
+    found, at = people.rows(matches.row), (matches.frame, matches.person)
+    identity = found.person if identities else matches.person
+    who, follows = np.full(true.shape[:2], UNMATCHED), np.zeros(true.shape[:2], dtype=bool)
+    who[at] = identity
+    follows[1:] = (who[1:] != UNMATCHED) & (who[1:] == who[:-1])
+
+    def motion(joints: Array) -> MotionScore:
+        placed = np.full(true.shape, np.nan)
+        placed[at] = joints
+        fast = fast_wrist_errors(placed, true, fps)
+        return MotionScore(
+            mpjpe_mm=1e3 * _mean(np.linalg.norm(placed - true, axis=-1)),
+            acceleration_error=_mean(acceleration_errors(placed, true, follows, fps)),
+            fast_wrist_error_mm=1e3 * float(np.median(fast)) if len(fast) > 0 else float("nan"),
+        )
+
+    views, error = views_used(found), found.joints - true[at]
+    moving = found.velocity - velocities(true, fps)[at]
     classes = {
         "seen": views >= 2,
         "one_view": views == 1,
         "no_view": views == 0,
-        "unseen": frames_unseen(views > 0, found.frame, chains.identity) >= LONG_UNSEEN,
+        "unseen": frames_unseen(views > 0, found.frame, identity) >= LONG_UNSEEN,
     }
     calibration = {
         name: covariance_calibration(error[those], found.covariance[those]) for name, those in classes.items()
     }
+    index = np.where(np.isin(people.frame, frames), people.frame - first, -1)
     return TrackingScore(
         metrics_of(matches, people.joints, true),
         identity_metrics(matches, index, people.person, people.joints, true) if identities else None,
-        motion=_motion(found.joints, true, chains, fps),
-        bodies=_motion(body_joints(found), true, chains, fps),
-        stature_spread_m=_widest(statures(found.betas), chains.identity),
-        twist_jumps=_twist_jumps(found, truth, numbers, chains),
+        motion=motion(found.joints),
+        bodies=motion(body_joints(found)),
         velocity_error=_mean(np.linalg.norm(moving, axis=-1)),
         calibration=calibration | {"velocity": covariance_calibration(moving, found.velocity_covariance)},
     )
 
 
-def _motion(joints: Array, truth: Array, chains: Chains, fps: float) -> MotionScore:
-    """Score `joints` (M, J, 3) of the matched rows, metres, against `truth` (T, P, J, 3)."""
-    placed = chains.placed(joints)
-    fast = fast_joint_errors(placed, truth, chains.frames, fps)
-    return MotionScore(
-        mpjpe_mm=1e3 * _mean(np.linalg.norm(placed - truth, axis=-1)),
-        acceleration_error=_mean(acceleration_errors(placed, truth, chains.consecutive, fps)),
-        fast_wrist_error_mm=1e3 * float(np.median(fast)) if len(fast) > 0 else float("nan"),
+def identity_metrics(
+    matches: Matches,
+    index: NDArray[np.integer],
+    identity: NDArray[np.integer],
+    joints: NDArray[np.float64],
+    truth: NDArray[np.float64],
+) -> IdentityMetrics:
+    """Compare the identities of rows with those of the truth (T, P, J, 3), NaN where a person is absent.
+
+    Row n has `identity` (N,), `joints` (N, J, 3) in metres and belongs to frame `index` (N,) of the truth, -1
+    for a frame that is not scored. For IDF1 every identity is one person for good, and every person one identity,
+    so that as many rows as possible are nearer than 0.5 m to theirs (Ristani et al., "Performance
+    Measures and a Data Set for Multi-Target, Multi-Camera Tracking", 2016). Switches go by `matches`, which are
+    made frame by frame.
+    """
+    scored = np.flatnonzero((index >= 0) & np.isfinite(joints.sum(axis=2)).any(axis=1))
+    present = np.isfinite(truth.sum(axis=3)).any(axis=2)
+    names, number = np.unique(identity[scored], return_inverse=True)
+    pairs = np.stack([index[scored], number], axis=1)
+    if len(np.unique(pairs, axis=0)) < len(pairs):
+        raise ValueError("an identity has two rows in one frame: give each person one row a frame")
+    together = np.zeros((len(names), truth.shape[1]), dtype=np.int64)
+    for person in range(truth.shape[1]):
+        near = mean_distance(joints[scored], truth[index[scored], person]) < MAX_DISTANCE_M
+        together[:, person] = np.bincount(number[near], minlength=len(names))
+    best = linear_sum_assignment(together, maximize=True)
+    matched = np.bincount(number[np.isin(scored, matches.row)], minlength=len(names))
+    length = np.bincount(number, minlength=len(names))
+    by_frame = np.full(truth.shape[:2], UNMATCHED)
+    by_frame[matches.frame, matches.person] = identity[matches.row]
+    return IdentityMetrics(
+        true_positives=int(together[best].sum()),
+        rows=len(scored),
+        people_true=int(present.sum()),
+        switches=sum(int((np.diff(column[column != UNMATCHED]) != 0).sum()) for column in by_frame.T),
+        tracks=len(names),
+        false_tracks=int((2 * matched <= length).sum()),
+        longest_false_positive=int((length - matched).max(initial=0)),
     )
 
 
-def _twist_jumps(found: Reconstruction, truth: Reconstruction, frames: NDArray[np.int64], chains: Chains) -> int:
-    """Count of `TrackingScore.twist_jumps` of the matched rows `found`."""
-    index, person = frame_index(truth.frame, frames), np.unique(truth.person, return_inverse=True)[1]
-    rotations = np.full((*chains.consecutive.shape, 24, 3, 3), np.nan)
-    rotations[index[index >= 0], person[index >= 0]] = bone_rotations(truth)[index >= 0]
-    turned, true = twists(chains.placed(bone_rotations(found))), twists(rotations)
-    jumps = (np.abs(turned) > TWIST_JUMP) & (np.abs(turned - true) > TWIST_JUMP)
-    return int(jumps[chains.consecutive[1:]].sum())
+def body_joints(people: Reconstruction) -> Array:
+    """(N, J, 3) the joints of the fitted bodies, where the detector puts them; NaN where there is no body.
+
+    The offsets are those that the run learnt (`run["keypoint_offsets"]`); without any, the model's own joints.
+    """
+    model, offsets = BodyModel.default(), people.run.get("keypoint_offsets")
+    if offsets is not None:
+        model = model.with_keypoint_offsets(KeypointOffsets.from_dict(offsets))
+    columns = (people.betas, people.global_orient, people.body_pose, people.transl)
+    with torch.no_grad():
+        bodies = BodyParameters(*(torch.from_numpy(column).to(model.dtype) for column in columns))
+        return model.keypoints(bodies).double().numpy()
 
 
 def views_used(people: Reconstruction) -> NDArray[np.intp]:
@@ -163,35 +220,61 @@ def views_used(people: Reconstruction) -> NDArray[np.intp]:
     return people.observations.used.sum(axis=-1)
 
 
-def joints_by_frame(people: Reconstruction, frames: NDArray[np.integer]) -> Array:
-    """(T, P, J, 3) joints of the P identities of `people`, in rising order, in `frames` (T,); NaN where absent."""
+def joints_by_frame(people: Reconstruction) -> Array:
+    """(T, P, J, 3) joints of the P identities of `people`, in rising order, from their first frame to their last;
+    NaN where absent.
+    """
     names, number = np.unique(people.person, return_inverse=True)
-    index = frame_index(people.frame, frames)
-    table = np.full((len(frames), len(names), *people.joints.shape[1:]), np.nan)
-    table[index[index >= 0], number[index >= 0]] = people.joints[index >= 0]
+    index = people.frame - people.frame.min() if len(people) > 0 else people.frame
+    table = np.full((index.max(initial=-1) + 1, len(names), *people.joints.shape[1:]), np.nan)
+    table[index, number] = people.joints
     return table
 
 
-def frame_index(frame: NDArray[np.integer], frames: NDArray[np.integer]) -> NDArray[np.intp]:
-    """(N,) place of each row's frame in `frames` (T,), which rise; -1 for one that is not among them."""
-    if len(frames) == 0:
-        return np.full(len(frame), -1)
-    if (np.diff(frames) <= 0).any():
-        raise ValueError("frames must rise: give each frame number once, smallest first")
-    place = np.minimum(np.searchsorted(frames, frame), len(frames) - 1)
-    return np.where(frames[place] == frame, place, -1)
+def acceleration_errors(placed: Array, truth: Array, follows: NDArray[np.bool_], fps: float) -> Array:
+    """(T - 2, P, J) length of the difference of accelerations, m/s²: of `placed` and `truth` (T, P, J, 3), metres.
+
+    The acceleration is the second difference over three frames; NaN where one of them does not follow (T, P) the
+    one before.
+    """
+    error = placed - truth
+    second = (error[2:] - 2 * error[1:-1] + error[:-2]) * fps**2
+    whole = follows[1:-1] & follows[2:]
+    return np.where(whole[..., None], np.linalg.norm(second, axis=-1), np.nan)
 
 
-def _span(truth: Reconstruction) -> NDArray[np.int64]:
-    """All frame numbers from the first to the last."""
-    return np.arange(truth.frame.min(), truth.frame.max() + 1) if len(truth) > 0 else np.zeros(0, dtype=np.int64)
+def velocities(truth: Array, fps: float) -> Array:
+    """(T, P, J, 3) velocities in m/s of `truth` (T, P, J, 3), metres: half the difference over two frames.
+
+    NaN in the first and last frame, and beside a frame that is missing.
+    """
+    velocity = np.full(truth.shape, np.nan)
+    velocity[1:-1] = (truth[2:] - truth[:-2]) * fps / 2
+    return velocity
 
 
-def _widest(values: Array, identity: NDArray[np.integer]) -> float:
-    """The largest over identities of largest minus smallest value; NaN where there is none."""
-    known = np.isfinite(values)
-    parts = [values[known & (identity == name)] for name in np.unique(identity[known])]
-    return max((float(np.ptp(part)) for part in parts), default=float("nan"))
+def fast_wrist_errors(placed: Array, truth: Array, fps: float) -> Array:
+    """(M,) errors in metres of the wrists whose truth is faster than 1.5 m/s (difference over two frames)."""
+    true = truth[:, :, WRISTS]
+    fast = np.linalg.norm(velocities(true, fps), axis=-1) > FAST_M_S
+    error = np.linalg.norm(placed[:, :, WRISTS] - true, axis=-1)
+    return error[fast & np.isfinite(error)]
+
+
+def frames_unseen(seen: NDArray[np.bool_], frame: NDArray[np.integer], identity: NDArray[np.integer]) -> NDArray:
+    """(N, J) for how many frames, up to this one and with it, a joint of an identity has not been `seen` (N, J).
+
+    The count begins anew where the identity has no row in the frame before.
+    """
+    order = np.lexsort((frame, identity))
+    seen, frame, identity = seen[order], frame[order], identity[order]
+    starts = np.ones(len(order), dtype=bool)
+    starts[1:] = (np.diff(frame) != 1) | (np.diff(identity) != 0)
+    place = np.arange(len(order))[:, None]
+    last = np.where(seen, place, np.where(starts[:, None], place - 1, -1))
+    count = np.empty(last.shape, dtype=np.intp)
+    count[order] = place - np.maximum.accumulate(last, axis=0)
+    return count
 
 
 def _mean(values: Array) -> float:

@@ -7,6 +7,7 @@ import json
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,8 +124,9 @@ class DetectorStatistics:
     def read(cls, path: Path) -> "DetectorStatistics":
         """From a file like the shipped one: an entry for each field."""
         content = json.loads(path.read_text(encoding="utf-8"))
-        tables = {name: content[name] for name in cls.__dataclass_fields__}
-        return cls(**{k: np.array(v, dtype=np.float64) if isinstance(v, list) else v for k, v in tables.items()})
+        tables: dict[str, Any] = {name: content[name] for name in cls.__dataclass_fields__}
+        of_lists = {k: np.array(v, dtype=np.float64) for k, v in tables.items() if isinstance(v, list)}
+        return cls(**(tables | of_lists))
 
     def quantile(self, table: Array, probability: Array) -> Array:
         """Values (...,) at `probability` (...,) of quantile tables (..., K), or of one table (K,)."""

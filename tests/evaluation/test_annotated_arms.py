@@ -5,7 +5,8 @@ import pytest
 
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.evaluation.annotated_arms import (
+from shapepose_fg.evaluation.experiments.footage import single_footage
+from shapepose_fg.evaluation.single_person import (
     ANNOTATION,
     ARMS,
     SIGMA_PX,
@@ -13,7 +14,6 @@ from shapepose_fg.evaluation.annotated_arms import (
     measure_arms,
     read_annotated_arms,
 )
-from shapepose_fg.evaluation.footage import single_footage
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.simulation import built_in_scene
 from shapepose_fg.simulation.files import truth_of
@@ -88,7 +88,7 @@ def test_errors_misses_and_ellipsoids(truth, marks):
     moved = truth.joints.copy()
     moved[truth.frame < 20, BODY_25.index("LWrist")] += [0.0, 0.3, 0.0]
     found = measure_arms(replace(truth, joints=moved), arms)
-    assert found.of("LWrist").error_m[:10] == pytest.approx(0.3, abs=1e-3)
+    assert found.error_m[arms.joint == ARMS.index("LWrist")][:10] == pytest.approx(0.3, abs=1e-3)
     assert found.as_dict()["arms_wrong"] == pytest.approx(100 * 10 / 80)
     assert found.as_dict()["arms_inside_95"] == pytest.approx(100 * 70 / 80)
     wide = replace(truth, joints=moved, covariance=truth.covariance * 100)  # 20 cm: 0.3 m is inside 95 %
@@ -97,7 +97,8 @@ def test_errors_misses_and_ellipsoids(truth, marks):
     assert np.isinf(missing.error_m).sum() == 4
     assert missing.as_dict()["arms_wrong"] == pytest.approx(100 * 4 / 80)
     moved[truth.frame == 6, BODY_25.index("RElbow")] = np.nan
-    assert np.isinf(measure_arms(replace(truth, joints=moved), arms).of("RElbow").error_m).sum() == 1
+    gone = measure_arms(replace(truth, joints=moved), arms)
+    assert np.isinf(gone.error_m[gone.joint == ARMS.index("RElbow")]).sum() == 1
 
 
 def test_a_file_that_is_no_annotation(scene, tmp_path):

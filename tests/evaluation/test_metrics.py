@@ -158,7 +158,7 @@ def test_someone_far_does_not_decide_about_the_near():
 def test_mean_distance_by_hand():
     predicted = np.array([[[0.0, 0, 0], [np.nan, 0, 0], [1, 1, 1]]])
     truth = np.array([[[0.0, 0.3, 0], [0, 0, 0], [np.nan, 0, 0]], np.full((3, 3), np.nan)])
-    np.testing.assert_allclose(mean_distance(predicted, truth), [[(0.3 + 0.5) / 2, np.inf]])
+    np.testing.assert_allclose(mean_distance(predicted[:, None], truth), [[(0.3 + 0.5) / 2, np.inf]])
 
 
 def test_shapes_that_disagree_are_refused(truth):

@@ -6,7 +6,7 @@ from rich.console import Console
 
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.evaluation.other_results.skeleton_text import SHELF_JOINTS
+from shapepose_fg.evaluation.other_results import SHELF_JOINTS
 from shapepose_fg.evaluation.shelf import (
     LIMB_NAMES,
     LIMBS,
@@ -52,14 +52,13 @@ def people(*rows, frame=None, **more):
     )
 
 
-def annotated(*rows, actor=None, frame=None, frame_count=10):
+def annotated(*rows, actor=None, frame=None):
     joints = shelf_joints(np.concatenate(rows))
     count = len(joints)
     return ShelfGroundTruth(
         np.zeros(count, int) if frame is None else np.array(frame),
         np.arange(count) if actor is None else np.array(actor),
         joints,
-        frame_count,
     )
 
 
@@ -268,7 +267,6 @@ def test_reading_a_small_file(tmp_path):
     truth = read_shelf_ground_truth(path)
     assert truth.frame.tolist() == [0, 2, 2]
     assert truth.actor.tolist() == [2, 0, 3]
-    assert truth.frame_count == 3
     np.testing.assert_allclose(truth.joints[1, 4], [0.4, 0.4, 0.4])
 
 
@@ -330,7 +328,6 @@ def shelf(shared_data):
 
 
 def test_the_real_annotation(shelf):
-    assert shelf.frame_count == 301
     assert np.bincount(shelf.actor).tolist() == [131, 19, 93, 11]
     assert np.unique(shelf.frame).tolist() == [*range(101), *range(216, 231), *range(270, 285)]
     assert np.isfinite(shelf.joints).all()

@@ -21,7 +21,7 @@ from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25, COCO_17
 from shapepose_fg.detection2d.onnx_file import read_onnx
 from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
-from shapepose_fg.evaluation.other_results.reading import read_people
+from shapepose_fg.evaluation.other_results import read_people
 from shapepose_fg.io.calibration import read_rig, write_rig
 from shapepose_fg.io.config import read_config, toml_text
 from shapepose_fg.io.corrections import correct, read_corrections, take_back

@@ -1,6 +1,5 @@
 """README.md, docs/using.md and docs/extending.md, typed as a reader would type them; and links that lead on."""
 
-import json
 import re
 import shlex
 from pathlib import Path
@@ -12,7 +11,6 @@ from shapepose_fg.cli.main import main
 from shapepose_fg.core.detections import Detections, Recording
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.evaluation.experiments.made_with import changes, made_with
 from shapepose_fg.evaluation.metrics import joint_metrics
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.config import toml_text
@@ -20,7 +18,6 @@ from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.simulation import Scene, built_in_scene, simulate
 
 ROOT = Path(__file__).parents[2]
-EVALUATION = ROOT / "docs" / "evaluation.md"
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
@@ -154,28 +151,3 @@ def test_files_that_are_named_exist(page):
     there = [f"/{path.relative_to(ROOT)}" for folder in folders for path in folder.rglob("*.*")]
     missing = {name for name in named if not any(path.endswith(f"/{name}") for path in there)}
     assert missing <= {"settings.toml"}
-
-
-def test_tables_that_are_older_than_the_defaults_are_named():
-    """Each table's mark names a file in docs/made_with: settings and data then. Where these are not those of now,
-    the table is in the list of older ones in evaluation.md, and no other table is.
-    """
-    every = [made_with(basis) for basis in ("pipeline", "bodies")]
-    found = {}
-    for page in PAGES:
-        for name, digits in re.findall(r"<!-- ([\w ]+?)(?: @(\w+))? -->", page.read_text(encoding="utf-8")):
-            if name != "end":
-                found[name] = digits
-    assert "" not in found.values()
-    old = set[str]()
-    for digits in set(found.values()):
-        then = json.loads((ROOT / "docs" / "made_with" / f"{digits}.json").read_text(encoding="utf-8"))
-        # The basis with which a table was made is the one whose names it has.
-        now = max(every, key=lambda each: len(set(each) & set(then)) - len(set(each) - set(then)))
-        if changes(then, now):
-            old |= {name for name, each in found.items() if each == digits}
-    named = re.search(r"Older than the present defaults: ([^.]*)\.", " ".join(EVALUATION.read_text().split()))
-    listed = set(re.findall(r"`([\w ]+)`", named[1])) if named else set()
-    assert listed == old, (
-        f"measure anew with scripts/reproduce_tables.py --only ... --update, or list: {sorted(old)}"
-    )

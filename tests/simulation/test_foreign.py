@@ -6,8 +6,8 @@ from scipy.optimize import least_squares
 
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS
+from shapepose_fg.body.shapes import statures_m
 from shapepose_fg.core.skeleton import BODY_25, SMPL_24
-from shapepose_fg.evaluation.bodies import statures
 from shapepose_fg.simulation import built_in_scene
 from shapepose_fg.simulation.foreign import PEOPLE, Proportions, people_of, recast, reshaped
 
@@ -72,7 +72,7 @@ def test_a_child_is_1_2_m_with_a_large_head_and_short_legs():
     joints, vertices = made("children")
     plain, skin = rest(BODY, np.zeros(10))
     model, betas = reshaped(BODY, np.zeros((1, 10)), [Proportions.child()])
-    assert statures(betas, model)[0] == pytest.approx(1.2, abs=0.005)
+    assert statures_m(betas, model.arrays)[0] == pytest.approx(1.2, abs=0.005)
     hip = [
         (each[1, 1] - points[:, 1].min()) / np.ptp(points[:, 1])
         for each, points in ((joints, vertices), (plain, skin))

@@ -1,25 +1,50 @@
 """What each thing is worth that we do differently from the paper: added to its method, and taken from ours."""
+# ruff: noqa: RUF009  (values of the class `Varied` itself: they cover properties of its base)
 
 from collections.abc import Iterator, Sequence
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from operator import attrgetter
 from typing import Any
 
-from shapepose_fg.evaluation.experiments.experiment import Column, Experiment
+from shapepose_fg.estimation.estimator_config import RefineConfig, WindowGraphConfig
+from shapepose_fg.evaluation.experiments.experiment import Experiment, columns
 from shapepose_fg.evaluation.experiments.scenes import FRAME_BY_FRAME, OVER_TIME, case
-from shapepose_fg.evaluation.experiments.stretches import Scale
-from shapepose_fg.evaluation.varied import varied
+from shapepose_fg.evaluation.experiments.segments import Scale
 from shapepose_fg.pipeline.pipeline import PipelineConfig
+from shapepose_fg.proposal.association import AssociationConfig
+from shapepose_fg.proposal.candidates import CandidateConfig
+from shapepose_fg.proposal.proposals import ProposalConfig
+from shapepose_fg.tracking.tracker import TrackingConfig
 
 FRAMES = 30
-"""Of each stretch."""
+"""Of each segment."""
+COLUMNS = columns(
+    *(("F1, %", "f1"), ("MPJPE, mm", "mpjpe_mm"), ("FP", "false_positives", 0, "sum")),
+    ("missed", "people_missed", 0, "sum"),
+)
+
+
+@dataclass(frozen=True)
+class Varied(PipelineConfig):
+    """`PipelineConfig` whose steps' own numbers, which `method` chooses there, are fields."""
+
+    candidates: CandidateConfig = CandidateConfig()
+    proposals: ProposalConfig = ProposalConfig()
+    association: AssociationConfig = AssociationConfig()
+    tracking: TrackingConfig = TrackingConfig()
+    window_graph: WindowGraphConfig = WindowGraphConfig()
+    refine: RefineConfig = RefineConfig()
+
+
+def varied(config: PipelineConfig) -> Varied:
+    """The same settings, of which all can be replaced; those that only choose the steps' numbers say nothing."""
+    chosen = ("method", "people", "solving")
+    return Varied(**{each.name: getattr(config, each.name) for each in fields(Varied) if each.name not in chosen})
+
+
 OURS = varied(FRAME_BY_FRAME)
 PAPER = varied(PipelineConfig.paper())
 """What each is added to; what each is taken from is ours frame by frame, as time stands in a row of its own."""
-COLUMNS = (
-    *(Column("F1, %", "f1"), Column("MPJPE, mm", "mpjpe_mm")),
-    *(Column("false positives", "false_positives", 0, "sum"), Column("missed", "people_missed", 0, "sum")),
-)
 
 SWITCHES: dict[str, tuple[str, ...]] = {
     "pairs whose rays pass each other": ("candidates.gate_m", "candidates.min_angle_deg"),
@@ -63,15 +88,13 @@ SWITCHES: dict[str, tuple[str, ...]] = {
     "offsets of the detector's joints": ("offsets.source",),
 }
 """What is switched, and the settings that do it."""
-QUICK = ("leave-one-out",)
-"""The switches of a quick run."""
 
 
 def ablation(scale: Scale) -> Experiment:
-    """A row for each configuration, over one stretch of each sequence."""
+    """A row for each configuration, over one segment of each sequence."""
     rows = {
-        name: [case(f"{name} {stretch.label}", stretch, config) for stretch in scale.one_each(FRAMES)]
-        for name, config in configurations(QUICK if scale.quick else tuple(SWITCHES))
+        name: [case(f"{name} {each.label}", each, config) for each in scale.one_each(FRAMES)]
+        for name, config in configurations(("leave-one-out",) if scale.quick else tuple(SWITCHES))
     }
     return Experiment("ablation", rows, COLUMNS)
 

@@ -1,15 +1,20 @@
 """What an experiment is: cases that are measured one by one, and a table whose rows pool their figures."""
 
+import json
+import re
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import read_json, write_content
+
 Figures = dict[str, Any]
 """What a case measured: numbers and texts by name, None where there is nothing to measure; JSON holds them."""
-Basis = Literal["pipeline", "bodies"]
-"""What figures depend on: every setting and all data that ship, or only those of fitting bodies."""
 
 _POOLED = {"mean": np.average, "least": np.min, "most": np.max, "sum": np.sum}
 
@@ -50,6 +55,11 @@ class Column:
         return f"{np.average(values, weights=weights):.{self.decimals}f}"
 
 
+def columns(*given: tuple[Any, ...]) -> tuple[Column, ...]:
+    """Columns from what `Column` takes."""
+    return tuple(Column(*each) for each in given)
+
+
 @dataclass(frozen=True)
 class Experiment:
     """A table of the documents."""
@@ -60,17 +70,14 @@ class Experiment:
     """What a row is called, and the cases whose figures it pools; a case may be in several rows."""
     columns: Sequence[Column]
     """The table's columns but for the first, which has the names of the rows."""
-    basis: Basis = "pipeline"
-    """What makes the figures old when it changes."""
 
     @property
     def cases(self) -> list[Case]:
         """Every case once, in the order in which they are measured. ValueError for two of one name."""
-        every = {id(case): case for row in self.rows.values() for case in row}.values()
-        names = [case.name for case in every]
-        if len(set(names)) < len(names):
-            raise ValueError(f"{self.name}: two cases have one name: {sorted(names)}")
-        return list(every)
+        every = list({id(case): case for row in self.rows.values() for case in row}.values())
+        if len({case.name for case in every}) < len(every):
+            raise ValueError(f"{self.name}: two cases have one name: {sorted(case.name for case in every)}")
+        return every
 
     def only(self, wanted: Callable[[str], bool]) -> "Experiment":
         """The same with the cases whose names are wanted."""
@@ -87,3 +94,29 @@ class Experiment:
             those = [figures[case.name] for case in row]
             lines.append(f"| {label} | {' | '.join(column.cell(those) for column in self.columns)} |")
         return lines
+
+
+def measured(
+    experiment: Experiment, folder: Path, *, afresh: bool = False, told: Callable[[str], None] = print
+) -> tuple[dict[str, Figures], float]:
+    """The figures of every case by name, and the seconds that all of them took, whenever that was.
+
+    Each case has a file in `folder`: a run that was stopped goes on, but for one that begins `afresh`. InputError
+    for a file that has no figures.
+    """
+    figures, seconds = dict[str, Figures](), 0.0
+    for case in experiment.cases:
+        file = folder.joinpath(*(re.sub(r"[^A-Za-z0-9.+-]+", "_", each.name) for each in (experiment, case)))
+        file = file.with_name(f"{file.name}.json")
+        if afresh or not file.is_file():
+            began = time.perf_counter()
+            found = {"figures": case.measure(), "seconds": time.perf_counter() - began}
+            write_content(file, json.dumps(found, indent=1) + "\n")
+            told(f"  {experiment.name}: {case.name}, {found['seconds']:.0f} s")
+        kept = read_json(file)  # as JSON gives it back, so that a run that goes on is no other
+        try:
+            figures[case.name] = dict(kept["figures"])
+            seconds += float(kept["seconds"])
+        except (KeyError, TypeError, ValueError):
+            raise InputError(f"{file}: these are not figures of an experiment; delete it") from None
+    return figures, seconds

@@ -2,9 +2,7 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,51 +10,50 @@ from numpy.typing import NDArray
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.alternation import before_refinement
-from shapepose_fg.evaluation.baseline.over_time import over_time
-from shapepose_fg.evaluation.baseline.people import FoundPeople, find_everybody
-from shapepose_fg.evaluation.experiments.experiment import Case, Column, Experiment, Figures
+from shapepose_fg.evaluation.baseline import frame_by_frame, over_time
+from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures, columns
 from shapepose_fg.evaluation.experiments.scenes import FRAME_BY_FRAME, OVER_TIME
-from shapepose_fg.evaluation.experiments.stretches import Scale, Stretch, shorter
-from shapepose_fg.evaluation.matching import People
+from shapepose_fg.evaluation.experiments.segments import Scale, Segment
+from shapepose_fg.evaluation.matching import People, PlainPeople
 from shapepose_fg.evaluation.metrics import joint_metrics
 from shapepose_fg.evaluation.smplify import SmplOnly, smpl_only
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 
-Found = TypeVar("Found", bound=People)
 FRAMES = 100
-"""Of each stretch."""
+"""Of each segment."""
 THRESHOLDS_M = (0.2, 0.1, 0.05)
 """A joint is correct if it is at most so far from the true one."""
-COLUMNS = (
+_SHARES = {"P": "precision", "R": "recall", "F1": "f1"}
+COLUMNS = columns(
     *(
-        Column(f"{heading} at {limit:g} m", f"{figure}_{limit:g}")
+        (f"{words} at {limit:g} m", f"{name}_{limit:g}")
         for limit in THRESHOLDS_M
-        for heading, figure in (("P", "precision"), ("R", "recall"), ("F1", "f1"))
+        for words, name in _SHARES.items()
     ),
-    *(Column("MPJPE, mm", "mpjpe_mm"), Column("least F1", "f1_0.2", 1, "least")),
-    *(Column(f"{heading} of mid-hips", f"{name}_hip") for heading, name in (("P", "precision"), ("R", "recall"))),
-    *(Column("missed", "missed", 0), Column("false positives", "false_positives", 0)),
-    *(Column("ms a frame", "cpu_ms", 0), Column("body fit or stage II, ms a person", "fit_ms")),
+    *(("MPJPE, mm", "mpjpe_mm"), ("least F1", "f1_0.2", 1, "least"), ("P of mid-hips", "precision_hip")),
+    *(("R of mid-hips", "recall_hip"), ("missed", "missed", 0), ("FP", "false_positives", 0)),
+    *(("ms a frame", "cpu_ms", 0), ("body fit or stage II, ms a person", "fit_ms")),
 )
 
 
-@dataclass(frozen=True)
-class PlainPeople:
-    """Joints and nothing else; implements `People`."""
-
-    frame: NDArray[np.integer]
-    """(N,) frame of each row."""
-    joints: NDArray[np.floating]
-    """(N, J, 3) metres; NaN where unknown."""
-
-
 def interactions(scale: Scale) -> Experiment:
-    """All methods on all stretches."""
+    """All methods on all segments."""
     rows = {
-        label: [Case(f"{label} {each.label}", partial(make, shorter(each, FRAMES))) for each in scale.stretches]
+        label: [
+            Case(f"{label} {each.label}", partial(_measure, each.shorter(FRAMES), make)) for each in scale.segments
+        ]
         for label, make in METHODS.items()
     }
     return Experiment("interactions", rows, COLUMNS)
+
+
+def _measure(segment: Segment, make: Callable[[Segment], tuple[People, Figures]]) -> Figures:
+    """A method's people scored, its time beside them."""
+    _ = segment.detections
+    began = time.process_time()
+    people, more = make(segment)
+    cpu_ms = 1e3 * (time.process_time() - began) / len(segment.span)
+    return scored(people, segment.scene.keypoints) | {"cpu_ms": cpu_ms} | more
 
 
 def scored(people: People, truth: NDArray[np.float64]) -> Figures:
@@ -66,75 +63,58 @@ def scored(people: People, truth: NDArray[np.float64]) -> Figures:
     """
     found = {f"{limit:g}": joint_metrics(people, truth, correct_m=limit) for limit in THRESHOLDS_M}
     first, hip = found["0.2"], [BODY_25.index("MidHip")]
-    found["hip"] = joint_metrics(PlainPeople(people.frame, np.asarray(people.joints)[:, hip]), truth[:, :, hip])
-    shares = {
-        f"{name}_{limit}": 100 * getattr(each, name)
-        for limit, each in found.items()
-        for name in ("precision", "recall", "f1")
+    found["hip"] = joint_metrics(_with_joints(people, people.joints[:, hip]), truth[:, :, hip])
+    figures = {
+        f"{name}_{at}": 100 * getattr(each, name) for at, each in found.items() for name in _SHARES.values()
     }
-    figures = shares | {"mpjpe_mm": first.mpjpe_mm}
-    return {name: value if np.isfinite(value) else None for name, value in figures.items()} | {
-        "missed": first.people_missed,
-        "false_positives": first.false_positives,
-    }
+    figures["mpjpe_mm"] = first.mpjpe_mm
+    counts = {"missed": first.people_missed, "false_positives": first.false_positives}
+    return {name: value if np.isfinite(value) else None for name, value in figures.items()} | counts
 
 
-def _timed(stretch: Stretch, make: Callable[[], Found]) -> tuple[Found, float]:
-    """What is made, and the processor's milliseconds a frame."""
-    _ = stretch.detections
-    began = time.process_time()
-    made = make()
-    return made, 1e3 * (time.process_time() - began) / len(stretch.span)
+def _with_joints(people: People, joints: NDArray[np.floating]) -> PlainPeople:
+    return PlainPeople(people.frame.astype(np.int64), joints.astype(np.float64))
 
 
-def _baseline(stretch: Stretch, timed: bool) -> Figures:
-    people, cpu_ms = _timed_baseline(stretch)
-    followed = over_time(people, stretch.scene.fps) if timed else people
-    return scored(followed, stretch.scene.keypoints) | {"cpu_ms": cpu_ms}
+def _baseline(segment: Segment, timed: bool) -> tuple[People, Figures]:
+    people = frame_by_frame(segment.detections, segment.scene.rig)
+    return over_time(people, segment.scene.fps) if timed else people, {}
 
 
-@lru_cache(maxsize=8)
-def _timed_baseline(stretch: Stretch) -> tuple[FoundPeople, float]:
-    return _timed(stretch, lambda: find_everybody(stretch.detections, stretch.scene.rig))
-
-
-def _proposals(stretch: Stretch, config: PipelineConfig) -> Figures:
+def _proposals(segment: Segment, config: PipelineConfig) -> tuple[People, Figures]:
     """Stage I of every frame, triangulated."""
-    scene = stretch.scene
-    before, cpu_ms = _timed(stretch, lambda: before_refinement(stretch.detections, scene.rig, config))
-    return scored(before, scene.keypoints) | {"cpu_ms": cpu_ms}
+    return before_refinement(segment.detections, segment.scene.rig, config), {}
 
 
-def _method(stretch: Stretch, config: PipelineConfig) -> Figures:
-    people, cpu_ms = _timed(stretch, lambda: stretch.reconstruct(config))
-    return scored(people, stretch.scene.keypoints) | {"cpu_ms": cpu_ms}
+def _method(segment: Segment, config: PipelineConfig) -> tuple[People, Figures]:
+    return segment.reconstruct(config), {}
 
 
 @lru_cache(maxsize=8)
-def _alone(stretch: Stretch) -> tuple[Reconstruction, float, SmplOnly]:
-    """Ours frame by frame with its time, and SMPL-only on the same people and detections."""
-    people, cpu_ms = _timed(stretch, lambda: stretch.reconstruct(FRAME_BY_FRAME))
-    return people, cpu_ms, smpl_only(people, stretch.scene.rig, FRAME_BY_FRAME.observations)
+def _frame_by_frame(segment: Segment) -> tuple[Reconstruction, float, SmplOnly]:
+    """Ours frame by frame, its milliseconds a frame, and SMPL-only on the same people and detections."""
+    began = time.process_time()
+    people = segment.reconstruct(FRAME_BY_FRAME)
+    cpu_ms = 1e3 * (time.process_time() - began) / len(segment.span)
+    return people, cpu_ms, smpl_only(people, segment.scene.rig, FRAME_BY_FRAME.observations)
 
 
-def _triangulated(stretch: Stretch) -> Figures:
-    people, _, same = _alone(stretch)
-    return scored(PlainPeople(people.frame, same.triangulated), stretch.scene.keypoints)
+def _triangulated(segment: Segment) -> tuple[People, Figures]:
+    people, _, same = _frame_by_frame(segment)
+    return _with_joints(people, same.triangulated), {"cpu_ms": None}
 
 
-def _smpl_only(stretch: Stretch) -> Figures:
-    people, _, same = _alone(stretch)
-    fit_ms = 1e3 * same.cpu_s / max(len(people), 1)
-    return scored(same.people, stretch.scene.keypoints) | {"fit_ms": fit_ms}
+def _smpl_only(segment: Segment) -> tuple[People, Figures]:
+    people, _, same = _frame_by_frame(segment)
+    return same.people, {"cpu_ms": None, "fit_ms": 1e3 * same.cpu_s / max(len(people), 1)}
 
 
-def _ours_alone(stretch: Stretch) -> Figures:
-    people, cpu_ms, _ = _alone(stretch)
-    fit_ms = 1e3 * people.run["seconds"]["solve"] / max(len(people), 1)
-    return scored(people, stretch.scene.keypoints) | {"cpu_ms": cpu_ms, "fit_ms": fit_ms}
+def _ours(segment: Segment) -> tuple[People, Figures]:
+    people, cpu_ms, _ = _frame_by_frame(segment)
+    return people, {"cpu_ms": cpu_ms, "fit_ms": 1e3 * people.run["seconds"]["solve"] / max(len(people), 1)}
 
 
-METHODS: dict[str, Callable[[Stretch], Figures]] = {
+METHODS: dict[str, Callable[[Segment], tuple[People, Figures]]] = {
     "baseline, frame by frame (Dong et al. 2019: 71.0 / 80.2 / 75.3)": partial(_baseline, timed=False),
     "baseline, over time": partial(_baseline, timed=True),
     "paper's settings (90.1 / 89.0 / 89.2)": partial(_method, config=PipelineConfig.paper()),
@@ -142,7 +122,7 @@ METHODS: dict[str, Callable[[Stretch], Figures]] = {
     "initial proposals": partial(_proposals, config=FRAME_BY_FRAME),
     "ours, triangulated before stage II": _triangulated,
     "SMPL-only, of the same people and detections (78.3 / 77.4 / 77.8)": _smpl_only,
-    "**ours, frame by frame**": _ours_alone,
+    "**ours, frame by frame**": _ours,
     "**ours, over time**": partial(_method, config=OVER_TIME),
 }
 """The methods, and precision, recall and F1 at 0.2 m that the paper has for them on its own recording."""

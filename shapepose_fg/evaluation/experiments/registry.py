@@ -5,15 +5,12 @@ from collections.abc import Iterator
 from shapepose_fg.evaluation.experiments import footage, scenes
 from shapepose_fg.evaluation.experiments.ablation import ablation
 from shapepose_fg.evaluation.experiments.experiment import Experiment
-from shapepose_fg.evaluation.experiments.fitters import fitters
 from shapepose_fg.evaluation.experiments.methods import interactions
-from shapepose_fg.evaluation.experiments.stretches import Scale
+from shapepose_fg.evaluation.experiments.segments import Scale
 
 _EVERY = (
-    *(footage.shelf, footage.shelf_limbs),
-    *(scenes.scenes, scenes.in_time, scenes.frame_by_frame, scenes.held_back, scenes.who_is_there),
-    *(footage.views, footage.single),
-    *(interactions, ablation, scenes.foreign, fitters),
+    *(footage.shelf, footage.shelf_limbs, scenes.in_time, scenes.held_back, scenes.who_is_there),
+    *(footage.views, footage.single, interactions, ablation, scenes.foreign),
 )
 
 

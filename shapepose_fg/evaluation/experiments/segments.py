@@ -1,4 +1,4 @@
-"""Stretches of simulated scenes, and how much is measured: everything for the documents, a little for tests."""
+"""Segments of simulated scenes, and how much is measured: everything for the documents, a little for tests."""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
@@ -16,25 +16,19 @@ from shapepose_fg.simulation.foreign import DETECTOR_S_OWN, people_of, recast
 from shapepose_fg.simulation.room import SequenceConfig
 from shapepose_fg.simulation.sequences import Split
 
-STRETCHES: dict[Split, dict[str, tuple[range, ...]]] = {
-    "report": {
-        "salsa": (range(108, 408), range(618, 918)),
-        "crossing": (range(0, 300), range(726, 1026)),
-        "crowd": (range(0, 300), range(826, 1126)),
-    },
-    "tune": {
-        "salsa": (range(0, 300), range(564, 864)),
-        "crossing": (range(0, 300), range(564, 864)),
-        "crowd": (range(241, 541), range(900, 1200)),
-    },
+SEGMENTS: dict[Split, dict[str, tuple[int, int]]] = {
+    "report": {"salsa": (108, 618), "crossing": (0, 726), "crowd": (0, 826)},
+    "tune": {"salsa": (0, 564), "crossing": (0, 564), "crowd": (241, 900)},
 }
-"""Stretches of the named sequences without a cut, 300 frames each."""
+"""Where the segments of the named sequences without a cut begin; each has 300 frames."""
+RECORDINGS = ("shelf", "pose2sim_single", "cmu_mocap")
+"""Folders of recordings and of recorded motions that experiments are of."""
 QUICK_FRAMES = 4
 """Frames of a scene that a quick run takes."""
 
 
 @dataclass(frozen=True)
-class Stretch:
+class Segment:
     """Consecutive frames of a simulated scene."""
 
     name: str
@@ -80,8 +74,12 @@ class Stretch:
     def truth(self) -> Reconstruction:
         """The people as a result, in which everybody is somebody else after a cut."""
         truth = truth_of(self.scene)
-        segment = np.searchsorted(self.scene.cuts, truth.frame, side="right")
-        return replace(truth, person=truth.person + segment * (int(truth.person.max(initial=0)) + 1))
+        part = np.searchsorted(self.scene.cuts, truth.frame, side="right")
+        return replace(truth, person=truth.person + part * (int(truth.person.max(initial=0)) + 1))
+
+    def shorter(self, frames: int) -> "Segment":
+        """Its first so many frames, or all that it has."""
+        return replace(self, span=self.span[:frames])
 
     def reconstruct(self, config: PipelineConfig | None = None) -> Reconstruction:
         """Reconstructed at the scene's rate."""
@@ -95,75 +93,57 @@ class Scale:
     """How much is measured, and on what."""
 
     quick: bool = False
-    """A few frames of the built-in scene in place of all stretches: whether everything works, in two minutes."""
+    """A few frames of the built-in scene in place of all segments: whether everything works, in two minutes."""
     data: Path | None = None
-    """Folder with `data/`: recordings and motions. None: there are none."""
+    """Folder with the `RECORDINGS`. None: there are none."""
     split: Split = "report"
     """Choose on `tune`, report on `report`."""
     seeds: tuple[int, ...] = tuple(range(6101, 6106))
     """Of the sequences that are drawn anew (`who is there`)."""
 
     @cached_property
-    def stretches(self) -> tuple[Stretch, ...]:
+    def segments(self) -> tuple[Segment, ...]:
         """Two of each sequence; none where there is nothing to simulate them from."""
         if self.quick:
-            return (Stretch("demo", range(QUICK_FRAMES)),)
-        if self.mocap is None:
-            return ()
-        return tuple(
-            Stretch(name, span, self.split, mocap=self.mocap)
-            for name, spans in STRETCHES[self.split].items()
-            for span in spans
-        )
+            return (Segment("demo", range(QUICK_FRAMES)),)
+        every = SEGMENTS[self.split].items() if self.mocap is not None else ()
+        begins = ((name, start) for name, starts in every for start in starts)
+        return tuple(Segment(name, range(n, n + 300), self.split, mocap=self.mocap) for name, n in begins)
 
-    def one_each(self, frames: int) -> tuple[Stretch, ...]:
-        """The first so many frames of the first stretch of each sequence, for what takes long."""
-        return tuple(shorter(each, frames) for each in self.stretches[::2])
+    def one_each(self, frames: int) -> tuple[Segment, ...]:
+        """The first so many frames of the first segment of each sequence, for what takes long."""
+        return tuple(each.shorter(frames) for each in self.segments[::2])
 
-    @property
-    def shelf(self) -> Path | None:
-        """The folder of the Shelf recording; None where there is none."""
-        return self._at("shelf")
-
-    @property
-    def pose2sim_single(self) -> Path | None:
-        """The folder of Pose2Sim's demo recording, and its detections."""
-        return self._at("pose2sim_single")
+    def recording(self, name: str) -> Path | None:
+        """The folder of one of the `RECORDINGS`; None where there is none."""
+        folder = None if self.data is None else self.data / name
+        return folder if folder is not None and folder.is_dir() else None
 
     @property
     def mocap(self) -> Path | None:
         """The file of recorded motions."""
-        folder = self._at("cmu_mocap")
+        folder = self.recording("cmu_mocap")
         return None if folder is None else folder / "cmu_smpl24.npz"
 
-    def _at(self, name: str) -> Path | None:
-        folder = None if self.data is None else self.data / "data" / name
-        return folder if folder is not None and folder.is_dir() else None
-
-
-def shorter(stretch: Stretch, frames: int) -> Stretch:
-    """The first so many frames of a stretch, or all that it has."""
-    return replace(stretch, span=stretch.span[:frames])
-
 
 @lru_cache(maxsize=8)
-def _scene(stretch: Stretch) -> Scene:
-    own = {"people": stretch.people, "seed": stretch.seed} if stretch.name == "demo" else {}
+def _scene(segment: Segment) -> Scene:
+    own = {"people": segment.people, "seed": segment.seed} if segment.name == "demo" else {}
     whole = named_scene(
-        stretch.name,
-        split=stretch.split,
-        cameras=stretch.cameras,
-        frames=stretch.span.stop,
-        mocap=stretch.mocap,
-        config=stretch.made,
-        fps=stretch.fps,
+        segment.name,
+        split=segment.split,
+        cameras=segment.cameras,
+        frames=segment.span.stop,
+        mocap=segment.mocap,
+        config=segment.made,
+        fps=segment.fps,
         **own,
     )
-    scene = whole.part(stretch.span)
-    return scene if stretch.bodies is None else recast(scene, people_of(stretch.bodies, scene.people))
+    scene = whole.part(segment.span)
+    return scene if segment.bodies is None else recast(scene, people_of(segment.bodies, scene.people))
 
 
 @lru_cache(maxsize=8)
-def _detections(stretch: Stretch) -> DetectionSequence:
-    offsets = DETECTOR_S_OWN if stretch.own_joints else None
-    return simulate(_scene(stretch), DetectorConfig(offsets=offsets), stretch.seed)
+def _detections(segment: Segment) -> DetectionSequence:
+    offsets = DETECTOR_S_OWN if segment.own_joints else None
+    return simulate(_scene(segment), DetectorConfig(offsets=offsets), segment.seed)

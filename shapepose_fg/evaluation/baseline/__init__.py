@@ -1,1 +1,0 @@
-"""A method without a body, to compare with: people grouped in 2D, matched between views, triangulated."""

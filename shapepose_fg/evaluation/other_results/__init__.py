@@ -1,1 +1,0 @@
-"""Results of other systems, read so that they are scored like ours."""
