@@ -14,6 +14,7 @@ from shapepose_fg.body.model.body_model import BodyParameters
 from shapepose_fg.body.shapes import SubjectShapes
 from shapepose_fg.core.reconstruction import Reconstruction, Status
 from shapepose_fg.core.storage.kept_arrays import InMemory
+from shapepose_fg.estimation.floor import Floor
 from shapepose_fg.pipeline.bodies_over_time import (
     STRETCH_ROWS,
     BodiesOverTime,
@@ -72,6 +73,19 @@ def test_nobody_and_no_file(scene, fitter):
     other = SubjectShapes.empty("another body")
     with pytest.raises(ValueError, match="same body model"):
         with_bodies_over_time(people, fitter, other)
+
+
+def test_bodies_stand_on_the_floor_that_was_found(scene, fitter):
+    """A floor 20 cm above the scene's own: whoever stands there is lifted out of it."""
+    people, floor = seen(scene, slice(0, 4), 0), Floor(np.array([0.0, 0.0, 1.0]), 0.2, 0.01, 100, 1.0)
+    lowest = []
+    for each in (None, floor):
+        found = with_bodies_over_time(people, fitter, floor=each)
+        columns = (found.betas, found.global_orient, found.body_pose, found.transl)
+        with torch.no_grad():
+            points = fitter.model.vertices(BodyParameters(*(torch.from_numpy(one).float() for one in columns)))
+        lowest.append(points[..., 2].min().item())
+    assert lowest[0] < 0.1 and lowest[1] > 0.17
 
 
 def test_every_row_gets_its_own_body():
