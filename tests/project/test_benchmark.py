@@ -36,6 +36,7 @@ def recording():
     return simulate(scene), scene.rig
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("temporal", [False, True])
 def test_times_of_stages_add_up(recording, temporal):
     spent = spend(*recording, replace(PipelineConfig(), temporal=temporal), 5)
