@@ -80,7 +80,6 @@ def test_mistakes_of_one_camera_are_told_apart(recording, room):
             assert found.amount == pytest.approx(amount, rel=0.03)
 
 
-@pytest.mark.slow
 def test_exchanged_cameras_are_named(recording, room):
     found = only_finding(recording, exchanged(room, 1, 4))
     assert (found.kind, found.cameras) == (Kind.EXCHANGED, (1, 4))
