@@ -80,6 +80,7 @@ def in_chunks(scene, recording, times):
 def test_every_row_is_of_its_frame_and_its_person(scene, whole):
     """In a run of several windows: where somebody is when, how fast, with which body, from which detections."""
     assert np.bincount(whole.frame).tolist() == [2] * 54
+    assert np.lexsort((whole.person, whole.frame)).tolist() == list(range(len(whole)))
     np.testing.assert_allclose(whole.time_s, whole.frame / scene.fps, atol=1e-9)
     places, speeds = scene.keypoints, np.gradient(scene.keypoints, 1 / scene.fps, axis=0)
     apart = np.linalg.norm(whole.joints[:, None] - places[whole.frame], axis=-1)
@@ -144,6 +145,7 @@ def test_chunks_change_neither_people_nor_names(whole, in_chunks):
     assert apart.max() < 2e-3 and apart.mean() < 1e-5
     one, other = ({e["person"]: e["evidence"] for e in each.run["probability"]} for each in (whole, in_chunks))
     assert one.keys() == {name for name, _ in pairs}
+    assert len(set(one.values())) == 4, "everybody's own"
     for name, in_chunk in pairs:
         assert one[name] == pytest.approx(other[in_chunk], abs=2e-3)
 
