@@ -125,8 +125,9 @@ class DetectorStatistics:
         """From a file like the shipped one: an entry for each field."""
         content = json.loads(path.read_text(encoding="utf-8"))
         tables: dict[str, Any] = {name: content[name] for name in cls.__dataclass_fields__}
-        of_lists = {k: np.array(v, dtype=np.float64) for k, v in tables.items() if isinstance(v, list)}
-        return cls(**(tables | of_lists))
+        for name, table in tables.items():
+            tables[name] = np.array(table, dtype=np.float64) if isinstance(table, list) else table
+        return cls(**tables)
 
     def quantile(self, table: Array, probability: Array) -> Array:
         """Values (...,) at `probability` (...,) of quantile tables (..., K), or of one table (K,)."""
