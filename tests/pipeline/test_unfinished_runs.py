@@ -21,7 +21,7 @@ from shapepose_fg.cli.main import main
 from shapepose_fg.cli.stopping import Stopped
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.core.storage.kept_arrays import InFolder
+from shapepose_fg.core.storage.kept_arrays import InFolder, InMemory
 from shapepose_fg.core.storage.output_folder import only_run_in
 from shapepose_fg.estimation.detector_offsets import OffsetConfig
 from shapepose_fg.io.config import toml_text
@@ -129,14 +129,15 @@ def test_what_is_in_memory_and_what_is_in_the_files_is_the_same(dance, tmp_path)
         assert (tmp_path / name).read_bytes() == (whole / name).read_bytes(), name
 
 
-def test_who_comes_when_a_run_goes_on_is_nobody_of_before(scene, recording, tmp_path):
+@pytest.mark.parametrize("chunk_frames", [None, 6])
+def test_who_comes_when_a_run_goes_on_is_nobody_of_before(scene, recording, tmp_path, chunk_frames):
     """Stopped behind the first of two windows, between which the recording is cut: the same, and new names."""
     frames, config = range(12), replace(CONFIG, offsets=OffsetConfig(source="none"))
-    task = Task(recording, scene.rig, config, frames, cuts=(6,))
+    task, execution = Task(recording, scene.rig, config, frames, cuts=(6,)), Execution(chunk_frames=chunk_frames)
     with pytest.raises(Stopped):
-        reconstruct_parts(Interrupted(tmp_path / "parts", 2, behind=False), task)
-    result = reconstruct_parts(InFolder(tmp_path / "parts"), task).reconstruction()
-    usual = reconstruct(recording, scene.rig, config, frames=frames, cuts=(6,))
+        reconstruct_parts(Interrupted(tmp_path / "parts", 2, behind=False), task, execution)
+    result = reconstruct_parts(InFolder(tmp_path / "parts"), task, execution).reconstruction()
+    usual = reconstruct_parts(InMemory(), task, execution).reconstruction()
     for name in result.ROWS:
         assert getattr(result, name).tobytes() == getattr(usual, name).tobytes(), name
     before, after = (set(result.person[side].tolist()) for side in (result.frame < 6, result.frame >= 6))
