@@ -50,7 +50,8 @@ def main() -> None:
         parser.error("--update: of all cases at full scale, split report; leave out the other options")
     data = recordings(ROOT.parent / "shared" if arguments.data is None else arguments.data)
     if data is None and arguments.data is not None:
-        parser.error(f"--data {arguments.data}: neither there nor in data/ is one of {', '.join(RECORDINGS)}")
+        wanted = " or ".join(RECORDINGS)
+        parser.error(f"--data: neither {arguments.data} nor {arguments.data / 'data'} has a folder {wanted}")
     torch.set_num_threads(1)
     scale = Scale(arguments.quick, data, arguments.split, *[tuple(arguments.seeds)] if arguments.seeds else [])
     commit = code_commit()

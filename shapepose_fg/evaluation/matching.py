@@ -20,10 +20,12 @@ class People(Protocol):
     @property
     def frame(self) -> NDArray[np.integer]:
         """(N,) frame of each row."""
+        ...
 
     @property
     def joints(self) -> NDArray[np.floating]:
         """(N, J, 3) joints of each row, metres, NaN where unknown."""
+        ...
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from shapepose_fg.evaluation.speed import BackAndForth, peak_mib, rows_mib, spend
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.simulation import built_in_scene, simulate
 
@@ -38,8 +37,8 @@ def recording():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("temporal", [False, True])
-def test_times_of_stages_add_up(recording, temporal):
-    spent = spend(*recording, replace(PipelineConfig(), temporal=temporal), 5)
+def test_times_of_stages_add_up(benchmark, recording, temporal):
+    spent = benchmark.spend(*recording, replace(PipelineConfig(), temporal=temporal), 5)
     assert len(spent.people) == 20
     whole = sum(spent.stages_ms.values())
     # All but what lies between the stages is in one of them.
@@ -47,15 +46,15 @@ def test_times_of_stages_add_up(recording, temporal):
     assert spent.stages_ms["solve"] > 0 and min(spent.stages_ms.values()) >= 0
 
 
-def test_a_long_recording_goes_back_and_forth(recording):
-    long = BackAndForth(recording[0], 12)
+def test_a_long_recording_goes_back_and_forth(benchmark, recording):
+    long = benchmark.BackAndForth(recording[0], 12)
     assert len(long) == 12
     assert [id(long[t]) for t in range(12)] == [id(recording[0][t]) for t in (0, 1, 2, 3, 4, 4, 3, 2, 1, 0, 0, 1)]
 
 
-def test_memory_of_rows(recording):
-    spent = spend(*recording, PipelineConfig(), 2)
-    assert 0 < rows_mib(spent.people) < peak_mib()
+def test_memory_of_rows(benchmark, recording):
+    spent = benchmark.spend(*recording, PipelineConfig(), 2)
+    assert 0 < benchmark.rows_mib(spent.people) < benchmark.peak_mib()
 
 
 @pytest.mark.slow
