@@ -35,7 +35,6 @@ def recording():
     return simulate(scene), scene.rig
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("temporal", [False, True])
 def test_times_of_stages_add_up(benchmark, recording, temporal):
     spent = benchmark.spend(*recording, replace(PipelineConfig(), temporal=temporal), 5)
