@@ -144,6 +144,20 @@ def test_who_comes_when_a_run_goes_on_is_nobody_of_before(scene, recording, tmp_
     assert len(before) == len(after) == 2 and not before & after
 
 
+def test_people_are_followed_on_from_where_a_run_was_stopped(scene, recording, tmp_path):
+    """Behind the first of several windows, in the middle of a segment."""
+    config = replace(CONFIG, offsets=OffsetConfig(source="none"))
+    task = Task(recording, scene.rig, config, range(24))
+    kept = Interrupted(tmp_path / "parts", 2, behind=False)
+    with pytest.raises(Stopped):
+        reconstruct_parts(kept, task)
+    assert kept.names("followed") == ["followed-000000"]
+    result = reconstruct_parts(InFolder(tmp_path / "parts"), task).reconstruction()
+    usual = reconstruct_parts(InMemory(), task).reconstruction()
+    for name in result.ROWS:
+        assert getattr(result, name).tobytes() == getattr(usual, name).tobytes(), name
+
+
 def test_without_time_it_goes_on_too(scene, recording, tmp_path):
     config = PipelineConfig(temporal=False, batch_frames=4, offsets=OffsetConfig(source="none"))
     frames = range(4, 12)
