@@ -15,7 +15,7 @@ PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 demo: $(VENV)/installed
 	$(BIN)/shapepose-fg demo --output demo
 
-## Lint, types, and the tests that notice 95 % of what all of them do (see scripts/mutants.py): under three minutes.
+## Lint, types, and the tests that are not marked slow: under three minutes on two cores.
 test: check
 	$(PYTEST) -m "not slow"
 

@@ -189,7 +189,8 @@ class Copy:
         """What tests of `most_s` seconds in all, and at least one, say of a change."""
         lines = self.reached["lines"].get(mutant.path, {})
         tests = lines.get(str(mutant.line)) or sorted({name for names in lines.values() for name in names})
-        own, seconds = f"tests/{Path(mutant.path).parts[1]}/", self.reached["seconds"]
+        own = f"tests/{mutant.path.removeprefix('shapepose_fg/').split('/')[0]}/"
+        seconds = self.reached["seconds"]
         chosen, total = [], 0.0
         for test in sorted(tests, key=lambda name: (not name.startswith(own), seconds[name])):
             total += seconds[test]

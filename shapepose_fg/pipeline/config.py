@@ -48,7 +48,7 @@ class WindowConfig(Settings):
 
     overlap_s: Annotated[float, Interval(ge=0, le=60)] = 0.4
     """What a window takes of the frames before and after its own, and does not return: smoothing reaches a few
-    frames. Windows of other lengths move joints by under 2 mm in the median (tests/test_windows.py)."""
+    frames. Windows of other lengths move joints by under 2 mm in the median (tests/pipeline/test_windows.py)."""
     again_over_time: RepeatsOrNone = 8
     """How often detections are reassociated around a draft of a window, at the most: it ends when hardly any
     changes. Fewer rounds are faster; with 3, crowds before three cameras lose one to two points of F1."""

@@ -73,7 +73,7 @@ def _distorted(xy: Array, camera: Camera) -> Array:
 def other_sizes(given: Sequence[str], rig: Rig) -> tuple[Finding, ...]:
     """Cameras whose videos, or pictures, are not of the calibrated size; `given` as `find_footage` takes it."""
     found = []
-    for view, path in enumerate(find_footage(given, rig.names).paths):
+    for view, path in enumerate(find_footage(given, rig.names)[0]):
         is_video = path.suffix.lower() in VIDEOS and path.is_file()
         width, height = glance(path)[0] if is_video else open_footage(path).size
         if (width, height) != rig.cameras[view].image_size:

@@ -90,6 +90,7 @@ def test_bad_priors_are_refused(prior, change, message):
         replace(prior, **change)
 
 
+@pytest.mark.slow
 def test_predicts_hidden_joints_of_people_it_never_saw(prior, shared_data):
     motions = load_motions(shared_data / "cmu_mocap" / "cmu_smpl24.npz").of("test")
     motions = motions.rows(~np.isin(motions.subject, ["60", "61"]))  # salsa would be three frames in four

@@ -70,14 +70,14 @@ def onnx_file(path: Path, weights: np.ndarray, fixed: tuple[int, int] | None = N
     Written by hand, after the format's own description (onnx.proto), so that no test needs the package onnx.
     """
     size = weights.shape[2]
-    tensor = b"".join(_number(1, n) for n in weights.shape) + _number(2, 1) + _bytes(8, b"w")
-    tensor += _bytes(9, weights.astype("<f4").tobytes())
+    tensor = b"".join(varint(1, n) for n in weights.shape) + varint(2, 1) + blob(8, b"w")
+    tensor += blob(9, weights.astype("<f4").tobytes())
     attributes = _ints(b"kernel_shape", [size] * 2) + _ints(b"strides", [size] * 2)
-    node = _bytes(1, b"x") + _bytes(1, b"w") + _bytes(2, b"y") + _bytes(4, b"Conv") + attributes
+    node = blob(1, b"x") + blob(1, b"w") + blob(2, b"y") + blob(4, b"Conv") + attributes
     height, width = fixed or (b"h", b"w")
-    graph = _bytes(1, node) + _bytes(2, b"g") + _bytes(5, tensor) + _bytes(11, _value(b"x", [1, 3, height, width]))
-    graph += _bytes(12, _value(b"y", [1, weights.shape[0], b"p", b"q"]))
-    model = _number(1, 7) + _bytes(7, graph) + _bytes(8, _bytes(1, b"") + _number(2, 13))
+    graph = blob(1, node) + blob(2, b"g") + blob(5, tensor) + blob(11, _value(b"x", [1, 3, height, width]))
+    graph += blob(12, _value(b"y", [1, weights.shape[0], b"p", b"q"]))
+    model = varint(1, 7) + blob(7, graph) + blob(8, blob(1, b"") + varint(2, 13))
     path.write_bytes(model)
     return path
 
@@ -89,18 +89,18 @@ def _varint(n: int) -> bytes:
     return out + bytes([n])
 
 
-def _number(field: int, n: int) -> bytes:
+def varint(field: int, n: int) -> bytes:
     return _varint(field << 3) + _varint(n)
 
 
-def _bytes(field: int, content: bytes) -> bytes:
+def blob(field: int, content: bytes) -> bytes:
     return _varint(field << 3 | 2) + _varint(len(content)) + content
 
 
 def _ints(name: bytes, values: list[int]) -> bytes:
-    return _bytes(5, _bytes(1, name) + b"".join(_number(8, n) for n in values) + _number(20, 7))
+    return blob(5, blob(1, name) + b"".join(varint(8, n) for n in values) + varint(20, 7))
 
 
 def _value(name: bytes, shape: list[int | bytes]) -> bytes:
-    sides = b"".join(_bytes(1, _bytes(2, side) if isinstance(side, bytes) else _number(1, side)) for side in shape)
-    return _bytes(1, name) + _bytes(2, _bytes(1, _number(1, 1) + _bytes(2, sides)))
+    sides = b"".join(blob(1, blob(2, side) if isinstance(side, bytes) else varint(1, side)) for side in shape)
+    return blob(1, name) + blob(2, blob(1, varint(1, 1) + blob(2, sides)))

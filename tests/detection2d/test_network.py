@@ -7,7 +7,7 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.detection2d import onnx_file as onnx_file_reader
 from shapepose_fg.detection2d.network import HeatMapNetwork
 from shapepose_fg.detection2d.networks import layouts
-from tests.detection2d.conftest import _bytes, _number, onnx_file
+from tests.detection2d.conftest import blob, onnx_file, varint
 
 
 def means(channels: int, gain: float = 1.0) -> np.ndarray:
@@ -90,11 +90,11 @@ def test_a_file_that_is_too_large_is_not_read(tmp_path, monkeypatch):
 
 def test_weights_in_other_files_are_refused_wherever_they_stand(tmp_path):
     """In the graph, in a node's attribute, in a graph inside of it, in a function, in a sparse tensor."""
-    place = _bytes(1, b"location") + _bytes(2, b"../../etc/passwd")
-    tensor = _number(1, 3) + _bytes(13, place) + _number(14, 1)
-    inside = _bytes(6, _bytes(15, _bytes(1, tensor)))
-    models = [_bytes(7, _bytes(5, tensor)), _bytes(7, _bytes(1, _bytes(5, _bytes(5, tensor))))]
-    models += [_bytes(7, _bytes(1, _bytes(5, inside))), _bytes(25, _bytes(7, _bytes(5, _bytes(10, tensor))))]
+    place = blob(1, b"location") + blob(2, b"../../etc/passwd")
+    tensor = varint(1, 3) + blob(13, place) + varint(14, 1)
+    inside = blob(6, blob(15, blob(1, tensor)))
+    models = [blob(7, blob(5, tensor)), blob(7, blob(1, blob(5, blob(5, tensor))))]
+    models += [blob(7, blob(1, blob(5, inside))), blob(25, blob(7, blob(5, blob(10, tensor))))]
     file, whole = tmp_path / "n.onnx", onnx_file(tmp_path / "whole.onnx", means(78)).read_bytes()
     for model in models:
         file.write_bytes(whole + model)
@@ -107,12 +107,12 @@ def test_weights_in_other_files_are_refused_wherever_they_stand(tmp_path):
 def test_graphs_without_end_are_no_network(tmp_path, monkeypatch):
     file, graph = tmp_path / "n.onnx", b""
     for _ in range(200):
-        graph = _bytes(1, _bytes(5, _bytes(6, graph)))
-    file.write_bytes(_bytes(7, graph))
+        graph = blob(1, blob(5, blob(6, graph)))
+    file.write_bytes(blob(7, graph))
     with pytest.raises(InputError, match="not an ONNX network"):
         HeatMapNetwork.load(file)
     monkeypatch.setattr(onnx_file_reader, "_MOST_FIELDS", 1000)
-    file.write_bytes(_bytes(7, 1001 * _number(3, 1)))
+    file.write_bytes(blob(7, 1001 * varint(3, 1)))
     with pytest.raises(InputError, match="not an ONNX network"):
         HeatMapNetwork.load(file)
 

@@ -46,12 +46,13 @@ def test_marginals_are_the_reported_covariances_and_values_the_reported_joints(p
         known = np.isfinite(solution.joints).all(axis=2)
         assert known.mean() > 0.95 and len(solution.frames) == 12
         mine = next(
-            people.joints[people.person == person]
+            people.rows(people.person == person)
             for person in np.unique(people.person)
             if np.nanmax(np.abs(people.joints[people.person == person] - solution.joints)) < 1e-9
         )
         at = np.array([solution.values.atPoint3(key) for key in solution.keys[known].tolist()])
-        np.testing.assert_allclose(at, mine[known], atol=1e-6)
+        np.testing.assert_allclose(at, mine.joints[known], atol=1e-6)
+        assert solution.person == mine.person[0] and np.array_equal(solution.frames, mine.frame)
         # The solver's own graph has only what is new in every frame: a third of the reported sigmas.
         assert np.median(ratios(solution)) == pytest.approx(1.0, abs=1e-3)
         assert (np.abs(ratios(solution) - 1) < 0.05).mean() > 0.95

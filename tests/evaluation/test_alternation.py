@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.evaluation.alternation import BeforeRefinement, alternation_errors, before_refinement
@@ -53,6 +54,7 @@ def test_people_are_those_who_are_found_both_times():
     assert len(alternation_errors(nobody, one_person(truth[0, 1]), truth).after_mm) == 0
 
 
+@pytest.mark.slow
 def test_stage_two_helps_whom_the_views_see_badly():
     """What the project promises; misses are frequent here, so that few frames hold enough doubtful joints."""
     scene = built_in_scene(1000, frames=10)

@@ -12,8 +12,9 @@ from shapepose_fg.body.fitting.fitters import SmplFitter, make_fitter
 from shapepose_fg.body.fitting.weights import fingerprint
 from shapepose_fg.body.model.body_model import BodyParameters
 from shapepose_fg.body.shapes import SubjectShapes
-from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.reconstruction import Reconstruction, Status
 from shapepose_fg.core.storage.kept_arrays import InMemory
+from shapepose_fg.estimation.floor import Floor
 from shapepose_fg.pipeline.bodies_over_time import (
     SEGMENT_ROWS,
     BodiesOverTime,
@@ -72,6 +73,43 @@ def test_nobody_and_no_file(scene, fitter):
     other = SubjectShapes.empty("another body")
     with pytest.raises(ValueError, match="same body model"):
         with_bodies_over_time(people, fitter, other)
+
+
+def test_bodies_stand_on_the_floor_that_was_found(scene, fitter):
+    """A floor 20 cm above the scene's own: whoever stands there is lifted out of it."""
+    people, floor = seen(scene, slice(0, 4), 0), Floor(np.array([0.0, 0.0, 1.0]), 0.2, 0.01, 100, 1.0)
+    lowest = []
+    for each in (None, floor):
+        found = with_bodies_over_time(people, fitter, floor=each)
+        columns = (found.betas, found.global_orient, found.body_pose, found.transl)
+        with torch.no_grad():
+            points = fitter.model.vertices(BodyParameters(*(torch.from_numpy(one).float() for one in columns)))
+        lowest.append(points[..., 2].min().item())
+    assert lowest[0] < 0.1 and lowest[1] > 0.17
+
+
+def test_every_row_gets_its_own_body():
+    """Person 3 has five rows in two segments, person 8 three in one; windows of four rows each, people mixed."""
+    names = {3: {"a": range(0, 3), "b": range(3, 5)}, 8: {"c": range(3)}}
+    kept, number = InMemory(), {"a": [30, 31, 32], "b": [33, 34], "c": [80, 81, 82]}
+    for name, values in number.items():
+        ok = np.array(values) != 81
+        kept.keep(name, {"ok": ok, "transl": np.array(values)[:, None] + np.zeros(3)})
+    bodies = BodiesOverTime(kept, names, SubjectShapes.empty("b" * 64))
+    statuses = np.array([Status.OK, Status.BODY_UNDETERMINED, Status.BODY_UNDETERMINED, Status.NOT_SOLVED])
+    for person, before, expected in (
+        ([8, 3, 3, 8], {}, [80, 30, 31, -1]),
+        ([3, 8, 3, 3], {3: 2, 8: 2}, [32, 82, 33, 34]),
+    ):
+        whose, found = np.array(person), np.full((4, 3), -1.0)
+        assert bodies.filled("transl", found, whose, before)[:, 0].tolist() == expected
+        assert (found == -1).all(), "what was given stays as it was"
+        status = bodies.filled("status", statuses, whose, before)
+        assert status.tolist() == [Status.OK, Status.OK, Status.OK, Status.NOT_SOLVED]
+        undetermined = np.full(4, Status.BODY_UNDETERMINED)
+        has_body = bodies.filled("status", undetermined, whose, before) == Status.OK
+        assert has_body.tolist() == [each >= 0 for each in expected]
+        assert bodies.filled("joints", found, whose, before) is found
 
 
 def test_a_long_track_is_fitted_in_stretches_that_fit_together(fitter):

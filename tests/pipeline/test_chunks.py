@@ -4,17 +4,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+import torch
 
 from shapepose_fg.body.fitting.fitters import make_fitter
+from shapepose_fg.body.model.body_model import BodyParameters
 from shapepose_fg.cli.stopping import Stopped
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.reconstruction import Known, Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.core.storage.kept_arrays import InFolder
+from shapepose_fg.core.storage.kept_arrays import InFolder, InMemory
 from shapepose_fg.pipeline.engine import Setup
 from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.pipeline import PipelineConfig, Task, reconstruct, reconstruct_parts
 from shapepose_fg.pipeline.runs import chunks
+from shapepose_fg.pipeline.runs.assembly import Assembly
 from shapepose_fg.pipeline.runs.chunks import Border, Chunk, cut_in_chunks, same_people, windows_of
 from shapepose_fg.pipeline.solved_windows import solve_chunk
 from shapepose_fg.pipeline.windows import Engine, WindowConfig
@@ -53,13 +57,82 @@ def recording(scene):
 
 
 @pytest.fixture(scope="module")
-def whole(scene, recording):
-    return reconstruct(recording, scene.rig, CONFIG, cuts=CUTS)
+def times(scene):
+    return FrameTimes.from_fps(scene.fps, len(scene))
 
 
 @pytest.fixture(scope="module")
-def in_chunks(scene, recording):
-    return reconstruct(recording, scene.rig, CONFIG, cuts=CUTS, execution=Execution(chunk_frames=12))
+def assembly(scene, recording, times) -> Assembly:
+    return reconstruct_parts(InMemory(), Task(recording, scene.rig, CONFIG, times=times, cuts=CUTS))
+
+
+@pytest.fixture(scope="module")
+def whole(assembly) -> Reconstruction:
+    """Four windows."""
+    return assembly.reconstruction()
+
+
+@pytest.fixture(scope="module")
+def in_chunks(scene, recording, times):
+    return reconstruct(recording, scene.rig, CONFIG, times=times, cuts=CUTS, execution=Execution(chunk_frames=12))
+
+
+def test_every_row_is_of_its_frame_and_its_person(scene, whole):
+    """In a run of several windows: where somebody is when, how fast, with which body, from which detections."""
+    assert np.bincount(whole.frame).tolist() == [2] * 54
+    assert np.lexsort((whole.person, whole.frame)).tolist() == list(range(len(whole)))
+    np.testing.assert_allclose(whole.time_s, whole.frame / scene.fps, atol=1e-9)
+    places, speeds = scene.keypoints, np.gradient(scene.keypoints, 1 / scene.fps, axis=0)
+    apart = np.linalg.norm(whole.joints[:, None] - places[whole.frame], axis=-1)
+    who = apart.mean(axis=-1).argmin(axis=1)
+    assert len(set(zip(whole.person.tolist(), who.tolist(), (whole.frame >= 30).tolist(), strict=True))) == 4
+    truth, speed, seen = places[whole.frame, who], speeds[whole.frame, who], whole.known == Known.SEEN
+    error = whole.joints - truth
+    assert np.median(np.linalg.norm(error, axis=-1)[seen]) < 0.03
+    assert np.median(np.linalg.norm(whole.velocity - speed, axis=-1)[seen]) < 0.25
+    squared = np.einsum("nji,njik,njk->nj", error, np.linalg.inv(whole.covariance), error)
+    assert 0.85 < (squared[seen] < 7.81).mean() <= 1  # of a Gaussian 95 %
+    columns = (whole.betas, whole.global_orient, whole.body_pose, whole.transl)
+    body = scene.body.keypoints(BodyParameters(*(torch.from_numpy(each).float() for each in columns))).numpy()
+    moving = seen & (np.linalg.norm(speed, axis=-1) > 0.5)
+    for track in np.unique(whole.person):
+        mine = np.flatnonzero(whole.person == track)
+        for other in (truth, body):
+            late = {
+                step: np.linalg.norm(whole.joints[mine] - np.roll(other[mine], step, axis=0), axis=-1)[2:-2]
+                for step in (-1, 0, 1)
+            }
+            late = {step: each[moving[mine][2:-2]].mean() for step, each in late.items()}
+            assert min(late, key=late.__getitem__) == 0, "nearest to the truth and the body of its own frame"
+    projected = np.moveaxis(scene.rig.project(whole.joints)[0], 0, 2)
+    table = whole.observations
+    residual = (projected - table.xy)[table.used]
+    np.testing.assert_allclose(table.residual_px[table.used], residual, atol=1e-2)
+    assert np.median(np.linalg.norm(residual, axis=-1)) < 8
+
+
+def test_a_person_s_rows_are_read_from_all_windows(assembly, whole):
+    rows = [range(3, 8), range(18, 23), range(10, 14)]
+    for number, count in assembly.rows_of.items():
+        mine = np.flatnonzero(whole.person == number)
+        assert len(mine) == count
+        chosen = mine[np.concatenate(rows)]
+        found = assembly.person(number, rows)
+        known = np.linalg.norm(found.targets.information, axis=(-2, -1)) > 0
+        np.testing.assert_array_equal(found.targets.xyz[known], whole.joints[chosen][known])
+        np.testing.assert_allclose(
+            np.linalg.inv(found.targets.information[known]), whole.covariance[chosen][known], rtol=1e-6, atol=1e-12
+        )
+        np.testing.assert_array_equal(found.time_s, whole.time_s[chosen])
+    first, last = min(assembly.rows_of), max(assembly.rows_of)
+    named = replace(assembly, names={first: 40, last: first}, bodies=None).reconstruction()
+    expected = np.where(whole.person == first, 40, np.where(whole.person == last, first, whole.person))
+    np.testing.assert_array_equal(named.person, expected)
+    np.testing.assert_array_equal(named.observations.person, expected)
+    thinned = assembly.reconstruction(every=5)
+    expected = whole.rows(whole.frame % 5 == 0)
+    for name in whole.ROWS:
+        np.testing.assert_array_equal(getattr(thinned, name), getattr(expected, name), err_msg=name)
 
 
 def test_chunks_change_neither_people_nor_names(whole, in_chunks):
@@ -72,34 +145,37 @@ def test_chunks_change_neither_people_nor_names(whole, in_chunks):
     assert apart.max() < 2e-3 and apart.mean() < 1e-5
     one, other = ({e["person"]: e["evidence"] for e in each.run["probability"]} for each in (whole, in_chunks))
     assert one.keys() == {name for name, _ in pairs}
+    assert len(set(one.values())) == 4, "everybody's own"
     for name, in_chunk in pairs:
         assert one[name] == pytest.approx(other[in_chunk], abs=2e-3)
 
 
 @pytest.mark.slow
-def test_processes_change_no_byte_of_it(scene, recording, in_chunks):
-    found = reconstruct(recording, scene.rig, CONFIG, cuts=CUTS, execution=Execution(chunk_frames=12, workers=2))
+def test_processes_change_no_byte_of_it(scene, recording, times, in_chunks):
+    found = reconstruct(
+        recording, scene.rig, CONFIG, times=times, cuts=CUTS, execution=Execution(chunk_frames=12, workers=2)
+    )
     for name in found.ROWS:
         equal_nan = name != "status"
         assert np.array_equal(getattr(found, name), getattr(in_chunks, name), equal_nan=equal_nan), name
 
 
 @pytest.mark.slow
-def test_a_dask_cluster_changes_no_byte_of_it(scene, recording, in_chunks):
+def test_a_dask_cluster_changes_no_byte_of_it(scene, recording, times, in_chunks):
     pytest.importorskip("distributed", reason="Dask is an extra")
     execution = Execution(chunk_frames=12, workers=2, cluster="local")
-    found = reconstruct(recording, scene.rig, CONFIG, cuts=CUTS, execution=execution)
+    found = reconstruct(recording, scene.rig, CONFIG, times=times, cuts=CUTS, execution=execution)
     for name in ("joints", "covariance", "person", "body_pose"):
         assert np.array_equal(getattr(found, name), getattr(in_chunks, name), equal_nan=name != "person"), name
 
 
 @pytest.mark.slow
-def test_a_run_in_chunks_that_was_stopped_goes_on(scene, recording, in_chunks, tmp_path):
+def test_a_run_in_chunks_that_was_stopped_goes_on(scene, recording, times, in_chunks, tmp_path):
     def stop(done: int, _: int) -> None:
         if done >= 20:
             raise Stopped(15)
 
-    task = Task(recording, scene.rig, CONFIG, cuts=CUTS)
+    task = Task(recording, scene.rig, CONFIG, times=times, cuts=CUTS)
     with pytest.raises(Stopped):
         reconstruct_parts(InFolder(tmp_path), task, Execution(chunk_frames=12, progress=stop))
     done: list[int] = []
@@ -168,6 +244,22 @@ def test_every_chunk_gives_its_own_frames_and_whole_windows(fps, views, batch):
     assert pieces == whole
 
 
+def test_windows_take_the_frames_that_overlap_them():
+    """By default 0.4 s on either side: nine frames of 24 a second; the last takes what is left."""
+    times = FrameTimes.from_fps(24.0, 70).of_views(3)
+    engine = Engine(NobodyIsThere(), PipelineConfig(batch_frames=20))  # type: ignore[arg-type]
+    given = [Input(frame, times[frame], Detections.empty(), range(3)) for frame in range(70)]  # type: ignore[arg-type]
+    spans, _ = engine.follow(engine.start(), given, last=True)
+    own, taken = [], []
+    for span in spans:
+        frames = [each.frame for each, _ in span.decided]
+        own.append((frames[span.start], frames[span.stop - 1]))
+        taken.append((frames[0], frames[-1]))
+        assert frames == list(range(frames[0], frames[-1] + 1))
+    assert own == [(0, 19), (20, 39), (40, 69)]
+    assert taken == [(0, 29), (11, 49), (31, 69)]
+
+
 def test_a_chunk_without_its_frames_is_an_error_and_no_gap(scene, recording):
     setup = Setup(scene.rig, recording.skeleton, CONFIG, make_fitter(CONFIG.body))
     given = tuple(Input(n, np.full(4, n / 25), Detections.empty(), scene.rig) for n in range(16))
@@ -188,6 +280,21 @@ def test_who_is_who_by_detections_and_out_of_sight_by_place():
     before = border([0, 1, 2], [7, 8, -1], [[0, 0, 0], [9, 0, 0], [5, 0, 0.0]])
     after = border([10, 11, 12, 13], [8, 7, -1, -1], [[0, 0, 0], [9, 0, 0], [5.1, 0, 0], [5.0, 2, 0.0]])
     assert same_people(before, after) == {10: 1, 11: 0, 12: 2}
+
+
+def test_strangers_on_both_sides_of_a_border_stay_strangers():
+    """Other detections; out of sight in other places, or who knows where; one who is seen and one who is not."""
+    nowhere = [np.nan] * 3
+    for before, after in (
+        (([7], [[0, 0, 0.0]]), ([9], [[0, 0, 0.0]])),
+        (([-1], [[0, 0, 0.0]]), ([-1], [[0.4, 0, 0]])),
+        (([-1], [nowhere]), ([-1], [nowhere])),
+        (([7], [[0, 0, 0.0]]), ([-1], [[2, 0, 0.0]])),
+    ):
+        assert same_people(border([0], *before), border([10], *after)) == {}
+    # One of two goes on; the other's place is taken by nobody.
+    two, one = border([0, 1], [7, 8], [[0, 0, 0], [9, 0, 0.0]]), border([10], [8], [[9, 0, 0.0]])
+    assert same_people(two, one) == {10: 1} and same_people(one, two) == {1: 10}
 
 
 def test_chunks_shorter_than_a_window_are_refused(scene, recording):

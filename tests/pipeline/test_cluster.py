@@ -89,11 +89,13 @@ def test_who_shares_a_cluster_keeps_a_part_of_the_work_ready(sharing, under_way)
     assert len(taken) == under_way
 
 
+@pytest.mark.slow
 def test_an_error_of_the_work_is_that_error():
     with Cluster(None, 1, "") as cluster, pytest.raises(ArithmeticError, match="item 0"):
         list(cluster.map(fails, range(3)))
 
 
+@pytest.mark.slow
 def test_processes_of_this_machine_listen_to_this_machine_and_are_deaf_to_ctrl_c():
     import psutil
 

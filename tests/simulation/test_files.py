@@ -106,6 +106,7 @@ def test_frames_of_an_earlier_run_are_not_mixed_with_new_ones(tmp_path: Path, ca
     assert len(list(tmp_path.glob("openpose/cam0/*.json"))) == 2
 
 
+@pytest.mark.slow
 def test_a_sequence_of_recorded_motions(shared_data: Path, tmp_path: Path, monkeypatch):
     monkeypatch.setenv("SHAPEPOSE_DATA", str(shared_data.parent))
     options = ["simulate", "salsa", "--split", "tune", "--frames", "100:102", "--cameras", "3"]

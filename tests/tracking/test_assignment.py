@@ -186,7 +186,7 @@ def test_probabilities_are_the_marginals_of_all_ways_to_give_detections_out():
     score = np.random.default_rng(0).uniform(0, 1.6, (2, 5))
     possible = np.ones((2, 5), dtype=bool)
     possible[0, 2:4] = possible[1, 4] = False
-    weight = np.where(possible, np.exp(view_assignment._ODDS * (score - view_assignment._EVEN)), 0.0)
+    weight = np.where(possible, np.exp(5 * (score - 0.45)), 0.0)
     expected = by_enumeration(weight, detections.view)
     found = view_assignment.probabilities(score, possible, detections, 2)
     np.testing.assert_allclose(found[:, [1, 3]], expected[:, [1, 3]], atol=1e-9)

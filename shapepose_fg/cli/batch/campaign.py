@@ -269,7 +269,7 @@ def _look_at(entry: Entry, folder: Path, begun: bool) -> int:
     """Bytes of a recording's detections."""
     known = prepare(entry.request, folder, tell=lambda _: None)
     asked = known.request
-    places, _ = find_places(known.detections, asked.rig())
+    _, places, _ = find_places(known.detections, asked.rig())
     find_skeleton(asked.skeleton)
     source = known.settings().offsets.source
     for file in (asked.body, asked.timestamps, None if source in ("recording", "none") else Path(source)):

@@ -36,7 +36,8 @@ def result(scene: Scene) -> Reconstruction:
     frame, person = (index.ravel() for index in np.indices((FRAMES, 2)))
     motion, N = scene.motion, 2 * FRAMES
     wrist, ankle = BODY_25.index(GUESSED[1]), BODY_25.index(LOST[2])
-    variance = np.random.default_rng(0).uniform(1e-5, 4e-4, (N, 25, 3))
+    rng = np.random.default_rng(0)
+    variance = rng.uniform(1e-5, 4e-4, (N, 25, 3))
     joints, covariance = scene.keypoints.reshape(N, 25, 3).copy(), variance[..., None] * np.eye(3)
     known = np.full((N, 25), Known.SEEN)
     known[person == 0, wrist] = Known.BODY
@@ -55,14 +56,14 @@ def result(scene: Scene) -> Reconstruction:
         joint_names=np.array(BODY_25.joints),
         joints=joints,
         covariance=covariance,
-        confidence=np.full((N, 25), 0.7),
+        confidence=rng.uniform(0.3, 1, (N, 25)),
         betas=betas,
         global_orient=orient,
         body_pose=pose.reshape(N, 23, 3),
         transl=transl,
         status=np.where(bare, "body undetermined", "ok"),
         time_s=(frame + FIRST) / FPS,
-        velocity=np.zeros((N, 25, 3)),
+        velocity=rng.normal(0, 1, (N, 25, 3)),
         known=known,
         run={"frames": [FIRST, FIRST + FRAMES], "configuration": {"temporal": True}, "time": {"fps": FPS}},
     )

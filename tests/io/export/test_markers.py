@@ -172,20 +172,27 @@ def test_names_are_those_of_pose2sim_s_models():
 
 
 def test_csv_read_back(saved, result):
-    rows = list(csv.DictReader(io.StringIO(csv_text(read_take(saved)))))
-    assert tuple(rows[0]) == tuple(COLUMNS)
-    assert len(rows) == np.isfinite(result.joints).all(axis=2).sum()
-    frames = {int(row["frame"]) for row in rows if row["person"] == "7"}
-    assert not frames & set(AWAY)
-    row = next(row for row in rows if row["frame"] == "103" and row["person"] == "3" and row["joint"] == "RWrist")
-    there = result.rows((result.frame == 103) & (result.person == 3))
-    wrist = BODY_25.index("RWrist")
-    xyz = [float(row[name]) for name in ("x_m", "y_m", "z_m")]
-    np.testing.assert_allclose(xyz, there.joints[0, wrist], atol=5.1e-7)  # in the recording's own axes
-    sigmas = [float(row[f"sigma_{axis}_m"]) for axis in "xyz"]
-    np.testing.assert_allclose(sigmas, np.sqrt(np.diag(there.covariance[0, wrist])), atol=5.1e-7)
-    assert float(row["sigma_m"]) == pytest.approx(np.sqrt(np.mean(np.square(sigmas))), abs=1e-6)
-    assert row["known"] == "body" and row["time_s"] == "4.120000"
+    """Every cell, in the recording's own axes; lines by frame, person and joint."""
+    lines = list(csv.DictReader(io.StringIO(csv_text(read_take(saved)))))
+    assert tuple(lines[0]) == tuple(COLUMNS)
+    row, joint = np.nonzero(np.isfinite(result.joints).all(axis=2))
+    order = np.lexsort((joint, result.person[row], result.frame[row]))
+    row, joint = row[order], joint[order]
+    frames, persons = result.frame[row], result.person[row]
+    names = [(int(line["frame"]), int(line["person"]), line["joint"]) for line in lines]
+    assert names == list(zip(frames.tolist(), persons.tolist(), result.joint_names[joint].tolist(), strict=True))
+    variance = np.diagonal(result.covariance[row, joint], axis1=1, axis2=2)
+    expected = {"time_s": frames / FPS, "sigma_m": np.sqrt(variance.mean(axis=1))}
+    expected |= {"confidence": result.confidence[row, joint]}
+    for n, axis in enumerate("xyz"):
+        expected[f"{axis}_m"] = result.joints[row, joint, n]
+        expected[f"sigma_{axis}_m"] = np.sqrt(variance[:, n])
+        expected[f"v{axis}_m_s"] = result.velocity[row, joint, n]
+    for name, column in expected.items():
+        half_a_digit = 5.1e-5 if name == "confidence" else 5.1e-7
+        np.testing.assert_allclose([float(line[name]) for line in lines], column, atol=half_a_digit, err_msg=name)
+    guessed = (persons == GUESSED[0]) & (result.joint_names[joint] == GUESSED[1])
+    assert [line["known"] for line in lines] == np.where(guessed, "body", "seen").tolist()
 
 
 def test_a_missing_package_is_one_sentence_with_the_command(job, monkeypatch):
