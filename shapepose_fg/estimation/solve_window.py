@@ -30,9 +30,9 @@ from shapepose_fg.estimation.smoothing import smoothed
 from shapepose_fg.estimation.state import State
 from shapepose_fg.estimation.window_graph import ExtraFactors, WindowGraph
 from shapepose_fg.estimation.window_solution import WindowSolution
-from shapepose_fg.tracking.hypotheses import Input
 from shapepose_fg.tracking.reassociation import Survival, reassociate
 from shapepose_fg.tracking.view_assignment import AssignmentConfig
+from shapepose_fg.tracking.worlds import Input
 
 _SETTLED = 0.002
 """Detections are not assigned again when fewer than this share of them changed: in crowds before six cameras after

@@ -20,8 +20,8 @@ from shapepose_fg.pipeline.runs.notes import Notebook
 from shapepose_fg.pipeline.windows import Engine, Span
 from shapepose_fg.proposal.association import AssociationConfig, associate
 from shapepose_fg.proposal.candidates import CandidateConfig, PairPoints, triangulate_pairs, vote
-from shapepose_fg.proposal.hypotheses import Frame
 from shapepose_fg.proposal.people_2d import without_repeats
+from shapepose_fg.proposal.possible_people import Frame
 from shapepose_fg.proposal.proposals import ProposalConfig, propose
 from shapepose_fg.proposal.selection import choose
 from shapepose_fg.proposal.thinning import thinned_candidates, thinned_points

@@ -10,11 +10,11 @@ from shapepose_fg.body.fitting.priors import longest_bones
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.assignment import lesser
-from shapepose_fg.proposal.hypotheses import Frame, Hypotheses, gaps
+from shapepose_fg.proposal.possible_people import Frame, PossiblePeople, gaps
 from shapepose_fg.proposal.selection import PRIOR_WITH_BODY, existence
 from shapepose_fg.tracking.following import core_distance
-from shapepose_fg.tracking.hypotheses import Input
 from shapepose_fg.tracking.view_assignment import AssignmentConfig, assign_with_probability
+from shapepose_fg.tracking.worlds import Input
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def _existence(
 ) -> NDArray[np.float64]:
     """(P,) how probable each person of a frame is."""
     there = Frame(frame.detections, frame.rig, skeleton, longest_bones(skeleton))
-    return existence(Hypotheses(joints, candidate, gaps(joints, candidate, there)), there, PRIOR_WITH_BODY)
+    return existence(PossiblePeople(joints, candidate, gaps(joints, candidate, there)), there, PRIOR_WITH_BODY)
 
 
 def _gone(

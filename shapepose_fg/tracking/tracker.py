@@ -1,7 +1,7 @@
 """People are followed from frame to frame: predicted, found again in the views, measured.
 
 A track predicts where its joints are; the detections there are its observations, whether or not stage I would have
-found the person in this frame. Several worlds are followed at once (`hypotheses.py`): a world is a set of people,
+found the person in this frame. Several worlds are followed at once (`worlds.py`): a world is a set of people,
 of whom each detection has one; worlds know nothing of each other.
 """
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.tracking.evidence import Chosen, choose, left_over, own_evidence, probability, weighed
-from shapepose_fg.tracking.hypotheses import lasting
+from shapepose_fg.tracking.presence import Chosen, choose, left_over, own_evidence, probability, weighed
+from shapepose_fg.tracking.worlds import lasting
 
 PLACES = 4
 PRICE = 0.15

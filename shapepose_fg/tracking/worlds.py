@@ -2,7 +2,7 @@
 
 A world is a set of people of whom each detection has one. Who is there is seen best in some frame, and hardly in
 others; so people are sought in several frames, followed from there forwards and backwards, and what explains most
-is chosen (`evidence.py`). Whoever was chosen is put together in one world in the frames in which they are seen
+is chosen (`presence.py`). Whoever was chosen is put together in one world in the frames in which they are seen
 best, and followed from there again: people who know of each other do not take each other's detections.
 """
 
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
-from shapepose_fg.tracking.evidence import Chosen, choose, left_over, weighed
 from shapepose_fg.tracking.motion_filter import JointStates
+from shapepose_fg.tracking.presence import Chosen, choose, left_over, weighed
 from shapepose_fg.tracking.tracker import Tracker, Tracks
 
 Array = NDArray[np.float64]

@@ -76,7 +76,7 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Hypotheses:
+class PossiblePeople:
     """H people who may be there."""
 
     places: Array
@@ -89,30 +89,30 @@ class Hypotheses:
     def __len__(self) -> int:
         return len(self.places)
 
-    def rows(self, index: NDArray) -> "Hypotheses":
+    def rows(self, index: NDArray) -> "PossiblePeople":
         """Some of them."""
-        return Hypotheses(self.places[index], self.chosen[index], self.gap_m[index])
+        return PossiblePeople(self.places[index], self.chosen[index], self.gap_m[index])
 
-    def with_more(self, other: "Hypotheses") -> "Hypotheses":
+    def with_more(self, other: "PossiblePeople") -> "PossiblePeople":
         """These and others."""
-        return Hypotheses(
+        return PossiblePeople(
             np.concatenate([self.places, other.places]),
             np.concatenate([self.chosen, other.chosen]),
             np.concatenate([self.gap_m, other.gap_m]),
         )
 
-    def completed(self, person: int, part: "Hypotheses") -> "Hypotheses":
+    def completed(self, person: int, part: "PossiblePeople") -> "PossiblePeople":
         """The same with the joints of `part`, which is one, for those that `person` lacks."""
         lacks = np.zeros(self.places.shape[:2], dtype=bool)
         lacks[person] = np.isnan(self.places[person, :, 0]) & np.isfinite(part.places[0, :, 0])
-        return Hypotheses(
+        return PossiblePeople(
             np.where(lacks[..., None], part.places, self.places),
             np.where(lacks[..., None], part.chosen, self.chosen),
             np.where(lacks[..., None], part.gap_m, self.gap_m),
         )
 
     @classmethod
-    def none(cls, frame: Frame) -> "Hypotheses":
+    def none(cls, frame: Frame) -> "PossiblePeople":
         """Nobody."""
         shape = (0, len(frame.skeleton), len(frame.rig))
         return cls(np.zeros((*shape[:2], 3)), np.full(shape, -1, dtype=np.intp), np.zeros(shape))
@@ -120,7 +120,7 @@ class Hypotheses:
 
 def settled(
     places: Array, owns: NDArray[np.bool_], frame: Frame, passes: int, *, exclusive: bool = False
-) -> Hypotheses:
+) -> PossiblePeople:
     """People at `places` (H, J, 3) who are thought to own `owns` (H, D): detections chosen, joints triangulated.
 
     Several times in turn. With `exclusive` each detection is one person's; without, each takes what it would
@@ -137,7 +137,7 @@ def settled(
         chosen = np.where(astray[..., None], -1, chosen)
         owns = owned(chosen, len(frame.detections))
     places, gap_m = triangulated(chosen, frame)
-    return Hypotheses(places, chosen, gap_m)
+    return PossiblePeople(places, chosen, gap_m)
 
 
 def _claimed(places: Array, owns: NDArray[np.bool_], frame: Frame, *, exclusive: bool) -> NDArray[np.intp]:
