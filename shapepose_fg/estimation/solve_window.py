@@ -31,7 +31,6 @@ from shapepose_fg.estimation.state import State
 from shapepose_fg.estimation.window_graph import ExtraFactors, WindowGraph
 from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.tracking.reassociation import Survival, reassociate
-from shapepose_fg.tracking.view_assignment import AssignmentConfig
 from shapepose_fg.tracking.worlds import Input
 
 _SETTLED = 0.002
@@ -47,8 +46,6 @@ class Assigning:
     """All detections of the window's frames, before cameras that stand still."""
     skeleton: Skeleton
     """The detector's joints."""
-    config: AssignmentConfig
-    """How."""
     rounds: int
     """How often."""
     over_time: bool
@@ -94,9 +91,7 @@ def solve_window(
             places, covariance = smoothed(places, covariance, observations.track, times_s, motion)
         survival = None if assigning.over_time else Survival().at(n / max(assigning.rounds - 1, 1))
         before = observations
-        observations = reassociate(
-            assigning.frames, before, places, covariance, assigning.skeleton, assigning.config, survival
-        )
+        observations = reassociate(assigning.frames, before, places, covariance, assigning.skeleton, survival)
         if assigning.over_time and _changed(before, observations) < _SETTLED:
             break
     assigned = time.perf_counter()

@@ -67,7 +67,7 @@ class Setup:
         config, given = self.config, [frame for frame, _ in span.decided]
         rows = Observations.concatenate([part for _, part in span.decided])
         rounds = config.windows.again_alone if span.alone else config.windows.again_over_time
-        assigning = Assigning(given, self.skeleton, config.tracking.assignment, rounds, over_time=not span.alone)
+        assigning = Assigning(given, self.skeleton, rounds, over_time=not span.alone)
         solution = solve_window(
             rows,
             Views.of(self.rig),

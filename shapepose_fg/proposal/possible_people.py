@@ -9,28 +9,14 @@ from numpy.typing import NDArray
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.proposal.association import (
-    match_views,
-    mean_affinity,
-    owned,
-    projected_distances,
-    share_overlaps,
-    without_ties,
-)
-
-Array = NDArray[np.float64]
+from shapepose_fg.proposal.claims import Array, Claims, owned, projected_distances
 
 _NEAR_M = 0.06
 """How closeness to a joint falls off: sigma of a Gaussian, as a length at the joint's depth, as in `assign`."""
 _FAR_M = 0.15
 """No detection whose ray passes a joint at more is the joint's."""
-_LEAST_AFFINITY = 0.3
-"""What counts as affinity where no neighbour is seen; unrelated pairs are mostly 0, true ones above 0.4."""
 _SURE_AFFINITY = 0.5
 """Mean affinity that takes a detection for a joint whose place nobody knows."""
-_OVERLAP_M = 0.025
-"""Two people's projected joints closer than this overlap, as a length at their depth: the one detection there
-serves both. A detector is 2 to 3 cm off."""
 _KERNEL_M = 0.03
 """Scale of the Cauchy kernel with which joints are triangulated: what a detector is off, measured."""
 _ROUNDS = 2
@@ -142,25 +128,15 @@ def settled(
 
 def _claimed(places: Array, owns: NDArray[np.bool_], frame: Frame, *, exclusive: bool) -> NDArray[np.intp]:
     """(H, J, V) the detections nearest to the joints; where no place is known, those of affinity to the owned."""
-    detections, shape = frame.detections, (*places.shape[:2], len(frame.rig))
-    distance_m = projected_distances(frame.rig.project(places), detections.joint, detections, frame.rig)
-    affinity, neighbours = mean_affinity(owns, detections, frame.skeleton, len(frame.rig))
-    score = np.exp(-0.5 * (distance_m / _NEAR_M) ** 2) + np.where(neighbours > 0, affinity, _LEAST_AFFINITY)
-    placed = np.isfinite(places[:, detections.joint, 0])
-    likely = (distance_m < _FAR_M) & (score >= 2 * _LEAST_AFFINITY)
-    likely |= ~placed & (affinity >= _SURE_AFFINITY)
-    if exclusive:
-        chosen = match_views(likely, score, detections, shape)
-        overlap = (distance_m < _OVERLAP_M) & (affinity >= _LEAST_AFFINITY)
-        share_overlaps(chosen, overlap, distance_m, detections)
-        return chosen
-    person, detection = np.nonzero(likely)
-    order = np.argsort(
-        without_ties(score, detections)[person, detection], kind="stable"
-    )  # the best is written last
-    person, detection = person[order], detection[order]
-    chosen = np.full(shape, -1, dtype=np.intp)
-    chosen[person, detections.joint[detection], detections.view[detection]] = detection
+    found, rig = frame.detections, frame.rig
+    distance_m = projected_distances(rig.project(places), found.joint, found, rig)
+    inside, unplaced = distance_m < _FAR_M, np.isnan(places[:, found.joint, 0])
+    claims = Claims(found, frame.skeleton, len(rig), distance_m, _NEAR_M**2, inside, unplaced, _SURE_AFFINITY)
+    scored = claims.scored(owns)
+    if not exclusive:
+        return claims.matched(scored, world=np.arange(len(places)))
+    chosen = claims.matched(scored)
+    claims.share(chosen, scored.affinity)
     return chosen
 
 

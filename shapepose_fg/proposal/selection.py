@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.proposal.association import mean_affinity, owned
 from shapepose_fg.proposal.candidates import PairPoints
+from shapepose_fg.proposal.claims import LEAST_AFFINITY, mean_affinity, owned
 from shapepose_fg.proposal.pairs_of_people import pooled
 from shapepose_fg.proposal.possible_people import Array, Frame, PossiblePeople, settled
 
@@ -56,8 +56,6 @@ simulated crowds before two to six cameras."""
 _BONE = 0.15
 """What a unit of a bone's log-likelihood counts: bones are not independent. In crowds before three to six
 cameras 1 to 4 points more people are found than without, with fewer phantoms, which 0.3 and 0.6 make again."""
-_UNAFFILIATED = 0.3
-"""Affinity of a detection none of whose neighbours is seen, which says nothing."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +79,7 @@ class Evidence:
         affinity, neighbours = mean_affinity(
             owned(chosen, len(detections)), detections, frame.skeleton, len(frame.rig)
         )
-        affinity = np.where(neighbours > 0, affinity, _UNAFFILIATED)
+        affinity = np.where(neighbours > 0, affinity, LEAST_AFFINITY)
         near = np.exp(-0.5 * (np.nan_to_num(people.gap_m, posinf=1.0) / _GAP_M) ** 2)
         some = len(detections) > 0
         worth = detections.confidence[chosen] * affinity[rows, chosen] * near if some else np.zeros(has.shape)

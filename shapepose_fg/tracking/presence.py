@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.proposal.association import mean_affinity, owned
+from shapepose_fg.proposal.claims import mean_affinity, owned
 
 Array = NDArray[np.float64]
 

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.proposal.association import AssociationConfig, _by_support, associate, owned
+from shapepose_fg.proposal.association import AssociationConfig, _by_support, associate
 from shapepose_fg.proposal.candidates import CandidateConfig, triangulate_pairs, vote
+from shapepose_fg.proposal.claims import owned
 from shapepose_fg.proposal.proposals import ProposalConfig, Proposals, propose
 
 CORE = list(BODY_25.core)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import BODY_25, Skeleton
-from shapepose_fg.proposal.association import mean_affinity, share_overlaps
 from shapepose_fg.proposal.candidates import CandidateConfig, Candidates, PairPoints, triangulate_pairs, vote
+from shapepose_fg.proposal.claims import LEAST_AFFINITY, Claims, mean_affinity
 from shapepose_fg.proposal.growth import GrowthConfig, Links, grow, link
 from shapepose_fg.proposal.proposals import ProposalConfig, _apart, _Search
 
@@ -274,10 +274,13 @@ def test_an_overlap_serves_only_joints_that_have_nothing_of_their_own():
     two = Detections(np.zeros(2, int), np.full(2, nose), np.zeros((2, 2)), np.ones(2), none, np.zeros(0))
     chosen = np.full((2, 25, 1), -1, dtype=np.intp)
     chosen[0, nose, 0] = 0
-    share_overlaps(chosen, np.ones((2, 2), dtype=bool), np.array([[3.0, 1.0], [2.0, 4.0]]), two)
+    gates, enough = np.ones((2, 2), dtype=bool), np.full((2, 2), LEAST_AFFINITY)
+    claims = Claims(two, BODY_25, 1, np.array([[0.03, 0.01], [0.02, 0.024]]), 1.0, gates, gates, 0.5)
+    claims.share(chosen, enough)
     assert chosen[:, nose, 0].tolist() == [0, 0]
     chosen[1] = -1
-    share_overlaps(chosen, np.ones((2, 2), dtype=bool), np.array([[3.0, 1.0], [4.0, 2.0]]), two)
+    claims = replace(claims, distance_m=np.array([[0.03, 0.01], [0.024, 0.02]]))
+    claims.share(chosen, enough)
     assert chosen[:, nose, 0].tolist() == [0, 1] and (np.delete(chosen, nose, axis=1) == -1).all()
 
 
