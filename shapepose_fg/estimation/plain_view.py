@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.camera import Views
+from shapepose_fg.estimation.limbs import ARMS_AND_LEGS
 
 Array = NDArray[np.float64]
 
@@ -25,22 +26,16 @@ SPEED_M_S = 2.0
 """But no farther than it has moved since a view reported it, at this speed: `factors.CONSTANT_VELOCITY.start`."""
 _BEHIND_M = 0.05
 """Limbs hide what is this much behind them."""
-_LIMBS = {
-    ("Neck", "MidHip"): 0.17, ("Neck", "Nose"): 0.11, **{
-        (f"{side}{first}", f"{side}{second}"): radius for side in "RL" for first, second, radius in (
-            ("Shoulder", "Hip", 0.1), ("Shoulder", "Elbow", 0.06), ("Elbow", "Wrist", 0.05), ("Hip", "Knee", 0.09),
-            ("Knee", "Ankle", 0.07),
-        )
-    },
-}  # fmt: skip
-"""What hides others' joints: from joint to joint, half its width in metres."""
+_TRUNK = {("Neck", "MidHip"): 0.17, ("Neck", "Nose"): 0.11, ("RShoulder", "RHip"): 0.1, ("LShoulder", "LHip"): 0.1}
+"""What hides others' joints beside arms and legs: from joint to joint, half its width in metres."""
 
 
 def limbs_that_hide(joints: Sequence[str]) -> tuple[NDArray[np.intp], Array]:
     """(L, 2) the ends of the limbs of a detector's joints, and (L,) half their widths, metres."""
-    place = {name: number for number, name in enumerate(joints)}
-    there = {(place[a], place[b]): r for (a, b), r in _LIMBS.items() if a in place and b in place}
-    return np.array(list(there), dtype=np.intp).reshape(-1, 2), np.array(list(there.values()))
+    limbs = _TRUNK | {(f"{s}{a}", f"{s}{b}"): width for s in "RL" for (a, b), width in ARMS_AND_LEGS.items()}
+    there = [(joints.index(a), joints.index(b), w) for (a, b), w in limbs.items() if {a, b} <= set(joints)]
+    table = np.array(there).reshape(-1, 3)
+    return table[:, :2].astype(np.intp), table[:, 2]
 
 
 def elsewhere_variance(
