@@ -3,19 +3,16 @@
 Stage I (e) of the paper (section 3.1): gives each person *their* 2D observation of every joint in every view.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.core.bounds import Settings, Share
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.candidates import Candidates
 from shapepose_fg.proposal.claims import LEAST_AFFINITY, Claims, owned, projected_distances
-from shapepose_fg.proposal.proposals import Proposals
+from shapepose_fg.proposal.proposals import ProposalConfig, Proposals
 
 _NEAR_M = 0.08
 """How closeness to the projected joint falls off: sigma of a Gaussian, as a length at the joint's depth."""
@@ -28,27 +25,13 @@ _PASSES = 2
 """How often the choice is made again with the neighbours that the last one chose."""
 
 
-@dataclass(frozen=True)
-class AssociationConfig(Settings):
-    """When a 2D detection is an observation of a proposal's joint."""
-
-    min_observed_parts: Share = 0.35
-    """Least fraction of the core joints (trunk, arms, legs) that two views must see: 6 of 15. Of one whose upper
-    body alone shows there are 9. The paper asks for none."""
-
-    @classmethod
-    def paper(cls) -> "AssociationConfig":
-        """As written: whoever was proposed stays."""
-        return cls(min_observed_parts=0.0)
-
-
 def associate(
     proposals: Proposals,
     candidates: Candidates,
     detections: Detections,
     rig: Rig,
     skeleton: Skeleton,
-    config: AssociationConfig,
+    config: ProposalConfig,
 ) -> tuple[Observations, int]:
     """Give every person at most one detection per joint and view, and every detection to one person.
 
