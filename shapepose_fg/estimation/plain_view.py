@@ -54,35 +54,34 @@ def elsewhere_variance(
     xy, depth, _ = views.project(joints)
     inside = (depth > 0) & ((xy >= 0) & (xy < views.image_sizes)).all(axis=-1) & ~strong
     row, joint = np.nonzero(~strong.any(axis=-1) & (inside.sum(axis=-1) >= LEAST_VIEWS))
+    focal = np.broadcast_to(views.focal_px, (len(joints), depth.shape[2]))
     missed = np.zeros(joints.shape[:2])
     for number in np.unique(frame[row]).tolist():
         here, of_frame = frame[row] == number, np.flatnonzero(frame == number)
-        hidden = _hidden(xy, depth, row[here], joint[here], of_frame, views, limbs)
+        hidden = _hidden((xy, depth), (row[here], joint[here]), of_frame, focal[row[here]], limbs)
         missed[row[here], joint[here]] = (inside[row[here], joint[here]] & ~hidden).sum(axis=-1)
     unusual = UNUSUAL / (UNUSUAL + MISSED**missed)
     return np.where(missed >= LEAST_VIEWS, unusual * ELSEWHERE_M**2, 0.0)
 
 
 def _hidden(
-    xy: Array,
-    depth: Array,
-    row: NDArray[np.intp],
-    joint: NDArray[np.intp],
+    projected: tuple[Array, Array],
+    places: tuple[NDArray[np.intp], NDArray[np.intp]],
     people: NDArray[np.intp],
-    views: Views,
+    focal_px: Array,
     limbs: tuple[NDArray[np.intp], Array],
 ) -> NDArray[np.bool_]:
-    """(K, V) whether the joints (`row`, `joint`) lie behind a limb of the `people` (P,), theirs included."""
-    ends, radius = limbs
-    focal = views.rows(row).focal_px
-    focal = np.broadcast_to(focal if focal.ndim == 2 else focal[None], (len(row), depth.shape[2]))
+    """(K, V) whether joints, the rows and columns `places` (K,), lie behind a limb of the `people` (P,), theirs
+    included; `projected` pixels and depths of all, `focal_px` (K, V).
+    """
+    (xy, depth), (row, joint), (ends, radius) = projected, places, limbs
     first, along = xy[people][:, ends[:, 0]], xy[people][:, ends[:, 1]] - xy[people][:, ends[:, 0]]  # (P, L, V, 2)
     away = xy[row, joint][:, None, None] - first  # (K, P, L, V, 2)
     at = (away * along).sum(axis=-1) / np.maximum((along**2).sum(axis=-1), 1e-9)
     at = np.clip(at, 0.0, 1.0)
     beside = np.linalg.norm(away - at[..., None] * along, axis=-1)
     ahead = (1 - at) * depth[people][:, ends[:, 0]] + at * depth[people][:, ends[:, 1]]
-    within = beside * ahead < radius[:, None] * focal[:, None, None]
+    within = beside * ahead < radius[:, None] * focal_px[:, None, None]
     hides = within & (ahead > 0) & (ahead < depth[row, joint][:, None, None] - _BEHIND_M)
     own = (people == row[:, None])[..., None] & (ends == joint[:, None, None]).any(axis=-1)[:, None]  # (K, P, L)
     return (hides & ~own[..., None]).any(axis=(1, 2))

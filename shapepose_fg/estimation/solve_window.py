@@ -14,16 +14,10 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.body_step import BodyStep, disagreement
 from shapepose_fg.estimation.contact import feet_of, walking
-from shapepose_fg.estimation.draft import Draft, first_places, redraft
+from shapepose_fg.estimation.draft import Draft, redraft
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.in_time import interpolated
-from shapepose_fg.estimation.linearisation import (
-    Message,
-    ViewEvidence,
-    linearise,
-    mean_confidence,
-    observation_sigmas,
-)
+from shapepose_fg.estimation.linearisation import Message, ViewEvidence, linearise, mean_confidence
 from shapepose_fg.estimation.motion_model import LOST_M, MotionModel
 from shapepose_fg.estimation.outcome import outcome
 from shapepose_fg.estimation.smoothing import smoothed
@@ -97,13 +91,12 @@ def solve_window(
     assigned = time.perf_counter()
 
     # Draft: X_0, the observations' sigmas there, and everybody's graph.
-    first = first_places(observations, views, fitter, config)
-    sigmas = observation_sigmas(observations, first, views, config.observations, config.joints)
-    state = State.start(observations, views, sigmas, first, config, motion, extra_factors)
+    state = State.start(observations, views, fitter, config, motion, extra_factors)
     moving = state.people
     for n in range(config.refine.alternations if len(moving) > 0 else 0):  # Algorithm 1
         rows = np.concatenate([person.rows for person in moving])
-        observed, sigma, cameras, X = observations.rows(rows), sigmas[rows], views.rows(rows), state.joints[rows]
+        observed, cameras = observations.rows(rows), views.rows(rows)
+        sigma, X = state.sigmas[rows], state.joints[rows]
 
         # Gate: what the views say around X, delta of Eq. 2.
         evidence = linearise(observed, sigma, X, cameras, config.observations)

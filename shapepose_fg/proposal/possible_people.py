@@ -77,25 +77,23 @@ class PossiblePeople:
 
     def rows(self, index: NDArray) -> "PossiblePeople":
         """Some of them."""
-        return PossiblePeople(self.places[index], self.chosen[index], self.gap_m[index])
+        return PossiblePeople(*(each[index] for each in self._arrays))
 
     def with_more(self, other: "PossiblePeople") -> "PossiblePeople":
         """These and others."""
-        return PossiblePeople(
-            np.concatenate([self.places, other.places]),
-            np.concatenate([self.chosen, other.chosen]),
-            np.concatenate([self.gap_m, other.gap_m]),
-        )
+        both = zip(self._arrays, other._arrays, strict=True)
+        return PossiblePeople(*(np.concatenate(each) for each in both))
 
     def completed(self, person: int, part: "PossiblePeople") -> "PossiblePeople":
         """The same with the joints of `part`, which is one, for those that `person` lacks."""
-        lacks = np.zeros(self.places.shape[:2], dtype=bool)
-        lacks[person] = np.isnan(self.places[person, :, 0]) & np.isfinite(part.places[0, :, 0])
-        return PossiblePeople(
-            np.where(lacks[..., None], part.places, self.places),
-            np.where(lacks[..., None], part.chosen, self.chosen),
-            np.where(lacks[..., None], part.gap_m, self.gap_m),
-        )
+        lacks = np.zeros((*self.places.shape[:2], 1), dtype=bool)
+        lacks[person] = np.isnan(self.places[person, :, :1]) & np.isfinite(part.places[0, :, :1])
+        both = zip(self._arrays, part._arrays, strict=True)
+        return PossiblePeople(*(np.where(lacks, new, old) for old, new in both))
+
+    @property
+    def _arrays(self) -> tuple[Array, NDArray[np.intp], Array]:
+        return self.places, self.chosen, self.gap_m
 
     @classmethod
     def none(cls, frame: Frame) -> "PossiblePeople":

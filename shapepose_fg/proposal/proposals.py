@@ -32,8 +32,7 @@ class ProposalConfig(Settings):
     """Whether people are sought as pairs of 2D people, and judged by evidence (`selection.py`). In the paper, hips
     of three votes anchor people: all the settings below are for that."""
     min_probability: Share = 0.3
-    """Least probability of a new person; time, or a body, tells more. Over time, 0.5 and 0.3 gave F1 95.2 and 95.7
-    in the mean of five simulated recordings before three and four cameras."""
+    """Least probability of a new person; time, or a body, tells more."""
 
     box_horizontal_m: Metres = 1.0
     """Half the width of the box around the hip: arms and legs stretched reach 1 m from it."""

@@ -58,8 +58,7 @@ class TrackingConfig(Settings):
     """How people are followed."""
 
     min_new_joints: Count = 4
-    """Core joints that two views must see, by detections that no track has, for a new person. In frames that stand
-    alone three are enough: evidence decides there."""
+    """Core joints that two views must see, by detections that no track has, for a new person."""
     patience_s: Seconds = 0.5
     """A track without evidence for longer has ended."""
 
@@ -113,7 +112,7 @@ class Tracks:
             self.time_s,
             np.append(self.ids, others.ids),
             np.append(self.world, others.world),
-            JointStates.concatenate(self.joints, others.joints),
+            JointStates.concatenate([self.joints, others.joints]),
             np.append(self.evident_s, others.evident_s),
         )
 

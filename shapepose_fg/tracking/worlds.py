@@ -97,8 +97,7 @@ class Hypotheses:
         columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
         first = np.cumsum([0, *(int(part.world.max(initial=-1)) + 1 for part in parts)])
         columns["world"] = np.concatenate([part.world + n for part, n in zip(parts, first, strict=False)])
-        mean, covariance = (np.concatenate([getattr(p.joints, n) for p in parts]) for n in ("mean", "covariance"))
-        return replace(parts[0], **columns, joints=JointStates(mean, covariance))
+        return replace(parts[0], **columns, joints=JointStates.concatenate([part.joints for part in parts]))
 
 
 @dataclass(frozen=True)
