@@ -35,7 +35,7 @@ class Observations(Table):
     probability: Annotated[NDArray[np.float64], Column("N J V", missing=1.0)] = _LATER
     """(N, J, V) how probable it is that the observation is this person's; 1 where it is not said."""
     evidence: Annotated[NDArray[np.float64], Column("N", missing=np.nan)] = _LATER
-    """(N,) what speaks for the person being there at all: over time `tracking/evidence.py`, `own_evidence`, frame
+    """(N,) what speaks for the person being there at all: over time `tracking/presence.py`, `own_evidence`, frame
     by frame a probability; NaN where it is not said."""
 
     def __post_init__(self) -> None:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from factors import kernel_weight
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
+from shapepose_fg.estimation.limbs import ARMS_AND_LEGS
 from shapepose_fg.estimation.linearisation import LEAST_PROBABILITY, Message, ObservationConfig, ViewEvidence
 
 Array = NDArray[np.float64]
@@ -22,22 +23,18 @@ REACH_M = 0.6
 FITS_M = 0.05
 """An exchanged limb fits a body if it is as long as the body's own up to this, one sigma, metres: what limbs that
 were solved differ from their bodies' by."""
-_LIMBS = {
-    f"{side}{far}": (f"{side}{near}", f"{side}{end}")
-    for side in "RL"
-    for far, near, end in (
-        ("Elbow", "Shoulder", "Elbow"), ("Wrist", "Elbow", "Wrist"), ("Knee", "Hip", "Knee"),
-        *((foot, "Knee", "Ankle") for foot in ("Ankle", "BigToe", "SmallToe", "Heel")),
-    )
-}  # fmt: skip
-"""Joints that get exchanged with a limb, and from where to where the limb goes: a foot goes with its ankle."""
+_FEET = ("BigToe", "SmallToe", "Heel")
 
 
 def limbs_to_exchange(joints: Sequence[str]) -> NDArray[np.intp]:
-    """(L, 3) joints of a detector that get exchanged with a limb, and the two ends of the limb."""
-    place = {name: number for number, name in enumerate(joints)}
-    there = [(far, *ends) for far, ends in _LIMBS.items() if {far, *ends} <= place.keys()]
-    return np.array([[place[name] for name in limb] for limb in there], dtype=np.intp).reshape(-1, 3)
+    """(L, 3) joints of a detector that get exchanged with a limb, and the two ends of the limb.
+
+    A foot goes with its ankle.
+    """
+    named = [(far, near, far) for near, far in ARMS_AND_LEGS] + [(foot, "Knee", "Ankle") for foot in _FEET]
+    limbs = [tuple(f"{side}{name}" for name in limb) for side in "RL" for limb in named]
+    there = [[joints.index(name) for name in limb] for limb in limbs if {*limb} <= set(joints)]
+    return np.array(there, dtype=np.intp).reshape(-1, 3)
 
 
 def exchange_spread(joints: Array, bodies: Array, frame: NDArray[np.integer], limbs: NDArray[np.intp]) -> Array:

@@ -18,8 +18,7 @@ class WindowGraphConfig(Settings):
     """What goes into a person's graph."""
 
     rho_3d: Share = 1.0
-    """rho_3D of Eq. 4: joints whose mean confidence over all views is at most this are pulled by the body model.
-    The covariances are meant, so the body is evidence on every joint; the paper's 0.25 is for comparisons."""
+    """rho_3D of Eq. 4: joints whose mean confidence over all views is at most this are pulled by the body."""
     weight_2d: Factor = 1.0
     """w_2D of Eq. 5, multiplies the squared reprojection errors. With sigmas that are true, both weights are 1."""
     weight_shape: Factor = 1.0
@@ -47,34 +46,28 @@ class RefineConfig(Settings):
     alternations: Repeats = 3
     """N of Algorithm 1: how often the body is fitted and the joints are solved, at the most."""
     window_alternations: Repeats = 1
-    """The same for windows of several frames, which start from a draft of all joints (`draft`): a second
-    round, at twice the time, changed the mean error by 0.1 to 0.2 mm. Windows with factors of the user's own take
-    as many as frames alone: what such a factor says may be far from what the views said."""
+    """The same for windows of several frames, which start from a draft of all joints (`draft`). Windows with
+    factors of the user's own take as many as frames alone: these may say what is far from what the views said."""
     settled_m: MetresOrNone = 0.002
     """A window whose joints all moved less in a round is done: most frames are after one or two. 0: none is."""
     max_sigma_m: Metres = 0.5
     """A joint whose views leave it less certain than this in some direction is not determined by them."""
     disagreement: Annotated[float, Interval(ge=0, le=1e6)] = 6.0
     """A joint that its views put this many standard deviations from where the body can have it is seen wrongly:
-    its gates are decided anew from the body's place, and the body is fitted again without what was thrown away. 4
-    threw away more joints that were right than wrong ones, in simulated crowds whose detections had been given out
-    again. 0: nothing is thrown away, as in the paper."""
+    its gates are decided anew from the body's place, and the body is fitted again. 4 threw away more joints that
+    were right than wrong ones, in simulated crowds. 0: nothing is thrown away, as in the paper."""
     draft_reach_m: MetresOrNone = 0.05
-    """Where detections are given out again, a body is fitted to the views' detections around it, fit by fit, under
-    a kernel that narrows to this, as in SMPLify: the distance from the projection, as a length at the joint's
-    depth, at which a detection counts a quarter. So others' limbs lose their hold on it. 0: the body is fitted
-    once, to what lies within `rho_2d_m` of where the views alone put each joint. On `tune`, frames alone, 0 / 5
-    cm: F1 91.9 / 93.8 %, MPJPE 44 / 35 mm; over time 18.8 / 18.1 mm."""
+    """A draft's body is fitted to the detections around it, fit by fit, under a kernel that narrows to this, as in
+    SMPLify: the distance from the projection, as a length at the joint's depth, at which a detection counts a
+    quarter. 0: once, to what lies within `rho_2d_m` of where the views alone put each joint. On `tune`, frame by
+    frame, 0 / 5 cm: F1 91.9 / 93.8 %, MPJPE 44 / 35 mm."""
     complete_start: bool = True
-    """Whether in frames that stand alone joints that two views saw and stage I did not place are triangulated for
-    X_0. In the paper they are missing until the body puts them somewhere. Windows of several frames start from a
-    draft, which triangulates in any case."""
+    """Whether frame by frame joints that two views saw and stage I did not place are triangulated for X_0. In the
+    paper they are missing until the body puts them somewhere."""
     body_from_views: bool = True
-    """Whether the body is fitted to what the views alone say of each joint, weighed by it. In Algorithm 1 it is
-    fitted to X_n, all joints alike, of which part was made by the body."""
+    """Whether the body is fitted to what the views alone say of each joint; in Algorithm 1 to X_n, all alike."""
     leave_one_out: bool = True
-    """Whether what the body says of a joint comes from a fit without that joint's own target, so that no view
-    counts twice. In the paper it is the body fitted to everything, the joint included."""
+    """Whether what the body says of a joint comes from a fit without that joint's own target."""
 
     @classmethod
     def paper(cls) -> "RefineConfig":

@@ -20,11 +20,11 @@ leave open a joint that counts as seen (`outcome.SEEN_M`). With `_SWEEPS` sweeps
 times, as if this were 5 cm: of what a limb lacks (s² / (v + s²))^4 is left, s being this and v the variance of its
 ends along it. Ends of 2 cm each close a quarter of it, ends of 10 cm each all but a hundredth. Results are
 measured so."""
-_LIMBS = (
-    ("Shoulder", "Elbow"), ("Elbow", "Wrist"), ("Hip", "Knee"), ("Knee", "Ankle"), ("Ankle", "Heel"),
-    ("Ankle", "BigToe"), ("BigToe", "SmallToe"),
-)  # fmt: skip
-"""From the trunk outwards, on either side; a detector may lack some."""
+ARMS_AND_LEGS = {
+    ("Shoulder", "Elbow"): 0.06, ("Elbow", "Wrist"): 0.05, ("Hip", "Knee"): 0.09, ("Knee", "Ankle"): 0.07,
+}  # fmt: skip
+"""From the trunk outwards, on either side, and half their widths, metres."""
+_FEET = (("Ankle", "Heel"), ("Ankle", "BigToe"), ("BigToe", "SmallToe"))
 _SWEEPS = 4
 """How often all limbs are gone through, each time with the covariances of before the first: a wrist follows the
 elbow that the shoulder holds."""
@@ -85,10 +85,9 @@ def limb_steps(
 
 
 def limbs_of(joints: Sequence[str]) -> list[tuple[int, int]]:
-    """The arms and legs among a detector's joints, as pairs of their numbers."""
-    place = {name: number for number, name in enumerate(joints)}
-    named = [(f"{side}{first}", f"{side}{second}") for side in "RL" for first, second in _LIMBS]
-    return [(place[first], place[second]) for first, second in named if first in place and second in place]
+    """The arms, legs and feet among a detector's joints, as pairs of their numbers."""
+    ends = [(f"{side}{a}", f"{side}{b}") for side in "RL" for a, b in (*ARMS_AND_LEGS, *_FEET)]
+    return [(joints.index(a), joints.index(b)) for a, b in ends if a in joints and b in joints]
 
 
 def limb_lengths(body: NDArray[np.float64], limbs: Sequence[tuple[int, int]]) -> NDArray[np.float64]:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.camera import Views
+from shapepose_fg.estimation.limbs import ARMS_AND_LEGS
 
 Array = NDArray[np.float64]
 
@@ -25,22 +26,16 @@ SPEED_M_S = 2.0
 """But no farther than it has moved since a view reported it, at this speed: `factors.CONSTANT_VELOCITY.start`."""
 _BEHIND_M = 0.05
 """Limbs hide what is this much behind them."""
-_LIMBS = {
-    ("Neck", "MidHip"): 0.17, ("Neck", "Nose"): 0.11, **{
-        (f"{side}{first}", f"{side}{second}"): radius for side in "RL" for first, second, radius in (
-            ("Shoulder", "Hip", 0.1), ("Shoulder", "Elbow", 0.06), ("Elbow", "Wrist", 0.05), ("Hip", "Knee", 0.09),
-            ("Knee", "Ankle", 0.07),
-        )
-    },
-}  # fmt: skip
-"""What hides others' joints: from joint to joint, half its width in metres."""
+_TRUNK = {("Neck", "MidHip"): 0.17, ("Neck", "Nose"): 0.11, ("RShoulder", "RHip"): 0.1, ("LShoulder", "LHip"): 0.1}
+"""What hides others' joints beside arms and legs: from joint to joint, half its width in metres."""
 
 
 def limbs_that_hide(joints: Sequence[str]) -> tuple[NDArray[np.intp], Array]:
     """(L, 2) the ends of the limbs of a detector's joints, and (L,) half their widths, metres."""
-    place = {name: number for number, name in enumerate(joints)}
-    there = {(place[a], place[b]): r for (a, b), r in _LIMBS.items() if a in place and b in place}
-    return np.array(list(there), dtype=np.intp).reshape(-1, 2), np.array(list(there.values()))
+    limbs = _TRUNK | {(f"{s}{a}", f"{s}{b}"): width for s in "RL" for (a, b), width in ARMS_AND_LEGS.items()}
+    there = [(joints.index(a), joints.index(b), w) for (a, b), w in limbs.items() if {a, b} <= set(joints)]
+    table = np.array(there).reshape(-1, 3)
+    return table[:, :2].astype(np.intp), table[:, 2]
 
 
 def elsewhere_variance(
@@ -59,35 +54,34 @@ def elsewhere_variance(
     xy, depth, _ = views.project(joints)
     inside = (depth > 0) & ((xy >= 0) & (xy < views.image_sizes)).all(axis=-1) & ~strong
     row, joint = np.nonzero(~strong.any(axis=-1) & (inside.sum(axis=-1) >= LEAST_VIEWS))
+    focal = np.broadcast_to(views.focal_px, (len(joints), depth.shape[2]))
     missed = np.zeros(joints.shape[:2])
     for number in np.unique(frame[row]).tolist():
         here, of_frame = frame[row] == number, np.flatnonzero(frame == number)
-        hidden = _hidden(xy, depth, row[here], joint[here], of_frame, views, limbs)
+        hidden = _hidden((xy, depth), (row[here], joint[here]), of_frame, focal[row[here]], limbs)
         missed[row[here], joint[here]] = (inside[row[here], joint[here]] & ~hidden).sum(axis=-1)
     unusual = UNUSUAL / (UNUSUAL + MISSED**missed)
     return np.where(missed >= LEAST_VIEWS, unusual * ELSEWHERE_M**2, 0.0)
 
 
 def _hidden(
-    xy: Array,
-    depth: Array,
-    row: NDArray[np.intp],
-    joint: NDArray[np.intp],
+    projected: tuple[Array, Array],
+    places: tuple[NDArray[np.intp], NDArray[np.intp]],
     people: NDArray[np.intp],
-    views: Views,
+    focal_px: Array,
     limbs: tuple[NDArray[np.intp], Array],
 ) -> NDArray[np.bool_]:
-    """(K, V) whether the joints (`row`, `joint`) lie behind a limb of the `people` (P,), theirs included."""
-    ends, radius = limbs
-    focal = views.rows(row).focal_px
-    focal = np.broadcast_to(focal if focal.ndim == 2 else focal[None], (len(row), depth.shape[2]))
+    """(K, V) whether joints, the rows and columns `places` (K,), lie behind a limb of the `people` (P,), theirs
+    included; `projected` pixels and depths of all, `focal_px` (K, V).
+    """
+    (xy, depth), (row, joint), (ends, radius) = projected, places, limbs
     first, along = xy[people][:, ends[:, 0]], xy[people][:, ends[:, 1]] - xy[people][:, ends[:, 0]]  # (P, L, V, 2)
     away = xy[row, joint][:, None, None] - first  # (K, P, L, V, 2)
     at = (away * along).sum(axis=-1) / np.maximum((along**2).sum(axis=-1), 1e-9)
     at = np.clip(at, 0.0, 1.0)
     beside = np.linalg.norm(away - at[..., None] * along, axis=-1)
     ahead = (1 - at) * depth[people][:, ends[:, 0]] + at * depth[people][:, ends[:, 1]]
-    within = beside * ahead < radius[:, None] * focal[:, None, None]
+    within = beside * ahead < radius[:, None] * focal_px[:, None, None]
     hides = within & (ahead > 0) & (ahead < depth[row, joint][:, None, None] - _BEHIND_M)
     own = (people == row[:, None])[..., None] & (ends == joint[:, None, None]).any(axis=-1)[:, None]  # (K, P, L)
     return (hides & ~own[..., None]).any(axis=(1, 2))

@@ -14,25 +14,18 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.body_step import BodyStep, disagreement
 from shapepose_fg.estimation.contact import feet_of, walking
-from shapepose_fg.estimation.draft import Draft, first_places, redraft
+from shapepose_fg.estimation.draft import Draft, redraft
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.in_time import interpolated
-from shapepose_fg.estimation.linearisation import (
-    Message,
-    ViewEvidence,
-    linearise,
-    mean_confidence,
-    observation_sigmas,
-)
+from shapepose_fg.estimation.linearisation import Message, ViewEvidence, linearise, mean_confidence
 from shapepose_fg.estimation.motion_model import LOST_M, MotionModel
 from shapepose_fg.estimation.outcome import outcome
 from shapepose_fg.estimation.smoothing import smoothed
 from shapepose_fg.estimation.state import State
 from shapepose_fg.estimation.window_graph import ExtraFactors, WindowGraph
 from shapepose_fg.estimation.window_solution import WindowSolution
-from shapepose_fg.tracking.hypotheses import Input
 from shapepose_fg.tracking.reassociation import Survival, reassociate
-from shapepose_fg.tracking.view_assignment import AssignmentConfig
+from shapepose_fg.tracking.worlds import Input
 
 _SETTLED = 0.002
 """Detections are not assigned again when fewer than this share of them changed: in crowds before six cameras after
@@ -47,8 +40,6 @@ class Assigning:
     """All detections of the window's frames, before cameras that stand still."""
     skeleton: Skeleton
     """The detector's joints."""
-    config: AssignmentConfig
-    """How."""
     rounds: int
     """How often."""
     over_time: bool
@@ -94,21 +85,18 @@ def solve_window(
             places, covariance = smoothed(places, covariance, observations.track, times_s, motion)
         survival = None if assigning.over_time else Survival().at(n / max(assigning.rounds - 1, 1))
         before = observations
-        observations = reassociate(
-            assigning.frames, before, places, covariance, assigning.skeleton, assigning.config, survival
-        )
+        observations = reassociate(assigning.frames, before, places, covariance, assigning.skeleton, survival)
         if assigning.over_time and _changed(before, observations) < _SETTLED:
             break
     assigned = time.perf_counter()
 
     # Draft: X_0, the observations' sigmas there, and everybody's graph.
-    first = first_places(observations, views, fitter, config)
-    sigmas = observation_sigmas(observations, first, views, config.observations, config.joints)
-    state = State.start(observations, views, sigmas, first, config, motion, extra_factors)
+    state = State.start(observations, views, fitter, config, motion, extra_factors)
     moving = state.people
     for n in range(config.refine.alternations if len(moving) > 0 else 0):  # Algorithm 1
         rows = np.concatenate([person.rows for person in moving])
-        observed, sigma, cameras, X = observations.rows(rows), sigmas[rows], views.rows(rows), state.joints[rows]
+        observed, cameras = observations.rows(rows), views.rows(rows)
+        sigma, X = state.sigmas[rows], state.joints[rows]
 
         # Gate: what the views say around X, delta of Eq. 2.
         evidence = linearise(observed, sigma, X, cameras, config.observations)

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.body.fitting.fitter import BodyFit, FitStatus
+from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
+from shapepose_fg.estimation.draft import first_places
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
-from shapepose_fg.estimation.linearisation import Message, ViewEvidence
+from shapepose_fg.estimation.linearisation import Message, ViewEvidence, observation_sigmas
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.window_graph import ExtraFactors, WindowGraph
 
@@ -55,13 +56,14 @@ class State:
         cls,
         observations: Observations,
         views: Views,
-        sigmas: NDArray[np.float64],
-        first: NDArray[np.float64],
+        fitter: BodyFitter,
         config: EstimatorConfig,
         motion: MotionModel,
         extra_factors: ExtraFactors | None,
     ) -> "State":
-        """Nothing but X_0, and a graph for everybody, with the user's factors in it."""
+        """X_0, the observations' sigmas there, and a graph for everybody, with the user's factors in it."""
+        first = first_places(observations, views, fitter, config)
+        sigmas = observation_sigmas(observations, first, views, config.observations, config.joints)
         people = list[WindowGraph]()
         for rows in window_rows(observations):
             person = WindowGraph(observations.rows(rows), sigmas[rows], views.rows(rows), config, motion, rows)

@@ -27,7 +27,10 @@ class Chains:
     """(C, T - 1, n, n) of each state, rows, with the one before it, columns."""
 
     def covariances(self) -> NDArray[np.float64]:
-        """(C, T, n, n) marginal covariance of each state; NaN in all states of a chain that is not determined."""
+        """(C, T, n, n) marginal covariance of each state; NaN in all states of a chain that is not determined.
+
+        The blocks on the diagonal of the inverse: block Cholesky down the chains, and back, for all together.
+        """
         try:
             return self._blocks_of_inverse()
         except np.linalg.LinAlgError:
@@ -38,10 +41,6 @@ class Chains:
         return np.concatenate([chain.covariances() for chain in single])
 
     def _blocks_of_inverse(self) -> NDArray[np.float64]:
-        """(C, T, n, n) blocks on the diagonal of the inverse; LinAlgError where a chain is not determined.
-
-        Block Cholesky down the chains, and these blocks on the way back, for all chains together.
-        """
         steps = self.diagonal.shape[1]
         inverse, gain = np.empty_like(self.diagonal), np.empty_like(self.below)
         for t in range(steps):

@@ -238,12 +238,14 @@ class WindowGraph:
         inside = [(n, key) for n, key in enumerate(keys.ravel().tolist()) if self.values.exists(key)]
         if len(inside) == 0 or self.failure:
             return result.reshape(*keys.shape, 3, 3)
-        try:
-            found = self._marginals
-            for n, key in inside:
-                result[n] = found.marginalCovariance(key)
-        except RuntimeError:
-            result = self._damped_marginals(inside, keys.size)
+        for damped in (False, True):
+            try:
+                found = gtsam.Marginals(self._damped() if damped else self.graph, self.values)
+                for n, key in inside:
+                    result[n] = found.marginalCovariance(key)
+                break
+            except RuntimeError:
+                result[:] = np.nan
         result[~is_determined(result)] = np.nan
         return result.reshape(*keys.shape, 3, 3)
 
@@ -255,25 +257,13 @@ class WindowGraph:
         parameters.setRelativeErrorTol(self.config.tolerance * (10.0 if self.temporal else 1.0))
         return parameters
 
-    @property
-    def _marginals(self) -> gtsam.Marginals:
-        """Of the last solution; RuntimeError where the system is singular."""
-        return gtsam.Marginals(self.graph, self.values)
-
-    def _damped_marginals(self, inside: list[tuple[int, int]], count: int) -> NDArray[np.float64]:
-        """The same with a prior of 100 m on every variable: what is then wider than 10 m is not determined."""
-        result = np.full((count, 3, 3), np.nan)
+    def _damped(self) -> gtsam.NonlinearFactorGraph:
+        """The problem with a prior of 100 m on all variables: what is then wider than 10 m is not determined."""
         damped = gtsam.NonlinearFactorGraph(self.graph)
         wide = gtsam.noiseModel.Isotropic.Sigma(3, 100.0)
         for key in self.values.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
             damped.push_back(gtsam.PriorFactorPoint3(key, self.values.atPoint3(key), wide))
-        try:
-            found = gtsam.Marginals(damped, self.values)
-            for n, key in inside:
-                result[n] = found.marginalCovariance(key)
-        except RuntimeError:
-            return np.full((count, 3, 3), np.nan)
-        return result
+        return damped
 
     def _optimise(self) -> None:
         """Levenberg-Marquardt from `values`; where it fails they stay as they are, and `failure` says why."""

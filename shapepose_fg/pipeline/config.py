@@ -12,7 +12,6 @@ from shapepose_fg.estimation.detector_offsets import OffsetConfig
 from shapepose_fg.estimation.estimator_config import EstimatorConfig, RefineConfig, WindowGraphConfig
 from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.estimation.motion_model import MotionConfig
-from shapepose_fg.proposal.association import AssociationConfig
 from shapepose_fg.proposal.candidates import CandidateConfig
 from shapepose_fg.proposal.proposals import ProposalConfig
 from shapepose_fg.tracking.following import FollowingConfig
@@ -80,7 +79,7 @@ class SolvingConfig(Settings):
             raise ValueError(f"motion must be one of {', '.join(MOTIONS)}, got {self.motion}")
 
 
-Rules = TypeVar("Rules", CandidateConfig, ProposalConfig, AssociationConfig, WindowGraphConfig, RefineConfig)
+Rules = TypeVar("Rules", CandidateConfig, ProposalConfig, WindowGraphConfig, RefineConfig)
 _CONSTANT = "is no table any more: its settings are constants beside the steps that use them"
 
 
@@ -160,13 +159,8 @@ class PipelineConfig(Settings):
 
     @property
     def proposals(self) -> ProposalConfig:
-        """Stage I (d): candidates to people."""
+        """Stage I (d, e): candidates to people, and people to their 2D observations."""
         return replace(self._rules(ProposalConfig), min_probability=self.people.min_probability)
-
-    @property
-    def association(self) -> AssociationConfig:
-        """Stage I (e): people to their 2D observations."""
-        return self._rules(AssociationConfig)
 
     @property
     def tracking(self) -> TrackingConfig:

@@ -18,10 +18,10 @@ from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.runs.notes import Notebook
 from shapepose_fg.pipeline.windows import Engine, Span
-from shapepose_fg.proposal.association import AssociationConfig, associate
+from shapepose_fg.proposal.association import associate
 from shapepose_fg.proposal.candidates import CandidateConfig, PairPoints, triangulate_pairs, vote
-from shapepose_fg.proposal.hypotheses import Frame
 from shapepose_fg.proposal.people_2d import without_repeats
+from shapepose_fg.proposal.possible_people import Frame
 from shapepose_fg.proposal.proposals import ProposalConfig, propose
 from shapepose_fg.proposal.selection import choose
 from shapepose_fg.proposal.thinning import thinned_candidates, thinned_points
@@ -67,7 +67,7 @@ class Setup:
         config, given = self.config, [frame for frame, _ in span.decided]
         rows = Observations.concatenate([part for _, part in span.decided])
         rounds = config.windows.again_alone if span.alone else config.windows.again_over_time
-        assigning = Assigning(given, self.skeleton, config.tracking.assignment, rounds, over_time=not span.alone)
+        assigning = Assigning(given, self.skeleton, rounds, over_time=not span.alone)
         solution = solve_window(
             rows,
             Views.of(self.rig),
@@ -122,14 +122,12 @@ class StageOne:
     candidates: CandidateConfig
     """Pairs of views to 3D joint candidates."""
     proposals: ProposalConfig
-    """Candidates to people."""
-    association: AssociationConfig
-    """People to their 2D observations."""
+    """Candidates to people, and people to their 2D observations."""
 
     @classmethod
     def of(cls, config: PipelineConfig) -> "StageOne":
         """As the settings have it."""
-        return cls(config.candidates, config.proposals, config.association)
+        return cls(config.candidates, config.proposals)
 
     def by_hips(self) -> "StageOne":
         """The same with people sought by their hips, as in the paper, and not judged by evidence."""
@@ -167,7 +165,7 @@ class StageOne:
         with book.stage("propose"):
             proposals = propose(candidates, detections, skeleton, rig.up_vector, self.proposals)
         with book.stage("associate"):
-            observations, phantoms = associate(proposals, candidates, detections, rig, skeleton, self.association)
+            observations, phantoms = associate(proposals, candidates, detections, rig, skeleton, self.proposals)
         for reason, count in (*proposals.dropped.items(), ("hardly any joint seen by two views", phantoms)):
             book.drop(reason, count)
         return observations

@@ -32,7 +32,7 @@ from shapepose_fg.pipeline.runs.notes import Notebook, Notes
 from shapepose_fg.pipeline.runs.parts import Parts
 from shapepose_fg.pipeline.solved_windows import SolvedWindows
 from shapepose_fg.proposal.thinning import ThinnedFrames
-from shapepose_fg.tracking.evidence import probability
+from shapepose_fg.tracking.presence import probability
 from shapepose_fg.tracking.stitching import Ends, Trace, stitch
 
 P = ParamSpec("P")

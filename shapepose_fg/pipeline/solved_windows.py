@@ -21,7 +21,7 @@ from shapepose_fg.pipeline.runs.notes import Notebook, Notes
 from shapepose_fg.pipeline.runs.parts import Checkpoint, Part
 from shapepose_fg.pipeline.windows import Span
 from shapepose_fg.proposal.thinning import ThinnedFrames
-from shapepose_fg.tracking.hypotheses import Input
+from shapepose_fg.tracking.worlds import Input
 
 _FALSE_POSITIVE = "next to no detections of their own, or in somebody else's place"
 """Why people are dropped when detections are reassociated."""

@@ -25,8 +25,7 @@ class CandidateConfig(Settings):
 
     gate_m: Metres = 0.07
     """Largest reprojection error of a pair's point, as a length at the point's depth. The point shares the gap
-    between the two rays out, so its error has 0.7 of a detection's sigma: 2 cm where the detector is half sure
-    (3 cm, measured on real detections), and this is over three times as much."""
+    between the two rays out: its error is 0.7 of a detection's sigma, 2 cm where the detector is half sure."""
     min_angle_deg: Annotated[float, Interval(gt=0, le=90)] = 3.0
     """Smallest angle between the two rays; below it depth is guessed, not measured."""
     vote_radius_m: Metres = 0.12
@@ -45,8 +44,7 @@ class CandidateConfig(Settings):
     their mean."""
 
     most_pairs: Annotated[int, Interval(ge=1000, le=1_000_000)] = 150_000
-    """Pairs of detections of one joint that a frame may have: of more, each view keeps its most confident ones. 18
-    a view before 30 cameras, 47 before 12, 122 before 5."""
+    """Pairs of detections of one joint that a frame may have: of more, each view keeps its most confident ones."""
     most_points: Annotated[int, Interval(ge=100, le=100_000)] = 8000
     """Points of one joint: of more, the most confident. Twelve people before 30 cameras have 5000."""
     most_candidates: Annotated[int, Interval(ge=10, le=10_000)] = 250
@@ -118,13 +116,8 @@ def triangulate_pairs(detections: Detections, rig: Rig, config: CandidateConfig)
         np.concatenate([normalised, np.ones((len(detections), 1))], axis=1),
     )
     rays, origins = np.ascontiguousarray(rays.T), np.ascontiguousarray(rig.centres[detections.view].T)
-    parts = [slice(start, start + _PAIRS_AT_ONCE) for start in range(0, len(first), _PAIRS_AT_ONCE)]
-    near = np.concatenate(
-        [
-            np.zeros(0, dtype=bool),
-            *(_rays_meet(rays, origins, first[part], second[part], config) for part in parts),
-        ]
-    )
+    parts = [slice(start, start + _PAIRS_AT_ONCE) for start in range(0, max(len(first), 1), _PAIRS_AT_ONCE)]
+    near = np.concatenate([_rays_meet(rays, origins, first[part], second[part], config) for part in parts])
     first, second = first[near], second[near]
     xyz = _linear_points(rig, detections.view, normalised, first, second)
     error_m = np.maximum(
@@ -149,7 +142,8 @@ def vote(points: PairPoints, detections: Detections, views: int, config: Candida
     its remaining neighbours would be picked before them in any case, so the result is the same.
     """
     if len(points.xyz) == 0:
-        return _no_candidates()
+        none = np.zeros(0, dtype=np.intp)
+        return Candidates(np.zeros((0, 3)), none, np.zeros(0), none, none > 0, np.zeros((0, 2), dtype=np.intp))
     seed = _greedy_seeds(points, config.vote_radius_m)
     _, cluster = np.unique(seed, return_inverse=True)
     count = cluster.max() + 1
@@ -190,13 +184,6 @@ def _support(cluster: NDArray[np.intp], detection: NDArray[np.intp], detections:
     first = np.ones(len(order), dtype=bool)
     first[1:] = (cluster[1:] != cluster[:-1]) | (view[1:] != view[:-1])
     return np.stack([cluster[first], detection[first]], axis=1)
-
-
-def _no_candidates() -> Candidates:
-    none = np.zeros(0, dtype=np.intp)
-    return Candidates(
-        np.zeros((0, 3)), none, np.zeros(0), none, np.zeros(0, dtype=bool), np.zeros((0, 2), dtype=np.intp)
-    )
 
 
 def _same_joint_pairs(detections: Detections) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

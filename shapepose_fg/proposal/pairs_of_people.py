@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.proposal.candidates import PairPoints
-from shapepose_fg.proposal.hypotheses import Array, Frame, Hypotheses, connected, settled, sizes
 from shapepose_fg.proposal.people_2d import group_people
+from shapepose_fg.proposal.possible_people import Array, Frame, PossiblePeople, connected, settled, sizes
 
 _LEAST_JOINTS = 3
 """Joints of two 2D people that meet, and hang together: two hips may meet by chance."""
@@ -27,7 +27,7 @@ _PASSES = 3
 """How often detections are chosen around the joints, and joints triangulated."""
 
 
-def pooled(points: PairPoints, free: NDArray[np.bool_], frame: Frame) -> Hypotheses:
+def pooled(points: PairPoints, free: NDArray[np.bool_], frame: Frame) -> PossiblePeople:
     """People who may be there by the detections that are `free` (D,), each with all that it would explain.
 
     The pair points of two 2D people's joints, in parts that bones connect, are where a person may be; views that
@@ -45,7 +45,7 @@ def pooled(points: PairPoints, free: NDArray[np.bool_], frame: Frame) -> Hypothe
     has = np.isfinite(places[..., 0])
     different = _different(places, np.where(has, confidence[owners].sum(axis=1), 0.0).sum(axis=1))
     if len(different) == 0:
-        return Hypotheses.none(frame)
+        return PossiblePeople.none(frame)
     owners = owners[different]
     owns = (group == owners[:, :1]) | (group == owners[:, 1:])
     owns &= has[different][:, detections.joint]

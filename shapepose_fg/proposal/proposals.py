@@ -32,8 +32,7 @@ class ProposalConfig(Settings):
     """Whether people are sought as pairs of 2D people, and judged by evidence (`selection.py`). In the paper, hips
     of three votes anchor people: all the settings below are for that."""
     min_probability: Share = 0.3
-    """Least probability of a new person; time, or a body, tells more. Over time, 0.5 and 0.3 gave F1 95.2 and 95.7
-    in the mean of five simulated recordings before three and four cameras."""
+    """Least probability of a new person; time, or a body, tells more."""
 
     box_horizontal_m: Metres = 1.0
     """Half the width of the box around the hip: arms and legs stretched reach 1 m from it."""
@@ -54,15 +53,13 @@ class ProposalConfig(Settings):
     are, as in the paper."""
     split_shared: Annotated[int, Interval(ge=0, le=1000)] = 2
     """Core joints that the two may both have."""
-    min_own_views: Annotated[int, Interval(ge=0, le=1000)] = 0
-    """Views in which an anchor needs a detection of its own, not one that made a better anchor: where rays to
-    different people's hips cross, there is a candidate but nobody's. So is one of a person whose hips were taken
-    for a neighbour's, and which of the two it is shows when detections are given out again: F1 on `tune`, frames
-    alone, with 0 / 2 is 98.5 / 94.0 %; over time, before three and four cameras, 86 / 79 %."""
     min_grown_parts: Share = 0.4
     """Least fraction of the core joints that must have a strong candidate linked to the hip: one whose upper body
     alone shows has 0.6. On simulated people in close motion real ones have over 0.47, and most phantoms, whose
     joints belong to others, have less than 0.4. The paper asks for none."""
+    min_observed_parts: Share = 0.35
+    """Least fraction of the core joints that two views must see when each detection is one person's: 6 of 15. Of
+    one whose upper body alone shows there are 9. The paper asks for none."""
     weak_anchors: bool = True
     """Whether weak hips, and middles between two hips, anchor people too where strong joints are left over that
     nobody claims. In the paper only hips of three votes do."""
@@ -82,8 +79,8 @@ class ProposalConfig(Settings):
             evidence=False,
             separation_m=0.6,
             min_parts=0.9,
-            min_own_views=0,
             min_grown_parts=0.0,
+            min_observed_parts=0.0,
             split_m=0.0,
             weak_anchors=False,
             growth=GrowthConfig(bridge_m=0.0),
@@ -276,8 +273,8 @@ def _apart(
 ) -> NDArray[np.intp]:
     """Non-maximum suppression: `anchors` that stand apart from better ones and from `taken`, best first.
 
-    Apart in space, and with `min_own_views` in the views: a detection counts for one anchor only, and what is left
-    of a candidate without those that made better anchors decides how good it is.
+    A detection counts for one anchor only: what is left of a candidate without those that made better anchors
+    decides how good it is.
     """
     both = np.concatenate([taken, anchors])
     views = int(detections.view.max(initial=0)) + 1
@@ -288,12 +285,9 @@ def _apart(
     distance = np.linalg.norm(candidates.xyz[both, None] - candidates.xyz[both][None], axis=-1)
     open_ = np.ones(len(both), dtype=bool)
     kept = []
-    for _ in range(len(both)):  # a handful of people
-        eligible = open_ & ((weight > 0).sum(axis=1) >= config.min_own_views)
+    while open_.any():  # a handful of people
         waiting = np.flatnonzero(open_[: len(taken)])
-        if len(waiting) == 0 and not eligible.any():
-            break
-        best = waiting[0] if len(waiting) > 0 else np.where(eligible, weight.sum(axis=1), -1.0).argmax()
+        best = waiting[0] if len(waiting) > 0 else np.where(open_, weight.sum(axis=1), -1.0).argmax()
         kept.append(best)
         weight[made_of == made_of[best]] = 0.0
         open_ &= distance[best] >= config.separation_m

@@ -57,14 +57,10 @@ class Edit:
 
     def __str__(self) -> str:
         """The correction as it is typed."""
-        words = {
-            Action.MERGE: f"{self.person} {self.other}",
-            Action.SPLIT: f"{self.person} {self.frame} --new {self.other}",
-            Action.RENAME: f"{self.person} {self.other}",
-            Action.DROP: f"{self.person}",
-            Action.SWAP: f"{self.person} {self.other} {self.frame}",
-        }
-        return f"{self.action} {words[self.action]}"
+        if self.action == Action.SPLIT:
+            return f"{self.action} {self.person} {self.frame} --new {self.other}"
+        parts = self.action, self.person, self.other, self.frame
+        return " ".join(str(part) for part in parts if part is not None)
 
 
 @dataclass(frozen=True)
@@ -90,7 +86,18 @@ def free_number(person: NDArray[np.integer]) -> int:
 
 def apply(people: Reconstruction, edit: Edit) -> Edited:
     """`people` after one correction; ValueError, with the cure, where it cannot be made."""
-    return _EDITS[edit.action](people, edit)
+    rows = _rows_of(people, edit.person)
+    if edit.action == Action.DROP:
+        return Edited(people.rows(~rows))
+    if edit.action in (Action.MERGE, Action.SWAP):
+        others = _rows_of(people, _other(edit))
+        if edit.person == edit.other:
+            raise ValueError(f"{edit.action} needs two people, got {edit.person} twice")
+        return (_merge if edit.action == Action.MERGE else _swap)(people, edit, rows, others)
+    _refuse_taken(people, edit)
+    if edit.action == Action.SPLIT:
+        return _split(people, edit, rows)
+    return _relabelled(people, {edit.person: _other(edit)}, rows, changed=set())
 
 
 def replay(people: Reconstruction, edits: Sequence[Edit]) -> Edited:
@@ -143,70 +150,46 @@ def in_order(people: Reconstruction) -> Reconstruction:
     return people.rows(np.lexsort((people.person, people.frame)))
 
 
-def _merge(people: Reconstruction, edit: Edit) -> Edited:
-    one, other = _rows_of(people, edit.person), _rows_of(people, _other(edit))
-    both = np.intersect1d(people.frame[one], people.frame[other])
-    if edit.person == edit.other:
-        raise ValueError(f"merge needs two people, got {edit.person} twice")
+Rows = NDArray[np.bool_]
+"""(N,) some rows of a result."""
+
+
+def _merge(people: Reconstruction, edit: Edit, rows: Rows, others: Rows) -> Edited:
+    both = np.intersect1d(people.frame[rows], people.frame[others])
     if len(both) > 0:
         raise ValueError(
             f"{edit.person} and {edit.other} are both there in {len(both)} frames, the first is {both[0]}:"
             " they are two people; split one of them there, or drop one"
         )
-    return _relabelled(people, {_other(edit): edit.person}, other, changed={edit.person})
+    return _relabelled(people, {_other(edit): edit.person}, others, changed={edit.person})
 
 
-def _split(people: Reconstruction, edit: Edit) -> Edited:
-    rows, frame = _rows_of(people, edit.person), _frame(edit)
-    _refuse_taken(people, edit)
-    later = rows & (people.frame >= frame)
+def _split(people: Reconstruction, edit: Edit, rows: Rows) -> Edited:
+    assert edit.frame is not None
+    later = rows & (people.frame >= edit.frame)
     if not later.any() or (later == rows).all():
         frames = people.frame[rows]
         raise ValueError(
-            f"{edit.person} is there in frames {frames.min()} to {frames.max()}, and cannot be split at {frame};"
-            f" give a frame from {frames.min() + 1} to {frames.max()}"
+            f"{edit.person} is there in frames {frames.min()} to {frames.max()}, and cannot be split at"
+            f" {edit.frame}; give a frame from {frames.min() + 1} to {frames.max()}"
         )
     return _relabelled(people, {edit.person: _other(edit)}, later, changed={edit.person, _other(edit)})
 
 
-def _rename(people: Reconstruction, edit: Edit) -> Edited:
-    rows = _rows_of(people, edit.person)
-    _refuse_taken(people, edit)
-    return _relabelled(people, {edit.person: _other(edit)}, rows, changed=set())
-
-
-def _drop(people: Reconstruction, edit: Edit) -> Edited:
-    return Edited(people.rows(~_rows_of(people, edit.person)))
-
-
-def _swap(people: Reconstruction, edit: Edit) -> Edited:
-    one, other = _rows_of(people, edit.person), _rows_of(people, _other(edit))
-    if edit.person == edit.other:
-        raise ValueError(f"swap needs two people, got {edit.person} twice")
-    later = (one | other) & (people.frame >= _frame(edit))
+def _swap(people: Reconstruction, edit: Edit, rows: Rows, others: Rows) -> Edited:
+    assert edit.frame is not None
+    later = (rows | others) & (people.frame >= edit.frame)
     if not later.any():
-        last = people.frame[one | other].max()
+        last = people.frame[rows | others].max()
         raise ValueError(
             f"neither {edit.person} nor {edit.other} is there from frame {edit.frame} on; give one up to {last}"
         )
     names = {edit.person: _other(edit), _other(edit): edit.person}
-    if later.sum() == (one | other).sum():  # from before both began: they only change names
-        return _relabelled(people, names, later, changed=set())
-    return _relabelled(people, names, later, changed={edit.person, _other(edit)})
+    only_names = later.sum() == (rows | others).sum()  # from before both began
+    return _relabelled(people, names, later, changed=set() if only_names else set(names))
 
 
-_EDITS: dict[Action, Callable[[Reconstruction, Edit], Edited]] = {
-    Action.MERGE: _merge,
-    Action.SPLIT: _split,
-    Action.RENAME: _rename,
-    Action.DROP: _drop,
-    Action.SWAP: _swap,
-}
-
-
-def _relabelled(
-    people: Reconstruction, names: dict[int, int], rows: NDArray[np.bool_], changed: set[int]
-) -> Edited:
+def _relabelled(people: Reconstruction, names: dict[int, int], rows: Rows, changed: set[int]) -> Edited:
     """`people` with other identities in `rows` (N,); identities that lost all their rows are not to be solved."""
     person = people.person.copy()
     for old, new in names.items():
@@ -214,7 +197,7 @@ def _relabelled(
     return Edited(in_order(people.relabelled(person)), frozenset(changed) & frozenset(person.tolist()))
 
 
-def _rows_of(people: Reconstruction, person: int) -> NDArray[np.bool_]:
+def _rows_of(people: Reconstruction, person: int) -> Rows:
     """(N,) the rows of one identity; ValueError where there is nobody of that number."""
     rows = people.person == person
     if not rows.any():
@@ -239,9 +222,3 @@ def _other(edit: Edit) -> int:
     """The second identity of a correction that has one."""
     assert edit.other is not None
     return edit.other
-
-
-def _frame(edit: Edit) -> int:
-    """The frame of a correction that has one."""
-    assert edit.frame is not None
-    return edit.frame

@@ -11,9 +11,9 @@ from scipy.optimize import linear_sum_assignment
 from shapepose_fg.core.bounds import Seconds, Settings
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.tracking.evidence import Chosen, own_evidence
-from shapepose_fg.tracking.hypotheses import Hypotheses, Input, explained, times_of, unlikely
+from shapepose_fg.tracking.presence import Chosen, own_evidence
 from shapepose_fg.tracking.tracker import Tracker, Tracks
+from shapepose_fg.tracking.worlds import Hypotheses, Input, explained, times_of
 
 Array = NDArray[np.float64]
 
@@ -83,7 +83,7 @@ def _decide(tracker: Tracker, state: FollowState, own: int) -> tuple[FollowState
     """Rows of the first `own` frames that are pending."""
     frames = state.pending
     found, chosen = explained(tracker, frames, state.people, own - 1)
-    rest = unlikely(found, chosen, frames)
+    rest = found.account.left_over(chosen)
     for start, stop in zip(rest.start.tolist(), rest.stop.tolist(), strict=True):
         tracker.drop(_UNLIKELY, [frame.frame for frame in frames[start : min(stop, own)]])
     chosen = _with_detections(found, chosen, first=len(state.people) == 0, last=own == len(frames))

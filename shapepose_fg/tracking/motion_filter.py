@@ -55,11 +55,9 @@ class JointStates:
         return JointStates(self.mean[index], self.covariance[index])
 
     @classmethod
-    def concatenate(cls, first: "JointStates", second: "JointStates") -> "JointStates":
-        """The people of both."""
-        return cls(
-            np.concatenate([first.mean, second.mean]), np.concatenate([first.covariance, second.covariance])
-        )
+    def concatenate(cls, parts: Sequence["JointStates"]) -> "JointStates":
+        """The people of several."""
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("mean", "covariance")))
 
     @classmethod
     def at(cls, position: Array, sigma_m: Array, start: Sequence[float]) -> "JointStates":

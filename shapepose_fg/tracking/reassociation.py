@@ -10,11 +10,11 @@ from shapepose_fg.body.fitting.priors import longest_bones
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.assignment import lesser
-from shapepose_fg.proposal.hypotheses import Frame, Hypotheses, gaps
+from shapepose_fg.proposal.possible_people import Frame, PossiblePeople, gaps
 from shapepose_fg.proposal.selection import PRIOR_WITH_BODY, existence
 from shapepose_fg.tracking.following import core_distance
-from shapepose_fg.tracking.hypotheses import Input
-from shapepose_fg.tracking.view_assignment import AssignmentConfig, assign_with_probability
+from shapepose_fg.tracking.view_assignment import Predicted, assign_with_probability
+from shapepose_fg.tracking.worlds import Input
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,6 @@ def reassociate(
     joints: NDArray[np.float64],
     covariance: NDArray[np.float64],
     skeleton: Skeleton,
-    config: AssignmentConfig,
     survival: Survival | None = None,
 ) -> Observations:
     """The same rows with the detections around their `joints` (N, J, 3), known to `covariance` (N, J, 3, 3).
@@ -53,7 +52,7 @@ def reassociate(
         index = np.flatnonzero(rows.frame == frame.frame)
         if survival is not None:
             index = index[np.isfinite(sigma_m[index]).any(axis=1)]
-        candidate, probability = _given_out(frame, joints[index], sigma_m[index], skeleton, config)
+        candidate, probability = _given_out(frame, joints[index], sigma_m[index], skeleton)
         evidence = rows.evidence[index]
         while survival is not None and len(index) > 0:
             evidence = _existence(frame, candidate, joints[index], skeleton)
@@ -61,7 +60,7 @@ def reassociate(
             if not gone.any():
                 break
             index, evidence = index[~gone], evidence[~gone]
-            candidate, probability = _given_out(frame, joints[index], sigma_m[index], skeleton, config)
+            candidate, probability = _given_out(frame, joints[index], sigma_m[index], skeleton)
         part = Observations.of(candidate, frame.detections, joints[index])
         who = {name: getattr(rows, name)[index] for name in ("track", "frame", "time_s")}
         parts.append(replace(part, probability=probability, evidence=evidence, **who))
@@ -69,15 +68,11 @@ def reassociate(
 
 
 def _given_out(
-    frame: Input,
-    joints: NDArray[np.float64],
-    sigma_m: NDArray[np.float64],
-    skeleton: Skeleton,
-    config: AssignmentConfig,
+    frame: Input, joints: NDArray[np.float64], sigma_m: NDArray[np.float64], skeleton: Skeleton
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """(P, J, V) the detections of one frame's people, and how probably they are theirs."""
-    lost = ~np.isfinite(sigma_m)
-    return assign_with_probability(joints, sigma_m, lost, frame.detections, frame.rig, skeleton, config)
+    predicted = Predicted(joints, sigma_m, lost=~np.isfinite(sigma_m))
+    return assign_with_probability(predicted, frame.detections, frame.rig, skeleton)
 
 
 def _existence(
@@ -85,7 +80,7 @@ def _existence(
 ) -> NDArray[np.float64]:
     """(P,) how probable each person of a frame is."""
     there = Frame(frame.detections, frame.rig, skeleton, longest_bones(skeleton))
-    return existence(Hypotheses(joints, candidate, gaps(joints, candidate, there)), there, PRIOR_WITH_BODY)
+    return existence(PossiblePeople(joints, candidate, gaps(joints, candidate, there)), there, PRIOR_WITH_BODY)
 
 
 def _gone(

@@ -7,9 +7,8 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Interval
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 
 from shapepose_fg.core.bounds import Settings
 from shapepose_fg.core.skeleton import Skeleton
@@ -112,10 +111,7 @@ def stitch(ends: Ends, config: StitchingConfig, cuts_s: Sequence[float] = ()) ->
     be are joined, in the likeliest way by place and build. Nothing is joined across `cuts_s`.
     Time and memory grow with the pairs of tracks of which one begins within `longest_gap_s` of the other's end.
     """
-    before, after, cost = _pairs(ends, config, cuts_s)
-    joined = dict[int, int]()
-    for group in _groups(before, after, len(ends.track)):
-        joined |= _matched(before[group], after[group], cost[group])
+    joined = _matched(*_pairs(ends, config, cuts_s))
     names = {}
     for place in np.argsort(ends.time_s[:, 0], kind="stable").tolist():
         earlier = joined.get(place)
@@ -172,26 +168,16 @@ def _costs(apart_m: Array, reach_m: Array, unlike: Array) -> Array:
     return (apart_m / sigma_m) ** 2 + 4 * np.log(sigma_m / _PLACE_SIGMA_M) + unlike
 
 
-def _groups(before: NDArray[np.intp], after: NDArray[np.intp], count: int) -> list[NDArray[np.intp]]:
-    """Which pairs compete for tracks with each other, of `count` tracks: each group is decided by itself."""
-    if len(before) == 0:
-        return []
-    edges = coo_array((np.ones(len(before)), (before, count + after)), shape=(2 * count, 2 * count))
-    _, group = connected_components(edges, directed=False)
-    of_pair = group[before]
-    order = np.argsort(of_pair, kind="stable")
-    return np.split(order, np.flatnonzero(np.diff(of_pair[order])) + 1)
-
-
-def _matched(before: NDArray[np.intp], after: NDArray[np.intp], pair_cost: Array) -> dict[int, int]:
+def _matched(before: NDArray[np.intp], after: NDArray[np.intp], cost: Array) -> dict[int, int]:
     """For tracks that are joined the one before, of pairs (K,) that may be: as many as can be, the likeliest."""
     rows, row = np.unique(before, return_inverse=True)
     columns, column = np.unique(after, return_inverse=True)
-    count = len(rows)  # so many columns first: each track may have nobody after it
-    # A pair more counts more than all that others can gain by it.
-    alone = 1.0 + count * float(pair_cost.max())
-    cost = np.full((count, count + len(columns)), alone)
-    cost[row, count + column] = pair_cost
-    first, second = linear_sum_assignment(cost)
-    may = cost[first, second] < alone
-    return dict(zip(columns[second[may] - count].tolist(), rows[first[may]].tolist(), strict=True))
+    count, nobody = len(rows), len(columns) + np.arange(len(rows))  # each track may have nobody after it
+    # A pair more counts more than all that others can gain by it. A cost of 0 would be no pair.
+    alone = 2.0 + count * float(cost.max(initial=0.0))
+    costs = np.concatenate([1.0 + cost, np.full(count, alone)])
+    places = np.concatenate([row, np.arange(count)]), np.concatenate([column, nobody])
+    matrix = csr_array((costs, places), shape=(count, len(columns) + count))
+    first, second = min_weight_full_bipartite_matching(matrix) if count > 0 else (rows, rows)
+    joined = second < len(columns)
+    return dict(zip(columns[second[joined]].tolist(), rows[first[joined]].tolist(), strict=True))

@@ -1,12 +1,12 @@
 """People are followed from frame to frame: predicted, found again in the views, measured.
 
 A track predicts where its joints are; the detections there are its observations, whether or not stage I would have
-found the person in this frame. Several worlds are followed at once (`hypotheses.py`): a world is a set of people,
+found the person in this frame. Several worlds are followed at once (`worlds.py`): a world is a set of people,
 of whom each detection has one; worlds know nothing of each other.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, 
 from shapepose_fg.proposal.association import seen_twice
 from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.plausibility import torn_joints
-from shapepose_fg.tracking.view_assignment import AssignmentConfig, assign
+from shapepose_fg.tracking.view_assignment import FARTHEST_M, Predicted, assign
 
 Array = NDArray[np.float64]
 FindPeople = Callable[[Detections, Rig, bool], Observations]
@@ -57,11 +57,8 @@ _BIRTH_SIGMA_M = 0.04
 class TrackingConfig(Settings):
     """How people are followed."""
 
-    assignment: AssignmentConfig = field(default_factory=AssignmentConfig)
-    """Which detections are a track's."""
     min_new_joints: Count = 4
-    """Core joints that two views must see, by detections that no track has, for a new person. In frames that stand
-    alone three are enough: evidence decides there."""
+    """Core joints that two views must see, by detections that no track has, for a new person."""
     patience_s: Seconds = 0.5
     """A track without evidence for longer has ended."""
 
@@ -115,7 +112,7 @@ class Tracks:
             self.time_s,
             np.append(self.ids, others.ids),
             np.append(self.world, others.world),
-            JointStates.concatenate(self.joints, others.joints),
+            JointStates.concatenate([self.joints, others.joints]),
             np.append(self.evident_s, others.evident_s),
         )
 
@@ -154,16 +151,8 @@ class Tracker:
         lost = (joints.across_m > _LOST_M) & (before > _TRUSTED_M)
         lost &= ~lost[:, list(self.skeleton.core)].all(axis=1, keepdims=True)  # beside whom would they be sought?
         joints = self._beside_neighbours(joints, lost)
-        candidate = assign(
-            joints.position,
-            joints.sigma_m,
-            lost,
-            detections,
-            rig,
-            self.skeleton,
-            self.config.assignment,
-            tracks.world,
-        )
+        predicted = Predicted(joints.position, joints.sigma_m, lost, tracks.world)
+        candidate = assign(predicted, detections, rig, self.skeleton)
         joints, candidate = self._measure(joints, lost, candidate, detections, rig)
         evident_s = np.where(self._evident(candidate), time_s, tracks.evident_s)
         return replace(tracks, time_s=time_s, joints=joints, evident_s=evident_s), candidate
@@ -262,10 +251,9 @@ class Tracker:
             measured, inlier = joints.updated(said.information, toward), said.inlier
             at = measured.position
         trusted = measured.sigma_m < _TRUSTED_M
-        reach_m = self.config.assignment.farthest_m
-        torn = torn_joints(at, trusted, inlier.sum(axis=-1), self.scale.longest_m, self.skeleton, reach_m)
+        torn = torn_joints(at, trusted, inlier.sum(axis=-1), self.scale.longest_m, self.skeleton, FARTHEST_M)
         doubt = np.zeros(joints.covariance.shape[-2:])
-        doubt[:3, :3] = reach_m**2 * np.eye(3)
+        doubt[:3, :3] = FARTHEST_M**2 * np.eye(3)
         doubted = JointStates(measured.mean, measured.covariance + doubt)
         measured = measured.replaced(torn, doubted)
         return measured, np.where(inlier & ~torn[..., None], candidate, -1)

@@ -24,8 +24,8 @@ from shapepose_fg.pipeline.solved_windows import solve_chunk
 from shapepose_fg.pipeline.windows import Engine, WindowConfig
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.tracking.following import FollowingConfig
-from shapepose_fg.tracking.hypotheses import Input
 from shapepose_fg.tracking.tracker import BodyScale, Tracks
+from shapepose_fg.tracking.worlds import Input
 
 CONFIG = PipelineConfig(
     batch_frames=12, following=FollowingConfig(look_ahead_s=0.3), windows=WindowConfig(overlap_s=0.16)

@@ -10,7 +10,7 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.proposal.association import AssociationConfig, associate
+from shapepose_fg.proposal.association import associate
 from shapepose_fg.proposal.candidates import CandidateConfig, triangulate_pairs, vote
 from shapepose_fg.proposal.proposals import ProposalConfig, propose
 
@@ -23,7 +23,7 @@ def observe(detections: Detections, rig: Rig, truth: NDArray[np.float64], **sett
     config = CandidateConfig()
     candidates = vote(triangulate_pairs(detections, rig, config), detections, len(rig), config)
     proposals = propose(candidates, detections, BODY_25, UP, ProposalConfig())
-    found, _ = associate(proposals, candidates, detections, rig, BODY_25, AssociationConfig(**settings))
+    found, _ = associate(proposals, candidates, detections, rig, BODY_25, ProposalConfig(**settings))
     if len(truth) == 0:
         return found
     distance = np.nanmean(np.linalg.norm(found.initial[:, None] - truth[None], axis=-1), axis=-1)
@@ -194,4 +194,4 @@ def test_nobody_has_no_observations(five_cameras):
 
 def test_refuses_settings_that_make_no_sense():
     with pytest.raises(ValueError, match="min_observed_parts"):
-        AssociationConfig(min_observed_parts=-0.1)
+        ProposalConfig(min_observed_parts=-0.1)

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.proposal.association import AssociationConfig, _by_support, associate, owned
+from shapepose_fg.proposal.association import _by_support, associate
 from shapepose_fg.proposal.candidates import CandidateConfig, triangulate_pairs, vote
+from shapepose_fg.proposal.claims import owned
 from shapepose_fg.proposal.proposals import ProposalConfig, Proposals, propose
 
 CORE = list(BODY_25.core)
@@ -91,7 +92,7 @@ def test_observations_are_chosen_again_until_nobody_more_is_dropped(least, propo
         left, chosen = left[keep], chosen[keep]
         owns = owned(chosen, len(crowded))
         rounds = rounds - 1 if keep.all() else 2
-    config = AssociationConfig(min_observed_parts=least)
+    config = ProposalConfig(min_observed_parts=least)
     found, dropped = associate(proposals, candidates, crowded, five_cameras, BODY_25, config)
     np.testing.assert_array_equal(found.candidate, chosen)
     np.testing.assert_array_equal(found.initial, proposals.places[left])

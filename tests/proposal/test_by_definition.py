@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import BODY_25, Skeleton
-from shapepose_fg.proposal.association import mean_affinity, share_overlaps
 from shapepose_fg.proposal.candidates import CandidateConfig, Candidates, PairPoints, triangulate_pairs, vote
+from shapepose_fg.proposal.claims import LEAST_AFFINITY, Claims, mean_affinity
 from shapepose_fg.proposal.growth import GrowthConfig, Links, grow, link
 from shapepose_fg.proposal.proposals import ProposalConfig, _apart, _Search
 
 CONFIG = CandidateConfig()
 GATE_M, ANGLE_DEG, RHO_M = 0.07, 3.0, 0.12
 GROWTH = {"view_weight": 0.5, "sweeps": 2, "bridge_m": 0.55}
-PROPOSALS = {"box_horizontal_m": 1.0, "box_vertical_m": 1.2, "separation_m": 0.2, "min_own_views": 0}
+PROPOSALS = {"box_horizontal_m": 1.0, "box_vertical_m": 1.2, "separation_m": 0.2}
 """What is documented, so that another default is noticed."""
 
 
@@ -274,10 +274,13 @@ def test_an_overlap_serves_only_joints_that_have_nothing_of_their_own():
     two = Detections(np.zeros(2, int), np.full(2, nose), np.zeros((2, 2)), np.ones(2), none, np.zeros(0))
     chosen = np.full((2, 25, 1), -1, dtype=np.intp)
     chosen[0, nose, 0] = 0
-    share_overlaps(chosen, np.ones((2, 2), dtype=bool), np.array([[3.0, 1.0], [2.0, 4.0]]), two)
+    gates, enough = np.ones((2, 2), dtype=bool), np.full((2, 2), LEAST_AFFINITY)
+    claims = Claims(two, BODY_25, 1, np.array([[0.03, 0.01], [0.02, 0.024]]), 1.0, gates, gates, 0.5)
+    claims.share(chosen, enough)
     assert chosen[:, nose, 0].tolist() == [0, 0]
     chosen[1] = -1
-    share_overlaps(chosen, np.ones((2, 2), dtype=bool), np.array([[3.0, 1.0], [4.0, 2.0]]), two)
+    claims = replace(claims, distance_m=np.array([[0.03, 0.01], [0.024, 0.02]]))
+    claims.share(chosen, enough)
     assert chosen[:, nose, 0].tolist() == [0, 1] and (np.delete(chosen, nose, axis=1) == -1).all()
 
 
@@ -316,11 +319,10 @@ def apart(anchors, taken, candidates: Candidates, crowded, config: SimpleNamespa
     made_of = {n: set(candidates.support[candidates.support[:, 0] == n, 1].tolist()) for n in [*taken, *anchors]}
     kept, waiting, first = [], list(anchors), list(taken)
     while True:
-        own = [n for n in waiting if len(made_of[n]) >= config.min_own_views]
         if first:
             best = first.pop(0)
-        elif own:
-            best = max(own, key=lambda n: sum(crowded.confidence[row] for row in made_of[n]))
+        elif waiting:
+            best = max(waiting, key=lambda n: sum(crowded.confidence[row] for row in made_of[n]))
             kept.append(best)
         else:
             return kept
@@ -330,10 +332,8 @@ def apart(anchors, taken, candidates: Candidates, crowded, config: SimpleNamespa
         waiting = [n for n in waiting if n != best and far[n]]
 
 
-@pytest.mark.parametrize("own_views", [0, 2, 4])
-def test_anchors_stand_apart_in_space_and_by_their_detections(candidates, crowded, own_views):
-    config = ProposalConfig(min_own_views=own_views)
-    stated = SimpleNamespace(**PROPOSALS | {"min_own_views": own_views})
+def test_anchors_stand_apart_in_space_and_by_their_detections(candidates, crowded):
+    config, stated = ProposalConfig(), SimpleNamespace(**PROPOSALS)
     hips = np.flatnonzero(candidates.joint == BODY_25.root)
     assert len(hips) > 6
     expected = apart(hips.tolist(), [], candidates, crowded, stated)

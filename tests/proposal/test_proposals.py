@@ -10,7 +10,7 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.proposal.assignment import match_best_first
-from shapepose_fg.proposal.association import AssociationConfig, associate
+from shapepose_fg.proposal.association import associate
 from shapepose_fg.proposal.candidates import CandidateConfig, Candidates, triangulate_pairs, vote
 from shapepose_fg.proposal.growth import GrowthConfig, Links, grow, link
 from shapepose_fg.proposal.proposals import ProposalConfig, Proposals, propose
@@ -263,7 +263,7 @@ def test_a_phantom_where_rays_of_different_people_cross_is_dropped(five_cameras,
     assert (detections.joint[rows] == HIP).all()
     ghost = with_hip(candidates, two_people[:, HIP].mean(axis=0), votes=3, support=rows)
     proposals = propose(ghost, detections, BODY_25, UP, ProposalConfig())
-    people, unclaimed = associate(proposals, ghost, detections, five_cameras, BODY_25, AssociationConfig())
+    people, unclaimed = associate(proposals, ghost, detections, five_cameras, BODY_25, ProposalConfig())
     hips = people.initial[:, HIP]
     np.testing.assert_allclose(hips[hips[:, 0].argsort()], two_people[:, HIP], atol=0.005)
     assert unclaimed + sum(proposals.dropped.values()) >= 1
@@ -324,7 +324,7 @@ def test_from_two_cameras_to_thirty_and_up_to_a_dozen_people(
     proposals, candidates = find(detections, rig)
     used = proposals.candidate[proposals.candidate >= 0]
     assert len(np.unique(used)) == len(used), "a candidate serves one person"
-    observations, _ = associate(proposals, candidates, detections, rig, BODY_25, AssociationConfig())
+    observations, _ = associate(proposals, candidates, detections, rig, BODY_25, ProposalConfig())
     assert found <= len(observations) <= most
     distance = np.linalg.norm(observations.initial[:, None, HIP] - truth[None, :, HIP], axis=-1)
     # Points that cross by chance near a hip join its cluster and move its centre a little.

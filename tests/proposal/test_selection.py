@@ -11,10 +11,9 @@ from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people
 from shapepose_fg.proposal.candidates import CandidateConfig, triangulate_pairs
-from shapepose_fg.proposal.evidence import Evidence
-from shapepose_fg.proposal.hypotheses import Frame, Hypotheses, connected, settled, triangulated
 from shapepose_fg.proposal.people_2d import without_repeats
-from shapepose_fg.proposal.selection import choose, existence
+from shapepose_fg.proposal.possible_people import Frame, PossiblePeople, connected, settled, triangulated
+from shapepose_fg.proposal.selection import Evidence, choose, existence
 from shapepose_fg.simulation import built_in_scene, simulate
 
 HIPS = [8, 9, 12]
@@ -192,4 +191,4 @@ def test_a_view_that_misses_a_joint_and_sees_the_rest_speaks_against_it(five_cam
 
 def test_nobody_is_there_where_nothing_is_seen(five_cameras, nothing=Detections.empty()):
     people, sure = chosen(nothing, five_cameras)
-    assert len(people) == len(sure) == 0 == len(Hypotheses.none(frame_of(nothing, five_cameras)))
+    assert len(people) == len(sure) == 0 == len(PossiblePeople.none(frame_of(nothing, five_cameras)))

@@ -9,8 +9,8 @@ from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.pipeline.config import PeopleConfig
 from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people
 from shapepose_fg.tracking.following import FollowingConfig, FollowState, finish, follow
-from shapepose_fg.tracking.hypotheses import Input
 from shapepose_fg.tracking.tracker import BodyScale, Tracker, TrackingConfig, Tracks
+from shapepose_fg.tracking.worlds import Input
 
 FPS = 30.0
 

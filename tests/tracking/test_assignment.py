@@ -13,7 +13,7 @@ from shapepose_fg.tracking import view_assignment
 from shapepose_fg.tracking.following import Input
 from shapepose_fg.tracking.plausibility import torn_joints
 from shapepose_fg.tracking.reassociation import Survival, reassociate
-from shapepose_fg.tracking.view_assignment import AssignmentConfig, assign, assign_with_probability
+from shapepose_fg.tracking.view_assignment import Predicted, assign, assign_with_probability
 
 WRIST, ELBOW = BODY_25.index("RWrist"), BODY_25.index("RElbow")
 
@@ -33,7 +33,7 @@ def test_everybody_gets_their_own_detection_once(five_cameras, two_people, seen_
     rng = np.random.default_rng(0)
     predicted = two_people + rng.normal(0, 0.02, two_people.shape)
     sigma, lost = np.full((2, 25), 0.02), np.zeros((2, 25), dtype=bool)
-    candidate = assign(predicted, sigma, lost, detections, five_cameras, BODY_25, AssignmentConfig())
+    candidate = assign(Predicted(predicted, sigma, lost), detections, five_cameras, BODY_25)
     share, total = own(detections, five_cameras, two_people, candidate)
     assert share == 1.0 and total == 2 * 25 * 5
     taken = candidate[candidate >= 0]
@@ -47,7 +47,7 @@ def test_a_lost_wrist_is_found_by_its_elbow(five_cameras, two_people, seen_exact
     lost[:, WRIST] = True
     predicted[:, WRIST] = predicted[:, ELBOW]
     sigma[:, WRIST] = 0.3
-    candidate = assign(predicted, sigma, lost, detections, five_cameras, BODY_25, AssignmentConfig())
+    candidate = assign(Predicted(predicted, sigma, lost), detections, five_cameras, BODY_25)
     share, _ = own(detections, five_cameras, two_people, candidate)
     assert share == 1.0 and (candidate[:, WRIST] >= 0).all()
 
@@ -55,15 +55,8 @@ def test_a_lost_wrist_is_found_by_its_elbow(five_cameras, two_people, seen_exact
 def test_nobody_gets_what_is_too_far_away(five_cameras, two_people, seen_exactly):
     detections = seen_exactly(five_cameras, two_people[:1])
     beside = two_people[:1] + np.array([0.0, 0.0, 0.4])
-    nothing = assign(
-        beside,
-        np.full((1, 25), 0.02),
-        np.zeros((1, 25), bool),
-        detections,
-        five_cameras,
-        BODY_25,
-        AssignmentConfig(),
-    )
+    predicted = Predicted(beside, np.full((1, 25), 0.02), np.zeros((1, 25), bool))
+    nothing = assign(predicted, detections, five_cameras, BODY_25)
     # 0.4 m up is farther than 0.12 + 2 x 0.02 m, but for other joints of the same kind; there are none.
     assert (nothing < 0).all()
 
@@ -120,9 +113,9 @@ def test_detections_are_given_out_again_and_doubles_go(five_cameras, two_people,
     none = np.full((3, 25, 5), -1)
     rows = Observations.of(none, detections, joints)
     rows = replace(rows, track=np.array([4, 5, 6]), frame=np.full(3, 7), time_s=np.full((3, 5), 0.5))
-    kept = reassociate(given, rows, joints, covariance, BODY_25, AssignmentConfig())
+    kept = reassociate(given, rows, joints, covariance, BODY_25)
     assert kept.track.tolist() == [4, 5, 6] and (kept.time_s == 0.5).all()
-    alone = reassociate(given, rows, joints, covariance, BODY_25, AssignmentConfig(), Survival())
+    alone = reassociate(given, rows, joints, covariance, BODY_25, Survival())
     assert alone.track.tolist() == [4, 5]
     share, total = own(detections, five_cameras, two_people, alone.candidate)
     assert share == 1.0 and total == 250
@@ -139,7 +132,7 @@ def test_the_first_detection_of_a_frame_counts_as_any_other(five_cameras, two_pe
     covariance = np.broadcast_to(0.02**2 * np.eye(3), (1, 25, 3, 3))
     for least, people in ((0.5, 1), (0.95, 0)):
         survival = Survival(min_probability=least)
-        asked = given, rows, two_people[:1], covariance, BODY_25, AssignmentConfig(), survival
+        asked = given, rows, two_people[:1], covariance, BODY_25, survival
         assert len(reassociate(*asked)) == people
 
 
@@ -159,7 +152,7 @@ def test_nothing_is_expected_where_a_person_is_outside_of_the_picture(
     detections = every.only(every.view < 2)
     rows = Observations.of(np.full((1, 25, 5), -1), detections, two_people[:1])
     covariance = np.broadcast_to(0.02**2 * np.eye(3), (1, 25, 3, 3))
-    asked = [Input(0, np.zeros(5), detections, rig)], rows, two_people[:1], covariance, BODY_25, AssignmentConfig()
+    asked = [Input(0, np.zeros(5), detections, rig)], rows, two_people[:1], covariance, BODY_25
     assert len(reassociate(*asked, Survival(min_probability=0.99))) == 1
 
 
@@ -210,7 +203,7 @@ def test_two_people_side_by_side_are_less_certain_than_one_alone(five_cameras, t
         detections = replace(seen, pairs=np.zeros((0, 2), dtype=int), affinity=np.zeros(0))
         sigma, lost = np.full((2, 25), 0.02), np.zeros((2, 25), dtype=bool)
         chosen, probability = assign_with_probability(
-            people, sigma, lost, detections, five_cameras, BODY_25, AssignmentConfig()
+            Predicted(people, sigma, lost), detections, five_cameras, BODY_25
         )
         assert (chosen >= 0).all()
         median.append(np.median(probability))

@@ -8,10 +8,11 @@ import pytest
 
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.proposal import claims
 from shapepose_fg.tracking import view_assignment
 from shapepose_fg.tracking.following import Input
 from shapepose_fg.tracking.reassociation import Survival, _existence, _gone, reassociate
-from shapepose_fg.tracking.view_assignment import AssignmentConfig, assign
+from shapepose_fg.tracking.view_assignment import Predicted, assign
 
 CORE = list(BODY_25.core)
 LIMBS = {tuple(sorted(limb)) for limb in BODY_25.limbs}
@@ -28,7 +29,7 @@ def predicted(two_people):
     for person, joint in np.argwhere(lost).tolist():
         places[person, joint] = people[person, max(BODY_25.parents[joint], 0)]
     places[3, 4] = np.nan
-    return places, sigma, lost
+    return Predicted(places, sigma, lost)
 
 
 DEFAULTS = {
@@ -43,8 +44,23 @@ DEFAULTS = {
 """What is documented, so that another default is noticed."""
 
 
-def assigned(places, sigma, lost, crowded, rig, config: SimpleNamespace) -> np.ndarray:
+@pytest.fixture
+def settle(monkeypatch):
+    """Sets constants by the names that they have in `DEFAULTS`."""
+
+    def settle(**settings):
+        for name, value in settings.items():
+            for module in (view_assignment, claims):
+                for constant in (name.upper(), f"_{name.upper()}"):
+                    if hasattr(module, constant):
+                        monkeypatch.setattr(module, constant, value)
+
+    return settle
+
+
+def assigned(predicted: Predicted, crowded, rig, config: SimpleNamespace) -> np.ndarray:
     """Score every detection for every person, take the best first; again with the affinities to what was taken."""
+    places, sigma, lost = predicted.places, predicted.sigma_m, predicted.lost
     xy, depth = rig.project(places)
     listed = {tuple(pair): value for pair, value in zip(crowded.pairs.tolist(), crowded.affinity, strict=True)}
     near = [
@@ -100,22 +116,25 @@ def assigned(places, sigma, lost, crowded, rig, config: SimpleNamespace) -> np.n
 @pytest.mark.parametrize(
     "settings", [{}, {"passes": 1, "overlap_m": 0.3, "farthest_m": 0.2}, {"least_affinity": 0.0}]
 )
-def test_detections_are_taken_best_first_by_nearness_and_affinity(settings, predicted, crowded, five_cameras):
-    expected = assigned(*predicted, crowded, five_cameras, SimpleNamespace(**DEFAULTS | settings))
-    found = assign(*predicted, crowded, five_cameras, BODY_25, AssignmentConfig(**settings))
+def test_detections_are_taken_best_first_by_nearness_and_affinity(
+    settings, predicted, crowded, five_cameras, settle
+):
+    expected = assigned(predicted, crowded, five_cameras, SimpleNamespace(**DEFAULTS | settings))
+    settle(**settings)
+    found = assign(predicted, crowded, five_cameras, BODY_25)
     np.testing.assert_array_equal(found, expected)
-    assert (found >= 0).mean() > 0.5 and (found[predicted[2]] >= 0).any(), "lost joints are found, too"
-    wider = assign(*predicted, crowded, five_cameras, BODY_25, AssignmentConfig(overlap_m=0.005))
-    assert (wider != found).any() or "overlap_m" not in settings, "overlaps happen here"
+    assert (found >= 0).mean() > 0.5 and (found[predicted.lost] >= 0).any(), "lost joints are found, too"
+    settle(overlap_m=0.005)
+    assert (assign(predicted, crowded, five_cameras, BODY_25) != found).any() or "overlap_m" not in settings
 
 
 def test_a_detection_that_serves_two_is_theirs_with_a_probability_of_one_at_most(
-    predicted, crowded, five_cameras, monkeypatch
+    predicted, crowded, five_cameras, monkeypatch, settle
 ):
     """Marginals of competitors that form a cycle are not exact: those of one detection may add up to more."""
     monkeypatch.setattr(view_assignment, "probabilities", lambda score, *_: np.full(score.shape, 0.6))
-    asked = *predicted, crowded, five_cameras, BODY_25, AssignmentConfig(passes=1, overlap_m=0.3, farthest_m=0.2)
-    chosen, probability = view_assignment.assign_with_probability(*asked)
+    settle(passes=1, overlap_m=0.3, farthest_m=0.2)
+    chosen, probability = view_assignment.assign_with_probability(predicted, crowded, five_cameras, BODY_25)
     owners = np.bincount(chosen[chosen >= 0], minlength=len(crowded))
     assert (owners > 1).any(), "overlaps happen here"
     expected = np.where(owners[chosen] > 1, 1.0, 0.6)
@@ -129,7 +148,7 @@ def three(five_cameras, two_people, seen_exactly):
     places = np.stack([*two_people, two_people[0] + [0.15, 0.0, 0.0]])
     candidate = np.full((3, 25, 5), -1)
     sure = np.full((2, 25), 0.02), np.zeros((2, 25), dtype=bool)
-    candidate[:2] = assign(two_people, *sure, detections, five_cameras, BODY_25, AssignmentConfig())
+    candidate[:2] = assign(Predicted(two_people, *sure), detections, five_cameras, BODY_25)
     return Input(0, np.zeros(5), detections, five_cameras), candidate, places
 
 
@@ -170,9 +189,9 @@ def test_rows_without_a_joint_are_carried_by_motion_unless_they_must_survive(thr
     rows = Observations.of(np.full((3, 25, 5), -1), frame.detections, joints)
     rows = replace(rows, track=np.array([4, 5, 6]), frame=np.zeros(3, dtype=int))
     covariance = np.where(np.isnan(joints)[..., None], np.nan, 0.02**2 * np.eye(3))
-    kept = reassociate([frame], rows, joints, covariance, BODY_25, AssignmentConfig())
+    kept = reassociate([frame], rows, joints, covariance, BODY_25)
     assert kept.track.tolist() == [4, 5, 6] and not kept.seen[2].any() and kept.seen[:2].all()
-    left = reassociate([frame], rows, joints, covariance, BODY_25, AssignmentConfig(), Survival())
+    left = reassociate([frame], rows, joints, covariance, BODY_25, Survival())
     assert left.track.tolist() == [4, 5]
 
 
@@ -192,7 +211,7 @@ def test_nothing_farther_than_12_cm_and_two_sigma_or_half_a_metre_is_taken(
     sigma = np.full((1, 25), 1e-6)
     sigma[0, wrist] = sigma_m
     lost = np.zeros((1, 25), dtype=bool)
-    found = assign(predicted, sigma, lost, detections, five_cameras, BODY_25, AssignmentConfig())
+    found = assign(Predicted(predicted, sigma, lost), detections, five_cameras, BODY_25)
     assert (found[0, wrist, 0] >= 0) == taken
     assert (np.delete(found, wrist, axis=1) >= 0).all()
 
@@ -208,7 +227,7 @@ def test_somebody_alone_in_a_frame_may_be_nobody(five_cameras, two_people, seen_
         frame=np.zeros(1, dtype=int),
     )
     covariance = np.broadcast_to(0.02**2 * np.eye(3), (1, 25, 3, 3))
-    asked = [frame], rows, joints, covariance, BODY_25, AssignmentConfig()
+    asked = [frame], rows, joints, covariance, BODY_25
     assert len(reassociate(*asked)) == 1 and len(reassociate(*asked, Survival())) == 0
 
 
@@ -226,5 +245,5 @@ def test_detections_are_given_out_again_within_two_sigma(five_cameras, two_peopl
     )
     covariance = np.broadcast_to(np.diag([0.0, 0.0012 - 0.0004, 0.0004]), (1, 25, 3, 3))
     frame = Input(0, np.zeros(5), detections, five_cameras)
-    found = reassociate([frame], rows, joints, covariance, BODY_25, AssignmentConfig())
+    found = reassociate([frame], rows, joints, covariance, BODY_25)
     assert found.seen[0, wrist, 0] == taken

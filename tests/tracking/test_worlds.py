@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from shapepose_fg.tracking.hypotheses import Input, Seed, explained, follow_worlds
 from shapepose_fg.tracking.tracker import Tracker, Tracks
+from shapepose_fg.tracking.worlds import Input, Seed, explained, follow_worlds
 
 
 @pytest.fixture

@@ -11,7 +11,6 @@ from shapepose_fg.evaluation.experiments.experiment import Experiment, columns
 from shapepose_fg.evaluation.experiments.scenes import FRAME_BY_FRAME, OVER_TIME, case
 from shapepose_fg.evaluation.experiments.segments import Scale
 from shapepose_fg.pipeline.pipeline import PipelineConfig
-from shapepose_fg.proposal.association import AssociationConfig
 from shapepose_fg.proposal.candidates import CandidateConfig
 from shapepose_fg.proposal.proposals import ProposalConfig
 from shapepose_fg.tracking.tracker import TrackingConfig
@@ -30,7 +29,6 @@ class Varied(PipelineConfig):
 
     candidates: CandidateConfig = CandidateConfig()
     proposals: ProposalConfig = ProposalConfig()
-    association: AssociationConfig = AssociationConfig()
     tracking: TrackingConfig = TrackingConfig()
     window_graph: WindowGraphConfig = WindowGraphConfig()
     refine: RefineConfig = RefineConfig()
@@ -56,7 +54,7 @@ SWITCHES: dict[str, tuple[str, ...]] = {
     "false positives end early": (
         "proposals.min_grown_parts",
         "proposals.split_m",
-        "association.min_observed_parts",
+        "proposals.min_observed_parts",
         "tracking.min_new_joints",
     ),
     "gaps are bridged": ("proposals.growth.bridge_m",),

@@ -14,7 +14,7 @@ from shapepose_fg.core.storage.schema import Column, Table
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.windows import Engine, Span
 from shapepose_fg.tracking.following import BLOCK_S
-from shapepose_fg.tracking.hypotheses import Input
+from shapepose_fg.tracking.worlds import Input
 
 WARM_S = 6.0
 """Before a chunk people are followed for so long: who is there is known after a second or two, and people who hide

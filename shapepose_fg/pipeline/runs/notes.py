@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from shapepose_fg.estimation.window_solution import Problem
-from shapepose_fg.tracking.hypotheses import Input
+from shapepose_fg.tracking.worlds import Input
 
 
 @dataclass

@@ -15,9 +15,9 @@ from shapepose_fg.pipeline.runs.chunks import Border
 from shapepose_fg.pipeline.runs.notes import Notes
 from shapepose_fg.pipeline.windows import StreamState
 from shapepose_fg.tracking.following import FollowState
-from shapepose_fg.tracking.hypotheses import Input
 from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.tracker import Tracks
+from shapepose_fg.tracking.worlds import Input
 
 _STATUS = np.array([*map(str, Status)])
 """A status is kept as its place in this list."""

@@ -2,12 +2,13 @@
 
 A world is a set of people of whom each detection has one. Who is there is seen best in some frame, and hardly in
 others; so people are sought in several frames, followed from there forwards and backwards, and what explains most
-is chosen (`evidence.py`). Whoever was chosen is put together in one world in the frames in which they are seen
+is chosen (`presence.py`). Whoever was chosen is put together in one world in the frames in which they are seen
 best, and followed from there again: people who know of each other do not take each other's detections.
 """
 
 from collections.abc import Container, Iterable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -15,8 +16,8 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
-from shapepose_fg.tracking.evidence import Chosen, choose, left_over, weighed
 from shapepose_fg.tracking.motion_filter import JointStates
+from shapepose_fg.tracking.presence import Account, Chosen, weighed
 from shapepose_fg.tracking.tracker import Tracker, Tracks
 
 Array = NDArray[np.float64]
@@ -76,6 +77,15 @@ class Hypotheses:
     """(H, T) what being there costs (`weighed`)."""
     joints: JointStates
     """Where their joints are in the frame from which people are carried on."""
+    counts: NDArray[np.intp]
+    """(T,) how many detections each frame has."""
+    lasts_s: Array
+    """(T,) what each frame stands for, seconds (`lasting`)."""
+
+    @cached_property
+    def account(self) -> Account:
+        """The same as evidence."""
+        return Account.of(self.candidate, self.weight, self.price, self.there, self.counts, self.lasts_s)
 
     def __len__(self) -> int:
         return len(self.carried)
@@ -83,12 +93,11 @@ class Hypotheses:
     @classmethod
     def concatenate(cls, parts: Sequence["Hypotheses"]) -> "Hypotheses":
         """All of several, whose worlds are other ones."""
-        names = [each.name for each in fields(cls) if each.name not in ("joints", "world")]
+        names = ("carried", "there", "candidate", "places", "weight", "price")
         columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
         first = np.cumsum([0, *(int(part.world.max(initial=-1)) + 1 for part in parts)])
         columns["world"] = np.concatenate([part.world + n for part, n in zip(parts, first, strict=False)])
-        mean, covariance = (np.concatenate([getattr(p.joints, n) for p in parts]) for n in ("mean", "covariance"))
-        return cls(**columns, joints=JointStates(mean, covariance))
+        return replace(parts[0], **columns, joints=JointStates.concatenate([part.joints for part in parts]))
 
 
 @dataclass(frozen=True)
@@ -118,17 +127,17 @@ def explained(tracker: Tracker, frames: Sequence[Input], carried: Tracks, keep: 
     on = Seed(-1, carried, unseen, backwards=False, births=True)
     found = follow_worlds(tracker, frames, [on], keep)
     if len(frames) == 1 or _plain(found, times):
-        return found, _choose(found, frames)
+        return found, found.account.choose(found.world)
     found = Hypotheses.concatenate([found, follow_worlds(tracker, frames, _seeds(tracker, frames), keep)])
     before = 0.0
     for _ in range(_ROUNDS):
-        on_trial = _choose(found, frames, on_trial=True)
+        on_trial = found.account.choose(found.world, on_trial=True)
         if on_trial.evidence_s.sum() <= (1 + _GAIN) * before:
             break
         before = float(on_trial.evidence_s.sum())
         again = _restarts(tracker, frames, times, found, on_trial)
         found = Hypotheses.concatenate([found, follow_worlds(tracker, frames, again, keep)])
-    return found, _choose(found, frames)
+    return found, found.account.choose(found.world)
 
 
 def _plain(found: Hypotheses, times: Array) -> bool:
@@ -143,22 +152,6 @@ def _plain(found: Hypotheses, times: Array) -> bool:
 def times_of(frames: Sequence[Input]) -> Array:
     """(T,) times of frames, seconds."""
     return np.array([float(frame.time_s.mean()) for frame in frames])
-
-
-def unlikely(found: Hypotheses, chosen: Chosen, frames: Sequence[Input]) -> Chosen:
-    """Who was not chosen for too little evidence, or for being there too briefly."""
-    explains = found.candidate, found.weight, found.price, found.there
-    return left_over(*explains, *_weighing(frames), chosen)
-
-
-def _choose(found: Hypotheses, frames: Sequence[Input], *, on_trial: bool = False) -> Chosen:
-    explains = found.candidate, found.weight, found.price, found.there, found.world
-    return choose(*explains, *_weighing(frames), on_trial=on_trial)
-
-
-def _weighing(frames: Sequence[Input]) -> tuple[NDArray[np.intp], Array]:
-    """How many detections each frame has (T,), and the seconds that it stands for (T,)."""
-    return np.array([len(frame.detections) for frame in frames], dtype=np.intp), lasting(times_of(frames))
 
 
 def lasting(times_s: Array) -> Array:
@@ -372,4 +365,6 @@ class _Log:
                 mean[ids], covariance[ids] = mean[others], covariance[others]
         carried, world = (np.array(each, dtype=np.intp) for each in (self.carried, self.world))
         joints = JointStates(mean, covariance)
-        return Hypotheses(carried, world, there, candidate, places, weight, price, joints)
+        counts = np.array([len(frame.detections) for frame in self.frames], dtype=np.intp)
+        lasts_s = lasting(times_of(self.frames))
+        return Hypotheses(carried, world, there, candidate, places, weight, price, joints, counts, lasts_s)

@@ -9,28 +9,14 @@ from numpy.typing import NDArray
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.proposal.association import (
-    match_views,
-    mean_affinity,
-    owned,
-    projected_distances,
-    share_overlaps,
-    without_ties,
-)
-
-Array = NDArray[np.float64]
+from shapepose_fg.proposal.claims import Array, Claims, owned, projected_distances
 
 _NEAR_M = 0.06
 """How closeness to a joint falls off: sigma of a Gaussian, as a length at the joint's depth, as in `assign`."""
 _FAR_M = 0.15
 """No detection whose ray passes a joint at more is the joint's."""
-_LEAST_AFFINITY = 0.3
-"""What counts as affinity where no neighbour is seen; unrelated pairs are mostly 0, true ones above 0.4."""
 _SURE_AFFINITY = 0.5
 """Mean affinity that takes a detection for a joint whose place nobody knows."""
-_OVERLAP_M = 0.025
-"""Two people's projected joints closer than this overlap, as a length at their depth: the one detection there
-serves both. A detector is 2 to 3 cm off."""
 _KERNEL_M = 0.03
 """Scale of the Cauchy kernel with which joints are triangulated: what a detector is off, measured."""
 _ROUNDS = 2
@@ -76,7 +62,7 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Hypotheses:
+class PossiblePeople:
     """H people who may be there."""
 
     places: Array
@@ -89,30 +75,28 @@ class Hypotheses:
     def __len__(self) -> int:
         return len(self.places)
 
-    def rows(self, index: NDArray) -> "Hypotheses":
+    def rows(self, index: NDArray) -> "PossiblePeople":
         """Some of them."""
-        return Hypotheses(self.places[index], self.chosen[index], self.gap_m[index])
+        return PossiblePeople(*(each[index] for each in self._arrays))
 
-    def with_more(self, other: "Hypotheses") -> "Hypotheses":
+    def with_more(self, other: "PossiblePeople") -> "PossiblePeople":
         """These and others."""
-        return Hypotheses(
-            np.concatenate([self.places, other.places]),
-            np.concatenate([self.chosen, other.chosen]),
-            np.concatenate([self.gap_m, other.gap_m]),
-        )
+        both = zip(self._arrays, other._arrays, strict=True)
+        return PossiblePeople(*(np.concatenate(each) for each in both))
 
-    def completed(self, person: int, part: "Hypotheses") -> "Hypotheses":
+    def completed(self, person: int, part: "PossiblePeople") -> "PossiblePeople":
         """The same with the joints of `part`, which is one, for those that `person` lacks."""
-        lacks = np.zeros(self.places.shape[:2], dtype=bool)
-        lacks[person] = np.isnan(self.places[person, :, 0]) & np.isfinite(part.places[0, :, 0])
-        return Hypotheses(
-            np.where(lacks[..., None], part.places, self.places),
-            np.where(lacks[..., None], part.chosen, self.chosen),
-            np.where(lacks[..., None], part.gap_m, self.gap_m),
-        )
+        lacks = np.zeros((*self.places.shape[:2], 1), dtype=bool)
+        lacks[person] = np.isnan(self.places[person, :, :1]) & np.isfinite(part.places[0, :, :1])
+        both = zip(self._arrays, part._arrays, strict=True)
+        return PossiblePeople(*(np.where(lacks, new, old) for old, new in both))
+
+    @property
+    def _arrays(self) -> tuple[Array, NDArray[np.intp], Array]:
+        return self.places, self.chosen, self.gap_m
 
     @classmethod
-    def none(cls, frame: Frame) -> "Hypotheses":
+    def none(cls, frame: Frame) -> "PossiblePeople":
         """Nobody."""
         shape = (0, len(frame.skeleton), len(frame.rig))
         return cls(np.zeros((*shape[:2], 3)), np.full(shape, -1, dtype=np.intp), np.zeros(shape))
@@ -120,7 +104,7 @@ class Hypotheses:
 
 def settled(
     places: Array, owns: NDArray[np.bool_], frame: Frame, passes: int, *, exclusive: bool = False
-) -> Hypotheses:
+) -> PossiblePeople:
     """People at `places` (H, J, 3) who are thought to own `owns` (H, D): detections chosen, joints triangulated.
 
     Several times in turn. With `exclusive` each detection is one person's; without, each takes what it would
@@ -137,30 +121,20 @@ def settled(
         chosen = np.where(astray[..., None], -1, chosen)
         owns = owned(chosen, len(frame.detections))
     places, gap_m = triangulated(chosen, frame)
-    return Hypotheses(places, chosen, gap_m)
+    return PossiblePeople(places, chosen, gap_m)
 
 
 def _claimed(places: Array, owns: NDArray[np.bool_], frame: Frame, *, exclusive: bool) -> NDArray[np.intp]:
     """(H, J, V) the detections nearest to the joints; where no place is known, those of affinity to the owned."""
-    detections, shape = frame.detections, (*places.shape[:2], len(frame.rig))
-    distance_m = projected_distances(frame.rig.project(places), detections.joint, detections, frame.rig)
-    affinity, neighbours = mean_affinity(owns, detections, frame.skeleton, len(frame.rig))
-    score = np.exp(-0.5 * (distance_m / _NEAR_M) ** 2) + np.where(neighbours > 0, affinity, _LEAST_AFFINITY)
-    placed = np.isfinite(places[:, detections.joint, 0])
-    likely = (distance_m < _FAR_M) & (score >= 2 * _LEAST_AFFINITY)
-    likely |= ~placed & (affinity >= _SURE_AFFINITY)
-    if exclusive:
-        chosen = match_views(likely, score, detections, shape)
-        overlap = (distance_m < _OVERLAP_M) & (affinity >= _LEAST_AFFINITY)
-        share_overlaps(chosen, overlap, distance_m, detections)
-        return chosen
-    person, detection = np.nonzero(likely)
-    order = np.argsort(
-        without_ties(score, detections)[person, detection], kind="stable"
-    )  # the best is written last
-    person, detection = person[order], detection[order]
-    chosen = np.full(shape, -1, dtype=np.intp)
-    chosen[person, detections.joint[detection], detections.view[detection]] = detection
+    found, rig = frame.detections, frame.rig
+    distance_m = projected_distances(rig.project(places), found.joint, found, rig)
+    inside, unplaced = distance_m < _FAR_M, np.isnan(places[:, found.joint, 0])
+    claims = Claims(found, frame.skeleton, len(rig), distance_m, _NEAR_M**2, inside, unplaced, _SURE_AFFINITY)
+    scored = claims.scored(owns)
+    if not exclusive:
+        return claims.matched(scored, world=np.arange(len(places)))
+    chosen = claims.matched(scored)
+    claims.share(chosen, scored.affinity)
     return chosen
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.proposal.association import mean_affinity, owned
+from shapepose_fg.proposal.claims import mean_affinity, owned
 
 Array = NDArray[np.float64]
 
@@ -166,53 +166,9 @@ def probability(evidence: float) -> float:
     return float(1 / (1 + np.exp(-(_SCALE * evidence + _PRIOR))))
 
 
-def choose(
-    candidate: NDArray[np.integer],
-    weight: NDArray[np.floating],
-    price: NDArray[np.floating],
-    there: NDArray[np.bool_],
-    world: NDArray[np.intp],
-    counts: NDArray[np.intp],
-    lasts_s: Array,
-    *,
-    on_trial: bool = False,
-) -> Chosen:
-    """Choose hypotheses, and from when to when, so that each detection is evidence of one person only.
-
-    `candidate` (H, T, J, V) are the detections of H hypotheses in T frames, of `counts` (T,) in each frame, with
-    the `weight` (H, T, J, V) and the `price` (H, T) of `weighed`; `there` (H, T) tells where a hypothesis says
-    something, in frames that each stand for `lasts_s` (T,) seconds. `world` (H,) are people who were followed
-    together; `on_trial` takes those, too, who lack a little to be chosen. The best stretch of the best hypothesis
-    comes first; its detections are evidence of nobody else then. Where that is worse all in all, the people of one
-    world come first: a hypothesis that goes over from one person to another, always to who is seen better, is
-    better than either of them, and leaves the others with too little.
-    """
-    account = _Account.of(candidate, weight, price, there, counts, lasts_s, _ON_TRIAL if on_trial else 1.0)
-    if len(there) == 0:
-        return account.chosen(np.zeros(0, dtype=bool))
-    bound = np.bincount(world, np.maximum(account.best_stretches(account.alone)[0], 0.0))
-    tried = np.argsort(-bound, kind="stable")[:_WORLDS]
-    found = [account.chosen(first) for first in (np.zeros(len(world), dtype=bool), *(world == w for w in tried))]
-    return max(found, key=lambda each: float(each.evidence_s.sum()))
-
-
-def left_over(
-    candidate: NDArray[np.integer],
-    weight: NDArray[np.floating],
-    price: NDArray[np.floating],
-    there: NDArray[np.bool_],
-    counts: NDArray[np.intp],
-    lasts_s: Array,
-    chosen: Chosen,
-) -> Chosen:
-    """Who would be there besides those whom `choose` has `chosen` of them, if appearing cost nothing."""
-    account = replace(_Account.of(candidate, weight, price, there, counts, lasts_s, 1.0), appears_s=0.0)
-    return account.chosen(np.zeros(len(there), dtype=bool), chosen)
-
-
 @dataclass(frozen=True)
-class _Account:
-    """Hypotheses as detections with weights: what `choose` is given, made ready."""
+class Account:
+    """H hypotheses as detections with weights, in T frames: who of them is there is chosen from this."""
 
     place: NDArray[np.intp]
     """(H, T, J V) each detection's place among those of all frames; one more stands for none."""
@@ -230,10 +186,10 @@ class _Account:
     """The first frame in which anything is seen."""
     ends: int
     """And the last."""
-    appears_s: float
-    """What it costs to appear or vanish while others are watched, seconds."""
     least_s: float
     """Least evidence of a person, seconds."""
+    appears_s: float = _APPEARS_S
+    """What it costs to appear or vanish while others are watched, seconds."""
 
     @classmethod
     def of(
@@ -244,17 +200,40 @@ class _Account:
         there: NDArray[np.bool_],
         counts: NDArray[np.intp],
         lasts_s: Array,
-        demands: float,
-    ) -> "_Account":
-        """See `choose`; `demands` is the share of what is demanded of a person otherwise."""
+    ) -> "Account":
+        """Of detections `candidate` (H, T, J, V), of `counts` (T,) in each frame, with `weight` (H, T, J, V) and
+        `price` (H, T) of `weighed`.
+        """
         shape = (*there.shape, candidate[0, 0].size if there.size > 0 else 0)
         first, count = np.cumsum(counts) - counts, int(counts.sum())
         place = np.where(candidate >= 0, candidate + first[:, None, None], count).reshape(shape)
         weights = np.where(candidate >= 0, weight, 0.0).reshape(shape).astype(np.float32)
-        least_s = min(_LEAST_S, 0.25 * float(lasts_s.sum()))
         seen = np.append(np.flatnonzero(counts), 0)
-        span = int(seen[0]), int(seen.max())
-        return cls(place, weights, price, there, lasts_s, count, *span, demands * _APPEARS_S, demands * least_s)
+        span, least_s = (int(seen[0]), int(seen.max())), min(_LEAST_S, 0.25 * float(lasts_s.sum()))
+        return cls(place, weights, price, there, lasts_s, count, *span, least_s)
+
+    def choose(self, world: NDArray[np.intp], *, on_trial: bool = False) -> Chosen:
+        """Choose hypotheses, and from when to when, so that each detection is evidence of one person only.
+
+        `world` (H,) are people who were followed together; `on_trial` takes those, too, who lack a little to be
+        chosen. The best segment of the best hypothesis comes first; its detections are evidence of nobody else
+        then. Where that is worse all in all, the people of one world come first: a hypothesis that goes over from
+        one person to another, always to who is seen better, is better than either of them, and leaves the others
+        with too little.
+        """
+        account, first = self, np.zeros(len(world), dtype=bool)
+        if on_trial:
+            account = replace(self, appears_s=_ON_TRIAL * self.appears_s, least_s=_ON_TRIAL * self.least_s)
+        if len(world) == 0:
+            return account.in_turn(first)
+        bound = np.bincount(world, np.maximum(account.best_segments(account.alone)[0], 0.0))
+        tried = np.argsort(-bound, kind="stable")[:_WORLDS]
+        found = [account.in_turn(first), *(account.in_turn(world == each) for each in tried)]
+        return max(found, key=lambda each: float(each.evidence_s.sum()))
+
+    def left_over(self, chosen: Chosen) -> Chosen:
+        """Who would be there besides those whom `choose` has `chosen`, if appearing cost nothing."""
+        return replace(self, appears_s=0.0).in_turn(np.zeros(len(self.there), dtype=bool), chosen)
 
     @property
     def free(self) -> NDArray[np.float32]:
@@ -271,7 +250,7 @@ class _Account:
         share = np.einsum("htk,htk->ht", self.weight[:, span], free[self.place[:, span]])
         return np.where(self.there[:, span], (share - self.price[:, span]) * self.lasts_s[span], -np.inf)
 
-    def chosen(self, first: NDArray[np.bool_], before: Chosen | None = None) -> Chosen:
+    def in_turn(self, first: NDArray[np.bool_], before: Chosen | None = None) -> Chosen:
         """People one after the other, the best of those `first` (H,) before all others, besides those `before`."""
         free, gains, chosen = self.free, self.alone.copy(), list[tuple[int, int, int, float]]()
         taken, least = np.zeros(self.there.shape, dtype=bool), self.least_s
@@ -281,7 +260,7 @@ class _Account:
                 taken[h, start:stop] = True
             gains = np.where(taken, -np.inf, self.gains(free, slice(0, len(self.lasts_s))))
         while len(gains) > 0:
-            value, start, stop = self.best_stretches(gains)
+            value, start, stop = self.best_segments(gains)
             if first.any() and value[first].max() < least:
                 first = np.zeros_like(first)
             best = int(np.where(first | ~first.any(), value, -np.inf).argmax())
@@ -294,10 +273,10 @@ class _Account:
             gains[:, span] = np.where(taken[:, span], -np.inf, self.gains(free, span))
         return Chosen.of(chosen)
 
-    def best_stretches(self, gains: Array) -> tuple[Array, NDArray[np.intp], NDArray[np.intp]]:
-        """The stretch with the greatest sum of each row of `gains` (H, T): value (H,), start (H,), stop (H,).
+    def best_segments(self, gains: Array) -> tuple[Array, NDArray[np.intp], NDArray[np.intp]]:
+        """The segment with the greatest sum of each row of `gains` (H, T): value (H,), start (H,), stop (H,).
 
-        Where a stretch begins after the first frame in which anything is seen, or stops before the last, it costs
+        Where a segment begins after the first frame in which anything is seen, or stops before the last, it costs
         `appears_s` each. No part of it costs more than to vanish and to appear again.
         """
         H, T = gains.shape

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.tracking.evidence import Chosen, choose, left_over, own_evidence, probability, weighed
-from shapepose_fg.tracking.hypotheses import lasting
+from shapepose_fg.tracking.presence import Account, Chosen, own_evidence, probability, weighed
+from shapepose_fg.tracking.worlds import lasting
 
 PLACES = 4
 PRICE = 0.15
@@ -37,10 +37,9 @@ def evidence_of(
                 candidate[h, t, : len(own), 0] = own
     weight, price = np.full(candidate.shape, (1 + PRICE) / PLACES), np.full((len(rows), T), PRICE)
     world = np.array([world for _, world in rows])
-    counts, lasts_s = np.full(T, 8), np.full(T, step_s)
-    given = candidate, weight, price, there
-    chosen = choose(*given, world, counts, lasts_s, on_trial=on_trial)
-    return left_over(*given, counts, lasts_s, chosen) if left else chosen
+    account = Account.of(candidate, weight, price, there, np.full(T, 8), np.full(T, step_s))
+    chosen = account.choose(world, on_trial=on_trial)
+    return account.left_over(chosen) if left else chosen
 
 
 def stretches(chosen: Chosen) -> list[tuple[int, int, int]]:
