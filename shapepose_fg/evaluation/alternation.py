@@ -10,7 +10,7 @@ from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.estimation.linearisation import triangulate
-from shapepose_fg.evaluation.matching import match_people
+from shapepose_fg.evaluation.metrics import match_people
 from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people
 
 

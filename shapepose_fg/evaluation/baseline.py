@@ -10,7 +10,7 @@ from shapepose_fg.core.detections import Detections, DetectionSequence
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.linearisation import ObservationConfig, triangulate
-from shapepose_fg.evaluation.matching import PlainPeople
+from shapepose_fg.evaluation.metrics import PlainPeople
 from shapepose_fg.proposal.assignment import match_best_first
 from shapepose_fg.proposal.candidates import CandidateConfig, triangulate_pairs
 from shapepose_fg.proposal.people_2d import group_people

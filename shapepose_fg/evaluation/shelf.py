@@ -15,7 +15,7 @@ from rich.table import Table
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.evaluation.matching import People
+from shapepose_fg.evaluation.metrics import People
 from shapepose_fg.evaluation.other_results import SHELF_JOINTS, read_skeleton_text
 
 _LIMBS = {

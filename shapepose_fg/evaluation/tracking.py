@@ -12,11 +12,14 @@ from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.evaluation.matching import MAX_DISTANCE_M, Matches, match_people, mean_distance
 from shapepose_fg.evaluation.metrics import (
+    MAX_DISTANCE_M,
     CovarianceCalibration,
     JointMetrics,
+    Matches,
     covariance_calibration,
+    match_people,
+    mean_distance,
     metrics_of,
     share,
 )

@@ -19,9 +19,14 @@ from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections, Recording
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.simulation.affinities import Candidates, affinities
+from shapepose_fg.simulation.candidates import (
+    Candidates,
+    FalseCandidateProcess,
+    FalseCandidates,
+    NoiseProcess,
+    affinities,
+)
 from shapepose_fg.simulation.detector_statistics import JOINT_GROUP, DetectorStatistics, measured
-from shapepose_fg.simulation.memory import FalseCandidateProcess, FalseCandidates, NoiseProcess
 from shapepose_fg.simulation.scene import Scene
 from shapepose_fg.simulation.visibility import (
     Skin,

@@ -8,8 +8,7 @@ from shapepose_fg.core.detections import Recording
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation import baseline
 from shapepose_fg.evaluation.baseline import frame_by_frame, over_time, people_in_frame
-from shapepose_fg.evaluation.matching import PlainPeople
-from shapepose_fg.evaluation.metrics import joint_metrics
+from shapepose_fg.evaluation.metrics import PlainPeople, joint_metrics
 from shapepose_fg.simulation import built_in_scene, simulate
 
 

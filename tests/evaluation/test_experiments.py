@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.evaluation.experiments import ablation, scenes, segments
+from shapepose_fg.evaluation.experiments import ablation, scenes
 from shapepose_fg.evaluation.experiments.experiment import Case, Column, Experiment, measured
 from shapepose_fg.evaluation.experiments.registry import experiments
-from shapepose_fg.evaluation.experiments.segments import Scale, Segment
+from shapepose_fg.evaluation.experiments.scenes import Scale, Segment
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.simulation.training.motions import split_of
 
@@ -187,7 +187,7 @@ def test_a_case_is_drawn_by_its_seed_at_its_rate():
 def test_after_a_cut_everybody_is_somebody_else(monkeypatch):
     segment = Segment("demo", range(6), cameras=2, people=2)
     scene = replace(segment.scene, cuts=(2, 4))
-    monkeypatch.setattr(segments, "_scene", lambda _: scene)
+    monkeypatch.setattr(scenes, "_scene", lambda _: scene)
     truth = segment.truth
     people = [np.unique(truth.person[truth.frame == frame]).tolist() for frame in range(6)]
     assert people == [[0, 1], [0, 1], [2, 3], [2, 3], [4, 5], [4, 5]]

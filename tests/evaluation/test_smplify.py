@@ -12,8 +12,7 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.linearisation import ObservationConfig, triangulate
 from shapepose_fg.evaluation.experiments.methods import scored
-from shapepose_fg.evaluation.matching import PlainPeople
-from shapepose_fg.evaluation.metrics import joint_metrics
+from shapepose_fg.evaluation.metrics import PlainPeople, joint_metrics
 from shapepose_fg.evaluation.smplify import MultiViewSmplify, SmplifyConfig, _ViewTargets, smpl_only
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.simulation import built_in_scene, simulate

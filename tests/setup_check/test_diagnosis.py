@@ -22,9 +22,9 @@ from shapepose_fg.evaluation.spoiled_setups import (
 )
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
-from shapepose_fg.setup_check.adjustment import FOCAL, Q, changed
 from shapepose_fg.setup_check.diagnosis import diagnose
 from shapepose_fg.setup_check.findings import Kind, sentence
+from shapepose_fg.setup_check.fit import FOCAL, Q, changed
 
 
 def only_finding(recording, rig):

@@ -8,8 +8,7 @@ from typing import Any
 
 from shapepose_fg.estimation.estimator_config import RefineConfig, WindowGraphConfig
 from shapepose_fg.evaluation.experiments.experiment import Experiment, columns
-from shapepose_fg.evaluation.experiments.scenes import FRAME_BY_FRAME, OVER_TIME, case
-from shapepose_fg.evaluation.experiments.segments import Scale
+from shapepose_fg.evaluation.experiments.scenes import FRAME_BY_FRAME, OVER_TIME, Scale, case
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.proposal.association import AssociationConfig
 from shapepose_fg.proposal.candidates import CandidateConfig

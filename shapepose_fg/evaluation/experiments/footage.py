@@ -11,10 +11,9 @@ from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.evaluation.alternation import before_refinement
 from shapepose_fg.evaluation.baseline import frame_by_frame, over_time
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures, columns
-from shapepose_fg.evaluation.experiments.scenes import FRAME_BY_FRAME, MODES, OVER_TIME
-from shapepose_fg.evaluation.experiments.segments import Scale
+from shapepose_fg.evaluation.experiments.scenes import FRAME_BY_FRAME, MODES, OVER_TIME, Scale
 from shapepose_fg.evaluation.held_out_view import held_out
-from shapepose_fg.evaluation.matching import People, PlainPeople
+from shapepose_fg.evaluation.metrics import People, PlainPeople
 from shapepose_fg.evaluation.shelf import ACTORS, LIMB_NAMES, ShelfScore, evaluate_shelf, read_shelf_ground_truth
 from shapepose_fg.evaluation.single_person import (
     ANNOTATION,

@@ -12,10 +12,8 @@ from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.alternation import before_refinement
 from shapepose_fg.evaluation.baseline import frame_by_frame, over_time
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures, columns
-from shapepose_fg.evaluation.experiments.scenes import FRAME_BY_FRAME, OVER_TIME
-from shapepose_fg.evaluation.experiments.segments import Scale, Segment
-from shapepose_fg.evaluation.matching import People, PlainPeople
-from shapepose_fg.evaluation.metrics import joint_metrics
+from shapepose_fg.evaluation.experiments.scenes import FRAME_BY_FRAME, OVER_TIME, Scale, Segment
+from shapepose_fg.evaluation.metrics import People, PlainPeople, joint_metrics
 from shapepose_fg.evaluation.smplify import SmplOnly, smpl_only
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 
