@@ -1,4 +1,4 @@
-"""A method without bodies and graphs, to compare with: 2D people whose rays meet, triangulated and linked."""
+"""Methods to compare with: 2D people whose rays meet, triangulated and linked, without bodies; stage I alone."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.linearisation import ObservationConfig, triangulate
 from shapepose_fg.evaluation.metrics import PlainPeople
+from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people
 from shapepose_fg.proposal.assignment import match_best_first
 from shapepose_fg.proposal.candidates import CandidateConfig, triangulate_pairs
 from shapepose_fg.proposal.people_2d import group_people
@@ -38,6 +39,13 @@ def frame_by_frame(detections: DetectionSequence, rig: Rig) -> PlainPeople:
     frame, person = np.repeat(np.arange(len(placed)), count), [np.arange(each) for each in count]
     nothing = np.zeros((0, len(detections.skeleton), 3))
     return PlainPeople(frame, np.concatenate([nothing, *placed]), np.concatenate([np.arange(0), *person]))
+
+
+def initial_proposals(detections: DetectionSequence, rig: Rig, config: PipelineConfig) -> PlainPeople:
+    """What stage I by itself makes of every frame: X_0 of Algorithm 1; NaN where no two views agree."""
+    found = [find_people(detections[t], rig, detections.skeleton, config) for t in range(len(detections))]
+    frame = np.repeat(np.arange(len(found)), [len(people) for people in found])
+    return PlainPeople(frame, triangulate(Observations.concatenate(found), Views.of(rig), config.observations))
 
 
 def people_in_frame(found: Detections, rig: Rig, skeleton: Skeleton) -> Array:

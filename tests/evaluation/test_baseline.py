@@ -3,13 +3,15 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from shapepose_fg.core.detections import Recording
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation import baseline
-from shapepose_fg.evaluation.baseline import frame_by_frame, over_time, people_in_frame
-from shapepose_fg.evaluation.metrics import PlainPeople, joint_metrics
-from shapepose_fg.simulation import built_in_scene, simulate
+from shapepose_fg.evaluation.baseline import frame_by_frame, initial_proposals, over_time, people_in_frame
+from shapepose_fg.evaluation.metrics import PlainPeople, joint_metrics, match_people
+from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
+from shapepose_fg.simulation import DetectorConfig, built_in_scene, simulate
 
 
 def test_what_is_seen_exactly_is_found_exactly(five_cameras, two_people, seen_exactly):
@@ -114,3 +116,24 @@ def test_who_is_there_for_a_moment_was_nobody(monkeypatch):
     found = over_time(ghost, 25.0)
     assert len(np.unique(found.person)) == 2
     assert found.joints[..., 1].max() < 2
+
+
+@pytest.mark.slow
+def test_stage_two_helps_whom_the_views_see_badly():
+    """What the project promises; misses are frequent here, so that few frames hold enough doubtful joints."""
+    scene = built_in_scene(1000, frames=10)
+    detections = simulate(scene, DetectorConfig(misses=3.0), seed=1000)
+    config = replace(PipelineConfig(), temporal=False)
+    before, after = initial_proposals(detections, scene.rig, config), reconstruct(detections, scene.rig, config)
+    error = np.full((2, *scene.keypoints.shape[:3]), np.nan)
+    confidence = np.zeros(error.shape[1:])
+    for table, people in zip(error, (before, after), strict=True):
+        found = match_people(people.frame, people.joints, scene.keypoints)
+        at = (found.frame, found.person)
+        table[at] = np.linalg.norm(people.joints[found.row] - scene.keypoints[at], axis=-1)
+    confidence[at] = after.confidence[found.row]  # the mean over views
+    both = np.isfinite(error).all(axis=0)
+    well, badly = error[:, both & (confidence >= 0.25)], error[:, both & (confidence < 0.25)]
+    assert badly.shape[1] >= 20
+    assert badly[1].mean() < 0.8 * badly[0].mean()
+    assert well[1].mean() < well[0].mean()

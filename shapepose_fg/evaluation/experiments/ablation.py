@@ -2,7 +2,7 @@
 # ruff: noqa: RUF009  (values of the class `Varied` itself: they cover properties of its base)
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, replace
 from operator import attrgetter
 from typing import Any
 
@@ -117,18 +117,6 @@ def with_settings_of(config: PipelineConfig, other: PipelineConfig, names: Seque
     for name in names:
         config = _with(config, name, attrgetter(name)(other))
     return config
-
-
-def differing(one: Any, other: Any, prefix: str = "") -> list[str]:
-    """The names of all settings in which two configurations differ, as `table.name`."""
-    found = []
-    for field in fields(one):
-        a, b, name = getattr(one, field.name), getattr(other, field.name), f"{prefix}{field.name}"
-        if is_dataclass(a):
-            found += differing(a, b, f"{name}.")
-        elif a != b:
-            found.append(name)
-    return found
 
 
 def _with(config: Any, name: str, value: Any) -> Any:

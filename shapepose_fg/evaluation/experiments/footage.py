@@ -8,8 +8,7 @@ from pathlib import Path
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.evaluation.alternation import before_refinement
-from shapepose_fg.evaluation.baseline import frame_by_frame, over_time
+from shapepose_fg.evaluation.baseline import frame_by_frame, initial_proposals, over_time
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures, columns
 from shapepose_fg.evaluation.experiments.scenes import FRAME_BY_FRAME, MODES, OVER_TIME, Scale
 from shapepose_fg.evaluation.held_out_view import held_out
@@ -144,7 +143,7 @@ def _smpl_only(folder: Path) -> People:
 
 def _stage_one(folder: Path) -> People:
     recording = shelf_footage(folder)
-    return before_refinement(recording.detections, recording.rig, FRAME_BY_FRAME)
+    return initial_proposals(recording.detections, recording.rig, FRAME_BY_FRAME)
 
 
 def _bodies(folder: Path) -> People:

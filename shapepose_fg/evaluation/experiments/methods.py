@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.evaluation.alternation import before_refinement
-from shapepose_fg.evaluation.baseline import frame_by_frame, over_time
+from shapepose_fg.evaluation.baseline import frame_by_frame, initial_proposals, over_time
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures, columns
 from shapepose_fg.evaluation.experiments.scenes import FRAME_BY_FRAME, OVER_TIME, Scale, Segment
 from shapepose_fg.evaluation.metrics import People, PlainPeople, joint_metrics
@@ -81,7 +80,7 @@ def _baseline(segment: Segment, timed: bool) -> tuple[People, Figures]:
 
 def _proposals(segment: Segment, config: PipelineConfig) -> tuple[People, Figures]:
     """Stage I of every frame, triangulated."""
-    return before_refinement(segment.detections, segment.scene.rig, config), {}
+    return initial_proposals(segment.detections, segment.scene.rig, config), {}
 
 
 def _method(segment: Segment, config: PipelineConfig) -> tuple[People, Figures]:
