@@ -11,6 +11,9 @@ from scipy.special import gammaincinv
 
 from shapepose_fg.core.skeleton import BODY_25
 
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
 MAX_DISTANCE_M = 0.5
 """Metres. A prediction this far from a person, in the mean over joints, is not that person."""
 
@@ -35,7 +38,7 @@ class PlainPeople:
 
     frame: NDArray[np.int64]
     """(N,) frame of each row."""
-    joints: NDArray[np.float64]
+    joints: Array
     """(N, J, 3) joints of each row, metres in the world, NaN where unknown."""
     person: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     """(N,) identity, or the number within the frame; empty where there is none."""
@@ -47,17 +50,17 @@ class PlainPeople:
 class Matches:
     """M predictions that are people, and the people and predictions that are left over."""
 
-    row: NDArray[np.intp]
+    row: Index
     """(M,) row of the prediction."""
-    frame: NDArray[np.intp]
+    frame: Index
     """(M,) index of the frame in the truth."""
-    person: NDArray[np.intp]
+    person: Index
     """(M,) index of the person in the truth."""
-    duplicated: NDArray[np.intp]
+    duplicated: Index
     """Rows of predictions near a person who is matched with another prediction."""
-    invented: NDArray[np.intp]
+    invented: Index
     """Rows of predictions that are near no person."""
-    missed: NDArray[np.intp]
+    missed: Index
     """(K, 2) frame and person of the people who are matched with no prediction."""
 
 
@@ -101,7 +104,7 @@ def match_people(
     return Matches(row, at, who, twice, nowhere, np.array(missed, dtype=np.intp).reshape(-1, 2))
 
 
-def mean_distance(predicted: NDArray[np.float64], truth: NDArray[np.float64]) -> NDArray[np.float64]:
+def mean_distance(predicted: Array, truth: Array) -> Array:
     """Mean joint distance (...) in metres of pairs of people: `predicted` and `truth` (..., J, 3) broadcast.
 
     A joint that only the prediction lacks counts 0.5 m, one that the truth lacks counts nothing; infinite for a
@@ -203,13 +206,7 @@ def joint_metrics(
     return metrics_of(matches, joints, truth, correct_m=correct_m)
 
 
-def metrics_of(
-    matches: Matches,
-    joints: NDArray[np.float64],
-    truth: NDArray[np.float64],
-    *,
-    correct_m: float = CORRECT_M,
-) -> JointMetrics:
+def metrics_of(matches: Matches, joints: Array, truth: Array, *, correct_m: float = CORRECT_M) -> JointMetrics:
     """The figures of people who are matched already: rows `joints` (N, J, 3), `truth` (T, P, J, 3), metres.
 
     The joints may be some of those by which people were matched.
@@ -234,7 +231,7 @@ def metrics_of(
 class CovarianceCalibration:
     """Whether covariances say how far the joints really are from the truth."""
 
-    nees: NDArray[np.float64]
+    nees: Array
     """(M,) normalised estimation error squared e^T C^-1 e of each joint: chi-squared with 3 degrees of freedom
     if the covariances are true."""
     coverage: dict[float, float]

@@ -159,11 +159,7 @@ def score_tracks(
 
 
 def identity_metrics(
-    matches: Matches,
-    index: NDArray[np.integer],
-    identity: NDArray[np.integer],
-    joints: NDArray[np.float64],
-    truth: NDArray[np.float64],
+    matches: Matches, index: NDArray[np.integer], identity: NDArray[np.integer], joints: Array, truth: Array
 ) -> IdentityMetrics:
     """Compare the identities of rows with those of the truth (T, P, J, 3), NaN where a person is absent.
 

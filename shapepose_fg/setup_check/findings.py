@@ -113,10 +113,7 @@ def _focal(finding: Finding, side_px: int) -> str:
     by, more = (
         ("{percent:.0f} %", "")
         if 0.8 < finding.amount < 1.25
-        else (
-            "{amount:.2g} times what fits,",
-            " and the size of its pictures",
-        )
+        else ("{amount:.2g} times what fits,", " and the size of its pictures")
     )
     return f"{{who}} has a focal length in the calibration that looks {by} too {what}; check its intrinsics{more}"
 
