@@ -207,10 +207,7 @@ def joint_metrics(
 
 
 def metrics_of(matches: Matches, joints: Array, truth: Array, *, correct_m: float = CORRECT_M) -> JointMetrics:
-    """The figures of people who are matched already: rows `joints` (N, J, 3), `truth` (T, P, J, 3), metres.
-
-    The joints may be some of those by which people were matched.
-    """
+    """The figures of people who are matched already: rows `joints` (N, J, 3), `truth` (T, P, J, 3), metres."""
     true_known = np.isfinite(truth.sum(axis=3))
     distance = np.linalg.norm(joints[matches.row] - truth[matches.frame, matches.person], axis=2)
     both = np.isfinite(distance)

@@ -16,7 +16,7 @@ from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.io.footage.footage import glance, open_footage
 from shapepose_fg.io.footage.places import VIDEOS, find_footage
 from shapepose_fg.setup_check.evidence import Evidence, Look, gather
-from shapepose_fg.setup_check.findings import Duplicate, Finding, Kind
+from shapepose_fg.setup_check.findings import Finding, Kind
 from shapepose_fg.setup_check.fit import difference
 from shapepose_fg.setup_check.hypotheses import Lag, gross_mistake, lag_of, lags
 from shapepose_fg.setup_check.matching import same_frame
@@ -50,7 +50,8 @@ def duplicates(rig: Rig, evidence: Evidence) -> list[Finding]:
         pose = away <= _SAME_PLACE * spread and angle_deg < _SAME_ANGLE_DEG and len(rig) > 2
         seen = _same_detections(evidence, rig, first, second)
         if pose or seen:
-            findings.append(Finding(Kind.DUPLICATE, (first, second), duplicate=Duplicate(bool(pose), seen)))
+            same = "" if pose and seen else "pose" if pose else "detections"
+            findings.append(Finding(Kind.DUPLICATE, (first, second), same=same))
     return findings
 
 

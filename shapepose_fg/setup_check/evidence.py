@@ -99,10 +99,7 @@ def observed(groups: Groups, sightings: Sightings) -> tuple[Array, Array, Array]
 
 
 def triangulate(xy: Array, confidence: Array, size: Array, views: Views, steps: int = _STEPS) -> Structure:
-    """Robust triangulation of all joints: linear, then reweighted Gauss-Newton.
-
-    Needs two cameras for a joint; see `observed` for the arguments.
-    """
+    """Robust triangulation of what is `observed`, two cameras or more: linear, then reweighted Gauss-Newton."""
     seen = ~np.isnan(xy[..., 0])
     prior = np.where(seen, confidence, 0.0) / (KERNEL * np.where(np.isnan(size), 1.0, size)[:, None]) ** 2
     prior = np.where((seen.sum(axis=-1) >= 2)[..., None], prior, 0.0)

@@ -149,10 +149,7 @@ def _scaled_to(points: Array, xy: Array, camera: Pinhole, centre: Array) -> Pinh
 
 
 def scaled(camera: Pinhole, factor: float, centre: Array) -> Pinhole:
-    """The camera whose pixels are `factor` times as far from `centre` (2,).
-
-    About the principal point that is another focal length, about `CORNER` pictures of another size.
-    """
+    """Pixels `factor` times as far from `centre` (2,): another focal length, or about `CORNER` picture size."""
     K = camera.K.copy()
     K[:2, :2] *= factor
     K[:2, 2] = centre + factor * (K[:2, 2] - centre)

@@ -286,10 +286,7 @@ def camera_use(people: Reconstruction, detections: DetectionSequence, rig: Rig, 
 
 
 def _left_out(table: ObservationTable, rig: Rig) -> tuple[Array, Array]:
-    """(N, J, V) distance of each detection to where the others' used ones put the joint, pixels and millimetres.
-
-    Of rows spread over the result; NaN where fewer than two others saw the joint.
-    """
+    """(R, J, V) distances of detections from where two or more others put the joint, px and mm; R rows of all."""
     rows = np.unique(np.linspace(0, len(table) - 1, min(len(table), _ROWS)).astype(np.intp))
     xy, gate = table.xy[rows].astype(np.float64), table.gate[rows]
     confidence, size = table.confidence[rows].astype(np.float64), size_of(np.moveaxis(xy, 2, 1))

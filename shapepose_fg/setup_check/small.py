@@ -182,10 +182,7 @@ class Problem:
         return np.array([-self.normal.g[block] @ self.normal.solve(block) for block in blocks])
 
     def _solved(self, step: Callable[[Normal, Structure, Array], Array]) -> tuple[Views, Array, float]:
-        """Cameras after some steps (V Q,), the steps' sum (V, Q), and the part of the robust cost that remains.
-
-        `step` is told the normal equations, the people, and the sum so far.
-        """
+        """Cameras after steps (V Q,), which are told their sum so far; the sum (V, Q); the cost that remains."""
         views, structure, normal, total = self.views, self.structure, self.normal, np.zeros(len(self.views) * Q)
         for number in range(_ROUNDS):
             normal = normal_equations(structure, views) if number > 0 else normal

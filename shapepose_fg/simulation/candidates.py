@@ -20,10 +20,7 @@ Array = NDArray[np.float64]
 
 
 class NoiseProcess:
-    """Seven standard normal processes for every view, person and joint.
-
-    Each is the sum of a fast and a slow AR(1) process and of white noise.
-    """
+    """Seven standard normal processes for every view, person and joint: fast and slow AR(1), and white noise."""
 
     ERROR_X, ERROR_Y, CONFIDENCE, SCALE, SWAP, CAPTURE, LOST = range(7)
 

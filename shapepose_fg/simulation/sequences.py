@@ -133,7 +133,7 @@ class Room:
         """One who walks through, between and around all who are there already."""
         middles, limbs = self.points(_MIDDLES), self.points(_LIMBS)
         speed = float(np.linalg.norm(clip.pelvis[-1] - clip.pelvis[0]) / len(clip) * clip.fps)
-        way = way_through(
+        path, heading = way_through(
             np.concatenate([middles, limbs], axis=1),
             self.frames,
             self.rng,
@@ -143,7 +143,7 @@ class Room:
             half_room_m=_HALF_ROOM_M,
         )
         start = self.rng.uniform()
-        walk = walk_along(self.body, betas, clip, way.xy, way.heading, fps=self.fps, start=start)
+        walk = walk_along(self.body, betas, clip, path, heading, fps=self.fps, start=start)
         self._add(walk, clip.name)
 
     def points(self, joints: tuple[int, ...]) -> Array:

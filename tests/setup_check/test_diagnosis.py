@@ -99,10 +99,10 @@ def test_exchanged_cameras_are_named(recording, room):
 def test_a_camera_that_is_listed_twice_is_named(recording, room):
     found = only_finding(*listed_twice(recording, room, 1))
     assert (found.kind, found.cameras) == (Kind.DUPLICATE, (1, 5))
-    assert found.duplicate.same_pose and found.duplicate.same_detections
+    assert found.same == ""
     found = only_finding(recording, same_pose(room, 1, 3))
     assert (found.kind, found.cameras) == (Kind.DUPLICATE, (1, 3))
-    assert found.duplicate.same_pose and not found.duplicate.same_detections
+    assert found.same == "pose"
 
 
 @pytest.mark.slow
