@@ -72,7 +72,7 @@ def smpl_only(people: Reconstruction, rig: Rig, config: ObservationConfig) -> Sm
     with torch_threads(1):
         began = time.process_time()
         joints, _ = fitter.fit(observations, rig, start)
-        return SmplOnly(PlainPeople(people.frame, joints), start, time.process_time() - began)
+        return SmplOnly(PlainPeople(people.frame.astype(np.int64), joints), start, time.process_time() - began)
 
 
 class MultiViewSmplify:
