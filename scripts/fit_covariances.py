@@ -20,7 +20,7 @@ import torch
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.calibration import Calibration, Clues
-from shapepose_fg.evaluation.matching import match_people
+from shapepose_fg.evaluation.metrics import match_people
 from shapepose_fg.pipeline.pipeline import reconstruct
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.mocap import Mocap

@@ -23,7 +23,7 @@ import torch
 
 from shapepose_fg.evaluation.experiments.experiment import measured
 from shapepose_fg.evaluation.experiments.registry import experiments
-from shapepose_fg.evaluation.experiments.segments import RECORDINGS, Scale
+from shapepose_fg.evaluation.experiments.scenes import RECORDINGS, Scale
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

@@ -13,8 +13,7 @@ from rich.table import Table
 from shapepose_fg.core.detections import Recording
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.evaluation.matching import Matches, match_people
-from shapepose_fg.evaluation.metrics import CORRECT_M, covariance_calibration, joint_metrics
+from shapepose_fg.evaluation.metrics import CORRECT_M, Matches, covariance_calibration, joint_metrics, match_people
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.solved_setup import CAMERAS
 from shapepose_fg.pipeline.execution import Execution

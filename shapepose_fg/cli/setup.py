@@ -24,7 +24,7 @@ def check_calibration(
     """
     from shapepose_fg.core.storage.kept_arrays import InFolder
     from shapepose_fg.io.detections import read_detections
-    from shapepose_fg.setup_check.plain import other_sizes
+    from shapepose_fg.setup_check.diagnosis import other_sizes
     from shapepose_fg.setup_check.report import check_setup
     from shapepose_fg.setup_check.table import setup_report
 

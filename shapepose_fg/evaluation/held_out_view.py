@@ -11,7 +11,7 @@ from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.detections import DetectionSequence, Recording
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.estimation.linearisation import MIN_DEPTH_M, ObservationConfig
-from shapepose_fg.evaluation.matching import match_people
+from shapepose_fg.evaluation.metrics import match_people
 
 NEAR_M = 0.3
 """A candidate that the gate refused is compared as long as it lies within this length of the joint."""

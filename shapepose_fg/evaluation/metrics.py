@@ -1,13 +1,121 @@
-"""How good joints are against a known truth: precision, recall, MPJPE, people found, honest covariances."""
+"""How good joints are against a known truth: who is who, precision, recall, MPJPE, people found, covariances."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 from scipy.special import gammaincinv
 
-from shapepose_fg.evaluation.matching import Matches, People, PlainPeople, match_people
+from shapepose_fg.core.skeleton import BODY_25
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+MAX_DISTANCE_M = 0.5
+"""Metres. A prediction this far from a person, in the mean over joints, is not that person."""
+
+
+class People(Protocol):
+    """What is scored: a `Reconstruction`, or anything with its two arrays."""
+
+    @property
+    def frame(self) -> NDArray[np.integer]:
+        """(N,) frame of each row."""
+        ...
+
+    @property
+    def joints(self) -> NDArray[np.floating]:
+        """(N, J, 3) joints of each row, metres, NaN where unknown."""
+        ...
+
+
+@dataclass(frozen=True)
+class PlainPeople:
+    """N rows, one per person and frame, of which nothing but joints is known; implements `People`."""
+
+    frame: NDArray[np.int64]
+    """(N,) frame of each row."""
+    joints: Array
+    """(N, J, 3) joints of each row, metres in the world, NaN where unknown."""
+    person: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    """(N,) identity, or the number within the frame; empty where there is none."""
+    joint_names: tuple[str, ...] = BODY_25.joints
+    """(J,) names."""
+
+
+@dataclass(frozen=True)
+class Matches:
+    """M predictions that are people, and the people and predictions that are left over."""
+
+    row: Index
+    """(M,) row of the prediction."""
+    frame: Index
+    """(M,) index of the frame in the truth."""
+    person: Index
+    """(M,) index of the person in the truth."""
+    duplicated: Index
+    """Rows of predictions near a person who is matched with another prediction."""
+    invented: Index
+    """Rows of predictions that are near no person."""
+    missed: Index
+    """(K, 2) frame and person of the people who are matched with no prediction."""
+
+
+def match_people(
+    frame: NDArray[np.integer],
+    joints: NDArray[np.floating],
+    truth: NDArray[np.floating],
+    frames: Sequence[int] | range | None = None,
+) -> Matches:
+    """Match predictions `joints` (N, J, 3) of `frame` (N,) with `truth` (T, P, J, 3), all in metres.
+
+    `frames` (T,) numbers the frames of the truth, 0 to T - 1 by default; predictions of other frames are left
+    out, as are predictions and true people without any joint. The cost of a pair is its `mean_distance`; the
+    assignment is the best one of each frame (Hungarian), pairs of 0.5 m or more are none.
+    """
+    predicted, true = np.asarray(joints, dtype=np.float64), np.asarray(truth, dtype=np.float64)
+    if true.ndim != 4 or true.shape[3] != 3:
+        raise ValueError(f"truth must be (T, P, J, 3), got {true.shape}")
+    if predicted.shape != (len(frame), *true.shape[2:]):
+        raise ValueError(f"joints must be ({len(frame)}, {true.shape[2]}, 3), got {predicted.shape}")
+    numbers = range(len(true)) if frames is None else frames
+    if len(numbers) != len(true):
+        raise ValueError(f"frames must number the {len(true)} frames of the truth, got {len(numbers)}")
+    has_joint = np.isfinite(predicted.sum(axis=2)).any(axis=1)
+    is_there = np.isfinite(true.sum(axis=3)).any(axis=2)
+    pairs, missed = list[tuple[int, int, int]](), list[tuple[int, int]]()
+    duplicated, invented = list[int](), list[int]()
+    for index, number in enumerate(numbers):
+        rows, people = np.flatnonzero((np.asarray(frame) == number) & has_joint), np.flatnonzero(is_there[index])
+        cost = mean_distance(predicted[rows, None], true[index, people])
+        # Beyond the bound all pairs are equally none: a far one must not decide about the near ones.
+        at_row, at_person = linear_sum_assignment(np.minimum(cost, MAX_DISTANCE_M))
+        near = cost[at_row, at_person] < MAX_DISTANCE_M
+        at_row, at_person = at_row[near], at_person[near]
+        pairs += [(row, index, who) for row, who in zip(rows[at_row], people[at_person], strict=True)]
+        missed += [(index, who) for who in np.setdiff1d(people, people[at_person])]
+        for left in np.setdiff1d(np.arange(len(rows)), at_row):
+            (duplicated if (cost[left] < MAX_DISTANCE_M).any() else invented).append(int(rows[left]))
+    row, at, who = np.array(pairs, dtype=np.intp).reshape(-1, 3).T
+    twice, nowhere = (np.array(each, dtype=np.intp) for each in (duplicated, invented))
+    return Matches(row, at, who, twice, nowhere, np.array(missed, dtype=np.intp).reshape(-1, 2))
+
+
+def mean_distance(predicted: Array, truth: Array) -> Array:
+    """Mean joint distance (...) in metres of pairs of people: `predicted` and `truth` (..., J, 3) broadcast.
+
+    A joint that only the prediction lacks counts 0.5 m, one that the truth lacks counts nothing; infinite for a
+    person without joints.
+    """
+    distance = np.linalg.norm(predicted - truth, axis=-1)
+    known = np.isfinite(truth).all(axis=-1)
+    distance = np.where(known, np.where(np.isfinite(distance), distance, MAX_DISTANCE_M), 0.0).sum(axis=-1)
+    count = known.sum(axis=-1)
+    return np.where(count > 0, distance / np.maximum(count, 1), np.inf)
+
 
 CORRECT_M = 0.2
 """A joint is correct if it is at most this far from the true one (the protocol of Zhang et al.), metres."""
@@ -98,17 +206,8 @@ def joint_metrics(
     return metrics_of(matches, joints, truth, correct_m=correct_m)
 
 
-def metrics_of(
-    matches: Matches,
-    joints: NDArray[np.float64],
-    truth: NDArray[np.float64],
-    *,
-    correct_m: float = CORRECT_M,
-) -> JointMetrics:
-    """The figures of people who are matched already: rows `joints` (N, J, 3), `truth` (T, P, J, 3), metres.
-
-    The joints may be some of those by which people were matched.
-    """
+def metrics_of(matches: Matches, joints: Array, truth: Array, *, correct_m: float = CORRECT_M) -> JointMetrics:
+    """The figures of people who are matched already: rows `joints` (N, J, 3), `truth` (T, P, J, 3), metres."""
     true_known = np.isfinite(truth.sum(axis=3))
     distance = np.linalg.norm(joints[matches.row] - truth[matches.frame, matches.person], axis=2)
     both = np.isfinite(distance)
@@ -129,7 +228,7 @@ def metrics_of(
 class CovarianceCalibration:
     """Whether covariances say how far the joints really are from the truth."""
 
-    nees: NDArray[np.float64]
+    nees: Array
     """(M,) normalised estimation error squared e^T C^-1 e of each joint: chi-squared with 3 degrees of freedom
     if the covariances are true."""
     coverage: dict[float, float]

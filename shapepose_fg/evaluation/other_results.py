@@ -13,7 +13,7 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25, MID_HIP
 from shapepose_fg.core.storage.files import open_regular, read_text
-from shapepose_fg.evaluation.matching import PlainPeople
+from shapepose_fg.evaluation.metrics import PlainPeople
 from shapepose_fg.io.export.take import opensim_axes
 
 SHELF_JOINTS = tuple(

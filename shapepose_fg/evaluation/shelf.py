@@ -15,7 +15,7 @@ from rich.table import Table
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.evaluation.matching import People
+from shapepose_fg.evaluation.metrics import People, PlainPeople
 from shapepose_fg.evaluation.other_results import SHELF_JOINTS, read_skeleton_text
 
 _LIMBS = {
@@ -40,25 +40,13 @@ MISSING_JOINT_M, RECALL_M = 0.5, 0.2
 """What a missing joint counts in the choice of a prediction; a joint is recalled when it is at most so far off."""
 
 
-@dataclass(frozen=True)
-class ShelfGroundTruth:
-    """Annotated people, one row per person and frame."""
+def read_shelf_ground_truth(path: Path | str) -> PlainPeople:
+    """Annotated people from the text format of the 4D Association Graph's Shelf data, in `SHELF_JOINTS`.
 
-    frame: NDArray[np.int64]
-    """(G,) frame of the recording, counted from 0 in the file."""
-    actor: NDArray[np.int64]
-    """(G,) id as written: 0, 1, 2 are the actors 1, 2, 3; others are not scored."""
-    joints: NDArray[np.float64]
-    """(G, 15, 3) metres in the world, in the order of `SHELF_JOINTS`."""
-
-
-def read_shelf_ground_truth(path: Path | str) -> ShelfGroundTruth:
-    """Read annotated people from the text format of the 4D Association Graph's Shelf data.
-
-    InputError that names file and line for a missing, malformed or truncated file.
+    `person` 0, 1, 2 are the actors 1, 2, 3; others are not scored. InputError that names file and line for a
+    missing, malformed or truncated file.
     """
-    text = read_skeleton_text(Path(path), shelf=True)
-    return ShelfGroundTruth(text.frame, text.person, text.joints)
+    return read_skeleton_text(Path(path), shelf=True)
 
 
 @dataclass(frozen=True)
@@ -137,9 +125,7 @@ class ShelfScore:
         return table
 
 
-def evaluate_shelf(
-    people: People, ground_truth: ShelfGroundTruth, frames: Iterable[int] | None = None
-) -> ShelfScore:
+def evaluate_shelf(people: People, ground_truth: PlainPeople, frames: Iterable[int] | None = None) -> ShelfScore:
     """Score `people` against the annotated actors, in `frames` or in all annotated frames.
 
     Each annotated person takes the prediction of its frame with the smallest mean joint distance; two may take
@@ -148,7 +134,7 @@ def evaluate_shelf(
     whose run says which frames it covered (`run["frames"]`, [start, stop] or several) is scored on those.
     InputError if no annotated frame is left to score.
     """
-    scored = acted = np.isin(ground_truth.actor, ACTORS)
+    scored = acted = np.isin(ground_truth.person, ACTORS)
     frames = _frames_run(people) if frames is None else frames
     if frames is not None:
         scored = acted & np.isin(ground_truth.frame, np.fromiter(frames, dtype=np.int64))
@@ -162,7 +148,7 @@ def evaluate_shelf(
     found = np.where(np.isfinite(distance), distance, MISSING_JOINT_M).mean(axis=1) < MISSING_JOINT_M
     length = np.linalg.norm(truth[:, LIMBS[:, 0]] - truth[:, LIMBS[:, 1]], axis=2)
     right = distance[:, LIMBS].mean(axis=2) <= 0.5 * length  # a missing end (NaN) makes it false
-    member = ground_truth.actor[scored, None] == np.array(ACTORS)
+    member = ground_truth.person[scored, None] == np.array(ACTORS)
     known = np.isfinite(distance) & found[:, None]
     return ShelfScore(
         limbs_right=member.T.astype(np.int64) @ right,
@@ -178,10 +164,8 @@ def evaluate_shelf(
 
 def _distances(truth: NDArray[np.float64], frame: NDArray[np.int64], people: People) -> NDArray[np.float64]:
     """(G, 15) distances of the joints that annotated people (G, 15, 3) take, metres; NaN where there is none."""
-    joints, names = (
-        np.asarray(people.joints, dtype=np.float64),
-        tuple(getattr(people, "joint_names", BODY_25.joints)),
-    )
+    joints = np.asarray(people.joints, dtype=np.float64)
+    names = tuple(getattr(people, "joint_names", BODY_25.joints))
     if names not in (SHELF_JOINTS, BODY_25.joints):
         raise InputError("the people's joints are not those of BODY_25, which this protocol maps to Shelf's 15")
     joints = joints if names == SHELF_JOINTS else shelf_joints(joints)

@@ -26,6 +26,7 @@ from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.estimation.linearisation import ObservationConfig, triangulate
+from shapepose_fg.evaluation.metrics import PlainPeople
 
 Array = NDArray[np.float64]
 
@@ -36,41 +37,19 @@ _MOMENTUM, _MEMORY, _TINY = 0.8, 0.95, 1e-8
 _STEP_BETA, _STEP_RAD, _STEP_M = 0.5, 0.2, 0.03
 """Lengths of the first steps along betas, angles and translation; they fall to zero as half a cosine."""
 _MIN_DEPTH_M, _START_SIGMA_M, _MIN_START_JOINTS = 0.2, 0.05, 3
-
-
-@dataclass(frozen=True)
-class SmplifyConfig:
-    """Settings, chosen on the split `tune`: see docs/evaluation.md."""
-
-    iterations: int = 100
-    """Steps of Adam in all."""
-    root_iterations: int = 15
-    """Of these, the first move the root only, by the joints of the torso."""
-    sigma_m: float = 0.02
-    """One sigma of a detection of confidence 1, as a length at the person's depth."""
-    kernel_scale: float = 2.5
-    """Where the Geman-McClure kernel has cut a detection's weight to a quarter, sigmas."""
-    prior_start: float = 10.0
-    """How many times as stiff the priors begin; they loosen to 1 by the middle of the steps."""
-
-
-@dataclass(frozen=True)
-class SmplifyPeople:
-    """N rows, one per person and frame; what `evaluation` scores."""
-
-    frame: NDArray[np.intp]
-    """(N,) frame."""
-    joints: Array
-    """(N, J, 3) the bodies' joints, where the detector puts them, metres; NaN where nothing placed the body."""
-    parameters: BodyParameters
-    """The bodies, NaN where there is none."""
+_ROOT_STEPS, _STEPS = 15, 85
+"""Steps of Adam: of the root only, by the torso's joints, and of everything. These and the next were chosen on
+the split `tune` (docs/evaluation.md)."""
+_SIGMA_M, _STIFF = 0.02, 10.0
+"""One sigma of a detection of confidence 1, as a length at the person's depth; how many times as stiff the priors
+begin: they loosen to 1 by the middle of the steps."""
 
 
 @dataclass(frozen=True)
 class SmplOnly:
     """SMPL-only beside a result without time, row by row, from the same detections."""
 
-    people: SmplifyPeople
+    people: PlainPeople
     """Bodies fitted to the detections directly."""
     triangulated: Array
     """(N, J, 3) X_0: robust triangulation of the views alone, metres; NaN where no two views agree."""
@@ -92,16 +71,17 @@ def smpl_only(people: Reconstruction, rig: Rig, config: ObservationConfig) -> Sm
     start, fitter = triangulate(observations, Views.of(rig), config), MultiViewSmplify(model)
     with torch_threads(1):
         began = time.process_time()
-        fitted = fitter.fit(observations, rig, start)
-        return SmplOnly(fitted, start, time.process_time() - began)
+        joints, _ = fitter.fit(observations, rig, start)
+        return SmplOnly(PlainPeople(people.frame.astype(np.int64), joints), start, time.process_time() - began)
 
 
 class MultiViewSmplify:
     """Fits bodies to the views' detections of rows that have nothing to do with each other, all at once."""
 
-    def __init__(self, model: BodyModel | None = None, config: SmplifyConfig | None = None):
+    def __init__(self, model: BodyModel | None = None, kernel_scale: float = 2.5):
+        """At `kernel_scale` sigmas the Geman-McClure kernel has cut a detection's weight to a quarter."""
         model, prior = BodyModel.default() if model is None else model, PosePrior.default()
-        self.config = SmplifyConfig() if config is None else config
+        self._kernel_scale = kernel_scale
         self.model = model.to(torch.float32)
         self._frame = PersonFrame.of_angles(model, prior.mean, prior.covariance)
         self._slots = slots(model.keypoint_names)
@@ -110,8 +90,8 @@ class MultiViewSmplify:
         self._torso = torch.tensor([name in TORSO for name in model.keypoint_names])
 
     @torch.inference_mode()
-    def fit(self, observations: Observations, rig: Rig, start: Array) -> SmplifyPeople:
-        """Bodies of N rows.
+    def fit(self, observations: Observations, rig: Rig, start: Array) -> tuple[Array, BodyParameters]:
+        """Bodies of N rows: joints (N, J, 3) where the detector puts them, metres, and parameters; NaN for none.
 
         Where triangulation puts the joints, `start` (N, J, 3), metres, NaN where it does not, gives the root's
         first place, and nothing else. Rows with fewer than three joints have no body.
@@ -123,14 +103,14 @@ class MultiViewSmplify:
         free = torch.full((N, self._energy.num_free), torch.nan)
         if len(rows) > 0:
             rotation, pelvis = self._root(start[rows], placed[rows])
-            views = _ViewTargets.of(observations.rows(rows), rig, pelvis.numpy(), self.config.sigma_m)
+            views = _ViewTargets.of(observations.rows(rows), rig, pelvis.numpy(), _SIGMA_M)
             solved = self._solve(rotation, views)
             joints[rows] = (
                 self.model.keypoints(self._energy.complete(solved)).double().numpy() + pelvis.numpy()[:, None]
             )
             solved[:, -3:] += pelvis.float()
             free[torch.from_numpy(rows)] = solved
-        return SmplifyPeople(observations.frame, joints, self._energy.complete(free))
+        return joints, self._energy.complete(free)
 
     def _root(self, start: Array, placed: NDArray[np.bool_]) -> tuple[Tensor, Tensor]:
         """Rotations (B, 3, 3) and places (B, 3) of the root, by the torso's joints, or by all if these are few."""
@@ -144,20 +124,19 @@ class MultiViewSmplify:
 
     def _solve(self, rotation: Tensor, views: "_ViewTargets") -> Tensor:
         """Free parameters (B, P) around the root's start: all steps of Adam (Kingma and Ba 2015)."""
-        config, energy = self.config, self._energy
-        B = len(rotation)
+        energy, B = self._energy, len(rotation)
         angles = self._mean_angles.expand(B, -1)
         transl = self._frame.transl.float().expand(B, -1)
         free = torch.cat((torch.zeros(B, 10), log_so3(rotation).float(), angles, transl), 1)
         lengths = torch.full((energy.num_free,), _STEP_RAD)
         lengths[:10], lengths[-3:] = _STEP_BETA, _STEP_M
         for root_only in (True, False):
-            steps = config.root_iterations if root_only else config.iterations - config.root_iterations
+            steps = _ROOT_STEPS if root_only else _STEPS
             only = self._torso if root_only else None
             first, second = torch.zeros_like(free), torch.zeros_like(free)
             for n in range(steps):
                 looser = 1.0 if root_only else max(0.0, 1.0 - 2.0 * n / steps)
-                stiff, scale = config.prior_start**looser, config.kernel_scale * 4.0**looser
+                stiff, scale = _STIFF**looser, self._kernel_scale * 4.0**looser
                 # The priors are the energy's own; stiffer ones are detections that weigh less.
                 slope = energy.slope_of(free, lambda xyz: views.pull(xyz, scale, 1 / stiff, only))  # noqa: B023
                 gradient = slope.gradient.clone()

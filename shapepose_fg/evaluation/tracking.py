@@ -12,11 +12,14 @@ from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.evaluation.matching import MAX_DISTANCE_M, Matches, match_people, mean_distance
 from shapepose_fg.evaluation.metrics import (
+    MAX_DISTANCE_M,
     CovarianceCalibration,
     JointMetrics,
+    Matches,
     covariance_calibration,
+    match_people,
+    mean_distance,
     metrics_of,
     share,
 )
@@ -156,11 +159,7 @@ def score_tracks(
 
 
 def identity_metrics(
-    matches: Matches,
-    index: NDArray[np.integer],
-    identity: NDArray[np.integer],
-    joints: NDArray[np.float64],
-    truth: NDArray[np.float64],
+    matches: Matches, index: NDArray[np.integer], identity: NDArray[np.integer], joints: Array, truth: Array
 ) -> IdentityMetrics:
     """Compare the identities of rows with those of the truth (T, P, J, 3), NaN where a person is absent.
 
@@ -197,10 +196,7 @@ def identity_metrics(
 
 
 def body_joints(people: Reconstruction) -> Array:
-    """(N, J, 3) the joints of the fitted bodies, where the detector puts them; NaN where there is no body.
-
-    The offsets are those that the run learnt (`run["keypoint_offsets"]`); without any, the model's own joints.
-    """
+    """(N, J, 3) joints of the fitted bodies, with the offsets that the run learnt; NaN where there is no body."""
     model, offsets = BodyModel.default(), people.run.get("keypoint_offsets")
     if offsets is not None:
         model = model.with_keypoint_offsets(KeypointOffsets.from_dict(offsets))
@@ -221,9 +217,7 @@ def views_used(people: Reconstruction) -> NDArray[np.intp]:
 
 
 def joints_by_frame(people: Reconstruction) -> Array:
-    """(T, P, J, 3) joints of the P identities of `people`, in rising order, from their first frame to their last;
-    NaN where absent.
-    """
+    """(T, P, J, 3) joints of the P identities, in rising order, from first to last frame; NaN where absent."""
     names, number = np.unique(people.person, return_inverse=True)
     index = people.frame - people.frame.min() if len(people) > 0 else people.frame
     table = np.full((index.max(initial=-1) + 1, len(names), *people.joints.shape[1:]), np.nan)
@@ -232,10 +226,9 @@ def joints_by_frame(people: Reconstruction) -> Array:
 
 
 def acceleration_errors(placed: Array, truth: Array, follows: NDArray[np.bool_], fps: float) -> Array:
-    """(T - 2, P, J) length of the difference of accelerations, m/s²: of `placed` and `truth` (T, P, J, 3), metres.
+    """(T - 2, P, J) error of second differences, m/s², of `placed` and `truth` (T, P, J, 3), metres.
 
-    The acceleration is the second difference over three frames; NaN where one of them does not follow (T, P) the
-    one before.
+    NaN where one of the three frames does not follow (T, P) the one before.
     """
     error = placed - truth
     second = (error[2:] - 2 * error[1:-1] + error[:-2]) * fps**2
@@ -244,10 +237,7 @@ def acceleration_errors(placed: Array, truth: Array, follows: NDArray[np.bool_],
 
 
 def velocities(truth: Array, fps: float) -> Array:
-    """(T, P, J, 3) velocities in m/s of `truth` (T, P, J, 3), metres: half the difference over two frames.
-
-    NaN in the first and last frame, and beside a frame that is missing.
-    """
+    """(T, P, J, 3) velocities, m/s, of `truth` (T, P, J, 3), metres: over two frames; NaN beside missing ones."""
     velocity = np.full(truth.shape, np.nan)
     velocity[1:-1] = (truth[2:] - truth[:-2]) * fps / 2
     return velocity

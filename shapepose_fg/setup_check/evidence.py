@@ -10,11 +10,15 @@ from numpy.typing import NDArray
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.setup_check.fit import Others, Pinhole, match, possible_matches
-from shapepose_fg.setup_check.matching import GATE, Groups, Pairs, errors_of, group, median_of, pair_up
-from shapepose_fg.setup_check.sightings import Sightings, sightings_of
-from shapepose_fg.setup_check.structure import Structure, observed, triangulate
+from shapepose_fg.setup_check.matching import GATE, Groups, Pairs, Sightings, centres_of, median_of
 
 Array = NDArray[np.float64]
+
+_STEPS = 6
+"""Gauss-Newton steps of a robust triangulation; errors fall under a hundredth of a pixel in four."""
+KERNEL = 0.02
+"""Width of the Cauchy kernel, as a part of a person's size in the picture: a detector errs by 3 cm of 170."""
+
 
 ANCHORS = 100
 """Frames that are looked at, spread over the recording."""
@@ -56,13 +60,86 @@ def gather(detections: DetectionSequence, frames: range) -> Evidence:
         spread = np.unique(np.linspace(frames.start + most, frames.stop - 1 - most, ANCHORS).astype(np.intp))
         around = spread[:: max(1, ANCHORS // _LAG_ANCHORS)]
         wanted = np.unique(np.concatenate([spread, *(np.arange(t - most, t + most + 1) for t in around)]))
-    sightings = sightings_of(detections, wanted.tolist())
+    sightings = Sightings.of(detections, wanted.tolist())
     here = sightings.only(np.isin(sightings.frame, spread))
     _, each = np.unique(here.frame, return_counts=True)
     pairs = int((each * (each - 1) // 2).sum())
     if pairs > _MOST_PAIRS:
         spread = spread[:: -(-pairs // _MOST_PAIRS)]
     return Evidence(spread, sightings, most)
+
+
+@dataclass(frozen=True)
+class Structure:
+    """P people, J joints, V cameras."""
+
+    points: Array
+    """(P, J, 3) in the world, the calibration's unit; NaN where fewer than two cameras saw a joint."""
+    xy: Array
+    """(P, J, V, 2) detections, undistorted pixels; NaN where there is none."""
+    residual: Array
+    """(P, J, V, 2) projection minus detection, pixels; NaN where there is none."""
+    depth: Array
+    """(P, J, V) depth of each joint before each camera, the calibration's unit."""
+    size_px: Array
+    """(P, V) the person's size in each picture."""
+    weight: Array
+    """(P, J, V) robust weight of each detection, in 1 / pixels^2 of a unit of its noise; 0 where there is none."""
+    jacobian: Array
+    """(P, J, V, 2, 3) derivative of each projection by the point."""
+
+
+def observed(groups: Groups, sightings: Sightings) -> tuple[Array, Array, Array]:
+    """Detections (P, J, V, 2), confidences (P, J, V) and sizes (P, V) of groups; NaN, 0 and NaN for none."""
+    there = groups.member >= 0
+    xy = np.where(there[..., None, None], sightings.xy[groups.member], np.nan)
+    confidence = np.where(there[..., None], sightings.confidence[groups.member], 0.0)
+    size = np.where(there, sightings.size_px[groups.member], np.nan)
+    return np.moveaxis(xy, 1, 2), np.moveaxis(confidence, 1, 2), size
+
+
+def triangulate(xy: Array, confidence: Array, size: Array, views: Views, steps: int = _STEPS) -> Structure:
+    """Robust triangulation of what is `observed`, two cameras or more: linear, then reweighted Gauss-Newton."""
+    seen = ~np.isnan(xy[..., 0])
+    prior = np.where(seen, confidence, 0.0) / (KERNEL * np.where(np.isnan(size), 1.0, size)[:, None]) ** 2
+    prior = np.where((seen.sum(axis=-1) >= 2)[..., None], prior, 0.0)
+    points = _linear(xy, prior, views)
+    weight = prior
+    for step in range(steps + 1):
+        pixels, depth, jacobian = views.project(points)
+        residual = np.where((prior > 0)[..., None], pixels - xy, np.nan)
+        if step == steps:
+            break
+        ok = ~np.isnan(residual[..., 0])
+        square = np.where(ok, prior * np.nansum(residual**2, axis=-1), 0.0)
+        weight = np.where(ok, prior / (1 + square), 0.0)
+        root = np.sqrt(weight)[..., None]
+        A = np.where(ok[..., None, None], jacobian, 0.0) * root[..., None]
+        A = A.reshape(*A.shape[:2], 2 * len(views), 3)
+        r = (np.where(ok[..., None], residual, 0.0) * root).reshape(*A.shape[:3], 1)
+        H = A.swapaxes(-1, -2) @ A
+        scale = np.trace(H, axis1=-2, axis2=-1)[..., None, None]
+        H = H + (1e-9 * scale + 1e-300) * np.eye(3)
+        points = points - np.linalg.solve(H, A.swapaxes(-1, -2) @ r)[..., 0]
+    return Structure(points, xy, residual, depth, size, weight, jacobian)
+
+
+def _linear(xy: Array, weight: Array, views: Views) -> Array:
+    """(P, J, 3) points nearest to all rays, squares weighted; NaN where fewer than two cameras see a joint."""
+    inverse = np.linalg.inv(views.K)
+    to_world = views.cTw[:, :, :3].swapaxes(1, 2) @ inverse
+    rays = (to_world[:, :, :2] @ xy[..., None])[..., 0] + to_world[:, :, 2]
+    rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+    seen = weight > 0
+    rays = np.where(seen[..., None], rays, 0.0)
+    centres = centres_of(views)
+    # Sum over views of (1 - d d') x = sum of (1 - d d') c.
+    A = seen.sum(axis=-1)[..., None, None] * np.eye(3) - rays.swapaxes(-1, -2) @ rays
+    along = (rays * centres).sum(axis=-1, keepdims=True)
+    b = seen.astype(np.float64) @ centres - (rays * along).sum(axis=-2)
+    enough = seen.sum(axis=-1) >= 2
+    A = np.where(enough[..., None, None], A + 1e-12 * np.eye(3), np.eye(3))
+    return np.where(enough[..., None], np.linalg.solve(A, b[..., None])[..., 0], np.nan)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +190,7 @@ class Look:
     @cached_property
     def pairs(self) -> Pairs:
         """Which of them may be one person."""
-        return pair_up(self.sightings, self.views)
+        return Pairs.of(self.sightings, self.views)
 
     @property
     def view_count(self) -> int:
@@ -133,7 +210,7 @@ class Look:
     def groups(self, without: tuple[int, ...] = ()) -> Groups:
         """People as they are found without some of the cameras."""
         views = tuple(view for view in range(self.view_count) if view not in without)
-        return group(self.pairs, len(self.sightings), views)
+        return self.pairs.groups(len(self.sightings), views)
 
     def structure(self, without: tuple[int, ...] = (), steps: int = 6) -> tuple[Groups, Structure]:
         """These people, and where they are."""
@@ -166,9 +243,9 @@ class Look:
 
     def pair(self, first: int, second: int) -> tuple[Groups, Array, int]:
         """P people that two cameras see, by how much their rays miss (P,), and how many could be matched."""
-        groups = group(self.pairs, len(self.sightings), (first, second))
+        groups = self.pairs.groups(len(self.sightings), (first, second))
         possible = possible_matches(self.seen_by(first).frame, self.seen_by(second).frame)
-        return groups, errors_of(self.pairs, groups, first, second), possible
+        return groups, self.pairs.errors_of(groups, first, second), possible
 
     @cached_property
     def total(self) -> float:

@@ -31,14 +31,6 @@ class Kind(StrEnum):
 
 
 @dataclass(frozen=True)
-class Duplicate:
-    """In what two cameras are one."""
-
-    same_pose: bool
-    same_detections: bool
-
-
-@dataclass(frozen=True)
 class Finding:
     """One thing that is wrong with a set-up."""
 
@@ -54,8 +46,8 @@ class Finding:
     """How far the camera was moved, metres."""
     axis: str = ""
     """The axis that is up for the people."""
-    duplicate: Duplicate | None = None
-    """In what two cameras are one."""
+    same: str = ""
+    """In what alone two cameras are one, if not in both: "pose" or "detections"."""
 
 
 def sentence(finding: Finding, rig: Rig) -> str:
@@ -113,21 +105,16 @@ def _focal(finding: Finding, side_px: int) -> str:
     by, more = (
         ("{percent:.0f} %", "")
         if 0.8 < finding.amount < 1.25
-        else (
-            "{amount:.2g} times what fits,",
-            " and the size of its pictures",
-        )
+        else ("{amount:.2g} times what fits,", " and the size of its pictures")
     )
     return f"{{who}} has a focal length in the calibration that looks {by} too {what}; check its intrinsics{more}"
 
 
 def _duplicate(finding: Finding, side_px: int) -> str:
-    pair = finding.duplicate
-    if pair is None or (pair.same_pose and pair.same_detections):
+    if finding.same == "":
         return "{first} and {second} are one camera listed twice; take one of them out"
-    same, others = (
-        ("the same detections", "files") if pair.same_detections else ("one and the same pose", "calibration")
-    )
+    detections = finding.same == "detections"
+    same, others = ("the same detections", "files") if detections else ("one and the same pose", "calibration")
     return f"{{first}} and {{second}} have {same}; one of them has the other's {others}: give its own"
 
 

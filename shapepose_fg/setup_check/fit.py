@@ -7,15 +7,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from shapepose_fg.core.camera import Views
-from shapepose_fg.setup_check.adjustment import Q, changed
-from shapepose_fg.setup_check.matching import GATE, distances, same_frame
-from shapepose_fg.setup_check.sightings import MIN_JOINTS, Sightings
+from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Sightings, distances, same_frame
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
+PARAMETERS = ("turn x", "turn y", "turn z", "move x", "move y", "move z", "centre x", "centre y", "focal")
+"""Of a camera: a turn about its own axes (rad) where it stands, a move along them (unit of the calibration), the
+principal point (px), and the logarithm of the focal length."""
+Q = len(PARAMETERS)
+TURN, CENTRE, FOCAL, POSE = [0, 1, 2], [6, 7], [8], [0, 1, 2, 3, 4, 5]
+_MOST_ZOOM = 5.0
+"""A step of the focal length's logarithm beyond this is no camera's, and would soon be no number."""
 _TRIES = 40
 """Pairs of a person and a sighting that are tried as one another: half of them are, with two people."""
 _ROUNDS = 6
@@ -143,10 +149,7 @@ def _scaled_to(points: Array, xy: Array, camera: Pinhole, centre: Array) -> Pinh
 
 
 def scaled(camera: Pinhole, factor: float, centre: Array) -> Pinhole:
-    """The camera whose pixels are `factor` times as far from `centre` (2,).
-
-    About the principal point that is another focal length, about `CORNER` pictures of another size.
-    """
+    """Pixels `factor` times as far from `centre` (2,): another focal length, or about `CORNER` picture size."""
     K = camera.K.copy()
     K[:2, :2] *= factor
     K[:2, 2] = centre + factor * (K[:2, 2] - centre)
@@ -154,7 +157,7 @@ def scaled(camera: Pinhole, factor: float, centre: Array) -> Pinhole:
 
 
 def refined(others: Others, seen: Sightings, camera: Pinhole, columns: list[int]) -> Pinhole:
-    """The camera, some of its parameters (`adjustment.PARAMETERS`) fitted to the people that it matches."""
+    """The camera, some of its parameters (`PARAMETERS`) fitted to the people that it matches."""
     for _ in range(_ROUNDS):
         found = match(others, seen, camera)
         if len(found.person) == 0:
@@ -193,3 +196,13 @@ def difference(cTw: Array, other: Array) -> tuple[float, float]:
     cosine = (np.trace(cTw[:, :3] @ other[:, :3].T) - 1) / 2
     centres = [-each[:, :3].T @ each[:, 3] for each in (cTw, other)]
     return float(np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))), float(np.linalg.norm(centres[0] - centres[1]))
+
+
+def changed(views: Views, change: Array) -> Views:
+    """The cameras with `change` (V, Q) made to their parameters."""
+    cTw = Rotation.from_rotvec(change[:, 0:3]).as_matrix() @ views.cTw
+    cTw[:, :, 3] += change[:, 3:6]
+    K = views.K.copy()
+    K[:, :2, :2] *= np.exp(np.clip(change[:, 8], -_MOST_ZOOM, _MOST_ZOOM))[:, None, None]
+    K[:, :2, 2] += change[:, 6:8]
+    return Views(K, cTw)

@@ -1,26 +1,109 @@
-"""Which sightings of different cameras are one person, if the cameras are where they are said to be.
+"""Who was seen by which camera, and which sightings are one person, if the cameras are where they are said to be.
 
 Nothing here has a unit: an error is a part of the person's own size in the picture, so that a calibration in the
 wrong unit matches as well as the right one.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.camera import Views
-from shapepose_fg.setup_check.sightings import MIN_JOINTS, Sightings
+from shapepose_fg.core.detections import Detections, DetectionSequence
+from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.proposal.people_2d import group_people
 
+Mask = NDArray[np.bool_]
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
-Mask = NDArray[np.bool_]
+
+MIN_JOINTS = 5
+"""A person with fewer core joints in view says too little about the camera."""
+_STATURE_PER_SPREAD = 3.4
+"""Stature of a standing person over the root of the joints' summed variances: 1 / 0.29 if spread evenly."""
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """S people as single cameras saw them, J core joints each."""
+
+    frame: Index
+    """(S,) frame of the recording."""
+    view: Index
+    """(S,) camera in the rig."""
+    xy: Array
+    """(S, J, 2) joints, undistorted pixels; NaN where not seen."""
+    confidence: Array
+    """(S, J) the detector's score; 0 where not seen."""
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    @cached_property
+    def size_px(self) -> Array:
+        """(S,) how large a person is in the picture, about the height of one who stands, pixels."""
+        return size_of(self.xy)
+
+    @classmethod
+    def of(cls, detections: DetectionSequence, frames: Iterable[int]) -> "Sightings":
+        """The 2D people of some `frames`, grouped by affinities of their own picture; the core joints only."""
+        parts = [_of_frame(detections[frame], frame, detections.skeleton) for frame in frames]
+        joints = len(detections.skeleton.core)
+        none = cls(np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros((0, joints, 2)), np.zeros((0, joints)))
+        names = ("frame", "view", "xy", "confidence")
+        return cls(*(np.concatenate([getattr(part, name) for part in (none, *parts)]) for name in names))
+
+    def only(self, keep: NDArray[np.bool_] | Index) -> "Sightings":
+        """Some of the sightings."""
+        return Sightings(self.frame[keep], self.view[keep], self.xy[keep], self.confidence[keep])
+
+
+def size_of(xy: Array) -> Array:
+    """(...) size of people whose joints xy (..., J, 2) lie so, pixels; 1 where nothing is seen."""
+    seen = ~np.isnan(xy[..., :1])
+    count = np.maximum(seen.sum(axis=-2), 1)
+    here = np.where(seen, xy, 0.0)
+    mean = here.sum(axis=-2) / count
+    variance = (np.where(seen, (here - mean[..., None, :]) ** 2, 0.0).sum(axis=-2) / count).sum(axis=-1)
+    return np.asarray(np.maximum(_STATURE_PER_SPREAD * np.sqrt(variance), 1.0))
+
+
+def _of_frame(found: Detections, frame: int, skeleton: Skeleton) -> Sightings:
+    """The 2D people of one frame."""
+    place = np.full(len(skeleton), -1)
+    place[list(skeleton.core)] = np.arange(len(skeleton.core))
+    groups = [rows[place[found.joint[rows]] >= 0] for rows in group_people(found) if len(rows) >= MIN_JOINTS]
+    groups = [rows for rows in groups if len(rows) >= MIN_JOINTS]
+    xy = np.full((len(groups), len(skeleton.core), 2), np.nan)
+    confidence = np.zeros(xy.shape[:2])
+    for person, rows in enumerate(groups):
+        xy[person, place[found.joint[rows]]] = found.xy[rows]
+        confidence[person, place[found.joint[rows]]] = found.confidence[rows]
+    view = np.array([found.view[rows[0]] for rows in groups], dtype=np.intp)
+    return Sightings(np.full(len(groups), frame, dtype=np.intp), view, xy, confidence)
+
 
 GATE = 0.15
 """Two sightings whose joints miss each other by more than this part of the person's size are not one person: a
 detector errs by 3 cm of 170, and a calibration that is worth naming by three times that (docs/setup_checks.md)."""
 _MIN_ANGLE = np.deg2rad(4.0)
 """Least angle between two rays of a pair that places a person: below it depth is guessed."""
+
+
+@dataclass(frozen=True)
+class Groups:
+    """P people: the sighting of each camera."""
+
+    frame: Index
+    """(P,) frame."""
+    member: Index
+    """(P, V) the sighting of each camera, -1 where it does not see the person."""
+
+    def __len__(self) -> int:
+        return len(self.frame)
 
 
 @dataclass(frozen=True)
@@ -40,18 +123,54 @@ class Pairs:
     third_error: Array
     """(M, V) its median distance, as a part of its size; inf for none."""
 
+    @classmethod
+    def of(cls, sightings: Sightings, views: Views) -> "Pairs":
+        """All pairs of sightings that may be one person under the cameras `views`, the first camera's first."""
+        first, second = same_frame(sightings.frame, sightings.frame)
+        apart = sightings.view[first] < sightings.view[second]
+        first, second = first[apart], second[apart]
+        error, points = _meeting(sightings, views, first, second)
+        keep = error < GATE
+        members = np.stack([first[keep], second[keep]], axis=1)
+        third, third_error = _others(sightings, views, members, points[keep])
+        return cls(
+            members, sightings.view[members], error[keep], sightings.frame[members[:, 0]], third, third_error
+        )
 
-@dataclass(frozen=True)
-class Groups:
-    """P people: the sighting of each camera."""
+    def groups(self, count: int, views: tuple[int, ...]) -> Groups:
+        """People as the cameras `views` alone see them: the best supported pairs first, each sighting used once.
 
-    frame: Index
-    """(P,) frame."""
-    member: Index
-    """(P, V) the sighting of each camera, -1 where it does not see the person."""
+        `count` is S, of all sightings. In every round each frame takes its best pair with those that support it.
+        """
+        allowed = np.zeros(self.third.shape[1], dtype=bool)
+        allowed[list(views)] = True
+        free = np.ones(count + 1, dtype=bool)  # the last stands for no sighting
+        free[count] = False
+        V = len(allowed)
+        live = np.flatnonzero(allowed[self.views].all(axis=1))
+        members, thirds = self.members, self.third
+        frames, rows = [], []
+        while len(live := live[free[members[live]].all(axis=1)]) > 0:
+            supported = free[thirds[live]] & (thirds[live] >= 0) & allowed & (self.third_error[live] < GATE)
+            worth = 1 - self.error[live] / GATE
+            worth = worth + np.where(supported, 1 - self.third_error[live] / GATE, 0).sum(axis=1)
+            best = least_of_each(self.frame[live], -worth)
+            member = np.where(supported[best], thirds[live[best]], -1)
+            chosen = live[best]
+            member[np.arange(len(best))[:, None], self.views[chosen]] = members[chosen]
+            free[member[member >= 0]] = False
+            frames.append(self.frame[chosen])
+            rows.append(member)
+        if len(rows) == 0:
+            return Groups(np.zeros(0, np.intp), np.zeros((0, V), np.intp))
+        return Groups(np.concatenate(frames), np.concatenate(rows))
 
-    def __len__(self) -> int:
-        return len(self.frame)
+    def errors_of(self, groups: Groups, first: int, second: int) -> Array:
+        """(P,) by how much the rays of two cameras miss each other, of people grouped by these two alone."""
+        of_pair = (self.views == (first, second)).all(axis=1)
+        members = self.members[of_pair].tolist()
+        error = {(a, b): miss for (a, b), miss in zip(members, self.error[of_pair].tolist(), strict=True)}
+        return np.array([error[a, b] for a, b in groups.member[:, [first, second]].tolist()])
 
 
 def rays_of(sightings: Sightings, views: Views) -> Array:
@@ -65,23 +184,6 @@ def rays_of(sightings: Sightings, views: Views) -> Array:
 def centres_of(views: Views) -> Array:
     """(V, 3) optical centres in the world."""
     return -np.einsum("vji,vj->vi", views.cTw[:, :, :3], views.cTw[:, :, 3])
-
-
-def pair_up(sightings: Sightings, views: Views) -> Pairs:
-    """All pairs of sightings that may be one person under the cameras `views`."""
-    first, second = _pairs_of(sightings)
-    error, points = _meeting(sightings, views, first, second)
-    keep = error < GATE
-    members = np.stack([first[keep], second[keep]], axis=1)
-    third, third_error = _others(sightings, views, members, points[keep])
-    return Pairs(members, sightings.view[members], error[keep], sightings.frame[members[:, 0]], third, third_error)
-
-
-def _pairs_of(sightings: Sightings) -> tuple[Index, Index]:
-    """All pairs of sightings of one frame and two cameras, the camera that comes first in the rig first."""
-    first, second = same_frame(sightings.frame, sightings.frame)
-    apart = sightings.view[first] < sightings.view[second]
-    return first[apart], second[apart]
 
 
 def _meeting(sightings: Sightings, views: Views, first: Index, second: Index) -> tuple[Array, Array]:
@@ -166,43 +268,6 @@ def residuals(points: Array, xy: Array, K: Array, cTw: Array) -> Array:
         pixels = (camera @ K.T)[..., :2] / camera[..., 2:]
     residual = np.where(camera[..., 2:] > 0, pixels - xy, np.inf)
     return np.where(np.isnan(xy) | np.isnan(camera[..., 2:]), np.nan, residual)
-
-
-def group(pairs: Pairs, count: int, views: tuple[int, ...]) -> Groups:
-    """People as the cameras `views` alone see them: the best supported pairs first, each sighting used once.
-
-    `count` is S, of all sightings. In every round each frame takes its best pair with those that support it.
-    """
-    allowed = np.zeros(pairs.third.shape[1], dtype=bool)
-    allowed[list(views)] = True
-    free = np.ones(count + 1, dtype=bool)  # the last stands for no sighting
-    free[count] = False
-    V = len(allowed)
-    live = np.flatnonzero(allowed[pairs.views].all(axis=1))
-    members, thirds = pairs.members, pairs.third
-    frames, rows = [], []
-    while len(live := live[free[members[live]].all(axis=1)]) > 0:
-        supported = free[thirds[live]] & (thirds[live] >= 0) & allowed & (pairs.third_error[live] < GATE)
-        worth = 1 - pairs.error[live] / GATE
-        worth = worth + np.where(supported, 1 - pairs.third_error[live] / GATE, 0).sum(axis=1)
-        best = least_of_each(pairs.frame[live], -worth)
-        member = np.where(supported[best], thirds[live[best]], -1)
-        chosen = live[best]
-        member[np.arange(len(best))[:, None], pairs.views[chosen]] = members[chosen]
-        free[member[member >= 0]] = False
-        frames.append(pairs.frame[chosen])
-        rows.append(member)
-    if len(rows) == 0:
-        return Groups(np.zeros(0, np.intp), np.zeros((0, V), np.intp))
-    return Groups(np.concatenate(frames), np.concatenate(rows))
-
-
-def errors_of(pairs: Pairs, groups: Groups, first: int, second: int) -> Array:
-    """(P,) by how much the rays of two cameras miss each other, of people who were grouped by these two alone."""
-    of_pair = (pairs.views == (first, second)).all(axis=1)
-    members = pairs.members[of_pair].tolist()
-    error = {(a, b): miss for (a, b), miss in zip(members, pairs.error[of_pair].tolist(), strict=True)}
-    return np.array([error[a, b] for a, b in groups.member[:, [first, second]].tolist()])
 
 
 def median_of(values: Array, valid: Mask) -> Array:

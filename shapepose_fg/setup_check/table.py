@@ -6,8 +6,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from shapepose_fg.setup_check.in_result import CameraUse
-from shapepose_fg.setup_check.report import CameraFigures, PairFigures, SetupReport
+from shapepose_fg.setup_check.report import CameraFigures, CameraUse, PairFigures, SetupReport
 
 _WIDE = 12
 """Longest name of a camera that is written out; of a longer one the end is, which tells cameras apart."""

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,10 +119,7 @@ def walk_along(
 
 
 def _cycle(walk: Performance) -> tuple[Performance, float]:
-    """One or more double steps of a straight walk that can follow themselves, turned to walk along +x.
-
-    Returns them with the pelvis' way along x taken out of the joints, and the length of that way.
-    """
+    """Double steps of a straight walk that can follow themselves, without their way along +x; its length."""
     count = len(walk)
     way = walk.joints[-1, 0, :2] - walk.joints[0, 0, :2]
     walk = walk.moved(np.zeros(2), -float(np.arctan2(way[1], way[0])))
@@ -146,13 +142,8 @@ def _cycle(walk: Performance) -> tuple[Performance, float]:
     return Performance(rotations, joints - joints[:, :1] + places[:, None], walk.rest), length
 
 
-class Way(NamedTuple):
-    """Where somebody walks."""
-
-    xy: Array
-    """(T, 2) metres."""
-    heading: Array
-    """(T,) radians, from the x axis towards the y axis, without whole turns."""
+Way = tuple[Array, Array]
+"""Where somebody walks (T, 2), metres, and faces (T,), radians from the x axis towards y, without whole turns."""
 
 
 def way_through(
@@ -165,19 +156,16 @@ def way_through(
     distance_m: Array,
     half_room_m: float,
 ) -> Way:
-    """A way from wall to wall and back, past points `others` (T, K, 2) at `distance_m` (K,) or a little more.
-
-    Of several tries the one that keeps its distance best, then the one that comes closest.
-    """
+    """A way from wall to wall and back, past points `others` (T, K, 2) at `distance_m` (K,) or a little more."""
     ways = [_walk(others, frames, rng, fps, speed_mps, distance_m, half_room_m) for _ in range(_TRIES)]
     return max(ways, key=lambda way: _way_worth(way, others, distance_m))
 
 
 def _way_worth(way: Way, others: Array, distance_m: Array) -> float:
     """How good a way is: first that no one is bumped into, then that it is close."""
-    if others.shape[1] == 0 or len(way.xy) == 0:
+    if others.shape[1] == 0 or len(way[0]) == 0:
         return 0.0
-    room = (np.linalg.norm(others - way.xy[:, None], axis=-1) - distance_m).min(axis=1)
+    room = (np.linalg.norm(others - way[0][:, None], axis=-1) - distance_m).min(axis=1)
     return 30.0 * float(np.minimum(room, 0.0).mean()) + min(float(room.min()), 0.0) + float((room < 0.4).mean())
 
 
@@ -207,11 +195,8 @@ def _walk(
             places[later], headings[later] = xy, heading
             heading += rate / fps
             xy = xy + pace * speed / fps * along(np.array(heading))
-    sigma = 0.12 * fps
-    return Way(
-        gaussian_filter1d(places, sigma, axis=0, mode="nearest"),
-        gaussian_filter1d(headings, sigma, mode="nearest"),
-    )
+    path, facing = (gaussian_filter1d(each, 0.12 * fps, axis=0, mode="nearest") for each in (places, headings))
+    return path, facing
 
 
 def _arcs(xy: Array, heading: float, turns: Array, speeds: Array) -> Array:

@@ -19,9 +19,14 @@ from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections, Recording
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.simulation.affinities import Candidates, affinities
+from shapepose_fg.simulation.candidates import (
+    Candidates,
+    FalseCandidateProcess,
+    FalseCandidates,
+    NoiseProcess,
+    affinities,
+)
 from shapepose_fg.simulation.detector_statistics import JOINT_GROUP, DetectorStatistics, measured
-from shapepose_fg.simulation.memory import FalseCandidateProcess, FalseCandidates, NoiseProcess
 from shapepose_fg.simulation.scene import Scene
 from shapepose_fg.simulation.visibility import (
     Skin,
@@ -236,10 +241,8 @@ class Detector:
         )
 
     def _worse(self, visibility: Visibility, seen: Array, noise: Array) -> Array:
-        """How much worse than others (V, P, 25) joints are found, of people who are buried behind others, or lost.
-
-        As a standard normal (probit). What its own body hides is no worse off when others hide the rest.
-        """
+        """How much worse (V, P, 25) joints are found of people buried behind others, or lost, as a probit."""
+        # What its own body hides is no worse off when others hide the rest.
         table, behind = self._table, visibility.hidden_by >= 0
         share = (behind & (visibility.seen < 0.5)).mean(axis=-1, keepdims=True)
         buried = np.interp(share, table.buried_share, table.buried) * np.where(behind, 1.0, seen)
@@ -268,11 +271,7 @@ class Detector:
     def _captors(
         self, reported: NDArray[np.bool_], true_xy: Array, metres_a_px: Array, visibility: Visibility, noise: Array
     ) -> NDArray[np.intp]:
-        """Whose candidate stands for a joint that is missed behind another person: (2, V, P, 25).
-
-        The first is the person in front whose candidate the hidden joint's neighbours are joined to, the second
-        one whose candidate they are not joined to; -1 where there is none.
-        """
+        """(2, V, P, 25) who stands before a missed joint and captured it (`affinities`), or did not; -1: none."""
         table = self._table
         view, person, joint = np.nonzero((visibility.hidden_by >= 0) & visibility.in_image & ~reported)
         front = visibility.hidden_by[view, person, joint]

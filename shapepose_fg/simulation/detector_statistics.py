@@ -60,7 +60,7 @@ class DetectorStatistics:
     size_px_a_metre: float
     """The median size."""
     facing: Array
-    """(5, 2) cosines between which nose, eyes and ears come into sight (see `facing.py`)."""
+    """(5, 2) cosines between which nose, eyes and ears come into sight."""
     error_memory: Array
     """(2, 2) share and time constant in seconds of a fast and a slow part of the errors; the rest is white."""
     confidence_memory: Array

@@ -15,8 +15,7 @@ from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.write_detections import refuse_leftovers, write_association, write_openpose
 from shapepose_fg.simulation import Scene, built_in_scene
 from shapepose_fg.simulation.mocap import Mocap
-from shapepose_fg.simulation.room import SequenceConfig
-from shapepose_fg.simulation.sequences import SEQUENCES, Split, sequence
+from shapepose_fg.simulation.sequences import SEQUENCES, SequenceConfig, Split, sequence
 
 Format = Literal["association", "openpose"]
 """What detections are written as."""

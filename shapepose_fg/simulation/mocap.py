@@ -129,18 +129,9 @@ class Mocap:
         vectors, fps = self.arrays["poses"][frames].astype(np.float64), float(own["fps"])
         rotations = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(-1, 24, 3, 3)
         rotations, pelvis = _bridged(rotations, self.arrays["trans"][frames].astype(np.float64), fps)
-        return Clip(
-            name=self.names[index],
-            subject=self.subjects[index],
-            action=self.actions[index],
-            rotations=rotations,
-            pelvis=pelvis,
-            fps=fps,
-            leg_m=float(own["leg_m"]),
-            floor_y=float(own["floor_y"]),
-            wrist_valid=bool(own["wrist_valid"]),
-            toe_valid=bool(own["toe_valid"]),
-        )
+        who = (self.names[index], self.subjects[index], self.actions[index])
+        valid = (bool(own[name]) for name in ("wrist_valid", "toe_valid"))
+        return Clip(*who, rotations, pelvis, fps, float(own["leg_m"]), float(own["floor_y"]), *valid)
 
 
 def blend(first: Array, second: Array, share: Array) -> Array:

@@ -20,6 +20,8 @@ _PADDING_S = 3.0
 """Paths are known this long before the first and after the last frame, for the steps to come."""
 _STANCE = 0.6
 """Share of a stride in which a foot stands."""
+_WIDTH_M = 0.19
+"""Between the feet."""
 Path = Callable[[Array], tuple[Array, Array]]
 """Where a pelvis is over the floor at times (...,), seconds: positions (..., 2), metres; headings (...,), radians
 without jumps of a whole turn."""
@@ -215,72 +217,49 @@ def wave(build: Build, time: Array, spot: Array, heading: float, rng: np.random.
 
 
 def _puppet(
-    build: Build,
-    time: Array,
-    path: Path,
-    *,
-    stride_s: float,
-    phase: float,
-    dip: Array,
-    lean: Array,
-    wrists: Array,
-    reach: Array,
-    gaze: Array,
+    build: Build, time: Array, path: Path, *, stride_s: float, phase: float, dip: Array, **upper: Array
 ) -> Puppet:
-    """Put a body on the footsteps of `path`, its pelvis `dip` (T,) metres lower than upright."""
+    """Put a body on the footsteps of `path`, its pelvis `dip` (T,) metres lower than upright.
+
+    `upper` is what `Puppet` takes for trunk, hands and eyes.
+    """
     end = (time[-1] if len(time) else 0.0) + _PADDING_S
-    known = np.arange(-_PADDING_S, end, 0.02)
-    steps = footsteps(_tabulated(path, known), time, stride_s, width_m=0.19, phase=phase)
+    feet, lift, foot_heading, pitch, ahead = _footsteps(
+        _tabulated(path, np.arange(-_PADDING_S, end, 0.02)), time, stride_s, phase
+    )
     xy, heading = path(time)
-    ankles = np.concatenate([steps.xy, (build.ankle_m + steps.lift)[..., None]], axis=-1)
+    ankles = np.concatenate([feet, (build.ankle_m + lift)[..., None]], axis=-1)
     # Nobody walks on stretched legs: the pelvis is low enough for both feet, softly.
-    aside = np.linalg.norm(steps.xy - xy[:, None], axis=-1) - 0.5 * 0.16
+    aside = np.linalg.norm(feet - xy[:, None], axis=-1) - 0.5 * 0.16
     drop = np.sqrt(np.maximum((0.985 * build.leg_m) ** 2 - np.maximum(aside, 0.0) ** 2, 0.1))
     allowed = (ankles[..., 2] + drop).min(axis=1) + (build.pelvis_m - build.rest[1, 1] + build.floor)
     height = _soften(np.minimum(build.pelvis_m - dip, allowed))
     lean_back = -0.22 * np.maximum(dip - 0.05, 0.0)  # the hips go back over the heels in a crouch
-    xy = xy + lean_back[:, None] * along(heading)
     return Puppet(
-        pelvis=_at(xy, height),
+        pelvis=_at(xy + lean_back[:, None] * along(heading), height),
         heading=heading,
-        lean=lean,
         ankles=ankles,
-        foot_heading=steps.heading,
-        foot_pitch=steps.pitch,
-        wrists=wrists,
-        reach=reach,
-        swing=np.clip(0.55 * steps.swing[:, ::-1], -0.25, 0.3),
-        gaze=gaze,
+        foot_heading=foot_heading,
+        foot_pitch=pitch,
+        swing=np.clip(0.55 * ahead[:, ::-1], -0.25, 0.3),  # arms swing against the feet
+        **upper,
     )
 
 
-@dataclass(frozen=True)
-class Steps:
-    """The feet of a walk in T frames, left and right."""
+def _footsteps(
+    path: Path, time_s: Array, stride_s: float, phase: float
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Steps under `path` at T times: each foot stands `_STANCE` of a stride, then swings to its next place.
 
-    xy: Array
-    """(T, 2, 2) where the ankles are over the floor, metres."""
-    lift: Array
-    """(T, 2) how high they are above standing, metres."""
-    heading: Array
-    """(T, 2) where the feet point, radians."""
-    pitch: Array
-    """(T, 2) heel above toes, radians."""
-    swing: Array
-    """(T, 2) how far a foot is ahead of the pelvis, metres: arms swing against it."""
-
-
-def footsteps(path: Path, time_s: Array, stride_s: float, width_m: float, phase: float = 0.0) -> Steps:
-    """Steps under `path` at the T times: each foot stands `_STANCE` of a stride, then swings to its next place.
-
-    A foot stands where the hip is in the middle of its stance, `width_m` beside the other; the two are half
-    a stride apart. Who stays in place does not lift the feet.
+    Of each foot, left and right: the ankle over the floor (T, 2, 2) and how high above standing, metres; where it
+    points, and heel above toes, radians; how far it is ahead of the pelvis, metres: (T, 2) each. A foot stands
+    where the hip is in mid-stance, the two half a stride apart. Who stays in place does not lift the feet.
     """
     sides = np.array([0.0, 0.5])
     cycle = time_s[:, None] / stride_s + phase + sides
     number, part = np.floor(cycle), np.mod(cycle, 1.0)
-    here, here_heading = _plant(path, number, sides + phase, stride_s, width_m)
-    there, there_heading = _plant(path, number + 1, sides + phase, stride_s, width_m)
+    here, here_heading = _plant(path, number, sides + phase, stride_s)
+    there, there_heading = _plant(path, number + 1, sides + phase, stride_s)
     progress = np.clip((part - _STANCE) / (1 - _STANCE), 0.0, 1.0)
     eased = progress**2 * (3 - 2 * progress)
     xy = here + eased[..., None] * (there - here)
@@ -294,13 +273,13 @@ def footsteps(path: Path, time_s: Array, stride_s: float, width_m: float, phase:
     heading = here_heading + eased * (there_heading - here_heading)
     centre, facing = path(time_s)
     swing = ((xy - centre[:, None]) * along(facing)[:, None]).sum(axis=-1)
-    return Steps(xy, lift + 0.05 * push * effort, heading, (0.55 * push - 0.2 * strike) * effort, swing)
+    return xy, lift + 0.05 * push * effort, heading, (0.55 * push - 0.2 * strike) * effort, swing
 
 
-def _plant(path: Path, number: Array, offset: Array, stride_s: float, width_m: float) -> tuple[Array, Array]:
+def _plant(path: Path, number: Array, offset: Array, stride_s: float) -> tuple[Array, Array]:
     """Place (T, 2, 2) and heading (T, 2) of the feet in stance `number` (T, 2)."""
     xy, heading = path((number + _STANCE / 2 - offset) * stride_s)
-    side = np.array([0.5, -0.5]) * width_m
+    side = np.array([0.5, -0.5]) * _WIDTH_M
     return xy + left_of(heading) * side[:, None], heading + np.array([0.12, -0.12])
 
 

@@ -1,11 +1,12 @@
-"""Named interaction sequences around real two-person salsa takes.
+"""Named interaction sequences around real two-person salsa takes, in a room that fills up.
 
 Takes 60/61_01 to _07 are for choosing settings ("tune"), _09 to _15 for reporting ("report"); whoever else is
 in the room comes from other subjects. Room of 4 x 4 m, world z up, floor at z = 0.
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -13,14 +14,206 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.model.body_model import BodyModel
-from shapepose_fg.simulation.bystanders import standing_clips, walking_clips
+from shapepose_fg.simulation.bystanders import stand, standing_clips, walk_along, walking_clips, way_through
+from shapepose_fg.simulation.limbs import turned_about
 from shapepose_fg.simulation.mocap import Clip, Mocap
 from shapepose_fg.simulation.motion import Motion
-from shapepose_fg.simulation.performance import together
-from shapepose_fg.simulation.room import Room, SequenceConfig
+from shapepose_fg.simulation.performance import Figure, Performance, hold_hands, perform, together
 from shapepose_fg.simulation.scene import Scene, ring_of_cameras
 
 Array = NDArray[np.float64]
+
+_TORSO = (0, 6, 9, 12)
+"""Pelvis, spine and neck: what no one else may come into."""
+_HALF_ROOM_M = 1.75
+"""Pelvises stay within this of the middle of the room, in x and in y."""
+_LIMBS_M = 0.12
+"""No joint of who stands comes nearer than this to a joint of anybody else, where there is room for it."""
+_TORSO_M = 0.2
+"""How near to these another's joint may come."""
+_MIDDLES, _LIMBS = (0, 9), (18, 19, 20, 21, 22, 23, 4, 5)
+"""Pelvis and chest; elbows, wrists, hands, knees."""
+_SPOTS, _PAIR_OPTIONS, _TRIED = 150, 60, 30
+"""Places that are drawn for who stands and for a pair, and how many of them are looked at closely."""
+_PACE_MPS = 1.35
+"""People walk no faster through a room full of others."""
+_ARM_M = 0.3
+"""Who walks keeps this far from others' limbs."""
+
+
+@dataclass(frozen=True)
+class SequenceConfig:
+    """What a sequence is made of, and how hard it is."""
+
+    pairs: int = 1
+    """Salsa pairs in the room at a time, 0 to 2."""
+    standing: int = 1
+    """People who stand close and gesture."""
+    walking: int = 1
+    """People who walk through, between and around."""
+    close_m: float = 0.45
+    """Pelvises of people who do not dance together stay this far apart, or a little farther."""
+    segment_frames: int = 600
+    """Longest segment without a cut, at 30 frames a second."""
+    frames: int = 3000
+    """Length of the sequence."""
+    camera_distance_m: tuple[float, float] = (3.1, 3.6)
+    """Range of the cameras' distances from the middle."""
+    camera_height_m: tuple[float, float] = (2.0, 2.5)
+    """Range of the cameras' heights; every second one is 0.3 m lower."""
+    focal_px: tuple[float, float] = (860.0, 940.0)
+    """Range of the cameras' focal lengths."""
+    seed: int = 0
+    """Fixes everything that is drawn."""
+    without: frozenset[str] = frozenset()
+    """Subjects of recordings who are not among those who stand and walk; the dancers never are."""
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.pairs <= 2 and self.standing >= 0 and self.walking >= 0):
+            raise ValueError(f"pairs must be 0, 1 or 2, standing and walking at least 0; got {self}")
+        if not (self.close_m > 0 and self.segment_frames > 0 and self.frames >= 0):
+            raise ValueError(f"close_m, segment_frames must be positive, frames at least 0; got {self}")
+
+    @property
+    def people(self) -> int:
+        """Count of people."""
+        return 2 * self.pairs + self.standing + self.walking
+
+
+class Room:
+    """Who is in the room already, from one cut to the next."""
+
+    def __init__(self, body: BodyModel, config: SequenceConfig, frames: int, fps: float, rng: np.random.Generator):
+        self.body, self.config, self.frames, self.fps, self.rng = body, config, frames, fps, rng
+        self.performed: list[Performance] = []
+        """The people, in the order in which they came."""
+        self.names: list[str] = []
+        """The recordings that they perform."""
+
+    def add_pair(self, betas: Array, pair: tuple[Clip, Clip]) -> None:
+        """Two who dance together: one factor for both, so that who holds hands still does."""
+        legs = np.mean([Figure(self.body, shape).leg_m for shape in betas])
+        scale = float(legs / np.mean([clip.leg_m for clip in pair]))
+        two = hold_hands(
+            perform(self.body, betas[0], pair[0], scale=scale),
+            perform(self.body, betas[1], pair[1], scale=scale),
+            self.fps,
+        )
+        steps = np.concatenate([one.joints[:, 0, :2] for one in two])
+        middle = (steps.min(axis=0) + steps.max(axis=0)) / 2
+        two = [one.moved(-middle) for one in two]
+        turns, shifts = self._pair_options(_long_axis(steps - middle))
+        worth = [self._worth(two, turn, shift) for turn, shift in zip(turns, shifts, strict=True)]
+        placed = (
+            [one.moved(shifts[index], float(turns[index])) for one in two]
+            for index in np.argsort(worth)[::-1][:_TRIED]
+        )
+        for one, clip in zip(self._roomiest(placed), pair, strict=True):
+            self._add(one, clip.name)
+
+    def add_standing(self, betas: Array, clip: Clip) -> None:
+        """One who stays at a free spot close to the others, turned towards them."""
+        one = stand(self.body, betas, clip, self.frames, self.fps, start=int(self.rng.integers(10_000)))
+        faces = one.rotations[:, 0, :2, 2].mean(axis=0)
+        spots = self.rng.uniform(-_HALF_ROOM_M, _HALF_ROOM_M, (_SPOTS, 2))
+        noise = self.rng.normal(0.0, 0.5, _SPOTS)
+        others = self.points(_MIDDLES)
+        if others.shape[1] > 0:
+            nearest = np.linalg.norm(others[None, ::3] - spots[:, None, None], axis=-1).min(axis=(1, 2))
+            towards = others.mean(axis=(0, 1)) - spots
+        else:
+            nearest, towards = np.full(_SPOTS, self.config.close_m), np.tile([1.0, 0.0], (_SPOTS, 1))
+        turns = np.arctan2(towards[:, 1], towards[:, 0]) - np.arctan2(faces[1], faces[0]) + noise
+        short = np.maximum(self.config.close_m + 0.1 - nearest, 0.0)
+        order = np.argsort(20 * short + np.maximum(nearest - self.config.close_m, 0.0))[:_TRIED]
+        placed = ([one.moved(spots[index], float(turns[index]))] for index in order)
+        self._add(self._roomiest(placed)[0], clip.name)
+
+    def add_walking(self, betas: Array, clip: Clip) -> None:
+        """One who walks through, between and around all who are there already."""
+        middles, limbs = self.points(_MIDDLES), self.points(_LIMBS)
+        speed = float(np.linalg.norm(clip.pelvis[-1] - clip.pelvis[0]) / len(clip) * clip.fps)
+        path, heading = way_through(
+            np.concatenate([middles, limbs], axis=1),
+            self.frames,
+            self.rng,
+            fps=self.fps,
+            speed_mps=min(speed, _PACE_MPS),
+            distance_m=np.repeat([self.config.close_m, _ARM_M], [middles.shape[1], limbs.shape[1]]),
+            half_room_m=_HALF_ROOM_M,
+        )
+        start = self.rng.uniform()
+        walk = walk_along(self.body, betas, clip, path, heading, fps=self.fps, start=start)
+        self._add(walk, clip.name)
+
+    def points(self, joints: tuple[int, ...]) -> Array:
+        """(T, P x joints, 2) where SMPL's `joints` of everybody are over the floor."""
+        if len(self.performed) == 0:
+            return np.zeros((self.frames, 0, 2))
+        return np.concatenate([p.joints[:, list(joints), :2] for p in self.performed], axis=1)
+
+    def _add(self, performance: Performance, name: str) -> None:
+        self.performed.append(performance)
+        self.names.append(name)
+
+    def _pair_options(self, along: float) -> tuple[Array, Array]:
+        """Turns (N,) and places (N, 2) for a pair whose steps spread `along`: two pairs dance side by side."""
+        if self.config.pairs == 1:
+            turns, side = self.rng.uniform(-np.pi, np.pi, _PAIR_OPTIONS), 0.0
+        else:
+            turns = (
+                self.rng.choice([0.0, np.pi], _PAIR_OPTIONS) - along + self.rng.normal(0.0, 0.25, _PAIR_OPTIONS)
+            )
+            side = -0.6 if len(self.performed) == 0 else 0.6
+        return turns, np.array([0.0, side]) + self.rng.normal(0.0, 0.2, (_PAIR_OPTIONS, 2))
+
+    def _worth(self, two: list[Performance], turn: float, shift: Array) -> float:
+        """How well a pair is placed: inside the room, close to others, but not closer than allowed."""
+        steps = np.concatenate([one.joints[::3, list(_MIDDLES), :2] for one in two], axis=1)
+        steps = steps @ turned_about("z", np.array([turn]))[0, :2, :2].T + shift
+        outside = float(np.maximum(np.abs(steps) - _HALF_ROOM_M, 0.0).max())
+        gaps = np.linalg.norm(steps[:, :, None] - self.points(_MIDDLES)[::3, None], axis=-1)
+        spare = float(gaps.min()) - self.config.close_m if gaps.size > 0 else 0.0
+        return 20.0 * min(spare, 0.0) - max(spare, 0.0) - 10.0 * outside
+
+    def _roomiest(self, options: Iterable[list[Performance]]) -> list[Performance]:
+        """The first of the ways to place people that leaves all room enough, else that which leaves most."""
+        best, most = [], -np.inf
+        for placed in options:
+            reach = max(np.abs(one.joints[:, 0, :2]).max() for one in placed)
+            free = min((self._gap(one, other) for one in placed for other in self.performed), default=0.0)
+            free = min(free, _HALF_ROOM_M - float(reach))
+            if free > most:
+                best, most = placed, free
+            if free >= 0.0:
+                break
+        return best
+
+    def _gap(self, one: Performance, other: Performance) -> float:
+        """How much more room two people leave each other than is asked for, metres; negative: less."""
+        a, b = one.joints[::5], other.joints[::5]
+        limbs = np.linalg.norm(a[:, :, None] - b[:, None], axis=-1).min() - _LIMBS_M
+        trunks = clearance_m(a, b).min() - _TORSO_M
+        hips = np.linalg.norm((a - b)[:, 0, :2], axis=-1).min() - self.config.close_m
+        return float(min(limbs, trunks, hips))
+
+
+def clearance_m(first: Array, second: Array) -> Array:
+    """Least distance (T,) between the torso joints of one person and any joint of the other, (T, 24, 3) each."""
+    trunk = list(_TORSO)
+    gaps = [
+        np.linalg.norm(a[:, trunk, None] - b[:, None], axis=-1).min(axis=(1, 2))
+        for a, b in ((first, second), (second, first))
+    ]
+    return np.minimum(*gaps)
+
+
+def _long_axis(points: Array) -> float:
+    """Direction in which points (N, 2) spread most."""
+    _, vectors = np.linalg.eigh(np.cov(points.T) if len(points) > 1 else np.eye(2))
+    return float(np.arctan2(vectors[1, -1], vectors[0, -1]))
+
+
 Split = Literal["tune", "report"]
 
 DANCERS = frozenset({"60", "61"})

@@ -152,10 +152,7 @@ class VisibilityWorker:
 
 
 def facing(joints: NDArray[np.float64], centres: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Cosine (V, P, 5) between a face joint's way out of the head and the way to the camera: 1 seen frontally.
-
-    `joints` (P, 25, 3) BODY_25, `centres` (V, 3) of the cameras; the head's middle is that of the ears.
-    """
+    """Cosine (V, P, 5) of face `joints` (P, 25, 3) between the way out of the head and that to cameras (V, 3)."""
     face = joints[:, FACE]
     outward = face - joints[:, FACE[3:]].mean(axis=1, keepdims=True)
     to_camera = centres[:, None, None] - face

@@ -7,7 +7,7 @@ from rich.progress import TextColumn
 from rich.table import Table
 
 from shapepose_fg.cli.terminal import progress, show
-from shapepose_fg.setup_check.in_result import CameraUse, Distances
+from shapepose_fg.setup_check.report import CameraUse, Distances
 from shapepose_fg.setup_check.table import use_table
 
 

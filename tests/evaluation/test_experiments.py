@@ -4,17 +4,18 @@ import importlib.util
 import json
 import re
 import sys
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.evaluation.experiments import ablation, scenes, segments
+from shapepose_fg.evaluation.experiments import ablation, scenes
 from shapepose_fg.evaluation.experiments.experiment import Case, Column, Experiment, measured
 from shapepose_fg.evaluation.experiments.registry import experiments
-from shapepose_fg.evaluation.experiments.segments import Scale, Segment
+from shapepose_fg.evaluation.experiments.scenes import Scale, Segment
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.simulation.training.motions import split_of
 
@@ -154,16 +155,28 @@ def test_a_folder_without_recordings_is_named(script, tmp_path, capsys):
     assert f"{tmp_path / 'data'} has no shelf, cmu_mocap" in capsys.readouterr().err
 
 
+def differing(one: Any, other: Any, prefix: str = "") -> list[str]:
+    """The names of all settings in which two configurations differ, as `table.name`."""
+    found = []
+    for field in fields(one):
+        a, b, name = getattr(one, field.name), getattr(other, field.name), f"{prefix}{field.name}"
+        if is_dataclass(a):
+            found += differing(a, b, f"{name}.")
+        elif a != b:
+            found.append(name)
+    return found
+
+
 def test_every_setting_that_differs_from_the_paper_has_its_switch():
     switched = {name for names in ablation.SWITCHES.values() for name in names}
-    assert switched | {"temporal"} == set(ablation.differing(ablation.PAPER, ablation.varied(PipelineConfig())))
+    assert switched | {"temporal"} == set(differing(ablation.PAPER, ablation.varied(PipelineConfig())))
 
 
 def test_all_switches_together_lead_from_one_to_the_other():
     everything = [name for names in ablation.SWITCHES.values() for name in names]
     assert ablation.with_settings_of(ablation.PAPER, ablation.OURS, everything) == ablation.OURS
     one = ablation.with_settings_of(ablation.OURS, ablation.PAPER, everything[:1])
-    assert ablation.differing(one, ablation.OURS) == everything[:1]
+    assert differing(one, ablation.OURS) == everything[:1]
 
 
 @pytest.mark.slow
@@ -187,7 +200,7 @@ def test_a_case_is_drawn_by_its_seed_at_its_rate():
 def test_after_a_cut_everybody_is_somebody_else(monkeypatch):
     segment = Segment("demo", range(6), cameras=2, people=2)
     scene = replace(segment.scene, cuts=(2, 4))
-    monkeypatch.setattr(segments, "_scene", lambda _: scene)
+    monkeypatch.setattr(scenes, "_scene", lambda _: scene)
     truth = segment.truth
     people = [np.unique(truth.person[truth.frame == frame]).tolist() for frame in range(6)]
     assert people == [[0, 1], [0, 1], [2, 3], [2, 3], [4, 5], [4, 5]]

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.evaluation.matching import match_people, mean_distance
-from shapepose_fg.evaluation.metrics import covariance_calibration, joint_metrics
+from shapepose_fg.evaluation.metrics import covariance_calibration, joint_metrics, match_people, mean_distance
 
 J = 25
 MIRROR = np.array(BODY_25.mirror)

@@ -6,11 +6,11 @@ from rich.console import Console
 
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.evaluation.metrics import PlainPeople
 from shapepose_fg.evaluation.other_results import SHELF_JOINTS
 from shapepose_fg.evaluation.shelf import (
     LIMB_NAMES,
     LIMBS,
-    ShelfGroundTruth,
     evaluate_shelf,
     read_shelf_ground_truth,
     shelf_joints,
@@ -55,10 +55,10 @@ def people(*rows, frame=None, **more):
 def annotated(*rows, actor=None, frame=None):
     joints = shelf_joints(np.concatenate(rows))
     count = len(joints)
-    return ShelfGroundTruth(
+    return PlainPeople(
         np.zeros(count, int) if frame is None else np.array(frame),
-        np.arange(count) if actor is None else np.array(actor),
         joints,
+        np.arange(count) if actor is None else np.array(actor),
     )
 
 
@@ -266,7 +266,7 @@ def test_reading_a_small_file(tmp_path):
     path.write_text(FILE)
     truth = read_shelf_ground_truth(path)
     assert truth.frame.tolist() == [0, 2, 2]
-    assert truth.actor.tolist() == [2, 0, 3]
+    assert truth.person.tolist() == [2, 0, 3]
     np.testing.assert_allclose(truth.joints[1, 4], [0.4, 0.4, 0.4])
 
 
@@ -328,7 +328,7 @@ def shelf(shared_data):
 
 
 def test_the_real_annotation(shelf):
-    assert np.bincount(shelf.actor).tolist() == [131, 19, 93, 11]
+    assert np.bincount(shelf.person).tolist() == [131, 19, 93, 11]
     assert np.unique(shelf.frame).tolist() == [*range(101), *range(216, 231), *range(270, 285)]
     assert np.isfinite(shelf.joints).all()
     # People: lower legs of 30 to 60 cm, in a room of a few metres, standing on the floor z = 0.

@@ -5,7 +5,7 @@ import pytest
 
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.evaluation.matching import match_people
+from shapepose_fg.evaluation.metrics import match_people
 from shapepose_fg.evaluation.tracking import (
     acceleration_errors,
     body_joints,

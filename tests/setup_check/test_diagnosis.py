@@ -22,9 +22,9 @@ from shapepose_fg.evaluation.spoiled_setups import (
 )
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
-from shapepose_fg.setup_check.adjustment import FOCAL, Q, changed
 from shapepose_fg.setup_check.diagnosis import diagnose
 from shapepose_fg.setup_check.findings import Kind, sentence
+from shapepose_fg.setup_check.fit import FOCAL, Q, changed
 
 
 def only_finding(recording, rig):
@@ -99,10 +99,10 @@ def test_exchanged_cameras_are_named(recording, room):
 def test_a_camera_that_is_listed_twice_is_named(recording, room):
     found = only_finding(*listed_twice(recording, room, 1))
     assert (found.kind, found.cameras) == (Kind.DUPLICATE, (1, 5))
-    assert found.duplicate.same_pose and found.duplicate.same_detections
+    assert found.same == ""
     found = only_finding(recording, same_pose(room, 1, 3))
     assert (found.kind, found.cameras) == (Kind.DUPLICATE, (1, 3))
-    assert found.duplicate.same_pose and not found.duplicate.same_detections
+    assert found.same == "pose"
 
 
 @pytest.mark.slow

@@ -14,8 +14,7 @@ from shapepose_fg.evaluation.spoiled_setups import turned, zoomed
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.write_detections import write_openpose
 from shapepose_fg.setup_check.findings import Finding, Kind, sentence
-from shapepose_fg.setup_check.in_result import Distances, camera_use
-from shapepose_fg.setup_check.report import check_setup
+from shapepose_fg.setup_check.report import Distances, camera_use, check_setup
 
 
 @pytest.fixture(scope="module")

@@ -9,13 +9,14 @@ from numpy.typing import NDArray
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.simulation.mocap import Mocap
-from shapepose_fg.simulation.room import SequenceConfig, clearance_m
 from shapepose_fg.simulation.scene import Scene
 from shapepose_fg.simulation.sequences import (
     DANCERS,
     SEQUENCES,
     TAKES,
+    SequenceConfig,
     Split,
+    clearance_m,
     salsa_takes,
     sequence,
 )

@@ -13,8 +13,8 @@ from shapepose_fg.core.frame_times import rate_words
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.pipeline.pipeline import Task
 from shapepose_fg.pipeline.runs.assembly import Assembly
-from shapepose_fg.setup_check.in_result import ResultCheck, result_check
-from shapepose_fg.setup_check.plain import other_sizes
+from shapepose_fg.setup_check.diagnosis import other_sizes
+from shapepose_fg.setup_check.report import ResultCheck, result_check
 from shapepose_fg.setup_check.report import check_setup as check_detections
 from shapepose_fg.setup_check.table import use_table
 

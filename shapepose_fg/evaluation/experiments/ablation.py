@@ -2,14 +2,13 @@
 # ruff: noqa: RUF009  (values of the class `Varied` itself: they cover properties of its base)
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, replace
 from operator import attrgetter
 from typing import Any
 
 from shapepose_fg.estimation.estimator_config import RefineConfig, WindowGraphConfig
 from shapepose_fg.evaluation.experiments.experiment import Experiment, columns
-from shapepose_fg.evaluation.experiments.scenes import FRAME_BY_FRAME, OVER_TIME, case
-from shapepose_fg.evaluation.experiments.segments import Scale
+from shapepose_fg.evaluation.experiments.scenes import FRAME_BY_FRAME, OVER_TIME, Scale, case
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.proposal.candidates import CandidateConfig
 from shapepose_fg.proposal.proposals import ProposalConfig
@@ -116,18 +115,6 @@ def with_settings_of(config: PipelineConfig, other: PipelineConfig, names: Seque
     for name in names:
         config = _with(config, name, attrgetter(name)(other))
     return config
-
-
-def differing(one: Any, other: Any, prefix: str = "") -> list[str]:
-    """The names of all settings in which two configurations differ, as `table.name`."""
-    found = []
-    for field in fields(one):
-        a, b, name = getattr(one, field.name), getattr(other, field.name), f"{prefix}{field.name}"
-        if is_dataclass(a):
-            found += differing(a, b, f"{name}.")
-        elif a != b:
-            found.append(name)
-    return found
 
 
 def _with(config: Any, name: str, value: Any) -> Any:

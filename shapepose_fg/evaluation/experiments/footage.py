@@ -8,13 +8,11 @@ from pathlib import Path
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.evaluation.alternation import before_refinement
-from shapepose_fg.evaluation.baseline import frame_by_frame, over_time
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures, columns
-from shapepose_fg.evaluation.experiments.scenes import FRAME_BY_FRAME, MODES, OVER_TIME
-from shapepose_fg.evaluation.experiments.segments import Scale
+from shapepose_fg.evaluation.experiments.methods import initial_proposals
+from shapepose_fg.evaluation.experiments.scenes import FRAME_BY_FRAME, MODES, OVER_TIME, Scale
 from shapepose_fg.evaluation.held_out_view import held_out
-from shapepose_fg.evaluation.matching import People, PlainPeople
+from shapepose_fg.evaluation.metrics import People
 from shapepose_fg.evaluation.shelf import ACTORS, LIMB_NAMES, ShelfScore, evaluate_shelf, read_shelf_ground_truth
 from shapepose_fg.evaluation.single_person import (
     ANNOTATION,
@@ -131,12 +129,6 @@ def _ours(folder: Path, mode: str) -> Reconstruction:
     return shelf_footage(folder).reconstruct(MODES[mode])
 
 
-@cache
-def _baseline(folder: Path) -> PlainPeople:
-    recording = shelf_footage(folder)
-    return frame_by_frame(recording.detections, recording.rig)
-
-
 def _smpl_only(folder: Path) -> People:
     """SMPL-only of the people and detections of ours frame by frame."""
     people = _ours(folder, "frame by frame")
@@ -145,7 +137,7 @@ def _smpl_only(folder: Path) -> People:
 
 def _stage_one(folder: Path) -> People:
     recording = shelf_footage(folder)
-    return before_refinement(recording.detections, recording.rig, FRAME_BY_FRAME)
+    return initial_proposals(recording.detections, recording.rig, FRAME_BY_FRAME)
 
 
 def _bodies(folder: Path) -> People:
@@ -160,8 +152,6 @@ _SHELF: dict[str, Callable[[Path], People]] = {
     "(ours) stage I alone": _stage_one,
     "(ours) bodies' joints": _bodies,
     "SMPL-only, of the same people and detections": _smpl_only,
-    "baseline, with time": lambda folder: over_time(_baseline(folder), SHELF_FPS),
-    "baseline, without time": _baseline,
 }
 """What is measured on Shelf."""
 

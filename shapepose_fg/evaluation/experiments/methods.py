@@ -7,17 +7,17 @@ from functools import lru_cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.detections import DetectionSequence
+from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.evaluation.alternation import before_refinement
-from shapepose_fg.evaluation.baseline import frame_by_frame, over_time
+from shapepose_fg.estimation.linearisation import triangulate
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures, columns
-from shapepose_fg.evaluation.experiments.scenes import FRAME_BY_FRAME, OVER_TIME
-from shapepose_fg.evaluation.experiments.segments import Scale, Segment
-from shapepose_fg.evaluation.matching import People, PlainPeople
-from shapepose_fg.evaluation.metrics import joint_metrics
+from shapepose_fg.evaluation.experiments.scenes import FRAME_BY_FRAME, OVER_TIME, Scale, Segment
+from shapepose_fg.evaluation.metrics import People, PlainPeople, joint_metrics
 from shapepose_fg.evaluation.smplify import SmplOnly, smpl_only
-from shapepose_fg.pipeline.pipeline import PipelineConfig
+from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people
 
 FRAMES = 100
 """Of each segment."""
@@ -45,6 +45,13 @@ def interactions(scale: Scale) -> Experiment:
         for label, make in METHODS.items()
     }
     return Experiment("interactions", rows, COLUMNS)
+
+
+def initial_proposals(detections: DetectionSequence, rig: Rig, config: PipelineConfig) -> PlainPeople:
+    """What stage I by itself makes of every frame: X_0 of Algorithm 1; NaN where no two views agree."""
+    found = [find_people(detections[t], rig, detections.skeleton, config) for t in range(len(detections))]
+    frame = np.repeat(np.arange(len(found)), [len(people) for people in found])
+    return PlainPeople(frame, triangulate(Observations.concatenate(found), Views.of(rig), config.observations))
 
 
 def _measure(segment: Segment, make: Callable[[Segment], tuple[People, Figures]]) -> Figures:
@@ -76,14 +83,8 @@ def _with_joints(people: People, joints: NDArray[np.floating]) -> PlainPeople:
     return PlainPeople(people.frame.astype(np.int64), joints.astype(np.float64))
 
 
-def _baseline(segment: Segment, timed: bool) -> tuple[People, Figures]:
-    people = frame_by_frame(segment.detections, segment.scene.rig)
-    return over_time(people, segment.scene.fps) if timed else people, {}
-
-
 def _proposals(segment: Segment, config: PipelineConfig) -> tuple[People, Figures]:
-    """Stage I of every frame, triangulated."""
-    return before_refinement(segment.detections, segment.scene.rig, config), {}
+    return initial_proposals(segment.detections, segment.scene.rig, config), {}
 
 
 def _method(segment: Segment, config: PipelineConfig) -> tuple[People, Figures]:
@@ -115,8 +116,6 @@ def _ours(segment: Segment) -> tuple[People, Figures]:
 
 
 METHODS: dict[str, Callable[[Segment], tuple[People, Figures]]] = {
-    "baseline, frame by frame (Dong et al. 2019: 71.0 / 80.2 / 75.3)": partial(_baseline, timed=False),
-    "baseline, over time": partial(_baseline, timed=True),
     "paper's settings (90.1 / 89.0 / 89.2)": partial(_method, config=PipelineConfig.paper()),
     "initial proposals, paper's settings (83.7 / 82.8 / 83.4)": partial(_proposals, config=PipelineConfig.paper()),
     "initial proposals": partial(_proposals, config=FRAME_BY_FRAME),

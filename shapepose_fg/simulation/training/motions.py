@@ -144,10 +144,7 @@ def load_motions(path: str | Path) -> Motions:
 def frame_weights(
     length: NDArray[np.integer], subject: NDArray[np.str_], walking: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Weight (S,) of a frame of each of S recordings: recordings, subjects and walking are capped, by split.
-
-    Parameters: frames of each recording (S,), who was recorded (S,), whether it is walking (S,).
-    """
+    """Weight (S,) of a frame of each of S recordings: recordings, subjects and walking are capped, by split."""
     total = np.minimum(length.astype(np.float64), SEGMENT_CAP)
     for name in np.unique(subject):
         rows = subject == name
