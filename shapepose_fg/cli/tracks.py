@@ -45,8 +45,7 @@ def people_over_time(
 
 @tracks.command("list")
 def list_people(
-    context: typer.Context,
-    as_json: Annotated[bool, typer.Option("--json", help="Print them as JSON.")] = False,
+    context: typer.Context, as_json: Annotated[bool, typer.Option("--json", help="Print them as JSON.")] = False
 ) -> None:
     """Everybody: frames, gaps, stature, how often seen, how far they walked."""
     from shapepose_fg.core.reconstruction import Reconstruction

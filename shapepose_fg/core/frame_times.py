@@ -6,7 +6,8 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from shapepose_fg.core.arrays import Array
 
 _LEAST_FPS, _MOST_FPS = 1e-3, 1e6
 """No recording of people is slower, or faster."""
@@ -18,7 +19,7 @@ ASSUMED_FPS = 30.0
 class FrameTimes:
     """The times of T frames; frame numbers count from 0 in the file, as in `Reconstruction.frame`."""
 
-    time_s: NDArray[np.float64]
+    time_s: Array
     """(T,) seconds; or (T, V), a column for each camera, where they are not synchronised."""
     source: str = "given"
     """Where the times come from: "assumed", "fps", "given", or the name of a file."""
@@ -55,11 +56,11 @@ class FrameTimes:
         return cls(np.arange(frames) / ASSUMED_FPS, source="assumed")
 
     @property
-    def frame_s(self) -> NDArray[np.float64]:
+    def frame_s(self) -> Array:
         """(T,) the time of each frame: the mean over its cameras where each has its own."""
         return self.time_s if self.time_s.ndim == 1 else self.time_s.mean(axis=1)
 
-    def of_views(self, views: int) -> NDArray[np.float64]:
+    def of_views(self, views: int) -> Array:
         """(T, V) the time of each frame in each of `views` cameras."""
         return self.time_s if self.time_s.ndim == 2 else np.repeat(self.time_s[:, None], views, axis=1)
 

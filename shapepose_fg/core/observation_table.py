@@ -9,6 +9,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observations import Observations
@@ -99,7 +100,7 @@ class ObservationTable(Table):
         cls,
         observations: Observations,
         place: NDArray[np.integer],
-        joints: NDArray[np.float64],
+        joints: Array,
         gate: NDArray[np.uint8],
         rig: Rig,
         joint_names: Sequence[str],
@@ -143,7 +144,7 @@ class ObservationTable(Table):
         """The rows of `parts`, one after the other; ValueError where joints or views differ."""
         return ObservationTable.joined(parts) if len(parts) > 0 else cls.empty()
 
-    def observations(self, initial: NDArray[np.float64], time_s: NDArray[np.float64]) -> Observations:
+    def observations(self, initial: Array, time_s: Array) -> Observations:
         """The rows as they were given to be solved, dropped detections too: to solve them anew.
 
         `initial` (N, J, 3) is where to begin, `time_s` (N,) when the rows' frames were taken. Which detection each
@@ -161,7 +162,7 @@ class ObservationTable(Table):
         )
 
     @property
-    def used(self) -> NDArray[np.bool_]:
+    def used(self) -> Mask:
         """(N, J, V) which detections are part of the solution."""
         return self.gate == Gate.USED
 

@@ -11,6 +11,7 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observation_table import ObservationTable
 from shapepose_fg.core.result_files import OBSERVATIONS, PEOPLE, RUN, RUN_ID, SavedTable, check_id, write_result
@@ -51,7 +52,7 @@ class Known(IntEnum):
     have as much to say."""
 
     @classmethod
-    def observed(cls, known: NDArray[np.integer]) -> NDArray[np.bool_]:
+    def observed(cls, known: NDArray[np.integer]) -> Mask:
         """Of which joints (...) any view's detection was used."""
         return np.isin(known, (cls.SEEN, cls.WEAK))
 
@@ -72,29 +73,27 @@ class Reconstruction(Table):
     """(N,) identity of the person; without tracking, a number within the frame."""
     joint_names: Annotated[NDArray[np.str_], Column("J", np.str_)]
     """(J,) names of the joints, as OpenPose writes them."""
-    joints: Annotated[NDArray[np.float64], Column("N J 3", unit="m", most=1e6)]
+    joints: Annotated[Array, Column("N J 3", unit="m", most=1e6)]
     """(N, J, 3) joint positions in the world, metres; NaN where unknown."""
-    covariance: Annotated[NDArray[np.float64], Column("N J 3 3", unit="m²", most=1e12)]
+    covariance: Annotated[Array, Column("N J 3 3", unit="m²", most=1e12)]
     """(N, J, 3, 3) covariance of each joint's position, square metres; NaN where unknown."""
-    confidence: Annotated[NDArray[np.float64], Column("N J", most=1e3)]
+    confidence: Annotated[Array, Column("N J", most=1e3)]
     """(N, J) mean confidence of a joint's observations over all views, 0 to 1."""
-    betas: Annotated[NDArray[np.float64], Column("N 10", most=1e3)]
+    betas: Annotated[Array, Column("N 10", most=1e3)]
     """(N, 10) shape of the body, standard deviations; NaN where there is no body."""
-    global_orient: Annotated[NDArray[np.float64], Column("N 3", unit="rad", most=1e3)]
+    global_orient: Annotated[Array, Column("N 3", unit="rad", most=1e3)]
     """(N, 3) orientation of the pelvis in the world, axis times angle, radians."""
-    body_pose: Annotated[NDArray[np.float64], Column("N 23 3", unit="rad", most=1e3)]
+    body_pose: Annotated[Array, Column("N 23 3", unit="rad", most=1e3)]
     """(N, 23, 3) rotation of every other body joint against its parent, axis times angle, radians."""
-    transl: Annotated[NDArray[np.float64], Column("N 3", unit="m", most=1e6)]
+    transl: Annotated[Array, Column("N 3", unit="m", most=1e6)]
     """(N, 3) translation of the body, metres."""
     status: Annotated[NDArray[np.str_], Column("N", np.str_, stored=f"U{max(map(len, Status))}")]
     """(N,) one of the values of `Status`."""
-    time_s: Annotated[NDArray[np.float64], Column("N", unit="s", most=1e12, missing=np.nan)] = _LATER
+    time_s: Annotated[Array, Column("N", unit="s", most=1e12, missing=np.nan)] = _LATER
     """(N,) when the row's frame was taken, seconds; NaN where unknown, as it is where the column is not given."""
-    velocity: Annotated[NDArray[np.float64], Column("N J 3", unit="m/s", most=1e9, missing=np.nan)] = _LATER
+    velocity: Annotated[Array, Column("N J 3", unit="m/s", most=1e9, missing=np.nan)] = _LATER
     """(N, J, 3) velocity of each joint in the world, m/s; NaN where unknown or not given."""
-    velocity_covariance: Annotated[
-        NDArray[np.float64], Column("N J 3 3", unit="(m/s)²", most=1e18, missing=np.nan)
-    ] = _LATER
+    velocity_covariance: Annotated[Array, Column("N J 3 3", unit="(m/s)²", most=1e18, missing=np.nan)] = _LATER
     """(N, J, 3, 3) covariance of each joint's velocity, (m/s)²; NaN where unknown or not given."""
     known: Annotated[NDArray[np.uint8], Column("N J", np.uint8, missing=Known.UNKNOWN, codes=Known)] = _LATER
     """(N, J) how each joint is known: codes of `Known`; unknown where not given."""
@@ -248,7 +247,7 @@ class OpenedReconstruction(ExitStack):
         every = max(1, -(-len(self) // most_rows))
         return self.rows(None if every == 1 else np.flatnonzero(self.frame % every == 0)), every
 
-    def rows(self, index: NDArray[np.intp] | None = None, *, observations: bool = True) -> Reconstruction:
+    def rows(self, index: Index | None = None, *, observations: bool = True) -> Reconstruction:
         """The rows `index` (R,), rising, or all; with what they were solved from, where that is wanted.
 
         InputError where a file is damaged, or they would not fit in memory.

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.filesize import decimal
 
+from shapepose_fg.core.arrays import Index
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.run_summary import plain
 from shapepose_fg.core.storage.files import write_together
@@ -143,7 +144,7 @@ class SavedTable(ExitStack, Generic[T]):
             self._columns[name].check_range(name, column)
             return column
 
-    def read(self, index: NDArray[np.intp] | None, **others: Any) -> T:
+    def read(self, index: Index | None, **others: Any) -> T:
         """The rows `index` (R,), rising, or all, and `others` beside them; InputError where they do not make a
         table, or would not fit in memory.
         """

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Index
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.core.storage.kept_arrays import Arrays, KeptArrays
@@ -73,11 +73,7 @@ class DetectionTable:
 
 
 def keep_block(
-    kept: KeptArrays,
-    number: int,
-    candidates: Detections,
-    candidate_start: NDArray[np.intp],
-    pair_start: NDArray[np.intp],
+    kept: KeptArrays, number: int, candidates: Detections, candidate_start: Index, pair_start: Index
 ) -> None:
     """Keep block `number` of a recording: the candidates of its T frames, one frame after the other.
 

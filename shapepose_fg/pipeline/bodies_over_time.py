@@ -13,6 +13,7 @@ from shapepose_fg.body.fitting.fitter import BodyFitter, JointTargets, Shapes
 from shapepose_fg.body.fitting.weights import fingerprint
 from shapepose_fg.body.model.soles import above_floor
 from shapepose_fg.body.shapes import SubjectShapes, recognise
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.reconstruction import Reconstruction, Status
 from shapepose_fg.core.storage.kept_arrays import InMemory, KeptArrays
 from shapepose_fg.estimation.floor import Floor
@@ -37,7 +38,7 @@ class Person:
     """Who it is."""
     targets: JointTargets
     """The joints as they were solved."""
-    time_s: NDArray[np.float64]
+    time_s: Array
     """(N,) seconds."""
     shapes: Shapes | None = None
     """What is known of the shape, (1)."""
@@ -50,13 +51,7 @@ class Person:
     """What bodies do not sink into, where it was found."""
 
     @classmethod
-    def of(
-        cls,
-        number: int,
-        joints: NDArray[np.float64],
-        covariance: NDArray[np.float64],
-        time_s: NDArray[np.float64],
-    ) -> "Person":
+    def of(cls, number: int, joints: Array, covariance: Array, time_s: Array) -> "Person":
         """From the solved rows of one person: `joints` (N, J, 3), `covariance` (N, J, 3, 3), `time_s` (N,)."""
         solved = np.isfinite(joints.sum(axis=-1)) & np.isfinite(covariance.sum(axis=(-1, -2)))
         information = np.zeros_like(covariance)
@@ -196,10 +191,7 @@ def _spread(count: int, most: int, length: int) -> list[range]:
 
 
 def with_bodies_over_time(
-    people: Reconstruction,
-    fitter: BodyFitter,
-    known: SubjectShapes | None = None,
-    floor: Floor | None = None,
+    people: Reconstruction, fitter: BodyFitter, known: SubjectShapes | None = None, floor: Floor | None = None
 ) -> Reconstruction:
     """The same rows with one body per person, fitted to the joints as they were solved, and everybody's shape.
 

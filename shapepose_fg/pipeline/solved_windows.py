@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.frame_times import FrameTimes, segments
 from shapepose_fg.core.observation_table import Gate, ObservationTable, place_in_view
@@ -45,7 +46,7 @@ class SolvedWindows:
     """Where this process takes its notes."""
 
     @cached_property
-    def _time_s(self) -> NDArray[np.float64]:
+    def _time_s(self) -> Array:
         """(T, V) when each view took each frame."""
         return self.times.of_views(len(self.setup.rig))
 

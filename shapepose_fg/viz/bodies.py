@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.reconstruction import Reconstruction, Status
 
 if TYPE_CHECKING:
@@ -13,7 +14,7 @@ if TYPE_CHECKING:
 _BODY = ("betas", "global_orient", "body_pose", "transl")
 
 
-def surfaces(people: Reconstruction, body: "BodyModel") -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+def surfaces(people: Reconstruction, body: "BodyModel") -> tuple[Array, Index]:
     """Vertices (P, Nv, 3), metres, of the rows that have a body, and which rows these are (P,)."""
     import torch
 
@@ -31,9 +32,7 @@ def surfaces(people: Reconstruction, body: "BodyModel") -> tuple[NDArray[np.floa
         return body.vertices(BodyParameters(*parts)).numpy().astype(np.float64), rows
 
 
-def joined(
-    vertices: NDArray[np.floating], faces: NDArray[np.integer]
-) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+def joined(vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> tuple[Array, Index]:
     """Bodies (P, Nv, 3) that share `faces` (F, 3), as one mesh: vertices (P Nv, 3) and faces (P F, 3)."""
     people, count = vertices.shape[:2]
     every = faces[None] + count * np.arange(people)[:, None, None]

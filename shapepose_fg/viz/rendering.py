@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Camera
 from shapepose_fg.core.drawing import vertex_normals
 
@@ -44,7 +45,7 @@ class Surface:
     """(H, W) index of the face that is met; -1 where there is none."""
 
 
-def look_at(eye: NDArray[np.float64], target: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[np.float64]:
+def look_at(eye: Array, target: Array, up: Array) -> Array:
     """Pose `wTc` (4, 4) of a camera at `eye` (3,) that looks at `target` (3,), image up towards `up` (3,)."""
     forward = np.asarray(target, dtype=np.float64) - eye
     forward /= np.linalg.norm(forward)
@@ -91,12 +92,8 @@ def render_depth(
 
 
 def first_surface_at(
-    points_world: NDArray[np.floating],
-    faces: NDArray[np.integer],
-    camera: Camera,
-    column: NDArray[np.intp],
-    row: NDArray[np.intp],
-) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+    points_world: NDArray[np.floating], faces: NDArray[np.integer], camera: Camera, column: Index, row: Index
+) -> tuple[NDArray[np.float32], Index]:
     """Depth and vertex, each of the shape of `column` and `row`, of the first surface on the rays of some pixels.
 
     The vertex is the first corner of the face that is met. inf and -1 where nothing is. The same picture as
@@ -200,7 +197,7 @@ def render_shaded(
     faces: NDArray[np.integer],
     colours: NDArray[np.floating],
     camera: Camera,
-    light: NDArray[np.float64],
+    light: Array,
     samples: int = 3,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Picture of shaded meshes: colour (H, W, 3) in 0..1, multiplied by coverage, and coverage (H, W).
@@ -244,12 +241,8 @@ def _nearness_shadow(depth: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _barycentric(
-    vertices: NDArray[np.floating],
-    corners: NDArray[np.integer],
-    camera: Camera,
-    column: NDArray[np.intp],
-    row: NDArray[np.intp],
-) -> NDArray[np.float64]:
+    vertices: NDArray[np.floating], corners: NDArray[np.integer], camera: Camera, column: Index, row: Index
+) -> Array:
     """Perspective-correct weights (M, 3) of the corners (M, 3) of the faces met at pixels column, row (M,)."""
     points = (vertices @ camera.cTw[:, :3].T + camera.cTw[:, 3])[corners]
     ray = np.stack([column, row, np.ones(len(row))], axis=1) @ np.linalg.inv(camera.K).T

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Lens
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.calibration.content import Content, load
@@ -191,7 +191,7 @@ def _read_ros(content: Content) -> WrittenRig | None:
     return WrittenRig(cameras, "m", "z")
 
 
-def _ros_pose(path: Path, value: Any) -> NDArray[np.float64]:
+def _ros_pose(path: Path, value: Any) -> Array:
     """World from camera, of a message with translation and rotation."""
     message = _message_of(value)
     if message is None:

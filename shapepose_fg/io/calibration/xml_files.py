@@ -5,8 +5,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.calibration.written import (
@@ -66,7 +66,7 @@ def _node(element: ET.Element | None, place: str, cure: str) -> Node:
 
 
 def _qualisys(camera: ET.Element, place: str) -> WrittenCamera:
-    def values(tag: str, names: str, missing: dict[str, float] | None = None) -> NDArray[np.float64]:
+    def values(tag: str, names: str, missing: dict[str, float] | None = None) -> Array:
         node = _node(camera.find(tag), f"{place}: <{tag}>", _QTM)
         node = Node({**(missing or {}), **node.values}, node.place, node.cures)
         return np.concatenate([node.needed(name, 1) for name in names.split()])

@@ -10,10 +10,10 @@ from types import ModuleType
 from typing import Any, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shapepose_fg.body.model.smpl_file import SmplArrays
 from shapepose_fg.body.shapes import read_body
+from shapepose_fg.core.arrays import Index
 from shapepose_fg.core.camera import Axis
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import OpenedReconstruction, Reconstruction
@@ -222,7 +222,7 @@ def read_take(
 
 def chosen_rows(
     opened: OpenedReconstruction, path: Path, frames: range | None, persons: tuple[int, ...] | None
-) -> NDArray[np.intp] | None:
+) -> Index | None:
     """(R,) rows of these frames and people; None for all. InputError for somebody who is not there."""
     if frames is None and persons is None:
         return None

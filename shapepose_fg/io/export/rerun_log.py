@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from shapepose_fg.body.model.smpl_file import SmplArrays
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.drawing import bones_of, colour_of, thinned, vertex_normals
 from shapepose_fg.core.observation_table import Gate
@@ -117,9 +118,7 @@ def _log_person(rr: ModuleType, stream: Any, take: Take, person: int) -> None:
             stream.log(plot, rr.Scalars(float(np.median(known))))
 
 
-def _ellipsoids(
-    rr: ModuleType, centres: NDArray[np.float64], covariance: NDArray[np.float64], colour: NDArray[np.float64]
-) -> Any:
+def _ellipsoids(rr: ModuleType, centres: Array, covariance: Array, colour: Array) -> Any:
     """The 95 % regions of joints."""
     fine = np.isfinite(covariance).all(axis=(1, 2))
     variance, axes = np.linalg.eigh(covariance[fine])
@@ -134,12 +133,7 @@ def _ellipsoids(
 
 
 def _log_bodies(
-    rr: ModuleType,
-    stream: Any,
-    take: Take,
-    person: int,
-    arrays: SmplArrays,
-    mesh: tuple[NDArray[np.intp], NDArray[np.int32]],
+    rr: ModuleType, stream: Any, take: Take, person: int, arrays: SmplArrays, mesh: tuple[Index, NDArray[np.int32]]
 ) -> None:
     """The body of one person where there is one; of its skin the vertices and triangles `mesh`."""
     (kept, faces), who = mesh, int(take.persons[person])
@@ -252,5 +246,5 @@ def undistorting(camera: Camera, placement: Placement) -> tuple[NDArray[np.float
     return np.ascontiguousarray(there[..., 0]), np.ascontiguousarray(there[..., 1])
 
 
-def _rgb8(colours: NDArray[np.float64]) -> NDArray[np.uint8]:
+def _rgb8(colours: Array) -> NDArray[np.uint8]:
     return np.rint(255 * np.clip(colours, 0, 1)).astype(np.uint8)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.filesize import decimal
 
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Axis, Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Known, Reconstruction
@@ -44,11 +45,11 @@ class Take:
     """The rows; joints that are left out are NaN in it."""
     persons: NDArray[np.int64]
     """(P,) identities."""
-    rows: NDArray[np.intp]
+    rows: Index
     """(P, T) row of `people` of each person in each frame; -1 where there is none."""
     frames: NDArray[np.int64]
     """(T,) numbers of the frames, as in people.npz."""
-    times_s: NDArray[np.float64]
+    times_s: Array
     """(T,) when they were taken, seconds; rising."""
     fps: float
     """Frames a second: one over the median step."""
@@ -158,7 +159,7 @@ def _seen(people: Reconstruction) -> Reconstruction:
     return replace(people, **columns)
 
 
-def _times(people: Reconstruction, frames: NDArray[np.int64], fps: float | None) -> NDArray[np.float64]:
+def _times(people: Reconstruction, frames: NDArray[np.int64], fps: float | None) -> Array:
     """When each frame was taken: frames without a row lie between those with one."""
     if fps is not None:
         return frames / fps
@@ -182,7 +183,7 @@ def _fps_of(people: Reconstruction) -> float:
     return float(fps)
 
 
-def y_up(up: Axis) -> NDArray[np.float64]:
+def y_up(up: Axis) -> Array:
     """(3, 3) rotation from a world with the axis `up` upwards to y up: BVH and glTF.
 
     Z up becomes (x, z, -y), which Blender's importers undo: there the numbers are those of the world again.
@@ -190,11 +191,11 @@ def y_up(up: Axis) -> NDArray[np.float64]:
     return np.array(_TO_Y_UP[up], dtype=np.float64)
 
 
-def z_up(up: Axis) -> NDArray[np.float64]:
+def z_up(up: Axis) -> Array:
     """(3, 3) rotation to z up, as AMASS has it; the identity where z is up."""
     return _Z_FROM_Y @ y_up(up)
 
 
-def opensim_axes(up: Axis) -> NDArray[np.float64]:
+def opensim_axes(up: Axis) -> Array:
     """(3, 3) rotation to y up in TRC and C3D: Pose2Sim's, so that the same cameras give the same numbers."""
     return _FORWARD_X @ y_up(up)

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.camera_names import in_order
 from shapepose_fg.io.footage.places import PICTURES
@@ -59,7 +60,7 @@ class Video:
     path: Path
     size: tuple[int, int]
     """(width, height) of the pictures."""
-    time_s: NDArray[np.float64]
+    time_s: Array
     """(N,) the frames' own times in the file, seconds after the first."""
     notes: tuple[str, ...] = ()
     """What is wrong with the file, a sentence each."""
@@ -68,7 +69,7 @@ class Video:
     _last: Picture | None = None
 
     @property
-    def number(self) -> NDArray[np.intp]:
+    def number(self) -> Index:
         """(N,) frames count from 0."""
         return np.arange(len(self.time_s))
 
@@ -124,11 +125,11 @@ class PictureFiles:
     """(width, height) of the pictures."""
     files: tuple[Path, ...]
     """(N,) the files in the order of their numbers."""
-    number: NDArray[np.intp]
+    number: Index
     """(N,) number of each frame, rising."""
     notes: tuple[str, ...] = ()
     """What is wrong with the files, a sentence each."""
-    time_s: NDArray[np.float64] | None = None
+    time_s: Array | None = None
     """Files do not say when they were taken."""
 
     @classmethod
@@ -188,7 +189,7 @@ def _capture(path: Path) -> Any:
     return capture
 
 
-def _times(path: Path, stamp_s: NDArray[np.float64], fps: float) -> tuple[NDArray[np.float64], list[str]]:
+def _times(path: Path, stamp_s: Array, fps: float) -> tuple[Array, list[str]]:
     """(N,) seconds after the first frame, and what is odd about them.
 
     The file's own times where they rise; else the rate that it names.

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import read_json, write_content
@@ -54,7 +54,7 @@ class Placement:
     """(width, height) that the calibration is for."""
 
     @cached_property
-    def scale(self) -> NDArray[np.float64]:
+    def scale(self) -> Array:
         """(2,) pixels of the picture per calibrated pixel, x and y."""
         scale = np.array(self.picture_size, dtype=float) / self.calibrated_size
         if self.kind is PlacementKind.LETTERBOX:
@@ -62,7 +62,7 @@ class Placement:
         return scale if self.kind is PlacementKind.SCALE else np.ones(2)
 
     @cached_property
-    def shift(self) -> NDArray[np.float64]:
+    def shift(self) -> Array:
         """(2,) the left and upper edges of the calibrated picture, pixels from the picture's own edges."""
         centred = self.kind in (PlacementKind.LETTERBOX, PlacementKind.CROP_CENTRE)
         return (self.picture_size - self.scale * self.calibrated_size) / 2 if centred else np.zeros(2)
@@ -75,11 +75,11 @@ class Placement:
         left, top, right, bottom = np.concatenate([low, high]) - 0.5
         return float(left), float(top), float(right), float(bottom)
 
-    def to_picture(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    def to_picture(self, xy: Array) -> Array:
         """Pixels (..., 2) of the picture from calibrated pixels (as the lens gives them)."""
         return (xy + 0.5) * self.scale + self.shift - 0.5
 
-    def to_calibrated(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    def to_calibrated(self, xy: Array) -> Array:
         """Calibrated pixels (..., 2) from pixels of the picture."""
         return (xy + 0.5 - self.shift) / self.scale - 0.5
 
@@ -155,7 +155,7 @@ class CameraFootage:
     """The video, picture, or folder of pictures."""
     placement: Placement
     """Where calibrated pixels lie in the pictures."""
-    places: NDArray[np.intp]
+    places: Index
     """(T,) the picture of each frame, counted from 0 in the file; -1 where there is none."""
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.soles import lowest_of_feet
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.observation_table import ObservationTable
 from shapepose_fg.core.reconstruction import Known, Reconstruction, Status, count_rows
 from shapepose_fg.core.result_files import write_result
@@ -165,7 +166,7 @@ class Assembly:
             for name, each in empty.columns().items()
         }
 
-    def floor(self, model: BodyModel, up: NDArray[np.float64]) -> Floor | str:
+    def floor(self, model: BodyModel, up: Array) -> Floor | str:
         """Where the soles of everybody's bodies stand, or in words why no floor was found; `up` (3,) points up."""
         joints, parts = tuple(self.joint_names), self.parts
         # Ankles alone do not say where the sole is: unseen feet hang as the body's prior has them.

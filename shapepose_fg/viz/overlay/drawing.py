@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Camera
 from shapepose_fg.core.drawing import bones_of, colour_of
 from shapepose_fg.core.errors import InputError
@@ -48,11 +49,11 @@ class PictureView:
     """(width, height) of what is drawn on: the picture, enlarged or made smaller."""
 
     @property
-    def scale(self) -> NDArray[np.float64]:
+    def scale(self) -> Array:
         """(2,) drawn pixels per pixel of the picture, x and y."""
         return np.array(self.size) / self.placement.picture_size
 
-    def project(self, points: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def project(self, points: NDArray[np.floating]) -> tuple[Array, Array]:
         """Drawn pixels (..., 2) and depths (...,) in metres of `points` (..., 3) in the world.
 
         Pixels are NaN behind the camera, and far outside the picture.
@@ -61,7 +62,7 @@ class PictureView:
         xy[~(depth > NEAR_M)] = np.nan
         return self.through_lens(xy), depth
 
-    def through_lens(self, xy: NDArray[np.floating]) -> NDArray[np.float64]:
+    def through_lens(self, xy: NDArray[np.floating]) -> Array:
         """Drawn pixels (..., 2) from undistorted ones, as observations have them."""
         flat = np.asarray(xy, dtype=np.float64).reshape(-1, 2)
         size = np.array(self.camera.image_size)
@@ -113,11 +114,11 @@ def draw_bodies(
 class Skeletons:
     """People's joints in one frame."""
 
-    joints: NDArray[np.float64]
+    joints: Array
     """(P, J, 3) metres; NaN where unknown."""
-    seen: NDArray[np.bool_]
+    seen: Mask
     """(P, J) whether a view saw the joint in this frame; others are inferred."""
-    bones: NDArray[np.intp]
+    bones: Index
     """(B, 2) joints that are joined."""
     colours: Sequence[Colour]
     """(P,) one for each person."""
@@ -162,7 +163,7 @@ def draw_skeletons(picture: Picture, view: PictureView, people: Skeletons) -> No
             draw_label(picture, label, (top[0], top[1] - 5 * stroke), colour)
 
 
-def _top(xy: NDArray[np.float64], size: tuple[int, int]) -> tuple[float, float] | None:
+def _top(xy: Array, size: tuple[int, int]) -> tuple[float, float] | None:
     """The middle of a person's width, and the highest of their joints `xy` (K, 2); None outside the picture."""
     inside = np.all((xy >= 0) & (xy < np.array(size)), axis=1)
     if not inside.any():
@@ -171,9 +172,7 @@ def _top(xy: NDArray[np.float64], size: tuple[int, int]) -> tuple[float, float] 
     return float((xy[:, 0].min() + xy[:, 0].max()) / 2), float(xy[:, 1].min())
 
 
-def draw_detections(
-    picture: Picture, xy: NDArray[np.float64], used: NDArray[np.bool_], colours: NDArray[np.integer]
-) -> None:
+def draw_detections(picture: Picture, xy: Array, used: Mask, colours: NDArray[np.integer]) -> None:
     """Draw detections at drawn pixels `xy` (K, 2): squares in `colours` (K, 3), red crosses where not used."""
     reach = max(2, stroke_of(picture.shape[1::-1]))
     there = np.isfinite(xy).all(axis=1)
@@ -214,7 +213,7 @@ def draw_label(
     )
 
 
-def _fine(xy: NDArray[np.float64]) -> NDArray[np.int32]:
+def _fine(xy: Array) -> NDArray[np.int32]:
     """Pixels as OpenCV's drawing takes them with fractions."""
     return np.round(np.clip(xy, -30000, 30000) * (1 << _FINE)).astype(np.int32)
 

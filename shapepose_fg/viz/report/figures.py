@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Index, Mask
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.reconstruction import Known, Reconstruction
 from shapepose_fg.core.run_summary import covered_frames
@@ -119,11 +120,11 @@ def known_counts(people: Reconstruction, by: NDArray[np.integer] | None = None) 
     return counts
 
 
-def _share(true: NDArray[np.bool_]) -> float | None:
+def _share(true: Mask) -> float | None:
     return float(true.mean()) if true.size > 0 else None
 
 
-def _segments(table: ObservationTable) -> NDArray[np.intp]:
+def _segments(table: ObservationTable) -> Index:
     """(N,) which segment of the recording each row is in."""
     if len(table) == 0:
         return np.zeros(0, dtype=np.intp)

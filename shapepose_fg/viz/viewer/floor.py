@@ -6,10 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Camera
 from shapepose_fg.viz.rendering import rasterise
-
-Array = NDArray[np.float64]
 
 _CELL_M = 0.5
 _SHADOW_PX_PER_M = 100
@@ -59,7 +58,7 @@ class Floor:
 
 def floor_picture(
     floor: Floor, camera: Camera, vertices: Array, faces: NDArray[np.integer], light: Array
-) -> NDArray[np.float64]:
+) -> Array:
     """Picture (H, W, 3), 0..1, of the floor that `camera` sees, shaded by the bodies `vertices` (N, 3).
 
     `light` (3,) points from the scene to the light.

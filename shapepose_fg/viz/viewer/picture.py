@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.drawing import colour_of
@@ -18,8 +19,6 @@ from shapepose_fg.viz.bodies import joined, surfaces
 from shapepose_fg.viz.overlay.drawing import PictureView, Skeletons, draw_label, draw_skeletons, write_picture
 from shapepose_fg.viz.rendering import look_at, render_depth, render_shaded, zoom
 from shapepose_fg.viz.viewer.floor import Floor, floor_picture
-
-Array = NDArray[np.float64]
 
 _WIDE, _GAP, _HEADER = 1800, 14, 60
 """Width of the picture, space between its panels and above them, pixels."""
@@ -37,7 +36,7 @@ class _Mesh:
 
     vertices: Array
     """(M, 3) metres in the world."""
-    faces: NDArray[np.intp]
+    faces: Index
     """(F, 3)."""
     colours: Array
     """(M, 3) one per vertex, red, green, blue, 0..1."""
@@ -113,7 +112,7 @@ def _shaded(camera: Camera, floor: Floor, casting: _Mesh, drawn: list[tuple[_Mes
     return np.ascontiguousarray(np.rint(255 * np.clip(picture[..., ::-1], 0, 1)).astype(np.uint8))
 
 
-def _draw_people(panel: Picture, camera: Camera, people: Reconstruction, rows: NDArray[np.intp]) -> None:
+def _draw_people(panel: Picture, camera: Camera, people: Reconstruction, rows: Index) -> None:
     """The skeletons of some rows, with who they are."""
     placement = Placement(PlacementKind.SAME, camera.image_size, camera.image_size)
     view = PictureView(camera, placement, camera.image_size)
@@ -176,7 +175,7 @@ def floor_under(rig: Rig, joints: Array, truth: Array, points: Array) -> Floor:
     return replace(floor, radius_m=float(np.clip(1.05 * reach, 3.6, 10.0)))
 
 
-def two_views(rig: Rig, vertices: Array, faces: NDArray[np.intp]) -> tuple[int, int]:
+def two_views(rig: Rig, vertices: Array, faces: Index) -> tuple[int, int]:
     """The view in which bodies cover each other least, and one that looks from across, about 90 degrees."""
     if len(vertices) == 0:
         return 0, len(rig) // 2
