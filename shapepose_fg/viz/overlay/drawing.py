@@ -30,7 +30,7 @@ _BEND = 8
 """Pieces in which a bone is drawn, because a lens bends it."""
 _OPACITY = 0.45
 """Of bodies: what is under them stays visible."""
-_FINE = 8
+FINE = 8
 """Bits of a pixel's fraction in OpenCV's drawing."""
 _REACH = 0.5
 """Points farther outside the picture than this share of its size are not placed: no lens was calibrated there, and
@@ -91,8 +91,9 @@ def draw_bodies(
     vertices: NDArray[np.floating],
     faces: NDArray[np.integer],
     colours: Sequence[Colour],
+    opacity: float = _OPACITY,
 ) -> Picture:
-    """The surfaces `vertices` (P, Nv, 3), metres, half transparent in a colour each, lit from the camera."""
+    """The surfaces `vertices` (P, Nv, 3), metres, in a colour each, lit from the camera."""
     if len(vertices) == 0:
         return picture
     points, corners = joined(vertices, faces)
@@ -106,7 +107,7 @@ def draw_bodies(
     light = 0.35 + 0.65 * np.clip(-(normal @ view.camera.wTc[:3, 2]), 0.0, 1.0)
     own = np.array(colours, dtype=np.float64)[met // len(faces)]
     drawn = picture.copy()
-    drawn[row, column] = ((1 - _OPACITY) * picture[row, column] + _OPACITY * light[:, None] * own).astype(np.uint8)
+    drawn[row, column] = ((1 - opacity) * picture[row, column] + opacity * light[:, None] * own).astype(np.uint8)
     return drawn
 
 
@@ -147,15 +148,14 @@ def draw_skeletons(picture: Picture, view: PictureView, people: Skeletons) -> No
         ends = joints[people.bones]
         lines, _ = view.project(ends[:, :1] * (1 - part) + ends[:, 1:] * part)
         lines = lines[np.isfinite(lines).all(axis=(1, 2))]
-        fine = _fine(lines)
         for width, paint in ((stroke + 2, _DARK), (stroke, colour)):
-            cv2.polylines(picture, list(fine), False, paint, width, cv2.LINE_AA, _FINE)
+            cv2.polylines(picture, list(fine(lines)), False, paint, width, cv2.LINE_AA, FINE)
         xy, _ = view.project(joints)
         known = np.isfinite(xy).all(axis=1)
-        radius = round((stroke + 0.5) * (1 << _FINE))
-        for centre, filled in zip(_fine(xy[known]).tolist(), seen[known].tolist(), strict=True):
-            cv2.circle(picture, centre, radius, _WHITE if filled else _DARK, -1, cv2.LINE_AA, _FINE)
-            cv2.circle(picture, centre, radius, colour, max(1, stroke // 2), cv2.LINE_AA, _FINE)
+        radius = round((stroke + 0.5) * (1 << FINE))
+        for centre, filled in zip(fine(xy[known]).tolist(), seen[known].tolist(), strict=True):
+            cv2.circle(picture, centre, radius, _WHITE if filled else _DARK, -1, cv2.LINE_AA, FINE)
+            cv2.circle(picture, centre, radius, colour, max(1, stroke // 2), cv2.LINE_AA, FINE)
         tops.append(_top(xy[known], view.size))
     # Names last: no limbs cross them.
     for top, colour, label in zip(tops, people.colours, people.labels, strict=True):
@@ -177,19 +177,19 @@ def draw_detections(picture: Picture, xy: Array, used: Mask, colours: NDArray[np
     reach = max(2, stroke_of(picture.shape[1::-1]))
     there = np.isfinite(xy).all(axis=1)
     for (x, y), good, colour in zip(
-        _fine(xy[there]).tolist(), used[there].tolist(), colours[there].tolist(), strict=True
+        fine(xy[there]).tolist(), used[there].tolist(), colours[there].tolist(), strict=True
     ):
-        arm = reach << _FINE
+        arm = reach << FINE
         if good:
             box = ((x - arm, y - arm), (x + arm, y + arm))
-            cv2.rectangle(picture, *box, _DARK, 3, cv2.LINE_AA, _FINE)
+            cv2.rectangle(picture, *box, _DARK, 3, cv2.LINE_AA, FINE)
             light = tuple((np.asarray(colour) + 255) / 2)
-            cv2.rectangle(picture, *box, light, 1, cv2.LINE_AA, _FINE)
+            cv2.rectangle(picture, *box, light, 1, cv2.LINE_AA, FINE)
         else:
             arm = round(1.5 * arm)
             for width, paint in ((max(3, reach), _DARK), (max(1, reach // 2), GATED)):
-                cv2.line(picture, (x - arm, y - arm), (x + arm, y + arm), paint, width, cv2.LINE_AA, _FINE)
-                cv2.line(picture, (x - arm, y + arm), (x + arm, y - arm), paint, width, cv2.LINE_AA, _FINE)
+                cv2.line(picture, (x - arm, y - arm), (x + arm, y + arm), paint, width, cv2.LINE_AA, FINE)
+                cv2.line(picture, (x - arm, y + arm), (x + arm, y - arm), paint, width, cv2.LINE_AA, FINE)
 
 
 def draw_label(
@@ -213,9 +213,9 @@ def draw_label(
     )
 
 
-def _fine(xy: Array) -> NDArray[np.int32]:
+def fine(xy: Array) -> NDArray[np.int32]:
     """Pixels as OpenCV's drawing takes them with fractions."""
-    return np.round(np.clip(xy, -30000, 30000) * (1 << _FINE)).astype(np.int32)
+    return np.round(np.clip(xy, -30000, 30000) * (1 << FINE)).astype(np.int32)
 
 
 def write_picture(path: Path, picture: Picture) -> None:
