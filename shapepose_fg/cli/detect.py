@@ -35,12 +35,8 @@ _NETWORK = "Network"
 class NetworkOptions:
     """The network that detects, and how it is run."""
 
-    network: str = option(
-        _NETWORK, "ONNX file of a network of OpenPose's kind, or a named one.", REQUIRED, metavar="FILE|NAME"
-    )
-    layout: str | None = option(
-        _NETWORK, "How to read it: tf-pose, openpose-coco, openpose-body25.", metavar="NAME"
-    )
+    network: str = option(_NETWORK, "ONNX file like OpenPose's, or a named one.", REQUIRED, metavar="FILE|NAME")
+    layout: str | None = option(_NETWORK, "Its kind: tf-pose, openpose-coco, openpose-body25.", metavar="NAME")
     download: bool = option(_NETWORK, "Fetch a named network that is not here yet.", False, "--download")
     network_address: str | None = option(_NETWORK, "Where to fetch it from; its checksum decides.", metavar="URL")
     long_side: int = option(_NETWORK, "Longer side of what it is shown, pixels: more finds smaller people.", 656)
@@ -69,9 +65,7 @@ class NetworkOptions:
 class ClockOptions:
     """When pictures were taken."""
 
-    fps: list[str] | None = option(
-        TIME, "Frames a second, where the files are silent or wrong.", metavar="RATE|CAMERA=RATE"
-    )
+    fps: list[str] | None = option(TIME, "Frames a second, where files do not say.", metavar="RATE|CAMERA=RATE")
     start: list[str] | None = option(
         TIME, "When its first frame was taken: 0.2s, or 12f (its own frames); else 0.", metavar="CAMERA=TIME"
     )
@@ -127,9 +121,7 @@ def detect(
             raise
     for name, failed in zip(rig.names, report.unreadable, strict=True):
         if failed > 0:
-            note(
-                f"camera {name}: {failed} of {report.moments} pictures cannot be read; it has no detections there"
-            )
+            note(f"camera {name}: {failed} of {report.moments} pictures cannot be read; nothing is detected there")
     show(_summary(run, report, time.perf_counter() - begin))
     print(_next_command(run, cameras))
 

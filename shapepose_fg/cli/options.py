@@ -114,9 +114,7 @@ class CameraOptions:
     calibration: Path = option(INPUT, "Cameras: a file, or a folder, of one of the formats known.", REQUIRED)
     up: str | None = option(INPUT, "World axis that points up: x -x y -y z -z.", metavar="AXIS")
     unit: str | None = option(INPUT, "Unit of the calibration: m, cm or mm.", metavar="UNIT")
-    image_size: str | None = option(
-        INPUT, "Size of the calibrated pictures, where the file has none.", metavar="WxH"
-    )
+    image_size: str | None = option(INPUT, "Size of calibrated pictures where the file has none.", metavar="WxH")
 
     def rig(self) -> "Rig":
         """The cameras; InputError where they cannot be used."""
@@ -135,9 +133,7 @@ class DetectionOptions(CameraOptions):
     """Cameras, and what a 2D detector saw with them."""
 
     detections: Path = option(INPUT, "Folder with what a 2D detector wrote of every camera.", REQUIRED)
-    skeleton: str | None = option(
-        INPUT, "The detector's skeleton, or a TOML file that describes it.", metavar="NAME"
-    )
+    skeleton: str | None = option(INPUT, "The detector's skeleton, or a TOML file of it.", metavar="NAME")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -41,9 +41,7 @@ def view(
     stream = new_stream()
     viewer = viewer_file()
     if connect is None and not statistics and viewer is not None and switch_off(viewer):
-        note(
-            "rerun's statistics of use were on and are switched off now; `rerun analytics enable` switches them on"
-        )
+        note("rerun's statistics of use were on and are off now; `rerun analytics enable` switches them on")
     open_viewer(stream, take, connect)
     arrays, missing = body_if_there(Job(take, part.results, part.body))
     for each in missing:

@@ -69,9 +69,7 @@ class FrameTimes:
         if len(self) != frames:
             raise ValueError(f"times are needed for each of the {frames} frames, got {len(self)}")
         if self.time_s.ndim == 2 and self.time_s.shape[1] != views:
-            raise ValueError(
-                f"times must have a column for each of the {views} cameras, got {self.time_s.shape[1]}"
-            )
+            raise ValueError(f"times need a column for each of the {views} cameras, got {self.time_s.shape[1]}")
 
     def as_dict(self) -> dict[str, Any]:
         """What run.json says of the times: where they come from, and the median rate."""

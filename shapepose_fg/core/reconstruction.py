@@ -57,6 +57,8 @@ class Known(IntEnum):
         return np.isin(known, (cls.SEEN, cls.WEAK))
 
 
+BODY = ("betas", "global_orient", "body_pose", "transl")
+"""The columns of a result that are a body."""
 MOST_NUMBER = 2**53 - 1
 """The highest number of a frame or a person: the last whole number that all real ones below it are."""
 _LATER: Any = None
@@ -117,9 +119,7 @@ class Reconstruction(Table):
             raise ValueError(f"status must be one of {[*map(str, Status)]}, got {sorted(unknown)}")
         for name in ("frame", "person", "joint_names") if self.observations is not None else ():
             if not np.array_equal(getattr(self.observations, name), getattr(self, name)):
-                raise ValueError(
-                    f"observations must have the same {name} as the people, row by row (see `relabelled`)"
-                )
+                raise ValueError(f"observations must have the same {name} as the people (see `relabelled`)")
 
     @classmethod
     def empty(cls, joint_names: Sequence[str] = BODY_25.joints) -> "Reconstruction":
@@ -274,6 +274,11 @@ def _read_run(file: Path, people_id: object) -> dict[str, Any]:
         raise InputError(f"{file}: {error}; restore it or delete it") from None
     check_id(people_id, run.pop(RUN_ID, None), file)
     return run
+
+
+def with_body(*columns: Array) -> Mask:
+    """(N,) which rows have a body: all numbers of their `BODY` columns, each (N, ...), are known."""
+    return np.logical_and.reduce([np.isfinite(each).reshape(len(each), -1).all(axis=1) for each in columns])
 
 
 _BLOCK = 128

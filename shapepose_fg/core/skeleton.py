@@ -75,9 +75,7 @@ class Skeleton:
                 )
             made.add(joint)
         if len(core) == 0:
-            raise ValueError(
-                f"{name}: core must have a joint at least, by which a person is recognised; name some"
-            )
+            raise ValueError(f"{name}: core must have a joint at least, by which a person is recognised; name one")
         other = {place[a]: place[b] for a, b in (*mirror, *((b, a) for a, b in mirror))}
         edges = tuple((place[a], place[b]) for a, b in limbs)
         grown = _grown(place[anchor], edges, len(joints))

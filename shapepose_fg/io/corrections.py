@@ -100,9 +100,7 @@ def take_back(folder: str | Path, solve: Solve | None = None) -> tuple[Edit, Rec
     folder = Path(folder)
     edits = _kept_edits(folder)
     if len(edits) == 0:
-        raise InputError(
-            f"{folder}: there is no correction to take back; shapepose-fg tracks {folder} lists people"
-        )
+        raise InputError(f"{folder}: there is no correction to take back; see shapepose-fg tracks {folder}")
     if len(edits) == 1:
         _restore(folder)
         return edits[-1], Reconstruction.load(folder)

@@ -70,9 +70,7 @@ def read_skeleton(path: str | Path) -> Skeleton:
 
     anchor = points.get(file.anchor, file.anchor) if isinstance(file.anchor, str) else pair(file.anchor)
     if not isinstance(anchor, str) and set(anchor) not in _HIPS:
-        raise InputError(
-            f"{path}: an anchor of two is the middle of the hips; name others under [middles] and anchor there"
-        )
+        raise InputError(f"{path}: an anchor of two is the middle of the hips; name others under [middles]")
     core = [points.get(joint, joint) for joint in file.core or ()]
     if file.core is None:
         core = [point for point in points.values() if point not in _FACE_AND_TOES]

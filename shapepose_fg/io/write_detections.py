@@ -38,9 +38,7 @@ def write_association(recording: DetectionSequence, rig: Rig, folder: str | Path
         if camera.lens != "perspective" or camera.distortion[5:].any():
             raise ValueError(f"the format has five coefficients of distortion, camera {camera.name} another lens")
     if rig.up != "z":
-        raise ValueError(
-            f"the format has z up, this rig {rig.up}: turn the world before writing, and the truth with it"
-        )
+        raise ValueError(f"the format has z up, this rig {rig.up}: turn the world and the truth first")
     folder, calibration = Path(folder), dict[str, Any]()
     for camera in rig.cameras:
         entry = {

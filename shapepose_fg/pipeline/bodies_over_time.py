@@ -14,7 +14,7 @@ from shapepose_fg.body.fitting.weights import fingerprint
 from shapepose_fg.body.model.soles import above_floor
 from shapepose_fg.body.shapes import SubjectShapes, recognise
 from shapepose_fg.core.arrays import Array
-from shapepose_fg.core.reconstruction import Reconstruction, Status
+from shapepose_fg.core.reconstruction import BODY, Reconstruction, Status
 from shapepose_fg.core.storage.kept_arrays import InMemory, KeptArrays
 from shapepose_fg.estimation.floor import Floor
 
@@ -26,8 +26,6 @@ PIECE_ROWS = 160
 """Rows of such a piece: some seconds, so that poses are linked in time there, too."""
 _OVERLAP_ROWS = 32
 """Rows that a segment has of its neighbours, on either side, when poses are fitted."""
-BODY = ("betas", "global_orient", "body_pose", "transl")
-"""The columns of a result that are a body."""
 
 
 @dataclass(frozen=True)

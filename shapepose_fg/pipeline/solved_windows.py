@@ -12,9 +12,8 @@ from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.frame_times import FrameTimes, segments
 from shapepose_fg.core.observation_table import Gate, ObservationTable, place_in_view
-from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.reconstruction import BODY, Reconstruction
 from shapepose_fg.estimation.window_solution import WindowSolution
-from shapepose_fg.pipeline.bodies_over_time import BODY
 from shapepose_fg.pipeline.engine import Setup, Solved
 from shapepose_fg.pipeline.execution import Pool
 from shapepose_fg.pipeline.runs.chunks import Border, Chunk, Identities, cut_in_chunks, windows_of

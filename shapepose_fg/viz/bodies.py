@@ -6,12 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.arrays import Array, Index
-from shapepose_fg.core.reconstruction import Reconstruction, Status
+from shapepose_fg.core.reconstruction import BODY, Reconstruction, Status, with_body
 
 if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel
-
-_BODY = ("betas", "global_orient", "body_pose", "transl")
 
 
 def surfaces(people: Reconstruction, body: "BodyModel") -> tuple[Array, Index]:
@@ -20,14 +18,11 @@ def surfaces(people: Reconstruction, body: "BodyModel") -> tuple[Array, Index]:
 
     from shapepose_fg.body.model.body_model import BodyParameters
 
-    there = people.status == str(Status.OK)
-    for name in _BODY:
-        known = np.isfinite(getattr(people, name))
-        there = there & known.all(axis=tuple(range(1, known.ndim)))
-    rows = np.flatnonzero(there)
+    columns = [getattr(people, name) for name in BODY]
+    rows = np.flatnonzero((people.status == str(Status.OK)) & with_body(*columns))
     if len(rows) == 0:
         return np.zeros((0, body.num_vertices, 3)), rows
-    parts = (torch.from_numpy(getattr(people, name)[rows]).to(body.dtype) for name in _BODY)
+    parts = (torch.from_numpy(column[rows]).to(body.dtype) for column in columns)
     with torch.no_grad():
         return body.vertices(BodyParameters(*parts)).numpy().astype(np.float64), rows
 

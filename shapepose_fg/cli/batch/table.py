@@ -45,9 +45,7 @@ def read_table(path: Path) -> list[Entry]:
     defaults = _table(tables.get("defaults", {}), path, "defaults")
     recordings = _table(tables.get("recordings", {}), path, "recordings")
     if not 1 <= len(recordings) <= _MOST:
-        raise InputError(
-            f"{path}: {len(recordings)} recordings; give 1 to {_MOST} of them, each as [recordings.NAME]"
-        )
+        raise InputError(f"{path}: {len(recordings)} recordings; give 1 to {_MOST}, each as [recordings.NAME]")
     _check_names(list(recordings), path)
     config_from(defaults, Request, path, place="defaults", cure=_CURE)
     entries = []
@@ -101,7 +99,7 @@ def _inside(given: Path, path: Path, place: str) -> Path:
         raise InputError(f"{path}: {place}: no file has the name {str(given)[:80]!r}; correct it") from None
     if not (inside or given.is_absolute()):
         raise InputError(
-            f"{path}: {place}: {given} leads out of the table's folder; if that is meant, write an absolute path"
+            f"{path}: {place}: {given} leads out of the table's folder; if that is meant, make it absolute"
         )
     return found
 

@@ -31,9 +31,7 @@ _CURES = {
     **dict.fromkeys(("rotation", "translation"), _EXTRINSICS),
     **dict.fromkeys(("imgSize", "resolution", "size", "image_size"), _SIZE),
     **dict.fromkeys(("distCoeff", "dist", "distCoef"), "write at most k1 k2 p1 p2 k3, as OpenCV orders them"),
-    **dict.fromkeys(
-        ("distortion", "distortions"), "write k1 k2 p1 p2 k3 as OpenCV does, or k1 to k4 of a fisheye"
-    ),
+    **dict.fromkeys(("distortion", "distortions"), "write k1 k2 p1 p2 k3 as OpenCV does, or k1 to k4 of fisheyes"),
     "lens": "write perspective or fisheye",
 }
 """What to do about a value, by its name in any of the formats."""

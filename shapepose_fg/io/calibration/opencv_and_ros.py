@@ -113,9 +113,7 @@ def _read_easymocap(content: Content) -> WrittenRig | None:
         one.with_name(one.name.replace("intri", "extri")),
     ):
         if not path.is_file():
-            raise InputError(
-                f"{path}: this half of EasyMocap's calibration is missing; put both files into one folder"
-            )
+            raise InputError(f"{path}: this half of EasyMocap's calibration is missing; put both into one folder")
         value = load(path).value
         halves.append(Node(value if isinstance(value, dict) else {}, str(path), _EASYMOCAP))
     inner, outer = halves
@@ -142,9 +140,7 @@ _LENSES: dict[str, Lens] = {
     **dict.fromkeys(("equidistant", "fisheye"), "fisheye"),
 }
 """ROS' distortion models that are lenses of OpenCV."""
-_POSE_CURE = (
-    "write <camera>_pose.yaml with translation x y z and rotation x y z w of the optical frame in the world"
-)
+_POSE_CURE = "write <camera>_pose.yaml with translation and rotation (x y z w) of the optical frame in the world"
 
 
 def _is_info(value: Any) -> bool:

@@ -75,9 +75,7 @@ def assemble(views: Sequence[ViewStream], rig: Rig, skeleton: Skeleton, kept: Ke
         what = f"holds {view.frame_count} frames", f"holds {first.frame_count}"
         if view.frame_count == first.frame_count:
             what = f"starts at frame {view.first_number}", f"starts at frame {first.first_number}"
-        raise InputError(
-            f"{view.source} {what[0]}, but {first.source} {what[1]}; give the same frames of every camera"
-        )
+        raise InputError(f"{view.source} {what[0]}, but {first.source} {what[1]}; give the same frames of each")
     ideal = [_Undistorted(view.source, camera) for view, camera in zip(views, rig.cameras, strict=True)]
     for n, blocks in enumerate(zip(*(view.blocks for view in views), strict=True)):
         seen = [each.undistorted(block) for each, block in zip(ideal, blocks, strict=True)]

@@ -20,7 +20,7 @@ from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import Known
 from shapepose_fg.io.export.markers import sigma_m
 from shapepose_fg.io.export.registry import optional
-from shapepose_fg.io.export.skinned import rest_joints, skin
+from shapepose_fg.io.export.skinned import motion_of, skin
 from shapepose_fg.io.export.take import Take
 from shapepose_fg.io.footage.footage import Footage
 from shapepose_fg.io.footage.placement import CameraFootage, Placement
@@ -140,19 +140,18 @@ def _log_bodies(
     path, colour = f"{person_path(who)}/body", _rgb8(np.array(colour_of(who))).tolist()
     surface = rr.Mesh3D.from_fields(triangle_indices=faces, albedo_factor=[*colour, round(255 * 0.55)])
     stream.log(path, surface, static=True)
-    parts = [take.column(name, person) for name in ("betas", "global_orient", "body_pose", "transl")]
-    whole = np.all([np.isfinite(part).reshape(len(part), -1).all(axis=1) for part in parts], axis=0)
-    for index in np.flatnonzero((take.rows[person] >= 0) & ~whole).tolist():
-        _set_time(stream, take, index)
+    motion = motion_of(take, person, arrays, np.eye(3))
+    index = np.zeros(0, dtype=np.intp) if motion is None else motion.index
+    for at in np.setdiff1d(np.flatnonzero(take.rows[person] >= 0), index).tolist():
+        _set_time(stream, take, at)
         stream.log(path, rr.Clear(recursive=False))
-    index = np.flatnonzero(whole)
-    for chunk in (index[start : start + _CHUNK] for start in range(0, len(index), _CHUNK)):
-        betas, orient, pose, transl = (part[chunk] for part in parts)
-        vectors = np.concatenate([orient[:, None], pose], axis=1).reshape(-1, 3)
-        rotations = Rotation.from_rotvec(vectors).as_quat().reshape(len(chunk), -1, 4)
-        pelvis = rest_joints(arrays, betas)[:, 0] + transl
-        vertices = skin(arrays, betas, rotations, pelvis, kept).astype(np.float32)
-        for place, at in enumerate(chunk.tolist()):
+    if motion is None:
+        return
+    betas = take.column("betas", person)[index]
+    for start in range(0, len(index), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        vertices = skin(arrays, betas[part], motion.rotations[part], motion.pelvis[part], kept).astype(np.float32)
+        for place, at in enumerate(index[part].tolist()):
             _set_time(stream, take, at)
             normals = vertex_normals(vertices[place], faces).astype(np.float32)
             stream.log(path, rr.Mesh3D.from_fields(vertex_positions=vertices[place], vertex_normals=normals))

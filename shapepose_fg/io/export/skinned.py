@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS, SmplArrays
 from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.reconstruction import BODY, with_body
 from shapepose_fg.io.export.registry import Job, Written
 from shapepose_fg.io.export.take import Take
 
@@ -96,10 +97,8 @@ class Motion:
 
 def motion_of(take: Take, person: int, arrays: SmplArrays, axes: Array) -> Motion | None:
     """The body of one person in the world turned by `axes` (3, 3); None for somebody without a body."""
-    parts = [take.column(name, person) for name in ("betas", "global_orient", "body_pose", "transl")]
-    index = np.flatnonzero(
-        np.all([np.isfinite(part).reshape(len(part), -1).all(axis=1) for part in parts], axis=0)
-    )
+    parts = [take.column(name, person) for name in BODY]
+    index = np.flatnonzero(with_body(*parts))
     if len(index) == 0:
         return None
     betas, orient, pose, transl = (part[index] for part in parts)

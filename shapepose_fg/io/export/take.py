@@ -10,7 +10,7 @@ from rich.filesize import decimal
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Axis, Rig
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.reconstruction import Known, Reconstruction
+from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction
 from shapepose_fg.core.result_files import free_memory
 from shapepose_fg.core.run_summary import covered_frames
 
@@ -31,8 +31,8 @@ _LONGEST = 1_000_000
 """Frames of a file with one rate: nine hours at 30 a second. Beyond, times are in another unit or have a hole."""
 _BODY_BYTES = 2_000
 """What one person's body takes in a frame while it is written, about."""
-_OF_JOINTS, _OF_BODIES = "joints covariance velocity velocity_covariance", "betas global_orient body_pose transl"
-"""Columns of a result that are NaN where no view saw a joint, or a person."""
+_OF_JOINTS = ("joints", "covariance", "velocity", "velocity_covariance")
+"""Columns of a result that are NaN where no view saw a joint; those of `BODY` are where none saw the person."""
 _SHORTEST_S, _LONGEST_S = 1e-6, 1e5
 """From frame to frame: outside of this times are in another unit."""
 
@@ -152,8 +152,8 @@ def _seen(people: Reconstruction) -> Reconstruction:
         raise ValueError("people.npz does not say how joints are known; leave out --seen-only")
     seen = Known.observed(people.known)
     columns: dict[str, Any] = {"known": np.where(seen, people.known, Known.UNKNOWN).astype(np.uint8)}
-    for names, kept in ((_OF_JOINTS, seen), (_OF_BODIES, seen.any(axis=1))):
-        for name in names.split():
+    for names, kept in ((_OF_JOINTS, seen), (BODY, seen.any(axis=1))):
+        for name in names:
             value = getattr(people, name)
             columns[name] = np.where(kept.reshape(*kept.shape, *[1] * (value.ndim - kept.ndim)), value, np.nan)
     return replace(people, **columns)

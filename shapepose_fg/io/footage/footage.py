@@ -79,9 +79,7 @@ class Video:
         capture = _capture(path)
         size, fps = glance(path, capture)
         if not (min(size) > 0 and max(size) <= _LARGEST):
-            raise InputError(
-                f"{path}: the video's pictures would be {size[0]} x {size[1]}; give an undamaged video"
-            )
+            raise InputError(f"{path}: its pictures would be {size[0]} x {size[1]}; give an undamaged video")
         announced = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
         stamps = []
         while capture.grab():
@@ -196,9 +194,7 @@ def _times(path: Path, stamp_s: Array, fps: float) -> tuple[Array, list[str]]:
     """
     if len(stamp_s) > 1 and not (np.diff(stamp_s) > 0).all():
         if fps < 0.01:
-            raise InputError(
-                f"{path}: the video says neither times nor rate; give --fps CAMERA=RATE, or convert it"
-            )
+            raise InputError(f"{path}: the video says neither times nor rate; give --fps CAMERA=RATE")
         return np.arange(len(stamp_s)) / fps, [
             f"{path}: the frames' times in the file do not rise; its rate of {fps:g} a second was taken instead"
         ]

@@ -97,9 +97,7 @@ def _start(text: str | None, period: float, has_clock: bool) -> float:
     if match is None:
         raise InputError(f"--start {text}: must be seconds such as 0.2s, or the camera's own frames such as 12f")
     if match[2] == "s" and not has_clock:
-        raise InputError(
-            f"--start {text}: nothing says how many frames a second there are; give --fps, or frames (12f)"
-        )
+        raise InputError(f"--start {text}: nothing says how many frames a second there are; give --fps, or 12f")
     return float(match[1]) * (1.0 if match[2] == "s" else period)
 
 

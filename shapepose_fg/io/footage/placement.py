@@ -134,9 +134,7 @@ def place(
         kind = PlacementKind.SCALE
         note = f"{sizes}, of the same shape: taken as resized (--image-placement {name}=scale)"
     elif (height, width) == calibrated_size:
-        raise InputError(
-            f"{sizes}: the pictures lie on their side; turn the video by 90 degrees, or calibrate it as it is"
-        )
+        raise InputError(f"{sizes}: the pictures lie on their side; turn the video, or calibrate it as it is")
     else:
         raise InputError(
             f"{sizes}; say what was done to them with --image-placement: letterbox (resized, with bars), scale"

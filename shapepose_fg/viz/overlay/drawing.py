@@ -223,5 +223,5 @@ def write_picture(path: Path, picture: Picture) -> None:
     quality = [cv2.IMWRITE_JPEG_QUALITY, 90] if path.suffix == ".jpg" else []
     done, content = cv2.imencode(path.suffix, picture, quality)
     if not done:
-        raise InputError(f"{path}: the picture cannot be written in this format; use .png or .jpg")
+        raise InputError(f"{path}: pictures cannot be written in this format; use .png or .jpg")
     write_atomically(path, lambda stream: stream.write(content.tobytes()))
