@@ -9,3 +9,7 @@ Index = NDArray[np.intp]
 """Places in other arrays."""
 Mask = NDArray[np.bool_]
 """Which entries are meant."""
+Real = NDArray[np.floating]
+"""Real numbers of any precision."""
+Whole = NDArray[np.integer]
+"""Whole numbers of any size."""

@@ -9,7 +9,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.core.arrays import Array, Mask
+from shapepose_fg.core.arrays import Array, Mask, Whole
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observations import Observations
@@ -41,9 +41,9 @@ class Gate(IntEnum):
 class ObservationTable(Table):
     """The detections of N rows (person and frame), J joints and V views; row i is row i of people.npz."""
 
-    frame: Annotated[NDArray[np.integer], Column("N", np.int64)]
+    frame: Annotated[Whole, Column("N", np.int64)]
     """(N,) frame of each row."""
-    person: Annotated[NDArray[np.integer], Column("N", np.int64)]
+    person: Annotated[Whole, Column("N", np.int64)]
     """(N,) identity of the person of each row."""
     joint_names: Annotated[NDArray[np.str_], Column("J", np.str_)]
     """(J,) names of the joints."""
@@ -99,7 +99,7 @@ class ObservationTable(Table):
     def of(
         cls,
         observations: Observations,
-        place: NDArray[np.integer],
+        place: Whole,
         joints: Array,
         gate: NDArray[np.uint8],
         rig: Rig,
@@ -197,7 +197,7 @@ class ObservationTable(Table):
         return opened
 
 
-def place_in_view(candidate: NDArray[np.integer], view: NDArray[np.integer]) -> NDArray[np.int32]:
+def place_in_view(candidate: Whole, view: Whole) -> NDArray[np.int32]:
     """Detections counted among those of their own view, from where they are counted over all views of a frame.
 
     `candidate` of any shape holds rows of the frame's `Detections`, -1 for none (and stays so); `view` (D,) is

@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observation_table import ObservationTable
 from shapepose_fg.core.result_files import OBSERVATIONS, PEOPLE, RUN, RUN_ID, SavedTable, check_id, write_result
@@ -52,7 +52,7 @@ class Known(IntEnum):
     have as much to say."""
 
     @classmethod
-    def observed(cls, known: NDArray[np.integer]) -> Mask:
+    def observed(cls, known: Whole) -> Mask:
         """Of which joints (...) any view's detection was used."""
         return np.isin(known, (cls.SEEN, cls.WEAK))
 
@@ -69,9 +69,9 @@ _LATER: Any = None
 class Reconstruction(Table):
     """The people of a recording: N rows, one per person and frame, sorted as they were added."""
 
-    frame: Annotated[NDArray[np.integer], Column("N", np.int64, most=MOST_NUMBER)]
+    frame: Annotated[Whole, Column("N", np.int64, most=MOST_NUMBER)]
     """(N,) frame of each row, counted from 0 in the file."""
-    person: Annotated[NDArray[np.integer], Column("N", np.int64, most=MOST_NUMBER)]
+    person: Annotated[Whole, Column("N", np.int64, most=MOST_NUMBER)]
     """(N,) identity of the person; without tracking, a number within the frame."""
     joint_names: Annotated[NDArray[np.str_], Column("J", np.str_)]
     """(J,) names of the joints, as OpenPose writes them."""
@@ -157,7 +157,7 @@ class Reconstruction(Table):
         """The same people, with more to say in run.json."""
         return replace(self, run=self.run | entries)
 
-    def relabelled(self, person: NDArray[np.integer]) -> "Reconstruction":
+    def relabelled(self, person: Whole) -> "Reconstruction":
         """The same rows with other identities (N,), in `observations` too."""
         table = None if self.observations is None else replace(self.observations, person=person)
         return replace(self, person=person, observations=table)

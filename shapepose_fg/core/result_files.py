@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.filesize import decimal
 
-from shapepose_fg.core.arrays import Index
+from shapepose_fg.core.arrays import Index, Whole
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.run_summary import plain
 from shapepose_fg.core.storage.files import write_together
@@ -137,7 +137,7 @@ class SavedTable(ExitStack, Generic[T]):
             self.close()
             raise
 
-    def numbers(self, name: str) -> NDArray[np.integer]:
+    def numbers(self, name: str) -> Whole:
         """All of a column of whole numbers, checked: rows are chosen by it before the others are read."""
         with self._naming():
             column = self._columns[name].checked(name, self._npz.array(name), {"N": self.count})

@@ -13,7 +13,7 @@ from shapepose_fg.body.fitting.fitter import BodyFitter, JointTargets, Shapes
 from shapepose_fg.body.fitting.weights import fingerprint
 from shapepose_fg.body.model.soles import above_floor
 from shapepose_fg.body.shapes import SubjectShapes, recognise
-from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.arrays import Array, Whole
 from shapepose_fg.core.reconstruction import BODY, Reconstruction, Status
 from shapepose_fg.core.storage.kept_arrays import InMemory, KeptArrays
 from shapepose_fg.estimation.floor import Floor
@@ -86,9 +86,7 @@ class BodiesOverTime:
     shapes: SubjectShapes
     """Everybody's shape; those who were recognised by their known names."""
 
-    def filled(
-        self, column: str, values: NDArray[Any], person: NDArray[np.integer], before: Mapping[int, int]
-    ) -> NDArray[Any]:
+    def filled(self, column: str, values: NDArray[Any], person: Whole, before: Mapping[int, int]) -> NDArray[Any]:
         """Rows of a column of a result with these bodies, where there are any; `status` says that there are.
 
         `values` (R, ...) are the rows as they were, `person` (R,) whose they are, and `before` how many rows of

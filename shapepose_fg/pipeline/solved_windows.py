@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.arrays import Array, Whole
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.frame_times import FrameTimes, segments
 from shapepose_fg.core.observation_table import Gate, ObservationTable, place_in_view
@@ -164,11 +163,7 @@ class SolvedWindows:
 
 
 def result_rows(
-    solution: WindowSolution,
-    place: NDArray[np.integer],
-    rig: Rig,
-    joint_names: Sequence[str],
-    person: NDArray[np.integer],
+    solution: WindowSolution, place: Whole, rig: Rig, joint_names: Sequence[str], person: Whole
 ) -> Reconstruction:
     """N solved rows as a result, in their order; bodies that were not fitted are NaN there.
 

@@ -10,7 +10,7 @@ from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.threads import torch_threads
-from shapepose_fg.core.arrays import Index, Mask
+from shapepose_fg.core.arrays import Index, Mask, Whole
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.frame_times import segments
 from shapepose_fg.core.reconstruction import Reconstruction
@@ -135,6 +135,6 @@ def _windows(rows: Reconstruction, config: PipelineConfig) -> list[tuple[range, 
     return [(own, segment) for own, segment in windows if _inside(rows.frame, own).any()]
 
 
-def _inside(frame: NDArray[np.integer], span: range) -> Mask:
+def _inside(frame: Whole, span: range) -> Mask:
     """(N,) which frames are in `span`."""
     return (frame >= span.start) & (frame < span.stop)

@@ -3,9 +3,8 @@
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.arrays import Array, Index, Real, Whole
 from shapepose_fg.core.reconstruction import BODY, Reconstruction, Status, with_body
 
 if TYPE_CHECKING:
@@ -27,7 +26,7 @@ def surfaces(people: Reconstruction, body: "BodyModel") -> tuple[Array, Index]:
         return body.vertices(BodyParameters(*parts)).numpy().astype(np.float64), rows
 
 
-def joined(vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> tuple[Array, Index]:
+def joined(vertices: Real, faces: Whole) -> tuple[Array, Index]:
     """Bodies (P, Nv, 3) that share `faces` (F, 3), as one mesh: vertices (P Nv, 3) and faces (P F, 3)."""
     people, count = vertices.shape[:2]
     every = faces[None] + count * np.arange(people)[:, None, None]

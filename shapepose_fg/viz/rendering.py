@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.arrays import Array, Index, Real, Whole
 from shapepose_fg.core.camera import Camera
 
 NEAR_M = 0.05
@@ -73,9 +73,7 @@ def scaled(camera: Camera, scale: float) -> Camera:
     return zoom(camera, (0.0, 0.0, width, height), max(1, round(width * scale)))
 
 
-def render_depth(
-    vertices: NDArray[np.floating], faces: NDArray[np.integer], camera: Camera, *, cull_back: bool = False
-) -> Surface:
+def render_depth(vertices: Real, faces: Whole, camera: Camera, *, cull_back: bool = False) -> Surface:
     """Depth and face index of the mesh `vertices` (N, 3) world, `faces` (F, 3), in `camera`'s image.
 
     `cull_back` leaves out faces seen from behind: right, and twice as fast, for closed meshes whose faces
@@ -89,7 +87,7 @@ def render_depth(
 
 
 def first_surface_at(
-    points_world: NDArray[np.floating], faces: NDArray[np.integer], camera: Camera, column: Index, row: Index
+    points_world: Real, faces: Whole, camera: Camera, column: Index, row: Index
 ) -> tuple[NDArray[np.float32], Index]:
     """Depth and vertex, each of the shape of `column` and `row`, of the first surface on the rays of some pixels.
 
@@ -153,14 +151,7 @@ def _numbers(count: int) -> NDArray[np.float32]:
     return number
 
 
-def rasterise(
-    xy: NDArray[np.floating],
-    depth: NDArray[np.floating],
-    faces: NDArray[np.integer],
-    size: tuple[int, int],
-    *,
-    cull_back: bool = False,
-) -> Surface:
+def rasterise(xy: Real, depth: Real, faces: Whole, size: tuple[int, int], *, cull_back: bool = False) -> Surface:
     """Draw triangles with corners at pixels `xy` (N, 2) and `depth` (N,) into an image of `size` (W, H), by
     OpenCV.
 

@@ -10,10 +10,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shapepose_fg.body.model.smpl_file import SmplArrays
-from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.camera import Axis
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Known, Reconstruction
@@ -119,7 +118,7 @@ def _each(
     return written
 
 
-def trc_text(markers: Markers, frames: NDArray[np.integer], times_s: Array, fps: float, name: str) -> str:
+def trc_text(markers: Markers, frames: Whole, times_s: Array, fps: float, name: str) -> str:
     """A TRC file, metres to 6 digits; `name` stands in its first line.
 
     A frame without any marker has no row, for OpenSim's inverse kinematics stops at one. The rows' own numbers and

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.arrays import Array, Index, Mask, Real, Whole
 from shapepose_fg.core.camera import Camera
 from shapepose_fg.core.drawing import bones_of, colour_of
 from shapepose_fg.core.errors import InputError
@@ -53,7 +53,7 @@ class PictureView:
         """(2,) drawn pixels per pixel of the picture, x and y."""
         return np.array(self.size) / self.placement.picture_size
 
-    def project(self, points: NDArray[np.floating]) -> tuple[Array, Array]:
+    def project(self, points: Real) -> tuple[Array, Array]:
         """Drawn pixels (..., 2) and depths (...,) in metres of `points` (..., 3) in the world.
 
         Pixels are NaN behind the camera, and far outside the picture.
@@ -62,7 +62,7 @@ class PictureView:
         xy[~(depth > NEAR_M)] = np.nan
         return self.through_lens(xy), depth
 
-    def through_lens(self, xy: NDArray[np.floating]) -> Array:
+    def through_lens(self, xy: Real) -> Array:
         """Drawn pixels (..., 2) from undistorted ones, as observations have them."""
         flat = np.asarray(xy, dtype=np.float64).reshape(-1, 2)
         size = np.array(self.camera.image_size)
@@ -88,8 +88,8 @@ def stroke_of(size: tuple[int, int]) -> int:
 def draw_bodies(
     picture: Picture,
     view: PictureView,
-    vertices: NDArray[np.floating],
-    faces: NDArray[np.integer],
+    vertices: Real,
+    faces: Whole,
     colours: Sequence[Colour],
     opacity: float = _OPACITY,
 ) -> Picture:
@@ -172,7 +172,7 @@ def _top(xy: Array, size: tuple[int, int]) -> tuple[float, float] | None:
     return float((xy[:, 0].min() + xy[:, 0].max()) / 2), float(xy[:, 1].min())
 
 
-def draw_detections(picture: Picture, xy: Array, used: Mask, colours: NDArray[np.integer]) -> None:
+def draw_detections(picture: Picture, xy: Array, used: Mask, colours: Whole) -> None:
     """Draw detections at drawn pixels `xy` (K, 2): squares in `colours` (K, 3), red crosses where not used."""
     reach = max(2, stroke_of(picture.shape[1::-1]))
     there = np.isfinite(xy).all(axis=1)

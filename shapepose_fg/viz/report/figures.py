@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.core.arrays import Index, Mask
+from shapepose_fg.core.arrays import Index, Mask, Real, Whole
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.reconstruction import Known, Reconstruction
 from shapepose_fg.core.run_summary import covered_frames
@@ -30,7 +30,7 @@ class Residual:
     """Nine of ten are nearer."""
 
     @classmethod
-    def of(cls, px: NDArray[np.floating]) -> "Residual":
+    def of(cls, px: Real) -> "Residual":
         """Of all finite distances in `px`."""
         px = px[np.isfinite(px)]
         return cls(*np.quantile(px, [0.5, 0.9]).tolist()) if len(px) > 0 else cls(None, None)
@@ -110,7 +110,7 @@ def overall(people: Reconstruction) -> dict[str, Any]:
     }
 
 
-def known_counts(people: Reconstruction, by: NDArray[np.integer] | None = None) -> NDArray[np.int64]:
+def known_counts(people: Reconstruction, by: Whole | None = None) -> NDArray[np.int64]:
     """How many joints are known in each of `KINDS`: (J, 5) by joint, or (G, 5) by groups `by` (N,) of the rows."""
     kinds = people.known[..., None] == np.array(KINDS)
     if by is None:

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from shapepose_fg.body.model.body_model import BodyModel
-from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.arrays import Array, Index, Real
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.reconstruction import Reconstruction
@@ -86,7 +85,7 @@ def demo_picture(
     reconstruction: Reconstruction,
     frame: int,
     detections: Detections | None = None,
-    truth: NDArray[np.floating] | None = None,
+    truth: Real | None = None,
 ) -> None:
     """Write a PNG of the people of `frame`: over two views on the left, from a free viewpoint on the right.
 
