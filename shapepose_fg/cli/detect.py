@@ -55,9 +55,8 @@ class NetworkOptions:
         from shapepose_fg.detection2d.network import HeatMapNetwork
 
         with progress("fetching the network", "bytes") as fetched:
-            file = find_network(
-                self.network, download=self.download, address=self.network_address, progress=fetched
-            )
+            address = self.network_address
+            file = find_network(self.network, download=self.download, address=address, progress=fetched)
         return HeatMapNetwork.load(file, self.layout, cast("Backend", self.backend))
 
 

@@ -46,7 +46,7 @@ for _panel, _commands in {
 app.add_typer(tracks, name="tracks", rich_help_panel=_RESULT)
 app.add_typer(evaluate, name="evaluate", rich_help_panel=_TRY)
 
-_MOVED = {"--people": "the result is the first argument: shapepose-fg evaluate shelf RESULTS --ground-truth FILE"}
+_MOVED = {"--people": "give the result first: shapepose-fg evaluate shelf RESULTS --ground-truth FILE"}
 """Options that there were, and what took their place."""
 _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
 """What typer raises for a wrong command line; older and newer versions keep the class in different places."""

@@ -56,10 +56,9 @@ def grouped(command: Callable[..., Any]) -> Callable[..., Any]:
 
     @wraps(command)
     def called(**given: Any) -> Any:
-        made = {
-            name: cast(Any, hints[name])(**{key: given.pop(key) for key in keys}) for name, keys in taken.items()
-        }
-        return command(**made, **given)
+        for name, keys in taken.items():
+            given[name] = hints[name](**{key: given.pop(key) for key in keys})
+        return command(**given)
 
     del called.__wrapped__
     cast(Any, called).__signature__ = inspect.Signature(parameters)

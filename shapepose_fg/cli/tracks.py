@@ -150,12 +150,12 @@ def _tracks_table(results: Path) -> "RenderableType":
 
 def _body_of(run: "Mapping[str, Any]") -> "SmplArrays | None":
     """The body model that a result was made with; None where its file is not there any more."""
-    from shapepose_fg.body.shapes import read_body
+    from shapepose_fg.io.solved_setup import body_of
 
-    file = run.get("body")
-    if file is None:
-        return read_body()
-    return read_body(Path(file)) if Path(file).is_file() else None
+    try:
+        return body_of(run)
+    except InputError:
+        return None
 
 
 def _correct(context: typer.Context, action: str, person: int, **more: int | None) -> None:

@@ -163,9 +163,7 @@ class Camera:
         return self.lens == "fisheye" or bool(self.distortion.any())
 
     def _normalised(self, xy: Array) -> Array:
-        """Normalised image coordinates (N, 2) of pixels (N, 2). Lenses bend these, so that K may have a skew,
-        which OpenCV's own functions pass over.
-        """
+        """Normalised image coordinates (N, 2) of pixels (N, 2); OpenCV's own functions pass over a skew in K."""
         inverse = np.linalg.inv(self.K)
         return np.ascontiguousarray(xy @ inverse[:2, :2].T + inverse[:2, 2])
 

@@ -1,6 +1,4 @@
-"""The files of a result, people.npz, observations.npz and run.json: written together, tied by one id, and
-opened.
-"""
+"""The files of a result, people.npz, observations.npz and run.json: written together, tied by one id, opened."""
 
 import hashlib
 import json
@@ -100,9 +98,7 @@ class SavedTable(ExitStack, Generic[T]):
     """people.npz or observations.npz, open: a table of the class `kind`."""
 
     def __init__(self, file: Path, kind: type[T], cure: str) -> None:
-        """InputError, with the `cure`, where it cannot be read or an array is missing that earlier files have
-        too.
-        """
+        """InputError, with the `cure`, where it cannot be read or an array is missing that earlier files have."""
         super().__init__()
         self.file, self.kind, self.cure = file, kind, cure
         self._columns, told = columns_of(kind), kind.meanings()
@@ -145,9 +141,7 @@ class SavedTable(ExitStack, Generic[T]):
             return column
 
     def read(self, index: Index | None, **others: Any) -> T:
-        """The rows `index` (R,), rising, or all, and `others` beside them; InputError where they do not make a
-        table, or would not fit in memory.
-        """
+        """The rows `index` (R,), rising, or all, and `others`; InputError where they are no table, or too many."""
         self._check_memory(self.count if index is None else len(index))
         read = self._npz.array if index is None else lambda name: self._npz.rows(name, index)
         with self._naming():

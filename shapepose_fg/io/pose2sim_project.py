@@ -153,9 +153,7 @@ def _over(below: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
 
 
 def _calibration(session: Path, folder: Path) -> Path:
-    """The calibration of a session: the newest TOML, as Pose2Sim takes it, else a file of another known format, or
-    the folder itself, where a format has several files.
-    """
+    """The calibration of a session: the newest TOML, as Pose2Sim takes it, else a file or folder that is known."""
     places = dict.fromkeys((session.resolve(), folder.resolve()))
     inside = [each for place in places for each in sorted(place.iterdir()) if each.is_dir()]
     rooms = [each for each in inside if "calib" in each.name.lower()]

@@ -222,10 +222,9 @@ def with_bodies_over_time(
 
 def _subjects(shapes: Mapping[int, Shapes], body: str) -> SubjectShapes:
     """Everybody's shape, named by their numbers."""
-    mean, information = (
-        np.concatenate([getattr(each, name) for each in shapes.values()]) for name in ("mean", "information")
-    )
-    return SubjectShapes(np.array([str(number) for number in shapes]), mean, information, body)
+    mean, information = ([getattr(each, name) for each in shapes.values()] for name in ("mean", "information"))
+    names = np.array([str(number) for number in shapes])
+    return SubjectShapes(names, np.concatenate(mean), np.concatenate(information), body)
 
 
 def _names(numbers: Sequence[int], known: SubjectShapes, whose: Sequence[int]) -> list[str]:

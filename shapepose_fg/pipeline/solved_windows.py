@@ -107,17 +107,16 @@ class SolvedWindows:
                     yield chunk, given
 
         identities = Identities(begin.next_id, begin.border)
+        name = identities.name
         for found in pool.map(solve_chunk, jobs()):
             chunk, read = waiting.popleft()
             names = identities.names(found.begins, alone=chunk.first == chunk.own.start)
             identities.remember(found.ends, names)
             for solved in found.solved:
                 notes, last = self._notes(solved), solved is found.solved[-1]
-                notes.problems = [
-                    replace(each, track=identities.name(each.track, names)) for each in notes.problems
-                ]
-                notes.evidence = {identities.name(of, names): each for of, each in notes.evidence.items()}
-                track = [identities.name(each, names) for each in solved.solution.observations.track.tolist()]
+                notes.problems = [replace(each, track=name(each.track, names)) for each in notes.problems]
+                notes.evidence = {name(of, names): each for of, each in notes.evidence.items()}
+                track = [name(each, names) for each in solved.solution.observations.track.tolist()]
                 if last:
                     notes.add(read)
                     notes.add(found.notes)

@@ -97,11 +97,8 @@ def _solved(
             assert part.observations is not None
             # From the views: the joints as they are may be somebody else's.
             observations = part.observations.observations(np.full_like(part.joints, np.nan), part.time_s)
-            yield (
-                own,
-                part,
-                solve_window(observations, views, solver.fitter, settings, extra_factors=extra_factors),
-            )
+            found = solve_window(observations, views, solver.fitter, settings, extra_factors=extra_factors)
+            yield own, part, found
 
 
 def _rows_of(rows: Reconstruction, own: range, segment: range, overlap_s: float) -> Index:

@@ -45,7 +45,9 @@ def read_table(path: Path) -> list[Entry]:
     defaults = _table(tables.get("defaults", {}), path, "defaults")
     recordings = _table(tables.get("recordings", {}), path, "recordings")
     if not 1 <= len(recordings) <= _MOST:
-        raise InputError(f"{path}: {len(recordings)} recordings; give 1 to {_MOST}, each as [recordings.NAME]")
+        raise InputError(
+            f"{path}: {len(recordings)} recordings; give 1 to {_MOST} of them, each as [recordings.NAME]"
+        )
     _check_names(list(recordings), path)
     config_from(defaults, Request, path, place="defaults", cure=_CURE)
     entries = []

@@ -97,9 +97,7 @@ def read_npz(file: Path, names: Collection[str], cure: str) -> dict[str, NDArray
 
 @dataclass
 class _Member:
-    """An array of a file: its bytes, where among them the first row begins, and whether rows lie in Fortran's
-    order.
-    """
+    """An array of a file: its bytes, where the first row begins, and whether rows lie in Fortran's order."""
 
     stream: IO[bytes]
     begin: int

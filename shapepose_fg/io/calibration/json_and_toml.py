@@ -1,6 +1,4 @@
-"""Calibrations in JSON and TOML: our own rig file, 4D Association's, CMU Panoptic's, VoxelPose's; and a table per
-camera, as AniPose began it and Pose2Sim, FreeMoCap and Caliscope write it.
-"""
+"""Calibrations in JSON (our own rig file, 4D Association, CMU Panoptic, VoxelPose) and AniPose's kind of TOML."""
 
 import json
 from collections.abc import Mapping
@@ -134,9 +132,7 @@ def _read_panoptic(content: Content) -> WrittenRig | None:
 
 
 def _read_voxelpose(content: Content) -> WrittenRig | None:
-    """An object of cameras, a list, or a list under a sequence's name: millimetres, z up, R (X - T), distortion in
-    two parts, K for pictures whose size is not written.
-    """
+    """An object or list of cameras, or under a sequence's name: mm, z up, R (X - T), distortion in two parts."""
     value = content.value if content.syntax == "JSON" else None
     if isinstance(value, dict) and len(value) == 1 and isinstance(next(iter(value.values())), list):
         value = next(iter(value.values()))

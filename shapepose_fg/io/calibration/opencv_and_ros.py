@@ -1,6 +1,4 @@
-"""YAML and XML of OpenCV's FileStorage (OpenCV's own multi-view calibration, files with a node per camera,
-EasyMocap's), and ROS' camera_info.
-"""
+"""OpenCV's FileStorage (its multi-view calibration, a node per camera, EasyMocap's), and ROS' camera_info."""
 
 import re
 from collections.abc import Mapping

@@ -109,9 +109,8 @@ class Node:
         if name is None:
             return None
         value = self.values[name]
-        wanted = (" or ".join(map(str, counts)) or f"at most {most}") + (
-            " numbers" if counts != (1,) else " number"
-        )
+        noun = "number" if counts == (1,) else "numbers"
+        wanted = f"{' or '.join(map(str, counts)) or f'at most {most}'} {noun}"
         if counts != (1,) and not isinstance(value, list | np.ndarray):
             raise self.refuse(name, f"must hold {wanted}, got {describe(value)}")
         found = np.array(list(self._flat(name, value)))
@@ -149,9 +148,7 @@ class Node:
         return WrittenCamera(name, K_flat.reshape(3, 3), wTc, image_size, listed, lens)
 
     def pose(self, R: str, t: str, *, centre: bool = False) -> Array:
-        """World from camera (4, 4), of a rotation (9 numbers, or axis times angle) and a translation from the
-        world; or instead of that the camera's centre.
-        """
+        """World from camera, of a rotation (9 numbers, or axis times angle) and a translation, or `centre`."""
         turn, shift = self.needed(R, 9) if centre else self.needed(R, 9, 3), self.needed(t, 3)
         shift = -turn.reshape(3, 3) @ shift if centre else shift
         return pose(turn, shift, self.named(R) or R, self.place)

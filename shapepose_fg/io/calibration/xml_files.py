@@ -93,9 +93,7 @@ def _qualisys(camera: ET.Element, place: str) -> WrittenCamera:
 
 
 def _vicon(camera: ET.Element, place: str) -> WrittenCamera:
-    """By the first key frame. ORIENTATION x y z w turns the world's axes into the camera's; POSITION is the
-    centre.
-    """
+    """By the first key frame: ORIENTATION turns the world's axes into the camera's, POSITION is the centre."""
     key_frame = camera.find("KeyFrames/KeyFrame")
     if key_frame is None:
         raise InputError(f"{place}: it has no <KeyFrame>, so it is not calibrated; calibrate it, or delete it")

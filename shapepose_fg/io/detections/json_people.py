@@ -116,9 +116,7 @@ def _of_one_model(known: set[int], people: Iterable[list[float]], source: Path, 
 
 
 def read_json_people(place: Path) -> CameraPeople:
-    """The people of one camera: of a JSON file with all its frames, also the only one of a folder, or of a folder
-    with a file per frame. InputError naming file, key and cure.
-    """
+    """The people of one camera: of a JSON file with all frames, also a folder's only, or of a file per frame."""
     if not place.is_dir():
         return read_one_file(place)
     lists = _lists(place)

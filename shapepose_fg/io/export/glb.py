@@ -98,9 +98,8 @@ class _File:
         }
         text = json.dumps(tree, allow_nan=False).encode()
         text += b" " * (-len(text) % 4)
-        parts = b"".join(
-            struct.pack("<I4s", len(part), kind) + part for kind, part in ((b"JSON", text), (b"BIN\0", binary))
-        )
+        pairs = ((b"JSON", text), (b"BIN\0", binary))
+        parts = b"".join(struct.pack("<I4s", len(part), kind) + part for kind, part in pairs)
         return struct.pack("<4sII", b"glTF", 2, 12 + len(parts)) + parts
 
 
@@ -147,9 +146,8 @@ def _add_person(file: _File, who: int, motion: Motion, shared: dict[str, int], t
     }
     surface = {"baseColorFactor": [*_linear(colour_of(who)), 1.0], "metallicFactor": 0.0}
     material = file.add("materials", name=name, pbrMetallicRoughness=surface)
-    mesh = file.add(
-        "meshes", name=name, primitives=[{"attributes": attributes, "indices": triangles, "material": material}]
-    )
+    primitive = {"attributes": attributes, "indices": triangles, "material": material}
+    mesh = file.add("meshes", name=name, primitives=[primitive])
     # A bone's frame in the T-pose is the body's own, moved to the joint.
     inverse = np.tile(np.eye(4, dtype=np.float32), (BONES, 1, 1))
     inverse[:, :3, 3] = -rest.joints

@@ -1,6 +1,4 @@
-"""Bodies in motion as files: AMASS-style npz, as learning code reads it (z up, metres, radians), and BVH, as
-Blender and other animation programs read it (y up, metres).
-"""
+"""Bodies in motion: AMASS-style npz for learning code (z up, metres, radians); BVH for animation (y up)."""
 
 import warnings
 from collections.abc import Iterator

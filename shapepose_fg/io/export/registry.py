@@ -12,7 +12,6 @@ from typing import Any, get_args
 import numpy as np
 
 from shapepose_fg.body.model.smpl_file import SmplArrays
-from shapepose_fg.body.shapes import read_body
 from shapepose_fg.core.arrays import Index
 from shapepose_fg.core.camera import Axis
 from shapepose_fg.core.errors import InputError
@@ -22,7 +21,7 @@ from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.core.storage.files import write_content
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.export.take import Take
-from shapepose_fg.io.solved_setup import CAMERAS
+from shapepose_fg.io.solved_setup import CAMERAS, body_of
 
 
 class MarkerSet(StrEnum):
@@ -60,13 +59,7 @@ class Job:
     @cached_property
     def arrays(self) -> SmplArrays:
         """The body model; InputError where its file is not there any more."""
-        try:
-            return read_body(self.body)
-        except InputError as error:
-            if self.body is None or self.body.exists():
-                raise
-            problem = "the body model of this result is not there any more"
-            raise InputError(f"{self.body}: {problem}; put it back, or say with --body where it is") from error
+        return body_of(self.take.people.run, self.body_file)
 
 
 @dataclass
@@ -170,9 +163,8 @@ def export_result(
     """
     job: Job | None = None
     if not all(each.rows for each in formats):
-        needs: Any = {
-            name: any(getattr(each, name) for each in formats) for name in ("identities", "observations")
-        }
+        kinds = ("identities", "observations")
+        needs: Any = {name: any(getattr(each, name) for each in formats) for name in kinds}
         job = Job(read_take(results, **options, **needs), folder, body, markers, fill_gaps_s)
     done: dict[str, Written] = {}
     for each in formats:

@@ -1,6 +1,4 @@
-"""What a rerun recording holds: people and cameras in the world, what cameras saw and took, and how well it
-fits.
-"""
+"""What a rerun recording holds: people and cameras in the world, what cameras saw and took, and how it fits."""
 
 from collections.abc import Callable, Sequence
 from types import ModuleType
@@ -210,9 +208,7 @@ def log_pictures(
     pictures: Sequence[tuple[CameraFootage, Footage]],
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
-    """What the cameras took of a take's frames, undistorted, so that people and detections lie on it; a frame
-    without a picture has none.
-    """
+    """What the cameras took of a take's frames, undistorted, so that people and detections lie on it."""
     rr = optional("rerun", "view")
     if take.rig is None:
         raise ValueError("pictures need cameras")

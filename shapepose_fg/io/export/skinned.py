@@ -133,9 +133,7 @@ def everybody(job: Job, take: Take, kind: str, axes: Array, written: Written) ->
 
 
 def all_segments(job: Job, kind: str, axes: Array, written: Written) -> Iterator[tuple[Path, Motion, Take]]:
-    """Everybody's motion at one rate in parts without long holes, with the take that these are frames of; and the
-    name of each one's file, without ending.
-    """
+    """Everybody's motion at one rate without long holes: file without ending, motion, take of its frames."""
     take = written.at_one_rate(job.take)
     for who, motion in everybody(job, take, kind, axes, written):
         for segment in motion.segments(int(job.fill_gaps_s * take.fps + 1e-6)):

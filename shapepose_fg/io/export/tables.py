@@ -103,9 +103,8 @@ def write_parquet(opened: OpenedReconstruction, rows: Index | None, folder: Path
         with parquet.ParquetWriter(stream, schema, compression="zstd") as writer:
             for start in range(0, len(rows), _GROUP_ROWS):
                 columns, _ = _columns(opened, rows[start : start + _GROUP_ROWS])
-                arrays = [
-                    array(values, field.type) for values, field in zip(columns.values(), schema, strict=True)
-                ]
+                typed = zip(columns.values(), schema, strict=True)
+                arrays = [array(values, field.type) for values, field in typed]
                 writer.write_table(arrow.Table.from_arrays(arrays, schema=schema))
 
     write_atomically(folder / "people.parquet", write)

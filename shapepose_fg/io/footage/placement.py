@@ -1,6 +1,4 @@
-"""Where the calibrated picture lies in the pictures of the footage, if these have another size; and which pictures
-detections were made from: footage.json beside them, for who draws on the pictures.
-"""
+"""Where the calibrated picture lies in those of the footage; and footage.json: what detections were made from."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -122,12 +120,10 @@ def place(
     if wanted is not None or picture_size == calibrated_size:
         kind = wanted or PlacementKind.SAME
     elif max(abs(width - full_width), abs(height - full_height)) <= _BLOCK:
-        kind, note = (
-            PlacementKind.CROP,
-            (
-                f"{sizes}: the first column and row are taken to be the calibrated ones (--image-placement"
-                f" {name}=crop); if it was cut on both sides, give {name}=crop-centre; if resized, {name}=scale"
-            ),
+        kind = PlacementKind.CROP
+        note = (
+            f"{sizes}: the first column and row are taken to be the calibrated ones (--image-placement"
+            f" {name}=crop); if it was cut on both sides, give {name}=crop-centre; if resized, {name}=scale"
         )
     # Of one shape, to within the rounding of both sides to whole pixels.
     elif abs(width / full_width - height / full_height) <= 1 / full_width + 1 / full_height:

@@ -176,9 +176,8 @@ def draw_detections(picture: Picture, xy: Array, used: Mask, colours: Whole) -> 
     """Draw detections at drawn pixels `xy` (K, 2): squares in `colours` (K, 3), red crosses where not used."""
     reach = max(2, stroke_of(picture.shape[1::-1]))
     there = np.isfinite(xy).all(axis=1)
-    for (x, y), good, colour in zip(
-        fine(xy[there]).tolist(), used[there].tolist(), colours[there].tolist(), strict=True
-    ):
+    drawn = fine(xy[there]).tolist(), used[there].tolist(), colours[there].tolist()
+    for (x, y), good, colour in zip(*drawn, strict=True):
         arm = reach << FINE
         if good:
             box = ((x - arm, y - arm), (x + arm, y + arm))
@@ -207,10 +206,8 @@ def draw_label(
     top = bottom - tall - below - 2 * pad
     cv2.rectangle(picture, (left, top), (left + across + 2 * pad, bottom), colour, -1)
     light = np.dot(colour, (0.114, 0.587, 0.299)) > 150
-    place = (left + pad, bottom - pad - below)
-    cv2.putText(
-        picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, size, _DARK if light else _WHITE, thick, cv2.LINE_AA
-    )
+    place, ink = (left + pad, bottom - pad - below), _DARK if light else _WHITE
+    cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, size, ink, thick, cv2.LINE_AA)
 
 
 def fine(xy: Array) -> NDArray[np.int32]:

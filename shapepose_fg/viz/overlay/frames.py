@@ -178,10 +178,6 @@ def grid(pictures: Sequence[Picture], columns: int) -> Picture:
     """Pictures of one height side by side, `columns` in a row; short rows are filled up in dark grey."""
     rows = [np.hstack(pictures[at : at + columns]) for at in range(0, len(pictures), columns)]
     width = max(row.shape[1] for row in rows)
-    padded = [
-        np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=30)
-        if row.shape[1] < width
-        else row
-        for row in rows
-    ]
-    return np.vstack(padded)
+    return np.vstack(
+        [np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=30) for row in rows]
+    )

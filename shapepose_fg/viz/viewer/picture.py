@@ -130,9 +130,7 @@ def demo_picture(
 def _bodies(
     camera: Camera, floor: Floor, faces: Index, drawn: Sequence[tuple[Array, Sequence[Colour], float]]
 ) -> Picture:
-    """The floor, and over it bodies (P, Nv, 3) with their colours and opacity; twice as large at first, so that
-    edges are smooth.
-    """
+    """The floor, and over it bodies (P, Nv, 3) with colours and opacity; made smaller for smooth edges."""
     view = _view(camera, 2)
     panel = np.full((view.size[1], view.size[0], 3), 255, dtype=np.uint8)
     cells = np.arange(-floor.radius_m // _CELL_M, floor.radius_m // _CELL_M + 1) * _CELL_M
@@ -166,9 +164,7 @@ def _draw_dots(panel: Picture, window: Camera, camera: Camera, xy: Array) -> Non
         cv2.circle(panel, (x, y), 28, _DOT, -1, cv2.LINE_AA, 4)
 
 
-def _draw_frustum(
-    panel: Picture, camera: Camera, other: Camera, floor: Floor, colour: tuple[int, int, int]
-) -> None:
+def _draw_frustum(panel: Picture, camera: Camera, other: Camera, floor: Floor, colour: Colour) -> None:
     """A small pyramid where a camera is, its name, and a thread down to the floor."""
     width, height = other.image_size
     corners = np.array([[0, 0, 1], [width, 0, 1], [width, height, 1], [0, height, 1]])
@@ -193,16 +189,12 @@ def _place(page: Picture, panel: Picture, name: str, at: tuple[int, int]) -> Non
     cv2.rectangle(page, (at[0] - 1, at[1] - 1), (at[0] + width, at[1] + height), (212, 216, 217), 1)
 
 
-def _write(
-    picture: Picture, text: str, at: tuple[int, int], size: float, colour: tuple[int, int, int], thick: int
-) -> None:
+def _write(picture: Picture, text: str, at: tuple[int, int], size: float, colour: Colour, thick: int) -> None:
     cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, colour, thick, cv2.LINE_AA)
 
 
 def floor_under(rig: Rig, joints: Array, truth: Array, points: Array) -> Floor:
-    """The floor around `points` (K, 3): under the true soles (P, Nv, 3) where they are known, else under most
-    people's lowest `joints` (N, J, 3).
-    """
+    """The floor around `points` (K, 3): under true soles (P, Nv, 3) or most people's lowest `joints` (N, J, 3)."""
     up = rig.up_vector
     lowest = np.where(np.isfinite(joints).all(axis=-1), joints @ up, np.inf).min(axis=1, initial=np.inf)
     lowest = lowest[np.isfinite(lowest)] - _SOLE_M
