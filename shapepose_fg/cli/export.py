@@ -13,9 +13,7 @@ def export(
     take: TakeOptions,
     formats: list[str] = argument("FORMAT...", "One or more of amass trc c3d bvh glb csv parquet rrd, or all."),
     output: Path | None = option(RESULT, "Folder for the files; by default `export` in RESULTS."),
-    markers: str = option(
-        RESULT, "In trc, c3d: opensim (Pose2Sim's names), joints (ours), body (SMPL's).", "opensim"
-    ),
+    markers: str = option(RESULT, "Of trc, c3d: opensim (Pose2Sim's), joints (ours), body (SMPL's).", "opensim"),
     fill_gaps: float = option(RESULT, "Holes up to this are filled in amass and bvh.", 0.2, metavar="SECONDS"),
 ) -> None:
     """Write a result for other programs: shapepose-fg export RESULTS amass trc c3d bvh glb csv parquet rrd."""

@@ -45,9 +45,8 @@ class FrameTimes:
     def from_fps(cls, fps: float, frames: int) -> "FrameTimes":
         """`frames` frames at `fps` frames a second, frame 0 at 0 s."""
         if not _LEAST_FPS <= fps <= _MOST_FPS:
-            raise ValueError(
-                f"fps must be a positive number of frames a second, {_LEAST_FPS:g} to {_MOST_FPS:g}, got {fps}"
-            )
+            bounds = f"{_LEAST_FPS:g} to {_MOST_FPS:g}"
+            raise ValueError(f"fps must be a positive number of frames a second, {bounds}, got {fps}")
         return cls(np.arange(frames) / fps, source="fps")
 
     @classmethod

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,9 +133,7 @@ class ObservationTable(Table):
         )
 
     @classmethod
-    def empty(
-        cls, joint_names: Sequence[str] = BODY_25.joints, view_names: Sequence[str] = ()
-    ) -> "ObservationTable":
+    def empty(cls, joint_names: Sequence[str] = BODY_25.joints, view_names: Sequence[str] = ()) -> Self:
         """The table of a result without rows."""
         return cls.without_rows(joint_names=np.array(joint_names, str), view_names=np.array(view_names, str))
 

@@ -278,7 +278,7 @@ def _read_run(file: Path, people_id: object) -> dict[str, Any]:
 
 def with_body(*columns: Array) -> Mask:
     """(N,) which rows have a body: all numbers of their `BODY` columns, each (N, ...), are known."""
-    return np.logical_and.reduce([np.isfinite(each).reshape(len(each), -1).all(axis=1) for each in columns])
+    return np.logical_and.reduce([np.isfinite(each).all(axis=tuple(range(1, each.ndim))) for each in columns])
 
 
 _BLOCK = 128

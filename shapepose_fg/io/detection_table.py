@@ -62,11 +62,9 @@ class DetectionTable:
         block = self._at_hand[number]
         rows = slice(*block["candidate_start"][at : at + 2].tolist())
         links = slice(*block["pair_start"][at : at + 2].tolist())
-        view, joint = (block[name][rows].astype(np.intp) for name in ("view", "joint"))
-        pairs = block["pairs"][links].astype(np.intp)
-        return Detections(
-            view, joint, block["xy"][rows], block["confidence"][rows], pairs, block["affinity"][links]
-        )
+        view, joint, xy, confidence = (block[name][rows] for name in ("view", "joint", "xy", "confidence"))
+        pairs, affinity = block["pairs"][links].astype(np.intp), block["affinity"][links]
+        return Detections(view.astype(np.intp), joint.astype(np.intp), xy, confidence, pairs, affinity)
 
     def __iter__(self) -> Iterator[Detections]:
         return (self[frame] for frame in range(len(self)))

@@ -41,9 +41,7 @@ def estimate_offsets(
         thinned = ThinnedFrames(detections, len(rig), config.candidates)
         offsets = offsets_of(Setup(rig, thinned.skeleton, config, fitter), thinned, Notebook())
     if offsets is None:
-        raise ValueError(
-            f"offsets are known for {BODY_25.name} only, these are joints of {detections.skeleton.name}"
-        )
+        raise ValueError(f"offsets are known for {BODY_25.name} only, not for {detections.skeleton.name}")
     return offsets
 
 

@@ -131,10 +131,10 @@ def test_views_and_frames_are_well_chosen(scene: Scene, found: Reconstruction):
         xy, _ = window.project(points[seen])
         assert (xy > -1).all() and (xy < (640, 360)).all()
     floor = floor_under(scene.rig, joints, none, points)
-    assert abs(floor.height(np.zeros(3))) < 0.01  # the floor of the built-in scene is at 0
+    assert abs(floor.origin @ UP) < 0.01  # the floor of the built-in scene is at 0
     sunk = joints - np.array([0.5, 0, 0, 0])[:, None, None] * UP
-    assert abs(floor_under(scene.rig, sunk, none, points).height(np.zeros(3))) < 0.02
-    assert abs(floor_under(scene.rig, sunk, scene.vertices_at(0), points).height(np.zeros(3))) < 0.01
+    assert abs(floor_under(scene.rig, sunk, none, points).origin @ UP) < 0.02
+    assert abs(floor_under(scene.rig, sunk, scene.vertices_at(0), points).origin @ UP) < 0.01
     free = free_viewpoint(scene.rig, points, floor, (900, 800))
     xy, _ = free.project(points)
     assert (xy > 0).all() and (xy < (900, 800)).all()
@@ -149,4 +149,4 @@ def test_a_floor_has_axes_of_its_own_at_its_height(up: np.ndarray):
     assert abs(floor.origin @ up + 0.3) < 1e-12
     xy = np.array([[0.2, -0.4], [1.0, 2.0]])
     np.testing.assert_allclose(floor.coordinates(floor.at(xy) + 0.7 * up), xy)
-    np.testing.assert_allclose(floor.height(floor.at(xy) + 0.7 * up), 0.7)
+    np.testing.assert_allclose((floor.at(xy) - floor.origin) @ up, 0, atol=1e-12)

@@ -174,9 +174,8 @@ def _read_tables(content: Content, program: str) -> WrittenRig | None:
             continue
         node = Node(table, f'{content.path}: camera "{key}"', _CURES)
         # Caliscope's videos are called cam_0.mp4, those of its older versions port_0.mp4.
-        numbered = next(
-            (f"{kind}_{table[k]}" for kind, k in (("port", "port"), ("cam", "cam_id")) if k in table), key
-        )
+        kinds = (("port", "port"), ("cam", "cam_id"))
+        numbered = next((f"{kind}_{table[k]}" for kind, k in kinds if k in table), key)
         fisheye, wTc = table.get("fisheye", False), node.pose("rotation", "translation")
         if not isinstance(fisheye, bool):
             raise node.refuse("fisheye", f"must be true or false, got {describe(fisheye)}")

@@ -28,9 +28,7 @@ _LINES = {"1080p": 1080, "720p": 720, "540p": 540, "480p": 480}
 """Lines of a picture of the whole sensor by `video_resolution`."""
 _TO_OPENCV = np.diag([1.0, -1.0, -1.0])
 """QTM's cameras have y up and look along -z."""
-_NO_DISTORTION = dict.fromkeys(
-    (f"{kind}Distortion{n}" for kind in ("radial", "tangental") for n in (1, 2, 3)), 0.0
-)
+_DISTORTION = "radialDistortion1 radialDistortion2 tangentalDistortion1 tangentalDistortion2 radialDistortion3"
 
 
 def _cameras(
@@ -86,8 +84,7 @@ def _qualisys(camera: ET.Element, place: str) -> WrittenCamera:
         )
     scale = _LINES[resolution] / _LINES[_FULL]
     K = intrinsics(fx * scale, fy * scale, (cx - window[0]) * scale, (cy - window[1]) * scale)
-    names = "radialDistortion1 radialDistortion2 tangentalDistortion1 tangentalDistortion2 radialDistortion3"
-    distortion = values("intrinsic", names, _NO_DISTORTION).tolist()
+    distortion = values("intrinsic", _DISTORTION, dict.fromkeys(_DISTORTION.split(), 0.0)).tolist()
     width, height = (window[2:] - window[:2] + 1) * scale
     return WrittenCamera(camera.attrib["serial"], K, wTc, (round(width), round(height)), distortion)
 

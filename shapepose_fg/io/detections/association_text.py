@@ -167,9 +167,7 @@ def _blocks(
         yield with_middles(view, kind.skeleton) if kind.skeleton.middles else view
     if numbers.reaches(position + 1):
         what = f"more numbers follow the last of the {frame_count} frames"
-        raise numbers.refuse(
-            position, what, "correct the number of frames in line 1, or write the detections again"
-        )
+        raise numbers.refuse(position, what, "correct the number of frames in line 1, or write it again")
 
 
 def _candidates(

@@ -156,9 +156,8 @@ def _write_c3d(
         path = folder / f"{name(None if stop - first <= _MOST else span)}.c3d"
         fits = span[1] < _MOST
         if not fits:
-            written.notes.append(
-                f"{path.name} counts its frames from 1, not {span[0] + 1}: numbers in C3D end at {_MOST}"
-            )
+            counts = f"{path.name} counts its frames from 1, not {span[0] + 1}"
+            written.notes.append(f"{counts}: numbers in C3D end at {_MOST}")
         written.add(path, c3d_bytes(markers, span[0] if fits else 0, take.fps, part))
 
 

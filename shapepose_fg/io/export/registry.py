@@ -229,7 +229,6 @@ def chosen_rows(
         return np.flatnonzero(mine)
     found, there = mine & (opened.frame >= frames.start) & (opened.frame < frames.stop), opened.frame[mine]
     if len(there) > 0 and not found.any():
-        raise InputError(
-            f"--frames: {path} has no people in these frames; people are in frames {there.min()} to {there.max()}"
-        )
+        problem = f"{path} has no people in these frames"
+        raise InputError(f"--frames: {problem}; people are in frames {there.min()} to {there.max()}")
     return np.flatnonzero(found)

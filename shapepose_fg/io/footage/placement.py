@@ -111,9 +111,8 @@ def place(
     `wanted` says what was done, and where what is wanted is impossible.
     """
     (width, height), (full_width, full_height) = picture_size, calibrated_size
-    sizes = (
-        f"camera {name}: the pictures are {width} x {height}, the calibration is for {full_width} x {full_height}"
-    )
+    full = f"{full_width} x {full_height}"
+    sizes = f"camera {name}: the pictures are {width} x {height}, the calibration is for {full}"
     kind, note = wanted, None
     if wanted is PlacementKind.SAME and picture_size != calibrated_size:
         raise InputError(f"{sizes}: not the same size; give another --image-placement")

@@ -30,7 +30,7 @@ _BEND = 8
 """Pieces in which a bone is drawn, because a lens bends it."""
 _OPACITY = 0.45
 """Of bodies: what is under them stays visible."""
-FINE = 8
+_FINE = 8
 """Bits of a pixel's fraction in OpenCV's drawing."""
 _REACH = 0.5
 """Points farther outside the picture than this share of its size are not placed: no lens was calibrated there, and
@@ -149,18 +149,23 @@ def draw_skeletons(picture: Picture, view: PictureView, people: Skeletons) -> No
         lines, _ = view.project(ends[:, :1] * (1 - part) + ends[:, 1:] * part)
         lines = lines[np.isfinite(lines).all(axis=(1, 2))]
         for width, paint in ((stroke + 2, _DARK), (stroke, colour)):
-            cv2.polylines(picture, list(fine(lines)), False, paint, width, cv2.LINE_AA, FINE)
+            draw_lines(picture, lines, paint, width)
         xy, _ = view.project(joints)
         known = np.isfinite(xy).all(axis=1)
-        radius = round((stroke + 0.5) * (1 << FINE))
-        for centre, filled in zip(fine(xy[known]).tolist(), seen[known].tolist(), strict=True):
-            cv2.circle(picture, centre, radius, _WHITE if filled else _DARK, -1, cv2.LINE_AA, FINE)
-            cv2.circle(picture, centre, radius, colour, max(1, stroke // 2), cv2.LINE_AA, FINE)
+        radius = round((stroke + 0.5) * (1 << _FINE))
+        for centre, filled in zip(_fine(xy[known]).tolist(), seen[known].tolist(), strict=True):
+            cv2.circle(picture, centre, radius, _WHITE if filled else _DARK, -1, cv2.LINE_AA, _FINE)
+            cv2.circle(picture, centre, radius, colour, max(1, stroke // 2), cv2.LINE_AA, _FINE)
         tops.append(_top(xy[known], view.size))
     # Names last: no limbs cross them.
     for top, colour, label in zip(tops, people.colours, people.labels, strict=True):
         if top is not None:
             draw_label(picture, label, (top[0], top[1] - 5 * stroke), colour)
+
+
+def draw_lines(picture: Picture, xy: Array, colour: Colour, width: int = 1) -> None:
+    """Draw lines through the drawn pixels `xy` (L, K, 2)."""
+    cv2.polylines(picture, list(_fine(xy)), False, colour, width, cv2.LINE_AA, _FINE)
 
 
 def _top(xy: Array, size: tuple[int, int]) -> tuple[float, float] | None:
@@ -176,19 +181,19 @@ def draw_detections(picture: Picture, xy: Array, used: Mask, colours: Whole) -> 
     """Draw detections at drawn pixels `xy` (K, 2): squares in `colours` (K, 3), red crosses where not used."""
     reach = max(2, stroke_of(picture.shape[1::-1]))
     there = np.isfinite(xy).all(axis=1)
-    drawn = fine(xy[there]).tolist(), used[there].tolist(), colours[there].tolist()
+    drawn = _fine(xy[there]).tolist(), used[there].tolist(), colours[there].tolist()
     for (x, y), good, colour in zip(*drawn, strict=True):
-        arm = reach << FINE
+        arm = reach << _FINE
         if good:
             box = ((x - arm, y - arm), (x + arm, y + arm))
-            cv2.rectangle(picture, *box, _DARK, 3, cv2.LINE_AA, FINE)
+            cv2.rectangle(picture, *box, _DARK, 3, cv2.LINE_AA, _FINE)
             light = tuple((np.asarray(colour) + 255) / 2)
-            cv2.rectangle(picture, *box, light, 1, cv2.LINE_AA, FINE)
+            cv2.rectangle(picture, *box, light, 1, cv2.LINE_AA, _FINE)
         else:
             arm = round(1.5 * arm)
             for width, paint in ((max(3, reach), _DARK), (max(1, reach // 2), GATED)):
-                cv2.line(picture, (x - arm, y - arm), (x + arm, y + arm), paint, width, cv2.LINE_AA, FINE)
-                cv2.line(picture, (x - arm, y + arm), (x + arm, y - arm), paint, width, cv2.LINE_AA, FINE)
+                cv2.line(picture, (x - arm, y - arm), (x + arm, y + arm), paint, width, cv2.LINE_AA, _FINE)
+                cv2.line(picture, (x - arm, y + arm), (x + arm, y - arm), paint, width, cv2.LINE_AA, _FINE)
 
 
 def draw_label(
@@ -210,9 +215,9 @@ def draw_label(
     cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, size, ink, thick, cv2.LINE_AA)
 
 
-def fine(xy: Array) -> NDArray[np.int32]:
+def _fine(xy: Array) -> NDArray[np.int32]:
     """Pixels as OpenCV's drawing takes them with fractions."""
-    return np.round(np.clip(xy, -30000, 30000) * (1 << FINE)).astype(np.int32)
+    return np.round(np.clip(xy, -30000, 30000) * (1 << _FINE)).astype(np.int32)
 
 
 def write_picture(path: Path, picture: Picture) -> None:

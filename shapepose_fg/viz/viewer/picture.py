@@ -15,18 +15,8 @@ from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.io.footage.footage import Picture
 from shapepose_fg.io.footage.placement import Placement, PlacementKind
 from shapepose_fg.viz.bodies import joined, surfaces
-from shapepose_fg.viz.overlay.drawing import (
-    FINE,
-    Colour,
-    PictureView,
-    Skeletons,
-    blue_green_red,
-    draw_bodies,
-    draw_label,
-    draw_skeletons,
-    fine,
-    write_picture,
-)
+from shapepose_fg.viz.overlay import drawing
+from shapepose_fg.viz.overlay.drawing import Colour
 from shapepose_fg.viz.rendering import look_at, render_depth, zoom
 
 _WIDE, _GAP, _HEADER = 1800, 14, 60
@@ -74,10 +64,6 @@ class Floor:
         """(..., 3) the points of the floor with coordinates (..., 2)."""
         return self.origin + xy @ self.axes
 
-    def height(self, points: Array) -> Array:
-        """(...,) metres above the floor."""
-        return (points - self.origin) @ self.up
-
 
 def demo_picture(
     path: Path,
@@ -97,7 +83,7 @@ def demo_picture(
     people = reconstruction.at(frame)
     people = people.rows(np.argsort(people.person, kind="stable"))
     bodies, rows = surfaces(people, body)
-    found = bodies, [blue_green_red(person) for person in people.person[rows].tolist()]
+    found = bodies, [drawing.blue_green_red(person) for person in people.person[rows].tolist()]
     truth = np.zeros((0, body.num_vertices, 3)) if truth is None else np.asarray(truth, dtype=np.float64)
     points = np.concatenate([each.reshape(-1, 3) for each in (people.joints, bodies, truth)])
     points = points[np.isfinite(points).all(axis=1)]
@@ -124,7 +110,7 @@ def demo_picture(
     count = f"{len(people)} {'person' if len(people) == 1 else 'people'}, {len(rig)} cameras, frame {frame}"
     _write(page, "Every person in 3D", (_GAP, 40), 0.95, _INK, 2)
     _write(page, "; ".join([count, *signs]), (_LEFT + 2 * _GAP, 40), 0.6, _QUIET, 1)
-    write_picture(path, page)
+    drawing.write_picture(path, page)
 
 
 def _bodies(
@@ -138,22 +124,22 @@ def _bodies(
     start = start[np.linalg.norm(start, axis=1) < floor.radius_m]
     pieces = np.concatenate([np.stack([start, start + side], axis=1) for side in _CELL_M * np.eye(2)])
     xy, _ = view.project(floor.at(pieces))
-    cv2.polylines(panel, list(fine(xy[np.isfinite(xy).all(axis=(1, 2))])), False, _LINE, 1, cv2.LINE_AA, FINE)
+    drawing.draw_lines(panel, xy[np.isfinite(xy).all(axis=(1, 2))], _LINE)
     for bodies, colours, opacity in drawn:
-        panel = draw_bodies(panel, view, bodies, faces, colours, opacity)
+        panel = drawing.draw_bodies(panel, view, bodies, faces, colours, opacity)
     return np.asarray(cv2.resize(panel, camera.image_size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
-def _view(camera: Camera, scale: int = 1) -> PictureView:
+def _view(camera: Camera, scale: int = 1) -> drawing.PictureView:
     """The pictures of a camera without distortion, drawn `scale` times as large."""
     width, height = camera.image_size
     placement = Placement(PlacementKind.SAME, camera.image_size, camera.image_size)
-    return PictureView(camera, placement, (scale * width, scale * height))
+    return drawing.PictureView(camera, placement, (scale * width, scale * height))
 
 
 def _draw_people(panel: Picture, camera: Camera, people: Reconstruction, rows: Index) -> None:
     """The skeletons of some rows, with who they are."""
-    draw_skeletons(panel, _view(camera), Skeletons.of(people.rows(rows)))
+    drawing.draw_skeletons(panel, _view(camera), drawing.Skeletons.of(people.rows(rows)))
 
 
 def _draw_dots(panel: Picture, window: Camera, camera: Camera, xy: Array) -> None:
@@ -174,16 +160,16 @@ def _draw_frustum(panel: Picture, camera: Camera, other: Camera, floor: Floor, c
     inside = (xy[0] > 0) & (xy[0] < camera.image_size)  # NaN behind the eye compares false
     if not inside.all() or not np.isfinite(xy).all():
         return
-    ends = fine(xy)
-    sides = [ends[[0, corner]] for corner in range(1, 5)]
-    cv2.polylines(panel, [*sides, ends[[1, 2, 3, 4, 1]]], False, colour, 1, cv2.LINE_AA, FINE)
-    cv2.polylines(panel, [ends[[0, 5]]], False, _LINE, 1, cv2.LINE_AA, FINE)
+    corner = np.arange(1, 5)
+    drawing.draw_lines(panel, xy[np.stack([0 * corner, corner], axis=1)], colour)
+    drawing.draw_lines(panel, xy[np.stack([corner, np.roll(corner, 1)], axis=1)], colour)
+    drawing.draw_lines(panel, xy[[[0, 5]]], _LINE)
     _write(panel, other.name, (round(xy[:5, 0].mean()) - 18, round(xy[:5, 1].min()) - 8), 0.45, colour, 1)
 
 
 def _place(page: Picture, panel: Picture, name: str, at: tuple[int, int]) -> None:
     """Put a panel with its name on the page, its left upper corner `at`."""
-    draw_label(panel, name, (0, 0), (255, 255, 255), centred=False)
+    drawing.draw_label(panel, name, (0, 0), (255, 255, 255), centred=False)
     height, width = panel.shape[:2]
     page[at[1] : at[1] + height, at[0] : at[0] + width] = panel
     cv2.rectangle(page, (at[0] - 1, at[1] - 1), (at[0] + width, at[1] + height), (212, 216, 217), 1)
