@@ -31,5 +31,4 @@ def export(
     done = export_result(take.results, wanted, output, **how, **more)
     for file in (file for written in done.values() for file in written.files):
         print(file)
-    for each in (told for written in done.values() for told in written.notes):
-        note(each)
+    note(*(told for written in done.values() for told in written.notes))

@@ -87,9 +87,7 @@ class RunOptions:
 
     workers: int | None = workers_option()
     cluster: str | None = option(
-        RUN,
-        "Dask scheduler (tcp://host:8786) whose processes solve; `local`: Dask's own, here.",
-        metavar="ADDRESS",
+        RUN, "Dask scheduler (tcp://host:8786) that solves, or `local`.", metavar="ADDRESS"
     )
     resume: bool = option(RUN, "Go on with what was stopped in --output.", False, "--resume")
     restart: bool = option(RUN, "Begin anew, whatever was stopped in --output.", False, "--restart")

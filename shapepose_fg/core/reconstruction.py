@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.arrays import Array, Index, Mask, Whole
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.observation_table import ObservationTable
 from shapepose_fg.core.result_files import OBSERVATIONS, PEOPLE, RUN, RUN_ID, SavedTable, check_id, write_result
 from shapepose_fg.core.run_summary import check_run, merged_run
@@ -256,22 +256,17 @@ class OpenedReconstruction(ExitStack):
         if self._observed is None or not observations:
             return people
         table = self._observed.read(index)
-        try:
+        with naming(self._observed.file, "delete it or run the reconstruction again"):
             return replace(people, observations=table)
-        except ValueError as error:
-            file = self._observed.file
-            raise InputError(f"{file}: {error}; delete it or run the reconstruction again") from None
 
 
 def _read_run(file: Path, people_id: object) -> dict[str, Any]:
     """What run.json says, if it is of the run with that id; empty where there is none."""
     run = read_json(file) if file.is_file() else {}
-    try:
+    with naming(file, "restore it or delete it"):
         if not isinstance(run, dict):
             raise ValueError("must hold an object")
         check_run(run)
-    except ValueError as error:
-        raise InputError(f"{file}: {error}; restore it or delete it") from None
     check_id(people_id, run.pop(RUN_ID, None), file)
     return run
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.arrays import Array
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.core.storage.npz import read_npz, write_npz
 from shapepose_fg.core.storage.schema import Column, Table
@@ -93,7 +93,5 @@ class SubjectShapes(Table):
                 f"{file}: these are shapes of another body model, their betas mean something else on this one;"
                 " give --body the model that they were made with, or another file"
             )
-        try:
+        with naming(file, _CURE):
             return cls(columns["names"], columns["betas"], columns["information"], body)
-        except ValueError as error:
-            raise InputError(f"{file}: {error}; {_CURE}") from None

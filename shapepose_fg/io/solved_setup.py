@@ -34,9 +34,7 @@ class SolvedSetup(Generic[Settings]):
 
 
 def body_of(run: Mapping[str, Any], given: Path | None = None) -> SmplArrays:
-    """The body model of a result, whose run.json says `run`, or of the file `given`; InputError where it is not
-    there any more.
-    """
+    """The body model of a result whose run.json says `run`, or of the file `given`; InputError if it is gone."""
     named = run.get("body") if given is None else given
     file = None if named is None else Path(str(named))
     if file is None or file.exists():

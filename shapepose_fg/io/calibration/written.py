@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Axis, Camera, Lens, padded_distortion
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.validation import describe
 
@@ -49,10 +49,8 @@ class WrittenCamera:
         wTc = self.wTc.copy()
         wTc[:3, 3] *= metres
         size = self.image_size or image_size or (0, 0)
-        try:
+        with naming(path, "correct it in the file"):
             return Camera(self.name, self.K, wTc, size, padded_distortion(self.distortion, self.lens), self.lens)
-        except ValueError as error:
-            raise InputError(f"{path}: {error}; correct it in the file") from None
 
 
 @dataclass(frozen=True)

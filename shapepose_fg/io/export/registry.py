@@ -14,7 +14,7 @@ import numpy as np
 from shapepose_fg.body.model.smpl_file import SmplArrays
 from shapepose_fg.core.arrays import Index
 from shapepose_fg.core.camera import Axis
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.reconstruction import OpenedReconstruction, Reconstruction
 from shapepose_fg.core.result_files import results_folder
 from shapepose_fg.core.run_summary import covered_frames
@@ -206,10 +206,8 @@ def read_take(
         spans = covered_frames(people.run) or []
         cut = [[max(span.start, frames.start), min(span.stop, frames.stop)] for span in spans]
         people = people.with_run(frames=[[start, stop] for start, stop in cut if start < stop])
-    try:
+    with naming(path):
         return Take.of(people, axis, rig=rig, **options)
-    except ValueError as error:
-        raise InputError(f"{path}: {error}") from None
 
 
 def chosen_rows(
