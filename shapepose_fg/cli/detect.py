@@ -66,7 +66,7 @@ class ClockOptions:
 
     fps: list[str] | None = option(TIME, "Frames a second, where files do not say.", metavar="RATE|CAMERA=RATE")
     start: list[str] | None = option(
-        TIME, "When its first frame was taken: 0.2s, or 12f (its own frames); else 0.", metavar="CAMERA=TIME"
+        TIME, "When its first frame was taken: 0.2s, or 12f frames.", metavar="CAMERA=TIME"
     )
     frames: str | None = frames_option()
 

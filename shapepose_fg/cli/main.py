@@ -135,7 +135,7 @@ class Preset(StrEnum):
 
 @app.command("config", rich_help_panel=_RECORDING)
 @grouped
-def print_config(
+def config(
     preset: Preset = option(RESULT, "paper: the method as the paper has it.", Preset.DEFAULT),
 ) -> None:
     """Print every setting with its value, as TOML."""

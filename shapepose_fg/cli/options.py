@@ -86,9 +86,7 @@ class RunOptions:
     """What runs the work, and what becomes of work that was stopped."""
 
     workers: int | None = workers_option()
-    cluster: str | None = option(
-        RUN, "Dask scheduler (tcp://host:8786) that solves, or `local`.", metavar="ADDRESS"
-    )
+    cluster: str | None = option(RUN, "Dask scheduler (tcp://host:8786) to solve, or `local`.", metavar="ADDRESS")
     resume: bool = option(RUN, "Go on with what was stopped in --output.", False, "--resume")
     restart: bool = option(RUN, "Begin anew, whatever was stopped in --output.", False, "--restart")
 

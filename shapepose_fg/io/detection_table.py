@@ -70,16 +70,14 @@ class DetectionTable:
         return (self[frame] for frame in range(len(self)))
 
 
-def keep_block(
-    kept: KeptArrays, number: int, candidates: Detections, candidate_start: Index, pair_start: Index
-) -> None:
+def keep_block(kept: KeptArrays, number: int, candidates: Detections, start: Index, pair_start: Index) -> None:
     """Keep block `number` of a recording: the candidates of its T frames, one frame after the other.
 
-    `pairs` count from the first candidate of their own frame; `candidate_start` and `pair_start` (T + 1,) are
+    `pairs` count from the first candidate of their own frame; `start` and `pair_start` (T + 1,) are
     where each frame's candidates and pairs begin.
     """
     arrays = {name: getattr(candidates, name).astype(dtype) for name, dtype in _KEPT.items()}
-    kept.keep(_name(number), arrays | {"candidate_start": candidate_start, "pair_start": pair_start})
+    kept.keep(_name(number), arrays | {"candidate_start": start, "pair_start": pair_start})
 
 
 def _name(number: int) -> str:

@@ -45,14 +45,12 @@ def estimate_offsets(
     return offsets
 
 
-def kept_offsets(
-    kept: KeptArrays, setup: Setup, detections: ThinnedFrames, book: Notebook
-) -> KeypointOffsets | None:
+def kept_offsets(kept: KeptArrays, setup: Setup, frames: ThinnedFrames, book: Notebook) -> KeypointOffsets | None:
     """`offsets_of`; what a run began with it goes on with."""
     columns = [each.name for each in fields(KeypointOffsets)]
     if len(kept.names(_OFFSETS)) > 0:
         return KeypointOffsets(**{name: kept.array(_OFFSETS, name) for name in columns})
-    offsets = offsets_of(setup, detections, book)
+    offsets = offsets_of(setup, frames, book)
     if offsets is not None:
         kept.keep(_OFFSETS, {name: getattr(offsets, name) for name in columns})
     return offsets
