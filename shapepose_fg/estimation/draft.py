@@ -90,7 +90,7 @@ def _unchanged(now: Observations, before: Observations) -> tuple[NDArray[np.intp
     width = int(max(now.track.max(initial=0), before.track.max(initial=0))) + 1
     names = [each.frame * width + each.track for each in (now, before)]
     _, here, there = np.intersect1d(*names, assume_unique=True, return_indices=True)
-    same = now.candidate[here] == before.candidate[there]
+    same = (now.xy[here] == before.xy[there]).all(axis=-1)
     same &= np.abs(now.probability[here] - before.probability[there]) < _AS_PROBABLY
     same = same.all(axis=(1, 2))
     return here[same], there[same]

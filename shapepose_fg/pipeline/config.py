@@ -94,7 +94,8 @@ class PipelineConfig(Settings):
     people: PeopleConfig = field(default_factory=PeopleConfig)
     """Stage I, and people over time: who is there."""
     observations: ObservationConfig = field(default_factory=ObservationConfig)
-    """How far a 2D observation is trusted: for detectors other than OpenPose, `scripts/measure_detector.py`."""
+    """How far a 2D observation is trusted, as measured for OpenPose: a detector that is twice as far off wants
+    twice the `sigma_m`."""
     following: FollowingConfig = field(default_factory=FollowingConfig)
     """People over time: what becomes of tracks."""
     stitching: StitchingConfig = field(default_factory=StitchingConfig)

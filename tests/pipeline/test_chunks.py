@@ -25,6 +25,7 @@ from shapepose_fg.pipeline.windows import Engine, WindowConfig
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.tracking.following import FollowingConfig
 from shapepose_fg.tracking.hypotheses import Input
+from shapepose_fg.tracking.tracker import BodyScale, Tracks
 
 CONFIG = PipelineConfig(
     batch_frames=12, following=FollowingConfig(look_ahead_s=0.3), windows=WindowConfig(overlap_s=0.16)
@@ -206,6 +207,11 @@ class NobodyIsThere:
     """A tracker that finds nobody, and so is quick."""
 
     skeleton = BODY_25
+    scale = BodyScale(np.ones(25), np.ones(25))
+
+    def nobody(self) -> Tracks:
+        """Tracks of no people."""
+        return Tracks.none(BODY_25)
 
     def newcomers(self, *_: object) -> tuple[np.ndarray, np.ndarray]:
         """Nobody."""

@@ -270,3 +270,17 @@ def test_the_observations_are_what_the_joints_were_solved_from(dance, scene, peo
     np.testing.assert_array_equal(Known.observed(people.known), table.used.any(axis=-1))
     assert set(np.unique(people.known)) <= {Known.SEEN, Known.WEAK, Known.BODY}
     assert people.run["people"]["joints"]["seen"] == (people.known == Known.SEEN).sum()
+
+
+def test_detections_are_assigned_until_hardly_any_changes(scene: Scene, recording: Recording):
+    """More rounds than that change nothing; with one, they are not there yet."""
+    rounds = {}
+    for most in (1, 8, 50):
+        windows = replace(PipelineConfig().windows, again_over_time=most)
+        config = replace(PipelineConfig(), windows=windows)
+        rounds[most] = reconstruct(
+            recording, scene.rig, config, times=FrameTimes.from_fps(scene.fps, len(recording))
+        )
+    assert (rounds[8].joints == rounds[50].joints).all()
+    candidates = [np.asarray(rounds[most].observations.candidate) for most in (1, 8)]
+    assert candidates[0].shape == candidates[1].shape and (candidates[0] != candidates[1]).any()
