@@ -35,12 +35,8 @@ _NETWORK = "Network"
 class NetworkOptions:
     """The network that detects, and how it is run."""
 
-    network: str = option(
-        _NETWORK, "ONNX file of a network of OpenPose's kind, or a named one.", REQUIRED, metavar="FILE|NAME"
-    )
-    layout: str | None = option(
-        _NETWORK, "How to read it: tf-pose, openpose-coco, openpose-body25.", metavar="NAME"
-    )
+    network: str = option(_NETWORK, "ONNX file like OpenPose's, or a named one.", REQUIRED, metavar="FILE|NAME")
+    layout: str | None = option(_NETWORK, "Its kind: tf-pose, openpose-coco, openpose-body25.", metavar="NAME")
     download: bool = option(_NETWORK, "Fetch a named network that is not here yet.", False, "--download")
     network_address: str | None = option(_NETWORK, "Where to fetch it from; its checksum decides.", metavar="URL")
     long_side: int = option(_NETWORK, "Longer side of what it is shown, pixels: more finds smaller people.", 656)
@@ -59,9 +55,8 @@ class NetworkOptions:
         from shapepose_fg.detection2d.network import HeatMapNetwork
 
         with progress("fetching the network", "bytes") as fetched:
-            file = find_network(
-                self.network, download=self.download, address=self.network_address, progress=fetched
-            )
+            address = self.network_address
+            file = find_network(self.network, download=self.download, address=address, progress=fetched)
         return HeatMapNetwork.load(file, self.layout, cast("Backend", self.backend))
 
 
@@ -69,11 +64,9 @@ class NetworkOptions:
 class ClockOptions:
     """When pictures were taken."""
 
-    fps: list[str] | None = option(
-        TIME, "Frames a second, where the files are silent or wrong.", metavar="RATE|CAMERA=RATE"
-    )
+    fps: list[str] | None = option(TIME, "Frames a second, where files do not say.", metavar="RATE|CAMERA=RATE")
     start: list[str] | None = option(
-        TIME, "When its first frame was taken: 0.2s, or 12f (its own frames); else 0.", metavar="CAMERA=TIME"
+        TIME, "When its first frame was taken: 0.2s, or 12f frames.", metavar="CAMERA=TIME"
     )
     frames: str | None = frames_option()
 
@@ -127,9 +120,7 @@ def detect(
             raise
     for name, failed in zip(rig.names, report.unreadable, strict=True):
         if failed > 0:
-            note(
-                f"camera {name}: {failed} of {report.moments} pictures cannot be read; it has no detections there"
-            )
+            note(f"camera {name}: {failed} of {report.moments} pictures cannot be read; nothing is detected there")
     show(_summary(run, report, time.perf_counter() - begin))
     print(_next_command(run, cameras))
 

@@ -13,12 +13,8 @@ def export(
     take: TakeOptions,
     formats: list[str] = argument("FORMAT...", "One or more of amass trc c3d bvh glb csv parquet rrd, or all."),
     output: Path | None = option(RESULT, "Folder for the files; by default `export` in RESULTS."),
-    markers: str = option(
-        RESULT, "In trc and c3d: opensim (Pose2Sim's names), joints (ours) or body (SMPL's).", "opensim"
-    ),
-    fill_gaps: float = option(
-        RESULT, "Holes up to this long are filled in amass and bvh.", 0.2, metavar="SECONDS"
-    ),
+    markers: str = option(RESULT, "Of trc, c3d: opensim (Pose2Sim's), joints (ours), body (SMPL's).", "opensim"),
+    fill_gaps: float = option(RESULT, "Holes up to this are filled in amass and bvh.", 0.2, metavar="SECONDS"),
 ) -> None:
     """Write a result for other programs: shapepose-fg export RESULTS amass trc c3d bvh glb csv parquet rrd."""
     from shapepose_fg.io.export.markers import MarkerSet
@@ -35,5 +31,4 @@ def export(
     done = export_result(take.results, wanted, output, **how, **more)
     for file in (file for written in done.values() for file in written.files):
         print(file)
-    for each in (told for written in done.values() for told in written.notes):
-        note(each)
+    note(*(told for written in done.values() for told in written.notes))

@@ -46,9 +46,7 @@ for _panel, _commands in {
 app.add_typer(tracks, name="tracks", rich_help_panel=_RESULT)
 app.add_typer(evaluate, name="evaluate", rich_help_panel=_TRY)
 
-_MOVED = {
-    "--people": "give the result as the first argument: shapepose-fg evaluate shelf RESULTS --ground-truth FILE"
-}
+_MOVED = {"--people": "give the result first: shapepose-fg evaluate shelf RESULTS --ground-truth FILE"}
 """Options that there were, and what took their place."""
 _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
 """What typer raises for a wrong command line; older and newer versions keep the class in different places."""
@@ -85,9 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 @evaluate.command("shelf")
 @grouped
 def evaluate_shelf_command(
-    results: Path = argument(
-        "RESULTS", "Folder of a reconstruction, or its people.npz; 4D Association's text; TRC, or a folder of it."
-    ),
+    results: Path = argument("RESULTS", "Folder of a reconstruction; 4D Association's text; TRC."),
     ground_truth: Path = option(INPUT, "Annotation of the Shelf recording, as text.", REQUIRED),
     as_json: bool = json_option(),
 ) -> None:
@@ -112,9 +108,7 @@ it saw the people are reconstructed, over time."""
 @grouped
 def demo(
     output: Path = option(RESULT, "Folder for the result and the picture.", Path("demo")),
-    report: bool = option(
-        RESULT, "Leave report.html, the result as a page to look at.", True, "--report/--no-report"
-    ),
+    report: bool = option(RESULT, "Leave report.html, a page to look at.", True, "--report/--no-report"),
 ) -> None:
     """Reconstruct a built-in scene of four people, compare it with the truth, and draw it."""
     prepare_output(output)
@@ -141,10 +135,8 @@ class Preset(StrEnum):
 
 @app.command("config", rich_help_panel=_RECORDING)
 @grouped
-def print_config(
-    preset: Preset = option(
-        RESULT, "paper: the method as it is written, without what is settled differently here.", Preset.DEFAULT
-    ),
+def config(
+    preset: Preset = option(RESULT, "paper: the method as the paper has it.", Preset.DEFAULT),
 ) -> None:
     """Print every setting with its value, as TOML."""
     from shapepose_fg.io.config import toml_text

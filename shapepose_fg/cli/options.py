@@ -56,10 +56,9 @@ def grouped(command: Callable[..., Any]) -> Callable[..., Any]:
 
     @wraps(command)
     def called(**given: Any) -> Any:
-        made = {
-            name: cast(Any, hints[name])(**{key: given.pop(key) for key in keys}) for name, keys in taken.items()
-        }
-        return command(**made, **given)
+        for name, keys in taken.items():
+            given[name] = hints[name](**{key: given.pop(key) for key in keys})
+        return command(**given)
 
     del called.__wrapped__
     cast(Any, called).__signature__ = inspect.Signature(parameters)
@@ -87,11 +86,7 @@ class RunOptions:
     """What runs the work, and what becomes of work that was stopped."""
 
     workers: int | None = workers_option()
-    cluster: str | None = option(
-        RUN,
-        "Dask scheduler (tcp://host:8786) whose processes solve; `local`: Dask's own, here.",
-        metavar="ADDRESS",
-    )
+    cluster: str | None = option(RUN, "Dask scheduler (tcp://host:8786) to solve, or `local`.", metavar="ADDRESS")
     resume: bool = option(RUN, "Go on with what was stopped in --output.", False, "--resume")
     restart: bool = option(RUN, "Begin anew, whatever was stopped in --output.", False, "--restart")
 
@@ -114,9 +109,7 @@ class CameraOptions:
     calibration: Path = option(INPUT, "Cameras: a file, or a folder, of one of the formats known.", REQUIRED)
     up: str | None = option(INPUT, "World axis that points up: x -x y -y z -z.", metavar="AXIS")
     unit: str | None = option(INPUT, "Unit of the calibration: m, cm or mm.", metavar="UNIT")
-    image_size: str | None = option(
-        INPUT, "Size of the calibrated pictures, where the file has none.", metavar="WxH"
-    )
+    image_size: str | None = option(INPUT, "Size of calibrated pictures where the file has none.", metavar="WxH")
 
     def rig(self) -> "Rig":
         """The cameras; InputError where they cannot be used."""
@@ -135,9 +128,7 @@ class DetectionOptions(CameraOptions):
     """Cameras, and what a 2D detector saw with them."""
 
     detections: Path = option(INPUT, "Folder with what a 2D detector wrote of every camera.", REQUIRED)
-    skeleton: str | None = option(
-        INPUT, "The detector's skeleton, or a TOML file that describes it.", metavar="NAME"
-    )
+    skeleton: str | None = option(INPUT, "The detector's skeleton, or a TOML file of it.", metavar="NAME")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,6 +12,7 @@ from shapepose_fg.cli.terminal import note, progress
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import ASSUMED_FPS
 from shapepose_fg.core.result_files import results_folder
+from shapepose_fg.core.run_summary import covered_frames
 
 if TYPE_CHECKING:
     from shapepose_fg.core.camera import Rig
@@ -35,9 +36,7 @@ def overlay(
     pictures: PictureOptions,
     drawn: Drawn,
     results: Path = argument("RESULTS", "Folder of a reconstruction."),
-    detections: Path | None = option(
-        INPUT, "Folder that `detect` wrote: it says which picture belongs to which frame."
-    ),
+    detections: Path | None = option(INPUT, "Folder that `detect` wrote, which knows the pictures."),
     frames: str | None = frames_option(),
     output: Path | None = option(RESULT, "Folder for videos and pictures; by default RESULTS/overlay."),
 ) -> None:
@@ -73,7 +72,8 @@ def overlay(
         if drawn.stills is not None:
             chosen, fps = _stills(drawn.stills, length), None
         else:
-            chosen, fps = _recorded(run, length) if frames is None else frame_range(frames, length), _fps(run)
+            told = [each for span in covered_frames(run) or [range(length)] for each in span if each < length]
+            chosen, fps = told if frames is None else frame_range(frames, length), _fps(run)
         if len(chosen) == 0:
             raise InputError(f"{folder}: none of its frames has a picture; give the videos that it was made from")
         with progress("drawing") as done:
@@ -94,19 +94,10 @@ def _cameras(text: str, rig: "Rig") -> list[str]:
     return names
 
 
-def _recorded(run: Mapping[str, Any], length: int) -> range:
-    """The frames that a result tells of, people in them or not."""
-    told = run.get("frames")
-    if isinstance(told, list) and len(told) == 2 and all(isinstance(each, int) for each in told):
-        return range(max(0, told[0]), min(told[1], length))
-    return range(length)
-
-
 def _fps(run: Mapping[str, Any]) -> float:
     """Frames a second of the video that is made."""
-    told = run.get("time")
-    rate = told.get("fps") if isinstance(told, dict) else None
-    return float(rate) if isinstance(rate, int | float) and 0.1 <= rate <= 1000 else ASSUMED_FPS
+    rate = run.get("time", {}).get("fps")  # a number where it is said (`check_run`)
+    return float(rate) if rate is not None and 0.1 <= rate <= 1000 else ASSUMED_FPS
 
 
 def _stills(text: str, length: int) -> list[int]:

@@ -20,17 +20,14 @@ class PictureOptions:
 
     videos: list[str] | None = option(
         INPUT,
-        "Folder with a video, a picture, or a folder of pictures named after each camera; or each one's own,"
-        " given once for each camera.",
+        "Folder with a video, picture, or folder of pictures named after each camera; or each one's own.",
         None,
         "--videos",
         "--images",
         metavar="FOLDER|CAMERA=PATH",
     )
     image_placement: list[str] | None = option(
-        INPUT,
-        "How pictures of another size than the calibration's came about: scale, letterbox, crop, crop-centre.",
-        metavar="KIND|CAMERA=KIND",
+        INPUT, "Pictures of another size: scale, letterbox, crop, crop-centre.", metavar="KIND|CAMERA=KIND"
     )
 
     def named(self, rig: "Rig") -> list[str]:

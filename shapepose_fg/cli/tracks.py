@@ -45,8 +45,7 @@ def people_over_time(
 
 @tracks.command("list")
 def list_people(
-    context: typer.Context,
-    as_json: Annotated[bool, typer.Option("--json", help="Print them as JSON.")] = False,
+    context: typer.Context, as_json: Annotated[bool, typer.Option("--json", help="Print them as JSON.")] = False
 ) -> None:
     """Everybody: frames, gaps, stature, how often seen, how far they walked."""
     from shapepose_fg.core.reconstruction import Reconstruction
@@ -151,12 +150,12 @@ def _tracks_table(results: Path) -> "RenderableType":
 
 def _body_of(run: "Mapping[str, Any]") -> "SmplArrays | None":
     """The body model that a result was made with; None where its file is not there any more."""
-    from shapepose_fg.body.shapes import read_body
+    from shapepose_fg.io.solved_setup import body_of
 
-    file = run.get("body")
-    if file is None:
-        return read_body()
-    return read_body(Path(file)) if Path(file).is_file() else None
+    try:
+        return body_of(run)
+    except InputError:
+        return None
 
 
 def _correct(context: typer.Context, action: str, person: int, **more: int | None) -> None:

@@ -18,36 +18,22 @@ def view(
     part: TakeOptions,
     pictures: PictureOptions,
     connect: str | None = option(RUN, "A viewer that runs already: rerun+http://HOST:9876/proxy.", metavar="URL"),
-    statistics: bool = option(
-        RUN,
-        "Leave rerun's statistics of use, sent to its makers, as they are set.",
-        False,
-        "--statistics",
-    ),
+    statistics: bool = option(RUN, "Leave rerun's statistics of use as they are set.", False, "--statistics"),
 ) -> None:
     """Show a result in the rerun viewer: people, cameras, and what was used of what they saw, on a timeline."""
+    from shapepose_fg.io.export import rerun_app
     from shapepose_fg.io.export.registry import Job, read_take
-    from shapepose_fg.io.export.rerun_app import (
-        body_if_there,
-        new_stream,
-        open_viewer,
-        switch_off,
-        viewer_file,
-    )
     from shapepose_fg.io.export.rerun_log import log_pictures, log_take
 
     take = read_take(part.results, identities=False, **part.how())
     shown = _pictures(take, pictures) if pictures.videos else []
-    stream = new_stream()
-    viewer = viewer_file()
-    if connect is None and not statistics and viewer is not None and switch_off(viewer):
-        note(
-            "rerun's statistics of use were on and are switched off now; `rerun analytics enable` switches them on"
-        )
-    open_viewer(stream, take, connect)
-    arrays, missing = body_if_there(Job(take, part.results, part.body))
-    for each in missing:
-        note(each)
+    stream = rerun_app.new_stream()
+    viewer = rerun_app.viewer_file()
+    if connect is None and not statistics and viewer is not None and rerun_app.switch_off(viewer):
+        note("rerun's statistics of use were on and are off now; `rerun analytics enable` switches them on")
+    rerun_app.open_viewer(stream, take, connect)
+    arrays, missing = rerun_app.body_if_there(Job(take, part.results, part.body))
+    note(*missing)
     log_take(stream, take, arrays)
     if len(shown) > 0:
         with progress("showing pictures", "pictures") as done:

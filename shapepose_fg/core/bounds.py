@@ -40,9 +40,8 @@ def range_of(kind: type, name: str) -> str | None:
     interval = _intervals(kind).get(name) if issubclass(kind, Settings) else None
     if interval is None:
         return None
-    return (
-        f"above {interval.gt}, at most {interval.le}" if interval.ge is None else f"{interval.ge} to {interval.le}"
-    )
+    low = f"above {interval.gt}, at most" if interval.ge is None else f"{interval.ge} to"
+    return f"{low} {interval.le}"
 
 
 @cache

@@ -8,9 +8,9 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from factors.pinhole import project_with_jacobian, to_pixels
+from shapepose_fg.core.arrays import Array, Index
 
 Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
 """A world axis, as a calibration names the direction that is up."""
@@ -36,13 +36,13 @@ class Camera:
 
     name: str
     """What the calibration and the detection files call it."""
-    K: NDArray[np.float64]
+    K: Array
     """(3, 3) intrinsic matrix, pixels."""
-    wTc: NDArray[np.float64]
+    wTc: Array
     """(4, 4) world-from-camera pose, metres."""
     image_size: tuple[int, int]
     """(width, height), pixels."""
-    distortion: NDArray[np.float64] = field(default_factory=lambda: np.zeros(5))
+    distortion: Array = field(default_factory=lambda: np.zeros(5))
     """Coefficients in OpenCV's order, zero for a camera without distortion. Perspective: (5,) k1 k2 p1 p2 k3,
     or (8,) with k4 k5 k6 of the rational model, (12,) with s1 to s4, (14,) with a tilt. Fisheye: (4,) k1 to k4."""
     lens: Lens = "perspective"
@@ -84,8 +84,8 @@ class Camera:
     def from_camera_from_world(
         cls,
         name: str,
-        K: NDArray[np.float64],
-        cTw: NDArray[np.float64],
+        K: Array,
+        cTw: Array,
         image_size: tuple[int, int],
         distortion: Sequence[float] = (),
         lens: Lens = "perspective",
@@ -107,17 +107,17 @@ class Camera:
         return cls(name, np.asarray(K, dtype=np.float64), wTc, image_size, coefficients, lens)
 
     @cached_property
-    def cTw(self) -> NDArray[np.float64]:
+    def cTw(self) -> Array:
         """(3, 4) camera-from-world, [R | t]."""
         R = self.wTc[:3, :3].T
         return np.hstack([R, -R @ self.wTc[:3, 3:]])
 
     @property
-    def centre(self) -> NDArray[np.float64]:
+    def centre(self) -> Array:
         """(3,) optical centre in the world, metres."""
         return self.wTc[:3, 3]
 
-    def project(self, points_world: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def project(self, points_world: Array) -> tuple[Array, Array]:
         """Project `points_world` (..., 3) to *undistorted* pixels (..., 2) and depths (...,) in metres.
 
         A point that is not in front of the camera (depth <= 0) gets NaN pixels.
@@ -125,7 +125,7 @@ class Camera:
         points_camera = points_world @ self.cTw[:, :3].T + self.cTw[:, 3]
         return to_pixels(points_camera, self.K)
 
-    def undistort(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    def undistort(self, xy: Array) -> Array:
         """Map measured pixels (N, 2) to the pixels of the same camera without distortion.
 
         NaN where there is no such pixel: beyond what the lens's polynomial reaches, or at 90 degrees and more
@@ -143,7 +143,7 @@ class Camera:
         pixels[~undone] = np.nan
         return pixels
 
-    def distort(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    def distort(self, xy: Array) -> Array:
         """Map undistorted pixels (N, 2) to the pixels that the real lens gives (inverse of `undistort`)."""
         xy = np.asarray(xy, dtype=np.float64)
         if len(xy) == 0 or not self._bends:
@@ -162,10 +162,8 @@ class Camera:
         """Whether the lens moves any pixel: a fisheye does without a coefficient too."""
         return self.lens == "fisheye" or bool(self.distortion.any())
 
-    def _normalised(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Normalised image coordinates (N, 2) of pixels (N, 2). Lenses bend these, so that K may have a skew,
-        which OpenCV's own functions pass over.
-        """
+    def _normalised(self, xy: Array) -> Array:
+        """Normalised image coordinates (N, 2) of pixels (N, 2); OpenCV's own functions pass over a skew in K."""
         inverse = np.linalg.inv(self.K)
         return np.ascontiguousarray(xy @ inverse[:2, :2].T + inverse[:2, 2])
 
@@ -174,7 +172,7 @@ _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 """Steps and accuracy, in normalised coordinates, of undoing a distortion."""
 
 
-def padded_distortion(coefficients: Sequence[float], lens: Lens = "perspective") -> NDArray[np.float64]:
+def padded_distortion(coefficients: Sequence[float], lens: Lens = "perspective") -> Array:
     """`coefficients` with zeros up to the next number that OpenCV takes; ValueError where there are too many."""
     given = np.asarray(coefficients, dtype=np.float64)
     for count in _COEFFICIENTS[lens]:
@@ -210,37 +208,37 @@ class Rig:
         return tuple(camera.name for camera in self.cameras)
 
     @property
-    def up_vector(self) -> NDArray[np.float64]:
+    def up_vector(self) -> Array:
         """(3,) unit vector that points up in the world."""
         return np.array(_AXES[self.up[-1]]) * (-1.0 if self.up.startswith("-") else 1.0)
 
     @cached_property
-    def K(self) -> NDArray[np.float64]:
+    def K(self) -> Array:
         """(V, 3, 3) intrinsic matrices."""
         return np.stack([camera.K for camera in self.cameras])
 
     @cached_property
-    def cTw(self) -> NDArray[np.float64]:
+    def cTw(self) -> Array:
         """(V, 3, 4) camera-from-world matrices."""
         # The order in memory is that of a copy in another process, so that both round alike.
         return np.ascontiguousarray(np.stack([camera.cTw for camera in self.cameras]))
 
     @cached_property
-    def centres(self) -> NDArray[np.float64]:
+    def centres(self) -> Array:
         """(V, 3) optical centres in the world, metres."""
         return np.stack([camera.centre for camera in self.cameras])
 
     @cached_property
-    def image_sizes(self) -> NDArray[np.float64]:
+    def image_sizes(self) -> Array:
         """(V, 2) width and height, pixels."""
         return np.array([camera.image_size for camera in self.cameras], dtype=np.float64)
 
     @cached_property
-    def focal_px(self) -> NDArray[np.float64]:
+    def focal_px(self) -> Array:
         """(V,) mean of the two focal lengths, pixels."""
         return self.K[:, [0, 1], [0, 1]].mean(axis=1)
 
-    def project(self, points_world: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def project(self, points_world: Array) -> tuple[Array, Array]:
         """Project `points_world` (..., 3) into every view: undistorted pixels (V, ..., 2), depths (V, ...).
 
         NaN pixels where the depth is not positive.
@@ -251,13 +249,13 @@ class Rig:
         xy, depth = to_pixels(points_camera, self.K[:, None])
         return xy.reshape(len(self), *shape, 2), depth.reshape(len(self), *shape)
 
-    def rays(self, view: NDArray[np.intp], xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    def rays(self, view: Index, xy: Array) -> Array:
         """(D, 3) directions of length one, in the world, of undistorted pixels `xy` (D, 2) in views `view`."""
         camera = np.concatenate([self.normalise(view, xy), np.ones((len(xy), 1))], axis=1)
         world = np.einsum("dji,dj->di", self.cTw[view, :, :3], camera)
         return world / np.linalg.norm(world, axis=1, keepdims=True)
 
-    def normalise(self, view: NDArray[np.intp], xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    def normalise(self, view: Index, xy: Array) -> Array:
         """Normalised image coordinates (D, 2) of undistorted pixels `xy` (D, 2) seen in `view` (D,)."""
         K_inverse = np.linalg.inv(self.K)[view]
         return np.einsum("dij,dj->di", K_inverse[:, :2, :2], xy) + K_inverse[:, :2, 2]
@@ -267,11 +265,11 @@ class Rig:
 class Views:
     """The cameras of N rows (people, frames or both), each row with cameras of its own if they move."""
 
-    K: NDArray[np.float64]
+    K: Array
     """(V, 3, 3) intrinsic matrices of cameras that are the same for all rows, or (N, V, 3, 3), pixels."""
-    cTw: NDArray[np.float64]
+    cTw: Array
     """(V, 3, 4) camera from world of cameras that stand still, or (N, V, 3, 4), metres."""
-    image_sizes: NDArray[np.float64] | float = np.inf
+    image_sizes: Array | float = np.inf
     """(V, 2) width and height, pixels; infinite where they are not known."""
 
     def __post_init__(self) -> None:
@@ -299,18 +297,16 @@ class Views:
         return lengths[0] if lengths else None
 
     @property
-    def focal_px(self) -> NDArray[np.float64]:
+    def focal_px(self) -> Array:
         """(V,) or (N, V) mean of the two focal lengths, pixels."""
         return (self.K[..., 0, 0] + self.K[..., 1, 1]) / 2
 
-    def rows(self, index: NDArray[np.intp]) -> "Views":
+    def rows(self, index: Index) -> "Views":
         """The cameras of some of the rows."""
         K, cTw = (array[index] if array.ndim == 4 else array for array in (self.K, self.cTw))
         return Views(K, cTw, self.image_sizes)
 
-    def project(
-        self, points: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def project(self, points: Array) -> tuple[Array, Array, Array]:
         """Pixels (N, J, V, 2), depths (N, J, V) and derivatives (N, J, V, 2, 3) of `points` (N, J, 3), metres.
 
         Undistorted pixels; they and the derivatives are NaN where the depth is not positive.

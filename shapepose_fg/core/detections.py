@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.skeleton import Skeleton
 
 
@@ -14,17 +14,17 @@ from shapepose_fg.core.skeleton import Skeleton
 class Detections:
     """The 2D joint candidates of one frame in all views, and their part affinities."""
 
-    view: NDArray[np.intp]
+    view: Index
     """(D,) index of the camera in the rig."""
-    joint: NDArray[np.intp]
+    joint: Index
     """(D,) index of the joint in the skeleton."""
-    xy: NDArray[np.float64]
+    xy: Array
     """(D, 2) position, undistorted pixels."""
-    confidence: NDArray[np.float64]
+    confidence: Array
     """(D,) the detector's score, 0 to 1."""
-    pairs: NDArray[np.intp]
+    pairs: Index
     """(E, 2) two candidates of one view that a limb of the skeleton joins, first joint of the limb first."""
-    affinity: NDArray[np.float64]
+    affinity: Array
     """(E,) how well the image supports that the two belong to one person; a pair not listed has 0."""
 
     def __post_init__(self) -> None:
@@ -38,11 +38,11 @@ class Detections:
     def __len__(self) -> int:
         return len(self.view)
 
-    def only(self, keep: NDArray[np.bool_]) -> "Detections":
+    def only(self, keep: Mask) -> "Detections":
         """The candidates of the mask `keep` (D,), and the affinities between them."""
         return self.rows(np.flatnonzero(keep))
 
-    def rows(self, index: NDArray[np.intp]) -> "Detections":
+    def rows(self, index: Index) -> "Detections":
         """The candidates `index` (K,), each once, in that order, and the affinities between them."""
         place = np.full(len(self), -1, dtype=np.intp)
         place[index] = np.arange(len(index))

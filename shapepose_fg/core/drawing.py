@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index, Real, Whole
 from shapepose_fg.core.skeleton import BODY_25
 
 PALETTE = ("#3f7fb8", "#e0962f", "#2f9e80", "#c06c9c", "#6cb6dd", "#c8623f", "#7d70b8", "#a8a03c")
@@ -23,7 +24,7 @@ def colour_of(person: int) -> tuple[float, float, float]:
     return rgb(PALETTE[person % len(PALETTE)])
 
 
-def bones_of(joint_names: tuple[str, ...]) -> NDArray[np.intp]:
+def bones_of(joint_names: tuple[str, ...]) -> Index:
     """(B, 2) joints that a line joins: each of BODY_25 and the nearest joint towards the hip that is there."""
     rows = zip(BODY_25.joints, BODY_25.parents, strict=True)
     parents = {name: BODY_25.joints[parent] for name, parent in rows if parent >= 0} | {"Head": "Neck"}
@@ -37,7 +38,7 @@ def bones_of(joint_names: tuple[str, ...]) -> NDArray[np.intp]:
     return np.array(pairs, dtype=np.intp).reshape(-1, 2)
 
 
-def vertex_normals(vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> NDArray[np.float64]:
+def vertex_normals(vertices: Real, faces: Whole) -> Array:
     """Unit normals (N, 3): the mean of the adjacent faces', weighted by their areas."""
     a, b, c = (np.asarray(vertices, dtype=np.float64)[faces[:, m]] for m in range(3))
     normal = np.cross(b - a, c - a)
@@ -48,9 +49,7 @@ def vertex_normals(vertices: NDArray[np.floating], faces: NDArray[np.integer]) -
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
 
 
-def thinned(
-    vertices: NDArray[np.float64], faces: NDArray[np.integer], cell_m: float = CELL_M
-) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
+def thinned(vertices: Array, faces: Whole, cell_m: float = CELL_M) -> tuple[Index, NDArray[np.int32]]:
     """Which vertices (M,) of a mesh stay, and its triangles (F, 3) among these; for a T-pose, metres.
 
     Of the vertices in a cell of a grid the one nearest to their middle stands for all of them, and triangles that

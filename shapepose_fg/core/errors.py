@@ -1,5 +1,8 @@
 """The one exception that a user is meant to read: what is wrong with the input, where, and the cure."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 _LONGEST = 1000
 """Characters of a message: what a file holds in place of a number can be of any length."""
 
@@ -12,3 +15,14 @@ class InputError(ValueError):
         if len(line) > _LONGEST:
             line = f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 3 :]}"
         super().__init__(line)
+
+
+@contextmanager
+def naming(place: object, cure: str = "") -> Iterator[None]:
+    """A ValueError inside the block is an InputError that names its place, with the `cure` at its end."""
+    try:
+        yield
+    except InputError:
+        raise
+    except ValueError as error:
+        raise InputError(f"{place}: {error}{'; ' if cure else ''}{cure}") from None

@@ -6,7 +6,8 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from shapepose_fg.core.arrays import Array
 
 _LEAST_FPS, _MOST_FPS = 1e-3, 1e6
 """No recording of people is slower, or faster."""
@@ -18,7 +19,7 @@ ASSUMED_FPS = 30.0
 class FrameTimes:
     """The times of T frames; frame numbers count from 0 in the file, as in `Reconstruction.frame`."""
 
-    time_s: NDArray[np.float64]
+    time_s: Array
     """(T,) seconds; or (T, V), a column for each camera, where they are not synchronised."""
     source: str = "given"
     """Where the times come from: "assumed", "fps", "given", or the name of a file."""
@@ -44,9 +45,8 @@ class FrameTimes:
     def from_fps(cls, fps: float, frames: int) -> "FrameTimes":
         """`frames` frames at `fps` frames a second, frame 0 at 0 s."""
         if not _LEAST_FPS <= fps <= _MOST_FPS:
-            raise ValueError(
-                f"fps must be a positive number of frames a second, {_LEAST_FPS:g} to {_MOST_FPS:g}, got {fps}"
-            )
+            bounds = f"{_LEAST_FPS:g} to {_MOST_FPS:g}"
+            raise ValueError(f"fps must be a positive number of frames a second, {bounds}, got {fps}")
         return cls(np.arange(frames) / fps, source="fps")
 
     @classmethod
@@ -55,11 +55,11 @@ class FrameTimes:
         return cls(np.arange(frames) / ASSUMED_FPS, source="assumed")
 
     @property
-    def frame_s(self) -> NDArray[np.float64]:
+    def frame_s(self) -> Array:
         """(T,) the time of each frame: the mean over its cameras where each has its own."""
         return self.time_s if self.time_s.ndim == 1 else self.time_s.mean(axis=1)
 
-    def of_views(self, views: int) -> NDArray[np.float64]:
+    def of_views(self, views: int) -> Array:
         """(T, V) the time of each frame in each of `views` cameras."""
         return self.time_s if self.time_s.ndim == 2 else np.repeat(self.time_s[:, None], views, axis=1)
 
@@ -68,9 +68,7 @@ class FrameTimes:
         if len(self) != frames:
             raise ValueError(f"times are needed for each of the {frames} frames, got {len(self)}")
         if self.time_s.ndim == 2 and self.time_s.shape[1] != views:
-            raise ValueError(
-                f"times must have a column for each of the {views} cameras, got {self.time_s.shape[1]}"
-            )
+            raise ValueError(f"times need a column for each of the {views} cameras, got {self.time_s.shape[1]}")
 
     def as_dict(self) -> dict[str, Any]:
         """What run.json says of the times: where they come from, and the median rate."""

@@ -4,11 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Mask, Whole
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observations import Observations
@@ -40,9 +41,9 @@ class Gate(IntEnum):
 class ObservationTable(Table):
     """The detections of N rows (person and frame), J joints and V views; row i is row i of people.npz."""
 
-    frame: Annotated[NDArray[np.integer], Column("N", np.int64)]
+    frame: Annotated[Whole, Column("N", np.int64)]
     """(N,) frame of each row."""
-    person: Annotated[NDArray[np.integer], Column("N", np.int64)]
+    person: Annotated[Whole, Column("N", np.int64)]
     """(N,) identity of the person of each row."""
     joint_names: Annotated[NDArray[np.str_], Column("J", np.str_)]
     """(J,) names of the joints."""
@@ -98,8 +99,8 @@ class ObservationTable(Table):
     def of(
         cls,
         observations: Observations,
-        place: NDArray[np.integer],
-        joints: NDArray[np.float64],
+        place: Whole,
+        joints: Array,
         gate: NDArray[np.uint8],
         rig: Rig,
         joint_names: Sequence[str],
@@ -132,9 +133,7 @@ class ObservationTable(Table):
         )
 
     @classmethod
-    def empty(
-        cls, joint_names: Sequence[str] = BODY_25.joints, view_names: Sequence[str] = ()
-    ) -> "ObservationTable":
+    def empty(cls, joint_names: Sequence[str] = BODY_25.joints, view_names: Sequence[str] = ()) -> Self:
         """The table of a result without rows."""
         return cls.without_rows(joint_names=np.array(joint_names, str), view_names=np.array(view_names, str))
 
@@ -143,7 +142,7 @@ class ObservationTable(Table):
         """The rows of `parts`, one after the other; ValueError where joints or views differ."""
         return ObservationTable.joined(parts) if len(parts) > 0 else cls.empty()
 
-    def observations(self, initial: NDArray[np.float64], time_s: NDArray[np.float64]) -> Observations:
+    def observations(self, initial: Array, time_s: Array) -> Observations:
         """The rows as they were given to be solved, dropped detections too: to solve them anew.
 
         `initial` (N, J, 3) is where to begin, `time_s` (N,) when the rows' frames were taken. Which detection each
@@ -161,7 +160,7 @@ class ObservationTable(Table):
         )
 
     @property
-    def used(self) -> NDArray[np.bool_]:
+    def used(self) -> Mask:
         """(N, J, V) which detections are part of the solution."""
         return self.gate == Gate.USED
 
@@ -196,7 +195,7 @@ class ObservationTable(Table):
         return opened
 
 
-def place_in_view(candidate: NDArray[np.integer], view: NDArray[np.integer]) -> NDArray[np.int32]:
+def place_in_view(candidate: Whole, view: Whole) -> NDArray[np.int32]:
     """Detections counted among those of their own view, from where they are counted over all views of a frame.
 
     `candidate` of any shape holds rows of the frame's `Detections`, -1 for none (and stays so); `view` (D,) is

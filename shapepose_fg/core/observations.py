@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.storage.schema import Column, Table
 
@@ -18,23 +18,23 @@ _LATER: Any = None
 class Observations(Table):
     """The 2D observations of N rows: a row is one person (track) in one frame."""
 
-    xy: Annotated[NDArray[np.float64], Column("N J V 2", unit="px")]
+    xy: Annotated[Array, Column("N J V 2", unit="px")]
     """(N, J, V, 2) where view v saw joint j of the person, undistorted pixels; 0 where it did not."""
-    confidence: Annotated[NDArray[np.float64], Column("N J V")]
+    confidence: Annotated[Array, Column("N J V")]
     """(N, J, V) w_ij of Eq. 1, the detector's score; 0 where the view did not see the joint."""
-    initial: Annotated[NDArray[np.float64], Column("N J 3", unit="m")]
+    initial: Annotated[Array, Column("N J 3", unit="m")]
     """(N, J, 3) X_0: where stage I, or a track, puts the joints, metres; NaN where it does not know."""
-    track: Annotated[NDArray[np.intp], Column("N", np.intp)] = _LATER
+    track: Annotated[Index, Column("N", np.intp)] = _LATER
     """(N,) who it is, over time; 0 to N - 1 where it is not said."""
-    frame: Annotated[NDArray[np.intp], Column("N", np.intp, missing=0)] = _LATER
+    frame: Annotated[Index, Column("N", np.intp, missing=0)] = _LATER
     """(N,) frame of the row; 0 where it is not said."""
-    time_s: Annotated[NDArray[np.float64], Column("N V", unit="s", missing=0.0)] = _LATER
+    time_s: Annotated[Array, Column("N V", unit="s", missing=0.0)] = _LATER
     """(N, V) when each view was exposed, seconds: equal in a row if cameras are synchronised. 0 by default."""
-    candidate: Annotated[NDArray[np.intp], Column("N J V", np.intp, missing=-1)] = _LATER
+    candidate: Annotated[Index, Column("N J V", np.intp, missing=-1)] = _LATER
     """(N, J, V) which detection of the row's frame each observation is; -1 for none, or not said."""
-    probability: Annotated[NDArray[np.float64], Column("N J V", missing=1.0)] = _LATER
+    probability: Annotated[Array, Column("N J V", missing=1.0)] = _LATER
     """(N, J, V) how probable it is that the observation is this person's; 1 where it is not said."""
-    evidence: Annotated[NDArray[np.float64], Column("N", missing=np.nan)] = _LATER
+    evidence: Annotated[Array, Column("N", missing=np.nan)] = _LATER
     """(N,) what speaks for the person being there at all: over time `tracking/presence.py`, `own_evidence`, frame
     by frame a probability; NaN where it is not said."""
 
@@ -44,9 +44,7 @@ class Observations(Table):
         super().__post_init__()
 
     @classmethod
-    def of(
-        cls, candidate: NDArray[np.intp], detections: Detections, initial: NDArray[np.float64]
-    ) -> "Observations":
+    def of(cls, candidate: Index, detections: Detections, initial: Array) -> "Observations":
         """The detections `candidate` (N, J, V) of one frame, -1 for none, as observations."""
         seen = candidate >= 0
         xy, confidence = np.zeros((*seen.shape, 2)), np.zeros(seen.shape)
@@ -54,7 +52,7 @@ class Observations(Table):
         return cls(xy, confidence, initial, candidate=candidate)
 
     @property
-    def seen(self) -> NDArray[np.bool_]:
+    def seen(self) -> Mask:
         """(N, J, V) whether there is an observation."""
         return self.confidence > 0
 

@@ -11,7 +11,8 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.arrays import Array, Index, Mask, Whole
+from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.observation_table import ObservationTable
 from shapepose_fg.core.result_files import OBSERVATIONS, PEOPLE, RUN, RUN_ID, SavedTable, check_id, write_result
 from shapepose_fg.core.run_summary import check_run, merged_run
@@ -51,11 +52,13 @@ class Known(IntEnum):
     have as much to say."""
 
     @classmethod
-    def observed(cls, known: NDArray[np.integer]) -> NDArray[np.bool_]:
+    def observed(cls, known: Whole) -> Mask:
         """Of which joints (...) any view's detection was used."""
         return np.isin(known, (cls.SEEN, cls.WEAK))
 
 
+BODY = ("betas", "global_orient", "body_pose", "transl")
+"""The columns of a result that are a body."""
 MOST_NUMBER = 2**53 - 1
 """The highest number of a frame or a person: the last whole number that all real ones below it are."""
 _LATER: Any = None
@@ -66,35 +69,33 @@ _LATER: Any = None
 class Reconstruction(Table):
     """The people of a recording: N rows, one per person and frame, sorted as they were added."""
 
-    frame: Annotated[NDArray[np.integer], Column("N", np.int64, most=MOST_NUMBER)]
+    frame: Annotated[Whole, Column("N", np.int64, most=MOST_NUMBER)]
     """(N,) frame of each row, counted from 0 in the file."""
-    person: Annotated[NDArray[np.integer], Column("N", np.int64, most=MOST_NUMBER)]
+    person: Annotated[Whole, Column("N", np.int64, most=MOST_NUMBER)]
     """(N,) identity of the person; without tracking, a number within the frame."""
     joint_names: Annotated[NDArray[np.str_], Column("J", np.str_)]
     """(J,) names of the joints, as OpenPose writes them."""
-    joints: Annotated[NDArray[np.float64], Column("N J 3", unit="m", most=1e6)]
+    joints: Annotated[Array, Column("N J 3", unit="m", most=1e6)]
     """(N, J, 3) joint positions in the world, metres; NaN where unknown."""
-    covariance: Annotated[NDArray[np.float64], Column("N J 3 3", unit="m²", most=1e12)]
+    covariance: Annotated[Array, Column("N J 3 3", unit="m²", most=1e12)]
     """(N, J, 3, 3) covariance of each joint's position, square metres; NaN where unknown."""
-    confidence: Annotated[NDArray[np.float64], Column("N J", most=1e3)]
+    confidence: Annotated[Array, Column("N J", most=1e3)]
     """(N, J) mean confidence of a joint's observations over all views, 0 to 1."""
-    betas: Annotated[NDArray[np.float64], Column("N 10", most=1e3)]
+    betas: Annotated[Array, Column("N 10", most=1e3)]
     """(N, 10) shape of the body, standard deviations; NaN where there is no body."""
-    global_orient: Annotated[NDArray[np.float64], Column("N 3", unit="rad", most=1e3)]
+    global_orient: Annotated[Array, Column("N 3", unit="rad", most=1e3)]
     """(N, 3) orientation of the pelvis in the world, axis times angle, radians."""
-    body_pose: Annotated[NDArray[np.float64], Column("N 23 3", unit="rad", most=1e3)]
+    body_pose: Annotated[Array, Column("N 23 3", unit="rad", most=1e3)]
     """(N, 23, 3) rotation of every other body joint against its parent, axis times angle, radians."""
-    transl: Annotated[NDArray[np.float64], Column("N 3", unit="m", most=1e6)]
+    transl: Annotated[Array, Column("N 3", unit="m", most=1e6)]
     """(N, 3) translation of the body, metres."""
     status: Annotated[NDArray[np.str_], Column("N", np.str_, stored=f"U{max(map(len, Status))}")]
     """(N,) one of the values of `Status`."""
-    time_s: Annotated[NDArray[np.float64], Column("N", unit="s", most=1e12, missing=np.nan)] = _LATER
+    time_s: Annotated[Array, Column("N", unit="s", most=1e12, missing=np.nan)] = _LATER
     """(N,) when the row's frame was taken, seconds; NaN where unknown, as it is where the column is not given."""
-    velocity: Annotated[NDArray[np.float64], Column("N J 3", unit="m/s", most=1e9, missing=np.nan)] = _LATER
+    velocity: Annotated[Array, Column("N J 3", unit="m/s", most=1e9, missing=np.nan)] = _LATER
     """(N, J, 3) velocity of each joint in the world, m/s; NaN where unknown or not given."""
-    velocity_covariance: Annotated[
-        NDArray[np.float64], Column("N J 3 3", unit="(m/s)²", most=1e18, missing=np.nan)
-    ] = _LATER
+    velocity_covariance: Annotated[Array, Column("N J 3 3", unit="(m/s)²", most=1e18, missing=np.nan)] = _LATER
     """(N, J, 3, 3) covariance of each joint's velocity, (m/s)²; NaN where unknown or not given."""
     known: Annotated[NDArray[np.uint8], Column("N J", np.uint8, missing=Known.UNKNOWN, codes=Known)] = _LATER
     """(N, J) how each joint is known: codes of `Known`; unknown where not given."""
@@ -118,9 +119,7 @@ class Reconstruction(Table):
             raise ValueError(f"status must be one of {[*map(str, Status)]}, got {sorted(unknown)}")
         for name in ("frame", "person", "joint_names") if self.observations is not None else ():
             if not np.array_equal(getattr(self.observations, name), getattr(self, name)):
-                raise ValueError(
-                    f"observations must have the same {name} as the people, row by row (see `relabelled`)"
-                )
+                raise ValueError(f"observations must have the same {name} as the people (see `relabelled`)")
 
     @classmethod
     def empty(cls, joint_names: Sequence[str] = BODY_25.joints) -> "Reconstruction":
@@ -158,7 +157,7 @@ class Reconstruction(Table):
         """The same people, with more to say in run.json."""
         return replace(self, run=self.run | entries)
 
-    def relabelled(self, person: NDArray[np.integer]) -> "Reconstruction":
+    def relabelled(self, person: Whole) -> "Reconstruction":
         """The same rows with other identities (N,), in `observations` too."""
         table = None if self.observations is None else replace(self.observations, person=person)
         return replace(self, person=person, observations=table)
@@ -248,7 +247,7 @@ class OpenedReconstruction(ExitStack):
         every = max(1, -(-len(self) // most_rows))
         return self.rows(None if every == 1 else np.flatnonzero(self.frame % every == 0)), every
 
-    def rows(self, index: NDArray[np.intp] | None = None, *, observations: bool = True) -> Reconstruction:
+    def rows(self, index: Index | None = None, *, observations: bool = True) -> Reconstruction:
         """The rows `index` (R,), rising, or all; with what they were solved from, where that is wanted.
 
         InputError where a file is damaged, or they would not fit in memory.
@@ -257,24 +256,24 @@ class OpenedReconstruction(ExitStack):
         if self._observed is None or not observations:
             return people
         table = self._observed.read(index)
-        try:
+        with naming(self._observed.file, "delete it or run the reconstruction again"):
             return replace(people, observations=table)
-        except ValueError as error:
-            file = self._observed.file
-            raise InputError(f"{file}: {error}; delete it or run the reconstruction again") from None
 
 
 def _read_run(file: Path, people_id: object) -> dict[str, Any]:
     """What run.json says, if it is of the run with that id; empty where there is none."""
     run = read_json(file) if file.is_file() else {}
-    try:
+    with naming(file, "restore it or delete it"):
         if not isinstance(run, dict):
             raise ValueError("must hold an object")
         check_run(run)
-    except ValueError as error:
-        raise InputError(f"{file}: {error}; restore it or delete it") from None
     check_id(people_id, run.pop(RUN_ID, None), file)
     return run
+
+
+def with_body(*columns: Array) -> Mask:
+    """(N,) which rows have a body: all numbers of their `BODY` columns, each (N, ...), are known."""
+    return np.logical_and.reduce([np.isfinite(each).all(axis=tuple(range(1, each.ndim))) for each in columns])
 
 
 _BLOCK = 128

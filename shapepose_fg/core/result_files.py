@@ -1,11 +1,9 @@
-"""The files of a result, people.npz, observations.npz and run.json: written together, tied by one id, and
-opened.
-"""
+"""The files of a result, people.npz, observations.npz and run.json: written together, tied by one id, opened."""
 
 import hashlib
 import json
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO, Generic, TypeVar, cast
@@ -14,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.filesize import decimal
 
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.arrays import Index, Whole
+from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.run_summary import plain
 from shapepose_fg.core.storage.files import write_together
 from shapepose_fg.core.storage.npz import NpzFile, Pieces, write_npz
@@ -99,9 +98,7 @@ class SavedTable(ExitStack, Generic[T]):
     """people.npz or observations.npz, open: a table of the class `kind`."""
 
     def __init__(self, file: Path, kind: type[T], cure: str) -> None:
-        """InputError, with the `cure`, where it cannot be read or an array is missing that earlier files have
-        too.
-        """
+        """InputError, with the `cure`, where it cannot be read or an array is missing that earlier files have."""
         super().__init__()
         self.file, self.kind, self.cure = file, kind, cure
         self._columns, told = columns_of(kind), kind.meanings()
@@ -136,20 +133,18 @@ class SavedTable(ExitStack, Generic[T]):
             self.close()
             raise
 
-    def numbers(self, name: str) -> NDArray[np.integer]:
+    def numbers(self, name: str) -> Whole:
         """All of a column of whole numbers, checked: rows are chosen by it before the others are read."""
-        with self._naming():
+        with naming(self.file, self.cure):
             column = self._columns[name].checked(name, self._npz.array(name), {"N": self.count})
             self._columns[name].check_range(name, column)
             return column
 
-    def read(self, index: NDArray[np.intp] | None, **others: Any) -> T:
-        """The rows `index` (R,), rising, or all, and `others` beside them; InputError where they do not make a
-        table, or would not fit in memory.
-        """
+    def read(self, index: Index | None, **others: Any) -> T:
+        """The rows `index` (R,), rising, or all, and `others`; InputError where they are no table, or too many."""
         self._check_memory(self.count if index is None else len(index))
         read = self._npz.array if index is None else lambda name: self._npz.rows(name, index)
-        with self._naming():
+        with naming(self.file, self.cure):
             table = self.kind(**{name: read(name) for name in self._rows}, **self._shared)
             table.check_ranges()
             return replace(cast(Any, table), **others) if others else table
@@ -162,16 +157,6 @@ class SavedTable(ExitStack, Generic[T]):
                 f"{self.file}: {count} rows would take {decimal(needed)} of memory, and {decimal(free)} are free;"
                 " take some frames or people at a time (--frames, --person, or Reconstruction.open)"
             )
-
-    @contextmanager
-    def _naming(self) -> Iterator[None]:
-        """A ValueError inside the block is an InputError that names the file."""
-        try:
-            yield
-        except InputError:
-            raise
-        except ValueError as error:
-            raise InputError(f"{self.file}: {error}; {self.cure}") from None
 
 
 def free_memory() -> int | None:

@@ -66,9 +66,7 @@ def _joined(spans: Sequence[range]) -> list[Any]:
 
 
 def difference(one: Any, other: Any, name: str = "") -> tuple[str, Any, Any] | None:
-    """The dotted name of the first entry in which two sets of plain values differ, and both values; None where
-    there is none.
-    """
+    """The dotted name of the first entry in which two sets of plain values differ, and both values; or None."""
     if isinstance(one, dict) and isinstance(other, dict):
         for key in dict.fromkeys((*one, *other)):
             found = difference(one.get(key), other.get(key), f"{name}.{key}" if name else key)

@@ -8,7 +8,8 @@ from typing import Annotated, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.core.storage.npz import read_npz, write_npz
 from shapepose_fg.core.storage.schema import Column, Table
@@ -23,9 +24,9 @@ class SubjectShapes(Table):
 
     names: Annotated[NDArray[np.str_], Column("N", np.str_)]
     """(G,) who they are, each once: identities of a recording as text, or names of your own."""
-    betas: Annotated[NDArray[np.float64], Column("N 10")]
+    betas: Annotated[Array, Column("N 10")]
     """(G, 10) mean shape, standard deviations."""
-    information: Annotated[NDArray[np.float64], Column("N 10 10")]
+    information: Annotated[Array, Column("N 10 10")]
     """(G, 10, 10) inverse covariance of that shape, the prior over adults included."""
     body: str
     """Fingerprint of the body model that the betas are of (`body.fitting.weights.fingerprint`)."""
@@ -52,7 +53,7 @@ class SubjectShapes(Table):
         return cls(np.zeros(0, dtype="U1"), np.zeros((0, 10)), np.zeros((0, 10, 10)), body)
 
     @property
-    def covariance(self) -> NDArray[np.float64]:
+    def covariance(self) -> Array:
         """(G, 10, 10) how uncertain each shape is."""
         return np.linalg.inv(self.information).astype(np.float64, copy=False)
 
@@ -92,7 +93,5 @@ class SubjectShapes(Table):
                 f"{file}: these are shapes of another body model, their betas mean something else on this one;"
                 " give --body the model that they were made with, or another file"
             )
-        try:
+        with naming(file, _CURE):
             return cls(columns["names"], columns["betas"], columns["information"], body)
-        except ValueError as error:
-            raise InputError(f"{file}: {error}; {_CURE}") from None

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+
+from shapepose_fg.core.arrays import Index
 
 
 @dataclass(frozen=True)
@@ -74,9 +75,7 @@ class Skeleton:
                 )
             made.add(joint)
         if len(core) == 0:
-            raise ValueError(
-                f"{name}: core must have a joint at least, by which a person is recognised; name some"
-            )
+            raise ValueError(f"{name}: core must have a joint at least, by which a person is recognised; name one")
         other = {place[a]: place[b] for a, b in (*mirror, *((b, a) for a, b in mirror))}
         edges = tuple((place[a], place[b]) for a, b in limbs)
         grown = _grown(place[anchor], edges, len(joints))
@@ -133,7 +132,7 @@ class Skeleton:
         return beside[0], beside[1]
 
     @cached_property
-    def tree_levels(self) -> tuple[NDArray[np.intp], ...]:
+    def tree_levels(self) -> tuple[Index, ...]:
         """Joints by their distance from the root: level 0 is the root alone, level 1 its children, ..."""
         levels = [np.array([self.root])]
         while len(children := np.flatnonzero(np.isin(self.parents, levels[-1]))) > 0:
@@ -141,7 +140,7 @@ class Skeleton:
         return tuple(levels)
 
     @cached_property
-    def adjacency(self) -> NDArray[np.intp]:
+    def adjacency(self) -> Index:
         """(J, J) 1 where a limb joins two joints."""
         joined = np.zeros((len(self), len(self)), dtype=np.intp)
         first, second = np.array(self.limbs).T
@@ -149,7 +148,7 @@ class Skeleton:
         return joined
 
     @cached_property
-    def tree_neighbours(self) -> NDArray[np.intp]:
+    def tree_neighbours(self) -> Index:
         """(J, N) parent and children of each joint in the tree, filled up with -1."""
         parents = np.array(self.parents)
         lists = [[*parents[[j]][parents[[j]] >= 0], *np.flatnonzero(parents == j)] for j in range(len(self))]

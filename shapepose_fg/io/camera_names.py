@@ -56,9 +56,7 @@ def listing(names: Sequence[str], nothing: str = "nothing") -> str:
 
 
 def in_order(files: Sequence[tuple[int, Path]]) -> list[tuple[int, Path]]:
-    """Files by the numbers of their frames, which then rise; InputError where a number is no frame's, or twice
-    there.
-    """
+    """Files by the numbers of their frames, which rise; InputError where a number is no frame's or there twice."""
     ordered = sorted(files)
     if ordered[-1][0] >= MOST_FRAME:
         raise InputError(f"{ordered[-1][1]}: no frame has so high a number; number them by the recording's frames")

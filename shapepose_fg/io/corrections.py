@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.provenance import checksums
 from shapepose_fg.core.reconstruction import MOST_NUMBER, Reconstruction
 from shapepose_fg.core.result_files import OBSERVATIONS, PEOPLE, RUN
@@ -57,10 +57,8 @@ def read_corrections(folder: str | Path) -> tuple[Edit, ...]:
             )
         return ()
     content = validated(_File, read_json(file), file, _CURE)
-    try:
+    with naming(file, _CURE):
         edits = tuple(Edit(**edit.model_dump()) for edit in content.edits)
-    except ValueError as error:
-        raise InputError(f"{file}: {error}; {_CURE}") from None
     if content.people != _checksum(Path(folder)):
         raise InputError(f"{file}: people.npz is not what these corrections led to; {_CURE}")
     return edits
@@ -74,10 +72,8 @@ def correct(folder: str | Path, edit: Edit, solve: Solve | None = None) -> Edite
     """
     folder = Path(folder)
     edits, people = _kept_edits(folder), Reconstruction.load(folder)
-    try:
+    with naming(folder):
         edited = apply(people, edit)
-    except ValueError as error:
-        raise InputError(f"{folder}: {error}") from None
     solved = edited.people if solve is None else solve_anew(edited, solve)
     if len(edits) == 0:  # the result is copied aside, whole or not at all
         part = folder / _PART
@@ -100,9 +96,7 @@ def take_back(folder: str | Path, solve: Solve | None = None) -> tuple[Edit, Rec
     folder = Path(folder)
     edits = _kept_edits(folder)
     if len(edits) == 0:
-        raise InputError(
-            f"{folder}: there is no correction to take back; shapepose-fg tracks {folder} lists people"
-        )
+        raise InputError(f"{folder}: there is no correction to take back; see shapepose-fg tracks {folder}")
     if len(edits) == 1:
         _restore(folder)
         return edits[-1], Reconstruction.load(folder)

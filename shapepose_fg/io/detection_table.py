@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Index
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.core.storage.kept_arrays import Arrays, KeptArrays
@@ -62,30 +62,22 @@ class DetectionTable:
         block = self._at_hand[number]
         rows = slice(*block["candidate_start"][at : at + 2].tolist())
         links = slice(*block["pair_start"][at : at + 2].tolist())
-        view, joint = (block[name][rows].astype(np.intp) for name in ("view", "joint"))
-        pairs = block["pairs"][links].astype(np.intp)
-        return Detections(
-            view, joint, block["xy"][rows], block["confidence"][rows], pairs, block["affinity"][links]
-        )
+        view, joint, xy, confidence = (block[name][rows] for name in ("view", "joint", "xy", "confidence"))
+        pairs, affinity = block["pairs"][links].astype(np.intp), block["affinity"][links]
+        return Detections(view.astype(np.intp), joint.astype(np.intp), xy, confidence, pairs, affinity)
 
     def __iter__(self) -> Iterator[Detections]:
         return (self[frame] for frame in range(len(self)))
 
 
-def keep_block(
-    kept: KeptArrays,
-    number: int,
-    candidates: Detections,
-    candidate_start: NDArray[np.intp],
-    pair_start: NDArray[np.intp],
-) -> None:
+def keep_block(kept: KeptArrays, number: int, candidates: Detections, start: Index, pair_start: Index) -> None:
     """Keep block `number` of a recording: the candidates of its T frames, one frame after the other.
 
-    `pairs` count from the first candidate of their own frame; `candidate_start` and `pair_start` (T + 1,) are
+    `pairs` count from the first candidate of their own frame; `start` and `pair_start` (T + 1,) are
     where each frame's candidates and pairs begin.
     """
     arrays = {name: getattr(candidates, name).astype(dtype) for name, dtype in _KEPT.items()}
-    kept.keep(_name(number), arrays | {"candidate_start": candidate_start, "pair_start": pair_start})
+    kept.keep(_name(number), arrays | {"candidate_start": start, "pair_start": pair_start})
 
 
 def _name(number: int) -> str:

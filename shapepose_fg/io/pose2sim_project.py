@@ -77,9 +77,7 @@ def read_pose2sim_project(folder: Path) -> Pose2SimProject:
     config, session = _settings(folder)
     project = config.get("project", {})
     if not isinstance(project, dict):
-        raise InputError(
-            f"{folder / CONFIG}: project must be a table; write [project] as Pose2Sim's demos have it"
-        )
+        raise InputError(f"{folder / CONFIG}: project must be a table; write [project] as Pose2Sim's demos do")
     rate, span, multi_person = _checked(project, folder / CONFIG)
     calibration = _calibration(session, folder)
     entries = sorted((folder / "videos").iterdir()) if (folder / "videos").is_dir() else []
@@ -155,16 +153,12 @@ def _over(below: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
 
 
 def _calibration(session: Path, folder: Path) -> Path:
-    """The calibration of a session: the newest TOML, as Pose2Sim takes it, else a file of another known format, or
-    the folder itself, where a format has several files.
-    """
+    """The calibration of a session: the newest TOML, as Pose2Sim takes it, else a file or folder that is known."""
     places = dict.fromkeys((session.resolve(), folder.resolve()))
     inside = [each for place in places for each in sorted(place.iterdir()) if each.is_dir()]
     rooms = [each for each in inside if "calib" in each.name.lower()]
     if len(rooms) == 0:
-        raise InputError(
-            f"{session}: no folder of the calibration here; put the cameras into {session}/calibration"
-        )
+        raise InputError(f"{session}: no folder of the calibration here; put cameras into {session}/calibration")
     files = [each for room in rooms for each in room.iterdir() if each.is_file()]
     files.sort(key=lambda file: (file.stat().st_mtime, file.name), reverse=True)
     files.sort(key=lambda file: file.suffix != ".toml")  # the newest stays first among its kind

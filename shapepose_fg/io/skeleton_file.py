@@ -6,7 +6,7 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field
 
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.skeleton import MID_HIP, SKELETONS, Skeleton
 from shapepose_fg.core.storage.files import read_toml
 from shapepose_fg.io.validation import validated
@@ -70,14 +70,12 @@ def read_skeleton(path: str | Path) -> Skeleton:
 
     anchor = points.get(file.anchor, file.anchor) if isinstance(file.anchor, str) else pair(file.anchor)
     if not isinstance(anchor, str) and set(anchor) not in _HIPS:
-        raise InputError(
-            f"{path}: an anchor of two is the middle of the hips; name others under [middles] and anchor there"
-        )
+        raise InputError(f"{path}: an anchor of two is the middle of the hips; name others under [middles]")
     core = [points.get(joint, joint) for joint in file.core or ()]
     if file.core is None:
         core = [point for point in points.values() if point not in _FACE_AND_TOES]
         core += [] if isinstance(anchor, str) else [MID_HIP]
-    try:
+    with naming(path):
         return Skeleton.of(
             file.name,
             [points.get(joint, "") for joint in file.keypoints],
@@ -87,5 +85,3 @@ def read_skeleton(path: str | Path) -> Skeleton:
             core=core,
             middles={points[joint]: pair(ends) for joint, ends in file.middles.items()},
         )
-    except ValueError as error:
-        raise InputError(f"{path}: {error}") from None

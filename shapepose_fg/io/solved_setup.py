@@ -1,10 +1,13 @@
 """What a saved result was solved with: its cameras, its settings, and where the detector puts its joints."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
+from shapepose_fg.body.model.smpl_file import SmplArrays
+from shapepose_fg.body.shapes import read_body
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Reconstruction
@@ -28,6 +31,16 @@ class SolvedSetup(Generic[Settings]):
     """Where the detector puts its joints on the body; None where that was not asked for."""
     body: Path | None
     """File of the body model; None for the one that ships."""
+
+
+def body_of(run: Mapping[str, Any], given: Path | None = None) -> SmplArrays:
+    """The body model of a result whose run.json says `run`, or of the file `given`; InputError if it is gone."""
+    named = run.get("body") if given is None else given
+    file = None if named is None else Path(str(named))
+    if file is None or file.exists():
+        return read_body(file)
+    problem = "the body model of this result is not there any more"
+    raise InputError(f"{file}: {problem}; put it back, or say with --body where it is")
 
 
 def read_setup(folder: Path, people: Reconstruction, kind: type[Settings]) -> SolvedSetup[Settings]:

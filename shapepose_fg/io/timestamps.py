@@ -5,8 +5,8 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
@@ -61,7 +61,7 @@ def read_timestamps(path: str | Path, rig: Rig, frames: int) -> FrameTimes:
     return FrameTimes(time_s[:, 0] if len(wanted) == 1 else time_s, source=str(path))
 
 
-def _table(path: Path, rig: Rig) -> tuple[list[str], NDArray[np.float64], NDArray[np.intp]]:
+def _table(path: Path, rig: Rig) -> tuple[list[str], Array, Index]:
     """Names of the columns, the numbers (T, C), and the line of the file that each row is from."""
     names, rows, lines = list[str](), list[list[float]](), list[int]()
     for line, text in enumerate(read_text(path, most=_MOST_BYTES).splitlines(), start=1):
@@ -85,9 +85,7 @@ def _table(path: Path, rig: Rig) -> tuple[list[str], NDArray[np.float64], NDArra
     return names, np.array(rows).reshape(len(rows), len(names)), np.array(lines, dtype=np.intp)
 
 
-def _lines_of_frames(
-    path: Path, numbers: NDArray[np.float64], lines: NDArray[np.intp], frames: int
-) -> NDArray[np.intp]:
+def _lines_of_frames(path: Path, numbers: Array, lines: Index, frames: int) -> Index:
     """(T,) the row of each frame of the recording; frames that it does not have are passed over."""
     odd = np.flatnonzero((numbers != np.round(numbers)) | (numbers < 0))
     if len(odd) > 0:

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.errors import InputError
@@ -38,9 +38,7 @@ def write_association(recording: DetectionSequence, rig: Rig, folder: str | Path
         if camera.lens != "perspective" or camera.distortion[5:].any():
             raise ValueError(f"the format has five coefficients of distortion, camera {camera.name} another lens")
     if rig.up != "z":
-        raise ValueError(
-            f"the format has z up, this rig {rig.up}: turn the world before writing, and the truth with it"
-        )
+        raise ValueError(f"the format has z up, this rig {rig.up}: turn the world and the truth first")
     folder, calibration = Path(folder), dict[str, Any]()
     for camera in rig.cameras:
         entry = {
@@ -120,12 +118,7 @@ def _write_frames(stream: BinaryIO, recording: DetectionSequence, view: int, cam
 
 
 def association_lines(
-    kind: TextSkeleton,
-    joint: NDArray[np.intp],
-    fractions: NDArray[np.float64],
-    confidence: NDArray[np.float64],
-    pairs: NDArray[np.intp],
-    affinity: NDArray[np.float64],
+    kind: TextSkeleton, joint: Index, fractions: Array, confidence: Array, pairs: Index, affinity: Array
 ) -> Iterable[str]:
     """The lines of one frame: candidates joint by joint, then affinities limb by limb.
 
@@ -154,6 +147,6 @@ def association_lines(
             yield from (_numbers(row, 6) for row in scores)
 
 
-def _numbers(values: NDArray[np.float64], decimals: int) -> str:
+def _numbers(values: Array, decimals: int) -> str:
     """Numbers in a line; zeros short, for they are most of an affinity matrix."""
     return " ".join("0" if value == 0 else f"{value:.{decimals}f}" for value in values.tolist())

@@ -13,7 +13,8 @@ from shapepose_fg.body.fitting.fitter import BodyFitter, JointTargets, Shapes
 from shapepose_fg.body.fitting.weights import fingerprint
 from shapepose_fg.body.model.soles import above_floor
 from shapepose_fg.body.shapes import SubjectShapes, recognise
-from shapepose_fg.core.reconstruction import Reconstruction, Status
+from shapepose_fg.core.arrays import Array, Whole
+from shapepose_fg.core.reconstruction import BODY, Reconstruction, Status
 from shapepose_fg.core.storage.kept_arrays import InMemory, KeptArrays
 from shapepose_fg.estimation.floor import Floor
 
@@ -25,8 +26,6 @@ PIECE_ROWS = 160
 """Rows of such a piece: some seconds, so that poses are linked in time there, too."""
 _OVERLAP_ROWS = 32
 """Rows that a segment has of its neighbours, on either side, when poses are fitted."""
-BODY = ("betas", "global_orient", "body_pose", "transl")
-"""The columns of a result that are a body."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +36,7 @@ class Person:
     """Who it is."""
     targets: JointTargets
     """The joints as they were solved."""
-    time_s: NDArray[np.float64]
+    time_s: Array
     """(N,) seconds."""
     shapes: Shapes | None = None
     """What is known of the shape, (1)."""
@@ -50,13 +49,7 @@ class Person:
     """What bodies do not sink into, where it was found."""
 
     @classmethod
-    def of(
-        cls,
-        number: int,
-        joints: NDArray[np.float64],
-        covariance: NDArray[np.float64],
-        time_s: NDArray[np.float64],
-    ) -> "Person":
+    def of(cls, number: int, joints: Array, covariance: Array, time_s: Array) -> "Person":
         """From the solved rows of one person: `joints` (N, J, 3), `covariance` (N, J, 3, 3), `time_s` (N,)."""
         solved = np.isfinite(joints.sum(axis=-1)) & np.isfinite(covariance.sum(axis=(-1, -2)))
         information = np.zeros_like(covariance)
@@ -93,9 +86,7 @@ class BodiesOverTime:
     shapes: SubjectShapes
     """Everybody's shape; those who were recognised by their known names."""
 
-    def filled(
-        self, column: str, values: NDArray[Any], person: NDArray[np.integer], before: Mapping[int, int]
-    ) -> NDArray[Any]:
+    def filled(self, column: str, values: NDArray[Any], person: Whole, before: Mapping[int, int]) -> NDArray[Any]:
         """Rows of a column of a result with these bodies, where there are any; `status` says that there are.
 
         `values` (R, ...) are the rows as they were, `person` (R,) whose they are, and `before` how many rows of
@@ -196,10 +187,7 @@ def _spread(count: int, most: int, length: int) -> list[range]:
 
 
 def with_bodies_over_time(
-    people: Reconstruction,
-    fitter: BodyFitter,
-    known: SubjectShapes | None = None,
-    floor: Floor | None = None,
+    people: Reconstruction, fitter: BodyFitter, known: SubjectShapes | None = None, floor: Floor | None = None
 ) -> Reconstruction:
     """The same rows with one body per person, fitted to the joints as they were solved, and everybody's shape.
 
@@ -234,10 +222,9 @@ def with_bodies_over_time(
 
 def _subjects(shapes: Mapping[int, Shapes], body: str) -> SubjectShapes:
     """Everybody's shape, named by their numbers."""
-    mean, information = (
-        np.concatenate([getattr(each, name) for each in shapes.values()]) for name in ("mean", "information")
-    )
-    return SubjectShapes(np.array([str(number) for number in shapes]), mean, information, body)
+    mean, information = ([getattr(each, name) for each in shapes.values()] for name in ("mean", "information"))
+    names = np.array([str(number) for number in shapes])
+    return SubjectShapes(names, np.concatenate(mean), np.concatenate(information), body)
 
 
 def _names(numbers: Sequence[int], known: SubjectShapes, whose: Sequence[int]) -> list[str]:

@@ -193,9 +193,7 @@ def _dask() -> tuple[Any, Any]:
     try:
         from distributed import Client, LocalCluster
     except ImportError:
-        raise InputError(
-            'Dask is not installed: pip install "shapepose-fg[cluster]", or leave --cluster out'
-        ) from None
+        raise InputError('Dask is not installed: pip install "shapepose-fg[cluster]", or leave it out') from None
     return Client, LocalCluster
 
 

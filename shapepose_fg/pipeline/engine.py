@@ -99,9 +99,8 @@ class Setup:
             return (hips if weak else sure).people(detections, rig, skeleton, book)
 
         motion = MotionModel.load(skeleton.joints, config.motion, config.law)
-        scale = BodyScale(
-            longest_bones(skeleton), motion.density(np.full(len(skeleton), FAST_M_S), UNSEEN_S), config.law
-        )
+        density = motion.density(np.full(len(skeleton), FAST_M_S), UNSEEN_S)
+        scale = BodyScale(longest_bones(skeleton), density, config.law)
         tracker = Tracker(
             skeleton, scale, find, tracking, config.observations, weak_births=config.temporal, drop=book.drop_in
         )
@@ -136,7 +135,7 @@ class StageOne:
     def people(self, detections: Detections, rig: Rig, skeleton: Skeleton, book: Notebook) -> Observations:
         """The people of a frame."""
         if not self.proposals.evidence:
-            return self._anchored_at_hips(detections, rig, skeleton, book)
+            return self._by_hips(detections, rig, skeleton, book)
         once, index = without_repeats(detections)
         points = self._points(once, rig, book)
         with book.stage("propose"):
@@ -153,9 +152,7 @@ class StageOne:
             book.thin("points", len(points.xyz) < len(every.xyz))
         return points
 
-    def _anchored_at_hips(
-        self, detections: Detections, rig: Rig, skeleton: Skeleton, book: Notebook
-    ) -> Observations:
+    def _by_hips(self, detections: Detections, rig: Rig, skeleton: Skeleton, book: Notebook) -> Observations:
         """As the paper has it: votes, hips that anchor people, and joints linked to them."""
         points = self._points(detections, rig, book)
         with book.stage("vote"):

@@ -41,20 +41,16 @@ def estimate_offsets(
         thinned = ThinnedFrames(detections, len(rig), config.candidates)
         offsets = offsets_of(Setup(rig, thinned.skeleton, config, fitter), thinned, Notebook())
     if offsets is None:
-        raise ValueError(
-            f"offsets are known for {BODY_25.name} only, these are joints of {detections.skeleton.name}"
-        )
+        raise ValueError(f"offsets are known for {BODY_25.name} only, not for {detections.skeleton.name}")
     return offsets
 
 
-def kept_offsets(
-    kept: KeptArrays, setup: Setup, detections: ThinnedFrames, book: Notebook
-) -> KeypointOffsets | None:
+def kept_offsets(kept: KeptArrays, setup: Setup, frames: ThinnedFrames, book: Notebook) -> KeypointOffsets | None:
     """`offsets_of`; what a run began with it goes on with."""
     columns = [each.name for each in fields(KeypointOffsets)]
     if len(kept.names(_OFFSETS)) > 0:
         return KeypointOffsets(**{name: kept.array(_OFFSETS, name) for name in columns})
-    offsets = offsets_of(setup, detections, book)
+    offsets = offsets_of(setup, frames, book)
     if offsets is not None:
         kept.keep(_OFFSETS, {name: getattr(offsets, name) for name in columns})
     return offsets

@@ -16,7 +16,6 @@ from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.frame_times import FrameTimes, check_cuts, spans_of
 from shapepose_fg.core.provenance import versions
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.core.storage.kept_arrays import InMemory, KeptArrays
 from shapepose_fg.estimation.floor import Floor
 from shapepose_fg.estimation.window_graph import ExtraFactors
@@ -149,7 +148,7 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
                 with book.stage("follow"):
                     # Between two frames, where no rounding matters.
                     cuts_s = (times.frame_s[cuts] + times.frame_s[[cut - 1 for cut in cuts]]) / 2
-                    result = replace(result, names=_names(result, skeleton, config, cuts_s.tolist()))
+                    result = replace(result, names=_names(result, setup, cuts_s.tolist()))
             floor: Floor | str = "frames stand alone" if not config.temporal else "not sought"
             model = setup.fitter.model
             if config.temporal and model is not None and len(result) > 0:
@@ -180,16 +179,14 @@ def _fit_person(setup: Setup, person: Person) -> dict[str, Any]:
     return person.fitted(setup.fitter)
 
 
-def _names(
-    tracks: Assembly, skeleton: Skeleton, config: PipelineConfig, cuts_s: Sequence[float]
-) -> dict[int, int]:
+def _names(tracks: Assembly, setup: Setup, cuts_s: Sequence[float]) -> dict[int, int]:
     """What tracks are called when those of one person are joined over longer times out of sight."""
 
     def trace(track: int) -> Trace:
         pieces = tracks.own_pieces(track, ("time_s", "joints"))
-        return Trace.concatenate([Trace.of(track, time_s, joints, skeleton) for time_s, joints in pieces])
+        return Trace.concatenate([Trace.of(track, time_s, joints, setup.skeleton) for time_s, joints in pieces])
 
-    return stitch(Ends.of(map(trace, tracks.rows_of)), config.stitching, cuts_s)
+    return stitch(Ends.of(map(trace, tracks.rows_of)), setup.config.stitching, cuts_s)
 
 
 def _summary(notes: Notes, config: PipelineConfig, frames: range, result: Assembly) -> dict[str, Any]:

@@ -6,14 +6,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Whole
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.frame_times import FrameTimes, segments
 from shapepose_fg.core.observation_table import Gate, ObservationTable, place_in_view
-from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.reconstruction import BODY, Reconstruction
 from shapepose_fg.estimation.window_solution import WindowSolution
-from shapepose_fg.pipeline.bodies_over_time import BODY
 from shapepose_fg.pipeline.engine import Setup, Solved
 from shapepose_fg.pipeline.execution import Pool
 from shapepose_fg.pipeline.runs.chunks import Border, Chunk, Identities, cut_in_chunks, windows_of
@@ -45,7 +44,7 @@ class SolvedWindows:
     """Where this process takes its notes."""
 
     @cached_property
-    def _time_s(self) -> NDArray[np.float64]:
+    def _time_s(self) -> Array:
         """(T, V) when each view took each frame."""
         return self.times.of_views(len(self.setup.rig))
 
@@ -108,17 +107,16 @@ class SolvedWindows:
                     yield chunk, given
 
         identities = Identities(begin.next_id, begin.border)
+        name = identities.name
         for found in pool.map(solve_chunk, jobs()):
             chunk, read = waiting.popleft()
             names = identities.names(found.begins, alone=chunk.first == chunk.own.start)
             identities.remember(found.ends, names)
             for solved in found.solved:
                 notes, last = self._notes(solved), solved is found.solved[-1]
-                notes.problems = [
-                    replace(each, track=identities.name(each.track, names)) for each in notes.problems
-                ]
-                notes.evidence = {identities.name(of, names): each for of, each in notes.evidence.items()}
-                track = [identities.name(each, names) for each in solved.solution.observations.track.tolist()]
+                notes.problems = [replace(each, track=name(each.track, names)) for each in notes.problems]
+                notes.evidence = {name(of, names): each for of, each in notes.evidence.items()}
+                track = [name(each, names) for each in solved.solution.observations.track.tolist()]
                 if last:
                     notes.add(read)
                     notes.add(found.notes)
@@ -164,11 +162,7 @@ class SolvedWindows:
 
 
 def result_rows(
-    solution: WindowSolution,
-    place: NDArray[np.integer],
-    rig: Rig,
-    joint_names: Sequence[str],
-    person: NDArray[np.integer],
+    solution: WindowSolution, place: Whole, rig: Rig, joint_names: Sequence[str], person: Whole
 ) -> Reconstruction:
     """N solved rows as a result, in their order; bodies that were not fitted are NaN there.
 

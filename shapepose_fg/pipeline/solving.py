@@ -10,6 +10,7 @@ from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.threads import torch_threads
+from shapepose_fg.core.arrays import Index, Mask, Whole
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.frame_times import segments
 from shapepose_fg.core.reconstruction import Reconstruction
@@ -96,14 +97,11 @@ def _solved(
             assert part.observations is not None
             # From the views: the joints as they are may be somebody else's.
             observations = part.observations.observations(np.full_like(part.joints, np.nan), part.time_s)
-            yield (
-                own,
-                part,
-                solve_window(observations, views, solver.fitter, settings, extra_factors=extra_factors),
-            )
+            found = solve_window(observations, views, solver.fitter, settings, extra_factors=extra_factors)
+            yield own, part, found
 
 
-def _rows_of(rows: Reconstruction, own: range, segment: range, overlap_s: float) -> NDArray[np.intp]:
+def _rows_of(rows: Reconstruction, own: range, segment: range, overlap_s: float) -> Index:
     """Rows in a window's `own` frames, and in those within `overlap_s` of its borders, none beyond a cut."""
     frame, time_s = rows.frame, rows.time_s
     known, first = np.unique(frame, return_index=True)
@@ -134,6 +132,6 @@ def _windows(rows: Reconstruction, config: PipelineConfig) -> list[tuple[range, 
     return [(own, segment) for own, segment in windows if _inside(rows.frame, own).any()]
 
 
-def _inside(frame: NDArray[np.integer], span: range) -> NDArray[np.bool_]:
+def _inside(frame: Whole, span: range) -> Mask:
     """(N,) which frames are in `span`."""
     return (frame >= span.start) & (frame < span.stop)

@@ -8,8 +8,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.config import WindowConfig as WindowConfig
 from shapepose_fg.tracking.following import Decided, FollowState, alone, finish, follow
@@ -26,7 +26,7 @@ def window_stop(start: int, end: int, frames: int) -> int:
     return stop if stop + frames // 2 < end else end
 
 
-def near_border(times_s: NDArray[np.float64], border_s: float, overlap_s: float) -> NDArray[np.bool_]:
+def near_border(times_s: Array, border_s: float, overlap_s: float) -> Mask:
     """(T,) which frames, at `times_s` (T,), are so near to the border between two windows that both have them."""
     return np.abs(times_s - border_s) <= overlap_s
 

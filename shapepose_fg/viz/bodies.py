@@ -3,37 +3,30 @@
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from shapepose_fg.core.reconstruction import Reconstruction, Status
+from shapepose_fg.core.arrays import Array, Index, Real, Whole
+from shapepose_fg.core.reconstruction import BODY, Reconstruction, Status, with_body
 
 if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel
 
-_BODY = ("betas", "global_orient", "body_pose", "transl")
 
-
-def surfaces(people: Reconstruction, body: "BodyModel") -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+def surfaces(people: Reconstruction, body: "BodyModel") -> tuple[Array, Index]:
     """Vertices (P, Nv, 3), metres, of the rows that have a body, and which rows these are (P,)."""
     import torch
 
     from shapepose_fg.body.model.body_model import BodyParameters
 
-    there = people.status == str(Status.OK)
-    for name in _BODY:
-        known = np.isfinite(getattr(people, name))
-        there = there & known.all(axis=tuple(range(1, known.ndim)))
-    rows = np.flatnonzero(there)
+    columns = [getattr(people, name) for name in BODY]
+    rows = np.flatnonzero((people.status == str(Status.OK)) & with_body(*columns))
     if len(rows) == 0:
         return np.zeros((0, body.num_vertices, 3)), rows
-    parts = (torch.from_numpy(getattr(people, name)[rows]).to(body.dtype) for name in _BODY)
+    parts = (torch.from_numpy(column[rows]).to(body.dtype) for column in columns)
     with torch.no_grad():
         return body.vertices(BodyParameters(*parts)).numpy().astype(np.float64), rows
 
 
-def joined(
-    vertices: NDArray[np.floating], faces: NDArray[np.integer]
-) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+def joined(vertices: Real, faces: Whole) -> tuple[Array, Index]:
     """Bodies (P, Nv, 3) that share `faces` (F, 3), as one mesh: vertices (P Nv, 3) and faces (P F, 3)."""
     people, count = vertices.shape[:2]
     every = faces[None] + count * np.arange(people)[:, None, None]

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index, Real, Whole
 from shapepose_fg.core.camera import Camera
-from shapepose_fg.core.drawing import vertex_normals
 
 NEAR_M = 0.05
 """Faces with a corner nearer than this are dropped, metres: nothing is clipped."""
@@ -30,8 +30,6 @@ _BOTH_SIDES = (
     .setShadingType(cv2.RASTERIZE_SHADING_FLAT)
     .setCullingMode(cv2.RASTERIZE_CULLING_NONE)
 )
-_AMBIENT = 0.45
-"""Light that reaches every part of a shaded mesh."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +42,7 @@ class Surface:
     """(H, W) index of the face that is met; -1 where there is none."""
 
 
-def look_at(eye: NDArray[np.float64], target: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[np.float64]:
+def look_at(eye: Array, target: Array, up: Array) -> Array:
     """Pose `wTc` (4, 4) of a camera at `eye` (3,) that looks at `target` (3,), image up towards `up` (3,)."""
     forward = np.asarray(target, dtype=np.float64) - eye
     forward /= np.linalg.norm(forward)
@@ -75,9 +73,7 @@ def scaled(camera: Camera, scale: float) -> Camera:
     return zoom(camera, (0.0, 0.0, width, height), max(1, round(width * scale)))
 
 
-def render_depth(
-    vertices: NDArray[np.floating], faces: NDArray[np.integer], camera: Camera, *, cull_back: bool = False
-) -> Surface:
+def render_depth(vertices: Real, faces: Whole, camera: Camera, *, cull_back: bool = False) -> Surface:
     """Depth and face index of the mesh `vertices` (N, 3) world, `faces` (F, 3), in `camera`'s image.
 
     `cull_back` leaves out faces seen from behind: right, and twice as fast, for closed meshes whose faces
@@ -91,12 +87,8 @@ def render_depth(
 
 
 def first_surface_at(
-    points_world: NDArray[np.floating],
-    faces: NDArray[np.integer],
-    camera: Camera,
-    column: NDArray[np.intp],
-    row: NDArray[np.intp],
-) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+    points_world: Real, faces: Whole, camera: Camera, column: Index, row: Index
+) -> tuple[NDArray[np.float32], Index]:
     """Depth and vertex, each of the shape of `column` and `row`, of the first surface on the rays of some pixels.
 
     The vertex is the first corner of the face that is met. inf and -1 where nothing is. The same picture as
@@ -159,14 +151,7 @@ def _numbers(count: int) -> NDArray[np.float32]:
     return number
 
 
-def rasterise(
-    xy: NDArray[np.floating],
-    depth: NDArray[np.floating],
-    faces: NDArray[np.integer],
-    size: tuple[int, int],
-    *,
-    cull_back: bool = False,
-) -> Surface:
+def rasterise(xy: Real, depth: Real, faces: Whole, size: tuple[int, int], *, cull_back: bool = False) -> Surface:
     """Draw triangles with corners at pixels `xy` (N, 2) and `depth` (N,) into an image of `size` (W, H), by
     OpenCV.
 
@@ -193,67 +178,3 @@ def rasterise(
     hit = colour[..., 0] >= 0
     face = np.where(hit, index[np.where(hit, np.rint(colour[..., 0] / _NUMBER), 0).astype(np.intp)], -1)
     return Surface(np.where(hit, met, np.float32(np.inf)), face.astype(np.int32))
-
-
-def render_shaded(
-    vertices: NDArray[np.floating],
-    faces: NDArray[np.integer],
-    colours: NDArray[np.floating],
-    camera: Camera,
-    light: NDArray[np.float64],
-    samples: int = 3,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Picture of shaded meshes: colour (H, W, 3) in 0..1, multiplied by coverage, and coverage (H, W).
-
-    `colours` (N, 3) are the vertices' own, 0..1; `light` (3,) points from the scene to the light. Lambert's
-    law with light from both sides of the sky (half-Lambert), so that no part goes black. Each pixel is the
-    mean of `samples` x `samples` rays.
-    """
-    fine = scaled(camera, samples)
-    surface = render_depth(vertices, faces, fine, cull_back=True)
-    row, column = np.nonzero(surface.face >= 0)
-    corners = faces[surface.face[row, column]]
-    weight = _barycentric(vertices, corners, fine, column, row)
-    normal = (vertex_normals(vertices, faces)[corners] * weight[..., None]).sum(axis=1)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    toward_eye = -fine.wTc[:3, 2]
-    lit = 0.5 + 0.5 * normal @ (light / np.linalg.norm(light))
-    # A grazing surface darkens a little: limbs of one colour stay apart.
-    rim = 0.75 + 0.25 * np.clip(normal @ toward_eye, 0.0, 1.0) ** 0.5
-    shade = (_AMBIENT + (1.0 - _AMBIENT) * lit) * rim
-    base = (np.asarray(colours, dtype=np.float64)[corners] * weight[..., None]).sum(axis=1)
-    picture = np.zeros((*surface.face.shape, 4), dtype=np.float32)
-    picture[row, column, :3] = np.clip(base * shade[:, None], 0.0, 1.0)
-    picture[row, column, 3] = 1.0
-    picture = np.asarray(cv2.resize(picture, camera.image_size, interpolation=cv2.INTER_AREA), dtype=np.float32)
-    shadow = _nearness_shadow(surface.depth[samples // 2 :: samples, samples // 2 :: samples])
-    return picture[..., :3] * shadow[..., None], picture[..., 3]
-
-
-def _nearness_shadow(depth: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Darker (H, W) where something nearer is beside a pixel, so that who is in front stands out.
-
-    The depth buffer minus its own blur (Luft, Colditz and Deussen 2006), over pixels that hold a surface.
-    """
-    hit = np.isfinite(depth).astype(np.float32)
-    filled = np.where(hit > 0, depth, 0.0).astype(np.float32)
-    sigma = 0.012 * depth.shape[0]
-    near, weight = (np.asarray(cv2.GaussianBlur(q, (0, 0), sigma), dtype=np.float32) for q in (filled, hit))
-    mean = near / np.maximum(weight, 1e-3)
-    return (1.0 - 0.45 * hit * np.clip((filled - mean) / 0.3, 0.0, 1.0)).astype(np.float32)
-
-
-def _barycentric(
-    vertices: NDArray[np.floating],
-    corners: NDArray[np.integer],
-    camera: Camera,
-    column: NDArray[np.intp],
-    row: NDArray[np.intp],
-) -> NDArray[np.float64]:
-    """Perspective-correct weights (M, 3) of the corners (M, 3) of the faces met at pixels column, row (M,)."""
-    points = (vertices @ camera.cTw[:, :3].T + camera.cTw[:, 3])[corners]
-    ray = np.stack([column, row, np.ones(len(row))], axis=1) @ np.linalg.inv(camera.K).T
-    a, b, c = points[:, 0], points[:, 1], points[:, 2]
-    # The ray through the pixel is a mix of the corners with weights proportional to signed volumes.
-    volumes = np.stack([np.einsum("mi,mi->m", ray, np.cross(p, q)) for p, q in ((b, c), (c, a), (a, b))], axis=1)
-    return volumes / volumes.sum(axis=1, keepdims=True)

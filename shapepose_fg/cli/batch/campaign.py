@@ -280,8 +280,6 @@ def _look_at(entry: Entry, folder: Path, begun: bool) -> int:
     prepare_output(folder, (*OUTPUTS, LOG))
     refuse_corrected(folder)
     if (folder / PARTS).exists() and not begun:
-        raise InputError(
-            f"{folder / PARTS}: a run was stopped here; go on with --resume, or begin anew with --restart"
-        )
+        raise InputError(f"{folder / PARTS}: a run was stopped here; go on with --resume, or anew with --restart")
     files = (file for path in places for file in (path.rglob("*") if path.is_dir() else (path,)))
     return sum(file.stat().st_size for file in files if file.is_file())

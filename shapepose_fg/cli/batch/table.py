@@ -101,7 +101,7 @@ def _inside(given: Path, path: Path, place: str) -> Path:
         raise InputError(f"{path}: {place}: no file has the name {str(given)[:80]!r}; correct it") from None
     if not (inside or given.is_absolute()):
         raise InputError(
-            f"{path}: {place}: {given} leads out of the table's folder; if that is meant, write an absolute path"
+            f"{path}: {place}: {given} leads out of the table's folder; if that is meant, make it absolute"
         )
     return found
 

@@ -38,9 +38,7 @@ class Request(DetectionOptions):
 
     calibration: Path | None = option(INPUT, "Cameras: a file, or a folder, of one of the formats known.")
     detections: Path | None = option(INPUT, "Folder with what a 2D detector wrote of every camera.")
-    project: Path | None = option(
-        INPUT, "A Pose2Sim project instead: its cameras, detections, settings; adds TRC and C3D."
-    )
+    project: Path | None = option(INPUT, "A Pose2Sim project: its cameras, detections, settings; adds TRC, C3D.")
     config: Path | None = option(RESULT, "Settings as TOML; `shapepose-fg config` prints all.")
     frames: str | None = frames_option()
     body: Path | None = option(INPUT, "Body model in SMPL's file format, instead of the built-in.")
@@ -48,17 +46,11 @@ class Request(DetectionOptions):
     timestamps: Path | None = option(TIME, "Text file with the time of every frame in seconds, also by camera.")
     cuts: tuple[int, ...] = ()
     """First frames after a cut."""
-    temporal: bool | None = option(
-        TIME, "People over time, or every frame by itself.", None, "--temporal/--no-temporal"
-    )
+    temporal: bool | None = option(TIME, "People over time, or frame by frame.", None, "--temporal/--no-temporal")
     shapes: Path | None = option(RESULT, "File (.npz) of people's shapes: read where it is, kept up to date.")
     chunk_frames: int | None = option(RUN, "Follow people side by side, too, in chunks of about so many frames.")
-    report: bool = option(
-        RESULT, "Leave report.html, the result as a page to look at.", True, "--report/--no-report"
-    )
-    check: bool = option(
-        RESULT, "Whether cameras and detections fit, and what is wrong.", True, "--check/--no-check"
-    )
+    report: bool = option(RESULT, "Leave report.html, a page to look at.", True, "--report/--no-report")
+    check: bool = option(RESULT, "Whether cameras and detections fit.", True, "--check/--no-check")
 
 
 @dataclass(frozen=True)
@@ -85,9 +77,7 @@ class Prepared:
         found = PipelineConfig() if asked.config is None else read_config(asked.config, PipelineConfig)
         found = found if asked.temporal is None else replace(found, temporal=asked.temporal)
         if asked.shapes is not None and not found.temporal:
-            raise InputError(
-                "--shapes: a person's shape is known over time only; leave out --shapes or --no-temporal"
-            )
+            raise InputError("--shapes: a person's shape is known over time only; leave it out")
         if asked.chunk_frames is not None and not (found.temporal and asked.chunk_frames >= found.batch_frames):
             raise InputError(
                 f"--chunk-frames {asked.chunk_frames}: must be {found.batch_frames} (batch_frames) or more, and"

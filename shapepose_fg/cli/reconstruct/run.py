@@ -138,9 +138,8 @@ class _Run:
         """
         output = self.known.output
         if not (output / manifest.PARTS).is_dir():
-            manifest.check_room(
-                output, manifest.expected_bytes(self.recording, self.task.rig, self.task.whole()[0])
-            )
+            needed = manifest.expected_bytes(self.recording, self.task.rig, self.task.whole()[0])
+            manifest.check_room(output, needed)
             if resume:
                 note(f"{output}: no run was stopped here; this one begins anew")
         kept = manifest.open_run(output, self.begun(), resume=resume, restart=restart)
@@ -156,9 +155,9 @@ class _Run:
         """The reconstruction, its files, and what is said of it."""
         asked, output, rig, frames = self.known.request, self.known.output, self.task.rig, self.task.whole()[0]
         file, inputs = asked.shapes, dict(self.inputs)
-        known = (
-            None if file is None else manifest.people_at_start(kept, file, lambda: _known_people(file, asked.body))
-        )
+        known = None
+        if file is not None:
+            known = manifest.people_at_start(kept, file, lambda: _known_people(file, asked.body))
         start = time.perf_counter()
         told = self.execution.progress
         task = replace(self.task, shapes=known)

@@ -68,9 +68,7 @@ def read_bytes(path: Path, most: int = LARGE) -> bytes:
 def check_size(path: Path, size: int, most: int) -> None:
     """InputError where the file at `path` has more than `most` bytes."""
     if size > most:
-        raise InputError(
-            f"{path}: over {most >> 20} MiB are too much for such a file; check that this is the file"
-        )
+        raise InputError(f"{path}: over {most >> 20} MiB are too much for such a file; check the path")
 
 
 def read_text(path: Path, *, may_be_empty: bool = False, most: int = LARGE) -> str:

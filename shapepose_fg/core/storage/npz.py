@@ -13,6 +13,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import DTypeLike, NDArray
 
+from shapepose_fg.core.arrays import Index
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import open_regular
 
@@ -96,9 +97,7 @@ def read_npz(file: Path, names: Collection[str], cure: str) -> dict[str, NDArray
 
 @dataclass
 class _Member:
-    """An array of a file: its bytes, where among them the first row begins, and whether rows lie in Fortran's
-    order.
-    """
+    """An array of a file: its bytes, where the first row begins, and whether rows lie in Fortran's order."""
 
     stream: IO[bytes]
     begin: int
@@ -157,7 +156,7 @@ class NpzFile(ExitStack):
             with self._archive.open(self._members[name]) as stream:
                 return _with_letters(name, npy.read_array(stream, allow_pickle=False))
 
-    def rows(self, name: str, index: NDArray[np.intp]) -> NDArray[Any]:
+    def rows(self, name: str, index: Index) -> NDArray[Any]:
         """The rows `index` (R,), rising, of an array."""
         with self._telling():
             member = self._member(name)

@@ -21,9 +21,8 @@ def prepare_output(folder: Path, names: Iterable[str] = ()) -> None:
         with tempfile.TemporaryFile(dir=folder) as trial:
             trial.write(b"trial")
     except OSError as error:
-        raise InputError(
-            f"{folder}: results cannot be written here ({error.strerror}); give a folder that can be written"
-        ) from None
+        problem = f"results cannot be written here ({error.strerror})"
+        raise InputError(f"{folder}: {problem}; give a folder that can be written") from None
     for name in names:
         if (folder / name).is_dir():
             raise InputError(f"{folder / name}: this is a folder, and a file is to be written here; move it away")

@@ -1,5 +1,5 @@
 """Tables of arrays: what each column holds is said once, in the type of its field, and checked wherever one is
-made: `place: Annotated[NDArray[np.float64], Column("N 3", unit="m", most=1e6)]`.
+made: `place: Annotated[Array, Column("N 3", unit="m", most=1e6)]`.
 """
 
 from collections.abc import Sequence

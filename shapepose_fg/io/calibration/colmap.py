@@ -91,9 +91,7 @@ def _images(path: Path, lenses: dict[str, WrittenCamera]) -> list[WrittenCamera]
     for (number, words), name in zip(rows, names, strict=True):
         place = f"{path}: line {number}"
         if len(words) != 10 or words[8] not in lenses:
-            raise InputError(
-                f"{place}: must hold id, quaternion, translation, camera id and name; export it again"
-            )
+            raise InputError(f"{place}: must hold id, quaternion, translation, camera id and name; export again")
         qw, qx, qy, qz, *t = _numbers(words[1:8], 7, place)
         wTc = pose(rotation_of([qx, qy, qz, qw], "QW QX QY QZ", place), t, "QW QX QY QZ", place)
         cameras.append(replace(lenses[words[8]], name=name, wTc=wTc))
@@ -110,9 +108,7 @@ def _names(files: Sequence[str]) -> list[str]:
 
 def _numbers(words: Sequence[str], count: int, place: str) -> list[float]:
     if len(words) != count or not all(map(is_number, words)):
-        raise InputError(
-            f"{place}: must hold {count} finite numbers here, got {len(words)} words; export it again"
-        )
+        raise InputError(f"{place}: must hold {count} finite numbers, got {len(words)} words; export it again")
     return [float(word) for word in words]
 
 

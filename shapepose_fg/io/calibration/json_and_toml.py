@@ -1,6 +1,4 @@
-"""Calibrations in JSON and TOML: our own rig file, 4D Association's, CMU Panoptic's, VoxelPose's; and a table per
-camera, as AniPose began it and Pose2Sim, FreeMoCap and Caliscope write it.
-"""
+"""Calibrations in JSON (our own rig file, 4D Association, CMU Panoptic, VoxelPose) and AniPose's kind of TOML."""
 
 import json
 from collections.abc import Mapping
@@ -31,9 +29,7 @@ _CURES = {
     **dict.fromkeys(("rotation", "translation"), _EXTRINSICS),
     **dict.fromkeys(("imgSize", "resolution", "size", "image_size"), _SIZE),
     **dict.fromkeys(("distCoeff", "dist", "distCoef"), "write at most k1 k2 p1 p2 k3, as OpenCV orders them"),
-    **dict.fromkeys(
-        ("distortion", "distortions"), "write k1 k2 p1 p2 k3 as OpenCV does, or k1 to k4 of a fisheye"
-    ),
+    **dict.fromkeys(("distortion", "distortions"), "write k1 k2 p1 p2 k3 as OpenCV does, or k1 to k4 of fisheyes"),
     "lens": "write perspective or fisheye",
 }
 """What to do about a value, by its name in any of the formats."""
@@ -136,9 +132,7 @@ def _read_panoptic(content: Content) -> WrittenRig | None:
 
 
 def _read_voxelpose(content: Content) -> WrittenRig | None:
-    """An object of cameras, a list, or a list under a sequence's name: millimetres, z up, R (X - T), distortion in
-    two parts, K for pictures whose size is not written.
-    """
+    """An object or list of cameras, or under a sequence's name: mm, z up, R (X - T), distortion in two parts."""
     value = content.value if content.syntax == "JSON" else None
     if isinstance(value, dict) and len(value) == 1 and isinstance(next(iter(value.values())), list):
         value = next(iter(value.values()))
@@ -180,9 +174,8 @@ def _read_tables(content: Content, program: str) -> WrittenRig | None:
             continue
         node = Node(table, f'{content.path}: camera "{key}"', _CURES)
         # Caliscope's videos are called cam_0.mp4, those of its older versions port_0.mp4.
-        numbered = next(
-            (f"{kind}_{table[k]}" for kind, k in (("port", "port"), ("cam", "cam_id")) if k in table), key
-        )
+        kinds = (("port", "port"), ("cam", "cam_id"))
+        numbered = next((f"{kind}_{table[k]}" for kind, k in kinds if k in table), key)
         fisheye, wTc = table.get("fisheye", False), node.pose("rotation", "translation")
         if not isinstance(fisheye, bool):
             raise node.refuse("fisheye", f"must be true or false, got {describe(fisheye)}")

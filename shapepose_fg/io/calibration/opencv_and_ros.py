@@ -1,6 +1,4 @@
-"""YAML and XML of OpenCV's FileStorage (OpenCV's own multi-view calibration, files with a node per camera,
-EasyMocap's), and ROS' camera_info.
-"""
+"""OpenCV's FileStorage (its multi-view calibration, a node per camera, EasyMocap's), and ROS' camera_info."""
 
 import re
 from collections.abc import Mapping
@@ -8,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Lens
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.calibration.content import Content, load
@@ -113,9 +111,7 @@ def _read_easymocap(content: Content) -> WrittenRig | None:
         one.with_name(one.name.replace("intri", "extri")),
     ):
         if not path.is_file():
-            raise InputError(
-                f"{path}: this half of EasyMocap's calibration is missing; put both files into one folder"
-            )
+            raise InputError(f"{path}: this half of EasyMocap's calibration is missing; put both into one folder")
         value = load(path).value
         halves.append(Node(value if isinstance(value, dict) else {}, str(path), _EASYMOCAP))
     inner, outer = halves
@@ -142,9 +138,7 @@ _LENSES: dict[str, Lens] = {
     **dict.fromkeys(("equidistant", "fisheye"), "fisheye"),
 }
 """ROS' distortion models that are lenses of OpenCV."""
-_POSE_CURE = (
-    "write <camera>_pose.yaml with translation x y z and rotation x y z w of the optical frame in the world"
-)
+_POSE_CURE = "write <camera>_pose.yaml with translation and rotation (x y z w) of the optical frame in the world"
 
 
 def _is_info(value: Any) -> bool:
@@ -191,7 +185,7 @@ def _read_ros(content: Content) -> WrittenRig | None:
     return WrittenRig(cameras, "m", "z")
 
 
-def _ros_pose(path: Path, value: Any) -> NDArray[np.float64]:
+def _ros_pose(path: Path, value: Any) -> Array:
     """World from camera, of a message with translation and rotation."""
     message = _message_of(value)
     if message is None:

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import get_args
 
 from shapepose_fg.core.camera import Axis, Rig
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.io.calibration.colmap import COLMAP
 from shapepose_fg.io.calibration.content import Content, load
 from shapepose_fg.io.calibration.json_and_toml import JSON_AND_TOML
@@ -62,12 +62,8 @@ def read_rig(
         cures = " and ".join(written.cures.get(name, _MISSING[name]) for name in missing)
         names = f"{' and '.join(missing)} {'is' if len(missing) == 1 else 'are'}"
         raise InputError(f"{path}: recognised as {form.name}, where {names} missing; {cures}")
-    try:
+    with naming(path):
         return Rig(tuple(camera.finished(METRES[unit], image_size, path) for camera in written.cameras), up)
-    except InputError:
-        raise
-    except ValueError as error:
-        raise InputError(f"{path}: {error}") from None
 
 
 def is_calibration(path: Path) -> bool:

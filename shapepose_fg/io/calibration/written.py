@@ -7,10 +7,11 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Axis, Camera, Lens, padded_distortion
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.validation import describe
 
@@ -32,9 +33,9 @@ class WrittenCamera:
 
     name: str
     """What the file calls it."""
-    K: NDArray[np.float64]
+    K: Array
     """(3, 3) intrinsic matrix, pixels; (0, 0) is the centre of the first pixel."""
-    wTc: NDArray[np.float64]
+    wTc: Array
     """(4, 4) world-from-camera pose in the file's unit; x right, y down, z forward."""
     image_size: tuple[int, int] | None
     """(width, height), pixels; None where the file does not say."""
@@ -48,10 +49,8 @@ class WrittenCamera:
         wTc = self.wTc.copy()
         wTc[:3, 3] *= metres
         size = self.image_size or image_size or (0, 0)
-        try:
+        with naming(path, "correct it in the file"):
             return Camera(self.name, self.K, wTc, size, padded_distortion(self.distortion, self.lens), self.lens)
-        except ValueError as error:
-            raise InputError(f"{path}: {error}; correct it in the file") from None
 
 
 @dataclass(frozen=True)
@@ -99,7 +98,7 @@ class Node:
         every = names.split() if isinstance(names, str) else names
         return next((name for name in every if self.values.get(name) is not None), None)
 
-    def numbers(self, names: str | Sequence[str], *counts: int, most: int = -1) -> NDArray[np.float64] | None:
+    def numbers(self, names: str | Sequence[str], *counts: int, most: int = -1) -> Array | None:
         """The numbers, flat, under the first of `names` that there is; None where there is none.
 
         They are finite, and as many as one of `counts`, or at most `most` of them.
@@ -108,9 +107,8 @@ class Node:
         if name is None:
             return None
         value = self.values[name]
-        wanted = (" or ".join(map(str, counts)) or f"at most {most}") + (
-            " numbers" if counts != (1,) else " number"
-        )
+        noun = "number" if counts == (1,) else "numbers"
+        wanted = f"{' or '.join(map(str, counts)) or f'at most {most}'} {noun}"
         if counts != (1,) and not isinstance(value, list | np.ndarray):
             raise self.refuse(name, f"must hold {wanted}, got {describe(value)}")
         found = np.array(list(self._flat(name, value)))
@@ -122,7 +120,7 @@ class Node:
             raise self.refuse(name, "must have rows of one length") from None
         return found
 
-    def needed(self, names: str | Sequence[str], *counts: int, most: int = -1) -> NDArray[np.float64]:
+    def needed(self, names: str | Sequence[str], *counts: int, most: int = -1) -> Array:
         """The same of numbers that must be there."""
         found = self.numbers(names, *counts, most=most)
         if found is None:
@@ -133,7 +131,7 @@ class Node:
         self,
         name: str,
         K: str | Sequence[str],
-        wTc: NDArray[np.float64],
+        wTc: Array,
         size: Sequence[str | Sequence[str]],
         distortion: str | Sequence[str],
         lens: Lens = "perspective",
@@ -147,20 +145,18 @@ class Node:
         image_size = (given[0], given[1]) if len(given) == 2 else None
         return WrittenCamera(name, K_flat.reshape(3, 3), wTc, image_size, listed, lens)
 
-    def pose(self, R: str, t: str, *, centre: bool = False) -> NDArray[np.float64]:
-        """World from camera (4, 4), of a rotation (9 numbers, or axis times angle) and a translation from the
-        world; or instead of that the camera's centre.
-        """
+    def pose(self, R: str, t: str, *, centre: bool = False) -> Array:
+        """World from camera, of a rotation (9 numbers, or axis times angle) and a translation, or `centre`."""
         turn, shift = self.needed(R, 9) if centre else self.needed(R, 9, 3), self.needed(t, 3)
         shift = -turn.reshape(3, 3) @ shift if centre else shift
         return pose(turn, shift, self.named(R) or R, self.place)
 
-    def pose_of_rows(self, name: str) -> NDArray[np.float64]:
+    def pose_of_rows(self, name: str) -> Array:
         """The same of camera from world, 3 x 4 numbers."""
         cTw = self.needed(name, 12).reshape(3, 4)
         return pose(cTw[:, :3], cTw[:, 3], name, self.place)
 
-    def pose_of_matrix(self, name: str) -> NDArray[np.float64]:
+    def pose_of_matrix(self, name: str) -> Array:
         """The same as it is written, 4 x 4 numbers."""
         wTc = self.needed(name, 16).reshape(4, 4)
         if np.any(wTc[3] != (0, 0, 0, 1)):
@@ -180,9 +176,7 @@ class Node:
             yield float(value)
 
 
-def pose(
-    R: ArrayLike, t: ArrayLike, key: str, place: str, *, world_from_camera: bool = False
-) -> NDArray[np.float64]:
+def pose(R: ArrayLike, t: ArrayLike, key: str, place: str, *, world_from_camera: bool = False) -> Array:
     """The world-from-camera matrix (4, 4) of a rotation and a translation (3).
 
     They are camera-from-world unless said otherwise. `R` is a matrix (nine numbers in any shape, row by row) or
@@ -208,7 +202,7 @@ def pose(
     return wTc
 
 
-def rotation_of(quaternion: ArrayLike, key: str, place: str) -> NDArray[np.float64]:
+def rotation_of(quaternion: ArrayLike, key: str, place: str) -> Array:
     """The rotation matrix (3, 3) of a quaternion x y z w; InputError where it is not of length 1."""
     length = float(np.sqrt(np.square(quaternion).sum()))
     if not abs(length - 1) <= _ROTATION_TOLERANCE:
@@ -218,6 +212,6 @@ def rotation_of(quaternion: ArrayLike, key: str, place: str) -> NDArray[np.float
     return np.eye(3) + 2 * w * cross + 2 * cross @ cross
 
 
-def intrinsics(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
+def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Array:
     """The intrinsic matrix (3, 3)."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])

@@ -5,8 +5,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.calibration.written import (
@@ -28,9 +28,7 @@ _LINES = {"1080p": 1080, "720p": 720, "540p": 540, "480p": 480}
 """Lines of a picture of the whole sensor by `video_resolution`."""
 _TO_OPENCV = np.diag([1.0, -1.0, -1.0])
 """QTM's cameras have y up and look along -z."""
-_NO_DISTORTION = dict.fromkeys(
-    (f"{kind}Distortion{n}" for kind in ("radial", "tangental") for n in (1, 2, 3)), 0.0
-)
+_DISTORTION = "radialDistortion1 radialDistortion2 tangentalDistortion1 tangentalDistortion2 radialDistortion3"
 
 
 def _cameras(
@@ -66,7 +64,7 @@ def _node(element: ET.Element | None, place: str, cure: str) -> Node:
 
 
 def _qualisys(camera: ET.Element, place: str) -> WrittenCamera:
-    def values(tag: str, names: str, missing: dict[str, float] | None = None) -> NDArray[np.float64]:
+    def values(tag: str, names: str, missing: dict[str, float] | None = None) -> Array:
         node = _node(camera.find(tag), f"{place}: <{tag}>", _QTM)
         node = Node({**(missing or {}), **node.values}, node.place, node.cures)
         return np.concatenate([node.needed(name, 1) for name in names.split()])
@@ -86,16 +84,13 @@ def _qualisys(camera: ET.Element, place: str) -> WrittenCamera:
         )
     scale = _LINES[resolution] / _LINES[_FULL]
     K = intrinsics(fx * scale, fy * scale, (cx - window[0]) * scale, (cy - window[1]) * scale)
-    names = "radialDistortion1 radialDistortion2 tangentalDistortion1 tangentalDistortion2 radialDistortion3"
-    distortion = values("intrinsic", names, _NO_DISTORTION).tolist()
+    distortion = values("intrinsic", _DISTORTION, dict.fromkeys(_DISTORTION.split(), 0.0)).tolist()
     width, height = (window[2:] - window[:2] + 1) * scale
     return WrittenCamera(camera.attrib["serial"], K, wTc, (round(width), round(height)), distortion)
 
 
 def _vicon(camera: ET.Element, place: str) -> WrittenCamera:
-    """By the first key frame. ORIENTATION x y z w turns the world's axes into the camera's; POSITION is the
-    centre.
-    """
+    """By the first key frame: ORIENTATION turns the world's axes into the camera's, POSITION is the centre."""
     key_frame = camera.find("KeyFrames/KeyFrame")
     if key_frame is None:
         raise InputError(f"{place}: it has no <KeyFrame>, so it is not calibrated; calibrate it, or delete it")

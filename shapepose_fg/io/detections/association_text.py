@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Camera
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25, COCO_18, Skeleton
@@ -43,7 +43,7 @@ class TextSkeleton:
     """What is read from it."""
 
     @property
-    def limb_of(self) -> NDArray[np.intp]:
+    def limb_of(self) -> Index:
         """(J, J) the number of the limb from one joint to another, -1 where there is none."""
         table = np.full((len(self.joints), len(self.joints)), -1, dtype=np.intp)
         table[tuple(np.array(self.limbs).T)] = np.arange(len(self.limbs))
@@ -89,7 +89,7 @@ class NumberStream:
         self.path = path
         self.first = 0
         """How many numbers were forgotten."""
-        self.values: NDArray[np.float64] = np.zeros(0)
+        self.values: Array = np.zeros(0)
         """Numbers from the first that is not forgotten on."""
         self._pieces = _whole_words(path)
         self._most = path.stat().st_size // 2 + 1
@@ -114,7 +114,7 @@ class NumberStream:
         """An error about number `index`; None is what should be behind the last."""
         return InputError(f"{self.path}: line {self._line(index)}: {problem}; {cure}")
 
-    def _numbers(self, text: str, first: int) -> NDArray[np.float64]:
+    def _numbers(self, text: str, first: int) -> Array:
         """The numbers of a piece, finite; `first` are before it."""
         tokens = text.split()
         try:
@@ -167,18 +167,11 @@ def _blocks(
         yield with_middles(view, kind.skeleton) if kind.skeleton.middles else view
     if numbers.reaches(position + 1):
         what = f"more numbers follow the last of the {frame_count} frames"
-        raise numbers.refuse(
-            position, what, "correct the number of frames in line 1, or write the detections again"
-        )
+        raise numbers.refuse(position, what, "correct the number of frames in line 1, or write it again")
 
 
 def _candidates(
-    numbers: NumberStream,
-    kind: TextSkeleton,
-    counts: NDArray[np.intp],
-    starts: NDArray[np.intp],
-    start: int,
-    camera: Camera,
+    numbers: NumberStream, kind: TextSkeleton, counts: Index, starts: Index, start: int, camera: Camera
 ) -> ViewCandidates:
     """The candidates of the frames from `start` on; `starts` are places in `numbers.values`."""
     block, within = _expand(counts.ravel())
@@ -227,7 +220,7 @@ def _header(numbers: NumberStream) -> tuple[TextSkeleton, int]:
 
 def _layout(
     numbers: NumberStream, kind: TextSkeleton, frames: range, frame_count: int, position: int
-) -> tuple[NDArray[np.intp], NDArray[np.intp], int]:
+) -> tuple[Index, Index, int]:
     """How many candidates each joint of each frame has, and where the numbers of each block start.
 
     Returns `counts` (T, J), `starts` (T, J + 1), the first x of a joint, and in the last column the first affinity
@@ -266,9 +259,7 @@ def _layout(
     return np.array(counts, dtype=np.intp), np.array(starts, dtype=np.intp), position
 
 
-def _pairs(
-    values: NDArray[np.float64], kind: TextSkeleton, counts: NDArray[np.intp], starts: NDArray[np.intp]
-) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+def _pairs(values: Array, kind: TextSkeleton, counts: Index, starts: Index) -> tuple[Index, Array]:
     """The pairs of candidates (E, 2) with an affinity above 0, and that affinity (E,)."""
     first, second = np.array(kind.limbs).T
     sizes = counts[:, first] * counts[:, second]  # (T, L)
@@ -284,7 +275,7 @@ def _pairs(
     return np.column_stack([a, b]), affinity[used]
 
 
-def _expand(sizes: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _expand(sizes: Index) -> tuple[Index, Index]:
     """For every element of blocks of these sizes: its block, and its place within the block."""
     block = np.repeat(np.arange(len(sizes)), sizes)
     return block, np.arange(len(block)) - (np.cumsum(sizes) - sizes)[block]
@@ -340,7 +331,7 @@ def _with_middle(view: ViewCandidates, middle: int, first: int, second: int) -> 
     )
 
 
-def _equal_pairs(left: NDArray[np.intp], right: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _equal_pairs(left: Index, right: Index) -> tuple[Index, Index]:
     """All places i in `left` and k in `right` with equal values, as two arrays."""
     order = np.argsort(right, kind="stable")
     low, high = (np.searchsorted(right[order], left, side=side) for side in ("left", "right"))

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter
 
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import MIDDLE, read_json, read_text
 from shapepose_fg.io.camera_names import MOST_FRAME, in_order
@@ -116,9 +116,7 @@ def _of_one_model(known: set[int], people: Iterable[list[float]], source: Path, 
 
 
 def read_json_people(place: Path) -> CameraPeople:
-    """The people of one camera: of a JSON file with all its frames, also the only one of a folder, or of a folder
-    with a file per frame. InputError naming file, key and cure.
-    """
+    """The people of one camera: of a JSON file with all frames, also a folder's only, or of a file per frame."""
     if not place.is_dir():
         return read_one_file(place)
     lists = _lists(place)
@@ -238,7 +236,7 @@ class _Collected:
 
     def __init__(self, path: Path, program: str) -> None:
         self.path, self.program = path, program
-        self._keypoints, self._counts = list[NDArray[np.float64]](), set[int]()
+        self._keypoints, self._counts = list[Array](), set[int]()
 
     def valid(self, kind: TypeAdapter[list[Any]], items: Iterable[Any]) -> Iterator[tuple[int, list[Any]]]:
         """The items, some at a time, and the index of the first of them."""
@@ -258,7 +256,7 @@ class _Collected:
         blocks, rerun = self._in_order(np.array(frames, dtype=np.intp)), _RERUN[self.program]
         return CameraPeople(self.path, self.program, blocks, *listed, every_frame=False, rerun=rerun)
 
-    def _in_order(self, frames: NDArray[np.intp]) -> Iterator[PeopleBlock]:
+    def _in_order(self, frames: Index) -> Iterator[PeopleBlock]:
         """People in the order of their frames (N,), some frames at a time."""
         if len(frames) == 0:
             return

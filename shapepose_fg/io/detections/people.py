@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.core.storage.kept_arrays import KeptArrays
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
@@ -26,9 +26,9 @@ _OCCLUDED = 0.5
 class PeopleBlock:
     """People of some frames, keypoint by keypoint, in the detector's own order."""
 
-    frame: NDArray[np.intp]
+    frame: Index
     """(N,) number of each person's frame, as the files say it; not falling."""
-    keypoints: NDArray[np.float64]
+    keypoints: Array
     """(N, K, 3) x, y in pixels, score; a score of 0 (or less, or not a number) is a joint that was not seen."""
 
     @classmethod
@@ -39,7 +39,7 @@ class PeopleBlock:
         return cls(np.array(frames, dtype=np.intp), keypoints)
 
     @property
-    def scores(self) -> NDArray[np.float64]:
+    def scores(self) -> Array:
         """(S,) of keypoints that were seen."""
         every = self.keypoints[..., 2].ravel()
         return every[np.isfinite(every) & (every > 0)]
@@ -103,7 +103,7 @@ class KeptPeople:
             yield block
 
 
-Scores = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+Scores = Callable[[Array], Array]
 """Turns a detector's scores (...) into ones from 0 to 1."""
 
 
@@ -154,9 +154,7 @@ def candidates_of(people: KeptPeople, rule: Scores, skeleton: Skeleton, first: i
     return ViewStream(people.camera.source, count, blocks(), first)
 
 
-def _candidates(
-    frame: NDArray[np.intp], keypoints: NDArray[np.float64], rule: Scores, skeleton: Skeleton
-) -> ViewCandidates:
+def _candidates(frame: Index, keypoints: Array, rule: Scores, skeleton: Skeleton) -> ViewCandidates:
     """The joints of the people of some frames."""
     joints = _joints(keypoints, rule, skeleton)
     person, joint = np.nonzero(joints[..., 2] > 0)
@@ -171,7 +169,7 @@ def _candidates(
     return ViewCandidates.of(frame[person], joint, xy, score, pairs, np.ones(len(pairs)))
 
 
-def _joints(keypoints: NDArray[np.float64], rule: Scores, skeleton: Skeleton) -> NDArray[np.float64]:
+def _joints(keypoints: Array, rule: Scores, skeleton: Skeleton) -> Array:
     """(N, J, 3) the skeleton's joints with scores from 0 to 1, 0 0 0 where not seen."""
     target = np.arange(len(skeleton)) if skeleton.keypoints is None else np.array(skeleton.keypoints)
     joints = np.zeros((len(keypoints), len(skeleton), 3))

@@ -156,16 +156,12 @@ def _skeleton_of_people(people: Sequence[KeptPeople], wanted: Skeleton | None) -
     count, camera = next(iter(counts.items()))
     place = f"{camera.source}: recognised as {camera.program} with {count} keypoints a person"
     if wanted is not None and wanted.keypoint_count != count:
-        raise InputError(
-            f"{place}, but {wanted.name} has {wanted.keypoint_count}; name the detector's own skeleton"
-        )
+        raise InputError(f"{place}, but {wanted.name} has {wanted.keypoint_count}; name its own")
     found = wanted or next((each for each in SKELETONS.values() if each.keypoint_count == count), None)
     if found is None:
         known = ", ".join(f"{each.keypoint_count} ({each.name})" for each in SKELETONS.values())
         what = "MPI's: run OpenPose with --model_pose BODY_25" if count == 15 else "not known here"
-        raise InputError(
-            f"{place}, which is {what}, or describe them in a skeleton file (--skeleton); known are {known}"
-        )
+        raise InputError(f"{place}, which is {what}, or describe them in a --skeleton file; known are {known}")
     return found
 
 

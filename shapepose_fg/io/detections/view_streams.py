@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.errors import InputError
@@ -27,25 +27,19 @@ _LEAST_SCORE = 1e-6
 class ViewCandidates:
     """All candidates that one camera saw in some frames, sorted by frame and then by joint."""
 
-    frame: NDArray[np.intp]
+    frame: Index
     """(D,) frame of each candidate, from 0."""
     seen: Detections
     """The candidates, of view 0, pixels as measured; pairs join two of one frame."""
 
     @classmethod
     def of(
-        cls,
-        frame: NDArray[np.intp],
-        joint: NDArray[np.intp],
-        xy: NDArray[np.float64],
-        confidence: NDArray[np.float64],
-        pairs: NDArray[np.intp],
-        affinity: NDArray[np.float64],
+        cls, frame: Index, joint: Index, xy: Array, confidence: Array, pairs: Index, affinity: Array
     ) -> "ViewCandidates":
         """Of columns as in `Detections`."""
         return cls(frame, Detections(np.zeros_like(joint), joint, xy, confidence, pairs, affinity))
 
-    def only(self, keep: NDArray[np.bool_]) -> "ViewCandidates":
+    def only(self, keep: Mask) -> "ViewCandidates":
         """The candidates of the mask `keep` (D,), and the pairs between them."""
         return self if keep.all() else ViewCandidates(self.frame[keep], self.seen.only(keep))
 
@@ -81,9 +75,7 @@ def assemble(views: Sequence[ViewStream], rig: Rig, skeleton: Skeleton, kept: Ke
         what = f"holds {view.frame_count} frames", f"holds {first.frame_count}"
         if view.frame_count == first.frame_count:
             what = f"starts at frame {view.first_number}", f"starts at frame {first.first_number}"
-        raise InputError(
-            f"{view.source} {what[0]}, but {first.source} {what[1]}; give the same frames of every camera"
-        )
+        raise InputError(f"{view.source} {what[0]}, but {first.source} {what[1]}; give the same frames of each")
     ideal = [_Undistorted(view.source, camera) for view, camera in zip(views, rig.cameras, strict=True)]
     for n, blocks in enumerate(zip(*(view.blocks for view in views), strict=True)):
         seen = [each.undistorted(block) for each, block in zip(ideal, blocks, strict=True)]
@@ -93,9 +85,7 @@ def assemble(views: Sequence[ViewStream], rig: Rig, skeleton: Skeleton, kept: Ke
     return DetectionTable(skeleton, kept, first.frame_count, tuple(view.source for view in views), notes)
 
 
-def _together(
-    views: Sequence[ViewCandidates], frames: range
-) -> tuple[Detections, NDArray[np.intp], NDArray[np.intp]]:
+def _together(views: Sequence[ViewCandidates], frames: range) -> tuple[Detections, Index, Index]:
     """The candidates of all views in some frames, and (T + 1,) where candidates and pairs of each frame begin."""
     counts = [len(view.frame) for view in views]
     offsets = np.cumsum([0, *counts[:-1]])
@@ -126,7 +116,7 @@ class _LeftOut:
     def __init__(self, what: str, cure: str) -> None:
         self._what, self._cure, self._count, self._of, self._first = what, cure, 0, 0, ""
 
-    def add(self, out: NDArray[np.bool_], words: Callable[[int], str]) -> None:
+    def add(self, out: Mask, words: Callable[[int], str]) -> None:
         """Take in which candidates (D,) of a block are left out; `words` say where one of them is."""
         if self._count == 0 and out.any():
             self._first = words(int(np.argmax(out)))

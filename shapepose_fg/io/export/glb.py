@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS, SmplArrays
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.drawing import colour_of, vertex_normals
 from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.io.export.registry import Job, Written
@@ -34,7 +35,7 @@ def write_glb(job: Job) -> Written:
     return written
 
 
-def glb_bytes(motions: dict[int, Motion], arrays: SmplArrays, times_s: NDArray[np.float64]) -> bytes:
+def glb_bytes(motions: dict[int, Motion], arrays: SmplArrays, times_s: Array) -> bytes:
     """A GLB file of people by their numbers, in frames taken at `times_s` (T,); the file's time 0 is the first.
 
     A person is a node with a tree of 24 joints and a skinned mesh below it. Where a person is not there, its node
@@ -97,13 +98,12 @@ class _File:
         }
         text = json.dumps(tree, allow_nan=False).encode()
         text += b" " * (-len(text) % 4)
-        parts = b"".join(
-            struct.pack("<I4s", len(part), kind) + part for kind, part in ((b"JSON", text), (b"BIN\0", binary))
-        )
+        pairs = ((b"JSON", text), (b"BIN\0", binary))
+        parts = b"".join(struct.pack("<I4s", len(part), kind) + part for kind, part in pairs)
         return struct.pack("<4sII", b"glTF", 2, 12 + len(parts)) + parts
 
 
-def influences(weights: NDArray[np.float64]) -> list[tuple[NDArray[np.uint8], NDArray[np.float32]]]:
+def influences(weights: Array) -> list[tuple[NDArray[np.uint8], NDArray[np.float32]]]:
     """The bones (Nv, 4) that move each vertex most, with their weights (Nv, 4); then the next four, if there are.
 
     All sets together are the weights (Nv, 24) themselves. A program that reads the first set alone and makes it
@@ -146,9 +146,8 @@ def _add_person(file: _File, who: int, motion: Motion, shared: dict[str, int], t
     }
     surface = {"baseColorFactor": [*_linear(colour_of(who)), 1.0], "metallicFactor": 0.0}
     material = file.add("materials", name=name, pbrMetallicRoughness=surface)
-    mesh = file.add(
-        "meshes", name=name, primitives=[{"attributes": attributes, "indices": triangles, "material": material}]
-    )
+    primitive = {"attributes": attributes, "indices": triangles, "material": material}
+    mesh = file.add("meshes", name=name, primitives=[primitive])
     # A bone's frame in the T-pose is the body's own, moved to the joint.
     inverse = np.tile(np.eye(4, dtype=np.float32), (BONES, 1, 1))
     inverse[:, :3, 3] = -rest.joints
@@ -158,10 +157,10 @@ def _add_person(file: _File, who: int, motion: Motion, shared: dict[str, int], t
     return first
 
 
-def _animate(file: _File, first: int, motion: Motion, times: NDArray[np.float64]) -> None:
+def _animate(file: _File, first: int, motion: Motion, times: Array) -> None:
     """The channels of a person whose node is number `first`."""
 
-    def channel(node: int, path: str, at: int, values: NDArray[np.float64], interpolation: str = "LINEAR") -> None:
+    def channel(node: int, path: str, at: int, values: Array, interpolation: str = "LINEAR") -> None:
         output = file.array(values.astype(np.float32))
         file.samplers.append({"input": at, "output": output, "interpolation": interpolation})
         file.channels.append({"sampler": len(file.samplers) - 1, "target": {"node": node, "path": path}})
@@ -179,7 +178,7 @@ def _animate(file: _File, first: int, motion: Motion, times: NDArray[np.float64]
         channel(first, "scale", file.array(times[turns].astype(np.float32), bounds=True), scale, "STEP")
 
 
-def _shortest(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+def _shortest(rotations: Array) -> Array:
     """Quaternions (F, 24, 4) with signs such that each is near the one before."""
     inner = (rotations[1:] * rotations[:-1]).sum(axis=-1, keepdims=True)
     signs = np.cumprod(np.where(inner < 0, -1.0, 1.0), axis=0)

@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shapepose_fg.body.model.smpl_file import SmplArrays
+from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.camera import Axis
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Known, Reconstruction
@@ -33,18 +33,18 @@ class Markers:
 
     names: tuple[str, ...]
     """(M,) names."""
-    xyz: NDArray[np.float64]
+    xyz: Array
     """(T, M, 3) metres, y up; NaN where the marker is missing."""
-    sigma_m: NDArray[np.float64]
+    sigma_m: Array
     """(T, M) standard deviation, root mean square over the axes, metres; NaN where it is not known."""
 
     @property
-    def there(self) -> NDArray[np.bool_]:
+    def there(self) -> Mask:
         """(T, M) where a marker is not missing."""
         return np.asarray(np.isfinite(self.xyz).all(axis=2))
 
     @property
-    def frames(self) -> NDArray[np.intp]:
+    def frames(self) -> Index:
         """(F,) the frames with a marker."""
         return np.flatnonzero(self.there.sum(axis=1))
 
@@ -74,7 +74,7 @@ def opensim_names(joints: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(hip if name == MID_HIP else name for name in joints)
 
 
-def sigma_m(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+def sigma_m(covariance: Array) -> Array:
     """(...) standard deviation of positions with covariance (..., 3, 3): root mean square over the axes."""
     variance = np.trace(covariance, axis1=-2, axis2=-1) / 3
     with np.errstate(invalid="ignore"):
@@ -118,9 +118,7 @@ def _each(
     return written
 
 
-def trc_text(
-    markers: Markers, frames: NDArray[np.integer], times_s: NDArray[np.float64], fps: float, name: str
-) -> str:
+def trc_text(markers: Markers, frames: Whole, times_s: Array, fps: float, name: str) -> str:
     """A TRC file, metres to 6 digits; `name` stands in its first line.
 
     A frame without any marker has no row, for OpenSim's inverse kinematics stops at one. The rows' own numbers and
@@ -158,9 +156,8 @@ def _write_c3d(
         path = folder / f"{name(None if stop - first <= _MOST else span)}.c3d"
         fits = span[1] < _MOST
         if not fits:
-            written.notes.append(
-                f"{path.name} counts its frames from 1, not {span[0] + 1}: numbers in C3D end at {_MOST}"
-            )
+            counts = f"{path.name} counts its frames from 1, not {span[0] + 1}"
+            written.notes.append(f"{counts}: numbers in C3D end at {_MOST}")
         written.add(path, c3d_bytes(markers, span[0] if fits else 0, take.fps, part))
 
 

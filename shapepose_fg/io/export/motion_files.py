@@ -1,6 +1,4 @@
-"""Bodies in motion as files: AMASS-style npz, as learning code reads it (z up, metres, radians), and BVH, as
-Blender and other animation programs read it (y up, metres).
-"""
+"""Bodies in motion: AMASS-style npz for learning code (z up, metres, radians); BVH for animation (y up)."""
 
 import warnings
 from collections.abc import Iterator
@@ -11,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.core.storage.npz import write_npz
@@ -100,7 +99,7 @@ def bvh_text(motion: Motion, fps: float) -> str:
     return "\n".join([*lines, *(" ".join(row) for row in rows)]) + "\n"
 
 
-def _zxy_degrees(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+def _zxy_degrees(rotations: Array) -> Array:
     """(F, B, 3) angles about z, then the turned x, then the turned y, degrees, of quaternions (F, B, 4).
 
     From frame to frame no angle jumps by a full turn: programs that draw between frames go along the line.
@@ -143,5 +142,5 @@ def _joint(joint: int, rest: RestBody, indent: str) -> Iterator[str]:
     yield indent + "}"
 
 
-def _vector(xyz: NDArray[np.float64]) -> str:
+def _vector(xyz: Array) -> str:
     return " ".join(f"{value:.6f}" for value in xyz)

@@ -10,19 +10,18 @@ from types import ModuleType
 from typing import Any, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shapepose_fg.body.model.smpl_file import SmplArrays
-from shapepose_fg.body.shapes import read_body
+from shapepose_fg.core.arrays import Index
 from shapepose_fg.core.camera import Axis
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.reconstruction import OpenedReconstruction, Reconstruction
 from shapepose_fg.core.result_files import results_folder
 from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.core.storage.files import write_content
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.export.take import Take
-from shapepose_fg.io.solved_setup import CAMERAS
+from shapepose_fg.io.solved_setup import CAMERAS, body_of
 
 
 class MarkerSet(StrEnum):
@@ -60,13 +59,7 @@ class Job:
     @cached_property
     def arrays(self) -> SmplArrays:
         """The body model; InputError where its file is not there any more."""
-        try:
-            return read_body(self.body)
-        except InputError as error:
-            if self.body is None or self.body.exists():
-                raise
-            problem = "the body model of this result is not there any more"
-            raise InputError(f"{self.body}: {problem}; put it back, or say with --body where it is") from error
+        return body_of(self.take.people.run, self.body_file)
 
 
 @dataclass
@@ -170,9 +163,8 @@ def export_result(
     """
     job: Job | None = None
     if not all(each.rows for each in formats):
-        needs: Any = {
-            name: any(getattr(each, name) for each in formats) for name in ("identities", "observations")
-        }
+        kinds = ("identities", "observations")
+        needs: Any = {name: any(getattr(each, name) for each in formats) for name in kinds}
         job = Job(read_take(results, **options, **needs), folder, body, markers, fill_gaps_s)
     done: dict[str, Written] = {}
     for each in formats:
@@ -214,15 +206,13 @@ def read_take(
         spans = covered_frames(people.run) or []
         cut = [[max(span.start, frames.start), min(span.stop, frames.stop)] for span in spans]
         people = people.with_run(frames=[[start, stop] for start, stop in cut if start < stop])
-    try:
+    with naming(path):
         return Take.of(people, axis, rig=rig, **options)
-    except ValueError as error:
-        raise InputError(f"{path}: {error}") from None
 
 
 def chosen_rows(
     opened: OpenedReconstruction, path: Path, frames: range | None, persons: tuple[int, ...] | None
-) -> NDArray[np.intp] | None:
+) -> Index | None:
     """(R,) rows of these frames and people; None for all. InputError for somebody who is not there."""
     if frames is None and persons is None:
         return None
@@ -237,7 +227,6 @@ def chosen_rows(
         return np.flatnonzero(mine)
     found, there = mine & (opened.frame >= frames.start) & (opened.frame < frames.stop), opened.frame[mine]
     if len(there) > 0 and not found.any():
-        raise InputError(
-            f"--frames: {path} has no people in these frames; people are in frames {there.min()} to {there.max()}"
-        )
+        problem = f"{path} has no people in these frames"
+        raise InputError(f"--frames: {problem}; people are in frames {there.min()} to {there.max()}")
     return np.flatnonzero(found)

@@ -1,6 +1,4 @@
-"""What a rerun recording holds: people and cameras in the world, what cameras saw and took, and how well it
-fits.
-"""
+"""What a rerun recording holds: people and cameras in the world, what cameras saw and took, and how it fits."""
 
 from collections.abc import Callable, Sequence
 from types import ModuleType
@@ -13,13 +11,14 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from shapepose_fg.body.model.smpl_file import SmplArrays
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.drawing import bones_of, colour_of, thinned, vertex_normals
 from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import Known
 from shapepose_fg.io.export.markers import sigma_m
 from shapepose_fg.io.export.registry import optional
-from shapepose_fg.io.export.skinned import rest_joints, skin
+from shapepose_fg.io.export.skinned import motion_of, skin
 from shapepose_fg.io.export.take import Take
 from shapepose_fg.io.footage.footage import Footage
 from shapepose_fg.io.footage.placement import CameraFootage, Placement
@@ -117,9 +116,7 @@ def _log_person(rr: ModuleType, stream: Any, take: Take, person: int) -> None:
             stream.log(plot, rr.Scalars(float(np.median(known))))
 
 
-def _ellipsoids(
-    rr: ModuleType, centres: NDArray[np.float64], covariance: NDArray[np.float64], colour: NDArray[np.float64]
-) -> Any:
+def _ellipsoids(rr: ModuleType, centres: Array, covariance: Array, colour: Array) -> Any:
     """The 95 % regions of joints."""
     fine = np.isfinite(covariance).all(axis=(1, 2))
     variance, axes = np.linalg.eigh(covariance[fine])
@@ -134,31 +131,25 @@ def _ellipsoids(
 
 
 def _log_bodies(
-    rr: ModuleType,
-    stream: Any,
-    take: Take,
-    person: int,
-    arrays: SmplArrays,
-    mesh: tuple[NDArray[np.intp], NDArray[np.int32]],
+    rr: ModuleType, stream: Any, take: Take, person: int, arrays: SmplArrays, mesh: tuple[Index, NDArray[np.int32]]
 ) -> None:
     """The body of one person where there is one; of its skin the vertices and triangles `mesh`."""
     (kept, faces), who = mesh, int(take.persons[person])
     path, colour = f"{person_path(who)}/body", _rgb8(np.array(colour_of(who))).tolist()
     surface = rr.Mesh3D.from_fields(triangle_indices=faces, albedo_factor=[*colour, round(255 * 0.55)])
     stream.log(path, surface, static=True)
-    parts = [take.column(name, person) for name in ("betas", "global_orient", "body_pose", "transl")]
-    whole = np.all([np.isfinite(part).reshape(len(part), -1).all(axis=1) for part in parts], axis=0)
-    for index in np.flatnonzero((take.rows[person] >= 0) & ~whole).tolist():
-        _set_time(stream, take, index)
+    motion = motion_of(take, person, arrays, np.eye(3))
+    index = np.zeros(0, dtype=np.intp) if motion is None else motion.index
+    for at in np.setdiff1d(np.flatnonzero(take.rows[person] >= 0), index).tolist():
+        _set_time(stream, take, at)
         stream.log(path, rr.Clear(recursive=False))
-    index = np.flatnonzero(whole)
-    for chunk in (index[start : start + _CHUNK] for start in range(0, len(index), _CHUNK)):
-        betas, orient, pose, transl = (part[chunk] for part in parts)
-        vectors = np.concatenate([orient[:, None], pose], axis=1).reshape(-1, 3)
-        rotations = Rotation.from_rotvec(vectors).as_quat().reshape(len(chunk), -1, 4)
-        pelvis = rest_joints(arrays, betas)[:, 0] + transl
-        vertices = skin(arrays, betas, rotations, pelvis, kept).astype(np.float32)
-        for place, at in enumerate(chunk.tolist()):
+    if motion is None:
+        return
+    betas = take.column("betas", person)[index]
+    for start in range(0, len(index), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        vertices = skin(arrays, betas[part], motion.rotations[part], motion.pelvis[part], kept).astype(np.float32)
+        for place, at in enumerate(index[part].tolist()):
             _set_time(stream, take, at)
             normals = vertex_normals(vertices[place], faces).astype(np.float32)
             stream.log(path, rr.Mesh3D.from_fields(vertex_positions=vertices[place], vertex_normals=normals))
@@ -217,9 +208,7 @@ def log_pictures(
     pictures: Sequence[tuple[CameraFootage, Footage]],
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
-    """What the cameras took of a take's frames, undistorted, so that people and detections lie on it; a frame
-    without a picture has none.
-    """
+    """What the cameras took of a take's frames, undistorted, so that people and detections lie on it."""
     rr = optional("rerun", "view")
     if take.rig is None:
         raise ValueError("pictures need cameras")
@@ -252,5 +241,5 @@ def undistorting(camera: Camera, placement: Placement) -> tuple[NDArray[np.float
     return np.ascontiguousarray(there[..., 0]), np.ascontiguousarray(there[..., 1])
 
 
-def _rgb8(colours: NDArray[np.float64]) -> NDArray[np.uint8]:
+def _rgb8(colours: Array) -> NDArray[np.uint8]:
     return np.rint(255 * np.clip(colours, 0, 1)).astype(np.uint8)

@@ -6,10 +6,11 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS, SmplArrays
+from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.reconstruction import BODY, with_body
 from shapepose_fg.io.export.registry import Job, Written
 from shapepose_fg.io.export.take import Take
 
@@ -24,25 +25,25 @@ class RestBody:
 
     arrays: SmplArrays
     """The body model."""
-    betas: NDArray[np.float64]
+    betas: Array
     """(10,) the person's shape."""
 
     @cached_property
-    def joints(self) -> NDArray[np.float64]:
+    def joints(self) -> Array:
         """(24, 3) the joints."""
         return rest_joints(self.arrays, self.betas[None])[0]
 
     @cached_property
-    def vertices(self) -> NDArray[np.float64]:
+    def vertices(self) -> Array:
         """(Nv, 3) the skin."""
         return self.arrays.template + self.arrays.shapes @ self.betas
 
     @property
-    def offsets(self) -> NDArray[np.float64]:
+    def offsets(self) -> Array:
         """(24, 3) each joint from its parent; the pelvis from the origin."""
         return _offsets(self.joints[None])[0]
 
-    def tips(self) -> dict[int, NDArray[np.float64]]:
+    def tips(self) -> dict[int, Array]:
         """(3,) from each joint without children to the end of its bone: as far as its skin goes on."""
         leaves = set(range(BONES)) - set(SMPL_PARENTS)
         bone_of = self.arrays.weights.argmax(axis=1)
@@ -62,18 +63,18 @@ class Motion:
 
     rest: RestBody
     """The body, one shape for all frames."""
-    index: NDArray[np.intp]
+    index: Index
     """(F,) which frames of the take have a body."""
-    rotations: NDArray[np.float64]
+    rotations: Array
     """(F, 24, 4) each bone against its parent, the pelvis against the world; quaternions x y z w."""
-    pelvis: NDArray[np.float64]
+    pelvis: Array
     """(F, 3) the pelvis in the world, metres."""
     spread_m: float = 0.0
     """How far a joint lies at most from where it is with the frame's own shape; 0 where all have one shape."""
-    filled: NDArray[np.bool_] | None = None
+    filled: Mask | None = None
     """(F,) frames that lie in a hole, between those before and after it; None where no hole was filled."""
 
-    def joints(self) -> NDArray[np.float64]:
+    def joints(self) -> Array:
         """(F, 24, 3) the joints in the world, metres."""
         return pose_joints(self.rest.offsets[None], self.rotations, self.pelvis)
 
@@ -94,12 +95,10 @@ class Motion:
             yield Motion(self.rest, index, rotations, pelvis, filled=~np.isin(index, given))
 
 
-def motion_of(take: Take, person: int, arrays: SmplArrays, axes: NDArray[np.float64]) -> Motion | None:
+def motion_of(take: Take, person: int, arrays: SmplArrays, axes: Array) -> Motion | None:
     """The body of one person in the world turned by `axes` (3, 3); None for somebody without a body."""
-    parts = [take.column(name, person) for name in ("betas", "global_orient", "body_pose", "transl")]
-    index = np.flatnonzero(
-        np.all([np.isfinite(part).reshape(len(part), -1).all(axis=1) for part in parts], axis=0)
-    )
+    parts = [take.column(name, person) for name in BODY]
+    index = np.flatnonzero(with_body(*parts))
     if len(index) == 0:
         return None
     betas, orient, pose, transl = (part[index] for part in parts)
@@ -115,9 +114,7 @@ def motion_of(take: Take, person: int, arrays: SmplArrays, axes: NDArray[np.floa
     return replace(motion, spread_m=float(apart.max()))
 
 
-def everybody(
-    job: Job, take: Take, kind: str, axes: NDArray[np.float64], written: Written
-) -> Iterator[tuple[int, Motion]]:
+def everybody(job: Job, take: Take, kind: str, axes: Array, written: Written) -> Iterator[tuple[int, Motion]]:
     """Who has a body, and how it moves in the world turned by `axes` (3, 3).
 
     Who has none, or several shapes, is noted in `written`.
@@ -135,12 +132,8 @@ def everybody(
         yield who, motion
 
 
-def all_segments(
-    job: Job, kind: str, axes: NDArray[np.float64], written: Written
-) -> Iterator[tuple[Path, Motion, Take]]:
-    """Everybody's motion at one rate in parts without long holes, with the take that these are frames of; and the
-    name of each one's file, without ending.
-    """
+def all_segments(job: Job, kind: str, axes: Array, written: Written) -> Iterator[tuple[Path, Motion, Take]]:
+    """Everybody's motion at one rate without long holes: file without ending, motion, take of its frames."""
     take = written.at_one_rate(job.take)
     for who, motion in everybody(job, take, kind, axes, written):
         for segment in motion.segments(int(job.fill_gaps_s * take.fps + 1e-6)):
@@ -148,20 +141,14 @@ def all_segments(
             yield job.folder / f"person_{who}_frames_{first}-{last}", segment, take
 
 
-def rest_joints(arrays: SmplArrays, betas: NDArray[np.float64]) -> NDArray[np.float64]:
+def rest_joints(arrays: SmplArrays, betas: Array) -> Array:
     """(B, 24, 3) joints of shapes (B, 10) in the T-pose, metres."""
     mean = arrays.joint_regressor @ arrays.template
     shapes = np.einsum("jv,vxn->jxn", arrays.joint_regressor, arrays.shapes, optimize=True)
     return mean + np.einsum("jxn,bn->bjx", shapes, betas)
 
 
-def skin(
-    arrays: SmplArrays,
-    betas: NDArray[np.float64],
-    rotations: NDArray[np.float64],
-    pelvis: NDArray[np.float64],
-    only: NDArray[np.intp],
-) -> NDArray[np.float64]:
+def skin(arrays: SmplArrays, betas: Array, rotations: Array, pelvis: Array, only: Index) -> Array:
     """(F, M, 3) the vertices `only` (M,) of bodies (F, 10), turned (F, 24, 4) and placed (F, 3); metres.
 
     Without the corrections of the skin that depend on the pose, which the open body does not have.
@@ -176,9 +163,7 @@ def skin(
     return (blended[..., :3] @ shaped[..., None])[..., 0] + blended[..., 3]
 
 
-def pose_joints(
-    offsets: NDArray[np.float64], rotations: NDArray[np.float64], pelvis: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def pose_joints(offsets: Array, rotations: Array, pelvis: Array) -> Array:
     """(F, 24, 3) joints of bones with `offsets` (F or 1, 24, 3) from their parents, turned and placed."""
     turn = _accumulated(rotations)
     places = [pelvis]
@@ -187,12 +172,12 @@ def pose_joints(
     return np.stack(places, axis=1)
 
 
-def _offsets(rest: NDArray[np.float64]) -> NDArray[np.float64]:
+def _offsets(rest: Array) -> Array:
     """(B, 24, 3) joints in the T-pose from their parents; the pelvis from the origin."""
     return np.concatenate([rest[:, :1], rest[:, 1:] - rest[:, np.array(SMPL_PARENTS[1:])]], axis=1)
 
 
-def _accumulated(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+def _accumulated(rotations: Array) -> Array:
     """(F, 24, 3, 3) world from bone, of quaternions (F, 24, 4) against the parent."""
     local = Rotation.from_quat(rotations.reshape(-1, 4)).as_matrix().reshape(-1, BONES, 3, 3)
     world = [local[:, 0]]

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.reconstruction import Known, OpenedReconstruction
 from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.core.storage.schema import code_names
@@ -40,7 +41,7 @@ def write_csv(job: Job) -> Written:
 def csv_text(take: Take) -> str:
     """All joints that are placed: a joint that is not known has no line. What else is not known is empty."""
 
-    def words(values: NDArray[np.float64], digits: str = "%.6f") -> list[str]:
+    def words(values: Array, digits: str = "%.6f") -> list[str]:
         return np.where(np.isfinite(values), np.char.mod(digits, values), "").tolist()
 
     people = take.people
@@ -70,7 +71,7 @@ def csv_text(take: Take) -> str:
     return stream.getvalue()
 
 
-def write_parquet(opened: OpenedReconstruction, rows: NDArray[np.intp] | None, folder: Path) -> Written:
+def write_parquet(opened: OpenedReconstruction, rows: Index | None, folder: Path) -> Written:
     """`people.parquet`: a row per person and frame, columns as in people.npz and observations.npz.
 
     `rows` (R,), rising, chooses; None takes all; some are in memory at a time. An array of a row is a flat list in
@@ -102,18 +103,15 @@ def write_parquet(opened: OpenedReconstruction, rows: NDArray[np.intp] | None, f
         with parquet.ParquetWriter(stream, schema, compression="zstd") as writer:
             for start in range(0, len(rows), _GROUP_ROWS):
                 columns, _ = _columns(opened, rows[start : start + _GROUP_ROWS])
-                arrays = [
-                    array(values, field.type) for values, field in zip(columns.values(), schema, strict=True)
-                ]
+                typed = zip(columns.values(), schema, strict=True)
+                arrays = [array(values, field.type) for values, field in typed]
                 writer.write_table(arrow.Table.from_arrays(arrays, schema=schema))
 
     write_atomically(folder / "people.parquet", write)
     return Written([folder / "people.parquet"])
 
 
-def _columns(
-    opened: OpenedReconstruction, rows: NDArray[np.intp]
-) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+def _columns(opened: OpenedReconstruction, rows: Index) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """All columns in some rows, by their names, and what is said of the whole file."""
     people = opened.rows(rows)
     table = people.observations

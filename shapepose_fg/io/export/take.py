@@ -7,9 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.filesize import decimal
 
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Axis, Rig
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.reconstruction import Known, Reconstruction
+from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction
 from shapepose_fg.core.result_files import free_memory
 from shapepose_fg.core.run_summary import covered_frames
 
@@ -30,8 +31,8 @@ _LONGEST = 1_000_000
 """Frames of a file with one rate: nine hours at 30 a second. Beyond, times are in another unit or have a hole."""
 _BODY_BYTES = 2_000
 """What one person's body takes in a frame while it is written, about."""
-_OF_JOINTS, _OF_BODIES = "joints covariance velocity velocity_covariance", "betas global_orient body_pose transl"
-"""Columns of a result that are NaN where no view saw a joint, or a person."""
+_OF_JOINTS = ("joints", "covariance", "velocity", "velocity_covariance")
+"""Columns of a result that are NaN where no view saw a joint; those of `BODY` are where none saw the person."""
 _SHORTEST_S, _LONGEST_S = 1e-6, 1e5
 """From frame to frame: outside of this times are in another unit."""
 
@@ -44,11 +45,11 @@ class Take:
     """The rows; joints that are left out are NaN in it."""
     persons: NDArray[np.int64]
     """(P,) identities."""
-    rows: NDArray[np.intp]
+    rows: Index
     """(P, T) row of `people` of each person in each frame; -1 where there is none."""
     frames: NDArray[np.int64]
     """(T,) numbers of the frames, as in people.npz."""
-    times_s: NDArray[np.float64]
+    times_s: Array
     """(T,) when they were taken, seconds; rising."""
     fps: float
     """Frames a second: one over the median step."""
@@ -151,14 +152,14 @@ def _seen(people: Reconstruction) -> Reconstruction:
         raise ValueError("people.npz does not say how joints are known; leave out --seen-only")
     seen = Known.observed(people.known)
     columns: dict[str, Any] = {"known": np.where(seen, people.known, Known.UNKNOWN).astype(np.uint8)}
-    for names, kept in ((_OF_JOINTS, seen), (_OF_BODIES, seen.any(axis=1))):
-        for name in names.split():
+    for names, kept in ((_OF_JOINTS, seen), (BODY, seen.any(axis=1))):
+        for name in names:
             value = getattr(people, name)
             columns[name] = np.where(kept.reshape(*kept.shape, *[1] * (value.ndim - kept.ndim)), value, np.nan)
     return replace(people, **columns)
 
 
-def _times(people: Reconstruction, frames: NDArray[np.int64], fps: float | None) -> NDArray[np.float64]:
+def _times(people: Reconstruction, frames: NDArray[np.int64], fps: float | None) -> Array:
     """When each frame was taken: frames without a row lie between those with one."""
     if fps is not None:
         return frames / fps
@@ -182,7 +183,7 @@ def _fps_of(people: Reconstruction) -> float:
     return float(fps)
 
 
-def y_up(up: Axis) -> NDArray[np.float64]:
+def y_up(up: Axis) -> Array:
     """(3, 3) rotation from a world with the axis `up` upwards to y up: BVH and glTF.
 
     Z up becomes (x, z, -y), which Blender's importers undo: there the numbers are those of the world again.
@@ -190,11 +191,11 @@ def y_up(up: Axis) -> NDArray[np.float64]:
     return np.array(_TO_Y_UP[up], dtype=np.float64)
 
 
-def z_up(up: Axis) -> NDArray[np.float64]:
+def z_up(up: Axis) -> Array:
     """(3, 3) rotation to z up, as AMASS has it; the identity where z is up."""
     return _Z_FROM_Y @ y_up(up)
 
 
-def opensim_axes(up: Axis) -> NDArray[np.float64]:
+def opensim_axes(up: Axis) -> Array:
     """(3, 3) rotation to y up in TRC and C3D: Pose2Sim's, so that the same cameras give the same numbers."""
     return _FORWARD_X @ y_up(up)

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.camera_names import in_order
 from shapepose_fg.io.footage.places import PICTURES
@@ -59,7 +60,7 @@ class Video:
     path: Path
     size: tuple[int, int]
     """(width, height) of the pictures."""
-    time_s: NDArray[np.float64]
+    time_s: Array
     """(N,) the frames' own times in the file, seconds after the first."""
     notes: tuple[str, ...] = ()
     """What is wrong with the file, a sentence each."""
@@ -68,7 +69,7 @@ class Video:
     _last: Picture | None = None
 
     @property
-    def number(self) -> NDArray[np.intp]:
+    def number(self) -> Index:
         """(N,) frames count from 0."""
         return np.arange(len(self.time_s))
 
@@ -78,9 +79,7 @@ class Video:
         capture = _capture(path)
         size, fps = glance(path, capture)
         if not (min(size) > 0 and max(size) <= _LARGEST):
-            raise InputError(
-                f"{path}: the video's pictures would be {size[0]} x {size[1]}; give an undamaged video"
-            )
+            raise InputError(f"{path}: its pictures would be {size[0]} x {size[1]}; give an undamaged video")
         announced = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
         stamps = []
         while capture.grab():
@@ -124,11 +123,11 @@ class PictureFiles:
     """(width, height) of the pictures."""
     files: tuple[Path, ...]
     """(N,) the files in the order of their numbers."""
-    number: NDArray[np.intp]
+    number: Index
     """(N,) number of each frame, rising."""
     notes: tuple[str, ...] = ()
     """What is wrong with the files, a sentence each."""
-    time_s: NDArray[np.float64] | None = None
+    time_s: Array | None = None
     """Files do not say when they were taken."""
 
     @classmethod
@@ -188,16 +187,14 @@ def _capture(path: Path) -> Any:
     return capture
 
 
-def _times(path: Path, stamp_s: NDArray[np.float64], fps: float) -> tuple[NDArray[np.float64], list[str]]:
+def _times(path: Path, stamp_s: Array, fps: float) -> tuple[Array, list[str]]:
     """(N,) seconds after the first frame, and what is odd about them.
 
     The file's own times where they rise; else the rate that it names.
     """
     if len(stamp_s) > 1 and not (np.diff(stamp_s) > 0).all():
         if fps < 0.01:
-            raise InputError(
-                f"{path}: the video says neither times nor rate; give --fps CAMERA=RATE, or convert it"
-            )
+            raise InputError(f"{path}: the video says neither times nor rate; give --fps CAMERA=RATE")
         return np.arange(len(stamp_s)) / fps, [
             f"{path}: the frames' times in the file do not rise; its rate of {fps:g} a second was taken instead"
         ]

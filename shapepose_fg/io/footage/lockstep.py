@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.footage.footage import Footage
 from shapepose_fg.io.footage.places import per_camera
@@ -24,7 +24,7 @@ class CameraClock:
 
     name: str
     """The camera."""
-    time: NDArray[np.float64]
+    time: Array
     """(N,) times of its frames on the common clock, rising; seconds, or frames where there is no clock."""
     period: float
     """From one frame to the next, in the same unit."""
@@ -34,9 +34,9 @@ class CameraClock:
 class Lockstep:
     """The moments of a recording, and each camera's picture of each."""
 
-    picture: NDArray[np.intp]
+    picture: Index
     """(T, V) place of each camera's frame; -1 where it has none within half a frame."""
-    time_s: NDArray[np.float64] | None
+    time_s: Array | None
     """(T, V) when those frames were taken, seconds; the moment where there is none. None without a clock."""
     notes: tuple[str, ...]
     """What was left out, and how far pictures of one moment are apart."""
@@ -97,9 +97,7 @@ def _start(text: str | None, period: float, has_clock: bool) -> float:
     if match is None:
         raise InputError(f"--start {text}: must be seconds such as 0.2s, or the camera's own frames such as 12f")
     if match[2] == "s" and not has_clock:
-        raise InputError(
-            f"--start {text}: nothing says how many frames a second there are; give --fps, or frames (12f)"
-        )
+        raise InputError(f"--start {text}: nothing says how many frames a second there are; give --fps, or 12f")
     return float(match[1]) * (1.0 if match[2] == "s" else period)
 
 
@@ -151,7 +149,7 @@ def align(clocks: Sequence[CameraClock], has_clock: bool) -> Lockstep:
     return Lockstep(picture, time_s, (*notes, *misfits))
 
 
-def _nearest(clock: CameraClock, moment: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+def _nearest(clock: CameraClock, moment: Array) -> tuple[Index, Array]:
     """(T,) place of the frame nearest to each moment, -1 where it is more than half a frame away; and how far."""
     after = np.clip(np.searchsorted(clock.time, moment), 0, len(clock.time) - 1)
     before = np.maximum(after - 1, 0)
@@ -162,7 +160,7 @@ def _nearest(clock: CameraClock, moment: NDArray[np.float64]) -> tuple[NDArray[n
     return np.where(off <= clock.period / 2 * (1 + 1e-3) + 1e-9, place, -1), off
 
 
-def _left_out(clock: CameraClock, place: NDArray[np.intp], moment: float) -> str:
+def _left_out(clock: CameraClock, place: Index, moment: float) -> str:
     """How many frames a camera took before and after the moments, which follow each other after `moment`."""
     used = place[place >= 0]
     ends = [(int(used[0]), "start"), (int(len(clock.time) - 1 - used[-1]), "end")] if len(used) > 0 else []

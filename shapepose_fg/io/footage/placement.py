@@ -1,6 +1,4 @@
-"""Where the calibrated picture lies in the pictures of the footage, if these have another size; and which pictures
-detections were made from: footage.json beside them, for who draws on the pictures.
-"""
+"""Where the calibrated picture lies in those of the footage; and footage.json: what detections were made from."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -11,9 +9,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import read_json, write_content
@@ -54,7 +52,7 @@ class Placement:
     """(width, height) that the calibration is for."""
 
     @cached_property
-    def scale(self) -> NDArray[np.float64]:
+    def scale(self) -> Array:
         """(2,) pixels of the picture per calibrated pixel, x and y."""
         scale = np.array(self.picture_size, dtype=float) / self.calibrated_size
         if self.kind is PlacementKind.LETTERBOX:
@@ -62,7 +60,7 @@ class Placement:
         return scale if self.kind is PlacementKind.SCALE else np.ones(2)
 
     @cached_property
-    def shift(self) -> NDArray[np.float64]:
+    def shift(self) -> Array:
         """(2,) the left and upper edges of the calibrated picture, pixels from the picture's own edges."""
         centred = self.kind in (PlacementKind.LETTERBOX, PlacementKind.CROP_CENTRE)
         return (self.picture_size - self.scale * self.calibrated_size) / 2 if centred else np.zeros(2)
@@ -75,11 +73,11 @@ class Placement:
         left, top, right, bottom = np.concatenate([low, high]) - 0.5
         return float(left), float(top), float(right), float(bottom)
 
-    def to_picture(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    def to_picture(self, xy: Array) -> Array:
         """Pixels (..., 2) of the picture from calibrated pixels (as the lens gives them)."""
         return (xy + 0.5) * self.scale + self.shift - 0.5
 
-    def to_calibrated(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    def to_calibrated(self, xy: Array) -> Array:
         """Calibrated pixels (..., 2) from pixels of the picture."""
         return (xy + 0.5 - self.shift) / self.scale - 0.5
 
@@ -113,30 +111,25 @@ def place(
     `wanted` says what was done, and where what is wanted is impossible.
     """
     (width, height), (full_width, full_height) = picture_size, calibrated_size
-    sizes = (
-        f"camera {name}: the pictures are {width} x {height}, the calibration is for {full_width} x {full_height}"
-    )
+    full = f"{full_width} x {full_height}"
+    sizes = f"camera {name}: the pictures are {width} x {height}, the calibration is for {full}"
     kind, note = wanted, None
     if wanted is PlacementKind.SAME and picture_size != calibrated_size:
         raise InputError(f"{sizes}: not the same size; give another --image-placement")
     if wanted is not None or picture_size == calibrated_size:
         kind = wanted or PlacementKind.SAME
     elif max(abs(width - full_width), abs(height - full_height)) <= _BLOCK:
-        kind, note = (
-            PlacementKind.CROP,
-            (
-                f"{sizes}: the first column and row are taken to be the calibrated ones (--image-placement"
-                f" {name}=crop); if it was cut on both sides, give {name}=crop-centre; if resized, {name}=scale"
-            ),
+        kind = PlacementKind.CROP
+        note = (
+            f"{sizes}: the first column and row are taken to be the calibrated ones (--image-placement"
+            f" {name}=crop); if it was cut on both sides, give {name}=crop-centre; if resized, {name}=scale"
         )
     # Of one shape, to within the rounding of both sides to whole pixels.
     elif abs(width / full_width - height / full_height) <= 1 / full_width + 1 / full_height:
         kind = PlacementKind.SCALE
         note = f"{sizes}, of the same shape: taken as resized (--image-placement {name}=scale)"
     elif (height, width) == calibrated_size:
-        raise InputError(
-            f"{sizes}: the pictures lie on their side; turn the video by 90 degrees, or calibrate it as it is"
-        )
+        raise InputError(f"{sizes}: the pictures lie on their side; turn the video, or calibrate it as it is")
     else:
         raise InputError(
             f"{sizes}; say what was done to them with --image-placement: letterbox (resized, with bars), scale"
@@ -155,7 +148,7 @@ class CameraFootage:
     """The video, picture, or folder of pictures."""
     placement: Placement
     """Where calibrated pixels lie in the pictures."""
-    places: NDArray[np.intp]
+    places: Index
     """(T,) the picture of each frame, counted from 0 in the file; -1 where there is none."""
 
 

@@ -12,15 +12,16 @@ from numpy.typing import NDArray
 
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.soles import lowest_of_feet
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.observation_table import ObservationTable
-from shapepose_fg.core.reconstruction import Known, Reconstruction, Status, count_rows
+from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction, Status, count_rows
 from shapepose_fg.core.result_files import write_result
 from shapepose_fg.core.shapes import SubjectShapes
 from shapepose_fg.core.storage.npz import Pieces
 from shapepose_fg.core.storage.schema import Table
 from shapepose_fg.estimation.contact import feet_of
 from shapepose_fg.estimation.floor import LOOK_S, Floor, find_floor
-from shapepose_fg.pipeline.bodies_over_time import BODY, BodiesOverTime, Person
+from shapepose_fg.pipeline.bodies_over_time import BodiesOverTime, Person
 from shapepose_fg.pipeline.runs.parts import OBSERVED, Parts
 
 _FLOOR_ROWS = 4000
@@ -165,7 +166,7 @@ class Assembly:
             for name, each in empty.columns().items()
         }
 
-    def floor(self, model: BodyModel, up: NDArray[np.float64]) -> Floor | str:
+    def floor(self, model: BodyModel, up: Array) -> Floor | str:
         """Where the soles of everybody's bodies stand, or in words why no floor was found; `up` (3,) points up."""
         joints, parts = tuple(self.joint_names), self.parts
         # Ankles alone do not say where the sole is: unseen feet hang as the body's prior has them.

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.frame_times import segments
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.storage.schema import Column, Table
@@ -40,7 +40,7 @@ class Chunk:
 
 
 def cut_in_chunks(
-    frames: range, cuts: Sequence[int], time_s: NDArray[np.float64], config: PipelineConfig, chunk_frames: int
+    frames: range, cuts: Sequence[int], time_s: Array, config: PipelineConfig, chunk_frames: int
 ) -> list[Chunk]:
     """Chunks of about `chunk_frames` whose borders are those of windows, so that windows are as without chunks.
 
@@ -62,7 +62,7 @@ def cut_in_chunks(
     return found
 
 
-def _until(stop: int, segment: range, first: int, time_s: NDArray[np.float64], config: PipelineConfig) -> int:
+def _until(stop: int, segment: range, first: int, time_s: Array, config: PipelineConfig) -> int:
     """How far people must be followed for the window that ends at `stop`: half a window and the overlap beyond it,
     the block in which that is decided, as far as following looks ahead, and two frames to spare, in whole batches.
 
@@ -99,13 +99,13 @@ def windows_of(engine: Engine, chunk: Chunk, read: Callable[[int], Input]) -> It
 class Border(Table):
     """Who is where in the frames on both sides of a border: N rows."""
 
-    frame: Annotated[NDArray[np.intp], Column("N", np.intp)]
+    frame: Annotated[Index, Column("N", np.intp)]
     """(N,) frame of each row."""
-    track: Annotated[NDArray[np.intp], Column("N", np.intp)]
+    track: Annotated[Index, Column("N", np.intp)]
     """(N,) whose it is, as one of the chunks has it."""
-    candidate: Annotated[NDArray[np.intp], Column("N J V", np.intp)]
+    candidate: Annotated[Index, Column("N J V", np.intp)]
     """(N, J, V) its detections; -1 for none."""
-    place: Annotated[NDArray[np.float64], Column("N J 3", unit="m")]
+    place: Annotated[Array, Column("N J 3", unit="m")]
     """(N, J, 3) where its joints were expected, metres; NaN where nothing was."""
 
     @classmethod

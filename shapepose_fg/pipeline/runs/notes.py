@@ -1,6 +1,4 @@
-"""What a run notes down for run.json, window by window: times, how probable people are, who was dropped, what
-could not be solved.
-"""
+"""What a run notes down for run.json, window by window: times, who is how probable, dropped, or not solved."""
 
 import time
 from collections import Counter

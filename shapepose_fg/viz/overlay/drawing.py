@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index, Mask, Real, Whole
 from shapepose_fg.core.camera import Camera
 from shapepose_fg.core.drawing import bones_of, colour_of
 from shapepose_fg.core.errors import InputError
@@ -48,11 +49,11 @@ class PictureView:
     """(width, height) of what is drawn on: the picture, enlarged or made smaller."""
 
     @property
-    def scale(self) -> NDArray[np.float64]:
+    def scale(self) -> Array:
         """(2,) drawn pixels per pixel of the picture, x and y."""
         return np.array(self.size) / self.placement.picture_size
 
-    def project(self, points: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def project(self, points: Real) -> tuple[Array, Array]:
         """Drawn pixels (..., 2) and depths (...,) in metres of `points` (..., 3) in the world.
 
         Pixels are NaN behind the camera, and far outside the picture.
@@ -61,7 +62,7 @@ class PictureView:
         xy[~(depth > NEAR_M)] = np.nan
         return self.through_lens(xy), depth
 
-    def through_lens(self, xy: NDArray[np.floating]) -> NDArray[np.float64]:
+    def through_lens(self, xy: Real) -> Array:
         """Drawn pixels (..., 2) from undistorted ones, as observations have them."""
         flat = np.asarray(xy, dtype=np.float64).reshape(-1, 2)
         size = np.array(self.camera.image_size)
@@ -87,11 +88,12 @@ def stroke_of(size: tuple[int, int]) -> int:
 def draw_bodies(
     picture: Picture,
     view: PictureView,
-    vertices: NDArray[np.floating],
-    faces: NDArray[np.integer],
+    vertices: Real,
+    faces: Whole,
     colours: Sequence[Colour],
+    opacity: float = _OPACITY,
 ) -> Picture:
-    """The surfaces `vertices` (P, Nv, 3), metres, half transparent in a colour each, lit from the camera."""
+    """The surfaces `vertices` (P, Nv, 3), metres, in a colour each, lit from the camera."""
     if len(vertices) == 0:
         return picture
     points, corners = joined(vertices, faces)
@@ -105,7 +107,7 @@ def draw_bodies(
     light = 0.35 + 0.65 * np.clip(-(normal @ view.camera.wTc[:3, 2]), 0.0, 1.0)
     own = np.array(colours, dtype=np.float64)[met // len(faces)]
     drawn = picture.copy()
-    drawn[row, column] = ((1 - _OPACITY) * picture[row, column] + _OPACITY * light[:, None] * own).astype(np.uint8)
+    drawn[row, column] = ((1 - opacity) * picture[row, column] + opacity * light[:, None] * own).astype(np.uint8)
     return drawn
 
 
@@ -113,11 +115,11 @@ def draw_bodies(
 class Skeletons:
     """People's joints in one frame."""
 
-    joints: NDArray[np.float64]
+    joints: Array
     """(P, J, 3) metres; NaN where unknown."""
-    seen: NDArray[np.bool_]
+    seen: Mask
     """(P, J) whether a view saw the joint in this frame; others are inferred."""
-    bones: NDArray[np.intp]
+    bones: Index
     """(B, 2) joints that are joined."""
     colours: Sequence[Colour]
     """(P,) one for each person."""
@@ -146,9 +148,8 @@ def draw_skeletons(picture: Picture, view: PictureView, people: Skeletons) -> No
         ends = joints[people.bones]
         lines, _ = view.project(ends[:, :1] * (1 - part) + ends[:, 1:] * part)
         lines = lines[np.isfinite(lines).all(axis=(1, 2))]
-        fine = _fine(lines)
         for width, paint in ((stroke + 2, _DARK), (stroke, colour)):
-            cv2.polylines(picture, list(fine), False, paint, width, cv2.LINE_AA, _FINE)
+            draw_lines(picture, lines, paint, width)
         xy, _ = view.project(joints)
         known = np.isfinite(xy).all(axis=1)
         radius = round((stroke + 0.5) * (1 << _FINE))
@@ -162,7 +163,12 @@ def draw_skeletons(picture: Picture, view: PictureView, people: Skeletons) -> No
             draw_label(picture, label, (top[0], top[1] - 5 * stroke), colour)
 
 
-def _top(xy: NDArray[np.float64], size: tuple[int, int]) -> tuple[float, float] | None:
+def draw_lines(picture: Picture, xy: Array, colour: Colour, width: int = 1) -> None:
+    """Draw lines through the drawn pixels `xy` (L, K, 2)."""
+    cv2.polylines(picture, list(_fine(xy)), False, colour, width, cv2.LINE_AA, _FINE)
+
+
+def _top(xy: Array, size: tuple[int, int]) -> tuple[float, float] | None:
     """The middle of a person's width, and the highest of their joints `xy` (K, 2); None outside the picture."""
     inside = np.all((xy >= 0) & (xy < np.array(size)), axis=1)
     if not inside.any():
@@ -171,15 +177,12 @@ def _top(xy: NDArray[np.float64], size: tuple[int, int]) -> tuple[float, float] 
     return float((xy[:, 0].min() + xy[:, 0].max()) / 2), float(xy[:, 1].min())
 
 
-def draw_detections(
-    picture: Picture, xy: NDArray[np.float64], used: NDArray[np.bool_], colours: NDArray[np.integer]
-) -> None:
+def draw_detections(picture: Picture, xy: Array, used: Mask, colours: Whole) -> None:
     """Draw detections at drawn pixels `xy` (K, 2): squares in `colours` (K, 3), red crosses where not used."""
     reach = max(2, stroke_of(picture.shape[1::-1]))
     there = np.isfinite(xy).all(axis=1)
-    for (x, y), good, colour in zip(
-        _fine(xy[there]).tolist(), used[there].tolist(), colours[there].tolist(), strict=True
-    ):
+    drawn = _fine(xy[there]).tolist(), used[there].tolist(), colours[there].tolist()
+    for (x, y), good, colour in zip(*drawn, strict=True):
         arm = reach << _FINE
         if good:
             box = ((x - arm, y - arm), (x + arm, y + arm))
@@ -208,13 +211,11 @@ def draw_label(
     top = bottom - tall - below - 2 * pad
     cv2.rectangle(picture, (left, top), (left + across + 2 * pad, bottom), colour, -1)
     light = np.dot(colour, (0.114, 0.587, 0.299)) > 150
-    place = (left + pad, bottom - pad - below)
-    cv2.putText(
-        picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, size, _DARK if light else _WHITE, thick, cv2.LINE_AA
-    )
+    place, ink = (left + pad, bottom - pad - below), _DARK if light else _WHITE
+    cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, size, ink, thick, cv2.LINE_AA)
 
 
-def _fine(xy: NDArray[np.float64]) -> NDArray[np.int32]:
+def _fine(xy: Array) -> NDArray[np.int32]:
     """Pixels as OpenCV's drawing takes them with fractions."""
     return np.round(np.clip(xy, -30000, 30000) * (1 << _FINE)).astype(np.int32)
 
@@ -224,5 +225,5 @@ def write_picture(path: Path, picture: Picture) -> None:
     quality = [cv2.IMWRITE_JPEG_QUALITY, 90] if path.suffix == ".jpg" else []
     done, content = cv2.imencode(path.suffix, picture, quality)
     if not done:
-        raise InputError(f"{path}: the picture cannot be written in this format; use .png or .jpg")
+        raise InputError(f"{path}: pictures cannot be written in this format; use .png or .jpg")
     write_atomically(path, lambda stream: stream.write(content.tobytes()))

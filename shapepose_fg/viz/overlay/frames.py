@@ -16,22 +16,12 @@ from shapepose_fg.core.reconstruction import OpenedReconstruction, Reconstructio
 from shapepose_fg.io.footage.footage import Footage, Picture
 from shapepose_fg.io.footage.placement import CameraFootage
 from shapepose_fg.viz.bodies import surfaces
-from shapepose_fg.viz.overlay.drawing import (
-    Colour,
-    PictureView,
-    Skeletons,
-    blue_green_red,
-    draw_bodies,
-    draw_detections,
-    draw_label,
-    draw_skeletons,
-    write_picture,
-)
+from shapepose_fg.viz.overlay import drawing
 
 if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel
 
-_INK: Colour = (45, 45, 45)
+_INK: drawing.Colour = (45, 45, 45)
 _GRID = "grid"
 """What the file with all cameras is called."""
 
@@ -65,16 +55,16 @@ class Overlay:
         drawn = []
         for (used, footage), size in zip(self.cameras, sizes, strict=True):
             camera = self.rig.cameras[self.rig.names.index(used.name)]
-            view = PictureView(camera, used.placement, size)
+            view = drawing.PictureView(camera, used.placement, size)
             picture = _picture(used, footage, frame, size)
             if body is not None:
-                colours = [blue_green_red(int(people.person[row])) for row in rows]
-                picture = draw_bodies(picture, view, vertices, body.faces, colours)
+                colours = [drawing.blue_green_red(int(people.person[row])) for row in rows]
+                picture = drawing.draw_bodies(picture, view, vertices, body.faces, colours)
             if self.detections:
                 _draw_detections(picture, view, people)
             if self.skeletons:
-                draw_skeletons(picture, view, Skeletons.of(people))
-            draw_label(picture, f"camera {used.name}, frame {frame}", (0, 0), _INK, centred=False)
+                drawing.draw_skeletons(picture, view, drawing.Skeletons.of(people))
+            drawing.draw_label(picture, f"camera {used.name}, frame {frame}", (0, 0), _INK, centred=False)
             drawn.append(picture)
         return drawn
 
@@ -106,7 +96,7 @@ def write_overlay(
             for index, (name, picture) in enumerate(zip(names, pictures, strict=True)):
                 if fps is None:
                     paths.append(folder / f"{name}_{frame:06d}.jpg")
-                    write_picture(paths[-1], picture)
+                    drawing.write_picture(paths[-1], picture)
                     continue
                 if at == 0:
                     paths.append(folder / f"{name}.mp4")
@@ -124,9 +114,7 @@ def _video(path: Path, size: Sequence[int], fps: float) -> Iterator[cv2.VideoWri
     writer = cv2.VideoWriter(str(part), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
     try:
         if not writer.isOpened():
-            raise InputError(
-                f"{path}: a video of {size[0]} x {size[1]} cannot be written here; check space and rights"
-            )
+            raise InputError(f"{path}: a video of {size[0]} x {size[1]} cannot be written; check space and rights")
         yield writer
         writer.release()
         part.replace(path)
@@ -135,7 +123,7 @@ def _video(path: Path, size: Sequence[int], fps: float) -> Iterator[cv2.VideoWri
         part.unlink(missing_ok=True)
 
 
-def _draw_detections(picture: Picture, view: PictureView, people: Reconstruction) -> None:
+def _draw_detections(picture: Picture, view: drawing.PictureView, people: Reconstruction) -> None:
     """Draw what the camera of `view` saw of the people of one frame."""
     table = people.observations
     if table is None or view.camera.name not in table.view_names.tolist():
@@ -144,8 +132,8 @@ def _draw_detections(picture: Picture, view: PictureView, people: Reconstruction
     gate = table.gate[..., v]
     row, joint = np.nonzero(gate != Gate.NOT_SEEN)
     xy = view.through_lens(table.xy[row, joint, v])
-    colours = np.array([blue_green_red(person) for person in table.person[row].tolist()]).reshape(-1, 3)
-    draw_detections(picture, xy, gate[row, joint] == Gate.USED, colours)
+    colours = np.array([drawing.blue_green_red(person) for person in table.person[row].tolist()]).reshape(-1, 3)
+    drawing.draw_detections(picture, xy, gate[row, joint] == Gate.USED, colours)
 
 
 def _picture(used: CameraFootage, footage: Footage, frame: int, size: tuple[int, int]) -> Picture:
@@ -179,11 +167,6 @@ def grid_shape(sizes: Sequence[tuple[int, int]], width: int) -> tuple[int, list[
 def grid(pictures: Sequence[Picture], columns: int) -> Picture:
     """Pictures of one height side by side, `columns` in a row; short rows are filled up in dark grey."""
     rows = [np.hstack(pictures[at : at + columns]) for at in range(0, len(pictures), columns)]
-    width = max(row.shape[1] for row in rows)
-    padded = [
-        np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=30)
-        if row.shape[1] < width
-        else row
-        for row in rows
-    ]
-    return np.vstack(padded)
+    missing = [max(row.shape[1] for row in rows) - row.shape[1] for row in rows]
+    pairs = zip(rows, missing, strict=True)
+    return np.vstack([np.pad(row, ((0, 0), (0, n), (0, 0)), constant_values=30) for row, n in pairs])

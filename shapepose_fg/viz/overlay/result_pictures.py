@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Index
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.footage.footage import Footage, open_footage
@@ -90,7 +90,7 @@ def pictures_of(
     return pairs
 
 
-def _counted(footage: Footage) -> NDArray[np.intp]:
+def _counted(footage: Footage) -> Index:
     """(T,) the picture of each frame, counted from the first picture's number; -1 where one is missing."""
     count = int(footage.number[-1] - footage.number[0]) + 1
     if count > _MOST_FRAMES:

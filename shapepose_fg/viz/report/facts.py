@@ -17,9 +17,7 @@ def told_by(run: Run) -> dict[str, Any]:
     return {
         "warnings": [*map(str, lists(objects(run.get("setup")).get("warnings")))],
         "notes": [*map(str, lists(run.get("notes")))],
-        "problems": [
-            ", ".join(f"{key} {value}" for key, value in objects(each).items()) for each in lists(problems)
-        ],
+        "problems": [", ".join(f"{key} {it}" for key, it in objects(each).items()) for each in lists(problems)],
         "dropped": _dropped(objects(people.get("dropped")), objects(run.get("dropped_frames"))),
         "probabilities": _probabilities(run.get("probability")),
         "fps": number(time.get("fps")),
@@ -67,11 +65,8 @@ def _changed_settings(run: Run) -> list[tuple[str, str, str]]:
 def _dropped(reasons: Run, frames: Run) -> list[tuple[str, int, str]]:
     """Why somebody was left out: reason, how many, and in which frames, as far as there is room."""
     counts = {reason: number(count) for reason, count in reasons.items()}
-    return [
-        (reason, int(count), _frames_words(frames.get(reason)))
-        for reason, count in counts.items()
-        if count is not None
-    ]
+    told = [(reason, int(count)) for reason, count in counts.items() if count is not None]
+    return [(reason, count, _frames_words(frames.get(reason))) for reason, count in told]
 
 
 def _probabilities(listed: object) -> dict[int, float]:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Index, Mask, Real, Whole
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.reconstruction import Known, Reconstruction
 from shapepose_fg.core.run_summary import covered_frames
@@ -29,7 +30,7 @@ class Residual:
     """Nine of ten are nearer."""
 
     @classmethod
-    def of(cls, px: NDArray[np.floating]) -> "Residual":
+    def of(cls, px: Real) -> "Residual":
         """Of all finite distances in `px`."""
         px = px[np.isfinite(px)]
         return cls(*np.quantile(px, [0.5, 0.9]).tolist()) if len(px) > 0 else cls(None, None)
@@ -109,7 +110,7 @@ def overall(people: Reconstruction) -> dict[str, Any]:
     }
 
 
-def known_counts(people: Reconstruction, by: NDArray[np.integer] | None = None) -> NDArray[np.int64]:
+def known_counts(people: Reconstruction, by: Whole | None = None) -> NDArray[np.int64]:
     """How many joints are known in each of `KINDS`: (J, 5) by joint, or (G, 5) by groups `by` (N,) of the rows."""
     kinds = people.known[..., None] == np.array(KINDS)
     if by is None:
@@ -119,11 +120,11 @@ def known_counts(people: Reconstruction, by: NDArray[np.integer] | None = None) 
     return counts
 
 
-def _share(true: NDArray[np.bool_]) -> float | None:
+def _share(true: Mask) -> float | None:
     return float(true.mean()) if true.size > 0 else None
 
 
-def _segments(table: ObservationTable) -> NDArray[np.intp]:
+def _segments(table: ObservationTable) -> Index:
     """(N,) which segment of the recording each row is in."""
     if len(table) == 0:
         return np.zeros(0, dtype=np.intp)

@@ -20,11 +20,7 @@ _SCRIPTS = ("geometry.js", "skin.js", "drawing.js", "page.js")
 
 
 def page_text(
-    title: str,
-    people: Reconstruction,
-    tracks: Sequence[TrackSummary],
-    scene: Scene | None,
-    remarks: Sequence[str],
+    title: str, people: Reconstruction, tracks: Sequence[TrackSummary], scene: Scene | None, remarks: Sequence[str]
 ) -> str:
     """The page of a result as HTML: self-contained, with no address of anything else in it.
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS, SmplArrays
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Camera
 from shapepose_fg.core.drawing import PALETTE, bones_of, thinned
 from shapepose_fg.core.reconstruction import Known
@@ -92,19 +93,19 @@ def scene_of(take: Take, arrays: SmplArrays | None, most_bytes: int) -> Scene:
 class _Packing:
     """Places as whole numbers of a unit from an origin."""
 
-    origin: NDArray[np.float64]
+    origin: Array
     """(3,) metres."""
     unit_m: float
     """Metres."""
 
-    def __call__(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def __call__(self, points: Array) -> Array:
         """(..., 3) whole numbers of points (..., 3); missing where a point is not known or too far."""
         steps = np.rint((points - self.origin) / self.unit_m)
         near = np.isfinite(steps).all(axis=-1, keepdims=True) & (np.abs(steps) < -_MISSING).all(-1, keepdims=True)
         return np.where(near, steps, _MISSING)
 
 
-def _packing(joints: NDArray[np.float64]) -> _Packing:
+def _packing(joints: Array) -> _Packing:
     """How places are rounded."""
     placed = joints[np.isfinite(joints).all(axis=-1)]
     if len(placed) == 0:
@@ -115,7 +116,7 @@ def _packing(joints: NDArray[np.float64]) -> _Packing:
     return _Packing((low + high) / 2, 1e-3 * max(_FINEST_MM, coarse))
 
 
-def _known_and_sigma(known: NDArray[np.uint8], sigma: NDArray[np.float64]) -> NDArray[np.uint8]:
+def _known_and_sigma(known: NDArray[np.uint8], sigma: Array) -> NDArray[np.uint8]:
     """How a joint is known in the two low bits, its sigma's level in the six above; level 0 is not known.
 
     A joint that is seen weakly is drawn like one that the body places.
@@ -127,7 +128,7 @@ def _known_and_sigma(known: NDArray[np.uint8], sigma: NDArray[np.float64]) -> ND
     return (known + 4 * level).astype(np.uint8)
 
 
-def _floor(joints: NDArray[np.float64]) -> float:
+def _floor(joints: Array) -> float:
     """Height of the floor, metres: 0 where feet are near it, else where the lowest joints are."""
     height = joints[..., 2]
     placed = np.isfinite(height)
@@ -138,7 +139,7 @@ def _floor(joints: NDArray[np.float64]) -> float:
     return 0.0 if abs(ground) < _FLOOR_M else ground
 
 
-def _view(joints: NDArray[np.float64], centres: NDArray[np.float64]) -> dict[str, Any]:
+def _view(joints: Array, centres: Array) -> dict[str, Any]:
     """Where the people are, for the first look: the box around them, and how far they and the cameras reach."""
     points = joints.reshape(-1, 3)
     points = points[np.isfinite(points).all(axis=1)]
@@ -154,7 +155,7 @@ def _view(joints: NDArray[np.float64], centres: NDArray[np.float64]) -> dict[str
     return box | {"reach": max(reach, 1.0), "cameras": float(away)}
 
 
-def _camera(camera: Camera, axes: NDArray[np.float64]) -> dict[str, Any]:
+def _camera(camera: Camera, axes: Array) -> dict[str, Any]:
     """A camera in the page's axes; the columns of `turn` point right, down and forward."""
     width, height = camera.image_size
     return {
@@ -167,12 +168,7 @@ def _camera(camera: Camera, axes: NDArray[np.float64]) -> dict[str, Any]:
 
 
 def _bodies(
-    take: Take,
-    arrays: SmplArrays,
-    axes: NDArray[np.float64],
-    frame: NDArray[np.intp],
-    person: NDArray[np.intp],
-    pack: _Packing,
+    take: Take, arrays: SmplArrays, axes: Array, frame: Index, person: Index, pack: _Packing
 ) -> dict[str, Any]:
     """The bodies of N rows, each a `person` (N,) of the take in a `frame` (N,), for the page's script to bend.
 

@@ -1,11 +1,11 @@
 """A result's report.html, from a result in memory or in its folder."""
 
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 
 from shapepose_fg.body.model.smpl_file import SmplArrays
-from shapepose_fg.body.shapes import read_body
 from shapepose_fg.core.camera import Axis, Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import ASSUMED_FPS
@@ -14,7 +14,7 @@ from shapepose_fg.core.result_files import results_folder
 from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.export.take import Take
-from shapepose_fg.io.solved_setup import CAMERAS
+from shapepose_fg.io.solved_setup import CAMERAS, body_of
 from shapepose_fg.tracking.listing import list_tracks
 from shapepose_fg.viz.report.page import page_text
 from shapepose_fg.viz.report.scene import Scene, scene_of
@@ -76,7 +76,7 @@ def report_of(
     folder = results_folder(results)
     with Reconstruction.open(results) as opened:
         people, every = opened.thinned(MOST_ROWS)
-    if up is not None and up not in ("x", "-x", "y", "-y", "z", "-z"):
+    if up is not None and up not in get_args(Axis):
         raise InputError(f"--up {up}: must be one of x -x y -y z -z")
     cameras = folder / CAMERAS
     rig = read_rig(cameras) if cameras.is_file() else up
@@ -90,10 +90,8 @@ def th(number: int) -> str:
 
 def _body(people: Reconstruction, given: Path | None) -> tuple[SmplArrays | None, list[str]]:
     """The body model of a result; None, and a remark, where its file is not there any more."""
-    named = people.run.get("body")
-    file = given if given is not None else None if named is None else Path(str(named))
     try:
-        return read_body(file), []
+        return body_of(people.run, given), []
     except InputError as error:
         if given is not None:
             raise
