@@ -85,10 +85,9 @@ def disagreement(evidence: ViewEvidence, fit: BodyFit) -> NDArray[np.float64]:
     """How far (N, J) each joint's views put it from where the body can have it, in standard deviations.
 
     The smaller of two distances, each against the sum of both covariances: to where the rest of the body puts the
-    joint (`prior_xyz`), and to the joint of the body that was fitted with it. The first is a Gaussian around one
-    pose: a forearm that is bent further lies far outside it though no bone is too long for it. The second is there
-    to tell; it stays away from what no pose reaches, since its kernel is robust. Where the views leave a
-    direction open, they cannot disagree in it. 0 for rows without a body.
+    joint (`prior_xyz`), a Gaussian around one pose, far from which a forearm is that is only bent further; and to
+    the joint of the body that was fitted with it, whose robust kernel stays away from what no pose reaches. Where
+    the views leave a direction open, they cannot disagree in it. 0 for rows without a body.
     """
     model = MODEL_SIGMA_M**2 * np.eye(3)
     prior = _sigmas_apart(evidence, fit.prior_xyz, fit.prior_covariance)

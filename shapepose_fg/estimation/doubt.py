@@ -41,9 +41,8 @@ def exchange_spread(joints: Array, bodies: Array, frame: NDArray[np.integer], li
     """(N, J, 3, 3) outer products of the ways from joints to others' that may be theirs, m².
 
     Of `joints` (N, J, 3) in the `frame` (N,). Two people's limbs can have been exchanged for long, and each frame
-    looks certain. But hardly ever can both bodies have the other's: by chance a stranger's foot is as far from
-    one's own knee as the shin is long, as in the fitted `bodies` (N, J, 3). Where both can, it counts in full, and
-    less and less with what the limbs miss.
+    looks certain. But hardly ever are both as long as in the fitted `bodies` (N, J, 3). Where they are, it counts
+    in full, and less and less with what the limbs miss.
     """
     spread = np.zeros((*joints.shape, 3))
     far, near, end = limbs.T
@@ -70,11 +69,9 @@ def association_spread(
 ) -> Array:
     """(N, J, 3, 3) covariance between the places that joints have with and without each doubtful observation, m².
 
-    An observation of probability p is in the solution with p times its information. Were it certain, the joint
-    would be in one place, without it in another; of the mixture of both the solution's covariance stands for what
-    each leaves, and p (1 - p) d d^T is what is between them, d being the way from one to the other. Whole
-    stretches are the one or the other: d is taken from one frame's views, `evidence` at the solved joints, and
-    from what the `body` says, without the motion that holds a frame to its neighbours. The sum over the views.
+    Of an observation of probability p it is p (1 - p) d d^T, d being the way from the joint with it, as if it were
+    certain, to the joint without it. Whole segments are the one or the other: d is taken from one frame's views,
+    `evidence` at the solved joints, and from what the `body` says, without motion. The sum over the views.
     """
     joints = evidence.points
     spread = np.zeros((*joints.shape, 3))

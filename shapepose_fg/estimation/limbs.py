@@ -64,9 +64,8 @@ def limb_steps(
     """Steps (N, J, 3), metres, that take joints that no view saw, `unseen` (N, J), to where a body can have them.
 
     Motion carries each joint by itself: elbow and wrist, both hidden, drift apart. A body is fitted to all joints
-    as they are known, and an unseen one goes towards the body's, C (C + s² I)^-1 of the way: hardly where it was
-    seen a moment ago, and wholly where its covariance C is large. s is `LIMB_SIGMA_M`. Covariances stay: what the
-    body says of the joint without its views is in them already.
+    as they are known, and an unseen one goes towards the body's, C (C + s² I)^-1 of the way, for its covariance C
+    and s = `LIMB_SIGMA_M`. Covariances stay: what the body says of the joint is in them already.
     """
     known = np.asarray(np.isfinite(joints).all(axis=-1) & np.isfinite(covariance).all(axis=(-2, -1)))
     moved = unseen & known

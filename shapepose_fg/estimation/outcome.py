@@ -130,12 +130,11 @@ def _calibrated(
 def with_lasting(state: State, person: WindowGraph, marginal: NDArray[np.float64]) -> NDArray[np.float64]:
     """(T, J, 3, 3) covariance of joints, m²: `marginal` of the person's graph, and the errors that it left out.
 
-    The graph of several frames holds only the share of the errors that is new in every frame. Added is the share
-    that lasts, of what views and body leave in one frame, C_t; and of the share that motion smooths, that part
-    which it does not take away in truth, because errors fade over a few frames and not from one to the next
-    (`Lasting.kept`). Where a joint is not seen, what was left in the nearest frame in which it was is carried
-    along; a view that still sees it brings its own lasting error in, through the gain that it has. Joints solved
-    with offsets have it all in `marginal`.
+    Added is the share that lasts, of what views and body leave in one frame; and of the share that motion smooths,
+    the part that it does not take away in truth, because errors fade over a few frames (`Lasting.kept`). Where a
+    joint is not seen, what was left in the nearest frame in which it was is carried along; a view that still sees
+    it brings its own lasting error in, through the gain that it has. Joints solved with offsets have it all in
+    `marginal`.
     """
     said = state.of_views.information[person.rows]
     information = said + state.of_body.information[person.rows]

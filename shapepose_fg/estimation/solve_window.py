@@ -63,9 +63,8 @@ def solve_window(
     with whom they are.
 
     In each round the body is fitted to what the views alone say of all joints, and then pulls the joints. What it
-    says of a joint leaves that joint's own views out (`BodyFit.prior_xyz`), so that nothing is counted twice and
-    the covariances stay honest. Motion acts on the joints, never on what the body is fitted to. `config.refine`
-    switches to what the paper does in place of it.
+    says of a joint leaves that joint's own views out (`BodyFit.prior_xyz`), so that nothing is counted twice.
+    Motion acts on the joints, never on what the body is fitted to.
     """
     if len(views) != observations.confidence.shape[2] or views.rows_known not in (None, len(observations)):
         raise ValueError(

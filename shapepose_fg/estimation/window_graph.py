@@ -44,17 +44,15 @@ class WindowGraph:
 
     Joints are not tied to each other but by factors of your own, which keeps marginal covariances cheap.
 
-    **Errors that last.** A detector that is 2 cm off is so in the next frame too, and so is the body's guess: T
-    frames of one guess are one guess. In a window of several frames therefore
+    **Correlated errors.** A detector that is 2 cm off is so in the next frame too, and so is the body's guess. In
+    a window of several frames therefore
 
     - projections and body priors count with the share of their variance that is new in every frame, so that motion
-      smooths that only; `marginals` has nothing of the rest: what is reported in its place, with all of the error,
-      is `outcome.with_lasting`;
+      smooths that only; `marginals` has nothing of the rest (`outcome.with_lasting` adds it);
     - where a joint is lost from sight (`lost` of `solve`) the body's prior gets an offset that decays slowly
-      (`factors.motion`): the joint stays where the body puts it plus the difference that there was when it was
-      seen;
+      (`factors.motion`): the difference between joint and body when it was seen;
     - joints with factors of your own are solved with offsets of views and body both, and what the views say is one
-      Gaussian each: your factor is weighed against errors that last, and `marginals` holds all of them.
+      Gaussian each: your factor is weighed against all of the error, and `marginals` holds it.
     """
 
     def __init__(

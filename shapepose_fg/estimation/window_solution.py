@@ -90,11 +90,10 @@ class WindowSolution:
 class PersonGraph:
     """One person in T frames, solved.
 
-    The graph that is solved holds the share of all errors that is new in every frame: motion smooths no more. What
-    is reported has the rest, too: detections and body err alike for a while, a detection may be another's, a limb
-    may be exchanged. `graph` holds all of it: beside each position of the solver's graph there is a reported one,
-    which differs by what was found after solving, with an error that lasts. Its marginal covariances, of `keys`,
-    are the reported ones, and its values the reported joints.
+    The graph that is solved holds the share of all errors that is new in every frame. `graph` holds all of it:
+    beside each position of the solver's graph there is a reported one, which differs by what was found after
+    solving, with an error that lasts. Its marginal covariances, of `keys`, are the reported ones, and its values
+    the reported joints.
     """
 
     window: WindowGraph

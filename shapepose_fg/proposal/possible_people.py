@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,7 +93,7 @@ class PossiblePeople:
         return PossiblePeople(*(np.where(lacks, new, old) for old, new in both))
 
     @property
-    def _arrays(self) -> tuple[Array, NDArray[np.intp], Array]:
+    def _arrays(self) -> tuple[NDArray[Any], ...]:
         return self.places, self.chosen, self.gap_m
 
     @classmethod

@@ -37,10 +37,8 @@ class JointStates:
 
     @property
     def across_m(self) -> Array:
-        """(A, J) standard deviation of the position across the ray of a joint that one view sees, metres.
-
-        The root of what pairs of axes know together over what they know in sum: where all axes are alike it is
-        `sigma_m`, and an axis that is known much worse than the others (v) drops out: (u + w) v / v.
+        """(A, J) standard deviation of the position across the ray of a joint that one view sees, metres: an axis
+        that is known much worse than the others drops out, and where all are alike it is `sigma_m`.
         """
         P = self.covariance[..., :3, :3]
         trace = np.trace(P, axis1=-2, axis2=-1)

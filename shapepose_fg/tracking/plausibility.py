@@ -21,9 +21,8 @@ def torn_joints(
     nothing is too long.
 
     A joint whose parent is not judged is judged by the next such joint above it, with the bones between added up;
-    where there is none, by the first of the person. Two people who were near each other may have exchanged legs,
-    below a pelvis that nobody sees, and go apart: what hangs on so little goes, not what it is judged by. But only
-    where it is `reach_m` farther than bones are long: nearer, detections are given out again around whole bodies.
+    where there is none, by the first of the person: legs below a pelvis that nobody sees may be another's. It goes
+    where it is `reach_m` farther than bones are long: nearer, whole bodies put it right.
     """
     torn = np.zeros(trusted.shape, dtype=bool)
     person, joint, parent = np.arange(len(places))[:, None], np.arange(len(skeleton)), np.array(skeleton.parents)

@@ -1,6 +1,5 @@
 """Who was there, by evidence: what only a person explains, against what should have been seen of that person."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -59,12 +58,6 @@ class Chosen:
     evidence_s: Array
     """(K,) evidence, in seconds in which all of a person is seen by all views; what being there costs taken
     off."""
-
-    @classmethod
-    def of(cls, rows: Sequence[tuple[int, int, int, float]]) -> "Chosen":
-        """Of (hypothesis, start, stop, evidence), in order."""
-        hypothesis, start, stop = (np.array([row[n] for row in rows], dtype=np.intp) for n in range(3))
-        return cls(hypothesis, start, stop, np.array([row[3] for row in rows], dtype=np.float64))
 
     def __len__(self) -> int:
         return len(self.hypothesis)
@@ -271,7 +264,9 @@ class Account:
             free[self.place[best, span]] = 0.0
             taken[best, span] = True
             gains[:, span] = np.where(taken[:, span], -np.inf, self.gains(free, span))
-        return Chosen.of(chosen)
+        columns = np.array(chosen, dtype=np.float64).reshape(-1, 4).T
+        hypothesis, start, stop = columns[:3].astype(np.intp)
+        return Chosen(hypothesis, start, stop, columns[3])
 
     def best_segments(self, gains: Array) -> tuple[Array, NDArray[np.intp], NDArray[np.intp]]:
         """The segment with the greatest sum of each row of `gains` (H, T): value (H,), start (H,), stop (H,).

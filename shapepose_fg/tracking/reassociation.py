@@ -1,4 +1,4 @@
-"""Every detection is given out again, once it is known where people's joints are."""
+"""Detections are reassociated, once it is known where people's joints are."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

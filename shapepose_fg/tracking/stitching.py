@@ -161,8 +161,7 @@ def _costs(apart_m: Array, reach_m: Array, unlike: Array) -> Array:
     """(K,) how unlikely it is that two tracks are one, -2 log of a density but for a constant.
 
     Places `apart_m` (K,) are Gaussian on the floor, two standard deviations being what is in reach (K,); bones of
-    one person differ by `unlike` (K,) squared standard deviations, all bones together. The time between does not
-    count by itself: where as many come as go it is the same in all, whoever is who.
+    one person differ by `unlike` (K,) squared standard deviations, all bones together.
     """
     sigma_m = np.maximum(reach_m / 2, _PLACE_SIGMA_M)
     return (apart_m / sigma_m) ** 2 + 4 * np.log(sigma_m / _PLACE_SIGMA_M) + unlike

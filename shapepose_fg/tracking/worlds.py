@@ -1,9 +1,9 @@
 """Ways in which people may have gone through some frames: worlds, each followed from one frame to both ends.
 
-A world is a set of people of whom each detection has one. Who is there is seen best in some frame, and hardly in
-others; so people are sought in several frames, followed from there forwards and backwards, and what explains most
-is chosen (`presence.py`). Whoever was chosen is put together in one world in the frames in which they are seen
-best, and followed from there again: people who know of each other do not take each other's detections.
+A world is a set of people of whom each detection has one. People are sought in several frames, followed from
+there forwards and backwards, and what explains most is chosen (`presence.py`). Whoever was chosen is put together
+in one world in the frames in which they are seen best, and followed from there again: people of one world do not
+take each other's detections.
 """
 
 from collections.abc import Container, Iterable, Sequence
@@ -209,17 +209,22 @@ def _restarts(
     return seeds
 
 
+Followed = tuple[int, Seed, NDArray[np.intp]]
+"""A world's number, its seed, and the numbers of the people in it."""
+
+
 def follow_worlds(tracker: Tracker, frames: Sequence[Input], seeds: Sequence[Seed], keep: int) -> Hypotheses:
     """Follow all `seeds` forwards and backwards through T frames, side by side.
 
     Who is found on the way forwards is followed back, too.
     """
     log = _Log(tracker, frames, keep)
-    numbers = log.numbered(seeds)
-    born = list[tuple[int, Seed, NDArray[np.intp]]]()
+    given, born = list[Followed](), list[Followed]()
+    for world, seed in enumerate(seeds):
+        carried = seed.tracks.ids if seed.frame < 0 else None
+        given.append((world, seed, log.more(len(seed.tracks), world, carried)))
     for forwards in (True, False):
-        part = [(w, s, n) for w, (s, n) in enumerate(zip(seeds, numbers, strict=True))]
-        part = [each for each in part if (each[1].forwards if forwards else each[1].backwards)]
+        part = [each for each in given if (each[1].forwards if forwards else each[1].backwards)]
         born = _follow(tracker, frames, part + born, log, forwards=forwards)
     return log.hypotheses()
 
@@ -227,17 +232,14 @@ def follow_worlds(tracker: Tracker, frames: Sequence[Input], seeds: Sequence[See
 def _follow(
     tracker: Tracker,
     frames: Sequence[Input],
-    seeds: Iterable[tuple[int, Seed, NDArray[np.intp]]],
+    seeds: Iterable[Followed],
     log: "_Log",
     *,
     forwards: bool,
-) -> list[tuple[int, Seed, NDArray[np.intp]]]:
-    """One way through the frames: (world, seed, numbers of its people) begin in the seed's frame.
-
-    Returns who was found on the way, in the same form.
-    """
+) -> list[Followed]:
+    """One way through the frames, each seed from its frame on; returns who was found on the way."""
     tracks, births = tracker.nobody(), dict[int, int]()
-    born = list[tuple[int, Seed, NDArray[np.intp]]]()
+    born = list[Followed]()
     begins = dict[int, list[tuple[Tracks, NDArray[np.intp]]]]()
     for world, seed, numbers in seeds:
         place = np.full(len(numbers), world, dtype=np.intp)
@@ -266,7 +268,7 @@ def _follow(
         sought_s = time_s
         gone, same = _twins(tracks, candidate, births)
         if len(gone) > 0:
-            log.goes_on_as(t, tracks.ids[gone], tracks.ids[same], forwards=forwards)
+            log.twins.append((slice(t + 1, None) if forwards else slice(0, t), tracks.ids[gone], tracks.ids[same]))
             births = {world: since for world, since in births.items() if world not in tracks.world[gone]}
             rest = np.setdiff1d(np.arange(len(tracks)), gone)
             tracks, candidate = tracks.rows(rest), candidate[rest]
@@ -312,14 +314,7 @@ class _Log:
         self.carried, self.world = list[int](), list[int]()
         self.parts = list[tuple[int, NDArray[np.intp], NDArray[np.intp], Array, Array, Array]]()
         self.kept = list[tuple[NDArray[np.intp], JointStates]]()
-        self.twins = list[tuple[slice, NDArray[np.intp], NDArray[np.intp]]]()
-
-    def numbered(self, seeds: Sequence[Seed]) -> list[NDArray[np.intp]]:
-        """Numbers of the people of each seed."""
-        return [
-            self.more(len(seed.tracks), world, seed.tracks.ids if seed.frame < 0 else None)
-            for world, seed in enumerate(seeds)
-        ]
+        self.twins = list[tuple[slice, NDArray[np.intp], NDArray[np.intp]]]()  # frames, who, as whom
 
     def more(self, count: int, world: int, carried: NDArray[np.intp] | None = None) -> NDArray[np.intp]:
         """Numbers of people who are new here, in a world."""
@@ -340,10 +335,6 @@ class _Log:
         self.parts.append((t, tracks.ids, candidate, places, weight, price))
         if t == self.keep:
             self.kept.append((tracks.ids, joints))
-
-    def goes_on_as(self, t: int, who: NDArray[np.intp], others: NDArray[np.intp], *, forwards: bool) -> None:
-        """After frame `t`, people are where others are."""
-        self.twins.append((slice(t + 1, None) if forwards else slice(0, t), who, others))
 
     def hypotheses(self) -> Hypotheses:
         """All of it."""
