@@ -135,9 +135,7 @@ class Preset(StrEnum):
 
 @app.command("config", rich_help_panel=_RECORDING)
 @grouped
-def config(
-    preset: Preset = option(RESULT, "paper: the method as the paper has it.", Preset.DEFAULT),
-) -> None:
+def config(preset: Preset = option(RESULT, "paper: the method as the paper has it.", Preset.DEFAULT)) -> None:
     """Print every setting with its value, as TOML."""
     from shapepose_fg.io.config import toml_text
     from shapepose_fg.pipeline.pipeline import PipelineConfig
