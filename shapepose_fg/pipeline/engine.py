@@ -12,11 +12,11 @@ from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.motion_model import MotionModel
-from shapepose_fg.estimation.solve_window import Assigning, solve_window
 from shapepose_fg.estimation.window_graph import ExtraFactors
 from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.runs.notes import Notebook
+from shapepose_fg.pipeline.solve_window import Assigning, solve_window
 from shapepose_fg.pipeline.windows import Engine, Span
 from shapepose_fg.proposal.association import associate
 from shapepose_fg.proposal.candidates import CandidateConfig, PairPoints, triangulate_pairs, vote

@@ -16,12 +16,12 @@ from shapepose_fg.core.frame_times import segments
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.estimation.floor import Floor
-from shapepose_fg.estimation.solve_window import solve_window
 from shapepose_fg.estimation.window_graph import ExtraFactors
 from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution
 from shapepose_fg.io.solved_setup import SolvedSetup, setup_of
 from shapepose_fg.pipeline.bodies_over_time import with_bodies_over_time
 from shapepose_fg.pipeline.config import PipelineConfig
+from shapepose_fg.pipeline.solve_window import solve_window
 from shapepose_fg.pipeline.solved_windows import result_rows
 from shapepose_fg.pipeline.windows import near_border, window_stop
 

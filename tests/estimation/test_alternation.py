@@ -17,9 +17,9 @@ from shapepose_fg.core.reconstruction import Status
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.estimator_config import EstimatorConfig, RefineConfig, WindowGraphConfig
 from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas, triangulate
-from shapepose_fg.estimation.solve_window import solve_window
 from shapepose_fg.estimation.window_graph import WindowGraph
 from shapepose_fg.estimation.window_solution import WindowSolution
+from shapepose_fg.pipeline.solve_window import solve_window
 from shapepose_fg.pipeline.solved_windows import result_rows
 
 WRIST, ELBOW, KNEE = 4, 3, 13

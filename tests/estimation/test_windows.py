@@ -19,11 +19,11 @@ from shapepose_fg.estimation.estimator_config import EstimatorConfig, RefineConf
 from shapepose_fg.estimation.in_time import interpolated, near_in_time
 from shapepose_fg.estimation.linearisation import symmetric_roots
 from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
-from shapepose_fg.estimation.solve_window import solve_window
 from shapepose_fg.estimation.state import window_rows
 from shapepose_fg.estimation.state_covariances import Chains, state_covariances
 from shapepose_fg.estimation.window_graph import WindowGraph
 from shapepose_fg.estimation.window_solution import WindowSolution
+from shapepose_fg.pipeline.solve_window import solve_window
 
 FPS = 25.0
 FRAMES = 30

@@ -14,9 +14,9 @@ from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.body_step import JOINT_SIGMA_M, MODEL_SIGMA_M, BodyStep, joint_targets
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.linearisation import linearise, observation_sigmas
-from shapepose_fg.estimation.solve_window import solve_window
 from shapepose_fg.io.config import read_config
 from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people
+from shapepose_fg.pipeline.solve_window import solve_window
 from shapepose_fg.proposal.candidates import triangulate_pairs, vote
 
 PAPER = PipelineConfig.paper()

@@ -31,7 +31,7 @@ LEVELS = (
     "proposal",
     "estimation",
     "tracking",
-    "estimation.solve_window",
+    "pipeline.solve_window",
     "pipeline.config pipeline.cluster pipeline.bodies_over_time",
     "pipeline.windows",
     "pipeline.runs",
@@ -160,7 +160,7 @@ LIGHT = {
     "the package": "import shapepose_fg; dir(shapepose_fg)",
     "readers": "from shapepose_fg import InputError, Reconstruction, read_detections, read_rig, write_rig",
     "stage I": "import shapepose_fg.proposal.association",
-    "stage II": "import shapepose_fg.estimation.solve_window",
+    "stage II": "import shapepose_fg.pipeline.solve_window",
     "processes that look": "import shapepose_fg.simulation.visibility",
     "help": (
         "from shapepose_fg.cli.main import main\n"
