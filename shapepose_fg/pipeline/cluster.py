@@ -81,12 +81,17 @@ class Cluster(Generic[Shared]):
         how = {"pure": False, "retries": RETRIES}
         submit = partial(client.submit, _work, tuple(_program().items()), work, self._at, **how)
         try:
-            yield from in_order(submit, items, lambda: max(_LEAST, self._ahead * len(client.nthreads())))
+            yield from in_order(submit, items, self._most_under_way, client.cancel)
         except KilledWorker as error:
             raise RuntimeError(
                 f"{error.allowed_failures + 1} processes of the cluster ended one after the other before their"
                 " work: there may be too little memory for one"
             ) from None
+
+    def _most_under_way(self) -> int:
+        """As many items as keep every process of the cluster busy."""
+        client: Any = self._client
+        return max(_LEAST, self._ahead * len(client.nthreads()))
 
 
 @dataclass(frozen=True)

@@ -86,9 +86,16 @@ class Workers(Generic[Shared]):
 
 
 def in_order(
-    submit: Callable[[Item], Future[Result]], items: Iterable[Item], most: Callable[[], float]
+    submit: Callable[[Item], Future[Result]],
+    items: Iterable[Item],
+    most: Callable[[], float],
+    forget: Callable[[list[Future[Result]]], object] | None = None,
 ) -> Iterator[Result]:
-    """What comes of each item, in order; of those that were submitted `most` are under way at a time."""
+    """What comes of each item, in order; of those that were submitted `most` are under way at a time.
+
+    `forget` is given those that are not wanted any more. A pool of processes ends them by itself: to cancel them
+    while its processes end stops the thread that waits for these, and then the program waits for ever.
+    """
     waiting: deque[Future[Result]] = deque()
     try:
         for item in items:
@@ -98,8 +105,8 @@ def in_order(
         while len(waiting) > 0:
             yield waiting.popleft().result()
     finally:
-        for each in waiting:
-            each.cancel()
+        if forget is not None:
+            forget(list(waiting))
 
 
 def processes(*modules: str) -> "SpawnContext | ForkServerContext":
