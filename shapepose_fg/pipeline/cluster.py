@@ -88,7 +88,7 @@ class Cluster(Generic[Shared]):
                 " work: there may be too little memory for one"
             ) from None
 
-    def _most_under_way(self) -> int:
+    def _most_under_way(self) -> float:
         """As many items as keep every process of the cluster busy."""
         client: Any = self._client
         return max(_LEAST, self._ahead * len(client.nthreads()))
