@@ -129,3 +129,17 @@ def test_a_detection_less_probably_the_person_s_is_drafted_anew(fitter):
         draft.redraft(before, replace(rows, probability=now), views, counting, EstimatorConfig())
         fitted.append(counting.rows[:1])
     assert fitted == [[], [1]]
+
+
+def test_a_probability_that_creeps_is_drafted_anew_when_it_has_gone_far(fitter):
+    """From 1 by 0.15 a round: the second step is 0.3 from what the row was drafted with."""
+    rows, _ = with_a_neighbour_s_leg(True)
+    views, fitted = Views.of(SCENE.rig), []
+    last = draft.redraft(None, rows, views, fitter, EstimatorConfig())
+    for probability in (0.85, 0.7, 0.55):
+        now = rows.probability.copy()
+        now[4, LEG[1], 0] = probability
+        counting = Counting(fitter)
+        last = draft.redraft(last, replace(rows, probability=now), views, counting, EstimatorConfig())
+        fitted.append(counting.rows[:1])
+    assert fitted == [[], [1], []]
