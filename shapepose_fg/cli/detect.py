@@ -3,6 +3,7 @@
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -24,8 +25,8 @@ from shapepose_fg.core.errors import InputError
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from shapepose_fg.detection2d.detector import CameraDetector
-    from shapepose_fg.detection2d.network import Backend, HeatMapNetwork
+    from shapepose_fg.detection2d.detector import CameraDetector, Network
+    from shapepose_fg.detection2d.onnx_network import Backend
     from shapepose_fg.detection2d.recording import DetectionReport, DetectionRun
 
 _NETWORK = "Network"
@@ -35,29 +36,34 @@ _NETWORK = "Network"
 class NetworkOptions:
     """The network that detects, and how it is run."""
 
-    network: str = option(_NETWORK, "ONNX file like OpenPose's, or a named one.", REQUIRED, metavar="FILE|NAME")
-    layout: str | None = option(_NETWORK, "Its kind: tf-pose, openpose-coco, openpose-body25.", metavar="NAME")
-    download: bool = option(_NETWORK, "Fetch a named network that is not here yet.", False, "--download")
-    network_address: str | None = option(_NETWORK, "Where to fetch it from; its checksum decides.", metavar="URL")
-    long_side: int = option(_NETWORK, "Longer side of what it is shown, pixels: more finds smaller people.", 656)
-    backend: str = option(RUN, "What runs the network: opencv or onnxruntime.", "opencv", metavar="NAME")
+    network: str | None = option(_NETWORK, "ONNX file, TOML file of a network, or a name.", metavar="FILE|NAME")
+    download: str | None = option(_NETWORK, "The same by name, fetched once: rtmpose-s, -m, -x.", metavar="NAME")
+    boxes: str | None = option(_NETWORK, "What finds people for RTMPose: a YOLOX.", metavar="FILE|NAME")
+    layout: str | None = option(_NETWORK, "OpenPose's: tf-pose, openpose-coco, openpose-body25.", metavar="NAME")
+    long_side: int | None = option(_NETWORK, "OpenPose's: pixels that it is shown along the longer side (656).")
+    backend: str | None = option(RUN, "OpenPose's: opencv (what is taken) or onnxruntime.", metavar="NAME")
+    device: str = option(RUN, "Where onnxruntime runs: cpu, cuda, cuda:1, rocm, coreml.", "cpu", metavar="NAME")
 
     def check(self) -> None:
         """Refuse what makes no sense."""
-        if self.backend not in ("opencv", "onnxruntime"):
+        if (self.network is None) == (self.download is None):
+            raise InputError("give the network that detects: --network FILE, or --download NAME the first time")
+        if self.backend not in (None, "opencv", "onnxruntime"):
             raise InputError(f"--backend {self.backend}: must be opencv or onnxruntime")
-        if not 128 <= self.long_side <= 4096:
+        if self.backend == "opencv" and self.device != "cpu":
+            raise InputError(f"--device {self.device}: opencv runs on the cpu; leave --backend out")
+        if self.long_side is not None and not 128 <= self.long_side <= 4096:
             raise InputError(f"--long-side {self.long_side}: must be 128 to 4096 pixels")
 
-    def load(self) -> "HeatMapNetwork":
-        """The network, fetched if need be."""
-        from shapepose_fg.detection2d.download import find_network
-        from shapepose_fg.detection2d.network import HeatMapNetwork
+    def load(self) -> "Network":
+        """The network, fetched if that is asked for."""
+        from shapepose_fg.detection2d.download import named_file
+        from shapepose_fg.detection2d.opening import Running, open_network
 
+        running = Running(self.layout, self.long_side, cast("Backend | None", self.backend), self.device)
         with progress("fetching the network", "bytes") as fetched:
-            address = self.network_address
-            file = find_network(self.network, download=self.download, address=address, progress=fetched)
-        return HeatMapNetwork.load(file, self.layout, cast("Backend", self.backend))
+            found = partial(named_file, fetch=self.download is not None, say=note, progress=fetched)
+            return open_network(self.download or self.network or "", self.boxes, running, found)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +85,7 @@ def detect(
     clock: ClockOptions,
     output: Path = option(RESULT, "Folder for the detections; made if it is not there.", REQUIRED),
 ) -> None:
-    """Detect people's joints in videos or pictures, for `reconstruct`: candidates with part affinities.
+    """Detect people's joints in videos or pictures, for `reconstruct`: by RTMPose, or another network in ONNX.
 
     Pictures of rolled cameras are turned upright first; the calibration knows how. A run that is stopped goes on
     where it was when it is started again.
@@ -105,11 +111,10 @@ def detect(
     moments = replace(moments, picture=moments.picture[part], time_s=time_s)
     note(*moments.notes)
     detectors = [
-        CameraDetector.of(camera, rig.up_vector, placements[camera.name], loaded, network.long_side)
-        for camera in rig.cameras
+        CameraDetector.of(camera, rig.up_vector, placements[camera.name], loaded) for camera in rig.cameras
     ]
-    if loaded.only_size is not None:
-        note(_shown_small(detectors, loaded.only_size))
+    if (only_size := getattr(loaded, "only_size", None)) is not None:
+        note(_shown_small(detectors, only_size))
     run = DetectionRun(rig, footage, detectors, moments, output)
     begin = time.perf_counter()
     with progress("detecting", "pictures") as done:
@@ -142,11 +147,11 @@ def _summary(run: "DetectionRun", report: "DetectionReport", seconds: float) -> 
         turned, size = detector.view.turn_deg, detector.view.size
         row = (name, str(pictures), f"{footage.size[0]} x {footage.size[1]}")
         row += (f"{turned:.0f}°" if abs(turned) > 0.5 else "-", f"{size[0]} x {size[1]}")
-        rows.append((*row, f"{report.candidates[view] / max(pictures, 1):.1f}"))
+        rows.append((*row, f"{report.joints[view] / max(pictures, 1):.1f}"))
     total = max(report.moments * len(run.rig), 1)
     speed = f"{seconds:.1f} s, {1e3 * seconds / total:.0f} ms a picture"
     caption = f"{report.moments} frames of {len(run.rig)} cameras in {speed}"
-    return table("camera pictures size turned network candidates".split(), rows, caption=caption)
+    return table("camera pictures size turned network joints".split(), rows, caption=caption)
 
 
 def _next_command(run: "DetectionRun", cameras: CameraOptions) -> str:

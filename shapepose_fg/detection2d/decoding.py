@@ -4,13 +4,13 @@ Cao et al., "OpenPose: Realtime Multi-Person 2D Pose Estimation using Part Affin
 All joints, and all pairs of candidates of all limbs, are decoded at once.
 """
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.detection2d.found import Candidates
 from shapepose_fg.detection2d.networks import NetworkLayout
 
 _MIN_SCORE = 0.1
@@ -21,46 +21,6 @@ _MIN_ALONG = 0.05
 """A place supports a limb where the field has at least this component along it, as in OpenPose."""
 _MIN_SUPPORTED = 0.7
 """The share of places that must support a limb for it to have an affinity."""
-
-
-@dataclass(frozen=True)
-class Candidates:
-    """Joint candidates of one picture, sorted by joint, and affinities between them."""
-
-    joint: NDArray[np.intp]
-    """(D,) joint of each candidate, in the layout's order."""
-    xy: NDArray[np.float64]
-    """(D, 2) position."""
-    score: NDArray[np.float64]
-    """(D,) height of the peak, 0 to 1."""
-    pairs: NDArray[np.intp]
-    """(E, 2) candidates that a limb joins, the limb's first joint first."""
-    limb: NDArray[np.intp]
-    """(E,) the limb that joins each pair."""
-    affinity: NDArray[np.float64]
-    """(E,) mean of the field's component along the limb, 0 to 1; pairs without support are not listed."""
-
-    def __len__(self) -> int:
-        return len(self.joint)
-
-    @classmethod
-    def none(cls) -> "Candidates":
-        """Those of a picture in which nothing is."""
-        index, number = np.zeros(0, dtype=np.intp), np.zeros(0)
-        return cls(index, number.reshape(0, 2), number, index.reshape(0, 2), index, number)
-
-    def only(self, keep: NDArray[np.bool_]) -> "Candidates":
-        """The candidates of the mask `keep` (D,), and the affinities between them."""
-        place = np.cumsum(keep) - 1
-        both = keep[self.pairs].all(axis=1)
-        return Candidates(
-            self.joint[keep],
-            self.xy[keep],
-            self.score[keep],
-            place[self.pairs[both]],
-            self.limb[both],
-            self.affinity[both],
-        )
 
 
 def decode(output: NDArray[np.float32], layout: NetworkLayout) -> Candidates:
@@ -80,9 +40,7 @@ def decode(output: NDArray[np.float32], layout: NetworkLayout) -> Candidates:
     return Candidates(joint, xy, score, pairs, limb[there], affinity[there])
 
 
-def peaks(
-    heat: NDArray[np.float32], min_score: float = _MIN_SCORE
-) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
+def peaks(heat: NDArray[np.float32], min_score: float = _MIN_SCORE) -> tuple[Index, Array, Array]:
     """Joint (D,), position (D, 2) in cells, and height (D,) of the local maxima of heat maps (J, H, W).
 
     A maximum is no lower than its eight neighbours. Between cells its place and height are those of a Gaussian
@@ -101,15 +59,13 @@ def peaks(
         equal_before |= padded[joint, row + dr, column + dc] == padded[joint, row, column]
     joint, row, column = joint[~equal_before], row[~equal_before], column[~equal_before]
     centre = padded[joint, row, column].astype(np.float64)
-    x, rise_x = _vertex(padded[joint, row, column - 1], centre, padded[joint, row, column + 1])
-    y, rise_y = _vertex(padded[joint, row - 1, column], centre, padded[joint, row + 1, column])
+    x, rise_x = vertex(padded[joint, row, column - 1], centre, padded[joint, row, column + 1])
+    y, rise_y = vertex(padded[joint, row - 1, column], centre, padded[joint, row + 1, column])
     xy = np.column_stack([column - 1 + x, row - 1 + y])
     return joint, xy, np.minimum(centre * np.exp(rise_x + rise_y), 1.0)
 
 
-def _vertex(
-    before: NDArray[np.floating], centre: NDArray[np.float64], after: NDArray[np.floating]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def vertex(before: NDArray[np.floating], centre: Array, after: NDArray[np.floating]) -> tuple[Array, Array]:
     """Where a Gaussian through three neighbours is highest, -0.5 to 0.5 cells, and the logarithm of its rise.
 
     0 and 0 at the edge of the map.
@@ -125,10 +81,10 @@ def _vertex(
 
 def line_integrals(
     fields: NDArray[np.float32],
-    start: NDArray[np.float64],
-    end: NDArray[np.float64],
-    limb: NDArray[np.intp],
-) -> NDArray[np.float64]:
+    start: Array,
+    end: Array,
+    limb: Index,
+) -> Array:
     """(E,) the mean component of the affinity `fields` (2 L, H, W) along the lines from `start` to `end` (E, 2).
 
     `limb` (E,) says whose field each line is read from. 0 where too few places along the line support it.
@@ -148,9 +104,7 @@ def line_integrals(
     return np.where(supported & (length > 0), np.clip(component.mean(axis=1), 0.0, 1.0), 0.0)
 
 
-def _all_pairs(
-    joint: NDArray[np.intp], layout: NetworkLayout
-) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+def _all_pairs(joint: Index, layout: NetworkLayout) -> tuple[Index, Index, Index]:
     """First candidate, second candidate, and limb, each (E,), of all pairs that any limb could join.
 
     `joint` (D,) is sorted.

@@ -7,8 +7,8 @@ from importlib.resources import files
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Index
 from shapepose_fg.core.errors import InputError
 
 
@@ -40,35 +40,29 @@ class NetworkLayout:
     """The input is `scale` * colour + `offset`, with colours (blue, green, red) from 0 to 255."""
     offset: float
     """See `scale`."""
+    files: str = ""
+    """Checksums of known networks that have it."""
 
     @property
-    def limb_ends(self) -> NDArray[np.intp]:
+    def limb_ends(self) -> Index:
         """(L, 2) the joints that each limb joins."""
         return np.array(self.limbs, dtype=np.intp)
 
 
 @dataclass(frozen=True)
-class KnownNetwork:
+class NamedNetwork:
     """A network that can be asked for by name."""
 
-    name: str
-    """What it is called."""
-    about: str
-    """What it is, in a sentence."""
-    layout: str
-    """Name of its `NetworkLayout`."""
-    sha256: str
-    """Checksum of its file."""
-    bytes: int
-    """Size of its file."""
-    address: str | None
-    """Where it is fetched from; None where no public address is known, and the user names one."""
-    weights: str = ""
-    """Where its weights come from, in words."""
+    file: str
+    """The archive that holds it, at each of `bases()`."""
+    size: tuple[int, int]
+    """(width, height) of its input."""
+    boxes: str | None = None
+    """The name of the network that finds people for it; None of one that finds people."""
 
 
 @lru_cache(maxsize=1)
-def _table() -> dict[str, dict[str, dict[str, Any]]]:
+def _table() -> dict[str, Any]:
     return json.loads((files("shapepose_fg.detection2d") / "data" / "networks.json").read_text(encoding="utf-8"))
 
 
@@ -82,10 +76,15 @@ def layouts() -> dict[str, NetworkLayout]:
     return every
 
 
-@lru_cache(maxsize=1)
-def known_networks() -> dict[str, KnownNetwork]:
-    """All named networks by name."""
-    return {name: KnownNetwork(name, **entry) for name, entry in _table()["networks"].items()}
+def named_networks() -> dict[str, NamedNetwork]:
+    """All named networks: RTMPose of HALPE-26, and the YOLOX that rtmlib gives each."""
+    named = _table()["named"].items()
+    return {name: NamedNetwork(**(entry | {"size": tuple(entry["size"])})) for name, entry in named}
+
+
+def bases() -> tuple[str, ...]:
+    """Addresses of the folders that hold the named networks, as rtmlib publishes them: OpenMMLab's, its mirror."""
+    return tuple(_table()["bases"])
 
 
 def find_layout(wanted: str | None, sha256: str, channels: int | None, place: object) -> NetworkLayout:
@@ -100,12 +99,10 @@ def find_layout(wanted: str | None, sha256: str, channels: int | None, place: ob
         if wanted not in every:
             raise InputError(f"--layout {wanted}: not known; known are {listing}")
         return every[wanted]
-    for network in known_networks().values():
-        if network.sha256 == sha256:
-            return every[network.layout]
     fitting = [each for each in every.values() if each.channels == channels]
-    if len(fitting) == 1:
-        return fitting[0]
+    for found in ([each for each in every.values() if sha256 in each.files], fitting):
+        if len(found) == 1:
+            return found[0]
     gives = "gives no fixed number of channels" if channels is None else f"gives {channels} channels"
     choice = " or ".join(each.name for each in fitting) or "another network"
     raise InputError(

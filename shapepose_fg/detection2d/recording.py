@@ -12,13 +12,10 @@ import numpy as np
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import read_json, write_atomically, write_content
-from shapepose_fg.detection2d.decoding import Candidates
 from shapepose_fg.detection2d.detector import CameraDetector
-from shapepose_fg.io.detections.association_text import TEXT_SKELETONS
 from shapepose_fg.io.footage.footage import Footage
 from shapepose_fg.io.footage.lockstep import Lockstep
 from shapepose_fg.io.footage.placement import FOOTAGE, CameraFootage, write_used_footage
-from shapepose_fg.io.write_detections import association_lines
 
 BLOCK = 16
 """Moments that are kept together: what a run that is killed loses at most."""
@@ -47,7 +44,6 @@ class DetectionRun:
     @property
     def settings(self) -> dict[str, Any]:
         """What the detections depend on: equal for a run that goes on."""
-        first = self.detectors[0]
         cameras = [
             {
                 "name": name,
@@ -61,8 +57,7 @@ class DetectionRun:
                 zip(self.rig.names, self.footage, self.detectors, strict=True)
             )
         ]
-        network = {"sha256": first.network.sha256, "layout": first.network.layout.name}
-        return {"network": network, "detection": {"long_side": first.long_side}, "cameras": cameras}
+        return {**self.detectors[0].network.settings, "cameras": cameras}
 
 
 @dataclass(frozen=True)
@@ -71,14 +66,14 @@ class DetectionReport:
 
     moments: int
     """T, the frames of the detections."""
-    candidates: tuple[int, ...]
-    """(V,) how many candidates each camera has."""
+    joints: tuple[int, ...]
+    """(V,) how many joints were found in each camera's pictures."""
     unreadable: tuple[int, ...]
     """(V,) how many pictures of each camera could not be read."""
 
 
 def run_detection(run: DetectionRun, progress: Progress = lambda done, total: None) -> DetectionReport:
-    """Detect in all pictures, and write <camera>.txt (4D Association), times.csv and footage.json into the output.
+    """Detect in all pictures, and write <camera>.txt or <camera>.json, times.csv and footage.json into the output.
 
     Blocks that an earlier run of the same settings left are not done again; the files come out the same.
     InputError where the folder holds detections, or a run of other settings.
@@ -95,15 +90,17 @@ def run_detection(run: DetectionRun, progress: Progress = lambda done, total: No
             _write_block(run, moments, files[-1], progress)
         counts += [_read_block(files[-1], views, name) for name in ("found", "failed")]
         progress(moments.stop * views, total * views)
-    skeleton = TEXT_SKELETONS[run.detectors[0].network.layout.skeleton]
+    written = run.detectors[0].network.written
 
     def text_of(view: int) -> Iterator[bytes]:
-        yield f"{skeleton.number} {total}\n".encode()
+        yield written.head(total).encode()
         for file in files:
             yield _read_block(file, views, "text")[view].encode()
+        yield written.tail.encode()
 
     for view, name in enumerate(run.rig.names):
-        write_atomically(run.output / f"{name}.txt", lambda stream, view=view: stream.writelines(text_of(view)))
+        file = run.output / f"{name}{written.suffix}"
+        write_atomically(file, lambda stream, view=view: stream.writelines(text_of(view)))
     _write_times(run)
     used = [
         CameraFootage(name, footage.path.resolve(), detector.placement, run.moments.picture[:, view])
@@ -119,28 +116,19 @@ def run_detection(run: DetectionRun, progress: Progress = lambda done, total: No
 def _write_block(run: DetectionRun, moments: range, file: Path, progress: Progress) -> None:
     """Detect in the pictures of some moments, camera after camera of each moment, and keep what was found.
 
-    For each camera that is its text, how many candidates it has, and how many pictures could not be read.
+    For each camera that is its text, how many joints it has, and how many pictures could not be read.
     """
     views = len(run.rig)
-    lines: list[list[str]] = [[] for _ in range(views)]
-    found, failed = [0] * views, [0] * views
+    text, found, failed = [""] * views, [0] * views, [0] * views
     for t in moments:
-        for v, detector in enumerate(run.detectors):
+        for v, (camera, detector) in enumerate(zip(run.rig.cameras, run.detectors, strict=True)):
             place = int(run.moments.picture[t, v])
             picture = run.footage[v].at(place) if place >= 0 else None
             failed[v] += place >= 0 and picture is None
-            candidates = Candidates.none() if picture is None else detector.detect(picture)
-            found[v] += len(candidates)
-            lines[v] += association_lines(
-                TEXT_SKELETONS[detector.network.layout.skeleton],
-                candidates.joint,
-                candidates.xy / (np.array(run.rig.cameras[v].image_size) - 1.0),
-                candidates.score,
-                candidates.pairs,
-                candidates.affinity,
-            )
+            seen = None if picture is None else detector.detect(picture)
+            found[v] += 0 if seen is None else len(seen)
+            text[v] += detector.network.written.frame(t, seen, camera.image_size)
             progress(t * views + v + 1, len(run.moments) * views)
-    text = ["".join(f"{line}\n" for line in each) for each in lines]
     write_content(file, _json({"text": text, "found": found, "failed": failed}))
 
 
@@ -173,8 +161,9 @@ def _write_times(run: DetectionRun) -> None:
 def _refuse_others(run: DetectionRun, unfinished: Path) -> None:
     """InputError where the output folder holds other detections, or an unfinished run of other settings."""
     for name in run.rig.names:
-        if Path(name).name != name or name in (".", ".."):
+        if Path(name).name != name or name in (".", "..", Path(FOOTAGE).stem):
             raise InputError(f"camera {name!r}: the name cannot be that of a file; rename it in the calibration")
+    places = [run.output / f"{name}{suffix}" for name in run.rig.names for suffix in (".txt", ".json")]
     if (unfinished / _SETTINGS).is_file():
         before, now = read_json(unfinished / _SETTINGS), json.loads(_json(run.settings))
         if before != now:
@@ -187,10 +176,8 @@ def _refuse_others(run: DetectionRun, unfinished: Path) -> None:
             raise InputError(
                 f"{unfinished}: not a run of this program; delete the folder, or give another --output"
             )
-    elif there := [name for name in run.rig.names if (run.output / f"{name}.txt").exists()]:
-        raise InputError(
-            f"{run.output / there[0]}.txt: there are detections already; delete them, or give another --output"
-        )
+    elif there := [place for place in places if place.exists()]:
+        raise InputError(f"{there[0]}: there are detections already; delete them, or give another --output")
 
 
 def _difference(before: Any, now: dict[str, Any]) -> str:

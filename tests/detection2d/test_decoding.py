@@ -95,7 +95,7 @@ def test_leaving_candidates_out_keeps_the_pairs_between_the_rest():
     rng = np.random.default_rng(5)
     one = np.column_stack([rng.uniform(6, 24, 18), np.arange(18) * 2.0 + 2])
     found = decode(people_output(one[None], LAYOUT), LAYOUT)
-    part = found.only(found.joint != 1)
+    part = found.moved(found.xy, found.joint != 1)
     assert 1 not in part.joint
     assert len(part.pairs) == (~(np.array(LAYOUT.limbs) == 1).any(axis=1)).sum()
     assert (part.joint[part.pairs] == LAYOUT.limb_ends[part.limb]).all()

@@ -1,6 +1,7 @@
 """Painted people through the whole of `detect` but the network, which is a function here."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -54,10 +55,11 @@ def pictures(rolled_rig, apart, tmp_path_factory) -> Path:
 
 
 def run_of(rig: Rig, pictures: Path, output: Path, network, long_side: int = 640) -> DetectionRun:
+    network = replace(network, long_side=long_side)
     footage = [open_footage(pictures / name) for name in rig.names]
     placements = [Placement(PlacementKind.SAME, each.size, each.size) for each in footage]
     detectors = [
-        CameraDetector.of(camera, rig.up_vector, placement, network, long_side)
+        CameraDetector.of(camera, rig.up_vector, placement, network)
         for camera, placement in zip(rig.cameras, placements, strict=True)
     ]
     clocks = [CameraClock(name, np.arange(FRAMES) / 25, 1 / 25) for name in rig.names]
@@ -151,7 +153,5 @@ def test_where_a_picture_cannot_be_read_nobody_is_seen(rolled_rig, pictures, tmp
 
 def test_no_camera_s_name_leads_out_of_the_folder(rolled_rig):
     """Its detections are a file called so: the camera itself is refused."""
-    from dataclasses import replace
-
     with pytest.raises(ValueError, match="must not lead out of a folder"):
         replace(rolled_rig.cameras[0], name="../a")

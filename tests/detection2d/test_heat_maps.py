@@ -5,7 +5,7 @@ import pytest
 
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.detection2d import onnx_file as onnx_file_reader
-from shapepose_fg.detection2d.network import HeatMapNetwork
+from shapepose_fg.detection2d.heat_maps import HeatMapNetwork
 from shapepose_fg.detection2d.networks import layouts
 from tests.detection2d.conftest import blob, onnx_file, varint
 

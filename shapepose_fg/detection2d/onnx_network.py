@@ -1,0 +1,132 @@
+"""The network in an ONNX file, run by OpenCV or by onnxruntime."""
+
+import hashlib
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.detection2d.onnx_file import read_onnx
+
+Backend = Literal["opencv", "onnxruntime"]
+"""What runs the network."""
+Blob = NDArray[np.float32]
+"""What it takes and gives."""
+PROVIDERS = {"cpu": "CPU", "cuda": "CUDA", "rocm": "ROCM", "coreml": "CoreML", "directml": "Dml"}
+"""onnxruntime's names of devices."""
+_BATCH = 32
+"""Pictures at once: a crowd fills no memory."""
+
+
+@dataclass(frozen=True)
+class OnnxNetwork:
+    """A network that takes pictures and gives arrays."""
+
+    file: Path
+    """Where it lies, for messages."""
+    sha256: str
+    """Checksum of its file."""
+    forward: Callable[[Blob], list[Blob]]
+    """All its outputs for pictures (B, 3, height, width)."""
+    size: tuple[int, int] | None = None
+    """(width, height) that the file fixes; None where it takes pictures of any."""
+    outputs: tuple[str, ...] = ()
+    """The outputs' names, where they are known."""
+    at_once: int = 1
+    """Pictures that it takes at once, at most."""
+
+    @classmethod
+    def open(cls, file: str | Path, backend: Backend = "onnxruntime", device: str = "cpu") -> "OnnxNetwork":
+        """The network in `file`; `device` is one of `PROVIDERS`, "cuda:1" its second.
+
+        InputError where the file is missing, or no ONNX network, or the device is not there.
+        """
+        file = Path(file)
+        content = read_onnx(file)
+        sha256 = hashlib.sha256(content).hexdigest()
+        if backend == "onnxruntime":
+            return _with_onnxruntime(file, content, sha256, device)
+        return cls(file, sha256, _with_opencv(file, content))
+
+    def run(self, pictures: Blob) -> list[Blob]:
+        """All outputs for pictures (B, 3, height, width); InputError where it cannot be run on such."""
+        try:
+            return self.forward(pictures)
+        except Exception as error:
+            height, width = pictures.shape[2:]
+            raise InputError(
+                f"{self.file}: the network cannot be run on a picture of {width} x {height} ({first_line(error)});"
+                " give one that takes pictures (1, 3, height, width); RTMPose and its like need --boxes"
+            ) from None
+
+
+def _with_opencv(file: Path, content: bytes) -> Callable[[Blob], list[Blob]]:
+    """The network run by OpenCV's dnn, which takes pictures of any size."""
+    try:
+        net = cv2.dnn.readNetFromONNX(np.frombuffer(content, dtype=np.uint8))
+        empty = net.empty()
+    except cv2.error as error:
+        raise InputError(f"{file}: not an ONNX network that OpenCV can read ({first_line(error)})") from None
+    if empty:
+        raise InputError(f"{file}: not an ONNX network; give the ONNX file of a network")
+
+    def forward(pictures: Blob) -> list[Blob]:
+        net.setInput(pictures)
+        return [np.asarray(net.forward(), dtype=np.float32)]
+
+    return forward
+
+
+def _with_onnxruntime(file: Path, content: bytes, sha256: str, device: str) -> OnnxNetwork:
+    """The network run by onnxruntime, on the CPU on as many threads as OpenCV has."""
+    try:
+        onnxruntime: Any = import_module("onnxruntime")
+    except ImportError:
+        raise InputError(f'{file}: onnxruntime runs it, a package: pip install "shapepose-fg[detect]"') from None
+    kind, _, number = device.partition(":")
+    provider = f"{PROVIDERS.get(kind)}ExecutionProvider"
+    if provider not in (there := onnxruntime.get_available_providers()) or not (number or "0").isdecimal():
+        known = " ".join(name for name, each in PROVIDERS.items() if f"{each}ExecutionProvider" in there)
+        raise InputError(
+            f"--device {device}: the onnxruntime that is installed has {known}; install its package for the device"
+        )
+    options: Any = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = min(cv2.getNumThreads(), os.cpu_count() or 1)
+    options.log_severity_level = 4
+    try:
+        providers = [(provider, {"device_id": number} if number else {})]
+        session: Any = onnxruntime.InferenceSession(content, options, providers=providers)
+    except Exception as error:
+        raise InputError(f"{file}: not an ONNX network that onnxruntime can read ({first_line(error)})") from None
+    if provider not in session.get_providers():  # it goes on with the CPU in silence
+        raise InputError(f"--device {device}: the device cannot be used; check its driver, or leave --device out")
+    takes = session.get_inputs()
+    if len(takes) != 1:
+        raise InputError(f"{file}: the network takes {len(takes)} inputs; give one that takes pictures alone")
+    shape = [side if type(side) is int else None for side in takes[0].shape]
+    batch, _, height, width = shape if len(shape) == 4 else (1, 3, None, None)
+
+    def forward(pictures: Blob) -> list[Blob]:
+        return [np.asarray(each, dtype=np.float32) for each in session.run(None, {takes[0].name: pictures})]
+
+    size = None if height is None or width is None else (width, height)
+    names = tuple(each.name for each in session.get_outputs())
+    return OnnxNetwork(file, sha256, forward, size, names, _BATCH if batch is None else 1)
+
+
+def words(shape: Sequence[int]) -> str:
+    """An array's shape in words."""
+    return " x ".join(map(str, shape))
+
+
+def first_line(error: BaseException) -> str:
+    """The first line of a library's message, short."""
+    lines = str(error).strip().splitlines() or [type(error).__name__]
+    return lines[0][:160]
