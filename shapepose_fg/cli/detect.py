@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 from shapepose_fg.cli.options import (
     REQUIRED,
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from shapepose_fg.detection2d.detector import CameraDetector, Network
-    from shapepose_fg.detection2d.onnx_network import Backend
     from shapepose_fg.detection2d.recording import DetectionReport, DetectionRun
 
 _NETWORK = "Network"
@@ -58,12 +57,13 @@ class NetworkOptions:
     def load(self) -> "Network":
         """The network, fetched if that is asked for."""
         from shapepose_fg.detection2d.download import named_file
-        from shapepose_fg.detection2d.opening import Running, open_network
+        from shapepose_fg.detection2d.opening import open_network
 
-        running = Running(self.layout, self.long_side, cast("Backend | None", self.backend), self.device)
+        openpose = {"layout": self.layout, "long_side": self.long_side, "backend": self.backend}
         with progress("fetching the network", "bytes") as fetched:
             found = partial(named_file, fetch=self.download is not None, say=note, progress=fetched)
-            return open_network(self.download or self.network or "", self.boxes, running, found)
+            network = self.download or self.network or ""
+            return open_network(network, self.boxes, found, self.device, **openpose)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,6 +94,7 @@ def detect(
     if pictures.videos is None:
         raise InputError("--videos: missing; give the cameras' videos or pictures")
     from shapepose_fg.detection2d.detector import CameraDetector
+    from shapepose_fg.detection2d.heat_maps import HeatMapNetwork
     from shapepose_fg.detection2d.recording import DetectionRun, run_detection
     from shapepose_fg.io.footage.lockstep import align, clocks_of
     from shapepose_fg.io.footage.placement import placements_of
@@ -113,8 +114,8 @@ def detect(
     detectors = [
         CameraDetector.of(camera, rig.up_vector, placements[camera.name], loaded) for camera in rig.cameras
     ]
-    if (only_size := getattr(loaded, "only_size", None)) is not None:
-        note(_shown_small(detectors, only_size))
+    if isinstance(loaded, HeatMapNetwork) and loaded.network.size is not None:
+        note(_shown_small(detectors, loaded.network.size))
     run = DetectionRun(rig, footage, detectors, moments, output)
     begin = time.perf_counter()
     with progress("detecting", "pictures") as done:

@@ -4,13 +4,14 @@ Cao et al., "OpenPose: Realtime Multi-Person 2D Pose Estimation using Part Affin
 All joints, and all pairs of candidates of all limbs, are decoded at once.
 """
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from shapepose_fg.core.arrays import Array, Index
-from shapepose_fg.detection2d.found import Candidates
+from shapepose_fg.core.arrays import Array, Index, Mask, Real
 from shapepose_fg.detection2d.networks import NetworkLayout
 
 _MIN_SCORE = 0.1
@@ -23,6 +24,46 @@ _MIN_SUPPORTED = 0.7
 """The share of places that must support a limb for it to have an affinity."""
 
 
+@dataclass(frozen=True)
+class Candidates:
+    """Joint candidates of one picture, sorted by joint, and affinities between them."""
+
+    joint: Index
+    """(D,) joint of each candidate, in the layout's order."""
+    xy: Array
+    """(D, 2) position."""
+    score: Array
+    """(D,) height of the peak, 0 to 1."""
+    pairs: Index
+    """(E, 2) candidates that a limb joins, the limb's first joint first."""
+    limb: Index
+    """(E,) the limb that joins each pair."""
+    affinity: Array
+    """(E,) mean of the field's component along the limb, 0 to 1; pairs without support are not listed."""
+
+    def __len__(self) -> int:
+        return len(self.joint)
+
+    @classmethod
+    def none(cls) -> "Candidates":
+        """Those of a picture in which nothing is."""
+        index, number = np.zeros(0, dtype=np.intp), np.zeros(0)
+        return cls(index, number.reshape(0, 2), number, index.reshape(0, 2), index, number)
+
+    def moved(self, xy: Array, inside: Mask) -> "Candidates":
+        """The same at other positions; those that are not `inside` (D,) are left out."""
+        place = np.cumsum(inside) - 1
+        both = inside[self.pairs].all(axis=1)
+        return Candidates(
+            self.joint[inside],
+            xy[inside],
+            self.score[inside],
+            place[self.pairs[both]],
+            self.limb[both],
+            self.affinity[both],
+        )
+
+
 def decode(output: NDArray[np.float32], layout: NetworkLayout) -> Candidates:
     """Candidates of one picture from the network's `output` (C, H, W).
 
@@ -30,10 +71,10 @@ def decode(output: NDArray[np.float32], layout: NetworkLayout) -> Candidates:
     the output is taken for 0.
     """
     output = np.nan_to_num(output, nan=0.0, posinf=0.0, neginf=0.0)
-    heat = output[layout.first_heat_map : layout.first_heat_map + len(layout.joints)]
+    heat = output[: len(layout.text.joints)]
     joint, xy, score = peaks(heat)
     first, second, limb = _all_pairs(joint, layout)
-    fields = output[layout.first_affinity : layout.first_affinity + 2 * len(layout.limbs)]
+    fields = output[layout.first_affinity : layout.channels]
     affinity = line_integrals(fields, xy[first], xy[second], limb)
     there = affinity > 0
     pairs = np.column_stack([first, second])[there]
@@ -58,14 +99,19 @@ def peaks(heat: NDArray[np.float32], min_score: float = _MIN_SCORE) -> tuple[Ind
     for dr, dc in ((-1, -1), (-1, 0), (-1, 1), (0, -1)):
         equal_before |= padded[joint, row + dr, column + dc] == padded[joint, row, column]
     joint, row, column = joint[~equal_before], row[~equal_before], column[~equal_before]
-    centre = padded[joint, row, column].astype(np.float64)
-    x, rise_x = vertex(padded[joint, row, column - 1], centre, padded[joint, row, column + 1])
-    y, rise_y = vertex(padded[joint, row - 1, column], centre, padded[joint, row + 1, column])
-    xy = np.column_stack([column - 1 + x, row - 1 + y])
-    return joint, xy, np.minimum(centre * np.exp(rise_x + rise_y), 1.0)
+    xy, height = between_cells(padded, joint, row, column)
+    return joint, xy - 1, np.minimum(height, 1.0)
 
 
-def vertex(before: NDArray[np.floating], centre: Array, after: NDArray[np.floating]) -> tuple[Array, Array]:
+def between_cells(maps: Real, which: Index, row: Index, column: Index) -> tuple[Array, Array]:
+    """Places (N, 2) and heights (N,) of maxima of `maps` (M, H, W), none of which lies at an edge."""
+    centre = maps[which, row, column].astype(np.float64)
+    x, rise_x = _vertex(maps[which, row, column - 1], centre, maps[which, row, column + 1])
+    y, rise_y = _vertex(maps[which, row - 1, column], centre, maps[which, row + 1, column])
+    return np.column_stack([column + x, row + y]), centre * np.exp(rise_x + rise_y)
+
+
+def _vertex(before: Real, centre: Array, after: Real) -> tuple[Array, Array]:
     """Where a Gaussian through three neighbours is highest, -0.5 to 0.5 cells, and the logarithm of its rise.
 
     0 and 0 at the edge of the map.
@@ -109,9 +155,9 @@ def _all_pairs(joint: Index, layout: NetworkLayout) -> tuple[Index, Index, Index
 
     `joint` (D,) is sorted.
     """
-    count = np.bincount(joint, minlength=len(layout.joints))
+    count = np.bincount(joint, minlength=len(layout.text.joints))
     start = np.cumsum(count) - count
-    ends = layout.limb_ends
+    ends = np.array(layout.text.limbs)
     sizes = count[ends[:, 0]] * count[ends[:, 1]]
     limb = np.repeat(np.arange(len(ends)), sizes)
     within = np.arange(len(limb)) - (np.cumsum(sizes) - sizes)[limb]

@@ -7,15 +7,15 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Camera
-from shapepose_fg.detection2d.found import Candidates, People
+from shapepose_fg.detection2d.decoding import Candidates
 from shapepose_fg.detection2d.heat_maps import HeatMapNetwork
-from shapepose_fg.detection2d.top_down import TopDownNetwork
+from shapepose_fg.detection2d.top_down import People, TopDownNetwork
 from shapepose_fg.detection2d.upright import UprightView, roll_of
 from shapepose_fg.io.footage.placement import Placement
 
 Network = HeatMapNetwork | TopDownNetwork
 """What finds joints in upright pictures. Each says what it is shown of a picture (`view`), what it finds in that
-(`detect`), how that is written (`written`), and what it depends on (`settings`)."""
+(`detect`), how a file says it (`suffix`, `head`, `text`, `tail`), and what it depends on (`settings`)."""
 
 
 @dataclass(frozen=True)

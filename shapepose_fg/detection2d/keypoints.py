@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import SKELETONS, Skeleton
-from shapepose_fg.detection2d.decoding import vertex
+from shapepose_fg.detection2d.decoding import between_cells
 from shapepose_fg.detection2d.network_file import NetworkFile
 from shapepose_fg.detection2d.onnx_network import Blob, OnnxNetwork, words
 
@@ -124,13 +124,10 @@ def _decoded(network: OnnxNetwork, form: NetworkFile, blob: Blob) -> tuple[Array
 def _peaks(maps: Array, size: Index, corners: bool) -> tuple[Array, Array]:
     """Pixels (B, N, 2) and heights (B, N) of the highest places of maps (B, N, H, W), between the cells."""
     shape = np.array(maps.shape[:1:-1])
-    padded = np.pad(maps, ((0, 0), (0, 0), (1, 1), (1, 1)), constant_values=-np.inf)
-    row, column = np.divmod(maps.reshape(*maps.shape[:2], -1).argmax(axis=2), shape[0])
-    n, k = np.indices(row.shape)
-    around = [
-        [padded[n, k, row + 1, column + 1 + step] for step in (-1, 0, 1)],
-        [padded[n, k, row + 1 + step, column + 1] for step in (-1, 0, 1)],
-    ]
-    cell = np.dstack([column, row]) + np.dstack([vertex(*each)[0] for each in around])
+    flat = maps.reshape(-1, *maps.shape[2:])
+    row, column = np.divmod(flat.reshape(len(flat), -1).argmax(axis=1), shape[0])
+    padded = np.pad(flat, ((0, 0), (1, 1), (1, 1)), constant_values=-np.inf)
+    cell, height = between_cells(padded, np.arange(len(flat)), row + 1, column + 1)
+    cell -= 1
     pixel = cell * (size - 1) / np.maximum(shape - 1, 1) if corners else (cell + 0.5) * size / shape - 0.5
-    return pixel, around[0][1]
+    return pixel.reshape(*maps.shape[:2], 2), height.reshape(maps.shape[:2])

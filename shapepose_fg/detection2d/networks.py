@@ -6,36 +6,29 @@ from functools import lru_cache
 from importlib.resources import files
 from typing import Any
 
-import numpy as np
-
-from shapepose_fg.core.arrays import Index
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.io.detections.association_text import TEXT_SKELETONS, TextSkeleton
+
+STRIDE = 8
+"""Pixels of the input per cell of the output, along each axis."""
+MULTIPLE = 16
+"""Both sides of the input are multiples of this."""
 
 
 @dataclass(frozen=True)
 class NetworkLayout:
-    """What a network takes and gives: of OpenPose's kind, heat maps and part affinity fields in one array."""
+    """What a network of OpenPose's kind takes and gives.
+
+    In one array: the heat maps of the skeleton's joints, one of the background, and two maps (x, y) of part
+    affinities for each limb.
+    """
 
     name: str
     """What it is called."""
     about: str
     """Which networks have it, in a sentence."""
     skeleton: str
-    """The skeleton in which its detections are read, a name of `SKELETONS`."""
-    joints: tuple[str, ...]
-    """The J joints, in the order of the heat maps."""
-    limbs: tuple[tuple[int, int], ...]
-    """The L limbs, in the order of the affinity fields, two channels (x, y) each."""
-    first_heat_map: int
-    """Channel of joint 0."""
-    first_affinity: int
-    """Channel of the x of limb 0."""
-    channels: int
-    """How many channels the output has."""
-    stride: int
-    """Pixels of the input per cell of the output, along each axis."""
-    multiple: int
-    """Both sides of the input are multiples of this."""
+    """The skeleton whose joints and limbs these are, a name of `TEXT_SKELETONS`."""
     scale: float
     """The input is `scale` * colour + `offset`, with colours (blue, green, red) from 0 to 255."""
     offset: float
@@ -44,9 +37,19 @@ class NetworkLayout:
     """Checksums of known networks that have it."""
 
     @property
-    def limb_ends(self) -> Index:
-        """(L, 2) the joints that each limb joins."""
-        return np.array(self.limbs, dtype=np.intp)
+    def text(self) -> TextSkeleton:
+        """The joints and limbs, in order."""
+        return TEXT_SKELETONS[self.skeleton]
+
+    @property
+    def first_affinity(self) -> int:
+        """Channel of the x of limb 0."""
+        return len(self.text.joints) + 1
+
+    @property
+    def channels(self) -> int:
+        """How many channels the output has."""
+        return self.first_affinity + 2 * len(self.text.limbs)
 
 
 @dataclass(frozen=True)
@@ -69,11 +72,7 @@ def _table() -> dict[str, Any]:
 @lru_cache(maxsize=1)
 def layouts() -> dict[str, NetworkLayout]:
     """All layouts by name."""
-    every = {}
-    for name, entry in _table()["layouts"].items():
-        limbs = tuple(tuple(map(int, limb.split("-"))) for limb in entry["limbs"].split())
-        every[name] = NetworkLayout(name, **(entry | {"joints": tuple(entry["joints"].split()), "limbs": limbs}))
-    return every
+    return {name: NetworkLayout(name, **entry) for name, entry in _table()["layouts"].items()}
 
 
 def named_networks() -> dict[str, NamedNetwork]:

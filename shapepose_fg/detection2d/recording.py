@@ -90,16 +90,16 @@ def run_detection(run: DetectionRun, progress: Progress = lambda done, total: No
             _write_block(run, moments, files[-1], progress)
         counts += [_read_block(files[-1], views, name) for name in ("found", "failed")]
         progress(moments.stop * views, total * views)
-    written = run.detectors[0].network.written
+    network = run.detectors[0].network
 
     def text_of(view: int) -> Iterator[bytes]:
-        yield written.head(total).encode()
+        yield network.head(total).encode()
         for file in files:
             yield _read_block(file, views, "text")[view].encode()
-        yield written.tail.encode()
+        yield network.tail.encode()
 
     for view, name in enumerate(run.rig.names):
-        file = run.output / f"{name}{written.suffix}"
+        file = run.output / f"{name}{network.suffix}"
         write_atomically(file, lambda stream, view=view: stream.writelines(text_of(view)))
     _write_times(run)
     used = [
@@ -127,7 +127,7 @@ def _write_block(run: DetectionRun, moments: range, file: Path, progress: Progre
             failed[v] += place >= 0 and picture is None
             seen = None if picture is None else detector.detect(picture)
             found[v] += 0 if seen is None else len(seen)
-            text[v] += detector.network.written.frame(t, seen, camera.image_size)
+            text[v] += detector.network.text(t, seen, camera.image_size)
             progress(t * views + v + 1, len(run.moments) * views)
     write_content(file, _json({"text": text, "found": found, "failed": failed}))
 

@@ -3,18 +3,35 @@
 Boxes and joints are those of `rtmlib` to a hundredth of a pixel.
 """
 
-from dataclasses import dataclass
+import json
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.detection2d.boxes import BoxNetwork
-from shapepose_fg.detection2d.found import People, PeopleFile
 from shapepose_fg.detection2d.keypoints import KeypointNetwork
 from shapepose_fg.detection2d.upright import UprightView
+
+
+@dataclass(frozen=True)
+class People:
+    """People of one picture, whose joints the network grouped."""
+
+    xy: Array
+    """(P, K, 2) positions, in the order of the skeleton's keypoints."""
+    score: Array
+    """(P, K) as the network gives them; 0 or less is a joint that was not seen."""
+
+    def __len__(self) -> int:
+        return int((self.score > 0).sum())
+
+    def moved(self, xy: Array, inside: Mask) -> "People":
+        """The same at other positions; those that are not `inside` (P, K) are left out."""
+        return replace(self, xy=xy, score=np.where(inside, self.score, 0.0))
 
 
 @dataclass(frozen=True)
@@ -25,6 +42,7 @@ class TopDownNetwork:
     """What finds joints."""
     boxes: BoxNetwork | None
     """What finds people; None where the network is shown whole pictures."""
+    suffix, tail = ".json", "\n]\n"
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -36,10 +54,18 @@ class TopDownNetwork:
         }
         return {"network": said["network"], "detection": {"boxes": said["boxes"]}}
 
-    @property
-    def written(self) -> PeopleFile:
-        """How its detections are written."""
-        return PeopleFile()
+    def head(self, frames: int) -> str:
+        """The beginning of MMPose's JSON of a video."""
+        return "["
+
+    def text(self, number: int, found: Any, size: tuple[int, int]) -> str:
+        """Frame `number` in it: `People`, None where there was no picture. Joints that were not seen are 0 0 0."""
+        people = []
+        for xy, score in zip(found.xy, found.score, strict=True) if found else ():
+            if (seen := score > 0).any():
+                xy, score = np.where(seen[:, None], xy, 0.0).round(3), np.where(seen, score, 0.0).round(6)
+                people.append({"keypoints": xy.tolist(), "keypoint_scores": score.tolist()})
+        return f"{',' if number else ''}\n{json.dumps({'frame_id': number, 'instances': people}, allow_nan=False)}"
 
     def view(self, region: tuple[float, float, float, float], roll_deg: float) -> UprightView:
         """What it is shown of pictures with such a region and roll: as many pixels as there are."""

@@ -11,6 +11,7 @@ import pytest
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.detection2d.heat_maps import HeatMapNetwork
 from shapepose_fg.detection2d.networks import layouts
+from shapepose_fg.detection2d.onnx_network import OnnxNetwork
 from shapepose_fg.viz.rendering import look_at
 
 Sides = Sequence[int | str]
@@ -51,7 +52,8 @@ def see_discs(blob: np.ndarray) -> np.ndarray:
 
 @pytest.fixture
 def painted_network() -> HeatMapNetwork:
-    return HeatMapNetwork(layouts()["openpose-body25"], "0" * 64, see_discs)
+    network = OnnxNetwork(Path("painted.onnx"), "0" * 64, lambda blob: [see_discs(blob)])
+    return HeatMapNetwork(network, layouts()["openpose-body25"])
 
 
 @pytest.fixture(scope="session")

@@ -51,7 +51,7 @@ def test_onnxruntime_keeps_to_the_size_that_the_file_fixes(tmp_path):
     pytest.importorskip("onnxruntime", reason="onnxruntime is an extra: shapepose-fg[detect]")
     file = onnx_file(tmp_path / "n.onnx", means(78), fixed=(32, 64))
     network = HeatMapNetwork.load(file, backend="onnxruntime")
-    assert network.only_size == (64, 32)
+    assert network.network.size == (64, 32)
     assert network.run(np.zeros((32, 64, 3), np.uint8)).shape == (78, 4, 8)
 
 
@@ -98,9 +98,7 @@ def test_weights_in_other_files_are_refused_wherever_they_stand(tmp_path):
     file, whole = tmp_path / "n.onnx", onnx_file(tmp_path / "whole.onnx", means(78)).read_bytes()
     for model in models:
         file.write_bytes(whole + model)
-        with pytest.raises(
-            InputError, match=r"its weights lie in another file \('\.\./\.\./etc/passwd'\); give a"
-        ):
+        with pytest.raises(InputError, match="its weights lie in another file; give a network that holds them"):
             HeatMapNetwork.load(file)
 
 
