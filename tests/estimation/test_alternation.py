@@ -372,6 +372,7 @@ def seen_of(rig: Rig, detections: Detections, truth: NDArray[np.float64], within
     return replace(nowhere, initial=triangulate(nowhere, Views.of(rig), ObservationConfig()))
 
 
+@pytest.mark.slow
 def test_the_alternation_helps_on_the_built_in_scene():
     """Joints of low confidence end nearer the truth than triangulated, those of high confidence no farther."""
     from shapepose_fg.body.fitting.fitters import SmplFitter

@@ -13,6 +13,7 @@ from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.simulation import built_in_scene, simulate
 
 
+@pytest.mark.slow
 def test_constant_acceleration_the_whole_way():
     """Two people before four cameras: tracked, solved, bodies linked, as near to the truth as by default."""
     scene = built_in_scene(people=2, cameras=4, frames=24)

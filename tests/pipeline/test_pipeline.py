@@ -85,6 +85,7 @@ def test_the_run_says_how_it_came_about(people):
     assert all(0.3 < each["evidence"] <= 1 and 0.9 < each["probability"] <= 1 for each in run["probability"])
 
 
+@pytest.mark.slow
 def test_without_time_frames_stand_alone_and_batches_do_not_matter(scene, recording):
     recording = Recording(BODY_25, [recording[t] for t in range(10)])
     whole = reconstruct(recording, scene.rig, ALONE)
@@ -272,6 +273,7 @@ def test_the_observations_are_what_the_joints_were_solved_from(dance, scene, peo
     assert people.run["people"]["joints"]["seen"] == (people.known == Known.SEEN).sum()
 
 
+@pytest.mark.slow
 def test_detections_are_assigned_until_hardly_any_changes(scene: Scene, recording: Recording):
     """More rounds than that change nothing; with one, they are not there yet."""
     rounds = {}
