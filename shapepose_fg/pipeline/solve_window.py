@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.core.camera import Views
+from shapepose_fg.core.detections import Input
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.body_step import BodyStep, disagreement
@@ -25,7 +26,6 @@ from shapepose_fg.estimation.state import State
 from shapepose_fg.estimation.window_graph import ExtraFactors, WindowGraph
 from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.tracking.reassociation import Survival, reassociate
-from shapepose_fg.tracking.worlds import Input
 
 _SETTLED = 0.002
 """Detections are not assigned again when fewer than this share of them changed: in crowds before six cameras after
