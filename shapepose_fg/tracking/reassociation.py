@@ -67,6 +67,12 @@ def reassociate(
     return Observations.concatenate(parts)
 
 
+def changed(before: Observations, now: Observations) -> float:
+    """Share of the places where somebody is seen by a view, in the same rows, whose detection is another."""
+    seen = before.seen | now.seen
+    return float((before.candidate != now.candidate)[seen].sum() / max(seen.sum(), 1))
+
+
 def _given_out(
     frame: Input, joints: NDArray[np.float64], sigma_m: NDArray[np.float64], skeleton: Skeleton
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
