@@ -48,10 +48,6 @@ class ThinnedFrames:
         order = np.lexsort(found.pairs.T)
         return replace(found, pairs=found.pairs[order], affinity=found.affinity[order])
 
-    def in_recording(self, frame: int, candidate: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Detections of a thinned frame, of any shape, -1 for none: which of the recording's own they are."""
-        return np.append(self._rows(self.frames[frame]), -1)[candidate]
-
     def is_thinned(self, frame: int) -> bool:
         """Whether detections of a frame were left out."""
         return kept_detections(self.frames[frame], self.views, self.config) is not None

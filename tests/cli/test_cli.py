@@ -16,12 +16,12 @@ import shapepose_fg.cli.reconstruct.run
 from shapepose_fg.body.shapes import SubjectShapes
 from shapepose_fg.cli.main import main
 from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.notes import Notes
 from shapepose_fg.core.observation_table import ObservationTable
 from shapepose_fg.core.reconstruction import Known, Reconstruction, Status
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.pipeline.bodies_over_time import BodiesOverTime
 from shapepose_fg.pipeline.runs.assembly import Assembly
-from shapepose_fg.pipeline.runs.notes import Notes
 from shapepose_fg.pipeline.runs.parts import Part, Parts
 
 K = [1000.0, 0, 500, 0, 1000, 400, 0, 0, 1]

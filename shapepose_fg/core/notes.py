@@ -7,8 +7,23 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from shapepose_fg.estimation.window_solution import Problem
-from shapepose_fg.tracking.worlds import Input
+from shapepose_fg.core.detections import Input
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What went wrong with one joint of one person in one frame."""
+
+    row: int
+    """Row of the solution."""
+    track: int
+    """Who."""
+    frame: int
+    """When."""
+    joint: int
+    """Which joint, an index into the skeleton."""
+    reason: str
+    """What happened, in words."""
 
 
 @dataclass
