@@ -73,9 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if (what := failure(error)) is None:
             raise
         is_file = isinstance(error, OSError)
-        code = _fail(
-            f"{what}; {'check the path, its permissions and the space left' if is_file else 'start it again'}"
-        )
+        code = _fail(f"{what}; {'check path, permissions and space left' if is_file else 'start it again'}")
     except Stopped as stop:
         say("stopped", stop.message or "nothing is left half written", "bold yellow")
         code = stop.exit_code

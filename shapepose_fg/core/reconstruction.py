@@ -17,7 +17,7 @@ from shapepose_fg.core.observation_table import ObservationTable
 from shapepose_fg.core.result_files import OBSERVATIONS, PEOPLE, RUN, RUN_ID, SavedTable, check_id, write_result
 from shapepose_fg.core.run_summary import check_run, merged_run
 from shapepose_fg.core.shapes import SubjectShapes
-from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.core.skeleton import BODY_25, check_joint_names
 from shapepose_fg.core.storage.files import read_json
 from shapepose_fg.core.storage.schema import Column, Table
 
@@ -114,6 +114,7 @@ class Reconstruction(Table):
     def __post_init__(self) -> None:
         """Check every shape and type, once, and that `observations` are of these rows."""
         super().__post_init__()
+        check_joint_names(self.joint_names.tolist())
         unknown = set(np.unique(self.status).tolist()) - set(Status)
         if len(unknown) > 0:
             raise ValueError(f"status must be one of {[*map(str, Status)]}, got {sorted(unknown)}")
@@ -160,9 +161,7 @@ class Reconstruction(Table):
             *((name, ok & ~with_body(getattr(self, name))) for name in BODY),
         ):
             if wrong.any():
-                raise ValueError(
-                    f"{name} must be numbers where they are known, in row {wrong.argmax()} they are not"
-                )
+                raise ValueError(f"{name} must be numbers where they are known, not as in row {wrong.argmax()}")
 
     def at(self, frame: int) -> "Reconstruction":
         """The people of one frame."""

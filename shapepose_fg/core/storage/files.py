@@ -64,9 +64,7 @@ def inside(folder: Path, name: str) -> Path:
     except (OSError, RuntimeError):  # links that lead to each other
         stays = False
     if not stays:
-        raise InputError(
-            f"{place}: this is a link that leads out of its folder; remove it, or put the folder there"
-        )
+        raise InputError(f"{place}: this is a link that leads out of its folder; remove it, or give that folder")
     return place
 
 
@@ -218,7 +216,7 @@ def write_content(path: Path, content: str | bytes) -> None:
 
 def write_together(
     files: Mapping[Path, Callable[[BinaryIO], object]],
-    check: Callable[[Mapping[Path, Path]], object] | None = None,
+    check: Callable[[Mapping[Path, Path]], object] = lambda _: None,
 ) -> None:
     """`write_atomically` of several files in order, none of which is put in place before all are complete.
 
@@ -234,8 +232,7 @@ def write_together(
                     write(stream)
                     stream.flush()
                     os.fsync(stream.fileno())
-        if check is not None:
-            check(temporary)
+        check(temporary)
         for path in files:
             with _naming(path):
                 temporary[path].replace(path)

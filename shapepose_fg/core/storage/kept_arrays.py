@@ -96,7 +96,7 @@ class InFolder(KeptArrays):
     """The same as a file per set: safetensors, which holds no code and gives single arrays and rows of them.
 
     A file is on the disk when `keep` returns. It has a digest of each array, and one of these, its name and its
-    run: what is read is checked once, and again when the file has changed. InputError names a file that is damaged.
+    run: what is read is checked once, and again when the file has changed. InputError names a damaged file.
     """
 
     lasting = True

@@ -25,9 +25,8 @@ def prepare_output(folder: Path, names: Iterable[str] = ()) -> None:
         raise InputError(f"{folder}: {problem}; give a folder that can be written") from None
     for name in names:
         if (folder / name).exists() and not (folder / name).is_file():
-            raise InputError(
-                f"{folder / name}: this is a folder or a pipe, and a file is to be written; move it away"
-            )
+            what = "folder" if (folder / name).is_dir() else "pipe"
+            raise InputError(f"{folder / name}: this is a {what}, and a file is to be written here; move it away")
 
 
 @contextmanager

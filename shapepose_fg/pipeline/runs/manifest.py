@@ -143,10 +143,8 @@ def people_at_start(kept: KeptArrays, file: Path, load: Callable[[], SubjectShap
     with naming(kept.place(_KNOWN), ANEW):
         if not isinstance(about, dict) or not {"names", "body", "sha256"} <= about.keys():
             raise ValueError("it does not say whose shapes they are")
-        betas, information = (kept.array(_KNOWN, name) for name in _ARRAYS)
-        known = SubjectShapes(
-            np.array([*map(str, about["names"])], dtype=str), betas, information, str(about["body"])
-        )
+        names = np.array([*map(str, about["names"])], dtype=str)
+        known = SubjectShapes(names, *(kept.array(_KNOWN, name) for name in _ARRAYS), body=str(about["body"]))
     if now not in (about["sha256"], *map(kept.about, kept.names(_WRITTEN))):
         raise InputError(
             f"{file}: this has changed since the run was stopped; begin anew with --restart to use what it holds"
