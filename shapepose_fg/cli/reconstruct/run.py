@@ -216,8 +216,7 @@ class _Run:
             done = manifest.frames_done(output)
         except InputError as error:
             return str(error)
-        kept = f"{done} of {count} frames are kept in {output / manifest.PARTS}; go on with --resume"
-        return kept if done > 0 else "nothing is kept: no frame was done"
+        return f"{done} of {count} frames are kept in {output / manifest.PARTS}; go on with --resume"
 
 
 def _known_people(file: Path, body: Path | None) -> SubjectShapes:
