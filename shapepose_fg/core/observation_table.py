@@ -81,6 +81,8 @@ class ObservationTable(Table):
         for name in self.shared():
             if len(set(getattr(self, name).tolist())) < len(getattr(self, name)):
                 raise ValueError(f"{name} must differ from each other")
+        if not all(map(str.isprintable, self.view_names.tolist())):
+            raise ValueError("view_names must be names in one line")
         # A score may be too small for a float32, and which detection it was need not be said.
         wrong = {
             "candidate": (self.candidate >= 0) & ~seen,

@@ -17,7 +17,7 @@ from shapepose_fg.core.observation_table import ObservationTable
 from shapepose_fg.core.result_files import OBSERVATIONS, PEOPLE, RUN, RUN_ID, SavedTable, check_id, write_result
 from shapepose_fg.core.run_summary import check_run, merged_run
 from shapepose_fg.core.shapes import SubjectShapes
-from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.core.skeleton import BODY_25, check_joint_names
 from shapepose_fg.core.storage.files import read_json
 from shapepose_fg.core.storage.schema import Column, Table
 
@@ -114,6 +114,7 @@ class Reconstruction(Table):
     def __post_init__(self) -> None:
         """Check every shape and type, once, and that `observations` are of these rows."""
         super().__post_init__()
+        check_joint_names(self.joint_names.tolist())
         unknown = set(np.unique(self.status).tolist()) - set(Status)
         if len(unknown) > 0:
             raise ValueError(f"status must be one of {[*map(str, Status)]}, got {sorted(unknown)}")
@@ -149,6 +150,19 @@ class Reconstruction(Table):
         table = None if self.observations is None else self.observations.rows(index)
         return replace(self, **columns, observations=table)
 
+    def check_ranges(self) -> None:
+        """ValueError for what no result gives: also for a joint or a body that is called known and is not."""
+        super().check_ranges()
+        ok, known = self.status == Status.OK, self.known != Known.UNKNOWN
+        sure = np.isfinite(self.covariance).all(axis=(2, 3)) | ~ok[:, None]
+        for name, wrong in (
+            ("joints", (known & ~np.isfinite(self.joints).all(axis=2)).any(axis=1)),
+            ("covariance", (known & ~sure).any(axis=1)),
+            *((name, ok & ~with_body(getattr(self, name))) for name in BODY),
+        ):
+            if wrong.any():
+                raise ValueError(f"{name} must be numbers where they are known, not as in row {wrong.argmax()}")
+
     def at(self, frame: int) -> "Reconstruction":
         """The people of one frame."""
         return self.rows(self.frame == frame)
@@ -171,10 +185,10 @@ class Reconstruction(Table):
 
         A process killed on the way leaves each file as it was or as it shall be, and `load` says where they do not
         belong together (docs/conventions.md). Without `observations`, those of an earlier result are removed.
-        OSError where `folder` cannot be written.
+        InputError where `load` would refuse them, OSError where `folder` cannot be written.
         """
         observations = None if self.observations is None else self.observations.columns()
-        write_result(Path(folder), self.columns(), observations, self.run)
+        write_result(Path(folder), self.columns(), observations, self.run, check_files)
 
     @classmethod
     def load(cls, path: str | Path) -> "Reconstruction":
@@ -258,6 +272,22 @@ class OpenedReconstruction(ExitStack):
         table = self._observed.read(index)
         with naming(self._observed.file, "delete it or run the reconstruction again"):
             return replace(people, observations=table)
+
+
+def check_files(people: Path, observations: Path | None) -> None:
+    """InputError where the files of a result, on the way to their places, could not be read again."""
+    with SavedTable(people, Reconstruction, _UNREADABLE) as rows, ExitStack() as opened:
+        table = None if observations is None else ObservationTable.open(observations)
+        if table is not None:
+            opened.enter_context(table)
+        for start in range(0, rows.count, _CHECKED_ROWS):
+            index = np.arange(start, min(start + _CHECKED_ROWS, rows.count))
+            rows.read(index, observations=None if table is None else table.read(index))
+
+
+_UNREADABLE = "the result was not written, and what was there before is as it was"
+_CHECKED_ROWS = 4096
+"""Rows that are read at a time to see whether they can be."""
 
 
 def _read_run(file: Path, people_id: object) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -34,13 +34,18 @@ def results_folder(results: Path) -> Path:
 
 
 def write_result(
-    folder: Path, people: Mapping[str, Pieces], observations: Mapping[str, Pieces] | None, run: Mapping[str, Any]
+    folder: Path,
+    people: Mapping[str, Pieces],
+    observations: Mapping[str, Pieces] | None,
+    run: Mapping[str, Any],
+    check: Callable[[Path, Path | None], object] | None = None,
 ) -> None:
     """Write the files of a result into `folder`, none before all are complete on the disk.
 
     A process killed on the way leaves each file as it was or as it shall be; `check_id` tells where they are of
-    two runs. Without `observations`, those of an earlier result are removed. ValueError where `run` holds what
-    JSON cannot, OSError that names the file where one cannot be written.
+    two runs. Without `observations`, those of an earlier result are removed. Nothing is replaced where `check`
+    raises, which is given people.npz and observations.npz as they shall be. ValueError where `run` holds what JSON
+    cannot, OSError that names the file where one cannot be written.
     """
     digest = hashlib.sha256()
 
@@ -62,7 +67,18 @@ def write_result(
     # The order counts: the id is known when people.npz has been written.
     files = {folder / PEOPLE: write_people}
     files |= {} if observations is None else {folder / OBSERVATIONS: write_observations}
-    write_together({**files, folder / RUN: lambda stream: stream.write(run_text().encode())})
+
+    def checked(new: Mapping[Path, Path]) -> None:
+        try:
+            if check is not None:
+                check(new[folder / PEOPLE], new.get(folder / OBSERVATIONS))
+        except InputError as error:
+            message = str(error)
+            for path, temporary in new.items():
+                message = message.replace(str(temporary), str(path))
+            raise InputError(message) from None
+
+    write_together({**files, folder / RUN: lambda stream: stream.write(run_text().encode())}, checked)
     if observations is None:
         (folder / OBSERVATIONS).unlink(missing_ok=True)
 

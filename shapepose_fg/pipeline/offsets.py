@@ -9,10 +9,11 @@ from shapepose_fg.body.offsets.estimation import learn_offsets
 from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import DetectionSequence
+from shapepose_fg.core.errors import naming
 from shapepose_fg.core.notes import Notebook
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.core.storage.kept_arrays import KeptArrays
+from shapepose_fg.core.storage.kept_arrays import ANEW, KeptArrays
 from shapepose_fg.estimation.detector_offsets import confident_targets, spread_frames
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.setup import Setup
@@ -50,7 +51,8 @@ def kept_offsets(kept: KeptArrays, setup: Setup, frames: ThinnedFrames, book: No
     """`offsets_of`; what a run began with it goes on with."""
     columns = [each.name for each in fields(KeypointOffsets)]
     if len(kept.names(_OFFSETS)) > 0:
-        return KeypointOffsets(**{name: kept.array(_OFFSETS, name) for name in columns})
+        with naming(kept.place(_OFFSETS), ANEW):
+            return KeypointOffsets(**{name: kept.array(_OFFSETS, name) for name in columns})
     offsets = offsets_of(setup, frames, book)
     if offsets is not None:
         kept.keep(_OFFSETS, {name: getattr(offsets, name) for name in columns})

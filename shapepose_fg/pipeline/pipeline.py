@@ -134,11 +134,13 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
         if offsets is not None:
             setup = replace(setup, fitter=fitter.with_keypoint_offsets(offsets))
         parts = Parts(kept)
+        parts.check(skeleton.joints, rig.names, frames)
         done = parts.notes().frames
         windows = SolvedWindows(setup, detections, times, frames, cuts, book)
         with execution.pool(setup, len(frames)) as pool:
             beginning = book.torn_off()
-            for part in windows.after(parts.checkpoint(windows.read), pool, chunk):
+            nobody = setup.engine(book).tracker.nobody()
+            for part in windows.after(parts.checkpoint(windows.read, frames, nobody), pool, chunk):
                 parts.append(part)
                 done += part.notes.frames
                 if execution.progress is not None:

@@ -15,6 +15,7 @@ import pytest
 import shapepose_fg.cli.reconstruct.run
 from shapepose_fg.body.shapes import SubjectShapes
 from shapepose_fg.cli.main import main
+from shapepose_fg.core.errors import WorkLost
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.notes import Notes
 from shapepose_fg.core.observation_table import ObservationTable
@@ -455,3 +456,48 @@ def test_chunks_and_a_cluster_reach_the_pipeline(recording, pipeline, capsys):
     capsys.readouterr()
     assert run(*recording, "--chunk-frames", "20") == 2
     assert "--chunk-frames 20: must be 96" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (WorkLost("a worker process was killed"), "a worker process was killed"),
+        (MemoryError(), "too little memory"),
+        (RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory"), "too little memory"),
+        (OSError(28, "No space left on device", "/x/y"), "/x/y: No space left on device"),
+    ],
+)
+def test_what_the_system_does_to_a_run_is_one_sentence_with_the_way_on(
+    recording, monkeypatch, capsys, error, words
+):
+    def killed(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(shapepose_fg.cli.reconstruct.run, "reconstruct_parts", killed)
+    with pytest.raises(SystemExit) as ended:
+        main(recording)
+    said = capsys.readouterr().err
+    assert ended.value.code == 2 and said.count("\n") == 1
+    assert words in said and "0 of 5 frames are kept in" in said and "go on with --resume" in said
+
+
+@pytest.mark.parametrize("name", ["parts", ".detections", ".lock"])
+def test_a_link_in_the_folder_of_results_is_not_followed(recording, pipeline, tmp_path, capsys, name):
+    other = tmp_path / "other"
+    for folder in (other, tmp_path / "out"):
+        folder.mkdir()
+    (tmp_path / "out" / name).symlink_to(other)
+    with pytest.raises(SystemExit) as ended:
+        main(recording)
+    said = capsys.readouterr().err
+    assert ended.value.code == 2 and f"{name}: this is a link" in said and said.count("error") == 1
+    assert list(other.iterdir()) == []
+
+
+def test_an_export_follows_no_link_either(tmp_path, capsys):
+    (tmp_path / "results").mkdir()
+    (tmp_path / "other").mkdir()
+    (tmp_path / "results" / "export").symlink_to(tmp_path / "other")
+    with pytest.raises(SystemExit) as ended:
+        main(["export", str(tmp_path / "results"), "csv"])
+    assert ended.value.code == 2 and "export: this is a link" in capsys.readouterr().err

@@ -26,7 +26,7 @@ from shapepose_fg.cli.reconstruct.run import Ended, carry_out
 from shapepose_fg.cli.stopping import Stopped, stoppable
 from shapepose_fg.cli.terminal import note, use_any_streams
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.storage.files import open_regular
+from shapepose_fg.core.storage.files import inside, open_regular
 from shapepose_fg.core.storage.output_folder import prepare_output
 from shapepose_fg.io.corrections import refuse_corrected
 from shapepose_fg.io.detections.reading import find_places
@@ -211,7 +211,7 @@ def _lead(assignment: Assignment, tell: Connection, lifeline: Connection) -> Non
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=end_with, args=(lifeline,), daemon=True).start()
     use_any_streams()
-    log = assignment.folder / LOG
+    log = inside(assignment.folder, LOG)
     with log.open("ab", buffering=0) as stream:
         stream.write(f"--- {time.strftime('%Y-%m-%d %H:%M:%S')}\n".encode())
         for descriptor in (1, 2):

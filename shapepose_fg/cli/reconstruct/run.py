@@ -18,10 +18,11 @@ from shapepose_fg.cli.reconstruct.ending import check_setup, show_check, summary
 from shapepose_fg.cli.reconstruct.request import OUTPUTS, Prepared
 from shapepose_fg.cli.stopping import Stopped
 from shapepose_fg.cli.terminal import note, progress, show
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.errors import InputError, failure
 from shapepose_fg.core.provenance import ReadInputs, checksums, program_digest, versions
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.run_summary import plain
+from shapepose_fg.core.storage.files import inside
 from shapepose_fg.core.storage.kept_arrays import InFolder
 from shapepose_fg.core.storage.output_folder import only_run_in, prepare_output
 from shapepose_fg.io.calibration import write_rig
@@ -64,7 +65,7 @@ def carry_out(known: Prepared, execution: Execution, *, resume: bool = False, re
     rig = asked.rig()
     refuse_corrected(output)
     settings = known.settings()  # what is wrong with them is said before the whole recording is read
-    with only_run_in(output, OUTPUTS), _recording_folder(output / ".detections") as kept:
+    with only_run_in(output, OUTPUTS), _recording_folder(inside(output, ".detections")) as kept:
         recording = read_detections(known.detections, rig, asked.skeleton, kept)
         note(*recording.notes)
         count = len(recording)
@@ -147,9 +148,10 @@ class _Run:
             return self._finished(kept)
         except Stopped as stop:
             raise Stopped(stop.number, self._standing()) from None
-        except OSError as error:
-            place = f"{error.filename}: " if error.filename is not None else ""
-            raise InputError(f"{place}{error.strerror or error}; {self._standing()}") from None
+        except (OSError, MemoryError, RuntimeError) as error:
+            if (what := failure(error)) is None:
+                raise
+            raise InputError(f"{what}; {self._standing()}") from None
 
     def _finished(self, kept: InFolder) -> Ended:
         """The reconstruction, its files, and what is said of it."""
@@ -214,8 +216,7 @@ class _Run:
             done = manifest.frames_done(output)
         except InputError as error:
             return str(error)
-        kept = f"{done} of {count} frames are kept in {output / manifest.PARTS}; go on with --resume"
-        return kept if done > 0 else "nothing is kept: no frame was done"
+        return f"{done} of {count} frames are kept in {output / manifest.PARTS}; go on with --resume"
 
 
 def _known_people(file: Path, body: Path | None) -> SubjectShapes:
