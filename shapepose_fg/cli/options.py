@@ -183,9 +183,11 @@ def result_frames(text: str | None) -> range | None:
     return found
 
 
-def frame_range(text: str | None, count: int) -> range:
-    """Frames that `A:B` selects of a recording of `count` frames: half-open, either end optional."""
-    start, stop = (0, count) if text is None else ends(text)
+def frame_range(text: str | None, count: int, first: int = 0) -> range:
+    """Frames that `A:B` selects of a recording of `count` frames: half-open, either end optional; all from the
+    `first` on where it is None.
+    """
+    start, stop = (first, count) if text is None else ends(text)
     found = range(start, count if stop is None else stop)
     if text is not None and not (found and found.stop <= count):
         raise InputError(

@@ -33,7 +33,7 @@ def check_calibration(
         recording = read_detections(seen.detections, rig, seen.skeleton, InFolder(Path(folder)))
         note(*recording.notes)
         sizes = () if pictures.videos is None else other_sizes(pictures.videos, rig)
-        report = check_setup(recording, rig, frame_range(frames, len(recording)), sizes)
+        report = check_setup(recording, rig, frame_range(frames, len(recording), recording.first), sizes)
     if as_json:
         print(json.dumps(report.as_dict(), indent=2, allow_nan=False))
     else:

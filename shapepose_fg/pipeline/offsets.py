@@ -69,10 +69,11 @@ def offsets_of(setup: Setup, detections: ThinnedFrames, book: Notebook) -> Keypo
     if source != "recording":
         return KeypointOffsets.load(source)
     with book.stage("offsets"):
-        spread = spread_frames(len(detections), config.offsets.frames)
+        spread = spread_frames(len(detections) - detections.first, config.offsets.frames)
         # Joints that three views see well are wanted: people whose hips they see are enough, and found faster.
         hips = StageOne.of(config).by_hips()
-        people = [hips.people(detections[t], rig, setup.skeleton, Notebook()) for t in spread]
+        frames = (detections[detections.first + t] for t in spread)
+        people = [hips.people(frame, rig, setup.skeleton, Notebook()) for frame in frames]
         if len(people) == 0:
             return KeypointOffsets.identity()
         targets = confident_targets(Observations.concatenate(people), rig, config.observations)

@@ -87,11 +87,11 @@ class Prepared:
             raise InputError("--project: its files need people over time; leave out --no-temporal, or --project")
         return found
 
-    def span(self, count: int) -> range:
-        """The frames that are wanted of a recording of `count`."""
+    def span(self, count: int, first: int = 0) -> range:
+        """The frames that are wanted of a recording of `count`, in which nobody is seen before the `first`."""
         if self.project is not None and self.request.frames is None:
             return self.project.span(count)
-        return frame_range(self.request.frames, count)
+        return frame_range(self.request.frames, count, first)
 
     def times(self, rig: "Rig", count: int) -> "FrameTimes | None":
         """When the frames were taken; None where nothing says it."""

@@ -68,7 +68,7 @@ def carry_out(known: Prepared, execution: Execution, *, resume: bool = False, re
         recording = read_detections(known.detections, rig, asked.skeleton, kept)
         note(*recording.notes)
         count = len(recording)
-        span, times, cuts = known.span(count), known.times(rig, count), known.cuts(count)
+        span, times, cuts = known.span(count, recording.first), known.times(rig, count), known.cuts(count)
         execution = replace(execution, chunk_frames=asked.chunk_frames).worth(len(span))
         if execution.workers != 1 and execution.cluster is None:
             get_ready("shapepose_fg.pipeline.pipeline")
