@@ -168,7 +168,7 @@ def _skeleton_of_people(people: Sequence[KeptPeople], wanted: Skeleton | None) -
 
 
 def _streams_of(people: Sequence[KeptPeople], skeleton: Skeleton) -> tuple[list[ViewStream], list[str], int]:
-    """The people of every camera as candidates, what was made of their scores and frames, and `first` of the table.
+    """The people of every camera as candidates, what was made of their scores and frames, and the table's `first`.
 
     Where all files list people and not frames, their numbers are the frames': nobody is in those before the first.
     """
