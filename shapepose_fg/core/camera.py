@@ -192,8 +192,8 @@ class Rig:
 
     def __post_init__(self) -> None:
         names = [camera.name for camera in self.cameras]
-        if len(names) < 2:
-            raise ValueError(f"a rig needs at least 2 cameras to see depth, got {len(names)}")
+        if len(names) == 0:
+            raise ValueError("a rig needs a camera")
         if len(set(names)) != len(names):
             raise ValueError(f"camera names must differ, got {names}")
         if self.up not in ("x", "-x", "y", "-y", "z", "-z"):

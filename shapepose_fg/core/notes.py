@@ -27,6 +27,7 @@ class Problem:
     reason: str
     """What happened, in words."""
 
+
 _Count = Annotated[int, Field(ge=0, lt=2**53)]
 _Number = Annotated[float, Field(allow_inf_nan=False)]
 _Frames = dict[str, list[_Count]]

@@ -72,10 +72,10 @@ def offsets_of(setup: Setup, detections: ThinnedFrames, book: Notebook) -> Keypo
     if source != "recording":
         return KeypointOffsets.load(source)
     with book.stage("offsets"):
-        spread = spread_frames(len(detections), config.offsets.frames)
+        spread = spread_frames(len(detections) - detections.first, config.offsets.frames)
         # Joints that three views see well are wanted: people whose hips they see are enough, and found faster.
         hips = StageOne(setup.skeleton, config.candidates, config.proposals, Notebook()).by_hips()
-        people = [hips(detections[t], rig) for t in spread]
+        people = [hips(detections[detections.first + t], rig) for t in spread]
         if len(people) == 0:
             return KeypointOffsets.identity()
         targets = confident_targets(Observations.concatenate(people), rig, config.observations)

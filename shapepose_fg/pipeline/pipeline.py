@@ -99,6 +99,8 @@ class Task:
 
     def whole(self) -> tuple[range, FrameTimes, list[int]]:
         """Frames, times and cuts, those that are not given filled in; ValueError where they do not fit."""
+        if len(self.rig) < 2:
+            raise ValueError(f"at least 2 cameras are needed to see depth, got {len(self.rig)}")
         count = len(self.detections)
         frames = range(count) if self.frames is None else self.frames
         if frames.step != 1 or not 0 <= frames.start <= frames.stop <= count:

@@ -39,6 +39,11 @@ class ThinnedFrames:
         """The detector's joints."""
         return self.frames.skeleton
 
+    @property
+    def first(self) -> int:
+        """The first frame that the recording says anything of."""
+        return getattr(self.frames, "first", 0)
+
     def __len__(self) -> int:
         return len(self.frames)
 
