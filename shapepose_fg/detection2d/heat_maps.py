@@ -21,7 +21,7 @@ _LONG_SIDE = 656
 
 @dataclass(frozen=True)
 class HeatMapNetwork:
-    """A network that makes heat maps and part affinity fields of a picture; people are made of them later, in 3D."""
+    """A network that makes heat maps and part affinity fields of a picture; they are made people later, in 3D."""
 
     network: OnnxNetwork
     """What is run."""
@@ -81,7 +81,7 @@ class HeatMapNetwork:
         return UprightView.of(region, roll_deg, self.long_side, MULTIPLE, self.network.size)
 
     def run(self, picture: NDArray[np.uint8]) -> Blob:
-        """The output (C, H / 8, W / 8) of a `picture` (H, W, 3): blue, green, red. Its sides are multiples of 16."""
+        """The output (C, H / 8, W / 8) of a `picture` (H, W, 3), blue green red; its sides are multiples of 16."""
         blob = np.ascontiguousarray(picture.transpose(2, 0, 1)[None], dtype=np.float32)
         if (self.layout.scale, self.layout.offset) != (1.0, 0.0):
             blob = blob * np.float32(self.layout.scale) + np.float32(self.layout.offset)

@@ -102,15 +102,11 @@ def test_weights_in_other_files_are_refused_wherever_they_stand(tmp_path):
             HeatMapNetwork.load(file)
 
 
-def test_graphs_without_end_are_no_network(tmp_path, monkeypatch):
+def test_graphs_without_end_are_no_network(tmp_path):
     file, graph = tmp_path / "n.onnx", b""
     for _ in range(200):
         graph = blob(1, blob(5, blob(6, graph)))
     file.write_bytes(blob(7, graph))
-    with pytest.raises(InputError, match="not an ONNX network"):
-        HeatMapNetwork.load(file)
-    monkeypatch.setattr(onnx_file_reader, "_MOST_FIELDS", 1000)
-    file.write_bytes(blob(7, 1001 * varint(3, 1)))
     with pytest.raises(InputError, match="not an ONNX network"):
         HeatMapNetwork.load(file)
 
