@@ -25,8 +25,8 @@ from shapepose_fg.core.errors import InputError
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from shapepose_fg.detection2d.detector import CameraDetector, Network
-    from shapepose_fg.detection2d.recording import DetectionReport, DetectionRun
+    from shapepose_fg.detection2d.opening import Network
+    from shapepose_fg.detection2d.recording import CameraDetector, DetectionReport, DetectionRun
 
 _NETWORK = "Network"
 
@@ -103,9 +103,8 @@ def detect(
         raise InputError(
             f"{option_missing}: missing; give the cameras' videos or pictures, and a folder to write to"
         )
-    from shapepose_fg.detection2d.detector import CameraDetector
     from shapepose_fg.detection2d.heat_maps import HeatMapNetwork
-    from shapepose_fg.detection2d.recording import DetectionRun, run_detection
+    from shapepose_fg.detection2d.recording import CameraDetector, DetectionRun, run_detection
     from shapepose_fg.io.footage.lockstep import align, clocks_of
     from shapepose_fg.io.footage.placement import placements_of
 

@@ -2,15 +2,20 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from shapepose_fg.core.arrays import Array, Real
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.detection2d.network_file import BoxFile
 from shapepose_fg.detection2d.onnx_network import Blob, OnnxNetwork, words
+
+Side = Annotated[int, Field(ge=16, le=4096)]
+"""Pixels of a network's input along one axis."""
+_Share = Annotated[FiniteFloat, Field(gt=0, lt=1)]
 
 _GREY = 114
 """The colour beside pictures of another shape than the network's."""
@@ -21,26 +26,35 @@ _PERSON = 0
 _MOST_PEOPLE = 200
 """Of one picture; the surest."""
 _LEAST, _LEAST_SUPPRESSED = 0.7, 0.3
-"""Scores over which a box counts, by the export, as in rtmlib; the second where suppression is in the network."""
+"""Scores over which a box counts, as in rtmlib; the second where suppression is in the network."""
+
+
+class BoxForm(BaseModel):
+    """How a box network is to be read: the table `boxes` of a network's TOML file."""
+
+    model_config = ConfigDict(extra="forbid")
+    network: str = ""
+    """Its ONNX file."""
+    size: tuple[Side, Side] = (640, 640)
+    """(width, height) of its input, where the ONNX file does not fix it."""
+    min_score: _Share | None = None
+    """Less sure boxes are nobody's; None for rtmlib's own."""
+    max_overlap: _Share = 0.45
+    """Of two boxes that share more of their union than this one goes."""
 
 
 @dataclass(frozen=True)
 class BoxNetwork:
-    """YOLOX: boxes around people. With non-maximum suppression inside of the network, or without."""
+    """YOLOX, with non-maximum suppression inside of the network or without."""
 
     network: OnnxNetwork
     """What proposes boxes."""
-    form: BoxFile
+    form: BoxForm
     """How it is to be read."""
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """(width, height) of its input."""
-        return self.network.size or self.form.size
 
     def find(self, picture: NDArray[np.uint8]) -> Real:
         """(P, 4) left, top, right, bottom in pixels of a `picture` (H, W, 3), the surest first."""
-        size = np.array(self.size)
+        size = np.array(self.form.size)
         scale = float((size / picture.shape[1::-1]).min())
         width, height = (max(int(side * scale), 1) for side in picture.shape[1::-1])
         shown = np.full((size[1], size[0], 3), _GREY, dtype=np.uint8)
@@ -49,9 +63,9 @@ class BoxNetwork:
         boxes, score, least = self._proposed(outputs)
         boxes /= scale
         sound = np.isfinite(boxes).all(axis=1) & (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
-        there = np.flatnonzero((score > least) & sound)
+        there = np.flatnonzero((score > (self.form.min_score or least)) & sound)
         there = there[np.argsort(score[there])[::-1]]
-        if outputs[0].shape[-1] != 5:
+        if least == _LEAST:
             # Sides that count their last pixel too.
             rectangles = np.column_stack([boxes[there, :2], boxes[there, 2:] - boxes[there, :2] + 1])
             kept = cv2.dnn.NMSBoxes(rectangles.tolist(), score[there].tolist(), 0.0, self.form.max_overlap)
@@ -60,28 +74,24 @@ class BoxNetwork:
 
     def _proposed(self, outputs: Sequence[Blob]) -> tuple[Blob, Blob, float]:
         """(N, 4) boxes in pixels of the input, (N,) how sure each is of a person, and the least that counts."""
-        found = outputs[0]
-        if found.ndim != 3 or found.shape[0] != 1 or found.shape[2] < 5:
+        cells, stride = _grids(self.form.size)
+        shape = outputs[0].shape
+        if shape[:1] != (1,) or len(shape) != 3 or shape[2] < 5 or (shape[2] > 5 and shape[1] != len(cells)):
             raise InputError(
-                f"{self.network.file}: a YOLOX network gives 1 x N x 5 numbers, or 1 x N x 6 and more, this one"
-                f" {words(found.shape)}; give another --boxes"
+                f"{self.network.file}: of a picture of {words(self.form.size)} YOLOX gives 1 x {len(cells)} x 6"
+                f" numbers or more, with suppression inside 1 x N x 5, this network {words(shape)}; give another"
+                " --boxes"
             )
-        found = found[0]
-        if found.shape[1] == 5:
+        found = outputs[0][0]
+        if shape[2] == 5:
             labels = outputs[1].reshape(-1) if len(outputs) > 1 and outputs[1].size == len(found) else None
             score = found[:, 4] if labels is None else np.where(labels == _PERSON, found[:, 4], 0.0)
-            return found[:, :4], score, self.form.min_score or _LEAST_SUPPRESSED
-        cells, stride = _grids(self.size)
-        if len(cells) != len(found):
-            raise InputError(
-                f"{self.network.file}: of a picture of {words(self.size)} YOLOX proposes {len(cells)} boxes, this"
-                f" network {len(found)}; give another --boxes"
-            )
+            return found[:, :4], score, _LEAST_SUPPRESSED
         # In single precision, as the network computes: crops of the same boxes have the same pixels.
         centre = ((found[:, :2] + cells) * stride).astype(np.float32)
         sides = (np.exp(np.minimum(found[:, 2:4], 50)) * stride).astype(np.float32)
         boxes = np.hstack([centre - sides / 2, centre + sides / 2])
-        return boxes, found[:, 4] * found[:, 5 + _PERSON], self.form.min_score or _LEAST
+        return boxes, found[:, 4] * found[:, 5 + _PERSON], _LEAST
 
 
 def _grids(size: tuple[int, int]) -> tuple[Array, Array]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from shapepose_fg.core.arrays import Array, Index, Mask, Real
-from shapepose_fg.detection2d.networks import NetworkLayout
+from shapepose_fg.io.detections.association_text import TextSkeleton
 
 _MIN_SCORE = 0.1
 """Heights of peaks below this are noise."""
@@ -29,7 +29,7 @@ class Candidates:
     """Joint candidates of one picture, sorted by joint, and affinities between them."""
 
     joint: Index
-    """(D,) joint of each candidate, in the layout's order."""
+    """(D,) joint of each candidate, in the network's order."""
     xy: Array
     """(D, 2) position."""
     score: Array
@@ -64,18 +64,16 @@ class Candidates:
         )
 
 
-def decode(output: NDArray[np.float32], layout: NetworkLayout) -> Candidates:
+def decode(output: NDArray[np.float32], skeleton: TextSkeleton) -> Candidates:
     """Candidates of one picture from the network's `output` (C, H, W).
 
-    Positions are in cells of the output; (0, 0) is the centre of the first. What is not finite in
-    the output is taken for 0.
+    That is a map for each of the `skeleton`'s J joints, one of the background, and two (x, y) for each limb.
+    Positions are in cells; (0, 0) is the centre of the first. What is not finite in the output is taken for 0.
     """
     output = np.nan_to_num(output, nan=0.0, posinf=0.0, neginf=0.0)
-    heat = output[: len(layout.text.joints)]
-    joint, xy, score = peaks(heat)
-    first, second, limb = _all_pairs(joint, layout)
-    fields = output[layout.first_affinity : layout.channels]
-    affinity = line_integrals(fields, xy[first], xy[second], limb)
+    joint, xy, score = peaks(output[: len(skeleton.joints)])
+    first, second, limb = _all_pairs(joint, skeleton)
+    affinity = line_integrals(output[len(skeleton.joints) + 1 :], xy[first], xy[second], limb)
     there = affinity > 0
     pairs = np.column_stack([first, second])[there]
     return Candidates(joint, xy, score, pairs, limb[there], affinity[there])
@@ -125,12 +123,7 @@ def _vertex(before: Real, centre: Array, after: Real) -> tuple[Array, Array]:
     return shift, -0.25 * (low - high) * shift
 
 
-def line_integrals(
-    fields: NDArray[np.float32],
-    start: Array,
-    end: Array,
-    limb: Index,
-) -> Array:
+def line_integrals(fields: NDArray[np.float32], start: Array, end: Array, limb: Index) -> Array:
     """(E,) the mean component of the affinity `fields` (2 L, H, W) along the lines from `start` to `end` (E, 2).
 
     `limb` (E,) says whose field each line is read from. 0 where too few places along the line support it.
@@ -150,14 +143,14 @@ def line_integrals(
     return np.where(supported & (length > 0), np.clip(component.mean(axis=1), 0.0, 1.0), 0.0)
 
 
-def _all_pairs(joint: Index, layout: NetworkLayout) -> tuple[Index, Index, Index]:
+def _all_pairs(joint: Index, skeleton: TextSkeleton) -> tuple[Index, Index, Index]:
     """First candidate, second candidate, and limb, each (E,), of all pairs that any limb could join.
 
     `joint` (D,) is sorted.
     """
-    count = np.bincount(joint, minlength=len(layout.text.joints))
+    count = np.bincount(joint, minlength=len(skeleton.joints))
     start = np.cumsum(count) - count
-    ends = np.array(layout.text.limbs)
+    ends = np.array(skeleton.limbs)
     sizes = count[ends[:, 0]] * count[ends[:, 1]]
     limb = np.repeat(np.arange(len(ends)), sizes)
     within = np.arange(len(limb)) - (np.cumsum(sizes) - sizes)[limb]

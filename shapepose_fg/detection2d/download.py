@@ -2,6 +2,7 @@
 
 import hashlib
 import http.client
+import json
 import os
 import tempfile
 import urllib.error
@@ -9,17 +10,44 @@ import urllib.request
 import zipfile
 import zlib
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.resources import files
 from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import SMALL, read_text, write_content
-from shapepose_fg.detection2d.networks import bases, named_networks
-from shapepose_fg.detection2d.onnx_file import MOST_BYTES
+from shapepose_fg.detection2d.onnx_network import MOST_BYTES
+
+BASES = (
+    "https://download.openmmlab.com/mmpose/v1/projects/rtmposev1/onnx_sdk",
+    "https://huggingface.co/Tau-J/RTMPose/resolve/main/rtmposev1/onnx_sdk",
+)
+"""Addresses of the folders that hold the named networks, as rtmlib publishes them: OpenMMLab's, its mirror."""
 
 _TIMEOUT_S = 30.0
 _INSIDE = "end2end.onnx"
 """What the network is called in its archive."""
+
+
+@dataclass(frozen=True)
+class NamedNetwork:
+    """A network that can be asked for by name."""
+
+    file: str
+    """The archive that holds it, at each of `BASES`."""
+    size: tuple[int, int]
+    """(width, height) of its input."""
+    boxes: str | None = None
+    """The name of the network that finds people for it; None of one that finds people."""
+
+
+@lru_cache(maxsize=1)
+def named_networks() -> dict[str, NamedNetwork]:
+    """All of them by name: RTMPose of HALPE-26, and the YOLOX that rtmlib gives each."""
+    table = json.loads((files("shapepose_fg.detection2d") / "data" / "networks.json").read_text(encoding="utf-8"))
+    return {name: NamedNetwork(**(entry | {"size": tuple(entry["size"])})) for name, entry in table.items()}
 
 
 def cache_folder() -> Path:
@@ -78,7 +106,7 @@ class _OnlyHttps(urllib.request.HTTPRedirectHandler):
 def _fetched(file: str, progress: Callable[[int, int], object]) -> bytes:
     """The network in an archive, from the first address that has it."""
     problems, opener = list[str](), urllib.request.build_opener(_OnlyHttps)
-    for base in bases():
+    for base in BASES:
         try:
             with opener.open(f"{base}/{file}", timeout=_TIMEOUT_S) as answer, tempfile.TemporaryFile() as archive:
                 total, done = int(answer.headers.get("Content-Length") or 0), 0

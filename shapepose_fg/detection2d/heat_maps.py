@@ -1,6 +1,9 @@
 """Networks of OpenPose's kind: heat maps and part affinity fields of a whole picture."""
 
+import json
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -9,14 +12,51 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.detection2d.decoding import Candidates, decode
-from shapepose_fg.detection2d.networks import MULTIPLE, STRIDE, NetworkLayout, find_layout
 from shapepose_fg.detection2d.onnx_network import Backend, Blob, OnnxNetwork, words
 from shapepose_fg.detection2d.upright import UprightView
+from shapepose_fg.io.detections.association_text import TEXT_SKELETONS, TextSkeleton
 from shapepose_fg.io.write_detections import association_lines
 
+_STRIDE, _MULTIPLE = 8, 16
+"""Pixels of the input per cell of the output, along each axis; what both sides of the input are multiples of."""
 _TRIAL = (64, 64)
 """(width, height) of the empty picture that a new network is tried on."""
 _LONG_SIDE = 656
+
+
+@dataclass(frozen=True)
+class NetworkLayout:
+    """What a network takes, and which joints and limbs its output has, one after the other (`decode`)."""
+
+    name: str
+    """What it is called."""
+    about: str
+    """Which networks have it, in a sentence."""
+    skeleton: str
+    """The skeleton whose joints and limbs these are, a name of `TEXT_SKELETONS`."""
+    scale: float
+    """The input is `scale` * colour + `offset`, with colours (blue, green, red) from 0 to 255."""
+    offset: float
+    """See `scale`."""
+    sha256: str = ""
+    """Checksum of a known network that has it."""
+
+    @property
+    def text(self) -> TextSkeleton:
+        """The joints and limbs, in order."""
+        return TEXT_SKELETONS[self.skeleton]
+
+    @property
+    def channels(self) -> int:
+        """How many channels the output has."""
+        return len(self.text.joints) + 1 + 2 * len(self.text.limbs)
+
+
+@lru_cache(maxsize=1)
+def layouts() -> dict[str, NetworkLayout]:
+    """All layouts by name."""
+    table = json.loads((files("shapepose_fg.detection2d") / "data" / "layouts.json").read_text(encoding="utf-8"))
+    return {name: NetworkLayout(name, **entry) for name, entry in table.items()}
 
 
 @dataclass(frozen=True)
@@ -48,8 +88,8 @@ class HeatMapNetwork:
         network = OnnxNetwork.open(file, backend or ("opencv" if device == "cpu" else "onnxruntime"), device)
         width, height = network.size or _TRIAL
         shape = network.run(np.zeros((1, 3, height, width), dtype=np.float32))[0].shape
-        found = find_layout(layout, network.sha256, shape[1] if len(shape) == 4 else None, file)
-        wanted = (1, found.channels, height // STRIDE, width // STRIDE)
+        found = _layout_of(network, layout, shape)
+        wanted = (1, found.channels, height // _STRIDE, width // _STRIDE)
         if shape != wanted:
             raise InputError(
                 f"{file}: of a picture of {width} x {height} the network makes {words(shape)} numbers, layout"
@@ -67,8 +107,8 @@ class HeatMapNetwork:
         """The beginning of 4D Association's text."""
         return f"{self.layout.text.number} {frames}\n"
 
-    def text(self, number: int, found: Any, size: tuple[int, int]) -> str:
-        """A frame in it: `Candidates` in a picture of the calibrated `size`, None where there was no picture."""
+    def text(self, number: int, found: Candidates | None, size: tuple[int, int]) -> str:
+        """A frame in it: what was found in a picture of the calibrated `size`, None where there was no picture."""
         found = found or Candidates.none()
         fractions = found.xy / (np.array(size) - 1.0)
         lines = association_lines(
@@ -78,7 +118,7 @@ class HeatMapNetwork:
 
     def view(self, region: tuple[float, float, float, float], roll_deg: float) -> UprightView:
         """What it is shown of pictures with such a region and roll."""
-        return UprightView.of(region, roll_deg, self.long_side, MULTIPLE, self.network.size)
+        return UprightView.of(region, roll_deg, self.long_side, _MULTIPLE, self.network.size)
 
     def run(self, picture: NDArray[np.uint8]) -> Blob:
         """The output (C, H / 8, W / 8) of a `picture` (H, W, 3), blue green red; its sides are multiples of 16."""
@@ -89,5 +129,29 @@ class HeatMapNetwork:
 
     def detect(self, picture: NDArray[np.uint8]) -> Candidates:
         """Candidates in a `picture` (H, W, 3) of the view's size, in its pixels."""
-        found = decode(self.run(picture), self.layout)
-        return replace(found, xy=(found.xy + 0.5) * STRIDE - 0.5)
+        found = decode(self.run(picture), self.layout.text)
+        return replace(found, xy=(found.xy + 0.5) * _STRIDE - 0.5)
+
+
+def _layout_of(network: OnnxNetwork, wanted: str | None, shape: tuple[int, ...]) -> NetworkLayout:
+    """The layout that is `wanted`, or that of a known file, or the only one that fits the output's `shape`."""
+    every = layouts()
+    listing = "; ".join(f"{each.name} ({each.about})" for each in every.values())
+    if wanted is not None:
+        if wanted not in every:
+            raise InputError(f"--layout {wanted}: not known; known are {listing}")
+        return every[wanted]
+    if len(shape) != 4:
+        raise InputError(
+            f"{network.file}: the network gives {words(shape)} numbers, no heat maps of a whole picture; RTMPose"
+            " and its like need --boxes"
+        )
+    fitting = [each for each in every.values() if each.channels == shape[1]]
+    known = [each for each in fitting if each.sha256 == network.sha256] or fitting
+    if len(known) != 1:
+        choice = f"--layout {' or '.join(each.name for each in fitting)}" if fitting else "another network"
+        raise InputError(
+            f"{network.file}: the network gives {shape[1]} channels, which does not say how its output is to be"
+            f" read; give {choice} (known are {listing})"
+        )
+    return known[0]

@@ -1,7 +1,8 @@
-"""The network in an ONNX file, run by OpenCV or by onnxruntime."""
+"""A network in an ONNX file from outside, read within bounds and run by OpenCV or by onnxruntime."""
 
 import hashlib
 import os
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.detection2d.onnx_file import read_onnx
+from shapepose_fg.core.storage.files import read_bytes
 
 Backend = Literal["opencv", "onnxruntime"]
 """What runs the network."""
@@ -21,8 +22,13 @@ Blob = NDArray[np.float32]
 """What it takes and gives."""
 PROVIDERS = {"cpu": "CPU", "cuda": "CUDA", "rocm": "ROCM", "coreml": "CoreML", "directml": "Dml"}
 """onnxruntime's names of devices."""
+MOST_BYTES = 2**29
+"""Networks of people's joints have 2 to 400 MB."""
 _BATCH = 32
 """Pictures at once: a crowd fills no memory."""
+_ELSEWHERE = re.compile(rb"(?:\x0a|\x8a\x80*\0)(?:\x08|\x88\x80*\0)location")
+"""How protobuf writes the key under which a tensor says which file its numbers are in: field 1, 8 bytes; both
+numbers may be spelt with zeros behind."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +43,8 @@ class OnnxNetwork:
     """All its outputs for pictures (B, 3, height, width)."""
     size: tuple[int, int] | None = None
     """(width, height) that the file fixes; None where it takes pictures of any."""
+    inputs: tuple[str, ...] = ()
+    """The inputs' names, where they are known."""
     outputs: tuple[str, ...] = ()
     """The outputs' names, where they are known."""
     at_once: int = 1
@@ -50,30 +58,42 @@ class OnnxNetwork:
         """
         file = Path(file)
         content = read_onnx(file)
-        sha256 = hashlib.sha256(content).hexdigest()
-        if backend == "onnxruntime":
-            return _with_onnxruntime(file, content, sha256, device)
-        return cls(file, sha256, _with_opencv(file, content))
+        opened = _with_opencv(file, content) if backend == "opencv" else _with_onnxruntime(file, content, device)
+        return cls(file, hashlib.sha256(content).hexdigest(), *opened)
 
     def run(self, pictures: Blob) -> list[Blob]:
         """All outputs for pictures (B, 3, height, width); InputError where it cannot be run on such."""
         try:
             return self.forward(pictures)
         except Exception as error:
-            height, width = pictures.shape[2:]
             raise InputError(
-                f"{self.file}: the network cannot be run on a picture of {width} x {height} ({first_line(error)});"
-                " give one that takes pictures (1, 3, height, width); RTMPose and its like need --boxes"
+                f"{self.file}: it cannot be run on {words(pictures.shape)} numbers ({_first_line(error)});"
+                " give one that takes pictures, 1 x 3 x height x width; RTMPose and its like need --boxes"
             ) from None
 
 
-def _with_opencv(file: Path, content: bytes) -> Callable[[Blob], list[Blob]]:
+def read_onnx(file: Path) -> bytes:
+    """The bytes of a network's file.
+
+    InputError where it is missing, larger than any such network, or where its weights lie in other files: their
+    paths would be looked up wherever this program happens to run, and may lead anywhere.
+    """
+    content = read_bytes(file, MOST_BYTES)
+    if b"location" in content and _ELSEWHERE.search(content):
+        raise InputError(
+            f"{file}: its weights lie in another file; give a network that holds them itself, as"
+            " onnx.save_model(onnx.load(FILE), NEW) writes it"
+        )
+    return content
+
+
+def _with_opencv(file: Path, content: bytes) -> tuple[Callable[[Blob], list[Blob]]]:
     """The network run by OpenCV's dnn, which takes pictures of any size."""
     try:
         net = cv2.dnn.readNetFromONNX(np.frombuffer(content, dtype=np.uint8))
         empty = net.empty()
     except cv2.error as error:
-        raise InputError(f"{file}: not an ONNX network that OpenCV can read ({first_line(error)})") from None
+        raise InputError(f"{file}: not an ONNX network that OpenCV can read ({_first_line(error)})") from None
     if empty:
         raise InputError(f"{file}: not an ONNX network; give the ONNX file of a network")
 
@@ -81,18 +101,18 @@ def _with_opencv(file: Path, content: bytes) -> Callable[[Blob], list[Blob]]:
         net.setInput(pictures)
         return [np.asarray(net.forward(), dtype=np.float32)]
 
-    return forward
+    return (forward,)
 
 
-def _with_onnxruntime(file: Path, content: bytes, sha256: str, device: str) -> OnnxNetwork:
-    """The network run by onnxruntime, on the CPU on as many threads as OpenCV has."""
+def _with_onnxruntime(file: Path, content: bytes, device: str) -> tuple[Any, ...]:
+    """What else `OnnxNetwork` has, run by onnxruntime, on the CPU on as many threads as OpenCV has."""
     try:
         onnxruntime: Any = import_module("onnxruntime")
     except ImportError:
         raise InputError(f'{file}: onnxruntime runs it, a package: pip install "shapepose-fg[detect]"') from None
     kind, _, number = device.partition(":")
-    provider = f"{PROVIDERS.get(kind)}ExecutionProvider"
-    if provider not in (there := onnxruntime.get_available_providers()) or not (number or "0").isdecimal():
+    provider, there = f"{PROVIDERS.get(kind)}ExecutionProvider", onnxruntime.get_available_providers()
+    if provider not in there or not (number or "0").isdecimal():
         known = " ".join(name for name, each in PROVIDERS.items() if f"{each}ExecutionProvider" in there)
         raise InputError(
             f"--device {device}: the onnxruntime that is installed has {known}; install its package for the device"
@@ -104,7 +124,7 @@ def _with_onnxruntime(file: Path, content: bytes, sha256: str, device: str) -> O
         providers = [(provider, {"device_id": number} if number else {})]
         session: Any = onnxruntime.InferenceSession(content, options, providers=providers)
     except Exception as error:
-        raise InputError(f"{file}: not an ONNX network that onnxruntime can read ({first_line(error)})") from None
+        raise InputError(f"{file}: not an ONNX network that onnxruntime can read ({_first_line(error)})") from None
     if provider not in session.get_providers():  # it goes on with the CPU in silence
         raise InputError(f"--device {device}: the device cannot be used; check its driver, or leave --device out")
     takes = session.get_inputs()
@@ -117,8 +137,8 @@ def _with_onnxruntime(file: Path, content: bytes, sha256: str, device: str) -> O
         return [np.asarray(each, dtype=np.float32) for each in session.run(None, {takes[0].name: pictures})]
 
     size = None if height is None or width is None else (width, height)
-    names = tuple(each.name for each in session.get_outputs())
-    return OnnxNetwork(file, sha256, forward, size, names, _BATCH if batch is None else 1)
+    names = [tuple(each.name for each in ends) for ends in (takes, session.get_outputs())]
+    return forward, size, *names, _BATCH if batch is None else 1
 
 
 def words(shape: Sequence[int]) -> str:
@@ -126,7 +146,7 @@ def words(shape: Sequence[int]) -> str:
     return " x ".join(map(str, shape))
 
 
-def first_line(error: BaseException) -> str:
+def _first_line(error: BaseException) -> str:
     """The first line of a library's message, short."""
     lines = str(error).strip().splitlines() or [type(error).__name__]
     return lines[0][:160]

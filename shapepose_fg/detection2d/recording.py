@@ -8,14 +8,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import inside, read_json, write_atomically, write_content
-from shapepose_fg.detection2d.detector import CameraDetector
+from shapepose_fg.detection2d.decoding import Candidates
+from shapepose_fg.detection2d.opening import Network
+from shapepose_fg.detection2d.top_down import People
+from shapepose_fg.detection2d.upright import UprightView, roll_of
 from shapepose_fg.io.footage.footage import Footage
 from shapepose_fg.io.footage.lockstep import Lockstep
-from shapepose_fg.io.footage.placement import FOOTAGE, CameraFootage, write_used_footage
+from shapepose_fg.io.footage.placement import FOOTAGE, CameraFootage, Placement, write_used_footage
 
 BLOCK = 16
 """Moments that are kept together: what a run that is killed loses at most."""
@@ -24,6 +29,30 @@ _SETTINGS = "settings.json"
 
 Progress = Callable[[int, int], None]
 """Told how many pictures of how many are done."""
+
+
+@dataclass(frozen=True)
+class CameraDetector:
+    """The detector for the pictures of one camera."""
+
+    network: Network
+    """What detects."""
+    placement: Placement
+    """Where calibrated pixels lie in the pictures."""
+    view: UprightView
+    """What the network is shown."""
+
+    @classmethod
+    def of(cls, camera: Camera, up: Array, placement: Placement, network: Network) -> "CameraDetector":
+        """The detector for `camera` in a world where `up` (3,) points up."""
+        return cls(network, placement, network.view(placement.region, roll_of(camera, up)))
+
+    def detect(self, picture: NDArray[np.uint8]) -> Candidates | People:
+        """What is in a `picture` (H, W, 3), blue green red, in calibrated pixels, as the lens gives them."""
+        found = self.network.detect(self.view.input_of(picture))
+        xy = self.view.picture_from_input(found.xy)
+        # In the corners beside a turned picture there is nothing to see.
+        return found.moved(self.placement.to_calibrated(xy), self.view.inside(xy))
 
 
 @dataclass(frozen=True)
@@ -50,7 +79,7 @@ class DetectionRun:
                 "path": str(footage.path.resolve()),
                 "state": _state(footage.path),
                 "placement": str(detector.placement.kind),
-                "roll_deg": detector.roll_deg,
+                "turned_deg": detector.view.turn_deg,
                 "frames": self.moments.picture[:, view].tolist(),
             }
             for view, (name, footage, detector) in enumerate(

@@ -12,8 +12,7 @@ import pytest
 
 from shapepose_fg.cli.main import main
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.detection2d.heat_maps import HeatMapNetwork
-from shapepose_fg.detection2d.networks import layouts
+from shapepose_fg.detection2d.heat_maps import HeatMapNetwork, layouts
 from shapepose_fg.detection2d.onnx_network import OnnxNetwork
 from shapepose_fg.evaluation.single_person import man_of
 from shapepose_fg.io.calibration import read_rig, write_rig

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from shapepose_fg.core.camera import Camera, Rig
-from shapepose_fg.detection2d.heat_maps import HeatMapNetwork
-from shapepose_fg.detection2d.networks import layouts
+from shapepose_fg.detection2d.heat_maps import HeatMapNetwork, layouts
 from shapepose_fg.detection2d.onnx_network import OnnxNetwork
 from shapepose_fg.viz.rendering import look_at
 

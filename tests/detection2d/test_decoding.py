@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from shapepose_fg.detection2d.decoding import decode, line_integrals, peaks
-from shapepose_fg.detection2d.networks import NetworkLayout, layouts
+from shapepose_fg.detection2d.heat_maps import NetworkLayout, layouts
 
 LAYOUT = layouts()["tf-pose"]
 
@@ -29,7 +29,7 @@ def people_output(people: np.ndarray, layout: NetworkLayout, size: tuple[int, in
             t, off = to @ unit, np.abs(to @ np.array([-unit[1], unit[0]]))
             on = (t > -1) & (t < length + 1) & (off < 1.5)
             for axis in range(2):
-                output[layout.first_affinity + 2 * limb + axis][on] = 0.8 * unit[axis]
+                output[len(layout.text.joints) + 1 + 2 * limb + axis][on] = 0.8 * unit[axis]
     return output
 
 
@@ -64,7 +64,7 @@ def test_two_people_are_linked_to_themselves_alone(name):
         [rng.uniform(6, 24, len(layout.text.joints)), rng.permutation(len(layout.text.joints)) * 1.4 + 2]
     )
     people = one + np.array([[[0.0, 0.0]], [[30.0, 1.0]]])
-    found = decode(people_output(people, layout), layout)
+    found = decode(people_output(people, layout), layout.text)
     truth = people[:, found.joint]
     whose = np.linalg.norm(truth - found.xy, axis=-1).argmin(axis=0)
     assert np.linalg.norm(truth[whose, np.arange(len(found))] - found.xy, axis=1).max() < 0.2
@@ -89,14 +89,14 @@ def test_a_line_across_the_field_has_no_affinity():
 def test_what_is_no_number_and_an_empty_output_give_nobody():
     output = np.full((LAYOUT.channels, 12, 16), np.nan, dtype=np.float32)
     for each in (output, np.zeros_like(output)):
-        found = decode(each, LAYOUT)
+        found = decode(each, LAYOUT.text)
         assert len(found) == 0 and found.pairs.shape == (0, 2)
 
 
 def test_leaving_candidates_out_keeps_the_pairs_between_the_rest():
     rng = np.random.default_rng(5)
     one = np.column_stack([rng.uniform(6, 24, 18), np.arange(18) * 2.0 + 2])
-    found = decode(people_output(one[None], LAYOUT), LAYOUT)
+    found = decode(people_output(one[None], LAYOUT), LAYOUT.text)
     part = found.moved(found.xy, found.joint != 1)
     assert 1 not in part.joint
     assert len(part.pairs) == (~(np.array(LAYOUT.text.limbs) == 1).any(axis=1)).sum()

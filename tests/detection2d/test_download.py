@@ -9,9 +9,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import pytest
 
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.detection2d import download, onnx_file
-from shapepose_fg.detection2d.download import cache_folder, named_file
-from shapepose_fg.detection2d.networks import bases, named_networks
+from shapepose_fg.detection2d import download
+from shapepose_fg.detection2d.download import BASES, cache_folder, named_file, named_networks
 
 NETWORK = bytes(range(256)) * 400
 NAME, FILE = "rtmpose-m", named_networks()["rtmpose-m"].file
@@ -58,7 +57,7 @@ def server(monkeypatch, tmp_path):
     for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
         monkeypatch.delenv(name, raising=False)
     address = f"http://127.0.0.1:{served.server_port}"
-    monkeypatch.setattr(download, "bases", lambda: (f"{address}/first", f"{address}/mirror"))
+    monkeypatch.setattr(download, "BASES", (f"{address}/first", f"{address}/mirror"))
     yield pages, asked
     served.shutdown()
     thread.join()
@@ -116,8 +115,7 @@ def test_what_is_not_a_network_is_not_kept(server, monkeypatch, page, problem):
 
 
 def test_the_named_networks_are_rtmlib_s():
-    assert all(base.startswith("https://") for base in bases())
-    assert onnx_file.MOST_BYTES == download.MOST_BYTES
+    assert all(base.startswith("https://") for base in BASES)
     for network in named_networks().values():
         assert network.file.endswith(".zip") and "/" not in network.file
         assert network.boxes is None or named_networks()[network.boxes].boxes is None

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.detection2d import onnx_file as onnx_file_reader
-from shapepose_fg.detection2d.heat_maps import HeatMapNetwork
-from shapepose_fg.detection2d.networks import layouts
+from shapepose_fg.detection2d import onnx_network
+from shapepose_fg.detection2d.heat_maps import HeatMapNetwork, layouts
 from tests.detection2d.conftest import blob, onnx_file, varint
 
 
@@ -59,7 +58,7 @@ def test_onnxruntime_keeps_to_the_size_that_the_file_fixes(tmp_path):
 def test_what_is_no_such_network_is_said(tmp_path, backend):
     if backend == "onnxruntime":
         pytest.importorskip("onnxruntime", reason="onnxruntime is an extra: shapepose-fg[detect]")
-    with pytest.raises(InputError, match="there is no such file; give the ONNX file"):
+    with pytest.raises(InputError, match="there is no such file"):
         HeatMapNetwork.load(tmp_path / "no.onnx", backend=backend)
     with pytest.raises(InputError, match="this is a folder"):
         HeatMapNetwork.load(tmp_path, backend=backend)
@@ -69,7 +68,7 @@ def test_what_is_no_such_network_is_said(tmp_path, backend):
         with pytest.raises(InputError, match=re.escape(str(cut))):
             HeatMapNetwork.load(cut, backend=backend)
     other = onnx_file(tmp_path / "other.onnx", means(7))
-    with pytest.raises(InputError, match=r"gives 7 channels, .*give --layout another network"):
+    with pytest.raises(InputError, match=r"gives 7 channels, .*read; give another network"):
         HeatMapNetwork.load(other, backend=backend)
     with pytest.raises(InputError, match=r"makes 1 x 7 x 8 x 8 numbers.*expects 1 x 57 x 8 x 8"):
         HeatMapNetwork.load(other, "tf-pose", backend)
@@ -79,12 +78,12 @@ def test_what_is_no_such_network_is_said(tmp_path, backend):
 
 def test_a_file_that_is_too_large_is_not_read(tmp_path, monkeypatch):
     file = onnx_file(tmp_path / "n.onnx", means(78))
-    monkeypatch.setattr(onnx_file_reader, "MOST_BYTES", file.stat().st_size)
-    assert onnx_file_reader.read_onnx(file) == file.read_bytes()
+    monkeypatch.setattr(onnx_network, "MOST_BYTES", file.stat().st_size)
+    assert onnx_network.read_onnx(file) == file.read_bytes()
     with file.open("ab") as stream:
         stream.truncate(2**40)  # a hole: takes no room on the disk
     monkeypatch.undo()
-    with pytest.raises(InputError, match=r"over 512 MiB are too much for a network of this kind"):
+    with pytest.raises(InputError, match=r"over 512 MiB are too much for such a file"):
         HeatMapNetwork.load(file)
 
 
