@@ -1,7 +1,6 @@
 """The command `detect`: videos or pictures of calibrated cameras to 2D detections."""
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from shapepose_fg.detection2d.opening import Network
-    from shapepose_fg.detection2d.recording import CameraDetector, DetectionReport, DetectionRun
+    from shapepose_fg.detection2d.recording import DetectionRun
 
 _NETWORK = "Network"
 
@@ -121,52 +120,55 @@ def detect(
     moments = replace(moments, picture=moments.picture[part], time_s=time_s)
     note(*moments.notes)
     detectors = [
-        CameraDetector.of(camera, rig.up_vector, placements[camera.name], loaded) for camera in rig.cameras
+        CameraDetector.of(camera, rig.up_vector, each, placements[camera.name], loaded)
+        for camera, each in zip(rig.cameras, footage, strict=True)
     ]
     if isinstance(loaded, HeatMapNetwork) and loaded.network.size is not None:
-        note(_shown_small(detectors, loaded.network.size))
-    run = DetectionRun(rig, footage, detectors, moments, output)
+        width, height = loaded.network.size
+        smallest = min(detector.view.scale for detector in detectors)
+        note(
+            f"here the network takes pictures of {width} x {height} only, so they are shown to it at down to"
+            f" {100 * smallest:.0f} % of their size; --backend opencv takes any"
+        )
+    run = DetectionRun(detectors, moments, output)
     begin = time.perf_counter()
     with progress("detecting", "pictures") as done:
         try:
-            report = run_detection(run, done)
+            joints, unreadable = run_detection(run, done)
         except KeyboardInterrupt:
             note("stopped; the same command goes on from here")
             raise
-    for name, failed in zip(rig.names, report.unreadable, strict=True):
+    for name, failed in zip(rig.names, unreadable, strict=True):
         if failed > 0:
-            note(f"camera {name}: {failed} of {report.moments} pictures cannot be read; nothing is detected there")
-    show(_summary(run, report, time.perf_counter() - begin))
-    print(_next_command(output, cameras, project))
+            note(f"camera {name}: {failed} of {len(moments)} pictures cannot be read; nothing is detected there")
+    show(_summary(run, joints, unreadable, time.perf_counter() - begin))
+    print(_next_command(output, cameras, project, loaded))
 
 
-def _shown_small(detectors: "Sequence[CameraDetector]", size: tuple[int, int]) -> str:
-    """How large a network that takes one size only is shown the pictures."""
-    smallest = min(detector.view.scale for detector in detectors)
-    return (
-        f"here the network takes pictures of {size[0]} x {size[1]} only, so they are shown to it at down to"
-        f" {100 * smallest:.0f} % of their size; --backend opencv takes any"
-    )
-
-
-def _summary(run: "DetectionRun", report: "DetectionReport", seconds: float) -> "Table":
+def _summary(run: "DetectionRun", joints: list[int], unreadable: list[int], seconds: float) -> "Table":
     """What was detected in each camera's pictures, and how long it took."""
     rows = []
-    for view, (name, footage, detector) in enumerate(zip(run.rig.names, run.footage, run.detectors, strict=True)):
-        pictures = int((run.moments.picture[:, view] >= 0).sum()) - report.unreadable[view]
-        turned, size = detector.view.turn_deg, detector.view.size
-        row = (name, str(pictures), f"{footage.size[0]} x {footage.size[1]}")
-        row += (f"{turned:.0f}°" if abs(turned) > 0.5 else "-", f"{size[0]} x {size[1]}")
-        rows.append((*row, f"{report.joints[view] / max(pictures, 1):.1f}"))
-    total = max(report.moments * len(run.rig), 1)
-    speed = f"{seconds:.1f} s, {1e3 * seconds / total:.0f} ms a picture"
-    caption = f"{report.moments} frames of {len(run.rig)} cameras in {speed}"
+    for view, each in enumerate(run.cameras):
+        pictures = int((run.moments.picture[:, view] >= 0).sum()) - unreadable[view]
+        turned, (width, height), shown = each.view.turn_deg, each.footage.size, each.view.size
+        row = (
+            each.camera.name,
+            str(pictures),
+            f"{width} x {height}",
+            f"{turned:.0f}°" if abs(turned) > 0.5 else "-",
+        )
+        rows.append((*row, f"{shown[0]} x {shown[1]}", f"{joints[view] / max(pictures, 1):.1f}"))
+    frames, views = run.moments.picture.shape
+    speed = f"{seconds:.1f} s, {1e3 * seconds / max(frames * views, 1):.0f} ms a picture"
+    caption = f"{frames} frames of {views} cameras in {speed}"
     return table("camera pictures size turned network joints".split(), rows, caption=caption)
 
 
-def _next_command(output: Path, cameras: CameraOptions, project: Path | None) -> str:
+def _next_command(output: Path, cameras: CameraOptions, project: Path | None, network: "Network") -> str:
     """How to go on, as a line to copy, wherever it is pasted."""
     import shlex
+
+    from shapepose_fg.detection2d.top_down import TopDownNetwork
 
     files = {
         "--calibration": cameras.calibration,
@@ -175,6 +177,9 @@ def _next_command(output: Path, cameras: CameraOptions, project: Path | None) ->
     }
     if project is not None and output.resolve().parent == project.resolve():
         files = {"--project": project}
+    skeleton = network.form.skeleton if isinstance(network, TopDownNetwork) else None
+    if skeleton is not None and Path(skeleton).is_file():
+        files["--skeleton"] = Path(skeleton)
     options = {name: file.resolve() for name, file in files.items() if file is not None}
     options |= {"--up": cameras.up, "--unit": cameras.unit, "--image-size": cameras.image_size}
     words = [word for name, value in options.items() if value is not None for word in (name, str(value))]

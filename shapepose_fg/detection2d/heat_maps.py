@@ -85,17 +85,27 @@ class HeatMapNetwork:
         On the CPU OpenCV runs it, at any size, unless `backend` says otherwise. InputError where the file is
         missing, is no ONNX network, or does not fit the layout.
         """
+        every = layouts()
+        known = f"(known are {'; '.join(f'{each.name}, {each.about}' for each in every.values())})"
+        if layout not in (None, *every):
+            raise InputError(f"--layout {layout}: there is no such layout; give another {known}")
         network = OnnxNetwork.open(file, backend or ("opencv" if device == "cpu" else "onnxruntime"), device)
         width, height = network.size or _TRIAL
         shape = network.run(np.zeros((1, 3, height, width), dtype=np.float32))[0].shape
-        found = _layout_of(network, layout, shape)
-        wanted = (1, found.channels, height // _STRIDE, width // _STRIDE)
-        if shape != wanted:
+        cells = (height // _STRIDE, width // _STRIDE)
+        fitting = [each for each in every.values() if shape == (1, each.channels, *cells)]
+        if layout is not None:
+            fitting = [each for each in fitting if each.name == layout]
+        fitting = [each for each in fitting if each.sha256 == network.sha256] or fitting
+        if len(fitting) != 1:
+            what, cure = "no such layout has", "another network, or --boxes for RTMPose and its like"
+            if len(fitting) > 1:
+                what, cure = "several layouts have", f"--layout {' or '.join(each.name for each in fitting)}"
             raise InputError(
-                f"{file}: of a picture of {width} x {height} the network makes {words(shape)} numbers, layout"
-                f" {found.name} expects {words(wanted)}; give the layout of this network"
+                f"{file}: of a picture of {width} x {height} the network makes {words(shape)} numbers, as {what};"
+                f" give {cure} {known}"
             )
-        return cls(network, found, long_side or _LONG_SIDE)
+        return cls(network, fitting[0], long_side or _LONG_SIDE)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -131,27 +141,3 @@ class HeatMapNetwork:
         """Candidates in a `picture` (H, W, 3) of the view's size, in its pixels."""
         found = decode(self.run(picture), self.layout.text)
         return replace(found, xy=(found.xy + 0.5) * _STRIDE - 0.5)
-
-
-def _layout_of(network: OnnxNetwork, wanted: str | None, shape: tuple[int, ...]) -> NetworkLayout:
-    """The layout that is `wanted`, or that of a known file, or the only one that fits the output's `shape`."""
-    every = layouts()
-    listing = "; ".join(f"{each.name} ({each.about})" for each in every.values())
-    if wanted is not None:
-        if wanted not in every:
-            raise InputError(f"--layout {wanted}: not known; known are {listing}")
-        return every[wanted]
-    if len(shape) != 4:
-        raise InputError(
-            f"{network.file}: the network gives {words(shape)} numbers, no heat maps of a whole picture; RTMPose"
-            " and its like need --boxes"
-        )
-    fitting = [each for each in every.values() if each.channels == shape[1]]
-    known = [each for each in fitting if each.sha256 == network.sha256] or fitting
-    if len(known) != 1:
-        choice = f"--layout {' or '.join(each.name for each in fitting)}" if fitting else "another network"
-        raise InputError(
-            f"{network.file}: the network gives {shape[1]} channels, which does not say how its output is to be"
-            f" read; give {choice} (known are {listing})"
-        )
-    return known[0]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.arrays import Array
-from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.camera import Camera
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import inside, read_json, write_atomically, write_content
 from shapepose_fg.detection2d.decoding import Candidates
@@ -35,17 +35,24 @@ Progress = Callable[[int, int], None]
 class CameraDetector:
     """The detector for the pictures of one camera."""
 
+    camera: Camera
+    """The camera."""
+    footage: Footage
+    """Its pictures."""
+    placement: Placement
+    """Where calibrated pixels lie in them."""
     network: Network
     """What detects."""
-    placement: Placement
-    """Where calibrated pixels lie in the pictures."""
     view: UprightView
     """What the network is shown."""
 
     @classmethod
-    def of(cls, camera: Camera, up: Array, placement: Placement, network: Network) -> "CameraDetector":
+    def of(
+        cls, camera: Camera, up: Array, footage: Footage, placement: Placement, network: Network
+    ) -> "CameraDetector":
         """The detector for `camera` in a world where `up` (3,) points up."""
-        return cls(network, placement, network.view(placement.region, roll_of(camera, up)))
+        view = network.view(placement.region, roll_of(camera, up))
+        return cls(camera, footage, placement, network, view)
 
     def detect(self, picture: NDArray[np.uint8]) -> Candidates | People:
         """What is in a `picture` (H, W, 3), blue green red, in calibrated pixels, as the lens gives them."""
@@ -59,12 +66,8 @@ class CameraDetector:
 class DetectionRun:
     """What is to be detected."""
 
-    rig: Rig
-    """The cameras."""
-    footage: Sequence[Footage]
-    """(V,) their pictures."""
-    detectors: Sequence[CameraDetector]
-    """(V,) how each camera's pictures are read."""
+    cameras: Sequence[CameraDetector]
+    """(V,) how each camera's pictures are read, by one network."""
     moments: Lockstep
     """Which pictures belong together."""
     output: Path
@@ -75,42 +78,29 @@ class DetectionRun:
         """What the detections depend on: equal for a run that goes on."""
         cameras = [
             {
-                "name": name,
-                "path": str(footage.path.resolve()),
-                "state": _state(footage.path),
-                "placement": str(detector.placement.kind),
-                "turned_deg": detector.view.turn_deg,
+                "name": each.camera.name,
+                "path": str(each.footage.path.resolve()),
+                "state": _state(each.footage.path),
+                "placement": str(each.placement.kind),
+                "turned_deg": each.view.turn_deg,
                 "frames": self.moments.picture[:, view].tolist(),
             }
-            for view, (name, footage, detector) in enumerate(
-                zip(self.rig.names, self.footage, self.detectors, strict=True)
-            )
+            for view, each in enumerate(self.cameras)
         ]
-        return {**self.detectors[0].network.settings, "cameras": cameras}
+        return {**self.cameras[0].network.settings, "cameras": cameras}
 
 
-@dataclass(frozen=True)
-class DetectionReport:
-    """What came of it."""
-
-    moments: int
-    """T, the frames of the detections."""
-    joints: tuple[int, ...]
-    """(V,) how many joints were found in each camera's pictures."""
-    unreadable: tuple[int, ...]
-    """(V,) how many pictures of each camera could not be read."""
-
-
-def run_detection(run: DetectionRun, progress: Progress = lambda done, total: None) -> DetectionReport:
+def run_detection(run: DetectionRun, progress: Progress = lambda done, total: None) -> tuple[list[int], list[int]]:
     """Detect in all pictures, and write <camera>.txt or <camera>.json, times.csv and footage.json into the output.
 
-    Blocks that an earlier run of the same settings left are not done again; the files come out the same.
-    InputError where the folder holds detections, or a run of other settings.
+    (V,) how many joints were found in each camera's pictures, and (V,) how many of these could not be read. Blocks
+    that an earlier run of the same settings left are not done again; the files come out the same. InputError where
+    the folder holds detections, or a run of other settings.
     """
     unfinished = inside(run.output, _UNFINISHED)
     _refuse_others(run, unfinished)
     write_content(unfinished / _SETTINGS, _json(run.settings))
-    total, views = len(run.moments), len(run.rig)
+    total, views = len(run.moments), len(run.cameras)
     files, counts = list[Path](), np.zeros((2, views), dtype=np.intp)
     for start in range(0, total, BLOCK):
         files.append(unfinished / f"{start:09d}.json")
@@ -119,7 +109,7 @@ def run_detection(run: DetectionRun, progress: Progress = lambda done, total: No
             _write_block(run, moments, files[-1], progress)
         counts += [_read_block(files[-1], views, name) for name in ("found", "failed")]
         progress(moments.stop * views, total * views)
-    network = run.detectors[0].network
+    network = run.cameras[0].network
 
     def text_of(view: int) -> Iterator[bytes]:
         yield network.head(total).encode()
@@ -127,19 +117,17 @@ def run_detection(run: DetectionRun, progress: Progress = lambda done, total: No
             yield _read_block(file, views, "text")[view].encode()
         yield network.tail.encode()
 
-    for view, name in enumerate(run.rig.names):
-        file = run.output / f"{name}{network.suffix}"
+    used = []
+    for view, each in enumerate(run.cameras):
+        file = run.output / f"{each.camera.name}{network.suffix}"
         write_atomically(file, lambda stream, view=view: stream.writelines(text_of(view)))
+        places = run.moments.picture[:, view]
+        used.append(CameraFootage(each.camera.name, each.footage.path.resolve(), each.placement, places))
     _write_times(run)
-    used = [
-        CameraFootage(name, footage.path.resolve(), detector.placement, run.moments.picture[:, view])
-        for view, (name, footage, detector) in enumerate(
-            zip(run.rig.names, run.footage, run.detectors, strict=True)
-        )
-    ]
-    write_used_footage(run.output / FOOTAGE, used, {key: run.settings[key] for key in ("network", "detection")})
+    write_used_footage(run.output / FOOTAGE, used, network.settings)
     shutil.rmtree(unfinished)
-    return DetectionReport(total, *(tuple(each) for each in counts.tolist()))
+    joints, unreadable = counts.tolist()
+    return joints, unreadable
 
 
 def _write_block(run: DetectionRun, moments: range, file: Path, progress: Progress) -> None:
@@ -147,16 +135,16 @@ def _write_block(run: DetectionRun, moments: range, file: Path, progress: Progre
 
     For each camera that is its text, how many joints it has, and how many pictures could not be read.
     """
-    views = len(run.rig)
+    views = len(run.cameras)
     text, found, failed = [""] * views, [0] * views, [0] * views
     for t in moments:
-        for v, (camera, detector) in enumerate(zip(run.rig.cameras, run.detectors, strict=True)):
+        for v, each in enumerate(run.cameras):
             place = int(run.moments.picture[t, v])
-            picture = run.footage[v].at(place) if place >= 0 else None
+            picture = each.footage.at(place) if place >= 0 else None
             failed[v] += place >= 0 and picture is None
-            seen = None if picture is None else detector.detect(picture)
+            seen = None if picture is None else each.detect(picture)
             found[v] += 0 if seen is None else len(seen)
-            text[v] += detector.network.text(t, seen, camera.image_size)
+            text[v] += each.network.text(t, seen, each.camera.image_size)
             progress(t * views + v + 1, len(run.moments) * views)
     write_content(file, _json({"text": text, "found": found, "failed": failed}))
 
@@ -179,7 +167,7 @@ def _write_times(run: DetectionRun) -> None:
         file.unlink(missing_ok=True)
         return
     time_s = time_s - time_s.min()
-    names = list(run.rig.names)
+    names = [each.camera.name for each in run.cameras]
     apart = not run.moments.synchronised and not any(set(name) & set(", \t#") for name in names)
     columns = time_s if apart else time_s.mean(axis=1, keepdims=True)
     lines = [", ".join(["frame", *(names if apart else ["time_s"])])]
@@ -189,16 +177,20 @@ def _write_times(run: DetectionRun) -> None:
 
 def _refuse_others(run: DetectionRun, unfinished: Path) -> None:
     """InputError where the output folder holds other detections, or an unfinished run of other settings."""
-    for name in run.rig.names:
-        if Path(name).name != name or name in (".", "..", Path(FOOTAGE).stem):
-            raise InputError(f"camera {name!r}: the name cannot be that of a file; rename it in the calibration")
-    places = [run.output / f"{name}{suffix}" for name in run.rig.names for suffix in (".txt", ".json")]
+    names = [each.camera.name for each in run.cameras]
+    if Path(FOOTAGE).stem in names:
+        raise InputError(f"camera {Path(FOOTAGE).stem!r}: {FOOTAGE} is another file; rename it in the calibration")
+    places = [run.output / f"{name}{suffix}" for name in names for suffix in (".txt", ".json")]
     if (unfinished / _SETTINGS).is_file():
         before, now = read_json(unfinished / _SETTINGS), json.loads(_json(run.settings))
         if before != now:
+            words = {"network": "another network", "cameras": "other videos or cameras"}
+            differ = [
+                what for key, what in words.items() if isinstance(before, dict) and before.get(key) != now[key]
+            ]
             raise InputError(
-                f"{unfinished}: a run with {_difference(before, now)} was stopped here; start it as it was to go"
-                " on, or delete this folder"
+                f"{unfinished}: a run with {' and '.join(differ) or 'other settings'} was stopped here; start it"
+                " as it was to go on, or delete this folder"
             )
     elif unfinished.exists():
         if any(unfinished.iterdir()):
@@ -207,14 +199,6 @@ def _refuse_others(run: DetectionRun, unfinished: Path) -> None:
             )
     elif there := [place for place in places if place.exists()]:
         raise InputError(f"{there[0]}: there are detections already; delete them, or give another --output")
-
-
-def _difference(before: Any, now: dict[str, Any]) -> str:
-    """Which settings of an earlier run differ."""
-    words = {"network": "another network", "detection": "other settings", "cameras": "other videos or cameras"}
-    if not isinstance(before, dict):
-        return "other settings"
-    return " and ".join(what for key, what in words.items() if before.get(key) != now[key]) or "other settings"
 
 
 def _state(path: Path) -> list[int]:

@@ -41,7 +41,9 @@ def test_body_25_is_told_by_its_channels_and_coco_must_be_named(tmp_path):
     network = HeatMapNetwork.load(onnx_file(tmp_path / "n.onnx", means(78)))
     assert network.layout.name == "openpose-body25"
     coco = onnx_file(tmp_path / "coco.onnx", means(57))
-    with pytest.raises(InputError, match=r"gives 57 channels.*give --layout tf-pose or openpose-coco"):
+    with pytest.raises(
+        InputError, match=r"makes 1 x 57 x 8 x 8 numbers, as several.*give --layout tf-pose or openpose-coco"
+    ):
         HeatMapNetwork.load(coco)
     assert HeatMapNetwork.load(coco, "openpose-coco").layout.offset == -0.5
 
@@ -68,11 +70,13 @@ def test_what_is_no_such_network_is_said(tmp_path, backend):
         with pytest.raises(InputError, match=re.escape(str(cut))):
             HeatMapNetwork.load(cut, backend=backend)
     other = onnx_file(tmp_path / "other.onnx", means(7))
-    with pytest.raises(InputError, match=r"gives 7 channels, .*read; give another network"):
+    with pytest.raises(
+        InputError, match=r"makes 1 x 7 x 8 x 8 numbers, as no such.*give another network, or --boxes"
+    ):
         HeatMapNetwork.load(other, backend=backend)
-    with pytest.raises(InputError, match=r"makes 1 x 7 x 8 x 8 numbers.*expects 1 x 57 x 8 x 8"):
+    with pytest.raises(InputError, match=r"makes 1 x 7 x 8 x 8 numbers, as no such layout has"):
         HeatMapNetwork.load(other, "tf-pose", backend)
-    with pytest.raises(InputError, match="--layout mine: not known; known are tf-pose"):
+    with pytest.raises(InputError, match="--layout mine: there is no such layout; give another"):
         HeatMapNetwork.load(other, "mine", backend)
 
 
