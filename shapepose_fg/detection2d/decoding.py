@@ -44,12 +44,6 @@ class Candidates:
     def __len__(self) -> int:
         return len(self.joint)
 
-    @classmethod
-    def none(cls) -> "Candidates":
-        """Those of a picture in which nothing is."""
-        index, number = np.zeros(0, dtype=np.intp), np.zeros(0)
-        return cls(index, number.reshape(0, 2), number, index.reshape(0, 2), index, number)
-
     def moved(self, xy: Array, inside: Mask) -> "Candidates":
         """The same at other positions; those that are not `inside` (D,) are left out."""
         place = np.cumsum(inside) - 1

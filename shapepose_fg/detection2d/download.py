@@ -29,6 +29,7 @@ BASES = (
 _TIMEOUT_S = 30.0
 _INSIDE = "end2end.onnx"
 """What the network is called in its archive."""
+_BROKEN = (zipfile.BadZipFile, zlib.error, NotImplementedError)
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,7 @@ def _fetched(file: str, progress: Callable[[int, int], object]) -> bytes:
                 if done < total or done > MOST_BYTES:
                     raise ValueError(f"{done} bytes came of {total}" if done < total else "it has no end")
                 return _inside(archive)
-        except (OSError, ValueError, http.client.HTTPException) as error:
+        except (OSError, ValueError, EOFError, RuntimeError, http.client.HTTPException, *_BROKEN) as error:
             told = error if isinstance(error, urllib.error.HTTPError) else getattr(error, "reason", error)
             problems.append(f"{base}/{file} ({told})")
     raise InputError(
@@ -127,14 +128,13 @@ def _fetched(file: str, progress: Callable[[int, int], object]) -> bytes:
 
 
 def _inside(archive: IO[bytes]) -> bytes:
-    """The one network in an archive; ValueError where there is none. Nothing is unpacked to where it says."""
-    try:
-        with zipfile.ZipFile(archive) as opened:
-            found = [each for each in opened.infolist() if PurePosixPath(each.filename).name == _INSIDE]
-            with opened.open(found[0]) as stream:
-                content = stream.read(MOST_BYTES + 1)
-    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, IndexError) as error:
-        raise ValueError(f"no archive with one {_INSIDE}: {str(error)[:100]}") from None
-    if len(found) != 1 or len(content) > MOST_BYTES:
-        raise ValueError(f"{len(found)} files {_INSIDE}, the first of {len(content)} bytes or more")
+    """The one network in an archive. Nothing is unpacked to where the archive says."""
+    with zipfile.ZipFile(archive) as opened:
+        found = [each for each in opened.infolist() if PurePosixPath(each.filename).name == _INSIDE]
+        if len(found) != 1:
+            raise ValueError(f"it holds {len(found)} files {_INSIDE}")
+        with opened.open(found[0]) as stream:
+            content = stream.read(MOST_BYTES + 1)
+    if len(content) > MOST_BYTES:
+        raise ValueError(f"its {_INSIDE} has over {MOST_BYTES} bytes")
     return content

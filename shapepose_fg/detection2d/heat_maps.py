@@ -32,19 +32,14 @@ class NetworkLayout:
     """What it is called."""
     about: str
     """Which networks have it, in a sentence."""
-    skeleton: str
-    """The skeleton whose joints and limbs these are, a name of `TEXT_SKELETONS`."""
+    text: TextSkeleton
+    """The joints and limbs, in order."""
     scale: float
     """The input is `scale` * colour + `offset`, with colours (blue, green, red) from 0 to 255."""
     offset: float
     """See `scale`."""
     sha256: str = ""
     """Checksum of a known network that has it."""
-
-    @property
-    def text(self) -> TextSkeleton:
-        """The joints and limbs, in order."""
-        return TEXT_SKELETONS[self.skeleton]
 
     @property
     def channels(self) -> int:
@@ -56,7 +51,9 @@ class NetworkLayout:
 def layouts() -> dict[str, NetworkLayout]:
     """All layouts by name."""
     table = json.loads((files("shapepose_fg.detection2d") / "data" / "layouts.json").read_text(encoding="utf-8"))
-    return {name: NetworkLayout(name, **entry) for name, entry in table.items()}
+    return {
+        name: NetworkLayout(name, text=TEXT_SKELETONS[entry.pop("text")], **entry) for name, entry in table.items()
+    }
 
 
 @dataclass(frozen=True)
@@ -119,7 +116,8 @@ class HeatMapNetwork:
 
     def text(self, number: int, found: Candidates | None, size: tuple[int, int]) -> str:
         """A frame in it: what was found in a picture of the calibrated `size`, None where there was no picture."""
-        found = found or Candidates.none()
+        if found is None:
+            return "0\n" * len(self.layout.text.joints)
         fractions = found.xy / (np.array(size) - 1.0)
         lines = association_lines(
             self.layout.text, found.joint, fractions, found.score, found.pairs, found.affinity

@@ -22,8 +22,8 @@ from shapepose_fg.detection2d.upright import UprightView
 
 _Three = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 _Above0 = Annotated[FiniteFloat, Field(gt=0)]
-_AXES = {"simcc": (3, 3), "heat map": (4,), "coordinates": (3, 4)}
-"""How many axes the outputs of each decoding have; people of a whole picture may add one to coordinates."""
+_AXES = {"simcc": [3, 3], "heat map": [4], "coordinates": [3]}
+"""How many axes the outputs of each decoding have."""
 
 
 class KeypointForm(BaseModel):
@@ -204,17 +204,20 @@ def _decoded(network: OnnxNetwork, form: KeypointForm, blob: Blob) -> tuple[Arra
     outputs, axes = network.run(blob), _AXES[form.decoding]
     if form.outputs is not None:
         outputs = [outputs[network.outputs.index(name)] for name in form.outputs]
-    read = [each.astype(np.float64) for each in outputs[: len(axes) if form.decoding == "simcc" else 1]]
-    fits = all(each.ndim in axes and 0 not in each.shape for each in read)
-    if form.decoding == "coordinates":
-        fits = fits and read[0].shape[-1] in (2, 3)
-    elif form.decoding == "simcc":
-        fits = fits and len(read) == 2 and read[0].shape[:2] == read[1].shape[:2]
-    if not fits or len(read[0]) != len(blob):
-        shapes = " and ".join(words(each.shape) for each in outputs) or "nothing"
+    read = [each.astype(np.float64) for each in outputs[: len(axes)]]
+    if form.decoding == "coordinates" and read[0].ndim == 4:  # several people of each picture
+        read = [read[0].reshape(-1, *read[0].shape[2:])]
+    shapes = [each.shape for each in read]
+    if (
+        [*map(len, shapes)] != axes
+        or not all(map(all, shapes))
+        or shapes[0][0] % len(blob) != 0
+        or shapes[0][:2] != shapes[-1][:2]
+        or (form.decoding == "coordinates" and shapes[0][2] not in (2, 3))
+    ):
         raise InputError(
-            f"{network.file}: the network gives {shapes}, which is no {form.decoding}; describe it in a TOML file"
-            " (docs/detection.md)"
+            f"{network.file}: the network gives {' and '.join(words(each.shape) for each in outputs)}, which is no"
+            f" {form.decoding}; describe it in a TOML file (docs/detection.md)"
         )
     size = np.array(blob.shape[:1:-1])
     if form.decoding == "simcc":
@@ -223,8 +226,8 @@ def _decoded(network: OnnxNetwork, form: KeypointForm, blob: Blob) -> tuple[Arra
         return np.dstack([each.argmax(axis=2) for each in read]) / split, score
     if form.decoding == "heat map":
         return _peaks(read[0], size, form.cells == "corners")
-    found = read[0].reshape(-1, *read[0].shape[-2:])
-    return found[..., :2] * form.scale, found[..., 2] if found.shape[2] == 3 else np.ones(found.shape[:2])
+    (found,) = read
+    return found[..., :2] * form.scale, found[..., 2] if shapes[0][2] == 3 else np.ones(shapes[0][:2])
 
 
 def _peaks(maps: Array, size: Index, corners: bool) -> tuple[Array, Array]:

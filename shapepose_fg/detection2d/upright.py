@@ -93,24 +93,12 @@ class UprightView:
         part = picture[max(top, 0) : bottom, max(left, 0) : right]
         matrix = self.input_from_picture.copy()
         matrix[:, 2] += matrix[:, :2] @ (max(left, 0), max(top, 0))
-        # Halves first: sampling a picture that is much too large would pass over most of its pixels.
-        shrink = self.scale
-        size = np.maximum(np.round(np.array(part.shape[1::-1]) * shrink), 1).astype(int)
-        if shrink < 1:
-            small = cv2.resize(part, size.tolist(), interpolation=cv2.INTER_AREA)
-            ratio = np.array(part.shape[1::-1]) / size
-            matrix[:, 2] += matrix[:, :2] @ (0.5 * ratio - 0.5)
-            matrix[:, :2] = matrix[:, :2] * ratio
-        else:
-            small = part
-        turned = cv2.warpAffine(
-            small,
-            matrix,
-            self.size,
-            flags=cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_CONSTANT,
-            borderValue=cv2.mean(small)[:3],
-        )
+        # Made smaller by areas first: sampling a picture that is much too large passes over most of its pixels.
+        size = np.maximum(np.round(np.array(part.shape[1::-1]) * min(self.scale, 1.0)), 1).astype(int)
+        small, ratio = cv2.resize(part, size.tolist(), interpolation=cv2.INTER_AREA), part.shape[1::-1] / size
+        matrix[:, 2] += matrix[:, :2] @ (0.5 * ratio - 0.5)
+        matrix[:, :2] = matrix[:, :2] * ratio
+        turned = cv2.warpAffine(small, matrix, self.size, flags=cv2.INTER_LINEAR, borderValue=cv2.mean(small)[:3])
         return np.asarray(turned, dtype=np.uint8)
 
     def picture_from_input(self, xy: Array) -> Array:
