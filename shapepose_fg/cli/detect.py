@@ -35,7 +35,7 @@ class NetworkOptions:
     """The network that detects, and how it is run."""
 
     network: str | None = option(_NETWORK, "ONNX file, TOML file of a network, or a name.", metavar="FILE|NAME")
-    download: str | None = option(_NETWORK, "The same by name, fetched once: rtmpose-s, -m, -x.", metavar="NAME")
+    download: str | None = option(_NETWORK, "The same by name, fetched once: rtmpose-s -m -x.", metavar="NAME")
     boxes: str | None = option(_NETWORK, "What finds people for RTMPose: a YOLOX.", metavar="FILE|NAME")
     layout: str | None = option(_NETWORK, "OpenPose's: tf-pose, openpose-coco, openpose-body25.", metavar="NAME")
     long_side: int | None = option(_NETWORK, "OpenPose's: pixels that it is shown along the longer side (656).")
@@ -44,8 +44,12 @@ class NetworkOptions:
 
     def check(self) -> None:
         """Refuse what makes no sense."""
-        if (self.network is None) == (self.download is None):
-            raise InputError("give the network that detects: --network FILE, or --download NAME the first time")
+        if self.network is None and self.download is None:
+            raise InputError("say what detects: --download rtmpose-m the first time, or --network FILE")
+        if self.network is not None and self.download not in (None, self.network, self.boxes):
+            raise InputError(
+                f"--download {self.download}: neither --network nor --boxes is called so; leave it out"
+            )
         if self.backend not in (None, "opencv", "onnxruntime"):
             raise InputError(f"--backend {self.backend}: must be opencv or onnxruntime")
         if self.backend == "opencv" and self.device != "cpu":
@@ -61,7 +65,7 @@ class NetworkOptions:
         openpose = {"layout": self.layout, "long_side": self.long_side, "backend": self.backend}
         with progress("fetching the network", "bytes") as fetched:
             found = partial(named_file, fetch=self.download is not None, say=note, progress=fetched)
-            network = self.download or self.network or ""
+            network = self.network or self.download or ""
             return open_network(network, self.boxes, found, self.device, **openpose)
 
 
@@ -161,7 +165,7 @@ def _summary(run: "DetectionRun", joints: list[int], unreadable: list[int], seco
     frames, views = run.moments.picture.shape
     speed = f"{seconds:.1f} s, {1e3 * seconds / max(frames * views, 1):.0f} ms a picture"
     caption = f"{frames} frames of {views} cameras in {speed}"
-    return table("camera pictures size turned network joints".split(), rows, caption=caption)
+    return table("camera pictures size turned shown joints".split(), rows, caption=caption)
 
 
 def _next_command(output: Path, cameras: CameraOptions, project: Path | None, network: "Network") -> str:

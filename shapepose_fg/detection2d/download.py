@@ -123,7 +123,8 @@ def _fetched(file: str, progress: Callable[[int, int], object]) -> bytes:
             told = error if isinstance(error, urllib.error.HTTPError) else getattr(error, "reason", error)
             problems.append(f"{base}/{file} ({told})")
     raise InputError(
-        f"the network cannot be fetched from {' or '.join(problems)}; fetch it by hand and give its path"
+        f"the network cannot be fetched from {' or '.join(problems)}; fetch it by hand and give the path of the"
+        f" {_INSIDE} in it"
     )
 
 

@@ -30,8 +30,6 @@ class NetworkLayout:
 
     name: str
     """What it is called."""
-    about: str
-    """Which networks have it, in a sentence."""
     text: TextSkeleton
     """The joints and limbs, in order."""
     scale: float
@@ -83,24 +81,21 @@ class HeatMapNetwork:
         missing, is no ONNX network, or does not fit the layout.
         """
         every = layouts()
-        known = f"(known are {'; '.join(f'{each.name}, {each.about}' for each in every.values())})"
         if layout not in (None, *every):
-            raise InputError(f"--layout {layout}: there is no such layout; give another {known}")
+            raise InputError(f"--layout {layout}: there is no such layout; give one of {' '.join(every)}")
         network = OnnxNetwork.open(file, backend or ("opencv" if device == "cpu" else "onnxruntime"), device)
         width, height = network.size or _TRIAL
         shape = network.run(np.zeros((1, 3, height, width), dtype=np.float32))[0].shape
         cells = (height // _STRIDE, width // _STRIDE)
         fitting = [each for each in every.values() if shape == (1, each.channels, *cells)]
-        if layout is not None:
-            fitting = [each for each in fitting if each.name == layout]
+        fitting = [each for each in fitting if layout in (None, each.name)]
         fitting = [each for each in fitting if each.sha256 == network.sha256] or fitting
         if len(fitting) != 1:
-            what, cure = "no such layout has", "another network, or --boxes for RTMPose and its like"
+            which = "no layout known does; give another network, or --boxes with RTMPose and its like"
             if len(fitting) > 1:
-                what, cure = "several layouts have", f"--layout {' or '.join(each.name for each in fitting)}"
+                which = f"several layouts do; give --layout {' or '.join(each.name for each in fitting)}"
             raise InputError(
-                f"{file}: of a picture of {width} x {height} the network makes {words(shape)} numbers, as {what};"
-                f" give {cure} {known}"
+                f"{file}: it makes {words(shape)} numbers of {width} x {height} pixels, which {which}"
             )
         return cls(network, fitting[0], long_side or _LONG_SIDE)
 

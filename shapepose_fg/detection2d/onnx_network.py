@@ -93,7 +93,7 @@ def _with_opencv(file: Path, content: bytes) -> tuple[Callable[[Blob], list[Blob
         net = cv2.dnn.readNetFromONNX(np.frombuffer(content, dtype=np.uint8))
         empty = net.empty()
     except cv2.error as error:
-        raise InputError(f"{file}: not an ONNX network that OpenCV can read ({_first_line(error)})") from None
+        raise InputError(f"{file}: not an ONNX network that OpenCV can read ({error.err.strip()[:160]})") from None
     if empty:
         raise InputError(f"{file}: not an ONNX network; give the ONNX file of a network")
 
@@ -109,7 +109,9 @@ def _with_onnxruntime(file: Path, content: bytes, device: str) -> tuple[Any, ...
     try:
         onnxruntime: Any = import_module("onnxruntime")
     except ImportError:
-        raise InputError(f'{file}: onnxruntime runs it, a package: pip install "shapepose-fg[detect]"') from None
+        raise InputError(
+            f'{file}: the package onnxruntime runs it, which is missing; pip install "shapepose-fg[detect]"'
+        ) from None
     kind, _, number = device.partition(":")
     provider, there = f"{PROVIDERS.get(kind)}ExecutionProvider", onnxruntime.get_available_providers()
     if provider not in there or not (number or "0").isdecimal():

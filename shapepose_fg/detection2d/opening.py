@@ -4,6 +4,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import SKELETONS
 from shapepose_fg.core.storage.files import read_toml
@@ -49,6 +51,7 @@ def open_network(
     if people is not None:
         opened = OnnxNetwork.open(people.network, device=device)
         opened = BoxNetwork(opened, people.model_copy(update={"size": opened.size or people.size}))
+        opened.find(np.zeros((64, 64, 3), dtype=np.uint8))
     keypoints = OnnxNetwork.open(form.network, device=device)
     for name, there in (form.input, keypoints.inputs), *((each, keypoints.outputs) for each in form.outputs or ()):
         if name is not None and name not in there:

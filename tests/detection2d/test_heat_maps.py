@@ -42,7 +42,8 @@ def test_body_25_is_told_by_its_channels_and_coco_must_be_named(tmp_path):
     assert network.layout.name == "openpose-body25"
     coco = onnx_file(tmp_path / "coco.onnx", means(57))
     with pytest.raises(
-        InputError, match=r"makes 1 x 57 x 8 x 8 numbers, as several.*give --layout tf-pose or openpose-coco"
+        InputError,
+        match=r"makes 1 x 57 x 8 x 8 numbers of 64 x 64 pixels, which several.*--layout tf-pose or openpose-coco",
     ):
         HeatMapNetwork.load(coco)
     assert HeatMapNetwork.load(coco, "openpose-coco").layout.offset == -0.5
@@ -71,12 +72,12 @@ def test_what_is_no_such_network_is_said(tmp_path, backend):
             HeatMapNetwork.load(cut, backend=backend)
     other = onnx_file(tmp_path / "other.onnx", means(7))
     with pytest.raises(
-        InputError, match=r"makes 1 x 7 x 8 x 8 numbers, as no such.*give another network, or --boxes"
+        InputError, match=r"makes 1 x 7 x 8 x 8 numbers.* no layout known.*give another network, or --boxes"
     ):
         HeatMapNetwork.load(other, backend=backend)
-    with pytest.raises(InputError, match=r"makes 1 x 7 x 8 x 8 numbers, as no such layout has"):
+    with pytest.raises(InputError, match=r"makes 1 x 7 x 8 x 8 numbers.* no layout known does"):
         HeatMapNetwork.load(other, "tf-pose", backend)
-    with pytest.raises(InputError, match="--layout mine: there is no such layout; give another"):
+    with pytest.raises(InputError, match="--layout mine: there is no such layout; give one of tf-pose"):
         HeatMapNetwork.load(other, "mine", backend)
 
 
