@@ -15,7 +15,8 @@ from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25, COCO_17, HALPE_26
 from shapepose_fg.detection2d.boxes import BoxForm, BoxNetwork
 from shapepose_fg.detection2d.onnx_network import OnnxNetwork
-from shapepose_fg.detection2d.opening import open_network
+from shapepose_fg.detection2d.opening import open_network, read_form
+from shapepose_fg.detection2d.top_down import KeypointForm
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.simulation import built_in_scene
 from tests.detection2d.conftest import node, onnx_model, rtmpose_file, yolox_file
@@ -144,6 +145,14 @@ def test_what_a_file_says_of_another_network_is_refused_in_a_sentence(tmp_path, 
     (tmp_path / "n.toml").write_text("\n".join(['network = "pose.onnx"', *lines]))
     with pytest.raises(InputError, match=re.escape(problem)):
         open_network(str(tmp_path / "n.toml"), None, Path)
+
+
+def test_the_file_that_the_page_shows_is_read(tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "detection.md").read_text(encoding="utf-8")
+    (tmp_path / "other.toml").write_text(re.findall("```toml\n(.*?)```", page, re.DOTALL)[0])
+    form = read_form(tmp_path / "other.toml")
+    assert form.model_fields_set == set(KeypointForm.model_fields) and form.decoding == "heat map"
+    assert form.boxes is not None and form.boxes.model_fields_set >= {"network", "min_score", "max_overlap"}
 
 
 def test_networks_in_each_other_s_place_are_refused(tmp_path):
