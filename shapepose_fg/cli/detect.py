@@ -106,7 +106,6 @@ def detect(
         raise InputError(
             f"{option_missing}: missing; give the cameras' videos or pictures, and a folder to write to"
         )
-    from shapepose_fg.detection2d.heat_maps import HeatMapNetwork
     from shapepose_fg.detection2d.recording import CameraDetector, DetectionRun, run_detection
     from shapepose_fg.io.footage.lockstep import align, clocks_of
     from shapepose_fg.io.footage.placement import placements_of
@@ -127,13 +126,6 @@ def detect(
         CameraDetector.of(camera, rig.up_vector, each, placements[camera.name], loaded)
         for camera, each in zip(rig.cameras, footage, strict=True)
     ]
-    if isinstance(loaded, HeatMapNetwork) and loaded.network.size is not None:
-        width, height = loaded.network.size
-        smallest = min(detector.view.scale for detector in detectors)
-        note(
-            f"here the network takes pictures of {width} x {height} only, so they are shown to it at down to"
-            f" {100 * smallest:.0f} % of their size; --backend opencv takes any"
-        )
     run = DetectionRun(detectors, moments, output)
     begin = time.perf_counter()
     with progress("detecting", "pictures") as done:

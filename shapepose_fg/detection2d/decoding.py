@@ -1,12 +1,10 @@
 """A network's heat maps and part affinity fields as joint candidates with affinities.
 
 Cao et al., "OpenPose: Realtime Multi-Person 2D Pose Estimation using Part Affinity Fields", PAMI 2021, section 3.
-All joints, and all pairs of candidates of all limbs, are decoded at once.
 """
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
@@ -66,11 +64,14 @@ def decode(output: NDArray[np.float32], skeleton: TextSkeleton) -> Candidates:
     """
     output = np.nan_to_num(output, nan=0.0, posinf=0.0, neginf=0.0)
     joint, xy, score = peaks(output[: len(skeleton.joints)])
-    first, second, limb = _all_pairs(joint, skeleton)
-    affinity = line_integrals(output[len(skeleton.joints) + 1 :], xy[first], xy[second], limb)
+    of = [np.flatnonzero(joint == each) for each in range(len(skeleton.joints))]
+    joined = [
+        np.stack(np.meshgrid(of[a], of[b], indexing="ij"), axis=-1).reshape(-1, 2) for a, b in skeleton.limbs
+    ]
+    pairs, limb = np.concatenate(joined), np.repeat(np.arange(len(joined)), [len(each) for each in joined])
+    affinity = line_integrals(output[len(skeleton.joints) + 1 :], xy[pairs[:, 0]], xy[pairs[:, 1]], limb)
     there = affinity > 0
-    pairs = np.column_stack([first, second])[there]
-    return Candidates(joint, xy, score, pairs, limb[there], affinity[there])
+    return Candidates(joint, xy, score, pairs[there], limb[there], affinity[there])
 
 
 def peaks(heat: NDArray[np.float32], min_score: float = _MIN_SCORE) -> tuple[Index, Array, Array]:
@@ -80,18 +81,14 @@ def peaks(heat: NDArray[np.float32], min_score: float = _MIN_SCORE) -> tuple[Ind
     through it and its neighbours, along each axis.
     """
     padded = np.pad(heat, ((0, 0), (1, 1), (1, 1)), constant_values=-np.inf)
-    stack = padded.transpose(1, 2, 0)  # OpenCV filters all channels of a picture at once
-    largest = cv2.dilate(np.ascontiguousarray(stack), np.ones((3, 3), np.uint8)).reshape(stack.shape)
-    is_peak = (stack >= largest) & (stack >= min_score)
-    row, column, joint = np.nonzero(is_peak)
-    order = np.lexsort((column, row, joint))
-    joint, row, column = joint[order], row[order], column[order]
-    # Of a plateau of equal cells only the first is kept.
-    equal_before = np.zeros(len(joint), dtype=bool)
-    for dr, dc in ((-1, -1), (-1, 0), (-1, 1), (0, -1)):
-        equal_before |= padded[joint, row + dr, column + dc] == padded[joint, row, column]
-    joint, row, column = joint[~equal_before], row[~equal_before], column[~equal_before]
-    xy, height = between_cells(padded, joint, row, column)
+    rows, columns = heat.shape[1:]
+    is_peak = heat >= min_score
+    for down, right in np.ndindex(3, 3):
+        other = padded[:, down : down + rows, right : right + columns]
+        # Of a plateau of equal cells only the first is kept.
+        is_peak &= heat > other if (down, right) < (1, 1) else heat >= other
+    joint, row, column = np.nonzero(is_peak)
+    xy, height = between_cells(padded, joint, row + 1, column + 1)
     return joint, xy - 1, np.minimum(height, 1.0)
 
 
@@ -135,18 +132,3 @@ def line_integrals(fields: NDArray[np.float32], start: Array, end: Array, limb: 
         component += map_coordinates(fields, places, np.float64, order=1) * direction[:, axis, None]
     supported = (component >= _MIN_ALONG).mean(axis=1) >= _MIN_SUPPORTED
     return np.where(supported & (length > 0), np.clip(component.mean(axis=1), 0.0, 1.0), 0.0)
-
-
-def _all_pairs(joint: Index, skeleton: TextSkeleton) -> tuple[Index, Index, Index]:
-    """First candidate, second candidate, and limb, each (E,), of all pairs that any limb could join.
-
-    `joint` (D,) is sorted.
-    """
-    count = np.bincount(joint, minlength=len(skeleton.joints))
-    start = np.cumsum(count) - count
-    ends = np.array(skeleton.limbs)
-    sizes = count[ends[:, 0]] * count[ends[:, 1]]
-    limb = np.repeat(np.arange(len(ends)), sizes)
-    within = np.arange(len(limb)) - (np.cumsum(sizes) - sizes)[limb]
-    row, column = np.divmod(within, np.maximum(count[ends[limb, 1]], 1))
-    return start[ends[limb, 0]] + row, start[ends[limb, 1]] + column, limb

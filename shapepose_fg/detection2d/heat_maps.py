@@ -109,8 +109,8 @@ class HeatMapNetwork:
         """The beginning of 4D Association's text."""
         return f"{self.layout.text.number} {frames}\n"
 
-    def text(self, number: int, found: Candidates | None, size: tuple[int, int]) -> str:
-        """A frame in it: what was found in a picture of the calibrated `size`, None where there was no picture."""
+    def text(self, number: int, found: Any, size: tuple[int, int]) -> str:
+        """A frame in it: `Candidates` in a picture of the calibrated `size`, None where there was no picture."""
         if found is None:
             return "0\n" * len(self.layout.text.joints)
         fractions = found.xy / (np.array(size) - 1.0)

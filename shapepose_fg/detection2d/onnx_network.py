@@ -58,8 +58,8 @@ class OnnxNetwork:
         """
         file = Path(file)
         content = read_onnx(file)
-        opened = _with_opencv(file, content) if backend == "opencv" else _with_onnxruntime(file, content, device)
-        return cls(file, hashlib.sha256(content).hexdigest(), *opened)
+        run_by = _with_opencv if backend == "opencv" else _with_onnxruntime
+        return cls(file, hashlib.sha256(content).hexdigest(), *run_by(file, content, device))
 
     def run(self, pictures: Blob) -> list[Blob]:
         """All outputs for pictures (B, 3, height, width); InputError where it cannot be run on such."""
@@ -87,8 +87,8 @@ def read_onnx(file: Path) -> bytes:
     return content
 
 
-def _with_opencv(file: Path, content: bytes) -> tuple[Callable[[Blob], list[Blob]]]:
-    """The network run by OpenCV's dnn, which takes pictures of any size."""
+def _with_opencv(file: Path, content: bytes, device: str) -> tuple[Any, ...]:
+    """`forward` of the network run by OpenCV's dnn, on the CPU, which takes pictures of any size."""
     try:
         net = cv2.dnn.readNetFromONNX(np.frombuffer(content, dtype=np.uint8))
         empty = net.empty()
@@ -105,7 +105,7 @@ def _with_opencv(file: Path, content: bytes) -> tuple[Callable[[Blob], list[Blob
 
 
 def _with_onnxruntime(file: Path, content: bytes, device: str) -> tuple[Any, ...]:
-    """What else `OnnxNetwork` has, run by onnxruntime, on the CPU on as many threads as OpenCV has."""
+    """`forward` and what follows in `OnnxNetwork`, by onnxruntime; on the CPU on as many threads as OpenCV has."""
     try:
         onnxruntime: Any = import_module("onnxruntime")
     except ImportError:

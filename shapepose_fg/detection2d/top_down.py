@@ -135,8 +135,8 @@ class TopDownNetwork:
         """The beginning of MMPose's JSON of a video."""
         return "["
 
-    def text(self, number: int, found: People | None, size: tuple[int, int]) -> str:
-        """Frame `number` in it, of no picture where nothing was `found`. Joints that were not seen are 0 0 0."""
+    def text(self, number: int, found: Any, size: tuple[int, int]) -> str:
+        """Frame `number` in it: `People`, None where there was no picture. Joints that were not seen are 0 0 0."""
         people = []
         for xy, score in zip(found.xy, found.score, strict=True) if found else ():
             if (seen := score > 0).any():
@@ -196,7 +196,8 @@ def _crop(picture: NDArray[np.uint8], centre: Array, extent: Array, size: Array)
     points = points.astype(np.float32)
     beside = points[:, 1] + (points[:, 1] - points[:, 0])[:, ::-1] * np.float32([1, -1])
     matrix = cv2.getAffineTransform(*np.concatenate([points, beside[:, None]], axis=1))
-    return np.asarray(cv2.warpAffine(picture, matrix, size.astype(int).tolist(), flags=cv2.INTER_LINEAR), np.uint8)
+    crop = cv2.warpAffine(picture, matrix, (int(size[0]), int(size[1])), flags=cv2.INTER_LINEAR)
+    return np.asarray(crop, dtype=np.uint8)
 
 
 def _decoded(network: OnnxNetwork, form: KeypointForm, blob: Blob) -> tuple[Array, Array]:
