@@ -42,8 +42,11 @@ class NetworkOptions:
     backend: str | None = option(RUN, "OpenPose's: opencv (what is taken) or onnxruntime.", metavar="NAME")
     device: str = option(RUN, "Where onnxruntime runs: cpu, cuda, cuda:1, rocm, coreml.", "cpu", metavar="NAME")
 
-    def check(self) -> None:
-        """Refuse what makes no sense."""
+    def load(self) -> "Network":
+        """The network, fetched if that is asked for; InputError where options contradict each other."""
+        from shapepose_fg.detection2d.download import named_file
+        from shapepose_fg.detection2d.opening import open_network
+
         if self.network is None and self.download is None:
             raise InputError("say what detects: --download rtmpose-m the first time, or --network FILE")
         if self.network is not None and self.download not in (None, self.network, self.boxes):
@@ -56,12 +59,6 @@ class NetworkOptions:
             raise InputError(f"--device {self.device}: opencv runs on the cpu; leave --backend out")
         if self.long_side is not None and not 128 <= self.long_side <= 4096:
             raise InputError(f"--long-side {self.long_side}: must be 128 to 4096 pixels")
-
-    def load(self) -> "Network":
-        """The network, fetched if that is asked for."""
-        from shapepose_fg.detection2d.download import named_file
-        from shapepose_fg.detection2d.opening import open_network
-
         openpose = {"layout": self.layout, "long_side": self.long_side, "backend": self.backend}
         with progress("fetching the network", "bytes") as fetched:
             found = partial(named_file, fetch=self.download is not None, say=note, progress=fetched)
@@ -74,9 +71,7 @@ class ClockOptions:
     """When pictures were taken."""
 
     fps: list[str] | None = option(TIME, "Frames a second, where files do not say.", metavar="RATE|CAMERA=RATE")
-    start: list[str] | None = option(
-        TIME, "When its first frame was taken: 0.2s, or 12f frames.", metavar="CAMERA=TIME"
-    )
+    start: list[str] | None = option(TIME, "When its first frame was taken: 0.2s, or 12f.", metavar="CAMERA=TIME")
     frames: str | None = frames_option()
 
 
@@ -94,7 +89,6 @@ def detect(
     Pictures of rolled cameras are turned upright first; the calibration knows how. A run that is stopped goes on
     where it was when it is started again.
     """
-    network.check()
     if project is not None:
         from shapepose_fg.io.pose2sim_project import footage_of
 
@@ -102,10 +96,8 @@ def detect(
         cameras = replace(cameras, calibration=cameras.calibration or calibration)
         pictures, output = replace(pictures, videos=pictures.videos or [str(videos)]), output or pose
     if pictures.videos is None or output is None:
-        option_missing = "--videos" if pictures.videos is None else "--output"
-        raise InputError(
-            f"{option_missing}: missing; give the cameras' videos or pictures, and a folder to write to"
-        )
+        missing = "--videos, the cameras' videos or pictures" if pictures.videos is None else "--output, a folder"
+        raise InputError(f"what to read or where to write is missing; give {missing}")
     from shapepose_fg.detection2d.recording import CameraDetector, DetectionRun, run_detection
     from shapepose_fg.io.footage.lockstep import align, clocks_of
     from shapepose_fg.io.footage.placement import placements_of
@@ -118,9 +110,8 @@ def detect(
     note(*concluded)
     moments = align(*clocks_of(footage, clock.fps or [], clock.start or [], rig.names))
     span = frame_range(clock.frames, len(moments))
-    part = slice(span.start, span.stop)
-    time_s = None if moments.time_s is None else moments.time_s[part]
-    moments = replace(moments, picture=moments.picture[part], time_s=time_s)
+    time_s = None if moments.time_s is None else moments.time_s[span]
+    moments = replace(moments, picture=moments.picture[span], time_s=time_s)
     note(*moments.notes)
     detectors = [
         CameraDetector.of(camera, rig.up_vector, each, placements[camera.name], loaded)
@@ -146,17 +137,13 @@ def _summary(run: "DetectionRun", joints: list[int], unreadable: list[int], seco
     rows = []
     for view, each in enumerate(run.cameras):
         pictures = int((run.moments.picture[:, view] >= 0).sum()) - unreadable[view]
-        turned, (width, height), shown = each.view.turn_deg, each.footage.size, each.view.size
-        row = (
-            each.camera.name,
-            str(pictures),
-            f"{width} x {height}",
-            f"{turned:.0f}°" if abs(turned) > 0.5 else "-",
-        )
-        rows.append((*row, f"{shown[0]} x {shown[1]}", f"{joints[view] / max(pictures, 1):.1f}"))
+        turned = f"{each.view.turn_deg:.0f}°" if abs(each.view.turn_deg) > 0.5 else "-"
+        size, shown = (f"{width} x {height}" for width, height in (each.footage.size, each.view.size))
+        found = f"{joints[view] / max(pictures, 1):.1f}"
+        rows.append((each.camera.name, str(pictures), size, turned, shown, found))
     frames, views = run.moments.picture.shape
-    speed = f"{seconds:.1f} s, {1e3 * seconds / max(frames * views, 1):.0f} ms a picture"
-    caption = f"{frames} frames of {views} cameras in {speed}"
+    speed = f"{1e3 * seconds / max(frames * views, 1):.0f} ms a picture"
+    caption = f"{frames} frames of {views} cameras in {seconds:.1f} s, {speed}"
     return table("camera pictures size turned shown joints".split(), rows, caption=caption)
 
 
@@ -164,18 +151,12 @@ def _next_command(output: Path, cameras: CameraOptions, project: Path | None, ne
     """How to go on, as a line to copy, wherever it is pasted."""
     import shlex
 
-    from shapepose_fg.detection2d.top_down import TopDownNetwork
-
-    files = {
-        "--calibration": cameras.calibration,
-        "--detections": output,
-        "--output": output.resolve().parent / "results",
-    }
+    results = output.resolve().parent / "results"
+    files = {"--calibration": cameras.calibration, "--detections": output, "--output": results}
     if project is not None and output.resolve().parent == project.resolve():
         files = {"--project": project}
-    skeleton = network.form.skeleton if isinstance(network, TopDownNetwork) else None
-    if skeleton is not None and Path(skeleton).is_file():
-        files["--skeleton"] = Path(skeleton)
+    skeleton = Path(network.settings["network"].get("skeleton") or "")
+    files |= {"--skeleton": skeleton} if skeleton.is_file() else {}
     options = {name: file.resolve() for name, file in files.items() if file is not None}
     options |= {"--up": cameras.up, "--unit": cameras.unit, "--image-size": cameras.image_size}
     words = [word for name, value in options.items() if value is not None for word in (name, str(value))]

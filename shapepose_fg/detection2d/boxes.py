@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
-from shapepose_fg.core.arrays import Array, Real
+from shapepose_fg.core.arrays import Real
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.detection2d.onnx_network import Blob, OnnxNetwork, words
 
@@ -74,7 +74,10 @@ class BoxNetwork:
 
     def _proposed(self, outputs: Sequence[Blob]) -> tuple[Blob, Blob, float]:
         """(N, 4) boxes in pixels of the input, (N,) how sure each is of a person, and the least that counts."""
-        cells, stride = _grids(self.form.size)
+        # Column and row of all cells of the grids, one grid after the other.
+        grids = [np.indices((self.form.size[1] // step, self.form.size[0] // step))[::-1] for step in _STRIDES]
+        cells = np.concatenate([grid.reshape(2, -1).T for grid in grids])
+        stride = np.repeat(_STRIDES, [grid[0].size for grid in grids])[:, None]
         shape = outputs[0].shape
         if shape[:1] != (1,) or len(shape) != 3 or shape[2] < 5 or (shape[2] > 5 and shape[1] != len(cells)):
             raise InputError(
@@ -92,9 +95,3 @@ class BoxNetwork:
         sides = (np.exp(np.minimum(found[:, 2:4], 50)) * stride).astype(np.float32)
         boxes = np.hstack([centre - sides / 2, centre + sides / 2])
         return boxes, found[:, 4] * found[:, 5 + _PERSON], _LEAST
-
-
-def _grids(size: tuple[int, int]) -> tuple[Array, Array]:
-    """(N, 2) column and row of all cells of YOLOX's grids, one after the other, and (N, 1) their strides."""
-    grids = [np.indices((size[1] // step, size[0] // step))[::-1].reshape(2, -1).T for step in _STRIDES]
-    return np.concatenate(grids).astype(float), np.repeat(_STRIDES, [len(grid) for grid in grids])[:, None]

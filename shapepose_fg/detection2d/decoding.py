@@ -46,14 +46,8 @@ class Candidates:
         """The same at other positions; those that are not `inside` (D,) are left out."""
         place = np.cumsum(inside) - 1
         both = inside[self.pairs].all(axis=1)
-        return Candidates(
-            self.joint[inside],
-            xy[inside],
-            self.score[inside],
-            place[self.pairs[both]],
-            self.limb[both],
-            self.affinity[both],
-        )
+        joint, score, pairs = self.joint[inside], self.score[inside], place[self.pairs[both]]
+        return Candidates(joint, xy[inside], score, pairs, self.limb[both], self.affinity[both])
 
 
 def decode(output: NDArray[np.float32], skeleton: TextSkeleton) -> Candidates:

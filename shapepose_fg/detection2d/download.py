@@ -17,7 +17,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.storage.files import SMALL, read_text, write_content
+from shapepose_fg.core.storage.files import SMALL, read_bytes, read_text, write_content
 from shapepose_fg.detection2d.onnx_network import MOST_BYTES
 
 BASES = (
@@ -68,29 +68,22 @@ def named_file(
 
     The sha256 of the ONNX file is told to `say` and pinned at first use. InputError where it is another later.
     """
-    kept = cache_folder() / f"{name}.onnx"
-    pin = kept.with_suffix(".sha256")
-    content = None
-    if not kept.is_file():
-        if not fetch:
-            raise InputError(
-                f"{name}: it has not been fetched yet; --download {name} does so, or give a file's path"
-            )
-        content = _fetched(named_networks()[name].file, progress)
-        digest = hashlib.sha256(content).hexdigest()
-    else:
-        with kept.open("rb") as stream:
-            digest = hashlib.file_digest(stream, "sha256").hexdigest()
+    kept, pin = (cache_folder() / f"{name}.{ending}" for ending in ("onnx", "sha256"))
+    there = kept.is_file()
+    if not there and not fetch:
+        raise InputError(f"{name}: it has not been fetched yet; --download {name} does so, or give a file's path")
+    content = read_bytes(kept, MOST_BYTES) if there else _fetched(named_networks()[name].file, progress)
+    digest = hashlib.sha256(content).hexdigest()
     if not pin.is_file():
         write_content(pin, digest)
         say(f"{name}: sha256 {digest} is pinned in {pin}")
     pinned = read_text(pin, most=SMALL).strip()
     if digest != pinned:
         raise InputError(
-            f"{kept}: the sha256 of {'what came' if content else 'the file'} is {digest}, and {pinned[:64]} was"
+            f"{kept}: the sha256 of {'the file' if there else 'what came'} is {digest}, and {pinned[:64]} was"
             f" pinned at first use; if that is meant, delete the file and {pin.name} beside it"
         )
-    if content is not None:
+    if not there:
         write_content(kept, content)
     return kept
 

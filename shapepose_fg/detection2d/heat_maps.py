@@ -86,9 +86,9 @@ class HeatMapNetwork:
         network = OnnxNetwork.open(file, backend or ("opencv" if device == "cpu" else "onnxruntime"), device)
         width, height = network.size or _TRIAL
         shape = network.run(np.zeros((1, 3, height, width), dtype=np.float32))[0].shape
+        fitting = [each for each in every.values() if layout in (None, each.name)]
         cells = (height // _STRIDE, width // _STRIDE)
-        fitting = [each for each in every.values() if shape == (1, each.channels, *cells)]
-        fitting = [each for each in fitting if layout in (None, each.name)]
+        fitting = [each for each in fitting if shape == (1, each.channels, *cells)]
         fitting = [each for each in fitting if each.sha256 == network.sha256] or fitting
         if len(fitting) != 1:
             which = "no layout known does; give another network, or --boxes with RTMPose and its like"

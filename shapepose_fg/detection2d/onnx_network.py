@@ -54,10 +54,16 @@ class OnnxNetwork:
     def open(cls, file: str | Path, backend: Backend = "onnxruntime", device: str = "cpu") -> "OnnxNetwork":
         """The network in `file`; `device` is one of `PROVIDERS`, "cuda:1" its second.
 
-        InputError where the file is missing, or no ONNX network, or the device is not there.
+        InputError where the file is missing, no network or too large, where the device is not there, and where
+        weights lie in other files: their paths are looked up wherever this program runs, and may lead anywhere.
         """
         file = Path(file)
-        content = read_onnx(file)
+        content = read_bytes(file, MOST_BYTES)
+        if b"location" in content and _ELSEWHERE.search(content):
+            raise InputError(
+                f"{file}: its weights lie in another file; give a network that holds them itself, as"
+                " onnx.save_model(onnx.load(FILE), NEW) writes it"
+            )
         run_by = _with_opencv if backend == "opencv" else _with_onnxruntime
         return cls(file, hashlib.sha256(content).hexdigest(), *run_by(file, content, device))
 
@@ -70,21 +76,6 @@ class OnnxNetwork:
                 f"{self.file}: it cannot be run on {words(pictures.shape)} numbers ({_first_line(error)});"
                 " give one that takes pictures, 1 x 3 x height x width; RTMPose and its like need --boxes"
             ) from None
-
-
-def read_onnx(file: Path) -> bytes:
-    """The bytes of a network's file.
-
-    InputError where it is missing, larger than any such network, or where its weights lie in other files: their
-    paths would be looked up wherever this program happens to run, and may lead anywhere.
-    """
-    content = read_bytes(file, MOST_BYTES)
-    if b"location" in content and _ELSEWHERE.search(content):
-        raise InputError(
-            f"{file}: its weights lie in another file; give a network that holds them itself, as"
-            " onnx.save_model(onnx.load(FILE), NEW) writes it"
-        )
-    return content
 
 
 def _with_opencv(file: Path, content: bytes, device: str) -> tuple[Any, ...]:
@@ -150,5 +141,4 @@ def words(shape: Sequence[int]) -> str:
 
 def _first_line(error: BaseException) -> str:
     """The first line of a library's message, short."""
-    lines = str(error).strip().splitlines() or [type(error).__name__]
-    return lines[0][:160]
+    return (str(error).strip() or type(error).__name__).splitlines()[0][:160]

@@ -2,10 +2,10 @@
 
 import json
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from shapepose_fg.detection2d.decoding import Candidates
 from shapepose_fg.detection2d.opening import Network
 from shapepose_fg.detection2d.top_down import People
 from shapepose_fg.detection2d.upright import UprightView, roll_of
-from shapepose_fg.io.footage.footage import Footage
+from shapepose_fg.io.footage.footage import Footage, Progress
 from shapepose_fg.io.footage.lockstep import Lockstep
 from shapepose_fg.io.footage.placement import FOOTAGE, CameraFootage, Placement, write_used_footage
 
@@ -26,9 +26,6 @@ BLOCK = 16
 """Moments that are kept together: what a run that is killed loses at most."""
 _UNFINISHED = "unfinished"
 _SETTINGS = "settings.json"
-
-Progress = Callable[[int, int], None]
-"""Told how many pictures of how many are done."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +44,7 @@ class CameraDetector:
     """What the network is shown."""
 
     @classmethod
-    def of(
-        cls, camera: Camera, up: Array, footage: Footage, placement: Placement, network: Network
-    ) -> "CameraDetector":
+    def of(cls, camera: Camera, up: Array, footage: Footage, placement: Placement, network: Network) -> Self:
         """The detector for `camera` in a world where `up` (3,) points up."""
         view = network.view(placement.region, roll_of(camera, up))
         return cls(camera, footage, placement, network, view)
@@ -99,7 +94,7 @@ def run_detection(run: DetectionRun, progress: Progress = lambda done, total: No
     """
     unfinished = inside(run.output, _UNFINISHED)
     _refuse_others(run, unfinished)
-    write_content(unfinished / _SETTINGS, _json(run.settings))
+    write_content(unfinished / _SETTINGS, json.dumps(run.settings, allow_nan=False))
     total, views = len(run.moments), len(run.cameras)
     files, counts = list[Path](), np.zeros((2, views), dtype=np.intp)
     for start in range(0, total, BLOCK):
@@ -146,7 +141,7 @@ def _write_block(run: DetectionRun, moments: range, file: Path, progress: Progre
             found[v] += 0 if seen is None else len(seen)
             text[v] += each.network.text(t, seen, each.camera.image_size)
             progress(t * views + v + 1, len(run.moments) * views)
-    write_content(file, _json({"text": text, "found": found, "failed": failed}))
+    write_content(file, json.dumps({"text": text, "found": found, "failed": failed}))
 
 
 def _read_block(file: Path, views: int, name: str) -> list[Any]:
@@ -182,21 +177,15 @@ def _refuse_others(run: DetectionRun, unfinished: Path) -> None:
         raise InputError(f"camera {Path(FOOTAGE).stem!r}: {FOOTAGE} is another file; rename it in the calibration")
     places = [run.output / f"{name}{suffix}" for name in names for suffix in (".txt", ".json")]
     if (unfinished / _SETTINGS).is_file():
-        before, now = read_json(unfinished / _SETTINGS), json.loads(_json(run.settings))
+        before, now = read_json(unfinished / _SETTINGS), run.settings
         if before != now:
-            words = {"network": "another network", "cameras": "other videos or cameras"}
-            differ = [
-                what for key, what in words.items() if isinstance(before, dict) and before.get(key) != now[key]
-            ]
+            differ = [key for key in now if not isinstance(before, dict) or before.get(key) != now[key]]
             raise InputError(
-                f"{unfinished}: a run with {' and '.join(differ) or 'other settings'} was stopped here; start it"
-                " as it was to go on, or delete this folder"
+                f"{unfinished}: a run that differs in its {' and '.join(differ)} was stopped here; start it as it"
+                " was to go on, or delete this folder"
             )
-    elif unfinished.exists():
-        if any(unfinished.iterdir()):
-            raise InputError(
-                f"{unfinished}: not a run of this program; delete the folder, or give another --output"
-            )
+    elif unfinished.exists() and any(unfinished.iterdir()):
+        raise InputError(f"{unfinished}: not a run of this program; delete the folder, or give another --output")
     elif there := [place for place in places if place.exists()]:
         raise InputError(f"{there[0]}: there are detections already; delete them, or give another --output")
 
@@ -206,7 +195,3 @@ def _state(path: Path) -> list[int]:
     files = [path] if path.is_file() else sorted(each for each in path.iterdir() if each.is_file())
     states = [each.stat() for each in files]
     return [sum(each.st_size for each in states), max((each.st_mtime_ns for each in states), default=0)]
-
-
-def _json(value: Any) -> str:
-    return json.dumps(value, allow_nan=False)

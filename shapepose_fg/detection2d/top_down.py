@@ -99,12 +99,11 @@ class TopDownNetwork:
     ) -> "TopDownNetwork":
         """Tried on an empty picture: InputError where the network does not fit its description."""
         count = _decoded(network, form, np.zeros((1, 3, *form.size[::-1]), dtype=np.float32))[1].shape[1]
-        fitting = [each for each in SKELETONS.values() if each.keypoint_count == count]
-        if skeleton is None and len(fitting) == 0:
+        skeleton = skeleton or next((each for each in SKELETONS.values() if each.keypoint_count == count), None)
+        if skeleton is None:
             raise InputError(
                 f"{network.file}: no skeleton known here has {count} joints; name one in a network's TOML file"
             )
-        skeleton = skeleton or fitting[0]
         keypoints = range(len(skeleton)) if skeleton.keypoints is None else skeleton.keypoints
         names = ["" if joint < 0 else skeleton.joints[joint] for joint in keypoints]
         listed = names if form.joints is None else form.joints

@@ -84,7 +84,7 @@ def test_what_is_no_such_network_is_said(tmp_path, backend):
 def test_a_file_that_is_too_large_is_not_read(tmp_path, monkeypatch):
     file = onnx_file(tmp_path / "n.onnx", means(78))
     monkeypatch.setattr(onnx_network, "MOST_BYTES", file.stat().st_size)
-    assert onnx_network.read_onnx(file) == file.read_bytes()
+    assert HeatMapNetwork.load(file).layout.channels == 78
     with file.open("ab") as stream:
         stream.truncate(2**40)  # a hole: takes no room on the disk
     monkeypatch.undo()

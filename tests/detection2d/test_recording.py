@@ -123,11 +123,13 @@ def test_runs_do_not_mix(rolled_rig, pictures, tmp_path, painted_network):
 
     with pytest.raises(Stopped):
         run_detection(run_of(rolled_rig, pictures, tmp_path, painted_network), stop)
-    with pytest.raises(InputError, match="a run with other settings was stopped here; start it as it was"):
+    with pytest.raises(
+        InputError, match="a run that differs in its detection was stopped here; start it as it was"
+    ):
         run_detection(run_of(rolled_rig, pictures, tmp_path, painted_network, long_side=320))
     moved = tmp_path / "moved"
     shutil.copytree(pictures, moved)
-    with pytest.raises(InputError, match="a run with other videos or cameras was stopped"):
+    with pytest.raises(InputError, match="a run that differs in its cameras was stopped"):
         run_detection(run_of(rolled_rig, moved, tmp_path, painted_network))
     run_detection(run_of(rolled_rig, pictures, tmp_path, painted_network))
     with pytest.raises(InputError, match=r"a\.txt: there are detections already; delete them"):
