@@ -193,7 +193,7 @@ def _crop(picture: NDArray[np.uint8], centre: Array, extent: Array, size: Array)
     points = np.array([[centre, centre], [size / 2, size / 2]])
     points[:, 1, 1] -= extent[0] / 2, size[0] / 2
     points = points.astype(np.float32)
-    beside = points[:, 1] + (points[:, 1] - points[:, 0])[:, ::-1] * np.float32([1, -1])
+    beside = points[:, 1] + (points[:, 1] - points[:, 0])[:, ::-1] * np.array([1, -1], dtype=np.float32)
     matrix = cv2.getAffineTransform(*np.concatenate([points, beside[:, None]], axis=1))
     crop = cv2.warpAffine(picture, matrix, (int(size[0]), int(size[1])), flags=cv2.INTER_LINEAR)
     return np.asarray(crop, dtype=np.uint8)

@@ -3,6 +3,7 @@
 import json
 import re
 import shlex
+from importlib.metadata import distributions, requires
 from pathlib import Path
 
 import cv2
@@ -18,6 +19,7 @@ from shapepose_fg.detection2d.onnx_network import OnnxNetwork
 from shapepose_fg.detection2d.opening import open_network, read_form
 from shapepose_fg.detection2d.top_down import KeypointForm
 from shapepose_fg.io.calibration import write_rig
+from shapepose_fg.io.detections import read_detections
 from shapepose_fg.simulation import built_in_scene
 from tests.detection2d.conftest import node, onnx_model, rtmpose_file, yolox_file
 
@@ -188,6 +190,36 @@ def test_people_are_the_same_one_by_one_and_many_at_once(tmp_path):
     assert len(found[0].xy) > 32
     np.testing.assert_allclose(found[0].xy, found[1].xy, atol=1e-9)
     np.testing.assert_allclose(found[0].score, found[1].score, atol=1e-5)
+
+
+def test_one_opencv_is_asked_for_and_installed():
+    """Two would overwrite each other's cv2: rtmlib, which brings two more, is no dependency."""
+    asked = [re.split(r"[^\w-]", each)[0].lower() for each in requires("shapepose-fg") or ()]
+    assert [each for each in asked if "opencv" in each] == ["opencv-python-headless"] and "rtmlib" not in asked
+    installed = {each.name.lower() for each in distributions() if each.name}
+    assert {each for each in installed if each.startswith("opencv")} == {"opencv-python-headless"}
+
+
+def test_a_skeleton_of_one_s_own_goes_on_to_reconstruct(rolled_rig, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_rig(rolled_rig, "calibration.json")
+    Path("shots").mkdir()
+    for camera in rolled_rig.cameras:
+        cv2.imwrite(f"shots/{camera.name}.png", np.zeros((480, 640, 3), np.uint8))
+    Path("mine.toml").write_text(
+        'name = "mine"\nkeypoints = ["RHip", "LHip", "RKnee", "LKnee", "Neck"]\nanchor = ["RHip", "LHip"]\n'
+        'limbs = [["RHip", "RKnee"], ["LHip", "LKnee"], ["MidHip", "Neck"]]\n'
+        'mirror = [["RHip", "LHip"], ["RKnee", "LKnee"]]\n'
+    )
+    constant_file(Path("pose.onnx"), (96, 192), out=np.random.default_rng(0).uniform(1, 90, (1, 5, 3)))
+    Path("n.toml").write_text('network = "pose.onnx"\nskeleton = "mine.toml"\ndecoding = "coordinates"\n')
+    words = "detect --calibration calibration.json --images shots --network n.toml --output found"
+    with pytest.raises(SystemExit) as end:
+        main(words.split())
+    assert not end.value.code
+    assert f"--skeleton {tmp_path}/mine.toml" in capsys.readouterr().out
+    table = read_detections("found", rolled_rig, skeleton=tmp_path / "mine.toml")
+    assert table.skeleton.name == "mine" and len(table[0]) > 0
 
 
 def colours(count: int) -> np.ndarray:
