@@ -25,6 +25,8 @@ _PERSON = 0
 """The number of people among COCO's classes."""
 _MOST_PEOPLE = 200
 """Of one picture; the surest."""
+_FARTHEST = 1e6
+"""Pixels of the input: no box lies beyond."""
 _LEAST, _LEAST_SUPPRESSED = 0.7, 0.3
 """Scores over which a box counts, as in rtmlib; the second where suppression is in the network."""
 
@@ -61,16 +63,17 @@ class BoxNetwork:
         shown[:height, :width] = cv2.resize(picture, (width, height), interpolation=cv2.INTER_LINEAR)
         outputs = self.network.run(np.ascontiguousarray(shown.transpose(2, 0, 1)[None], dtype=np.float32))
         boxes, score, least = self._proposed(outputs)
-        boxes /= scale
-        sound = np.isfinite(boxes).all(axis=1) & (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
+        # What is no number is not less than this either.
+        sound = (np.abs(boxes) < _FARTHEST).all(axis=1) & (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
         there = np.flatnonzero((score > (self.form.min_score or least)) & sound)
         there = there[np.argsort(score[there])[::-1]]
+        boxes, score = boxes[there] / scale, score[there]
         if least == _LEAST:
             # Sides that count their last pixel too.
-            rectangles = np.column_stack([boxes[there, :2], boxes[there, 2:] - boxes[there, :2] + 1])
-            kept = cv2.dnn.NMSBoxes(rectangles.tolist(), score[there].tolist(), 0.0, self.form.max_overlap)
-            boxes, there = boxes.astype(np.float64), there[np.asarray(kept, dtype=np.intp)]
-        return boxes[there[:_MOST_PEOPLE]]
+            rectangles = np.column_stack([boxes[:, :2], boxes[:, 2:] - boxes[:, :2] + 1])
+            kept = cv2.dnn.NMSBoxes(rectangles.tolist(), score.tolist(), 0.0, self.form.max_overlap)
+            boxes = boxes[np.asarray(kept, dtype=np.intp)].astype(np.float64)
+        return boxes[:_MOST_PEOPLE]
 
     def _proposed(self, outputs: Sequence[Blob]) -> tuple[Blob, Blob, float]:
         """(N, 4) boxes in pixels of the input, (N,) how sure each is of a person, and the least that counts."""

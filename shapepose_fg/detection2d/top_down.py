@@ -233,7 +233,7 @@ def _decoded(network: OnnxNetwork, form: KeypointForm, blob: Blob) -> tuple[Arra
 def _peaks(maps: Array, size: Index, corners: bool) -> tuple[Array, Array]:
     """Pixels (B, N, 2) and heights (B, N) of the highest places of maps (B, N, H, W), between the cells."""
     shape = np.array(maps.shape[:1:-1])
-    flat = maps.reshape(-1, *maps.shape[2:])
+    flat = np.nan_to_num(maps, nan=0.0, posinf=0.0, neginf=0.0).reshape(-1, *maps.shape[2:])
     row, column = np.divmod(flat.reshape(len(flat), -1).argmax(axis=1), shape[0])
     padded = np.pad(flat, ((0, 0), (1, 1), (1, 1)), constant_values=-np.inf)
     cell, height = between_cells(padded, np.arange(len(flat)), row + 1, column + 1)

@@ -121,6 +121,19 @@ def test_coordinates_go_to_the_joints_that_the_file_names(tmp_path):
     assert np.flatnonzero(score[0]).tolist() == sorted([place["LHip"], place["Nose"]])
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e38])
+def test_what_is_no_number_or_no_place_is_nobody(tmp_path, value):
+    box = constant_file(tmp_path / "yolox.onnx", (208, 208), dets=np.array([[[0, 0, value, 100, 0.9]]]))
+    pose = rtmpose_file(tmp_path / "pose.onnx", 26, (96, 192), 0)
+    assert len(open_network(str(pose), str(box), Path).detect(np.zeros((208, 208, 3), np.uint8)).xy) == 0
+    flat, x, y = (np.full((1, 26, *shape), value) for shape in ((24, 12), (192,), (384,)))
+    for how, gives in ((['decoding = "heat map"'], {"maps": flat}), ([], {"simcc_x": x, "simcc_y": y})):
+        xy, score = detected(tmp_path, how, **gives)
+        assert np.isfinite(xy).all() and np.isfinite(score).all()
+        assert value == 1e38 or (score == 0).all()
+
+
 def test_a_network_of_whole_pictures_may_find_several_people(tmp_path):
     people = np.random.default_rng(2).uniform(20, 90, (1, 3, 17, 3))
     constant_file(tmp_path / "pose.onnx", (100, 200), out=people)
