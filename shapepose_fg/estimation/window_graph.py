@@ -25,6 +25,7 @@ from factors import (
     standing_factors,
     state_keys,
 )
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
@@ -55,11 +56,11 @@ class WindowGraph:
     def __init__(
         self,
         observations: Observations,
-        sigmas_px: NDArray[np.float64],
+        sigmas_px: Array,
         views: Views,
         config: EstimatorConfig,
         motion: MotionModel,
-        rows: NDArray[np.intp] | None = None,
+        rows: Index | None = None,
     ) -> None:
         """Make the factors of all observations: T rows of one person, frames rising.
 
@@ -134,7 +135,7 @@ class WindowGraph:
         return np.concatenate([self.state_keys, np.moveaxis(self._offset_keys, 0, -1)], axis=-1)
 
     @property
-    def present(self) -> NDArray[np.bool_]:
+    def present(self) -> Mask:
         """(T, J) which joints were in the last problem."""
         return self._present
 
@@ -167,24 +168,24 @@ class WindowGraph:
         return [each for each in self._tied if len(each) > 1]
 
     @property
-    def with_offsets(self) -> NDArray[np.bool_]:
+    def with_offsets(self) -> Mask:
         """(J,) joints with a factor of your own, in a window of several frames: solved with offsets throughout."""
         return self._touched if self.temporal else np.zeros_like(self._touched)
 
     @property
-    def touched(self) -> NDArray[np.bool_]:
+    def touched(self) -> Mask:
         """(J,) joints on which there is a factor of your own."""
         return self._touched
 
     def solve(
         self,
-        inlier: NDArray[np.bool_],
+        inlier: Mask,
         views: Message,
         body: Message,
-        initial: NDArray[np.float64],
-        lost: NDArray[np.bool_] | None = None,
-        standing: NDArray[np.float64] | None = None,
-    ) -> NDArray[np.float64]:
+        initial: Array,
+        lost: Mask | None = None,
+        standing: Array | None = None,
+    ) -> Array:
         """Minimise over the joints, from `initial` (T, J, 3) metres; returns (T, J, 3).
 
         `inlier` (T, J, V) are the observations that count (delta_ij of Eq. 2), `views` what they say together at
@@ -219,7 +220,7 @@ class WindowGraph:
         self._optimise()
         return self._points()[0]
 
-    def velocity(self) -> NDArray[np.float64]:
+    def velocity(self) -> Array:
         """(T, J, 3) velocities of the last solution, m/s; NaN where there are none."""
         return self._points()[1]
 
@@ -247,12 +248,12 @@ class WindowGraph:
         for factor in factors:
             push(factor)
 
-    def _seen(self, inlier: NDArray[np.bool_]) -> list[gtsam.NonlinearFactor]:
+    def _seen(self, inlier: Mask) -> list[gtsam.NonlinearFactor]:
         """The projection factors of `inlier` (T, J, V)."""
         chosen = np.flatnonzero(inlier[self._frame, self._joint, self._view])
         return [self._projections[n] for n in chosen.tolist()]
 
-    def _priors(self, body: Message, where: NDArray[np.bool_]) -> list[gtsam.NonlinearFactor]:
+    def _priors(self, body: Message, where: Mask) -> list[gtsam.NonlinearFactor]:
         """The body's pull on the joints of `where` (T, J)."""
         known = body.known & where
         share = self._motion.views.white_share if self.temporal else 1.0
@@ -261,7 +262,7 @@ class WindowGraph:
         return list(body_prior_factors(self.keys[known], body.xyz[known], symmetric))
 
     def _lasting(
-        self, said: Message, scale: float, errors: Lasting, source: int, chosen: NDArray[np.bool_]
+        self, said: Message, scale: float, errors: Lasting, source: int, chosen: Mask
     ) -> list[gtsam.NonlinearFactor]:
         """What is `said` of the joints of `chosen` (T, J), with an offset each that decays slowly."""
         known, keys = said.known & chosen, self._offset_keys[source]
@@ -274,7 +275,7 @@ class WindowGraph:
             factors += offset_factors(keys[there, joint], self.times_s[there], errors.correlation_s)
         return factors
 
-    def _motions(self, near: NDArray[np.float64], lost: NDArray[np.bool_] | None) -> list[gtsam.NonlinearFactor]:
+    def _motions(self, near: Array, lost: Mask | None) -> list[gtsam.NonlinearFactor]:
         """Motion of the joints that are in the problem; how far they may turn goes by their speed at `near`."""
         speed = speeds(near, self.times_s)
         density = self._motion.density(speed)
@@ -289,7 +290,7 @@ class WindowGraph:
             factors += law.factors(states, self.times_s, density[:, joint])
         return factors
 
-    def _start(self, initial: NDArray[np.float64], offsets: NDArray[np.bool_]) -> gtsam.Values:
+    def _start(self, initial: Array, offsets: Mask) -> gtsam.Values:
         """`initial` (T, J, 3) with its derivatives; `offsets` (2, T, J) of views and body start as they ended."""
         values = gtsam.Values()
         insert = values.insert
@@ -307,7 +308,7 @@ class WindowGraph:
             insert(key, last.atPoint3(key) if last.exists(key) else zero)
         return values
 
-    def _points(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _points(self) -> tuple[Array, Array]:
         """Positions and velocities (T, J, 3) of the last solution. Values are sorted as keys are: by joint, then
         frame.
         """

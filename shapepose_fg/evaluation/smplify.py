@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from shapepose_fg.body.fitting.energy import BodyEnergy, robust_weight
@@ -22,13 +21,12 @@ from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.rotation import log_so3
 from shapepose_fg.body.model.target_skeletons import slots
 from shapepose_fg.body.threads import torch_threads
+from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.estimation.linearisation import ObservationConfig, triangulate
 from shapepose_fg.evaluation.metrics import PlainPeople
-
-Array = NDArray[np.float64]
 
 TORSO = ("Neck", "RShoulder", "LShoulder", "MidHip", "RHip", "LHip")
 """What the root is found by."""
@@ -112,7 +110,7 @@ class MultiViewSmplify:
             free[torch.from_numpy(rows)] = solved
         return joints, self._energy.complete(free)
 
-    def _root(self, start: Array, placed: NDArray[np.bool_]) -> tuple[Tensor, Tensor]:
+    def _root(self, start: Array, placed: Mask) -> tuple[Tensor, Tensor]:
         """Rotations (B, 3, 3) and places (B, 3) of the root, by the torso's joints, or by all if these are few."""
         torso = placed & self._torso.numpy()
         used = np.where(torso.sum(axis=1, keepdims=True) >= _MIN_START_JOINTS, torso, placed)

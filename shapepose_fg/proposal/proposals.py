@@ -9,8 +9,8 @@ from typing import Annotated
 
 import numpy as np
 from annotated_types import Interval
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.bounds import Count, Metres, MetresOrNone, Settings, Share
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import Skeleton
@@ -91,12 +91,12 @@ class ProposalConfig(Settings):
 class Proposals:
     """People found in one frame, each with a candidate per joint."""
 
-    candidate: NDArray[np.intp]
+    candidate: Index
     """(P, J) index of the 3D candidate of each joint, -1 where there is none."""
-    places: NDArray[np.float64]
+    places: Array
     """(P, J, 3) where the joints are thought to be, metres: the candidates, and the middle of the hips as the root
     of a person whose root no two views saw; NaN elsewhere."""
-    score: NDArray[np.float64]
+    score: Array
     """(P,) mean confidence of the box's best candidates."""
     dropped: dict[str, int]
     """How many anchors were dropped, by reason."""
@@ -106,11 +106,7 @@ class Proposals:
 
 
 def propose(
-    candidates: Candidates,
-    detections: Detections,
-    skeleton: Skeleton,
-    up: NDArray[np.float64],
-    config: ProposalConfig,
+    candidates: Candidates, detections: Detections, skeleton: Skeleton, up: Array, config: ProposalConfig
 ) -> Proposals:
     """Find the people of a frame: anchors at the root joint, their boxes checked, their joints grown.
 
@@ -148,11 +144,11 @@ class _Search:
     links: Links
     detections: Detections
     skeleton: Skeleton
-    up: NDArray[np.float64]
+    up: Array
     config: ProposalConfig
     dropped: Counter[str]
 
-    def anchors(self, roots: NDArray[np.intp], taken: NDArray[np.intp]) -> NDArray[np.intp]:
+    def anchors(self, roots: Index, taken: Index) -> Index:
         """The root candidates `roots` whose box holds enough confident parts and that stand apart, best first."""
         parts, score = self.boxes(roots)
         enough = parts >= self.config.min_parts
@@ -166,7 +162,7 @@ class _Search:
         self.dropped["low confidence"] += int((enough & ~confident).sum())
         return kept
 
-    def boxes(self, roots: NDArray[np.intp]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def boxes(self, roots: Index) -> tuple[Array, Array]:
         """Fraction (H,) of the core parts in the box around each root, and mean confidence (H,) of the best."""
         candidates, config = self.candidates, self.config
         offset = candidates.xyz[None] - candidates.xyz[roots, None]
@@ -180,7 +176,7 @@ class _Search:
         core = best[:, self.skeleton.core]
         return (core > 0).mean(axis=1), core.sum(axis=1) / np.maximum((core > 0).sum(axis=1), 1)
 
-    def linked(self, anchors: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    def linked(self, anchors: Index) -> tuple[Index, Index]:
         """The anchors that enough strong joints are linked to, and what each chose (P, J)."""
         chosen = grow(anchors, self.candidates, self.links, self.skeleton, self.config.growth)
         core = chosen[:, self.skeleton.core]
@@ -195,7 +191,7 @@ class _Search:
         kept = anchors[linked & ~half]
         return kept, grow(kept, self.candidates, self.links, self.skeleton, self.config.growth)
 
-    def _halves(self, anchors: NDArray[np.intp], strong: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def _halves(self, anchors: Index, strong: Mask) -> Mask:
         """(P,) who has what somebody beside them lacks, and nearly nothing else: legs without trunk and arms, say.
 
         `strong` (P, K) tells who has a strong candidate for which core joint. Two real people have both.
@@ -206,7 +202,7 @@ class _Search:
         shared = strong.astype(np.intp) @ strong.T
         return (near & lesser(count) & (shared <= self.config.split_shared)).any(axis=1)
 
-    def unclaimed(self, chosen: NDArray[np.intp]) -> NDArray[np.bool_] | None:
+    def unclaimed(self, chosen: Index) -> Mask | None:
         """(C,) the candidates that nobody chose, if there are strong ones of enough joints to be a person.
 
         A candidate needs `_OWN_DETECTIONS`: others made what somebody chose.
@@ -221,19 +217,19 @@ class _Search:
         )
         return free if enough else None
 
-    def among(self, free: NDArray[np.bool_]) -> "_Search":
+    def among(self, free: Mask) -> "_Search":
         """The same search among some candidates only; what it drops is not counted."""
         both = free[self.links.ends].all(axis=1)
         links = Links(self.links.ends[both], self.links.score[both])
         hidden = replace(self.candidates, joint=np.where(free, self.candidates.joint, -1))
         return replace(self, candidates=hidden, links=links, dropped=Counter())
 
-    def people(self, taken: NDArray[np.intp]) -> NDArray[np.intp]:
+    def people(self, taken: Index) -> Index:
         """Anchors, strong or weak, of people beside those `taken`."""
         roots = np.flatnonzero(self.candidates.joint == self.skeleton.root)
         return self.linked(self.anchors(roots, taken))[0]
 
-    def with_middles(self, free: NDArray[np.bool_]) -> "_Search":
+    def with_middles(self, free: Mask) -> "_Search":
         """Add root candidates where nobody saw one: in the middle of two free hips, linked to both."""
         candidates, count = self.candidates, len(self.candidates)
         right, left = self.skeleton.hips
@@ -265,12 +261,8 @@ class _Search:
 
 
 def _apart(
-    anchors: NDArray[np.intp],
-    taken: NDArray[np.intp],
-    candidates: Candidates,
-    detections: Detections,
-    config: ProposalConfig,
-) -> NDArray[np.intp]:
+    anchors: Index, taken: Index, candidates: Candidates, detections: Detections, config: ProposalConfig
+) -> Index:
     """Non-maximum suppression: `anchors` that stand apart from better ones and from `taken`, best first.
 
     A detection counts for one anchor only: what is left of a candidate without those that made better anchors

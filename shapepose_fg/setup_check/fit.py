@@ -5,15 +5,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
 from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Sightings, distances, same_frame
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 PARAMETERS = ("turn x", "turn y", "turn z", "move x", "move y", "move z", "centre x", "centre y", "focal")
 """Of a camera: a turn about its own axes (rad) where it stands, a move along them (unit of the calibration), the

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Mask, Whole
 from shapepose_fg.core.reconstruction import MOST_NUMBER, Reconstruction
 
 Solve = Callable[[Reconstruction], Reconstruction]
@@ -79,7 +79,7 @@ class Edited:
         return {person: range(int(rows.min()), int(rows.max()) + 1) for person, rows in frames.items()}
 
 
-def free_number(person: NDArray[np.integer]) -> int:
+def free_number(person: Whole) -> int:
     """The number that a new identity gets, where these are the rows' (N,)."""
     return int(person.max(initial=-1)) + 1
 
@@ -150,7 +150,7 @@ def in_order(people: Reconstruction) -> Reconstruction:
     return people.rows(np.lexsort((people.person, people.frame)))
 
 
-Rows = NDArray[np.bool_]
+Rows = Mask
 """(N,) some rows of a result."""
 
 

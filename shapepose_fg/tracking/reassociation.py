@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.priors import longest_bones
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.detections import Input
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
@@ -35,8 +35,8 @@ class Survival:
 def reassociate(
     given: Sequence[Input],
     rows: Observations,
-    joints: NDArray[np.float64],
-    covariance: NDArray[np.float64],
+    joints: Array,
+    covariance: Array,
     skeleton: Skeleton,
     survival: Survival | None = None,
 ) -> Observations:
@@ -73,25 +73,19 @@ def changed(before: Observations, now: Observations) -> float:
     return float((before.candidate != now.candidate)[seen].sum() / max(seen.sum(), 1))
 
 
-def _given_out(
-    frame: Input, joints: NDArray[np.float64], sigma_m: NDArray[np.float64], skeleton: Skeleton
-) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+def _given_out(frame: Input, joints: Array, sigma_m: Array, skeleton: Skeleton) -> tuple[Index, Array]:
     """(P, J, V) the detections of one frame's people, and how probably they are theirs."""
     predicted = Predicted(joints, sigma_m, lost=~np.isfinite(sigma_m))
     return assign_with_probability(predicted, frame.detections, frame.rig, skeleton)
 
 
-def _existence(
-    frame: Input, candidate: NDArray[np.intp], joints: NDArray[np.float64], skeleton: Skeleton
-) -> NDArray[np.float64]:
+def _existence(frame: Input, candidate: Index, joints: Array, skeleton: Skeleton) -> Array:
     """(P,) how probable each person of a frame is."""
     there = Frame(frame.detections, frame.rig, skeleton, longest_bones(skeleton))
     return existence(PossiblePeople(joints, candidate, gaps(joints, candidate, there)), there, PRIOR_WITH_BODY)
 
 
-def _gone(
-    sure: NDArray[np.float64], joints: NDArray[np.float64], skeleton: Skeleton, survival: Survival
-) -> NDArray[np.bool_]:
+def _gone(sure: Array, joints: Array, skeleton: Skeleton, survival: Survival) -> Mask:
     """(P,) who is not probable enough, the least probable of them, or is a double of one who is more probable."""
     doubles = ((core_distance(joints, joints, skeleton) < survival.double_m) & lesser(sure)).any(axis=1)
     # What one leaves may be what another lacks.
