@@ -5,16 +5,13 @@ Stage I (d) and the first half of (e) of the paper (section 3.1, "Human Proposal
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
-from typing import Annotated
 
 import numpy as np
-from annotated_types import Interval
 
 from shapepose_fg.core.arrays import Array, Index, Mask
-from shapepose_fg.core.bounds import Count, Metres, MetresOrNone, Settings, Share
+from shapepose_fg.core.bounds import Count, Metres, Settings, Share
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.proposal.assignment import lesser
 from shapepose_fg.proposal.candidates import Candidates
 from shapepose_fg.proposal.growth import GrowthConfig, Links, grow, link
 
@@ -48,11 +45,6 @@ class ProposalConfig(Settings):
     separation_m: Metres = 0.2
     """Non-maximum suppression: of two anchors closer than this the better one stays. A pelvis is about 20 cm
     deep and 30 cm wide: the middles of two are not closer even when people hug."""
-    split_m: MetresOrNone = 0.4
-    """Two anchors nearer than this, with hardly a joint that both have, are one person's trunk and legs. 0: none
-    are, as in the paper."""
-    split_shared: Annotated[int, Interval(ge=0, le=1000)] = 2
-    """Core joints that the two may both have."""
     min_grown_parts: Share = 0.4
     """Least fraction of the core joints that must have a strong candidate linked to the hip: one whose upper body
     alone shows has 0.6. On simulated people in close motion real ones have over 0.47, and most phantoms, whose
@@ -81,7 +73,6 @@ class ProposalConfig(Settings):
             min_parts=0.9,
             min_grown_parts=0.0,
             min_observed_parts=0.0,
-            split_m=0.0,
             weak_anchors=False,
             growth=GrowthConfig(bridge_m=0.0),
         )
@@ -182,25 +173,12 @@ class _Search:
         core = chosen[:, self.skeleton.core]
         strong = (core >= 0) & self.candidates.strong[core]
         linked = strong.mean(axis=1) >= self.config.min_grown_parts
-        half = linked & self._halves(anchors, strong & linked[:, None])
-        if linked.all() and not half.any():
+        if linked.all():
             return anchors, chosen
         self.dropped["too few joints linked to the hip"] += int((~linked).sum())
-        self.dropped["the other half of a person"] += int(half.sum())
         # What the dropped had taken goes back to those whom it belongs to.
-        kept = anchors[linked & ~half]
+        kept = anchors[linked]
         return kept, grow(kept, self.candidates, self.links, self.skeleton, self.config.growth)
-
-    def _halves(self, anchors: Index, strong: Mask) -> Mask:
-        """(P,) who has what somebody beside them lacks, and nearly nothing else: legs without trunk and arms, say.
-
-        `strong` (P, K) tells who has a strong candidate for which core joint. Two real people have both.
-        """
-        hips = self.candidates.xyz[anchors]
-        near = np.linalg.norm(hips[:, None] - hips[None], axis=-1) < self.config.split_m
-        count = strong.sum(axis=1)
-        shared = strong.astype(np.intp) @ strong.T
-        return (near & lesser(count) & (shared <= self.config.split_shared)).any(axis=1)
 
     def unclaimed(self, chosen: Index) -> Mask | None:
         """(C,) the candidates that nobody chose, if there are strong ones of enough joints to be a person.

@@ -10,11 +10,11 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.frame_times import spans_of
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.evaluation.spoiled_setups import turned, zoomed
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.write_detections import write_openpose
 from shapepose_fg.setup_check.findings import Finding, Kind, sentence
 from shapepose_fg.setup_check.report import Distances, camera_use, check_setup
+from tests.setup_check.spoiled_setups import turned, zoomed
 
 
 @pytest.fixture(scope="module")
