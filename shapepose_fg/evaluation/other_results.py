@@ -14,6 +14,7 @@ from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25, MID_HIP
 from shapepose_fg.core.storage.files import open_regular, read_text
 from shapepose_fg.evaluation.metrics import PlainPeople
+from shapepose_fg.io.calibration.written import METRES
 from shapepose_fg.io.export.take import opensim_axes
 
 SHELF_JOINTS = tuple(
@@ -33,8 +34,6 @@ _MAX_PEOPLE, _MAX_FRAMES, _MAX_JOINTS = 1000, 10**7, 1000
 """Counts beyond these are none."""
 _FAR_M = 1e5
 """Nobody is so far from the origin of a room, metres: another unit, or a damaged file."""
-_METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
-"""What a unit of a TRC file's header is."""
 _MIDDLES = ("CHip", "Hip")
 """What Pose2Sim calls the middle of the hips."""
 _FILTERED = "_filt_"
@@ -242,7 +241,7 @@ def read_trc(path: Path, up: Axis = "z") -> PlainPeople:
     for heading in ("nummarkers", "units"):
         if heading not in header:
             refuse(3, f"has no value for {heading}")
-    if header["units"].lower() not in _METRES:
+    if header["units"].lower() not in METRES:
         refuse(3, f"has the unit {header['units'][:20]!r}; it must be m, cm or mm")
     count, names = header["nummarkers"], [cell.strip() for cell in lines[3][2:] if cell.strip()]
     if not count.isdecimal() or not 0 < int(count[:9]) <= _MAX_JOINTS:
@@ -265,7 +264,7 @@ def read_trc(path: Path, up: Axis = "z") -> PlainPeople:
             refuse(place, f"holds more than {len(names)} markers")
         rows.append(row[:width])
     table = np.array(rows, dtype=np.float64).reshape(len(rows), width)
-    xyz = _METRES[header["units"].lower()] * table[:, 2:].reshape(len(rows), len(names), 3)
+    xyz = METRES[header["units"].lower()] * table[:, 2:].reshape(len(rows), len(names), 3)
     # A marker of which one coordinate is missing is missing.
     xyz = np.where(np.isfinite(xyz).all(axis=-1, keepdims=True), xyz, np.nan) @ opensim_axes(up)
     frame, named = table[:, 0].astype(np.int64), tuple(MID_HIP if name in _MIDDLES else name for name in names)

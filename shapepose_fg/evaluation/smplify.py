@@ -17,7 +17,6 @@ from shapepose_fg.body.fitting.energy import BodyEnergy, robust_weight
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
-from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.rotation import log_so3
 from shapepose_fg.body.model.target_skeletons import slots
 from shapepose_fg.body.threads import torch_threads
@@ -27,6 +26,7 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.estimation.linearisation import ObservationConfig, triangulate
 from shapepose_fg.evaluation.metrics import PlainPeople
+from shapepose_fg.evaluation.tracking import detector_s_body
 
 TORSO = ("Neck", "RShoulder", "LShoulder", "MidHip", "RHip", "LHip")
 """What the root is found by."""
@@ -63,10 +63,8 @@ def smpl_only(people: Reconstruction, rig: Rig, config: ObservationConfig) -> Sm
     if people.observations is None:
         raise ValueError("people without observations: reconstruct them again")
     observations = people.observations.observations(np.full_like(people.joints, np.nan), people.time_s)
-    offsets, model = people.run.get("keypoint_offsets"), BodyModel.default()
-    if offsets is not None:
-        model = model.with_keypoint_offsets(KeypointOffsets.from_dict(offsets))
-    start, fitter = triangulate(observations, Views.of(rig), config), MultiViewSmplify(model)
+    start = triangulate(observations, Views.of(rig), config)
+    fitter = MultiViewSmplify(detector_s_body(people))
     with torch_threads(1):
         began = time.process_time()
         joints, _ = fitter.fit(observations, rig, start)

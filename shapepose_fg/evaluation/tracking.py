@@ -196,13 +196,17 @@ def identity_metrics(
 
 def body_joints(people: Reconstruction) -> Array:
     """(N, J, 3) joints of the fitted bodies, with the offsets that the run learnt; NaN where there is no body."""
-    model, offsets = BodyModel.default(), people.run.get("keypoint_offsets")
-    if offsets is not None:
-        model = model.with_keypoint_offsets(KeypointOffsets.from_dict(offsets))
+    model = detector_s_body(people)
     columns = (people.betas, people.global_orient, people.body_pose, people.transl)
     with torch.no_grad():
         bodies = BodyParameters(*(torch.from_numpy(column).to(model.dtype) for column in columns))
         return model.keypoints(bodies).double().numpy()
+
+
+def detector_s_body(people: Reconstruction) -> BodyModel:
+    """The open body, its joints where the run has learnt that the detector puts them."""
+    model, offsets = BodyModel.default(), people.run.get("keypoint_offsets")
+    return model if offsets is None else model.with_keypoint_offsets(KeypointOffsets.from_dict(offsets))
 
 
 def views_used(people: Reconstruction) -> Index:

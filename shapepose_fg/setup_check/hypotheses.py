@@ -142,8 +142,8 @@ _MISREAD: dict[Kind, Callable[[Array, Array], tuple[Array, Array]]] = {
 _FITTED: tuple[tuple[Kind, Fit, list[int]], ...] = (
     (Kind.TURNED, fit.turned_to, TURN),
     (Kind.MOVED, fit.posed_to, POSE),
-    (Kind.FOCAL, fit.zoomed_to, FOCAL),
-    (Kind.RESIZED, fit.resized_to, []),
+    (Kind.FOCAL, lambda points, xy, camera: fit.scaled_to(points, xy, camera, camera.K[:2, 2]), FOCAL),
+    (Kind.RESIZED, lambda points, xy, camera: fit.scaled_to(points, xy, camera, fit.CORNER), []),
 )
 """What is fitted of one camera: to one person exactly, then its parameters (`fit.PARAMETERS`) to all."""
 _FACTORS = (0.25, 1 / 3, 0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0, 3.0, 4.0)
@@ -228,9 +228,8 @@ def _of_one(look: Look, view: int, rng: np.random.Generator) -> Iterator[Change]
         best = fit.refined(others, seen, best, columns) if columns else best
         turn, moved = fit.difference(camera.cTw, best.cTw)
         size = float(best.K[0, 0] / camera.K[0, 0])
-        amount = {Kind.FOCAL: 1 / size, Kind.RESIZED: size}.get(
-            kind, turn
-        )  # what the calibration has over what fits
+        # What the calibration has over what fits.
+        amount = {Kind.FOCAL: 1 / size, Kind.RESIZED: size}.get(kind, turn)
         finding = Finding(Kind.TURNED if turn > _PLAIN_TURN_DEG else kind, (view,), amount, moved=moved)
         score = match(others, seen, best).score
         yield Change(finding, look.with_cameras({view: best}), score, max(len(columns), 1))

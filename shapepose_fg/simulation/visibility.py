@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.core.arrays import Array, Index, Mask, Real, Whole
+from shapepose_fg.core.arrays import Array, Index, Mask, Real
 from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.drawing import thinned
 from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 from shapepose_fg.pipeline.workers import Workers
 from shapepose_fg.viz.rendering import first_surface_at, scaled
@@ -83,10 +84,11 @@ class Skin:
     @classmethod
     def of(cls, body: "BodyModel", cell_m: float) -> "Skin":
         """The surface of `body`, with vertices merged that are within a cube of `cell_m` in the mean T-pose."""
-        vertices, faces, cell = coarsen(body.arrays.template, body.faces, cell_m)
+        template = body.arrays.template
+        vertices, faces, cell = thinned(template, body.faces, cell_m, template.min(axis=0))
         shown = body.arrays.weights @ _bones_near(body.parents).T
         mean = np.stack([np.bincount(cell, share) for share in shown.T], axis=1) / np.bincount(cell)[:, None]
-        return cls(vertices, faces.astype(np.int32), mean >= 0.5)
+        return cls(vertices, faces, mean >= 0.5)
 
 
 def see(rig: Rig, joints: Array, surfaces: Real, skin: Skin, config: VisibilityConfig) -> Visibility:
@@ -184,28 +186,3 @@ def _bones_near(parents: tuple[int, ...]) -> Array:
     adjacent[child, parent] = adjacent[parent, child] = 1
     own = np.array([[name in names.split("+") for name in SMPL_24] for names in _BONES], dtype=np.float64)
     return np.minimum(own @ adjacent, 1.0)
-
-
-def coarsen(vertices: Real, faces: Whole, cell_m: float) -> tuple[Index, Index, Index]:
-    """Fewer triangles over some of the vertices (N, 3): one vertex per cube of `cell_m`.
-
-    Returns the indices (M,) of the vertices that stay, faces (G, 3) over those, and the cube (N,) of each
-    vertex, from 0 to M - 1. A cube keeps the vertex nearest to its vertices' mean; triangles that collapse
-    or come twice go.
-    """
-    if cell_m <= 0:
-        every = np.arange(len(vertices))
-        return every, np.asarray(faces, dtype=np.intp), every
-    cells = np.floor((vertices - vertices.min(axis=0)) / cell_m).astype(np.int64)
-    _, cell = np.unique(cells, axis=0, return_inverse=True)
-    cell = cell.ravel()
-    size = np.bincount(cell)
-    mean = np.stack([np.bincount(cell, vertices[:, axis]) / size for axis in range(3)], axis=1)
-    order = np.lexsort((np.linalg.norm(vertices - mean[cell], axis=1), cell))
-    chosen = order[np.concatenate([[0], np.cumsum(size)[:-1]])]  # the first of each cell
-    small = cell[faces]
-    distinct = (small[:, 0] != small[:, 1]) & (small[:, 1] != small[:, 2]) & (small[:, 2] != small[:, 0])
-    small = small[distinct]
-    # Turn each triangle to begin with its smallest index: copies are equal and keep their winding.
-    turn = (small.argmin(axis=1)[:, None] + np.arange(3)) % 3
-    return chosen, np.unique(np.take_along_axis(small, turn, axis=1), axis=0), cell
