@@ -99,7 +99,7 @@ class MultiViewSmplify:
         free = torch.full((N, self._energy.num_free), torch.nan)
         if len(rows) > 0:
             rotation, pelvis = self._root(start[rows], placed[rows])
-            views = _ViewTargets.of(observations.rows(rows), rig, pelvis.numpy(), _SIGMA_M)
+            views = ViewTargets.of(observations.rows(rows), rig, pelvis.numpy(), _SIGMA_M)
             solved = self._solve(rotation, views)
             joints[rows] = (
                 self.model.keypoints(self._energy.complete(solved)).double().numpy() + pelvis.numpy()[:, None]
@@ -118,7 +118,7 @@ class MultiViewSmplify:
         xyz = torch.from_numpy(np.where(used[..., None], start, centre))
         return self._frame.place(xyz, torch.from_numpy(variance), self._slots)
 
-    def _solve(self, rotation: Tensor, views: "_ViewTargets") -> Tensor:
+    def _solve(self, rotation: Tensor, views: "ViewTargets") -> Tensor:
         """Free parameters (B, P) around the root's start: all steps of Adam (Kingma and Ba 2015)."""
         energy, B = self._energy, len(rotation)
         angles = self._mean_angles.expand(B, -1)
@@ -147,7 +147,7 @@ class MultiViewSmplify:
 
 
 @dataclass(frozen=True)
-class _ViewTargets:
+class ViewTargets:
     """The detections of B rows as lengths at each row's depth, around each row's own origin."""
 
     cTw: Tensor
@@ -162,7 +162,7 @@ class _ViewTargets:
     """(B, V) depth of the origin over sigma: from normalised coordinates to sigmas."""
 
     @classmethod
-    def of(cls, observations: Observations, rig: Rig, origin: Array, sigma_m: float) -> "_ViewTargets":
+    def of(cls, observations: Observations, rig: Rig, origin: Array, sigma_m: float) -> "ViewTargets":
         """The detections of B rows, with `origin` (B, 3) in the world."""
         B, J, V = observations.confidence.shape
         view = np.tile(np.arange(V), B * J)

@@ -39,7 +39,7 @@ def associate(
     joint seen by two views are dropped, and what they took is reassigned; the second value is their number.
     """
     claims = _claims(proposals.places, detections, rig, skeleton)
-    owns = _by_support(proposals, candidates, len(detections))
+    owns = by_support(proposals, candidates, len(detections))
     real = np.ones(len(proposals), dtype=bool)
     chosen = np.full((*proposals.candidate.shape, len(rig)), -1, dtype=np.intp)
     rounds = 1 + _PASSES
@@ -75,7 +75,7 @@ def seen_twice(seen: Mask, skeleton: Skeleton) -> Mask:
     return (seen.sum(axis=2) >= 2)[:, list(skeleton.core)]
 
 
-def _by_support(proposals: Proposals, candidates: Candidates, count: int) -> Mask:
+def by_support(proposals: Proposals, candidates: Candidates, count: int) -> Mask:
     """(P, D) whether a detection supports one of the person's candidates."""
     has = np.zeros((len(proposals), len(candidates) + 1), dtype=bool)
     np.put_along_axis(has, proposals.candidate, True, axis=1)  # -1 marks the spare last column

@@ -144,7 +144,7 @@ def vote(points: PairPoints, detections: Detections, views: int, config: Candida
     if len(points.xyz) == 0:
         none = np.zeros(0, dtype=np.intp)
         return Candidates(np.zeros((0, 3)), none, np.zeros(0), none, none > 0, np.zeros((0, 2), dtype=np.intp))
-    seed = _greedy_seeds(points, config.vote_radius_m)
+    seed = greedy_seeds(points, config.vote_radius_m)
     _, cluster = np.unique(seed, return_inverse=True)
     count = cluster.max() + 1
     votes = np.bincount(cluster, minlength=count)
@@ -236,7 +236,7 @@ _POINTS_AT_ONCE = 4096
 """Points whose neighbours among each other are looked up at once: before 30 cameras a joint has 400 of them."""
 
 
-def _greedy_seeds(points: PairPoints, radius_m: float) -> Index:
+def greedy_seeds(points: PairPoints, radius_m: float) -> Index:
     """The seed (M,) whose cluster each point joins, as if points were picked one by one by confidence.
 
     The most confident points are clustered first; what lies near their seeds is theirs, and the rest goes on.

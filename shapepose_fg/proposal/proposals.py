@@ -105,7 +105,7 @@ def propose(
     saw: weak root candidates anchor them, and in the end the middles between two hips. `up` is the (3,) unit
     vector that points up. Two people do not share a candidate.
     """
-    search = _Search(
+    search = Search(
         candidates, link(candidates, detections, config.growth), detections, skeleton, up, config, Counter()
     )
     roots = candidates.joint == skeleton.root
@@ -128,7 +128,7 @@ def propose(
 
 
 @dataclass(frozen=True)
-class _Search:
+class Search:
     """The search for people in one frame."""
 
     candidates: Candidates
@@ -145,7 +145,7 @@ class _Search:
         enough = parts >= self.config.min_parts
         confident = score >= self.config.min_confidence
         anchors = roots[enough & confident]
-        kept = _apart(anchors, taken, self.candidates, self.detections, self.config)
+        kept = standing_apart(anchors, taken, self.candidates, self.detections, self.config)
         self.dropped["hip seen as a better one's"] += len(anchors) - len(kept)
         self.dropped["more people than are looked for"] += max(0, len(kept) - self.config.most_people)
         kept = kept[: self.config.most_people]
@@ -195,7 +195,7 @@ class _Search:
         )
         return free if enough else None
 
-    def among(self, free: Mask) -> "_Search":
+    def among(self, free: Mask) -> "Search":
         """The same search among some candidates only; what it drops is not counted."""
         both = free[self.links.ends].all(axis=1)
         links = Links(self.links.ends[both], self.links.score[both])
@@ -207,7 +207,7 @@ class _Search:
         roots = np.flatnonzero(self.candidates.joint == self.skeleton.root)
         return self.linked(self.anchors(roots, taken))[0]
 
-    def with_middles(self, free: Mask) -> "_Search":
+    def with_middles(self, free: Mask) -> "Search":
         """Add root candidates where nobody saw one: in the middle of two free hips, linked to both."""
         candidates, count = self.candidates, len(self.candidates)
         right, left = self.skeleton.hips
@@ -238,7 +238,7 @@ class _Search:
         return replace(self, candidates=more, links=links)
 
 
-def _apart(
+def standing_apart(
     anchors: Index, taken: Index, candidates: Candidates, detections: Detections, config: ProposalConfig
 ) -> Index:
     """Non-maximum suppression: `anchors` that stand apart from better ones and from `taken`, best first.

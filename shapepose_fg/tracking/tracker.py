@@ -143,14 +143,14 @@ class Tracker:
         each track (A, J, V), -1 for none. No track ends here.
         """
         before = tracks.joints.across_m
-        joints = self._predict(tracks.joints, time_s - tracks.time_s) if len(tracks) > 0 else tracks.joints
+        joints = self.predict(tracks.joints, time_s - tracks.time_s) if len(tracks) > 0 else tracks.joints
         lost = (joints.across_m > _LOST_M) & (before > _TRUSTED_M)
         lost &= ~lost[:, list(self.skeleton.core)].all(axis=1, keepdims=True)  # beside whom would they be sought?
-        joints = self._beside_neighbours(joints, lost)
+        joints = self.beside_neighbours(joints, lost)
         predicted = Predicted(joints.position, joints.sigma_m, lost, tracks.world)
         candidate = assign(predicted, detections, rig, self.skeleton)
         joints, candidate = self._measure(joints, lost, candidate, detections, rig)
-        evident_s = np.where(self._evident(candidate), time_s, tracks.evident_s)
+        evident_s = np.where(self.evident(candidate), time_s, tracks.evident_s)
         return replace(tracks, time_s=time_s, joints=joints, evident_s=evident_s), candidate
 
     def alive(self, tracks: Tracks) -> Mask:
@@ -175,20 +175,20 @@ class Tracker:
         free = np.ones(len(detections), dtype=bool)
         free[candidate[candidate >= 0]] = False
         for find in self.find:
-            if not self._enough(detections, free):
+            if not self.enough(detections, free):
                 break
             rest = np.flatnonzero(free)
             people = find(detections.only(free), rig)
             own = np.where(people.candidate >= 0, np.append(rest, -1)[people.candidate], -1)
             new = (own >= 0).sum(axis=2)[:, core] >= 2
-            new = (new.sum(axis=1) >= self.config.min_new_joints) & _apart(people.initial, there)
+            new = (new.sum(axis=1) >= self.config.min_new_joints) & standing_apart(people.initial, there)
             found.append(people.initial[new])
             theirs.append(own[new])
             there = np.concatenate([there, people.initial[new]])
             free[own[new][own[new] >= 0]] = False
         return np.concatenate(found), np.concatenate(theirs)
 
-    def _predict(self, joints: JointStates, step_s: float) -> JointStates:
+    def predict(self, joints: JointStates, step_s: float) -> JointStates:
         """Joints `step_s` later; an unseen joint comes to move as the person does, straight on."""
         core = list(self.skeleton.core)
         certainty = 1 / joints.sigma_m[:, core, None] ** 2
@@ -201,7 +201,7 @@ class Tracker:
         joints = joints.with_derivatives(np.where(unseen, following, joints.velocity), fading)
         return joints.predicted(step_s, self.scale.motion, self.scale.density)
 
-    def _beside_neighbours(self, joints: JointStates, lost: Mask) -> JointStates:
+    def beside_neighbours(self, joints: JointStates, lost: Mask) -> JointStates:
         """Lost joints are put where their parents are, known to a bone's length; a lost root between its hips."""
         if not lost.any():
             return joints
@@ -247,13 +247,13 @@ class Tracker:
         measured = measured.replaced(torn, doubted)
         return measured, np.where(inlier & ~torn[..., None], candidate, -1)
 
-    def _evident(self, candidate: Index) -> Mask:
+    def evident(self, candidate: Index) -> Mask:
         """(A,) whether enough core joints are seen by two views, or by one."""
         seen = candidate >= 0
         in_a_view = seen[:, list(self.skeleton.core)].sum(axis=1).max(axis=1, initial=0)
         return (seen_twice(seen, self.skeleton).sum(axis=1) >= _MIN_SEEN_TWICE) | (in_a_view >= _MIN_IN_A_VIEW)
 
-    def _enough(self, detections: Detections, free: Mask) -> bool:
+    def enough(self, detections: Detections, free: Mask) -> bool:
         """Whether the free detections can be a person: enough core joints, each in two views."""
         core = np.zeros(len(self.skeleton), dtype=bool)
         core[list(self.skeleton.core)] = True
@@ -264,7 +264,7 @@ class Tracker:
         return int(twice.sum()) >= self.config.min_new_joints
 
 
-def _apart(places: Array, others: Array) -> Mask:
+def standing_apart(places: Array, others: Array) -> Mask:
     """(P,) people at `places` (P, J, 3) who stand apart from all `others` (A, J, 3); NaN joints count nothing."""
     distance = np.linalg.norm(places[:, None] - others[None], axis=-1)
     known = np.isfinite(distance)

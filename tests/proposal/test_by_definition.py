@@ -15,7 +15,7 @@ from shapepose_fg.core.skeleton import BODY_25, Skeleton
 from shapepose_fg.proposal.candidates import CandidateConfig, Candidates, PairPoints, triangulate_pairs, vote
 from shapepose_fg.proposal.claims import LEAST_AFFINITY, Claims, mean_affinity
 from shapepose_fg.proposal.growth import GrowthConfig, Links, grow, link
-from shapepose_fg.proposal.proposals import ProposalConfig, _apart, _Search
+from shapepose_fg.proposal.proposals import ProposalConfig, Search, standing_apart
 
 CONFIG = CandidateConfig()
 GATE_M, ANGLE_DEG, RHO_M = 0.07, 3.0, 0.12
@@ -337,17 +337,17 @@ def test_anchors_stand_apart_in_space_and_by_their_detections(candidates, crowde
     hips = np.flatnonzero(candidates.joint == BODY_25.root)
     assert len(hips) > 6
     expected = apart(hips.tolist(), [], candidates, crowded, stated)
-    assert _apart(hips, hips[:0], candidates, crowded, config).tolist() == expected
+    assert standing_apart(hips, hips[:0], candidates, crowded, config).tolist() == expected
     taken = expected[1:2]
     others = [n for n in hips.tolist() if n not in taken]
     beside = apart(others, taken, candidates, crowded, stated)
-    assert _apart(np.array(others), np.array(taken), candidates, crowded, config).tolist() == beside
+    assert standing_apart(np.array(others), np.array(taken), candidates, crowded, config).tolist() == beside
     assert 1 <= len(expected) < len(hips)
 
 
-def search(candidates: Candidates, links: Links, crowded, **settings) -> _Search:
+def search(candidates: Candidates, links: Links, crowded, **settings) -> Search:
     up = np.array([0.0, 0.0, 1.0])
-    return _Search(candidates, links, crowded, BODY_25, up, ProposalConfig(**settings), Counter())
+    return Search(candidates, links, crowded, BODY_25, up, ProposalConfig(**settings), Counter())
 
 
 @pytest.mark.parametrize("settings", [{}, {"box_horizontal_m": 0.3, "box_vertical_m": 0.5}])

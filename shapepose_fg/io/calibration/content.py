@@ -140,6 +140,10 @@ class _Loader(_Safe):
     """A safe loader that knows OpenCV's matrices, and numbers as Python prints them (1e-05)."""
 
 
+def _array_of_yaml(loader: Any, node: yaml.Node) -> Any:
+    return _array(loader.construct_mapping(node, deep=True))
+
+
 def _short_number(loader: Any, node: yaml.ScalarNode) -> Any:
     if len(node.value) > _MOST_DIGITS:
         raise yaml.constructor.ConstructorError(problem="a number is too long", problem_mark=node.start_mark)
@@ -155,9 +159,7 @@ def _unique_keys(loader: Any, node: yaml.MappingNode) -> Iterator[dict[Any, Any]
 
 
 for _tag in _ARRAY_TAGS:
-    _Loader.add_constructor(
-        f"tag:yaml.org,2002:{_tag}", lambda loader, node: _array(loader.construct_mapping(node, deep=True))
-    )
+    _Loader.add_constructor(f"tag:yaml.org,2002:{_tag}", _array_of_yaml)
 for _tag in ("int", "float"):
     _Loader.add_constructor(f"tag:yaml.org,2002:{_tag}", _short_number)
 _Loader.add_constructor("tag:yaml.org,2002:map", _unique_keys)
