@@ -28,10 +28,11 @@ class BodyConfig(Settings):
     """How bodies are fitted."""
 
     method: str = "auto"
-    """"learned": learned gradient descent; "plain": Levenberg-Marquardt; "auto": learned where the weights are for
-    the body at hand, plain on any other body."""
+    """"learned": learned gradient descent; "plain": Levenberg-Marquardt; "auto": learned where there are weights
+    for the body at hand, plain on any other body."""
     weights: str = ""
-    """File of the network's weights (scripts/train_fitter.py); empty: those that come with the package."""
+    """File of the network's weights; empty: those that come with the package, or that `shapepose-fg train-fitter`
+    made for another body."""
     model_sigma_m: Metres = 0.02
     """How far the detector's joints lie from the body's, metres: added to every target's covariance."""
     kernel_scale: Factor = 6.0
@@ -121,6 +122,11 @@ class JointTargets(Rows):
             raise ValueError(f"information must be {(*xyz.shape, 3)} like xyz, got {information.shape}")
         object.__setattr__(self, "xyz", xyz)
         object.__setattr__(self, "information", information)
+
+    def larger(self, size: NDArray[np.float64]) -> "JointTargets":
+        """The same people `size` (B,) times as large, in a world that is."""
+        size = size[:, None, None]
+        return JointTargets(self.xyz * size, self.information / size[..., None] ** 2)
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,7 @@ from shapepose_fg.body.fitting.posterior import (
     shared,
 )
 from shapepose_fg.body.fitting.priors import PosePrior
+from shapepose_fg.body.fitting.sizes import Sizes
 from shapepose_fg.body.fitting.weights import FitterWeights, fingerprint
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
@@ -62,7 +63,7 @@ def make_fitter(
     model = BodyModel.default() if model is None else model
     if config.method == "plain":
         return SmplFitter(model, config=config, law=law)
-    weights = FitterWeights.load(Path(config.weights)) if config.weights else FitterWeights.default()
+    weights = FitterWeights.load(Path(config.weights)) if config.weights else FitterWeights.of(model)
     if config.method == "auto" and not config.weights and fingerprint(model) != weights.body:
         return SmplFitter(model, config=config, law=law)
     return SmplFitter(model, config=config, weights=weights, law=law)
@@ -140,9 +141,22 @@ class SmplFitter(BodyFitter):
         *,
         fixed_shapes: bool = False,
     ) -> SequenceFit:
-        """See `BodyFitter`."""
+        """See `BodyFitter`; who is far from the size of adults is fitted at that size first (`sizes`)."""
         sequence = SequenceFitter(self.energy, self._starts, self.law, self.config)
-        return sequence.fit(targets, groups, time_s, shapes, fixed_shapes=fixed_shapes)
+        found = sequence.fit(targets, groups, time_s, shapes, fixed_shapes=fixed_shapes)
+        sizes = Sizes.of(self.model)
+        size = sizes.beyond(found.shapes.mean)
+        far = size != 1
+        if shapes is not None or not far.any():
+            return found
+        rows = np.flatnonzero(np.isin(groups, found.groups[far]))
+        own, groups, time_s = targets.rows(rows), groups[rows], time_s[rows]
+        adult = own.larger(1 / size[np.searchsorted(found.groups, groups)])
+        mean = found.shapes.mean.copy()
+        mean[far] = sizes.resized(sequence.fit(adult, groups, time_s).shapes.mean, size[far])
+        shapes = Shapes(mean, found.shapes.information)
+        again = sequence.fit(own, groups, time_s, Shapes(mean[far], shapes.information[far]), fixed_shapes=True)
+        return SequenceFit(found.fit.with_rows(rows, again.fit), found.groups, shapes)
 
     def _fit(
         self, targets: JointTargets, initial: BodyFit | None, groups: NDArray[np.intp] | None, *, leave_out: bool

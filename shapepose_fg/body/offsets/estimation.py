@@ -24,6 +24,7 @@ from shapepose_fg.body.fitting.evidence import Evidence, weigh
 from shapepose_fg.body.fitting.fitter import BodyConfig, BodyFit, JointTargets
 from shapepose_fg.body.fitting.fitters import SmplFitter
 from shapepose_fg.body.fitting.priors import PosePrior
+from shapepose_fg.body.fitting.sizes import Sizes
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import LARGEST_M, RIDES_ON, KeypointOffsets
 from shapepose_fg.core.bounds import Metres, Repeats, Settings
@@ -72,7 +73,12 @@ def learn_offsets(
     precision = np.linalg.inv(_prior_covariance(prior))
     model, fit = model.with_keypoint_offsets(_made(np.zeros(75), precision, np.zeros(25))), None
     for _ in range(prior.rounds):
-        fit = SmplFitter(model, wide, config).fit_whole(targets, fit)
+        fitter = SmplFitter(model, wide, config)
+        fit = fitter.fit_whole(targets, fit)
+        size = Sizes.of(model).beyond(fit.betas)
+        if (size != 1).any():  # a room full of children is no detector's habit
+            targets = targets.larger(1 / size)
+            fit = fitter.fit_whole(targets)
         if not fit.ok.any():
             break
         energy = BodyEnergy(model.to(torch.float64), wide)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, MIRROR
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import SMPL_24
@@ -45,6 +46,8 @@ of unseen people 1.6 nats a frame and took 0.1 from everything else; without a c
 TARGET_FPS = 30.0
 """AMASS recordings are thinned to about this many frames a second: every k-th frame, nothing interpolated."""
 
+_LEANING_RAD = 0.15
+"""How far people who are drawn lean, one sigma."""
 _WRISTS, _HANDS, _TOES = (20, 21), (22, 23), (10, 11)
 _BODY_COLUMNS = 66
 """Root and 21 body joints, three columns each: what SMPL, SMPL+H and SMPL-X files agree on."""
@@ -110,6 +113,15 @@ class Motions:
             raise ValueError(f"split must be one of {' '.join(SPLITS)}, got {split!r}")
         subjects, place = np.unique(self.subject, return_inverse=True)
         return self.rows(np.array([split_of(str(name)) == split for name in subjects], dtype=bool)[place])
+
+
+def drawn_motions(count: int, seed: int) -> Motions:
+    """Poses of the pose prior, upright and of any heading: what there is to learn from without recordings."""
+    rng = np.random.default_rng(seed)
+    root = rng.normal(0, _LEANING_RAD, (count, 1, 3))
+    root[:, 0, 1] = rng.uniform(-np.pi, np.pi, count)
+    poses = np.concatenate((root, PosePrior.default().sample(rng, count)), axis=1).astype(np.float32)
+    return Motions(poses, np.ones(count), np.full(count, UNKNOWN_SUBJECT))
 
 
 _Recording = tuple[str, bool, NDArray[np.float32]]
