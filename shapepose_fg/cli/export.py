@@ -6,6 +6,7 @@ from shapepose_fg.cli.options import RESULT, TakeOptions, argument, grouped, opt
 from shapepose_fg.cli.terminal import note
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.result_files import results_folder
+from shapepose_fg.core.storage.files import inside
 
 
 @grouped
@@ -26,7 +27,7 @@ def export(
     if not 0 <= fill_gaps <= 3600:
         raise InputError(f"--fill-gaps {fill_gaps:g}: must be seconds, 0 or more")
     wanted = list(FORMATS.values()) if "all" in formats else chosen(formats)
-    output = results_folder(take.results) / "export" if output is None else output
+    output = inside(results_folder(take.results), "export") if output is None else output
     more = {"markers": MarkerSet(markers), "fill_gaps_s": fill_gaps, "body": take.body}
     done = export_result(take.results, wanted, output, **how, **more)
     for file in (file for written in done.values() for file in written.files):

@@ -25,7 +25,7 @@ from shapepose_fg.cli.terminal import say, show, use_any_streams
 from shapepose_fg.cli.tracks import tracks
 from shapepose_fg.cli.train_fitter import train_fitter
 from shapepose_fg.cli.view import view
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.errors import InputError, failure
 from shapepose_fg.core.storage.output_folder import prepare_output
 
 # Everything else is imported inside the commands: `--help` must not wait for torch.
@@ -71,9 +71,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         # Or Python would complain at exit that it cannot flush.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 1
-    except OSError as error:
-        place = f"{error.filename}: " if error.filename is not None else ""
-        code = _fail(f"{place}{error.strerror or error}; check the path, its permissions and the space left")
+    except (OSError, MemoryError, RuntimeError) as error:
+        if (what := failure(error)) is None:
+            raise
+        is_file = isinstance(error, OSError)
+        code = _fail(f"{what}; {'check path, permissions and space left' if is_file else 'start it again'}")
     except Stopped as stop:
         say("stopped", stop.message or "nothing is left half written", "bold yellow")
         code = stop.exit_code

@@ -13,6 +13,7 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import ASSUMED_FPS
 from shapepose_fg.core.result_files import results_folder
 from shapepose_fg.core.run_summary import covered_frames
+from shapepose_fg.core.storage.files import inside
 
 if TYPE_CHECKING:
     from shapepose_fg.core.camera import Rig
@@ -59,7 +60,7 @@ def overlay(
     with Reconstruction.open(folder) as people:
         rig, run = read_rig(folder / CAMERAS), people.run
         names = pictures.named(rig) if drawn.cameras is None else _cameras(drawn.cameras, rig)
-        shown = pictures.of_result(run, rig, names, detections)
+        shown = pictures.of_result(folder, run, rig, names, detections)
         if drawn.points and not people.observed:
             note(f"{folder}: there is no observations.npz, so no detections are drawn")
         model, file = None, run.get("body")
@@ -78,7 +79,7 @@ def overlay(
             raise InputError(f"{folder}: none of its frames has a picture; give the videos that it was made from")
         with progress("drawing") as done:
             width = None if drawn.each else drawn.width
-            written = write_overlay(over, chosen, output or folder / "overlay", width, fps, done)
+            written = write_overlay(over, chosen, output or inside(folder, "overlay"), width, fps, done)
         for path in written:
             print(f"written  {path}")
 

@@ -1,13 +1,14 @@
 """What the commands say on a terminal: results, notes, a bar while something runs."""
 
 import os
+import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
+    from rich.console import Console, RenderableType
     from rich.progress import Progress
     from rich.table import Table
 
@@ -27,15 +28,53 @@ def use_any_streams() -> None:
         stream = getattr(sys, name)
         if stream is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: PTH123, SIM115
-        elif hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="backslashreplace")
+        elif not isinstance(stream, _Stripped):
+            if hasattr(stream, "reconfigure"):
+                stream.reconfigure(errors="backslashreplace")
+            setattr(sys, name, _Stripped(stream))
+
+
+class _Stripped:
+    """A stream that takes whatever is said, without what a terminal would obey: names of files and keys are in it.
+
+    Rich gets the stream beneath, which its colours go to; what it prints is stripped by `console`.
+    """
+
+    def __init__(self, stream: Any) -> None:
+        self.rich_proxied_file = stream
+
+    def write(self, text: str) -> int:
+        self.rich_proxied_file.write(printable(text))
+        return len(text)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.rich_proxied_file, name)
+
+
+_OBEYED = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
+
+
+def printable(text: str) -> str:
+    """The text without control characters, but for ends of lines and tabs, and without changes of direction."""
+    return _OBEYED.sub("", text)
+
+
+def console(**options: Any) -> "Console":
+    """A console that strips what is printed on it; text is no markup."""
+    from rich.console import Console
+    from rich.segment import Segment
+
+    class Stripping(Console):
+        def render(self, *arguments: Any, **options: Any) -> Iterator[Segment]:
+            for each in super().render(*arguments, **options):
+                yield each if each.control else each._replace(text=printable(each.text))
+
+    return Stripping(markup=False, emoji=False, **options)
 
 
 def show(content: "RenderableType") -> None:
     """Print on stdout; with colours on a terminal only. Text is no markup: names and paths are in it."""
-    from rich.console import Console
-
-    Console(markup=False, emoji=False).print(content)
+    console().print(content)
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[Any]], *, left: int = 1, caption: str = "") -> "Table":
@@ -52,10 +91,9 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[Any]], *, left: int = 1,
 
 def say(what: str, message: str, style: str) -> None:
     """Say on stderr, in one paragraph that begins with `what`."""
-    from rich.console import Console
     from rich.text import Text
 
-    Console(stderr=True).print(Text.assemble((f"{what}: ", style), message), soft_wrap=True)
+    console(stderr=True).print(Text.assemble((f"{what}: ", style), message), soft_wrap=True)
 
 
 def note(*messages: str) -> None:
@@ -72,12 +110,11 @@ def warn(message: str) -> None:
 @contextmanager
 def bars(unit: str = "") -> Iterator["Progress"]:
     """Progress bars on stderr while the block runs; nothing is shown where that is not a terminal."""
-    from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    console, left = Console(stderr=True), TimeRemainingColumn(compact=True)
+    shown_on, left = console(stderr=True), TimeRemainingColumn(compact=True)
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TextColumn(unit))
-    with Progress(*columns, left, console=console, transient=True, disable=not console.is_terminal) as shown:
+    with Progress(*columns, left, console=shown_on, transient=True, disable=not shown_on.is_terminal) as shown:
         yield shown
 
 

@@ -17,6 +17,19 @@ class InputError(ValueError):
         super().__init__(line)
 
 
+class WorkLost(RuntimeError):
+    """A process ended before its work, which is not done; what was done before it is kept."""
+
+
+def failure(error: BaseException) -> str | None:
+    """An error of the system, of memory or of a lost process, as the beginning of a sentence; None for others."""
+    if isinstance(error, OSError):
+        return f"{f'{error.filename}: ' if error.filename is not None else ''}{error.strerror or error}"
+    if isinstance(error, MemoryError) or "allocate memory" in str(error):  # torch's own is a RuntimeError
+        return "there is too little memory: close other programs, or give fewer --workers"
+    return str(error) if isinstance(error, WorkLost) else None
+
+
 @contextmanager
 def naming(place: object, cure: str = "") -> Iterator[None]:
     """A ValueError inside the block is an InputError that names its place, with the `cure` at its end."""

@@ -11,13 +11,13 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.core.arrays import Array, Index, Mask, Whole
+from shapepose_fg.core.arrays import Array, Mask, Whole
 from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.observation_table import ObservationTable
 from shapepose_fg.core.result_files import OBSERVATIONS, PEOPLE, RUN, RUN_ID, SavedTable, check_id, write_result
 from shapepose_fg.core.run_summary import check_run, merged_run
 from shapepose_fg.core.shapes import SubjectShapes
-from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.core.skeleton import BODY_25, check_joint_names
 from shapepose_fg.core.storage.files import read_json
 from shapepose_fg.core.storage.schema import Column, Table
 
@@ -114,6 +114,7 @@ class Reconstruction(Table):
     def __post_init__(self) -> None:
         """Check every shape and type, once, and that `observations` are of these rows."""
         super().__post_init__()
+        check_joint_names(self.joint_names.tolist())
         unknown = set(np.unique(self.status).tolist()) - set(Status)
         if len(unknown) > 0:
             raise ValueError(f"status must be one of {[*map(str, Status)]}, got {sorted(unknown)}")
@@ -149,6 +150,19 @@ class Reconstruction(Table):
         table = None if self.observations is None else self.observations.rows(index)
         return replace(self, **columns, observations=table)
 
+    def check_ranges(self) -> None:
+        """ValueError for what no result gives: also for a joint or a body that is called known and is not."""
+        super().check_ranges()
+        ok, known = self.status == Status.OK, self.known != Known.UNKNOWN
+        sure = np.isfinite(self.covariance).all(axis=(2, 3)) | ~ok[:, None]
+        for name, wrong in (
+            ("joints", (known & ~np.isfinite(self.joints).all(axis=2)).any(axis=1)),
+            ("covariance", (known & ~sure).any(axis=1)),
+            *((name, ok & ~with_body(getattr(self, name))) for name in BODY),
+        ):
+            if wrong.any():
+                raise ValueError(f"{name} must be numbers where they are known, not as in row {wrong.argmax()}")
+
     def at(self, frame: int) -> "Reconstruction":
         """The people of one frame."""
         return self.rows(self.frame == frame)
@@ -171,10 +185,10 @@ class Reconstruction(Table):
 
         A process killed on the way leaves each file as it was or as it shall be, and `load` says where they do not
         belong together (docs/conventions.md). Without `observations`, those of an earlier result are removed.
-        OSError where `folder` cannot be written.
+        InputError where `load` would refuse them, OSError where `folder` cannot be written.
         """
         observations = None if self.observations is None else self.observations.columns()
-        write_result(Path(folder), self.columns(), observations, self.run)
+        write_result(Path(folder), self.columns(), observations, self.run, check_files)
 
     @classmethod
     def load(cls, path: str | Path) -> "Reconstruction":
@@ -209,7 +223,7 @@ class OpenedReconstruction(ExitStack):
         try:
             people = SavedTable(file, Reconstruction, "give the people.npz of a reconstruction")
             self._people = self.enter_context(people)
-            self.frame, self.person = (self._people.numbers(name) for name in ("frame", "person"))
+            self.frame, self.person = (self._people.column(name) for name in ("frame", "person"))
             """(N,) frame of each row, and identity of each row's person."""
             self.run = _read_run(file.with_name(RUN), self._people.run_id)
             """What run.json says."""
@@ -247,17 +261,41 @@ class OpenedReconstruction(ExitStack):
         every = max(1, -(-len(self) // most_rows))
         return self.rows(None if every == 1 else np.flatnonzero(self.frame % every == 0)), every
 
-    def rows(self, index: Index | None = None, *, observations: bool = True) -> Reconstruction:
-        """The rows `index` (R,), rising, or all; with what they were solved from, where that is wanted.
+    def __getattr__(self, name: str) -> Any:
+        """A whole column, as `Reconstruction` has it, read when it is asked for."""
+        if name not in (*Reconstruction.ROWS, "joint_names"):
+            raise AttributeError(f"{type(self).__name__!r} has no attribute {name!r}")
+        return self._people.column(name)
+
+    def rows(self, index: NDArray | None = None, *, observations: bool = True) -> Reconstruction:
+        """The rows `index`, a mask (N,) or numbers (R,) that rise, or all; with what they were solved from, where
+        that is wanted.
 
         InputError where a file is damaged, or they would not fit in memory.
         """
+        index = np.flatnonzero(index) if index is not None and index.dtype == bool else index
         people = self._people.read(index, run=self.run)
         if self._observed is None or not observations:
             return people
         table = self._observed.read(index)
         with naming(self._observed.file, "delete it or run the reconstruction again"):
             return replace(people, observations=table)
+
+
+def check_files(people: Path, observations: Path | None) -> None:
+    """InputError where the files of a result, on the way to their places, could not be read again."""
+    with SavedTable(people, Reconstruction, _UNREADABLE) as rows, ExitStack() as opened:
+        table = None if observations is None else ObservationTable.open(observations)
+        if table is not None:
+            opened.enter_context(table)
+        for start in range(0, rows.count, _CHECKED_ROWS):
+            index = np.arange(start, min(start + _CHECKED_ROWS, rows.count))
+            rows.read(index, observations=None if table is None else table.read(index))
+
+
+_UNREADABLE = "the result was not written, and what was there before is as it was"
+_CHECKED_ROWS = 4096
+"""Rows that are read at a time to see whether they can be."""
 
 
 def _read_run(file: Path, people_id: object) -> dict[str, Any]:

@@ -2,9 +2,10 @@
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
+from itertools import chain, count
 from pathlib import Path
 from typing import Any, BinaryIO, Generic, TypeVar, cast
 
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.filesize import decimal
 
-from shapepose_fg.core.arrays import Index, Whole
+from shapepose_fg.core.arrays import Index
 from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.run_summary import plain
 from shapepose_fg.core.storage.files import write_together
@@ -33,14 +34,32 @@ def results_folder(results: Path) -> Path:
     return results.parent if results.name == PEOPLE else results
 
 
+def set_aside(folder: Path) -> list[str]:
+    """Rename exports and overlays of the result in `folder`, which a new one takes the place of: nobody is to take
+    them for the new one's. What is to be said of it.
+    """
+    told = []
+    for made in (folder / name for name in ("export", "overlay")):
+        if made.is_dir():
+            names = (made.with_name(f"{made.name}-older{number}") for number in chain([""], count(2)))
+            made.rename(free := next(path for path in names if not path.exists()))
+            told.append(f"{made} is of the result before; it is called {free.name} now")
+    return told
+
+
 def write_result(
-    folder: Path, people: Mapping[str, Pieces], observations: Mapping[str, Pieces] | None, run: Mapping[str, Any]
+    folder: Path,
+    people: Mapping[str, Pieces],
+    observations: Mapping[str, Pieces] | None,
+    run: Mapping[str, Any],
+    check: Callable[[Path, Path | None], object] | None = None,
 ) -> None:
     """Write the files of a result into `folder`, none before all are complete on the disk.
 
     A process killed on the way leaves each file as it was or as it shall be; `check_id` tells where they are of
-    two runs. Without `observations`, those of an earlier result are removed. ValueError where `run` holds what
-    JSON cannot, OSError that names the file where one cannot be written.
+    two runs. Without `observations`, those of an earlier result are removed. Nothing is replaced where `check`
+    raises, which is given people.npz and observations.npz as they shall be. ValueError where `run` holds what JSON
+    cannot, OSError that names the file where one cannot be written.
     """
     digest = hashlib.sha256()
 
@@ -62,7 +81,18 @@ def write_result(
     # The order counts: the id is known when people.npz has been written.
     files = {folder / PEOPLE: write_people}
     files |= {} if observations is None else {folder / OBSERVATIONS: write_observations}
-    write_together({**files, folder / RUN: lambda stream: stream.write(run_text().encode())})
+
+    def checked(new: Mapping[Path, Path]) -> None:
+        try:
+            if check is not None:
+                check(new[folder / PEOPLE], new.get(folder / OBSERVATIONS))
+        except InputError as error:
+            message = str(error)
+            for path, temporary in new.items():
+                message = message.replace(str(temporary), str(path))
+            raise InputError(message) from None
+
+    write_together({**files, folder / RUN: lambda stream: stream.write(run_text().encode())}, checked)
     if observations is None:
         (folder / OBSERVATIONS).unlink(missing_ok=True)
 
@@ -133,8 +163,10 @@ class SavedTable(ExitStack, Generic[T]):
             self.close()
             raise
 
-    def numbers(self, name: str) -> Whole:
-        """All of a column of whole numbers, checked: rows are chosen by it before the others are read."""
+    def column(self, name: str) -> NDArray[Any]:
+        """All of a column, checked: rows are chosen by it before the others are read."""
+        if name not in self._rows:  # a shared one, or files of earlier versions lack it
+            return self._shared[name] if name in self._shared else getattr(self.read(None), name)
         with naming(self.file, self.cure):
             column = self._columns[name].checked(name, self._npz.array(name), {"N": self.count})
             self._columns[name].check_range(name, column)

@@ -1,13 +1,25 @@
 """What a detector's joints are called, how limbs join them, and which are left and right of each other."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from shapepose_fg.core.arrays import Index
+
+_LONGEST_NAME = 64
+
+
+def check_joint_names(names: Iterable[str]) -> None:
+    """ValueError for a name that breaks the lines of other programs' files, or is a formula in their tables."""
+    for name in names:
+        if not (0 < len(name) <= _LONGEST_NAME and name.isprintable() and name[0] not in "=+-@"):
+            raise ValueError(
+                f"joint_names must be 1 to {_LONGEST_NAME} letters in one line, the first none of = + - @, got"
+                f" {name[:_LONGEST_NAME]!r}"
+            )
 
 
 @dataclass(frozen=True)
@@ -59,6 +71,7 @@ class Skeleton:
             limbs = [*limbs, *((MID_HIP, end) for end in anchor)]
             anchor = MID_HIP
         joints = (*(joint for joint in keypoints if joint), *middles)
+        check_joint_names(joints)
         place = {joint: index for index, joint in enumerate(joints)}
         twice = next((joint for joint, count in Counter(joints).items() if count > 1), None)
         if twice is not None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.storage.files import read_json, write_atomically, write_content
+from shapepose_fg.core.storage.files import inside, read_json, write_atomically, write_content
 from shapepose_fg.detection2d.decoding import Candidates
 from shapepose_fg.detection2d.detector import CameraDetector
 from shapepose_fg.io.detections.association_text import TEXT_SKELETONS
@@ -83,7 +83,7 @@ def run_detection(run: DetectionRun, progress: Progress = lambda done, total: No
     Blocks that an earlier run of the same settings left are not done again; the files come out the same.
     InputError where the folder holds detections, or a run of other settings.
     """
-    unfinished = run.output / _UNFINISHED
+    unfinished = inside(run.output, _UNFINISHED)
     _refuse_others(run, unfinished)
     write_content(unfinished / _SETTINGS, _json(run.settings))
     total, views = len(run.moments), len(run.rig)

@@ -13,7 +13,7 @@ from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.provenance import checksums
 from shapepose_fg.core.reconstruction import MOST_NUMBER, Reconstruction
 from shapepose_fg.core.result_files import OBSERVATIONS, PEOPLE, RUN
-from shapepose_fg.core.storage.files import read_json, write_content
+from shapepose_fg.core.storage.files import inside, read_json, write_content
 from shapepose_fg.io.validation import validated
 from shapepose_fg.tracking.edits import Edit, Edited, Solve, apply, solve_anew, undo
 
@@ -76,7 +76,7 @@ def correct(folder: str | Path, edit: Edit, solve: Solve | None = None) -> Edite
         edited = apply(people, edit)
     solved = edited.people if solve is None else solve_anew(edited, solve)
     if len(edits) == 0:  # the result is copied aside, whole or not at all
-        part = folder / _PART
+        part, _ = inside(folder, _PART), inside(folder, UNCORRECTED)
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir()
         for file in (folder / name for name in _FILES):
@@ -125,7 +125,7 @@ def _write(folder: Path, people: Reconstruction, edits: Sequence[Edit]) -> None:
 
 def _kept_edits(folder: Path) -> tuple[Edit, ...]:
     """`read_corrections`; InputError where the result as it was before them is not there any more."""
-    edits, file = read_corrections(folder), folder / UNCORRECTED / PEOPLE
+    edits, file = read_corrections(folder), inside(folder, UNCORRECTED) / PEOPLE
     if len(edits) > 0 and not file.is_file():
         cure = f"put it back, or delete {CORRECTIONS} to keep the result as it is now"
         raise InputError(f"{file}: the result as it was before the corrections is not there; {cure}")

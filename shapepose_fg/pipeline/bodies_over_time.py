@@ -16,6 +16,7 @@ from shapepose_fg.body.shapes import SubjectShapes, recognise
 from shapepose_fg.core.arrays import Array, Whole
 from shapepose_fg.core.reconstruction import BODY, Reconstruction, Status
 from shapepose_fg.core.storage.kept_arrays import InMemory, KeptArrays
+from shapepose_fg.core.storage.schema import Column, columns_of
 from shapepose_fg.estimation.floor import Floor
 
 SEGMENT_ROWS = 4000
@@ -71,6 +72,12 @@ class Person:
         return {"ok": fit.ok, **dict(zip(BODY, bodies, strict=True)), **shape}
 
 
+_BODIES = {name: column for name, column in columns_of(Reconstruction).items() if name in BODY} | {
+    "ok": Column("N", np.bool_),
+    "mean": Column("1 10", most=1e3),
+    "information": Column("1 10 10", most=1e12),
+}
+"""What `Person.fitted` gives."""
 Fits = Callable[[Iterable[Person]], Iterable[dict[str, NDArray[Any]]]]
 """Fits the bodies of people (`Person.fitted`), in order."""
 
@@ -136,10 +143,13 @@ def fit_everybody(
     long = [number for number, count in counts.items() if count > most]
     places: dict[int, dict[str, range]] = {}
 
-    def fit(jobs: Mapping[str, Callable[[], Person]]) -> None:
-        """Fit what is not kept yet under these names."""
-        missing = sorted(jobs.keys() - set(kept.names("")), key=list(jobs).index)
-        for name, bodies in zip(missing, fits(jobs[name]() for name in missing), strict=True):
+    def fit(jobs: Mapping[str, tuple[int, Callable[[], Person]]]) -> None:
+        """Fit what is not kept yet under these names: so many rows, of whom."""
+        there = set(kept.names(""))
+        for name in jobs.keys() & there:
+            kept.columns(name, _BODIES, {"N": jobs[name][0]})
+        missing = [name for name in jobs if name not in there]
+        for name, bodies in zip(missing, fits(jobs[name][1]() for name in missing), strict=True):
             kept.keep(name, bodies)
 
     def whole(number: int, prior: Shapes | None) -> Person:
@@ -152,7 +162,8 @@ def fit_everybody(
     def found(kind: str, prior: Mapping[int, Shapes | None]) -> dict[int, Shapes]:
         """Some people's shapes, and their bodies where the track is short."""
         names = {number: f"{kind}-{number}" for number in prior}
-        fit({name: partial(whole, number, prior[number]) for number, name in names.items()})
+        rows = {number: 0 if number in long else counts[number] for number in names}
+        fit({name: (rows[number], partial(whole, number, prior[number])) for number, name in names.items()})
         places.update({number: {name: range(counts[number])} for number, name in names.items()})
         return {n: Shapes(kept.array(name, "mean"), kept.array(name, "information")) for n, name in names.items()}
 
@@ -174,7 +185,13 @@ def fit_everybody(
     for number in long:
         edges = np.linspace(0, counts[number], 1 - (-counts[number] // most)).round().astype(int).tolist()
         places[number] = {f"segment-{number}-{n:04d}": range(*ends) for n, ends in enumerate(pairwise(edges))}
-    fit({name: partial(segment, number, own) for number in long for name, own in places[number].items()})
+    fit(
+        {
+            name: (len(own), partial(segment, number, own))
+            for number in long
+            for name, own in places[number].items()
+        }
+    )
     names = _names(list(counts), known, whose.tolist())
     return BodiesOverTime(kept, places, _subjects(shapes, known.body).named(names))
 

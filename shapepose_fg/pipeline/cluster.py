@@ -3,13 +3,14 @@
 import socket
 import warnings
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.errors import InputError, WorkLost
 from shapepose_fg.core.provenance import program_digest, versions
 from shapepose_fg.pipeline.workers import get_ready, in_order, processes, what_workers_inherit
 
@@ -71,7 +72,8 @@ class Cluster(Generic[Shared]):
     def map(self, work: Callable[[Shared, Item], Result], items: Iterable[Item]) -> Iterator[Result]:
         """`work(shared, item)` for each item, in order; `items` are taken as they are needed.
 
-        An item whose process is lost is done again by another; RuntimeError where that happens too often.
+        An item whose process is lost is done again by another; `WorkLost` where that happens too often, or the
+        scheduler is gone.
         """
         from distributed import KilledWorker
 
@@ -83,10 +85,12 @@ class Cluster(Generic[Shared]):
         try:
             yield from in_order(submit, items, self._most_under_way, client.cancel)
         except KilledWorker as error:
-            raise RuntimeError(
+            raise WorkLost(
                 f"{error.allowed_failures + 1} processes of the cluster ended one after the other before their"
                 " work: there may be too little memory for one"
             ) from None
+        except CancelledError:
+            raise WorkLost("the cluster's scheduler is gone") from None
 
     def _most_under_way(self) -> float:
         """As many items as keep every process of the cluster busy."""

@@ -14,6 +14,8 @@ from functools import partial
 from multiprocessing import forkserver, get_context, resource_tracker
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
+from shapepose_fg.core.errors import WorkLost
+
 if TYPE_CHECKING:
     from multiprocessing.context import ForkServerContext, SpawnContext
 
@@ -54,7 +56,7 @@ class Workers(Generic[Shared]):
             self._lifeline: Any = lifeline
             given: tuple[Any, ...] = (content, held)  # one end of a pipe, of one class or another by the system
             self._pool = ProcessPoolExecutor(self.count, context, initializer=_begin, initargs=given)
-            with what_workers_inherit():
+            with what_workers_inherit(), _telling_of_lost_ones():
                 for _ in range(self.count):  # the pool starts a process for each of its first jobs
                     self._pool.submit(_nothing)
         return self
@@ -70,19 +72,26 @@ class Workers(Generic[Shared]):
     def map(self, work: Callable[[Shared, Item], Result], items: Iterable[Item]) -> Iterator[Result]:
         """`work(shared, item)` for each item, in order; `items` are taken as they are needed.
 
-        RuntimeError where a process dies.
+        `WorkLost` where a process dies.
         """
         if self._pool is None:
             yield from (work(self._shared, item) for item in items)
             return
-        try:
-            pool: Any = self._pool
+        pool: Any = self._pool
+        with _telling_of_lost_ones():
             yield from in_order(partial(pool.submit, _work, work), items, lambda: self._ahead * self.count)
-        except BrokenProcessPool as error:
-            raise RuntimeError(
-                "a worker process ended before its work: there may be too little memory for so many; in a script,"
-                " call what takes `workers` below `if __name__ == '__main__':`"
-            ) from error
+
+
+@contextmanager
+def _telling_of_lost_ones() -> Iterator[None]:
+    """`WorkLost` where a process dies in the block, or the one that processes are forked off."""
+    try:
+        yield
+    except (BrokenProcessPool, EOFError, ConnectionError) as error:
+        raise WorkLost(
+            "a worker process was killed, as the system does where there is too little memory for so many (in a"
+            " script, call what takes `workers` below `if __name__ == '__main__':`)"
+        ) from error
 
 
 def in_order(

@@ -1,12 +1,15 @@
 """What is said on a terminal: names and paths of the user's stand there as they are."""
 
+import json
+import unicodedata
 from pathlib import Path
 
 import pytest
 from rich.progress import TextColumn
 from rich.table import Table
 
-from shapepose_fg.cli.terminal import progress, show
+from shapepose_fg.cli.main import main
+from shapepose_fg.cli.terminal import bars, note, progress, show, use_any_streams
 from shapepose_fg.setup_check.report import CameraUse, Distances
 from shapepose_fg.setup_check.table import use_table
 
@@ -30,3 +33,53 @@ def test_a_bar_s_words_are_no_markup(monkeypatch):
     with progress("looking through a[/b]"):
         (words, *_) = (each for each in shown if isinstance(each, TextColumn))
         assert words.markup is False
+
+
+ESCAPES = "\x1b]0;title\x07\x1b[31mred\x9b2J\r\x08\u202e"
+
+
+def obeyed(text: str) -> set[str]:
+    """What a terminal would do something at, but for ends of lines."""
+    return {letter for letter in text if unicodedata.category(letter) in ("Cc", "Cf")} - {"\n"}
+
+
+def test_what_is_said_has_no_escapes(capsys, monkeypatch):
+    use_any_streams()
+    note(ESCAPES)
+    show(ESCAPES)
+    table = Table(ESCAPES, title=ESCAPES)
+    table.add_row(ESCAPES)
+    show(table)
+    print(ESCAPES, flush=True)
+    with bars() as shown:
+        shown.console.print(ESCAPES)
+    said = "".join(capsys.readouterr())
+    assert said.count("red") == 7 and not obeyed(said)
+    monkeypatch.setattr("rich.console.Console.is_terminal", True)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    note(ESCAPES)
+    assert capsys.readouterr().err.startswith("\x1b[1mnote: \x1b[0m"), "colours of our own stay"
+
+
+def test_names_and_keys_of_files_reach_no_terminal_as_they_are(tmp_path, capsys):
+    """Keys of TOML and JSON, names of files and recordings, arguments."""
+    escaped = json.dumps(ESCAPES)
+    (tmp_path / "keys.toml").write_text(f"{escaped} = 1\n[{escaped}]\na = 2", encoding="utf-8")
+    (tmp_path / "keys.json").write_text(f'{{{escaped}: 1, "K": {{{escaped}: [1]}}}}', encoding="utf-8")
+    (tmp_path / "table.toml").write_text(f"[recordings.{escaped}]\n{escaped} = 1", encoding="utf-8")
+    (tmp_path / f"a{ESCAPES}").write_text("{}")
+    common = ["--detections", str(tmp_path), "--output", str(tmp_path / "out")]
+    for words in (
+        ["reconstruct", "--calibration", str(tmp_path / "keys.json"), *common],
+        ["reconstruct", "--calibration", str(tmp_path / f"a{ESCAPES}"), *common],
+        ["reconstruct", "--calibration", str(tmp_path / f"b{ESCAPES}"), *common],
+        ["reconstruct", "--calibration", "c", "--config", str(tmp_path / "keys.toml"), *common],
+        ["batch", str(tmp_path / "table.toml"), "--output", str(tmp_path / "out")],
+        ["report", str(tmp_path / ESCAPES)],
+        [ESCAPES],
+    ):
+        with pytest.raises(SystemExit) as ended:
+            main(words)
+        said = "".join(capsys.readouterr())
+        assert ended.value.code == 2 and "error" in said and not obeyed(said), words

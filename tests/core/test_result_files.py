@@ -105,7 +105,7 @@ def test_a_disk_that_is_full_at_any_write_leaves_the_old_files_and_is_named(two_
     for room in (0, 1000, whole - 10):
         left = room
 
-        def limited(files, write_together=write_together):
+        def limited(files, check, write_together=write_together):
             def full(write):
                 class Full:
                     def __init__(self, stream):
@@ -123,7 +123,7 @@ def test_a_disk_that_is_full_at_any_write_leaves_the_old_files_and_is_named(two_
 
                 return lambda stream: write(Full(stream))
 
-            write_together({path: full(write) for path, write in files.items()})
+            write_together({path: full(write) for path, write in files.items()}, check)
 
         monkeypatch.setattr(shapepose_fg.core.result_files, "write_together", limited)
         with pytest.raises(OSError, match="No space left on device") as caught:

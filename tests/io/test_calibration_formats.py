@@ -359,6 +359,20 @@ def test_a_malformed_file_is_one_sentence(tmp_path, program):
     refuses(path, expected, **wishes)
 
 
+@pytest.mark.parametrize(("program", "keys"), [("CMU Panoptic", "K R t distCoef"), ("VoxelPose", "R T k p")])
+def test_columns_that_are_ragged_are_named(tmp_path, program, keys):
+    """`"t": [[0], [0], 0]`: as many numbers as it takes, in no matrix."""
+    write, wishes, _ = WRITERS[program]
+    text = write(tmp_path).read_text()
+    for key in keys.split():
+        content = json.loads(text)
+        cameras = content["cameras"] if "cameras" in content else list(content.values())
+        flat = np.ravel(cameras[0][key]).tolist()
+        cameras[0][key] = [*([each] for each in flat[:-1]), flat[-1]]
+        (tmp_path / "ragged.json").write_text(json.dumps(content))
+        refuses(tmp_path / "ragged.json", f"{key} must have rows of one length", **wishes)
+
+
 def test_malformed_panoptic(tmp_path):
     content = json.loads(panoptic(tmp_path).read_text())
     content["cameras"][1]["R"][0][0] += 0.5

@@ -308,7 +308,7 @@ class _Done:
     """Parts of eight frames."""
 
     def notes(self):
-        from shapepose_fg.pipeline.runs.notes import Notes
+        from shapepose_fg.core.notes import Notes
 
         return Notes(frames=8)
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from shapepose_fg.core.errors import WorkLost
 from shapepose_fg.pipeline.workers import Workers, suitable_workers, what_workers_inherit
 
 
@@ -61,6 +62,22 @@ def test_processes_start_from_one_that_has_loaded_what_they_need(tmp_path):
     assert first == second, "both pools' processes have the same parent"
     loaded, parent, script = first
     assert loaded == "True" and parent != script
+
+
+def is_killed(_: int, item: int) -> int:
+    if item == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return item
+
+
+@pytest.mark.skipif(os.name != "posix", reason="kills processes by POSIX signals")
+def test_a_worker_that_is_killed_from_outside_is_told_of():
+    """As the system does where memory is short; what was done before it comes through."""
+    done = []
+    with pytest.raises(WorkLost, match="a worker process was killed"), Workers(2, 10, ahead=1) as workers:
+        done += workers.map(is_killed, range(9))
+    with Workers(2, 10) as workers:
+        assert list(workers.map(times, [1])) == [10], "the next ones work"
 
 
 @pytest.mark.parametrize("count", [0, -1])

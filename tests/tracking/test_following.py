@@ -5,12 +5,12 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.detections import Detections, Input
 from shapepose_fg.pipeline.runs.parts import Checkpoint, checkpoint_arrays, checkpoint_of
 from shapepose_fg.pipeline.windows import StreamState
 from shapepose_fg.tracking.following import BLOCK_S, FollowingConfig, FollowState, finish, follow
 from shapepose_fg.tracking.tracker import Tracks
-from shapepose_fg.tracking.worlds import Input, Seed, follow_worlds
+from shapepose_fg.tracking.worlds import Seed, follow_worlds
 
 
 def who(rows, truth):
@@ -257,7 +257,8 @@ def test_whoever_goes_on_from_a_checkpoint_finds_the_same_bytes(tracker, five_ca
             if each.frame == stop:
                 assert len(state.pending) > 0 and len(state.people) == (2 if stop > 40 else 0)
                 arrays = checkpoint_arrays(Checkpoint(stop, state=StreamState(state)))
-                state = checkpoint_of(arrays.__getitem__, list(arrays), given.__getitem__).state.follow
+                first = state.pending[0].frame
+                state = checkpoint_of(arrays, given.__getitem__, first, range(60)).state.follow
             state, more = follow(tracker, state, each, FollowingConfig())
             decided += more
         return state, decided + finish(tracker, state)[1]

@@ -56,6 +56,18 @@ def _refuse_irregular(path: Path, mode: int) -> None:
         raise InputError(f"{path}: this is a pipe or a device, no file; write it into a file first")
 
 
+def inside(folder: Path, name: str) -> Path:
+    """`folder / name`; InputError where a link there leads out of the folder, in which nothing is written then."""
+    place = folder / name
+    try:
+        stays = place.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError):  # links that lead to each other
+        stays = False
+    if not stays:
+        raise InputError(f"{place}: this is a link that leads out of its folder; remove it, or give that folder")
+    return place
+
+
 def read_bytes(path: Path, most: int = LARGE) -> bytes:
     """What is in the file at `path`; InputError as of `open_regular`, and where it has more than `most` bytes."""
     with open_regular(path) as stream:
@@ -202,8 +214,14 @@ def write_content(path: Path, content: str | bytes) -> None:
     write_atomically(path, lambda stream: stream.write(data))
 
 
-def write_together(files: Mapping[Path, Callable[[BinaryIO], object]]) -> None:
-    """`write_atomically` of several files in order, none of which is put in place before all are complete."""
+def write_together(
+    files: Mapping[Path, Callable[[BinaryIO], object]],
+    check: Callable[[Mapping[Path, Path]], object] = lambda _: None,
+) -> None:
+    """`write_atomically` of several files in order, none of which is put in place before all are complete.
+
+    And before `check`, which is told under which name each is complete, has returned.
+    """
     temporary: dict[Path, Path] = {}
     try:
         for path, write in files.items():
@@ -214,6 +232,7 @@ def write_together(files: Mapping[Path, Callable[[BinaryIO], object]]) -> None:
                     write(stream)
                     stream.flush()
                     os.fsync(stream.fileno())
+        check(temporary)
         for path in files:
             with _naming(path):
                 temporary[path].replace(path)

@@ -1,7 +1,9 @@
 """Named sets of arrays that are kept while a run goes on: in memory, or as files that survive the process."""
 
+import hashlib
 import json
 import mmap
+import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,12 +14,15 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.storage.files import write_content
+from shapepose_fg.core.errors import InputError, naming
+from shapepose_fg.core.storage.files import LARGE, check_size, inside, open_regular, write_content
+from shapepose_fg.core.storage.schema import Column
 
 Arrays = Mapping[str, NDArray[Any]]
 """Arrays of numbers by name."""
 _SUFFIX = ".safetensors"
+ANEW = "begin that run anew with --restart"
+"""What to do where a set is damaged."""
 _ALIGNED = 64
 """Bytes; arrays begin at multiples of it."""
 
@@ -58,6 +63,18 @@ class KeptArrays:
         """Which arrays a set has."""
         return list(self._sets[name][0])
 
+    def place(self, name: str) -> str:
+        """Where a set is, in words."""
+        return name
+
+    def columns(self, name: str, columns: Mapping[str, Column], sizes: dict[str, int]) -> dict[str, NDArray[Any]]:
+        """Arrays of a set; InputError where one is not as its column says, or not of these `sizes`."""
+        with naming(self.place(name), ANEW):
+            found = {key: column.checked(key, self.array(name, key), sizes) for key, column in columns.items()}
+            for key, column in columns.items():
+                column.check_range(key, found[key])
+            return found
+
 
 InMemory = KeptArrays
 
@@ -78,13 +95,16 @@ def _mapped(arrays: Arrays) -> Arrays:
 class InFolder(KeptArrays):
     """The same as a file per set: safetensors, which holds no code and gives single arrays and rows of them.
 
-    A file is on the disk when `keep` returns. Reading raises InputError that names a file that is damaged.
+    A file is on the disk when `keep` returns. It has a digest of each array, and one of these, its name and its
+    run: what is read is checked once, and again when the file has changed. InputError names a damaged file.
     """
 
     lasting = True
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, run: str = "") -> None:
+        """`run` is the run that they are of: files of another one are refused."""
+        self.folder, self._run = folder, run
+        self._checked: dict[tuple[str, str | None], tuple[int, ...]] = {}
 
     def names(self, prefix: str) -> list[str]:
         found = (file.name for file in self.folder.glob(f"*{_SUFFIX}") if not file.name.startswith("."))
@@ -92,7 +112,9 @@ class InFolder(KeptArrays):
 
     def keep(self, name: str, arrays: Arrays, about: Any = None) -> None:
         content = {key: np.ascontiguousarray(array) for key, array in arrays.items()}
-        write_content(self._file(name), save(content, {"about": json.dumps(about)}))
+        arrays_say = json.dumps({key: _digest(key, array) for key, array in content.items()})
+        said = {"about": json.dumps(about), "arrays": arrays_say}
+        write_content(self._file(name), save(content, said | {"sha256": self._seal(name, said)}))
 
     def drop(self, name: str) -> None:
         self._file(name).unlink(missing_ok=True)
@@ -102,25 +124,60 @@ class InFolder(KeptArrays):
             return json.loads(file.metadata()["about"])
 
     def array(self, name: str, key: str, rows: slice = slice(None)) -> NDArray[Any]:
-        with self._opened(name) as file:
+        with self._opened(name, key) as file:
             return file.get_tensor(key) if rows == slice(None) else file.get_slice(key)[rows]
 
     def keys(self, name: str) -> list[str]:
         with self._opened(name) as file:
-            return list(file.keys())
+            return list(json.loads(file.metadata()["arrays"]))
+
+    def place(self, name: str) -> str:
+        return str(self._file(name))
 
     def _file(self, name: str) -> Path:
         return self.folder / f"{name}{_SUFFIX}"
 
+    def _seal(self, name: str, said: Mapping[str, str]) -> str:
+        """The digest of all that a file says but for its arrays, whose own digests are in it."""
+        return hashlib.sha256(json.dumps([self._run, name, said["about"], said["arrays"]]).encode()).hexdigest()
+
     @contextmanager
-    def _opened(self, name: str) -> Iterator[Any]:
-        """A file of arrays; what is wrong with it, now or when it is read, is an InputError."""
+    def _opened(self, name: str, key: str | None = None) -> Iterator[Any]:
+        """A file of arrays, of which what is said, and the array `key`, are as they were written.
+
+        What is wrong with it, now or when it is read, is an InputError.
+        """
         try:
-            with safe_open(self._file(name), framework="numpy") as content:
+            file = inside(self.folder, f"{name}{_SUFFIX}")
+            with open_regular(file, ANEW) as stream:
+                status = os.fstat(stream.fileno())
+            check_size(file, status.st_size, LARGE)
+            stamp = status.st_ino, status.st_size, status.st_mtime_ns
+            with safe_open(file, framework="numpy") as content:
+                if self._checked.get((name, None)) != stamp:
+                    said = content.metadata() or {}
+                    if said.keys() != {"about", "arrays", "sha256"} or said["sha256"] != self._seal(name, said):
+                        raise ValueError(_CHANGED)
+                    self._checked[name, None] = stamp
+                if key is not None and self._checked.get((name, key)) != stamp:
+                    if json.loads(content.metadata()["arrays"])[key] != _digest(key, content.get_tensor(key)):
+                        raise ValueError(_CHANGED)
+                    self._checked[name, key] = stamp
                 yield content
-        except (OSError, SafetensorError, KeyError, TypeError, json.JSONDecodeError) as error:
+        except InputError:
+            raise
+        except (OSError, SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise InputError(
-                f"{self._file(name)}: a part of an unfinished run cannot be read ({reason}); begin that run anew"
-                " with --restart"
+                f"{self._file(name)}: a part of an unfinished run cannot be read ({reason}); {ANEW}"
             ) from None
+
+
+_CHANGED = "it is not as it was written, or of another run"
+
+
+def _digest(key: str, array: NDArray[Any]) -> str:
+    """Of an array by its name, type, shape and bytes."""
+    digest = hashlib.sha256(json.dumps([key, array.dtype.str, array.shape]).encode())
+    digest.update(array.reshape(-1).view(np.uint8) if array.size > 0 else b"")
+    return digest.hexdigest()

@@ -24,8 +24,9 @@ def prepare_output(folder: Path, names: Iterable[str] = ()) -> None:
         problem = f"results cannot be written here ({error.strerror})"
         raise InputError(f"{folder}: {problem}; give a folder that can be written") from None
     for name in names:
-        if (folder / name).is_dir():
-            raise InputError(f"{folder / name}: this is a folder, and a file is to be written here; move it away")
+        if (folder / name).exists() and not (folder / name).is_file():
+            what = "folder" if (folder / name).is_dir() else "pipe"
+            raise InputError(f"{folder / name}: this is a {what}, and a file is to be written here; move it away")
 
 
 @contextmanager
@@ -39,6 +40,8 @@ def only_run_in(folder: Path, names: Iterable[str]) -> Iterator[None]:
     names, is_new = tuple(names), not folder.exists()
     prepare_output(folder, names)
     file = folder / _LOCK
+    if file.is_symlink() or (file.exists() and not file.is_file()):
+        raise InputError(f"{file}: this is a link or a pipe, and no run's; remove it")
     lock = FileLock(file, timeout=0)
     try:
         lock.acquire()

@@ -4,7 +4,7 @@ made: `place: Annotated[Array, Column("N 3", unit="m", most=1e6)]`.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from enum import IntEnum
+from enum import Enum
 from functools import cache
 from typing import Any, ClassVar, Self, cast, get_type_hints
 
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.storage.npz import Pieces
 
-_ALLOWED = {"i": "iu", "u": "iu", "f": "f", "U": "U"}
-"""Kinds of NumPy types that may stand for a column's own kind: whole numbers, real numbers, text."""
+_ALLOWED = {"i": "iu", "u": "iu", "f": "f", "U": "U", "b": "b"}
+"""Kinds of NumPy types that may stand for a column's own kind: whole and real numbers, text, yes and no."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Column:
     """The largest magnitude in a file, beyond which no result goes and products of it are no numbers."""
     missing: Any = None
     """What it holds where it is not given, as in files of earlier versions; None where it must be given."""
-    codes: type[IntEnum] | None = None
+    codes: type[Enum] | None = None
     """What its codes mean, counted from 0."""
     stored: Any = None
     """The type in files, where that is another."""
@@ -163,6 +163,6 @@ class Table:
         return {f"{name}_names": code_names(codes) for name, codes in coded.items()}
 
 
-def code_names(kinds: type[IntEnum]) -> NDArray[np.str_]:
+def code_names(kinds: type[Enum]) -> NDArray[np.str_]:
     """(K,) what each code of `kinds` means, in words."""
     return np.array([kind.name.lower().replace("_", " ") for kind in kinds])

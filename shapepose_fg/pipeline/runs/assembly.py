@@ -14,7 +14,7 @@ from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.soles import lowest_of_feet
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.observation_table import ObservationTable
-from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction, Status, count_rows
+from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction, Status, check_files, count_rows
 from shapepose_fg.core.result_files import write_result
 from shapepose_fg.core.shapes import SubjectShapes
 from shapepose_fg.core.storage.npz import Pieces
@@ -144,7 +144,7 @@ class Assembly:
 
     def save(self, folder: Path) -> None:
         """Write what `Reconstruction.save` writes; it is never all in memory."""
-        write_result(folder, self.columns(), self.observation_columns(), self.run)
+        write_result(folder, self.columns(), self.observation_columns(), self.run, check_files)
 
     def with_run(self, **entries: Any) -> "Assembly":
         """The same with more to say in run.json."""

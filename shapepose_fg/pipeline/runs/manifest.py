@@ -14,13 +14,13 @@ from rich.filesize import decimal
 
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import DetectionSequence
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.observation_table import ObservationTable
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.run_summary import difference
 from shapepose_fg.core.shapes import SubjectShapes
-from shapepose_fg.core.storage.files import read_json, sweep, write_content
-from shapepose_fg.core.storage.kept_arrays import InFolder, KeptArrays
+from shapepose_fg.core.storage.files import inside, read_bytes, read_json, sweep, write_content
+from shapepose_fg.core.storage.kept_arrays import ANEW, InFolder, KeptArrays
 from shapepose_fg.pipeline.runs.parts import Parts
 
 PARTS = "parts"
@@ -42,22 +42,21 @@ def open_run(output: Path, begun: dict[str, Any], *, resume: bool = False, resta
     given, and where it was begun from something else: the first difference is named. The caller is the only run in
     `output`.
     """
-    folder = output / PARTS
-    manifest = folder / _MANIFEST
-    shutil.rmtree(output / _GONE, ignore_errors=True)  # what a kill left of a run that was being removed
+    folder = inside(output, PARTS)
+    manifest = inside(folder, _MANIFEST)
+    shutil.rmtree(inside(output, _GONE), ignore_errors=True)  # what a kill left of a run that was being removed
     begun = json.loads(json.dumps({"format": _FORMAT, **begun}))
     # A run that was killed at its very beginning leaves the manifest's temporary file alone.
     left = [folder] if folder.is_file() else folder.iterdir() if folder.is_dir() else ()
     if not manifest.is_file() and any(not file.name.startswith(f".{_MANIFEST}.") for file in left):
         raise InputError(f"{folder}: not of a run of this program; move it away, or give another --output")
-    kept = InFolder(folder)
+    kept = InFolder(folder, _digest(begun))
     if manifest.is_file() and not restart:
         sweep(folder)
-        done = frames_done(output)
         if resume:
             _refuse_other(folder, read_json(manifest), begun)
             return kept
-        if done > 0:
+        if (done := frames_done(output)) > 0:
             raise InputError(
                 f"{folder}: a run was stopped here after {done} frames; go on with --resume, or begin anew with"
                 " --restart"
@@ -69,12 +68,18 @@ def open_run(output: Path, begun: dict[str, Any], *, resume: bool = False, resta
 
 def frames_done(output: Path) -> int:
     """How many frames of the unfinished run in `output` are kept."""
-    return Parts(InFolder(output / PARTS)).notes().frames
+    folder = inside(output, PARTS)
+    return Parts(InFolder(folder, _digest(read_json(inside(folder, _MANIFEST))))).notes().frames
+
+
+def _digest(begun: Any) -> str:
+    """Of what a run was begun from."""
+    return hashlib.sha256(json.dumps(begun, sort_keys=True).encode()).hexdigest()
 
 
 def end_run(output: Path) -> None:
     """Remove what a run kept: its results are written."""
-    gone = output / _GONE
+    gone = inside(output, _GONE)
     shutil.rmtree(gone, ignore_errors=True)
     if (output / PARTS).exists():
         (output / PARTS).rename(gone)
@@ -128,19 +133,23 @@ def people_at_start(kept: KeptArrays, file: Path, load: Callable[[], SubjectShap
 
     InputError where the file has changed since, but for what this run itself wrote into it.
     """
-    now = hashlib.sha256(file.read_bytes()).hexdigest() if file.exists() else None
+    now = hashlib.sha256(read_bytes(file)).hexdigest() if file.exists() else None
     if _KNOWN not in kept.names(_KNOWN):
         known = load()
         about = {"names": known.names.tolist(), "body": known.body, "sha256": now}
         kept.keep(_KNOWN, {name: getattr(known, name) for name in _ARRAYS}, about)
         return known
     about = kept.about(_KNOWN)
+    with naming(kept.place(_KNOWN), ANEW):
+        if not isinstance(about, dict) or not {"names", "body", "sha256"} <= about.keys():
+            raise ValueError("it does not say whose shapes they are")
+        names = np.array([*map(str, about["names"])], dtype=str)
+        known = SubjectShapes(names, *(kept.array(_KNOWN, name) for name in _ARRAYS), body=str(about["body"]))
     if now not in (about["sha256"], *map(kept.about, kept.names(_WRITTEN))):
         raise InputError(
             f"{file}: this has changed since the run was stopped; begin anew with --restart to use what it holds"
         )
-    betas, information = (kept.array(_KNOWN, name) for name in _ARRAYS)
-    return SubjectShapes(np.array(about["names"], dtype=str), betas, information, about["body"])
+    return known
 
 
 def checksum_at_start(kept: KeptArrays) -> str:

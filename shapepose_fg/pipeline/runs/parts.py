@@ -1,26 +1,30 @@
 """Solved windows, kept one after the other: what a run has done so far, and from where it can go on."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.detections import Input
+from shapepose_fg.core.errors import naming
+from shapepose_fg.core.notes import Notes
 from shapepose_fg.core.observation_table import ObservationTable
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Reconstruction, Status
-from shapepose_fg.core.storage.kept_arrays import KeptArrays
+from shapepose_fg.core.storage.kept_arrays import ANEW, KeptArrays
+from shapepose_fg.core.storage.schema import Column, columns_of
 from shapepose_fg.pipeline.runs.chunks import Border
-from shapepose_fg.pipeline.runs.notes import Notes
 from shapepose_fg.pipeline.windows import StreamState
 from shapepose_fg.tracking.following import FollowState
 from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.tracker import Tracks
-from shapepose_fg.tracking.worlds import Input
 
 _STATUS = np.array([*map(str, Status)])
 """A status is kept as its place in this list."""
+_CODE = Column("N", np.uint8, codes=Status)
 OBSERVED = "observations."
 """What the names of observations' columns begin with, among those of a part."""
 
@@ -93,7 +97,22 @@ class Parts:
         """A column of a part, by its name in people.npz, or in observations.npz with `OBSERVED` before it."""
         shared = name.removeprefix(OBSERVED)
         values = self.kept.array(_name(n), shared if shared in ObservationTable.ROWS[:2] else name)
-        return _STATUS[values] if name == "status" else values
+        return _STATUS[_CODE.checked(name, values, {})] if name == "status" else values
+
+    def check(self, joint_names: Sequence[str], view_names: Sequence[str], frames: range) -> None:
+        """InputError for a part that is none of a run of these joints, views and frames."""
+        for n in range(len(self)):
+            with naming(self.kept.place(_name(n)), ANEW):
+                own = {name: self.column(n, OBSERVED + name) for name in ObservationTable.ROWS}
+                table = ObservationTable(**own, joint_names=joint_names, view_names=view_names)  # type: ignore[arg-type]
+                own = {name: self.column(n, name) for name in Reconstruction.ROWS}
+                rows = Reconstruction(**own, joint_names=table.joint_names, observations=table)
+                rows.check_ranges()
+                table.check_ranges()
+                wrong = (rows.frame < frames.start) | (rows.frame >= frames.stop)
+                notes = Notes.from_dict(self.kept.about(_name(n)))
+                if wrong.any() or any(each.joint >= len(joint_names) for each in notes.problems):
+                    raise ValueError("its rows are not of this run")
 
     def drop(self, n: int) -> None:
         """Forget the rows of a part."""
@@ -103,15 +122,23 @@ class Parts:
         """What is to be said about all of them."""
         notes = Notes()
         for n in range(len(self)):
-            notes.add(Notes.from_dict(self.kept.about(_name(n))))
+            with naming(self.kept.place(_name(n)), ANEW):
+                notes.add(Notes.from_dict(self.kept.about(_name(n))))
         return notes
 
-    def checkpoint(self, read: Callable[[int], Input]) -> Checkpoint | None:
-        """From where following goes on; None at the beginning. `read` gives what the cameras saw of a frame."""
+    def checkpoint(self, read: Callable[[int], Input], frames: range, nobody: Tracks) -> Checkpoint | None:
+        """From where following goes on; None at the beginning. `read` gives what the cameras saw of a frame.
+
+        InputError where it is none of a run of these `frames`, whose tracks are as those of `nobody`.
+        """
         name = self._followed
         if name is None:
             return None
-        return checkpoint_of(lambda key: self.kept.array(name, key), self.kept.keys(name), read)
+        keys, (joints, size) = self.kept.keys(name), nobody.joints.mean.shape[1:]
+        columns = {key: column for key, column in _FOLLOWED.items() if key in keys or key == "at"}
+        found = self.kept.columns(name, columns, {"J": joints, "S": size})
+        with naming(self.kept.place(name), ANEW):
+            return checkpoint_of(found, read, frames.start + self.notes().frames, frames)
 
 
 def _name(n: int) -> str:
@@ -142,27 +169,54 @@ def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray[Any]]:
     return arrays
 
 
+_WHOLE = partial(Column, dtype=np.int64, most=2**53)
+_FOLLOWED = {
+    **{"at": _WHOLE("2"), "numbers": _WHOLE("2"), "pending.frames": _WHOLE("P")},
+    **{"decided.frames": _WHOLE("D"), "decided.counts": _WHOLE("D")},
+    **{"people.ids": Column("A", np.intp), "people.world": Column("A", np.intp), "people.evident_s": Column("A")},
+    **{"people.mean": Column("A J S"), "people.covariance": Column("A J S S"), "people.time_s": Column("1")},
+    **{f"border.{name}": column for name, column in columns_of(Border).items()},
+    **{f"decided.{name}": column for name, column in columns_of(Observations).items()},
+}
+"""What `checkpoint_arrays` gives."""
+
+
 def checkpoint_of(
-    array: Callable[[str], NDArray[Any]], keys: Sequence[str], read: Callable[[int], Input]
+    arrays: Mapping[str, NDArray[Any]], read: Callable[[int], Input], solved: int, frames: range
 ) -> Checkpoint:
-    """The checkpoint that `checkpoint_arrays` made the arrays of; `read` gives what the cameras saw of a frame."""
-    following, next_id = array("at").tolist()
-    border = Border(*(array(f"border.{name}") for name in Border.ROWS)) if "border.frame" in keys else None
-    if "numbers" not in keys:
+    """The checkpoint that `checkpoint_arrays` made the `arrays` of.
+
+    `read` gives what the cameras saw of a frame; frames before `solved` are in parts, and all of the run are
+    `frames`. ValueError where the arrays are not of such a run.
+    """
+    following, next_id = arrays["at"].tolist()
+    if "numbers" not in arrays:
+        if following != solved or (following not in frames and following != frames.stop):
+            raise ValueError(f"it goes on at frame {following}, and the parts end at {solved}")
+        border = Border(*(arrays[f"border.{name}"] for name in Border.ROWS)) if "border.frame" in arrays else None
         return Checkpoint(following, next_id, border=border)
+    next_track, before = arrays["numbers"].tolist()
+    pending, decided_at = arrays["pending.frames"].tolist(), arrays["decided.frames"].tolist()
+    waiting = [*decided_at, *pending]
+    if following not in frames or waiting != list(range(solved - before, following)) or before > len(decided_at):
+        raise ValueError(f"it goes on at frame {following}, and the parts end at {solved}")
     people = Tracks(
-        time_s=float(array("people.time_s")[0]),
-        joints=JointStates(array("people.mean"), array("people.covariance")),
-        **{name: array(f"people.{name}") for name in _TRACKS},
+        time_s=float(arrays["people.time_s"][0]),
+        joints=JointStates(arrays["people.mean"], arrays["people.covariance"]),
+        **{name: arrays[f"people.{name}"] for name in _TRACKS},
     )
-    next_track, before = array("numbers").tolist()
-    pending, frames = array("pending.frames").tolist(), array("decided.frames").tolist()
-    given = {frame: read(frame) for frame in (*pending, *frames)}
-    decided = []
-    if len(frames) > 0:
-        rows = Observations(**{name: array(f"decided.{name}") for name in Observations.ROWS})
-        cuts = np.cumsum(array("decided.counts"))[:-1]
+    if not all(np.isfinite(each).all() for each in (people.joints.mean, people.joints.covariance)):
+        raise ValueError("its tracks must be finite")
+    given, decided = {frame: read(frame) for frame in waiting}, []
+    if len(decided_at) > 0:
+        rows = Observations(**{name: arrays[f"decided.{name}"] for name in Observations.ROWS})
+        if not np.array_equal(rows.frame, np.repeat(arrays["decided.frames"], arrays["decided.counts"])):
+            raise ValueError("its rows are not of its frames")
+        most = np.array([len(given[frame].detections) for frame in rows.frame.tolist()], dtype=np.intp)
+        if (rows.candidate >= most[:, None, None]).any():
+            raise ValueError("its rows are of other detections")
+        cuts = np.cumsum(arrays["decided.counts"])[:-1]
         parts = [rows.rows(index) for index in np.split(np.arange(len(rows)), cuts)]
-        decided = [(given[frame], part) for frame, part in zip(frames, parts, strict=True)]
+        decided = [(given[frame], part) for frame, part in zip(decided_at, parts, strict=True)]
     follow = FollowState(people, next_track, tuple(given[frame] for frame in pending))
-    return Checkpoint(following, next_id, StreamState(follow, tuple(decided), before), border)
+    return Checkpoint(following, next_id, StreamState(follow, tuple(decided), before))

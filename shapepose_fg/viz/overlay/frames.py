@@ -111,6 +111,7 @@ def _video(path: Path, size: Sequence[int], fps: float) -> Iterator[cv2.VideoWri
     """An mp4 video that is put in place when it is complete."""
     part = path.with_name(f".{path.stem}.part.mp4")  # OpenCV tells the container by the ending
     path.parent.mkdir(parents=True, exist_ok=True)
+    part.unlink(missing_ok=True)  # it may be a link
     writer = cv2.VideoWriter(str(part), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
     try:
         if not writer.isOpened():

@@ -5,10 +5,45 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
-from shapepose_fg.estimation.window_solution import Problem
-from shapepose_fg.tracking.worlds import Input
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from shapepose_fg.core.detections import Input
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What went wrong with one joint of one person in one frame."""
+
+    row: int
+    """Row of the solution."""
+    track: int
+    """Who."""
+    frame: int
+    """When."""
+    joint: int
+    """Which joint, an index into the skeleton."""
+    reason: str
+    """What happened, in words."""
+
+
+_Count = Annotated[int, Field(ge=0, lt=2**53)]
+_Number = Annotated[float, Field(allow_inf_nan=False)]
+_Frames = dict[str, list[_Count]]
+
+
+class _Kept(BaseModel):
+    """Notes as plain values."""
+
+    model_config = ConfigDict(extra="forbid")
+    frames: _Count
+    seconds: dict[str, _Number]
+    evidence: dict[_Count, tuple[_Number, Annotated[int, Field(gt=0)]]]
+    probable: dict[str, _Count]
+    dropped: _Frames
+    thinned_frames: _Frames
+    problems: list[Problem]
 
 
 @dataclass
@@ -19,7 +54,7 @@ class Notes:
     """How many frames it is of."""
     seconds: Counter[str] = field(default_factory=Counter)
     """Time per stage, over all processes."""
-    evidence: dict[int, list[float]] = field(default_factory=dict)
+    evidence: dict[int, Sequence[float]] = field(default_factory=dict)
     """Of each track the sum of its rows' evidence (`Observations.evidence`), and how many rows that is."""
     probable: Counter[str] = field(default_factory=Counter)
     """Frame by frame how many rows are so probable, by tenths rounded down."""
@@ -49,10 +84,13 @@ class Notes:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Notes":
-        """What `as_dict` gave."""
-        made = {"evidence": {int(track): each for track, each in values["evidence"].items()}}
-        made |= {name: Counter(values[name]) for name in ("seconds", "probable")}
-        return cls(**{**values, **made, "problems": [Problem(**each) for each in values["problems"]]})
+        """What `as_dict` gave; ValueError where `values` are something else."""
+        try:
+            made = vars(_Kept.model_validate(values))
+        except ValidationError as error:
+            problem = error.errors(include_url=False)[0]
+            raise ValueError(f"notes: {'.'.join(map(str, problem['loc']))}: {problem['msg']}") from None
+        return cls(**made | {name: Counter(made[name]) for name in ("seconds", "probable")})
 
 
 class Notebook:
