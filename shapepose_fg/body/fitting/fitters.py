@@ -47,6 +47,8 @@ more."""
 _CONVERGED = 9.0
 """Without a network, rows whose energy a Newton step would still lower by more (3 sigma of the posterior) are
 NOT_CONVERGED; with one, `BodyConfig.unfinished` says so after the plain optimiser has tried."""
+_ROUNDS = 2
+"""How often somebody is fitted at an adult's size: the first sizes are those that the prior of adults leaves."""
 _SPREAD = {"RWrist": 2.0, "LWrist": 2.0}
 """Multiplies the variance of joints without their own target. Elbows bend farther from their mean than a Gaussian
 says: without it, 85 % of the wrists of the validation subjects (training.motions) lay in their 90 % ellipsoids."""
@@ -145,18 +147,19 @@ class SmplFitter(BodyFitter):
         sequence = SequenceFitter(self.energy, self._starts, self.law, self.config)
         found = sequence.fit(targets, groups, time_s, shapes, fixed_shapes=fixed_shapes)
         sizes = Sizes.of(self.model)
-        size = sizes.beyond(found.shapes.mean)
-        far = size != 1
+        far = sizes.far(found.shapes.mean, 2.0)
         if shapes is not None or not far.any():
             return found
         rows = np.flatnonzero(np.isin(groups, found.groups[far]))
         own, groups, time_s = targets.rows(rows), groups[rows], time_s[rows]
-        adult = own.larger(1 / size[np.searchsorted(found.groups, groups)])
-        mean = found.shapes.mean.copy()
-        mean[far] = sizes.resized(sequence.fit(adult, groups, time_s).shapes.mean, size[far])
-        shapes = Shapes(mean, found.shapes.information)
-        again = sequence.fit(own, groups, time_s, Shapes(mean[far], shapes.information[far]), fixed_shapes=True)
-        return SequenceFit(found.fit.with_rows(rows, again.fit), found.groups, shapes)
+        whose = np.unique(groups, return_inverse=True)[1]
+        mean, information = found.shapes.mean.copy(), found.shapes.information
+        for _ in range(_ROUNDS):
+            size = sizes.ratio(mean[far])
+            adult = sequence.fit(own.larger(1 / size[whose]), groups, time_s)
+            mean[far] = sizes.resized(adult.shapes.mean, size)
+        again = sequence.fit(own, groups, time_s, Shapes(mean[far], information[far]), fixed_shapes=True)
+        return SequenceFit(found.fit.with_rows(rows, again.fit), found.groups, Shapes(mean, information))
 
     def _fit(
         self, targets: JointTargets, initial: BodyFit | None, groups: NDArray[np.intp] | None, *, leave_out: bool

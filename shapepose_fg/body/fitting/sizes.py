@@ -13,7 +13,7 @@ import torch
 
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
-from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.arrays import Array, Mask
 
 _ADULT = 2.0
 """Standard deviations of adults' stature from their mean, beyond which somebody is fitted at another size."""
@@ -52,11 +52,13 @@ class Sizes:
         stature = float(template[top, 1] - template[sole, 1])
         return cls(*points_at_rest(body), stature, shapes[top, 1] - shapes[sole, 1])
 
-    def beyond(self, betas: Array) -> Array:
-        """(G,) by how much those of `betas` (G, 10) are larger than the mean; 1 for whoever is about an adult."""
-        above = betas @ self.taller
-        far = np.abs(above) > _ADULT * np.linalg.norm(self.taller)
-        return np.where(far, 1 + above / self.stature_m, 1.0)
+    def far(self, betas: Array, sigmas: float = 3.0) -> Mask:
+        """(G,) who of `betas` (G, 10) is far from the mean."""
+        return np.abs(betas @ self.taller) > sigmas * np.linalg.norm(self.taller)
+
+    def ratio(self, betas: Array) -> Array:
+        """(G,) how many times as tall as the mean body those of `betas` (G, 10) are."""
+        return 1 + betas @ self.taller / self.stature_m
 
     def resized(self, betas: Array, size: Array) -> Array:
         """(G, 10) betas next to those of bodies `betas` (G, 10) that are `size` (G,) times as large, as tall as they.

@@ -75,9 +75,10 @@ def learn_offsets(
     for _ in range(prior.rounds):
         fitter = SmplFitter(model, wide, config)
         fit = fitter.fit_whole(targets, fit)
-        size = Sizes.of(model).beyond(fit.betas)
-        if (size != 1).any():  # a room full of children is no detector's habit
-            targets = targets.larger(1 / size)
+        sizes = Sizes.of(model)
+        far = sizes.far(fit.betas)
+        if far.any():  # a room full of children is no detector's habit
+            targets = targets.larger(np.where(far, 1 / sizes.ratio(fit.betas), 1.0))
             fit = fitter.fit_whole(targets)
         if not fit.ok.any():
             break
