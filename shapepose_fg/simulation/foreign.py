@@ -5,12 +5,10 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
+from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.smpl_file import NUM_BETAS, SMPL_PARENTS
 from shapepose_fg.core.skeleton import SMPL_24
@@ -110,51 +108,6 @@ def reshaped(body: BodyModel, betas: Array, proportions: Sequence[Proportions]) 
         shapes[..., person] -= arrays.template
     model = BodyModel(replace(arrays, shapes=shapes), body.dtype, body.keypoint_offsets, body.keypoint_names)
     return model, np.eye(len(betas), NUM_BETAS)
-
-
-def another_body(body: BodyModel, seed: int = 0) -> BodyModel:
-    """Another body in SMPL's format, made of `body`: what a licensed file is to the one that ships.
-
-    Its template is of other proportions and rests with arms and legs at other angles; its shapes are mixtures of
-    `body`'s, by a random rotation and scales; joints and keypoints are regressed from more of the mesh, and skinning
-    is softer.
-    """
-    rng, arrays = np.random.default_rng(seed), body.arrays
-    neighbours = _smoothing(arrays.faces, len(arrays.template))
-    length = np.ones(24) + 0.06 * np.repeat(rng.uniform(-1, 1, 4), (4, 8, 4, 8))
-    resting = BodyParameters.zeros(1 + NUM_BETAS, torch.float64)
-    resting.betas[1:] = torch.eye(NUM_BETAS)
-    for joint, degrees in {"left_hip": 4, "right_hip": -4, "left_shoulder": -6, "right_shoulder": 6}.items():
-        resting.body_pose[:, SMPL_24.index(joint) - 1, 2] = np.radians(degrees)
-    template, *shaped = body.to(torch.float64).vertices(resting).numpy()
-    mixed = np.linalg.qr(rng.normal(size=(NUM_BETAS, NUM_BETAS)))[0] * rng.uniform(0.8, 1.25, NUM_BETAS)
-    joints = arrays.joint_regressor @ template
-    template = _stretched(template, joints, arrays.weights, Proportions(length, np.full(24, 1.05)))
-    skinning = arrays.weights
-    for _ in range(8):
-        skinning = neighbours @ skinning
-    regressors = arrays.joint_regressor, arrays.keypoint_regressor
-    for _ in range(3):
-        regressors = tuple(regressor @ neighbours for regressor in regressors)
-    other = replace(
-        arrays,
-        template=template * (1.02, 0.99, 1.03),
-        shapes=(np.stack(shaped, -1) - body.to(torch.float64).vertices(resting)[0].numpy()[..., None]) @ mixed,
-        joint_regressor=regressors[0],
-        keypoint_regressor=regressors[1],
-        weights=skinning,
-    )
-    return BodyModel(other, body.dtype)
-
-
-def _smoothing(faces: NDArray[np.int64], count: int) -> csr_array:
-    """(Nv, Nv) which gives each vertex the mean of itself and its neighbours."""
-    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    ends = np.unique(
-        np.concatenate([ends, ends[:, ::-1], np.repeat(np.arange(count)[:, None], 2, axis=1)]), axis=0
-    )
-    share = 1 / np.bincount(ends[:, 0], minlength=count)
-    return csr_array((share[ends[:, 0]], (ends[:, 0], ends[:, 1])), shape=(count, count))
 
 
 def _stretched(vertices: Array, joints: Array, weights: Array, proportions: Proportions) -> Array:

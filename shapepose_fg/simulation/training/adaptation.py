@@ -1,16 +1,15 @@
-"""Weights of the learned fitter for any body: from nothing, or from those that ship; and how good they are."""
+"""The learned fitter for another body: the shipped network in that body's words, trained on, and how good it is."""
 
 import json
-import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from shapepose_fg.body.fitting.descent import NUM_PARAMETERS, UpdateNetwork, gradient_scale
-from shapepose_fg.body.fitting.fitter import BodyFitter, JointTargets
+from shapepose_fg.body.fitting.fitters import SmplFitter
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.sizes import points_at_rest
 from shapepose_fg.body.fitting.weights import FitterWeights, fingerprint
@@ -19,77 +18,62 @@ from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.provenance import versions
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.simulation.training.motions import (
-    ACKNOWLEDGEMENT,
-    TEST_SUBJECTS,
-    VALIDATION_SUBJECTS,
-    Motions,
-)
+from shapepose_fg.simulation.training.motions import Motions
 from shapepose_fg.simulation.training.train import (
     PeopleSource,
+    Score,
     Trainer,
     TrainingConfig,
-    Validation,
     calibrated,
+    compared,
 )
 
+TRAINED, PLAIN = "trained", "plain optimiser"
 _RIDGE_M = 0.005
 """What of a shape moves points by less than this says nothing of which shape it is in the other body."""
-_BATCH = 64
-"""People who are fitted at a time."""
-_VALIDATION_PEOPLE, _CALIBRATION_PEOPLE = 2048, 4096
+_SLOWER = 0.2
+"""Of the learning rate for a network from nothing: this one knows nearly everything."""
+_CALIBRATION_PEOPLE = 4096
 _SEEN = tuple(range(len(BODY_25)))
 
 
-def trained(
+def adapted(
     body: BodyModel,
     motions: Motions,
-    validation: Motions,
+    unseen: Motions,
     config: TrainingConfig,
-    about: str,
-    *,
-    from_scratch: bool = False,
+    card: Mapping[str, str],
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> FitterWeights:
-    """Weights for `body`, trained on `motions`, with covariances that hold on `validation`.
+) -> tuple[FitterWeights, dict[str, Score]]:
+    """The shipped weights trained on `motions` for `body`, and what they and the plain optimiser do on `unseen` ones.
 
-    They begin as the shipped ones, unless `from_scratch`. `about` says what the motions are, for the card;
-    `progress` is told how many iterations of how many are done.
+    Covariances hold on `unseen`. `card` says what the motions are; `progress` is told how many iterations of how
+    many are done.
     """
-    shipped = FitterWeights.default()
-    still = replace(config, shake_rad=0.0, exchange=0.0)
+    shipped, frame = FitterWeights.default(), PersonFrame.of(body, motions.poses, motions.weight)
+    rate = _SLOWER * config.learning_rate
+    config = replace(config, network=shipped.network.config, learning_rate=rate)
     torch.manual_seed(config.seed)
-    if from_scratch:
-        network, frame = UpdateNetwork(config.network), PersonFrame.of(body, motions.poses, motions.weight)
-        network.gradient_scale.copy_(gradient_scale(body.points, _SEEN))
-    else:
-        config = replace(config, network=shipped.network.config)
-        network, frame = translated(shipped, BodyModel.default(), body, motions)
     # The network lives on a GPU where there is one, the bodies on the CPU.
-    network.to("cuda" if torch.cuda.is_available() else "cpu")
+    network = translated(shipped, BodyModel.default(), body).to("cuda" if torch.cuda.is_available() else "cpu")
     trainer = Trainer(PeopleSource(motions, body, frame, config), frame, network, config)
     for done, _ in enumerate(trainer.run(config.iterations), start=1):
         progress(done, config.iterations)
     network = trainer.averaged.requires_grad_(False).eval().cpu()
-    unseen = PeopleSource(validation, body, frame, still)
-    errors = Validation(unseen, frame, still, _VALIDATION_PEOPLE).errors_mm(network)
-    card = {
-        "data": f"{about}: {len(motions)} frames of {len(set(motions.subject.tolist()))} subjects for training",
-        "not seen": f"subjects {' '.join(VALIDATION_SUBJECTS)} (validation), {' '.join(TEST_SUBJECTS)} (test)",
-        "begun from": "nothing" if from_scratch else "the shipped weights",
-        "training": f"{config.iterations} iterations of {config.batch} people, seed {config.seed}",
-        "validation": "mean joint error after each step, mm: " + ", ".join(f"{error:.1f}" for error in errors),
-        "acknowledgement": ACKNOWLEDGEMENT,
+    source = PeopleSource(unseen, body, frame, replace(config, shake_rad=0.0, exchange=0.0))
+    weights = FitterWeights(network, frame, fingerprint(body), shipped.spread)
+    weights = calibrated(weights, source, _CALIBRATION_PEOPLE)
+    scores = compared({TRAINED: SmplFitter(body, weights=weights), PLAIN: SmplFitter(body)}, source)
+    about = {
+        "training": f"the shipped weights, {config.iterations} batches of {config.batch}, seed {config.seed}",
+        "validation": ", ".join(f"{name} {score.joints_mm:.1f} mm" for name, score in scores.items()),
         "made with": json.dumps(versions()),
     }
-    weights = FitterWeights(network, frame, fingerprint(body), shipped.spread, card)
-    return calibrated(weights, unseen, body, _CALIBRATION_PEOPLE)
+    return replace(weights, card={**card, **about}), scores
 
 
-def translated(
-    weights: FitterWeights, trained_on: BodyModel, body: BodyModel, motions: Motions
-) -> tuple[UpdateNetwork, PersonFrame]:
-    """Network and frame of `weights` for `body`: shapes are those of `trained_on` in other words, all else stays.
+def translated(weights: FitterWeights, trained_on: BodyModel, body: BodyModel) -> UpdateNetwork:
+    """The network of `weights` for `body`: shapes are those of `trained_on` in other words, all else stays.
 
     With betas c = M b of the body that it knows, the same person has b = N c: by least squares of all points. So
     it is told M b and the gradient Nᵀ dE/db, and steps by N times what it says.
@@ -97,7 +81,7 @@ def translated(
     network = UpdateNetwork(weights.network.config)
     network.load_state_dict(weights.network.state_dict())
     if fingerprint(body) == weights.body:
-        return network, weights.frame
+        return network
     (_, old), (_, new) = points_at_rest(trained_on), points_at_rest(body)
     M, N = _solved(old, new), _solved(new, old)
     before, after = weights.network.gradient_scale[:10], gradient_scale(body.points, _SEEN)
@@ -109,50 +93,9 @@ def translated(
         enter[:, betas] = enter[:, betas] @ M
         enter[:, gradient] = (enter[:, gradient] * before) @ N.T / after[:10]
         leave.weight[:10], leave.bias[:10] = N @ leave.weight[:10], N @ leave.bias[:10]
-    return network, PersonFrame.of(body, motions.poses, motions.weight)
+    return network
 
 
 def _solved(by: Array, wanted: Array) -> Tensor:
     """X (10, 10) with `by` X next to `wanted`."""
     return torch.from_numpy(np.linalg.solve(by.T @ by + _RIDGE_M**2 * np.eye(10), by.T @ wanted)).float()
-
-
-@dataclass(frozen=True)
-class Score:
-    """How a fitter does on bodies that it has not seen."""
-
-    joints_mm: float
-    """Mean error of all joints."""
-    missing_mm: float
-    """The same of joints without a target; NaN where there are none."""
-    ms: float
-    """Processor time of a fit, leave-one-out passes included."""
-
-
-def compared(
-    fitters: Mapping[str, BodyFitter], source: PeopleSource, sigma_m: float, missing: float, count: int = 256
-) -> dict[str, Score]:
-    """Scores of `fitters` on the same `count` people: noise of `sigma_m`, a share of the joints `missing`.
-
-    Rows that some fitter does not finish count for none.
-    """
-    generator = torch.Generator().manual_seed(3)
-    truth = source.draw(count, generator).points[:, list(_SEEN)].double().numpy()
-    rng = np.random.default_rng(3)
-    targets = truth + rng.normal(0, sigma_m, truth.shape)
-    gone = rng.random(truth.shape[:2]) < missing
-    information = np.where(gone[..., None, None], 0.0, np.eye(3) / sigma_m**2)
-    error, spent = dict[str, np.ndarray](), dict[str, float]()
-    for name, fitter in fitters.items():
-        begin, found = time.process_time(), []
-        for at in range(0, count, _BATCH):
-            part = slice(at, at + _BATCH)
-            found.append(fitter.fit(JointTargets(targets[part], information[part])).joints)
-        spent[name] = 1000 * (time.process_time() - begin) / count
-        error[name] = 1000 * np.linalg.norm(np.concatenate(found) - truth, axis=-1)
-    done = np.all([np.isfinite(each).all(axis=1) for each in error.values()], axis=0)
-    hidden = gone & done[:, None]
-    return {
-        name: Score(each[done].mean(), each[hidden].mean() if hidden.any() else np.nan, spent[name])
-        for name, each in error.items()
-    }
