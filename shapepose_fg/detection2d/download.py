@@ -1,7 +1,6 @@
 """A named network, fetched once from its public address, and only if its checksum is right."""
 
 import hashlib
-import os
 import urllib.error
 import urllib.parse
 import urllib.request
@@ -9,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.storage.files import write_atomically
+from shapepose_fg.core.storage.files import user_cache, write_atomically
 from shapepose_fg.detection2d.networks import KnownNetwork, known_networks
 
 _CHUNK = 1 << 16
@@ -18,8 +17,7 @@ _TIMEOUT_S = 30.0
 
 def cache_folder() -> Path:
     """Where fetched networks are kept: the user's cache, XDG_CACHE_HOME where it is set."""
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "shapepose-fg" / "networks"
+    return user_cache("networks")
 
 
 def find_network(

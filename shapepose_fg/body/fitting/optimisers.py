@@ -1,10 +1,10 @@
 """How one body is fitted to one row of targets: by a network's steps and a polish, or by Levenberg-Marquardt.
 
-Both have `arrive`, from which `again` is short, and `first`, the two in one; rows are independent."""
+Both have `arrive`, from which `again` is short, and `first`, the two in one; rows are independent.
+"""
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from shapepose_fg.body.fitting.descent import BodyState, DescentTargets, LearnedDescent
@@ -23,8 +23,7 @@ from shapepose_fg.body.fitting.weights import FitterWeights
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.rotation import log_so3
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, slots
-
-Array = NDArray[np.float64]
+from shapepose_fg.core.arrays import Array, Mask
 
 STALE = 0.3
 """Change of a joint's robust weight, in a step, from which on a row is linearised anew after it."""
@@ -122,7 +121,7 @@ class LevenbergMarquardt:
     def arrive(
         self, targets: WhitenedTargets, variance: Array, start: Tensor | None = None
     ) -> tuple[Tensor, Held]:
-        """The optimum (B, P), with each row's own shape, held by the priors; from `start` where that is not NaN."""
+        """The optimum (B, P), each with its own shape, held by the priors; from `start` where that is no NaN."""
         rotation, pelvis = self._frame.place(targets.xyz.double(), torch.from_numpy(variance), self._slots)
         angles = self._mean_angles.expand(len(variance), -1)
         parts = (angles.new_zeros(len(variance), 10), log_so3(rotation), angles, pelvis + self._frame.transl)
@@ -145,7 +144,7 @@ class LevenbergMarquardt:
         free = self.solve(free, targets, np.ones(len(free), dtype=bool), held)
         return self._energy.evaluate(free, targets, torch.tensor(self._kernel_scale), held)
 
-    def solve(self, free: Tensor, targets: WhitenedTargets, warm: NDArray[np.bool_], held: Held) -> Tensor:
+    def solve(self, free: Tensor, targets: WhitenedTargets, warm: Mask, held: Held) -> Tensor:
         """Minimise from `free` (B, P); rows leave the batch as they finish. Returns (B, P)."""
         energy, kernel_scale = self._energy, self._kernel_scale
         result, rows = free.clone(), torch.arange(len(free))

@@ -1,9 +1,9 @@
 """People whom the shapes of adults do not reach: children, and the very tall.
 
-A body's shapes are those of adults. Their stature extrapolates badly: at 1.10 m, five standard deviations below the
-mean, thighs are a sixth too short for a child, and joints that are where a child's are make a body that is 6 cm too
-tall. So whoever is so small or tall is fitted at the size of an adult, and the body of that shape and that size is
-then the nearest one that the model has *of the same stature*.
+A body's shapes are those of adults, and their stature extrapolates badly: at 1.10 m, five standard deviations
+below the mean, thighs are a sixth too short for a child, and joints that are where a child's are make a body that
+is 6 cm too tall. So whoever is so small or tall is fitted at the size of an adult. The body of that shape and size
+is then the nearest one that the model has *of the same stature*.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.core.arrays import Array, Mask
 
 _ADULT = 2.0
-"""Standard deviations of adults' stature from their mean, beyond which somebody is fitted at another size."""
+"""Standard deviations from the mean that adults' stature is within."""
 _POINT_M = 0.02
 """How near a point must be to its place to be worth a beta of 1."""
 
@@ -35,10 +35,6 @@ def points_at_rest(body: BodyModel) -> tuple[Array, Array]:
 class Sizes:
     """What a body model says of sizes."""
 
-    points: Array
-    """(150,) of the mean body at rest, metres."""
-    by_betas: Array
-    """(150, 10) how they move."""
     stature_m: float
     """Of the mean body."""
     taller: Array
@@ -46,30 +42,29 @@ class Sizes:
 
     @classmethod
     def of(cls, body: BodyModel) -> "Sizes":
-        """Of a body model, without a detector's offsets."""
+        """Of a body model."""
         template, shapes = body.arrays.template, body.arrays.shapes
         top, sole = template[:, 1].argmax(), template[:, 1].argmin()
-        stature = float(template[top, 1] - template[sole, 1])
-        return cls(*points_at_rest(body), stature, shapes[top, 1] - shapes[sole, 1])
+        return cls(float(template[top, 1] - template[sole, 1]), shapes[top, 1] - shapes[sole, 1])
 
-    def far(self, betas: Array, sigmas: float = 3.0) -> Mask:
-        """(G,) who of `betas` (G, 10) is far from the mean."""
-        return np.abs(betas @ self.taller) > sigmas * np.linalg.norm(self.taller)
+    def far(self, betas: Array) -> Mask:
+        """(G,) whose stature, of those of `betas` (G, 10), is not one of an adult."""
+        return np.abs(betas @ self.taller) > _ADULT * np.linalg.norm(self.taller)
 
     def ratio(self, betas: Array) -> Array:
         """(G,) how many times as tall as the mean body those of `betas` (G, 10) are."""
         return 1 + betas @ self.taller / self.stature_m
 
-    def resized(self, betas: Array, size: Array) -> Array:
-        """(G, 10) betas next to those of bodies `betas` (G, 10) that are `size` (G,) times as large, as tall as they.
+    def resized(self, body: BodyModel, betas: Array, size: Array) -> Array:
+        """(G, 10) betas near those of bodies `betas` (G, 10) that are `size` (G,) times as large, and as tall.
 
         min |points - wanted|² / sigma² + |betas|², with the stature as a constraint.
         """
-        own = self.points + betas @ self.by_betas.T
-        wanted = size[:, None] * own - self.points
-        tall = size * (self.stature_m + betas @ self.taller) - self.stature_m
+        mean, by_betas = points_at_rest(body)
+        wanted = size[:, None] * (mean + betas @ by_betas.T) - mean
+        taller = (size * self.ratio(betas) - 1) * self.stature_m
         system = np.zeros((11, 11))
-        system[:10, :10] = self.by_betas.T @ self.by_betas + _POINT_M**2 * np.eye(10)
+        system[:10, :10] = by_betas.T @ by_betas + _POINT_M**2 * np.eye(10)
         system[:10, 10] = system[10, :10] = self.taller
-        right = np.concatenate([wanted @ self.by_betas, tall[:, None]], axis=1)
+        right = np.concatenate([wanted @ by_betas, taller[:, None]], axis=1)
         return np.linalg.solve(system, right.T).T[:, :10]

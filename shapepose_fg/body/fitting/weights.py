@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
@@ -17,6 +16,7 @@ from shapepose_fg.body.fitting.descent import NetworkConfig, UpdateNetwork
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, slots
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import open_regular, user_cache, write_content
 
@@ -63,7 +63,7 @@ class FitterWeights:
         own = fingerprint(model) != shipped.body and kept.is_file()
         return FitterWeights.load(kept) if own else shipped
 
-    def spread_of(self, names: tuple[str, ...]) -> NDArray[np.float64]:
+    def spread_of(self, names: tuple[str, ...]) -> Array:
         """(J,) `spread` of the keypoints with these names."""
         return self.spread[list(slots(names))].double().numpy()
 
@@ -136,7 +136,7 @@ def fingerprint(model: BodyModel) -> str:
 
 
 def adapted_file(model: BodyModel) -> Path:
-    """Where `shapepose-fg train-fitter` keeps its weights for this body, made of the shipped ones as they are now."""
+    """Where `shapepose-fg train-fitter` keeps weights for this body, begun as those that ship now."""
     digest = hashlib.sha256(fingerprint(model).encode() + _DEFAULT.read_bytes())
     for array in (model.arrays.weights, model.arrays.keypoint_regressor):
         digest.update(np.ascontiguousarray(array, dtype=np.float32).tobytes())

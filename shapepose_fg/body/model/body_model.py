@@ -21,6 +21,7 @@ from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.body.model.skinned_points import SkinnedPoints, contract
 from shapepose_fg.body.model.smpl_file import NUM_BETAS, SMPL_PARENTS, SmplArrays, read_smpl_file
 from shapepose_fg.body.model.target_skeletons import slots
+from shapepose_fg.core.arrays import Array, Index, Real
 from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 
 _DEFAULT_FILE = Path(__file__).parents[1] / "data" / "open_body.npz"
@@ -111,7 +112,7 @@ class BodyModel:
         return BodyModel.load(_DEFAULT_FILE)
 
     @classmethod
-    def load(cls, path: str | Path, *, keypoint_regressor: NDArray[np.floating] | None = None) -> "BodyModel":
+    def load(cls, path: str | Path, *, keypoint_regressor: Real | None = None) -> "BodyModel":
         """A model from SMPL's `.npz` or official `.pkl`; InputError where it cannot be used.
 
         `keypoint_regressor` (25, Nv) makes the BODY_25 keypoints from vertices. Without it the file's own
@@ -150,7 +151,7 @@ class BodyModel:
         """What the file held, in float64."""
         return self._arrays
 
-    def vertices(self, parameters: BodyParameters, only: NDArray[np.intp] | None = None) -> Tensor:
+    def vertices(self, parameters: BodyParameters, only: Index | None = None) -> Tensor:
         """(B, Nv, 3) the skinned mesh, metres; or (B, M, 3), the vertices `only` (M,) of it.
 
         The only thing here whose cost grows with the mesh. ValueError where `only` has other than one axis.
@@ -224,7 +225,7 @@ class BodyModel:
         local = exp_so3(torch.cat((parameters.global_orient[:, None], parameters.body_pose), 1))
         return local, accumulate(local)
 
-    def _part_of_mesh(self, only: NDArray[np.intp]) -> "_Mesh":
+    def _part_of_mesh(self, only: Index) -> "_Mesh":
         """What some of the vertices need; the last part is kept, for it is asked for frame after frame."""
         if only.ndim != 1:
             raise ValueError(f"only must be (M,) numbers of vertices, got {only.shape}")
@@ -267,7 +268,7 @@ class _Mesh:
     weights: Tensor
     """(Nv, 24) skinning weights."""
 
-    def part(self, vertices: NDArray[np.intp]) -> "_Mesh":
+    def part(self, vertices: Index) -> "_Mesh":
         """What some of the vertices need."""
         rows = torch.from_numpy(vertices)
         blend = self.pose_blend
@@ -314,7 +315,7 @@ def _contract(arrays: SmplArrays) -> SkinnedPoints:
     return keypoints.joined(head).joined(own)
 
 
-def _regressed(arrays: SmplArrays, regressor: NDArray[np.float64], joints: NDArray[np.float64]) -> SkinnedPoints:
+def _regressed(arrays: SmplArrays, regressor: Array, joints: Array) -> SkinnedPoints:
     """The contraction of a regressor (K, Nv)."""
     touched = np.flatnonzero(np.any(regressor != 0, axis=0))
     regressor, weights = regressor[:, touched], arrays.weights[touched]

@@ -1,4 +1,4 @@
-"""The learned fitter for another body: the shipped network in that body's words, trained on, and how good it is."""
+"""The learned fitter for another body: the shipped network in that body's words, and trained on it."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -45,7 +45,7 @@ def adapted(
     card: Mapping[str, str],
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[FitterWeights, dict[str, Score]]:
-    """The shipped weights trained on `motions` for `body`, and what they and the plain optimiser do on `unseen` ones.
+    """The shipped weights trained on `motions` for `body`; what they and the plain optimiser do on `unseen` ones.
 
     Covariances hold on `unseen`. `card` says what the motions are; `progress` is told how many iterations of how
     many are done.
