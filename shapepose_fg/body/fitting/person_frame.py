@@ -31,12 +31,8 @@ class PersonFrame:
 
     def __post_init__(self) -> None:
         K = len(BODY_POINTS)
-        for name, shape in {
-            "rest_xyz": (K, 3),
-            "rest_variance": (K,),
-            "local": (24, 3, 3),
-            "transl": (3,),
-        }.items():
+        shapes = {"rest_xyz": (K, 3), "rest_variance": (K,), "local": (24, 3, 3), "transl": (3,)}
+        for name, shape in shapes.items():
             if getattr(self, name).shape != shape:
                 raise ValueError(f"{name} must be {shape}, got {tuple(getattr(self, name).shape)}")
 
