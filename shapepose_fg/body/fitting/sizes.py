@@ -67,4 +67,4 @@ class Sizes:
         system[:10, :10] = by_betas.T @ by_betas + _POINT_M**2 * np.eye(10)
         system[:10, 10] = system[10, :10] = self.taller
         right = np.concatenate([wanted @ by_betas, taller[:, None]], axis=1)
-        return np.linalg.solve(system, right.T).T[:, :10]
+        return np.asarray(np.linalg.solve(system, right.T).T[:, :10], dtype=np.float64)
