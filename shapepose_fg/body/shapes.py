@@ -40,12 +40,7 @@ def recognise(found: SubjectShapes, known: SubjectShapes, ratio: float = 10.0) -
     return whose
 
 
-def _log_evidence(
-    seen: Array,
-    gradient: Array,
-    mean: Array,
-    information: Array,
-) -> Array:
+def _log_evidence(seen: Array, gradient: Array, mean: Array, information: Array) -> Array:
     """(G, K) log of how likely observations are under each of K priors, up to a constant of each observation.
 
     `seen` (G, 10, 10) and `gradient` (G, 10) are information and information times mean of what was seen alone,

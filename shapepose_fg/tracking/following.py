@@ -5,9 +5,9 @@ memory.
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.bounds import Seconds, Settings
 from shapepose_fg.core.detections import Input
 from shapepose_fg.core.observations import Observations
@@ -15,8 +15,6 @@ from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.tracking.presence import Chosen, own_evidence
 from shapepose_fg.tracking.tracker import Tracker, Tracks
 from shapepose_fg.tracking.worlds import Hypotheses, explained, times_of
-
-Array = NDArray[np.float64]
 
 BLOCK_S = 3.0
 """People are decided for so long at a time: in some of its frames everybody is seen well."""
@@ -116,7 +114,7 @@ def alone(tracker: Tracker, given: Input, next_id: int) -> Observations:
     return _observed(given, candidate, places, next_id + np.arange(len(places)))
 
 
-def _rows(given: Input, t: int, found: Hypotheses, chosen: Chosen, identity: NDArray[np.intp]) -> Observations:
+def _rows(given: Input, t: int, found: Hypotheses, chosen: Chosen, identity: Index) -> Observations:
     """The people of a frame as observations, each identity once; what is not known well is left open."""
     here = np.flatnonzero(chosen.during(t) & (identity >= 0))
     _, first = np.unique(identity[here], return_index=True)
@@ -127,7 +125,7 @@ def _rows(given: Input, t: int, found: Hypotheses, chosen: Chosen, identity: NDA
     return replace(_observed(given, own, found.places[who, t], identity[here]), evidence=evidence)
 
 
-def _observed(given: Input, candidate: NDArray[np.intp], places: Array, track: NDArray[np.intp]) -> Observations:
+def _observed(given: Input, candidate: Index, places: Array, track: Index) -> Observations:
     """People at `places` (P, J, 3) with their detections (P, J, V) as rows of a frame."""
     return replace(
         Observations.of(candidate, given.detections, places),
@@ -139,7 +137,7 @@ def _observed(given: Input, candidate: NDArray[np.intp], places: Array, track: N
 
 def _identities(
     found: Hypotheses, chosen: Chosen, state: FollowState, times: Array, own: int, skeleton: Skeleton
-) -> tuple[NDArray[np.intp], int]:
+) -> tuple[Index, int]:
     """(K,) the identity of everybody who was chosen, -1 for whom only later frames have; and the next new one.
 
     Whoever is there from the first frame on is one of those carried on, where there is one in the same place; who
@@ -163,9 +161,7 @@ def _identities(
     return identity, next_id
 
 
-def _returned(
-    found: Hypotheses, chosen: Chosen, k: int, identity: NDArray[np.intp], times: Array, skeleton: Skeleton
-) -> int:
+def _returned(found: Hypotheses, chosen: Chosen, k: int, identity: Index, times: Array, skeleton: Skeleton) -> int:
     """The identity of the nearest person who vanished before the `k`-th chosen appears; -1 where nobody fits."""
     start, best, nearest_m = int(chosen.start[k]), -1, np.inf
     here = found.places[chosen.hypothesis[[k]], start]

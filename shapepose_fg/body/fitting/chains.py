@@ -40,13 +40,7 @@ class Segment:
 
 
 def cut_segments(
-    rows: Index,
-    group: Index,
-    time_s: Array,
-    *,
-    gap_s: float,
-    length: int,
-    overlap: int,
+    rows: Index, group: Index, time_s: Array, *, gap_s: float, length: int, overlap: int
 ) -> list[Segment]:
     """The `rows` (R,), of so many people `group` (B,) at the times `time_s` (B,), as segments.
 

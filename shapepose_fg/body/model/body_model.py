@@ -90,7 +90,8 @@ class BodyModel:
 
         `contracted` is what another model made of the same arrays (`_contract`): it costs more than all else here.
         """
-        self._arrays = arrays
+        self.arrays = arrays
+        """What the file held, in float64."""
         self.dtype = dtype
         """Floating point type of parameters and results."""
         self.keypoint_offsets = KeypointOffsets.identity() if offsets is None else offsets
@@ -134,22 +135,17 @@ class BodyModel:
 
     def _with(self, **changed: Any) -> "BodyModel":
         kept = {"dtype": self.dtype, "offsets": self.keypoint_offsets, "keypoint_names": self.keypoint_names}
-        return BodyModel(self._arrays, **(kept | changed), contracted=self._contracted)
+        return BodyModel(self.arrays, **(kept | changed), contracted=self._contracted)
 
     @property
     def faces(self) -> NDArray[np.int64]:
         """(F, 3) vertex indices of the triangles, counter-clockwise seen from outside."""
-        return self._arrays.faces
+        return self.arrays.faces
 
     @property
     def num_vertices(self) -> int:
         """Vertices of the mesh, Nv."""
-        return len(self._arrays.template)
-
-    @property
-    def arrays(self) -> SmplArrays:
-        """What the file held, in float64."""
-        return self._arrays
+        return len(self.arrays.template)
 
     def vertices(self, parameters: BodyParameters, only: Index | None = None) -> Tensor:
         """(B, Nv, 3) the skinned mesh, metres; or (B, M, 3), the vertices `only` (M,) of it.
@@ -237,7 +233,7 @@ class BodyModel:
     @cached_property
     def _mesh(self) -> "_Mesh":
         """The big arrays, made when vertices are first asked for."""
-        arrays = self._arrays
+        arrays = self.arrays
         shapes = arrays.shapes.transpose(2, 0, 1)  # (10, Nv, 3)
         rest, rest_shapes = arrays.joint_regressor @ arrays.template, arrays.joint_regressor @ shapes
         blend = arrays.pose_blend
