@@ -23,6 +23,7 @@ from shapepose_fg.cli.stopping import Stopped, stoppable
 from shapepose_fg.cli.terminal import progress as progress_bar
 from shapepose_fg.cli.terminal import say, show, use_any_streams
 from shapepose_fg.cli.tracks import tracks
+from shapepose_fg.cli.train_fitter import train_fitter
 from shapepose_fg.cli.view import view
 from shapepose_fg.core.errors import InputError, failure
 from shapepose_fg.core.storage.output_folder import prepare_output
@@ -40,6 +41,7 @@ _RECORDING, _RESULT, _TRY = "From a recording to a result", "With a result", "To
 for _panel, _commands in {
     _RECORDING: (detect, check_calibration, reconstruct, batch),
     _RESULT: (report, overlay, view, export),
+    _TRY: (train_fitter,),
 }.items():
     for _command in _commands:
         app.command(rich_help_panel=_panel)(_command)

@@ -3,7 +3,6 @@
 import hashlib
 import http.client
 import json
-import os
 import tempfile
 import urllib.error
 import urllib.request
@@ -17,7 +16,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.storage.files import SMALL, read_bytes, read_text, write_content
+from shapepose_fg.core.storage.files import SMALL, read_bytes, read_text, user_cache, write_content
 from shapepose_fg.detection2d.onnx_network import MOST_BYTES
 
 BASES = (
@@ -53,8 +52,7 @@ def named_networks() -> dict[str, NamedNetwork]:
 
 def cache_folder() -> Path:
     """Where fetched networks are kept: the user's cache, XDG_CACHE_HOME where it is set."""
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "shapepose-fg" / "networks"
+    return user_cache("networks")
 
 
 def named_file(

@@ -114,6 +114,16 @@ def test_joints_are_where_they_are(found, truth):
     assert error[~seen].mean() < 150  # half a second without elbow and wrist
 
 
+@pytest.mark.parametrize("size", [0.65, 1.2])
+def test_bodies_far_from_an_adult_s_size_are_as_tall_as_they_are(fitter, found, truth, targets, size):
+    small = fitter.fit_sequence(targets.larger(np.full(len(targets), size)), GROUP, TIME_S)
+    expected = size * stature_m(found.shapes.mean)
+    np.testing.assert_allclose(stature_m(small.shapes.mean), expected, atol=0.03)
+    assert small.fit.ok.all() and (small.fit.betas[:FRAMES] == small.fit.betas[0]).all()
+    error = 1e3 * np.linalg.norm(small.fit.joints - size * truth, axis=-1)
+    assert np.delete(error, HIDDEN, axis=0).mean() < 18  # the nearest shape is not quite theirs
+
+
 def test_bodies_move_as_the_truth_does(fitter, found, truth, targets):
     alone = fitter.fit(targets)
     true, ours, before = (acceleration(xyz) for xyz in (truth, found.fit.joints, alone.joints))

@@ -89,7 +89,7 @@ def test_what_is_no_safetensors_file_is_refused(tmp_path, file):
 def test_other_safetensors_files_are_refused(file, metadata):
     tensors, _ = contents(file)
     save_file(tensors, file, metadata=metadata)
-    assert_refused(file, r"not weights of the learned fitter; make them with scripts/train_fitter\.py")
+    assert_refused(file, r"not weights of the learned fitter; make some with shapepose-fg train-fitter")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

@@ -51,7 +51,7 @@ LEVELS = (
     "cli.reconstruct",
     "cli.batch",
     "cli.demo cli.tracks cli.detect cli.overlay cli.export cli.report cli.view cli.setup cli.simulate"
-    " cli.batch.command",
+    " cli.train_fitter cli.batch.command",
     "cli.main",
     "__main__",
 )

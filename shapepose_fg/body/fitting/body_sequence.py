@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from factors import Motion
@@ -22,8 +21,7 @@ from shapepose_fg.body.fitting.fitter import (
     check_groups,
 )
 from shapepose_fg.body.fitting.posterior import joint_covariance
-
-Array = NDArray[np.float64]
+from shapepose_fg.core.arrays import Array, Index, Mask
 
 SEGMENT_ROWS = 320
 """Longer chains are cut, so that memory does not grow with them."""
@@ -39,7 +37,7 @@ class SequenceFitter:
 
     energy: BodyEnergy
     """Of a row."""
-    starts: Callable[[Evidence], tuple[Tensor, Tensor | None, NDArray[np.bool_]]]
+    starts: Callable[[Evidence], tuple[Tensor, Tensor | None, Mask]]
     """Bodies of rows (R) by themselves: parameters (R, P) around their centres, around which angles (R, A) they
     are held, which are good."""
     law: Motion
@@ -49,7 +47,7 @@ class SequenceFitter:
     def fit(
         self,
         targets: JointTargets,
-        groups: NDArray[np.intp],
+        groups: Index,
         time_s: Array,
         shapes: Shapes | None = None,
         *,
@@ -87,9 +85,7 @@ class SequenceFitter:
                 self._fill(fit, part, free[torch.from_numpy(part)], origin[part], rows, evidence)
         return SequenceFit(fit, numbers, known)
 
-    def _start(
-        self, evidence: Evidence, group: NDArray[np.intp], time_s: Array
-    ) -> tuple[Tensor, Array, ChainRows, NDArray[np.bool_]]:
+    def _start(self, evidence: Evidence, group: Index, time_s: Array) -> tuple[Tensor, Array, ChainRows, Mask]:
         """Where B rows start: bodies row by row; who has none starts as the nearest of the group in time.
 
         Returns parameters (B, P), around which origins (B, 3), one for all rows of a group, what is minimised, and
@@ -151,7 +147,7 @@ class SequenceFitter:
     def _fill(
         self,
         fit: BodyFit,
-        part: NDArray[np.intp],
+        part: Index,
         body: Tensor,
         origin: Array,
         rows: ChainRows,
@@ -184,7 +180,7 @@ def _rows_per_look(time_s: Array, segments: list[Segment], correlation_s: float,
     return np.maximum(rows / (1 + looks), 1.0)
 
 
-def _nearest(sorted_s: Array, asked_s: Array) -> NDArray[np.intp]:
+def _nearest(sorted_s: Array, asked_s: Array) -> Index:
     """(M,) index of the nearest of some sorted times to each that is asked for."""
     after = np.clip(np.searchsorted(sorted_s, asked_s), 0, len(sorted_s) - 1)
     before = np.maximum(after - 1, 0)

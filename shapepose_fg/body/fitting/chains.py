@@ -6,15 +6,14 @@ from typing import TypeVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from factors import Motion
 from shapepose_fg.body.fitting.energy import BodyEnergy, Held, WhitenedTargets
 from shapepose_fg.body.fitting.priors import MotionPrior
 from shapepose_fg.body.model.rotation import exp_so3, log_so3, right_jacobian_inverse
+from shapepose_fg.core.arrays import Array, Index, Mask
 
-Array = NDArray[np.float64]
 T_ = TypeVar("T_", "_State", "_Normal")
 
 MAX_ITERATIONS = 8
@@ -32,16 +31,16 @@ _DAMPING_START, _DAMPING_MIN, _DAMPING_MAX = 1e-4, 1e-8, 1e4
 class Segment:
     """Rows of one person that follow each other."""
 
-    rows: NDArray[np.intp]
+    rows: Index
     """(T,) in the order of time."""
-    kept: NDArray[np.bool_]
+    kept: Mask
     """(T,) whether a row belongs to this segment; the others overlap with the one before or after."""
     group: int
     """Whose."""
 
 
 def cut_segments(
-    rows: NDArray[np.intp], group: NDArray[np.intp], time_s: Array, *, gap_s: float, length: int, overlap: int
+    rows: Index, group: Index, time_s: Array, *, gap_s: float, length: int, overlap: int
 ) -> list[Segment]:
     """The `rows` (R,), of so many people `group` (B,) at the times `time_s` (B,), as segments.
 

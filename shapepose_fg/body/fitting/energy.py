@@ -282,10 +282,8 @@ class BodyEnergy:
     def _pulls(self, free: Tensor, held: Held | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Of what holds the rows: energy (B,), half its gradient by betas (B, 10) and angles (B, A), stiffness."""
         held = Held.by_priors() if held is None else held
-        away, error = (
-            free[:, :10] - held.betas,
-            free[:, 13:-3] - (self._mean if held.angles is None else held.angles),
-        )
+        away = free[:, :10] - held.betas
+        error = free[:, 13:-3] - (self._mean if held.angles is None else held.angles)
         by_angles = error @ self.precision
         energy = (held.stiffness * away.square()).sum(-1) + (by_angles * error).sum(-1)
         return energy, held.stiffness * away, by_angles, held.stiffness

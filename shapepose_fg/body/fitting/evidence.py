@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitter import STATUS_TYPE, FitStatus, JointTargets, Rows
-
-Array = NDArray[np.float64]
+from shapepose_fg.core.arrays import Array, Mask
 
 _ROUNDING = 1e-4
 """Asymmetry or negativity of information, relative, that passes for rounding: inverses of rays lose much."""
@@ -65,7 +64,7 @@ def weigh(targets: JointTargets, model_sigma_m: float) -> Evidence:
     return Evidence(status, xyz, root, np.where(full, variance, np.inf), centre)
 
 
-def determine_pose(xyz: Array, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def determine_pose(xyz: Array, used: Mask) -> Mask:
     """(...) whether the joints `used` (..., K) of `xyz` (..., K, 3) are enough, and do not lie on a line."""
     count = used.sum(axis=-1)
     points = np.where(used[..., None], xyz, 0.0)
@@ -77,7 +76,7 @@ def determine_pose(xyz: Array, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return (count >= LEAST_JOINTS) & (off >= MIN_SPREAD_M**2)
 
 
-def _refuse_nonsense(targets: JointTargets) -> tuple[Array, Array, NDArray[np.bool_]]:
+def _refuse_nonsense(targets: JointTargets) -> tuple[Array, Array, Mask]:
     """Targets and information with rows that are not finite set to zero, and which rows (B,) were finite.
 
     The place of a joint without information may be anything, NaN too: it is not used.

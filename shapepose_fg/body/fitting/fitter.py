@@ -9,6 +9,7 @@ import numpy as np
 from annotated_types import Interval
 from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.bounds import Factor, Metres, RepeatsOrNone, Seconds, Settings
 
 if TYPE_CHECKING:
@@ -28,10 +29,11 @@ class BodyConfig(Settings):
     """How bodies are fitted."""
 
     method: str = "auto"
-    """"learned": learned gradient descent; "plain": Levenberg-Marquardt; "auto": learned where the weights are for
-    the body at hand, plain on any other body."""
+    """"learned": learned gradient descent; "plain": Levenberg-Marquardt; "auto": learned where there are weights
+    for the body at hand, plain on any other body."""
     weights: str = ""
-    """File of the network's weights (scripts/train_fitter.py); empty: those that come with the package."""
+    """File of the network's weights; empty: those that come with the package, or that `shapepose-fg train-fitter`
+    made for another body."""
     model_sigma_m: Metres = 0.02
     """How far the detector's joints lie from the body's, metres: added to every target's covariance."""
     kernel_scale: Factor = 6.0
@@ -105,9 +107,9 @@ class Rows:
 class JointTargets(Rows):
     """Where the joints of B people (rows: people, frames or both) should be, and how surely."""
 
-    xyz: NDArray[np.float64]
+    xyz: Array
     """(B, J, 3) target of each joint in the world, metres; ignored where the information is zero."""
-    information: NDArray[np.float64]
+    information: Array
     """(B, J, 3, 3) inverse covariance of each target, 1/m², symmetric and positive *semi*-definite.
 
     Zero for a joint never seen, rank 2 for one that a single view saw (a ray), full otherwise."""
@@ -122,6 +124,11 @@ class JointTargets(Rows):
         object.__setattr__(self, "xyz", xyz)
         object.__setattr__(self, "information", information)
 
+    def larger(self, size: Array) -> "JointTargets":
+        """The same people `size` (B,) times as large, in a world that is."""
+        size = size[:, None, None]
+        return JointTargets(self.xyz * size, self.information / size[..., None] ** 2)
+
 
 @dataclass(frozen=True)
 class BodyFit(Rows):
@@ -130,29 +137,29 @@ class BodyFit(Rows):
     A row whose status is not OK has NaN joints and covariances and zero parameters: parameters are never NaN.
     """
 
-    betas: NDArray[np.float64]
+    betas: Array
     """(B, 10) shape, in standard deviations."""
-    global_orient: NDArray[np.float64]
+    global_orient: Array
     """(B, 3) rotation of the root, axis-angle, rad."""
-    body_pose: NDArray[np.float64]
+    body_pose: Array
     """(B, 23, 3) rotations of the other joints relative to their parents, axis-angle, rad."""
-    transl: NDArray[np.float64]
+    transl: Array
     """(B, 3) translation, metres."""
-    joints: NDArray[np.float64]
+    joints: Array
     """(B, J, 3) the body's own joints in the detector's skeleton, world, metres."""
-    covariance: NDArray[np.float64]
+    covariance: Array
     """(B, J, 3, 3) covariance of `joints` given all targets, m² (Laplace)."""
-    prior_xyz: NDArray[np.float64]
+    prior_xyz: Array
     """(B, J, 3) where the body puts each joint *without* that joint's own target, metres."""
-    prior_covariance: NDArray[np.float64]
+    prior_covariance: Array
     """(B, J, 3, 3) its covariance as a prediction of the detector's joint: model error included, m²."""
-    residual_m: NDArray[np.float64]
+    residual_m: Array
     """(B,) weighted root mean square distance of the joints to their targets, metres; NaN where not OK."""
     status: NDArray[np.str_]
     """(B,) a `FitStatus` each."""
 
     @property
-    def ok(self) -> NDArray[np.bool_]:
+    def ok(self) -> Mask:
         """(B,) which rows hold a body."""
         return self.status == FitStatus.OK
 
@@ -164,7 +171,7 @@ class BodyFit(Rows):
         columns = [np.zeros((B, *shape)) for shape in zeros] + [np.full((B, *shape), np.nan) for shape in unknown]
         return cls(*columns, status=np.asarray(status).astype(STATUS_TYPE))
 
-    def put_bodies(self, index: NDArray[np.intp], body: "BodyParameters", origin: NDArray[np.float64]) -> None:
+    def put_bodies(self, index: Index, body: "BodyParameters", origin: Array) -> None:
         """Write bodies (R) that were found around `origin` (R, 3), metres, over the rows `index` (R,)."""
         for name in ("betas", "global_orient", "body_pose"):
             getattr(self, name)[index] = getattr(body, name).double().numpy()
@@ -175,9 +182,9 @@ class BodyFit(Rows):
 class Shapes:
     """What is known of the shapes of G people: a Gaussian over the betas of each."""
 
-    mean: NDArray[np.float64]
+    mean: Array
     """(G, 10) in standard deviations over adults."""
-    information: NDArray[np.float64]
+    information: Array
     """(G, 10, 10) inverse covariances. Those of an unknown person are the identity around 0."""
 
     def __post_init__(self) -> None:
@@ -198,7 +205,7 @@ class SequenceFit:
     fit: BodyFit
     """The bodies. `covariance` is what a row's own targets say at the shape of its group: correlated errors are
     not averaged out. `prior_xyz` and `prior_covariance` are NaN: they are `fit`'s."""
-    groups: NDArray[np.intp]
+    groups: Index
     """(G,) the groups, in order."""
     shapes: Shapes
     """(G) their shapes given everything, what was known before included: the prior of their next recording."""
@@ -212,9 +219,7 @@ class BodyFitter(ABC):
     the detector's offsets are not learnt, and there is no one body for each person over time."""
 
     @abstractmethod
-    def fit(
-        self, targets: JointTargets, initial: BodyFit | None = None, groups: NDArray[np.intp] | None = None
-    ) -> BodyFit:
+    def fit(self, targets: JointTargets, initial: BodyFit | None = None, groups: Index | None = None) -> BodyFit:
         """Fit a body to every row of `targets`.
 
         `initial` has one row per target; its OK rows are where the fit may start. `groups` (B,) are whole numbers:
@@ -232,8 +237,8 @@ class BodyFitter(ABC):
     def fit_sequence(
         self,
         targets: JointTargets,
-        groups: NDArray[np.intp],
-        time_s: NDArray[np.float64],
+        groups: Index,
+        time_s: Array,
         shapes: Shapes | None = None,
         *,
         fixed_shapes: bool = False,
@@ -262,7 +267,7 @@ def check_fitter(fitter: object) -> None:
         )
 
 
-def check_groups(groups: NDArray[np.intp], rows: int) -> NDArray[np.intp]:
+def check_groups(groups: Index, rows: int) -> Index:
     """`groups` if it is one whole number a row; ValueError otherwise."""
     groups = np.asarray(groups)
     if groups.shape != (rows,) or groups.dtype.kind not in "iu":

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from factors import CONSTANT_VELOCITY, Motion
@@ -32,11 +31,11 @@ from shapepose_fg.body.fitting.posterior import (
     shared,
 )
 from shapepose_fg.body.fitting.priors import PosePrior
+from shapepose_fg.body.fitting.sizes import Sizes
 from shapepose_fg.body.fitting.weights import FitterWeights, fingerprint
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
-
-Array = NDArray[np.float64]
+from shapepose_fg.core.arrays import Array, Index, Mask
 
 _CHUNK = 128
 """Passes that are fitted at a time: their Hessians stay in the cache, and memory does not grow with the batch."""
@@ -46,6 +45,8 @@ more."""
 _CONVERGED = 9.0
 """Without a network, rows whose energy a Newton step would still lower by more (3 sigma of the posterior) are
 NOT_CONVERGED; with one, `BodyConfig.unfinished` says so after the plain optimiser has tried."""
+_ROUNDS = 2
+"""How often somebody is fitted at an adult's size: the first sizes are those that the prior of adults leaves."""
 _SPREAD = {"RWrist": 2.0, "LWrist": 2.0}
 """Multiplies the variance of joints without their own target. Elbows bend farther from their mean than a Gaussian
 says: without it, 85 % of the wrists of the validation subjects (training.motions) lay in their 90 % ellipsoids."""
@@ -62,7 +63,7 @@ def make_fitter(
     model = BodyModel.default() if model is None else model
     if config.method == "plain":
         return SmplFitter(model, config=config, law=law)
-    weights = FitterWeights.load(Path(config.weights)) if config.weights else FitterWeights.default()
+    weights = FitterWeights.load(Path(config.weights)) if config.weights else FitterWeights.of(model)
     if config.method == "auto" and not config.weights and fingerprint(model) != weights.body:
         return SmplFitter(model, config=config, law=law)
     return SmplFitter(model, config=config, weights=weights, law=law)
@@ -113,9 +114,7 @@ class SmplFitter(BodyFitter):
         return SmplFitter(model, self.prior, self.config, self.weights, self.law)
 
     @torch.inference_mode()
-    def fit(
-        self, targets: JointTargets, initial: BodyFit | None = None, groups: NDArray[np.intp] | None = None
-    ) -> BodyFit:
+    def fit(self, targets: JointTargets, initial: BodyFit | None = None, groups: Index | None = None) -> BodyFit:
         """Fit a body to every row of `targets`; see `BodyFit` for what comes back.
 
         OK rows of `initial` are warm starts of Levenberg-Marquardt: no closed form, no annealing; passes that
@@ -134,18 +133,32 @@ class SmplFitter(BodyFitter):
     def fit_sequence(
         self,
         targets: JointTargets,
-        groups: NDArray[np.intp],
+        groups: Index,
         time_s: Array,
         shapes: Shapes | None = None,
         *,
         fixed_shapes: bool = False,
     ) -> SequenceFit:
-        """See `BodyFitter`."""
+        """See `BodyFitter`; who is far from the size of adults is fitted at that size first (`sizes`)."""
         sequence = SequenceFitter(self.energy, self._starts, self.law, self.config)
-        return sequence.fit(targets, groups, time_s, shapes, fixed_shapes=fixed_shapes)
+        found = sequence.fit(targets, groups, time_s, shapes, fixed_shapes=fixed_shapes)
+        sizes = Sizes.of(self.model)
+        far = sizes.far(found.shapes.mean)
+        if shapes is not None or not far.any():
+            return found
+        rows = np.flatnonzero(np.isin(groups, found.groups[far]))
+        own, groups, time_s = targets.rows(rows), groups[rows], time_s[rows]
+        whose = np.unique(groups, return_inverse=True)[1]
+        mean, information = found.shapes.mean.copy(), found.shapes.information
+        for _ in range(_ROUNDS):
+            size = sizes.ratio(mean[far])
+            adult = sequence.fit(own.larger(1 / size[whose]), groups, time_s)
+            mean[far] = sizes.resized(self.model, adult.shapes.mean, size)
+        again = sequence.fit(own, groups, time_s, Shapes(mean[far], information[far]), fixed_shapes=True)
+        return SequenceFit(found.fit.with_rows(rows, again.fit), found.groups, Shapes(mean, information))
 
     def _fit(
-        self, targets: JointTargets, initial: BodyFit | None, groups: NDArray[np.intp] | None, *, leave_out: bool
+        self, targets: JointTargets, initial: BodyFit | None, groups: Index | None, *, leave_out: bool
     ) -> BodyFit:
         """A body for every row."""
         count = len(self.sets)
@@ -215,7 +228,7 @@ class SmplFitter(BodyFitter):
         betas = pooled_betas(free[:, :10], precision, passes.pool, votes, held)
         return torch.cat((betas, free[:, 10:]), 1), held.at_shape(betas, shared(passes.pool, votes))
 
-    def _fill(self, fit: BodyFit, rows: NDArray[np.intp], passes: Passes, parts: list[JointPosterior]) -> None:
+    def _fill(self, fit: BodyFit, rows: Index, passes: Passes, parts: list[JointPosterior]) -> None:
         """Fill `fit`'s `rows` (R,) with what the passes found.
 
         Rows whose energy a Newton step would still lower, or that are not finite, become NOT_CONVERGED.
@@ -236,7 +249,7 @@ class SmplFitter(BodyFitter):
         fit.prior_covariance[rows] = wider * prior_covariance[done] + self.config.model_sigma_m**2 * np.eye(3)
         fit.residual_m[rows] = np.sqrt(found.squared.sum(axis=1) / evidence.total_information)[done]
 
-    def _starts(self, evidence: Evidence) -> tuple[Tensor, Tensor | None, NDArray[np.bool_]]:
+    def _starts(self, evidence: Evidence) -> tuple[Tensor, Tensor | None, Mask]:
         """Bodies of rows (R) with all their targets, nothing left out, each with a shape of its own.
 
         Returns their parameters (R, P) around `evidence.centre`, around which angles (R, A) they are held (None:
@@ -261,7 +274,7 @@ class SmplFitter(BodyFitter):
         return start
 
 
-def evenly(groups: NDArray[np.intp], count: int) -> NDArray[np.bool_]:
+def evenly(groups: Index, count: int) -> Mask:
     """(R,) at most `count` rows of each group (R,), evenly spread over its rows."""
     order = np.argsort(groups, kind="stable")
     _, first, size = np.unique(groups[order], return_index=True, return_counts=True)
@@ -272,6 +285,6 @@ def evenly(groups: NDArray[np.intp], count: int) -> NDArray[np.bool_]:
     return chosen
 
 
-def _part(start: Tensor | None, chunk: NDArray[np.intp]) -> Tensor | None:
+def _part(start: Tensor | None, chunk: Index) -> Tensor | None:
     """The starts of a chunk: passes that leave targets out have none, an earlier body has seen them."""
     return None if start is None or chunk[0] >= len(start) else start[chunk]

@@ -4,14 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.energy import BodyEnergy, WhitenedTargets
 from shapepose_fg.body.fitting.evidence import Evidence, determine_pose
 from shapepose_fg.body.fitting.fitter import BodyConfig
 from shapepose_fg.body.fitting.priors import PosePrior
-
-Array = NDArray[np.float64]
+from shapepose_fg.core.arrays import Array, Index, Mask
 
 SETS = 6
 """So many sets: more cost more passes, and leave fewer joints out at a time."""
@@ -31,39 +29,39 @@ class Passes:
 
     evidence: Evidence
     """(R) the targets."""
-    row: NDArray[np.intp]
+    row: Index
     """(M,) whose targets; the first R are 0 to R - 1."""
-    without: NDArray[np.bool_]
+    without: Mask
     """(M, J) targets that are left out."""
-    pool: NDArray[np.intp]
+    pool: Index
     """(M,) passes with the same number get one shape: rows of one group, with the same targets left out of all."""
-    votes: NDArray[np.bool_]
+    votes: Mask
     """(M,) whether a pass has a part in its pool's shape."""
-    source: NDArray[np.intp]
+    source: Index
     """(R, J) the pass from which each joint's prior is taken."""
 
     @classmethod
-    def whole(cls, evidence: Evidence, groups: NDArray[np.intp]) -> "Passes":
+    def whole(cls, evidence: Evidence, groups: Index) -> "Passes":
         """One pass with all targets for each row of `groups` (R,), and nothing left out."""
         R, J = evidence.xyz.shape[:2]
         row = np.arange(R)
         source = np.repeat(row[:, None], J, axis=1)
         return cls(evidence, row, np.zeros((R, J), dtype=bool), groups, np.ones(R, dtype=bool), source)
 
-    def chunks(self, size: int) -> list[list[NDArray[np.intp]]]:
+    def chunks(self, size: int) -> list[list[Index]]:
         """Passes with all targets, and those without some if there are any, in parts of at most `size`."""
         R, M = len(self.source), len(self.row)
         ends = [(0, R), (R, M)] if M > R else [(0, R)]
         return [[np.arange(at, min(at + size, end)) for at in range(start, end, size)] for start, end in ends]
 
-    def asked(self, index: NDArray[np.intp]) -> NDArray[np.intp]:
+    def asked(self, index: Index) -> Index:
         """(B, N) joints that some passes are for: all, or those left out, of some sets others too."""
         without = self.without[index]
         if not without.any():
             return np.broadcast_to(np.arange(without.shape[1]), without.shape)
         return np.argsort(~without, axis=1, kind="stable")[:, : self.without.sum(axis=1).max()]
 
-    def given(self, index: NDArray[np.intp]) -> tuple[WhitenedTargets, Array]:
+    def given(self, index: Index) -> tuple[WhitenedTargets, Array]:
         """The targets of some passes around their rows' centres, in single precision, and the variance of each.
 
         The variances (B, J) are infinite where a target is left out. Single precision is a micrometre off at 10 m
@@ -75,7 +73,7 @@ class Passes:
         return targets, np.where(without, np.inf, evidence.variance_m2[row])
 
 
-def plan_passes(evidence: Evidence, sets: NDArray[np.intp], groups: NDArray[np.intp]) -> Passes:
+def plan_passes(evidence: Evidence, sets: Index, groups: Index) -> Passes:
     """One pass with all targets for each row (R), one more for every set of joints (J,) to leave out.
 
     A set without a target in any row of a group (R,) needs no pass. Where what is left would not determine the
@@ -103,7 +101,7 @@ def plan_passes(evidence: Evidence, sets: NDArray[np.intp], groups: NDArray[np.i
     return Passes(evidence, row, without, group[row] * (S + 1) + of_set + 1, votes, source)
 
 
-def left_out_sets(energy: BodyEnergy, prior: PosePrior) -> NDArray[np.intp]:
+def left_out_sets(energy: BodyEnergy, prior: PosePrior) -> Index:
     """Which of `SETS` sets each joint (J,) is left out with: joints that tell little of each other.
 
     The cost of a pair is how much less certain each of the two is when the other is missing too (`_coupling`); the

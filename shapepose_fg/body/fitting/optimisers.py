@@ -1,10 +1,10 @@
-"""How one body is fitted to one row of targets: by a network's steps and a polish, or by Levenberg-Marquardt."""
+"""How one body is fitted to one row of targets: by a network's steps and a polish, or by Levenberg-Marquardt.
 
-from typing import Protocol
+Both have `arrive`, from which `again` is short, and `first`, the two in one; rows are independent.
+"""
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from shapepose_fg.body.fitting.descent import BodyState, DescentTargets, LearnedDescent
@@ -23,8 +23,7 @@ from shapepose_fg.body.fitting.weights import FitterWeights
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.rotation import log_so3
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, slots
-
-Array = NDArray[np.float64]
+from shapepose_fg.core.arrays import Array, Mask
 
 STALE = 0.3
 """Change of a joint's robust weight, in a step, from which on a row is linearised anew after it."""
@@ -37,25 +36,6 @@ MAX_ITERATIONS = 40
 TOLERANCE = 1e-2
 """A row is done when a step lowers its energy (in squared standard deviations) by less."""
 _DAMPING_START, _DAMPING_MIN, _DAMPING_MAX = 1e-3, 1e-7, 1e7
-
-
-class Optimiser(Protocol):
-    """How bodies are fitted to some targets; rows are independent."""
-
-    def arrive(self, targets: WhitenedTargets, variance: Array, start: Tensor | None) -> tuple[Tensor, Held]:
-        """Parameters (B, P) from which `again` is short, and what bodies are held by; arguments as of `first`."""
-        ...
-
-    def first(self, targets: WhitenedTargets, variance: Array, start: Tensor | None) -> tuple[Evaluated, Held]:
-        """Bodies (B) from nowhere, or from `start` (B, P) where that is not NaN, and what they were held by.
-
-        `variance` (B, J) is that of each target, infinite where it is not known in all directions, m².
-        """
-        ...
-
-    def again(self, free: Tensor, targets: WhitenedTargets, held: Held) -> Evaluated:
-        """Bodies from `free` (B, P) on, held by something else."""
-        ...
 
 
 class NetworkDescent:
@@ -77,7 +57,10 @@ class NetworkDescent:
     def arrive(
         self, targets: WhitenedTargets, variance: Array, start: Tensor | None = None
     ) -> tuple[Tensor, Held]:
-        """See `Optimiser`: where the network arrives from the closed form on, and held there."""
+        """Parameters (B, P) where the network arrives from the closed form on, and that bodies are held there.
+
+        `variance` (B, J) is that of each target, infinite where it is not known in all directions, m².
+        """
         frame, count, sigma2 = self._frame, len(targets.xyz), torch.from_numpy(variance).float()
         rotation, origin = frame.place(targets.xyz, sigma2, self._slots)
         inside = (targets.xyz - origin[:, None]) @ rotation
@@ -101,7 +84,7 @@ class NetworkDescent:
     def first(
         self, targets: WhitenedTargets, variance: Array, start: Tensor | None = None
     ) -> tuple[Evaluated, Held]:
-        """See `Optimiser`: a short polish from where the network arrived."""
+        """Bodies (B) after a short polish from where the network arrived, and what they were held by."""
         arrived, held = self.arrive(targets, variance, start)
         return self.again(arrived, targets, held), held
 
@@ -138,7 +121,7 @@ class LevenbergMarquardt:
     def arrive(
         self, targets: WhitenedTargets, variance: Array, start: Tensor | None = None
     ) -> tuple[Tensor, Held]:
-        """See `Optimiser`: the optimum, with each row's own shape, held by the priors."""
+        """The optimum (B, P), each with its own shape, held by the priors; from `start` where that is no NaN."""
         rotation, pelvis = self._frame.place(targets.xyz.double(), torch.from_numpy(variance), self._slots)
         angles = self._mean_angles.expand(len(variance), -1)
         parts = (angles.new_zeros(len(variance), 10), log_so3(rotation), angles, pelvis + self._frame.transl)
@@ -152,16 +135,16 @@ class LevenbergMarquardt:
     def first(
         self, targets: WhitenedTargets, variance: Array, start: Tensor | None = None
     ) -> tuple[Evaluated, Held]:
-        """See `Optimiser`."""
+        """The bodies of `arrive`, evaluated."""
         free, held = self.arrive(targets, variance, start)
         return self._energy.evaluate(free, targets, torch.tensor(self._kernel_scale), held), held
 
     def again(self, free: Tensor, targets: WhitenedTargets, held: Held) -> Evaluated:
-        """See `Optimiser`."""
+        """The optimum from `free` (B, P) on, held by something else."""
         free = self.solve(free, targets, np.ones(len(free), dtype=bool), held)
         return self._energy.evaluate(free, targets, torch.tensor(self._kernel_scale), held)
 
-    def solve(self, free: Tensor, targets: WhitenedTargets, warm: NDArray[np.bool_], held: Held) -> Tensor:
+    def solve(self, free: Tensor, targets: WhitenedTargets, warm: Mask, held: Held) -> Tensor:
         """Minimise from `free` (B, P); rows leave the batch as they finish. Returns (B, P)."""
         energy, kernel_scale = self._energy, self._kernel_scale
         result, rows = free.clone(), torch.arange(len(free))

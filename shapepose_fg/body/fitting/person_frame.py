@@ -4,12 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters, accumulate
 from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
+from shapepose_fg.core.arrays import Array, Real
 
 
 @dataclass(frozen=True)
@@ -31,17 +31,13 @@ class PersonFrame:
 
     def __post_init__(self) -> None:
         K = len(BODY_POINTS)
-        for name, shape in {
-            "rest_xyz": (K, 3),
-            "rest_variance": (K,),
-            "local": (24, 3, 3),
-            "transl": (3,),
-        }.items():
+        shapes = {"rest_xyz": (K, 3), "rest_variance": (K,), "local": (24, 3, 3), "transl": (3,)}
+        for name, shape in shapes.items():
             if getattr(self, name).shape != shape:
                 raise ValueError(f"{name} must be {shape}, got {tuple(getattr(self, name).shape)}")
 
     @classmethod
-    def of(cls, model: BodyModel, poses: NDArray[np.floating], weight: NDArray[np.floating]) -> "PersonFrame":
+    def of(cls, model: BodyModel, poses: Real, weight: Real) -> "PersonFrame":
         """The frame of a body that takes `poses` (N, 24, 3), axis-angle, root first, weighing (N,); float32."""
         angles, share = poses[:, 1:].reshape(len(poses), 69).astype(np.float64), weight / weight.sum()
         mean = share @ angles
@@ -49,9 +45,7 @@ class PersonFrame:
         return cls(frame.rest_xyz.float(), frame.rest_variance.float(), frame.local.float(), frame.transl.float())
 
     @classmethod
-    def of_angles(
-        cls, model: BodyModel, mean: NDArray[np.float64], covariance: NDArray[np.float64]
-    ) -> "PersonFrame":
+    def of_angles(cls, model: BodyModel, mean: Array, covariance: Array) -> "PersonFrame":
         """The frame of a body whose 69 joint angles have this mean (69,) and covariance (69, 69), rad; float64."""
         model = model.to(torch.float64)
         pose = torch.from_numpy(mean).view(1, 23, 3)

@@ -4,14 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from shapepose_fg.body.fitting.energy import Evaluated, Held, factored
 from shapepose_fg.body.fitting.fitter import Rows
 from shapepose_fg.body.fitting.left_out import Passes
-
-Array = NDArray[np.float64]
+from shapepose_fg.core.arrays import Array, Index, Mask
 
 LIMB_M = 0.4
 """Radius on which the end of a swinging limb moves, for the curvature that a linearisation leaves out.
@@ -35,7 +33,7 @@ class JointPosterior(Rows):
     """(B,) by how much a Newton step would still lower the energy."""
 
     @classmethod
-    def of(cls, body: Evaluated, asked: NDArray[np.intp]) -> "JointPosterior":
+    def of(cls, body: Evaluated, asked: Index) -> "JointPosterior":
         """From bodies and the joints (B, N) whose covariance is asked for."""
         by_joint = body.jacobian.unflatten(1, (-1, 3))
         if asked.shape[1] == by_joint.shape[1]:  # with all targets: in double precision
@@ -97,9 +95,7 @@ def shape_precision(factor: Tensor) -> Tensor:
     return torch.linalg.inv(half.mT @ half)
 
 
-def pooled_betas(
-    alone: Tensor, precision: Tensor, pool: NDArray[np.intp], votes: NDArray[np.bool_], held: Held
-) -> Tensor:
+def pooled_betas(alone: Tensor, precision: Tensor, pool: Index, votes: Mask, held: Held) -> Tensor:
     """Shapes (B, 10) at which the rows of each `pool` (B,) agree best, to first order; single rows keep their own.
 
     A row's fit is a Gaussian over its betas: `precision` S (B, 10, 10) around the shape `alone` (B, 10). Taken out
@@ -132,7 +128,7 @@ def pooled_betas(
     return torch.where(shared(pool, votes)[:, None], betas, alone)
 
 
-def shared(pool: NDArray[np.intp], votes: NDArray[np.bool_]) -> Tensor:
+def shared(pool: Index, votes: Mask) -> Tensor:
     """(B,) which rows take a shape that others of their `pool` (B,) have a part in."""
     _, place = np.unique(pool, return_inverse=True)
     return torch.from_numpy((np.bincount(place, weights=votes)[place] - votes) > 0)

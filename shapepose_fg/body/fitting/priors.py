@@ -8,13 +8,11 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.core.storage.npz import read_npz
-
-Array = NDArray[np.float64]
 
 NUM_ANGLES = 69
 """The 23 local rotations below the root, axis-angle, in SMPL's order."""
@@ -77,12 +75,12 @@ class PosePrior:
         """The same with standard deviations `factor` times as large."""
         return replace(self, covariance=factor**2 * self.covariance)
 
-    def marginal_precision(self, angles: NDArray[np.intp]) -> Array:
+    def marginal_precision(self, angles: Index) -> Array:
         """(A, A) inverse covariance of some `angles` (A,), the others free, 1/rad²."""
         precision = np.linalg.inv(self.covariance[angles[:, None], angles])
         return np.asarray((precision + precision.T) / 2, dtype=np.float64)
 
-    def regression(self, given: NDArray[np.intp], asked: NDArray[np.intp]) -> Array:
+    def regression(self, given: Index, asked: Index) -> Array:
         """Matrix G (M, A) that predicts angles `asked` (M,) from `given` ones (A,).
 
         E[asked | given] = mean[asked] + G (given - mean[given]).
@@ -134,7 +132,7 @@ class MotionPrior:
         data = read_npz(_DATA / "motion_prior.npz", ("acceleration", "velocity", "provenance"), _CURE)
         return MotionPrior(data["acceleration"], data["velocity"], str(data["provenance"]))
 
-    def part(self, angles: NDArray[np.intp]) -> tuple[Array, Array]:
+    def part(self, angles: Index) -> tuple[Array, Array]:
         """Acceleration and velocity (N,) of the root, some of the `angles` (A,) and the place."""
         kept = np.concatenate([np.arange(3), 3 + angles, np.arange(-3, 0) + NUM_MOVING])
         return self.acceleration[kept], self.velocity[kept]

@@ -2,23 +2,23 @@
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
 from shapepose_fg.body.fitting.descent import NetworkConfig, UpdateNetwork
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, slots
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.storage.files import open_regular
+from shapepose_fg.core.storage.files import open_regular, user_cache, write_content
 
 _DEFAULT = Path(__file__).parents[1] / "data" / "fitter.safetensors"
 _FORMAT = "shapepose-fg fitter 1"
@@ -42,6 +42,8 @@ class FitterWeights:
     """(K,) by which the variance of each of `BODY_POINTS` without its own target is multiplied: calibrated."""
     card: dict[str, str] = field(default_factory=dict)
     """What it was trained on, by which command, and its errors."""
+    file: Path | None = None
+    """What they were read from; None where they ship with the package, or are new."""
 
     def __post_init__(self) -> None:
         if self.spread.shape != (len(BODY_POINTS),):
@@ -51,9 +53,17 @@ class FitterWeights:
     @cache
     def default() -> "FitterWeights":
         """The weights that ship with the package (read once)."""
-        return FitterWeights.load(_DEFAULT)
+        return replace(FitterWeights.load(_DEFAULT), file=None)
 
-    def spread_of(self, names: tuple[str, ...]) -> NDArray[np.float64]:
+    @staticmethod
+    def of(model: BodyModel) -> "FitterWeights":
+        """Those that `shapepose-fg train-fitter` keeps for this body; where it has not run, the shipped ones."""
+        shipped = FitterWeights.default()
+        kept = adapted_file(model)
+        own = fingerprint(model) != shipped.body and kept.is_file()
+        return FitterWeights.load(kept) if own else shipped
+
+    def spread_of(self, names: tuple[str, ...]) -> Array:
         """(J,) `spread` of the keypoints with these names."""
         return self.spread[list(slots(names))].double().numpy()
 
@@ -62,7 +72,9 @@ class FitterWeights:
         """Read a safetensors file; InputError naming it where it cannot be used."""
         about, tensors = _read_tensors(path)
         if about.get("format") != _FORMAT:
-            raise InputError(f"{path}: not weights of the learned fitter; make them with scripts/train_fitter.py")
+            raise InputError(
+                f"{path}: not weights of the learned fitter; make some with shapepose-fg train-fitter"
+            )
         if not all(bool(torch.isfinite(tensor).all()) for tensor in tensors.values()):
             raise InputError(f"{path}: the weights hold NaN or infinity; train or fetch them again")
         try:
@@ -73,7 +85,7 @@ class FitterWeights:
             network.load_state_dict(learnt, assign=True)
             frame = PersonFrame(**{k.removeprefix(_FRAME): v for k, v in tensors.items() if k.startswith(_FRAME)})
             network.requires_grad_(False)
-            return cls(network.eval(), frame, about["body"], spread, json.loads(about["card"]))
+            return cls(network.eval(), frame, about["body"], spread, json.loads(about["card"]), path)
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             why = f"weights of another version of the fitter ({str(error).splitlines()[0]}); train them anew"
             raise InputError(f"{path}: {why}") from error
@@ -90,14 +102,14 @@ class FitterWeights:
             "body": self.body,
             "card": json.dumps(self.card),
         }
-        save_file(tensors, path, metadata=about)
+        write_content(path, save(tensors, metadata=about))
 
     def check(self, model: BodyModel) -> None:
         """InputError where `model` is not the body they were trained on: betas would mean other shapes."""
         if fingerprint(model) != self.body:
             raise InputError(
                 "these weights of the learned fitter were trained on another body model: train some on yours with"
-                " scripts/train_fitter.py --body, or choose the plain fitter"
+                " shapepose-fg train-fitter --body, or choose the plain fitter"
             )
 
 
@@ -121,3 +133,11 @@ def fingerprint(model: BodyModel) -> str:
     for array in (model.arrays.template, model.arrays.shapes, model.arrays.joint_regressor):
         digest.update(np.ascontiguousarray(array, dtype=np.float32).tobytes())
     return digest.hexdigest()
+
+
+def adapted_file(model: BodyModel) -> Path:
+    """Where `shapepose-fg train-fitter` keeps weights for this body, begun as those that ship now."""
+    digest = hashlib.sha256(fingerprint(model).encode() + _DEFAULT.read_bytes())
+    for array in (model.arrays.weights, model.arrays.keypoint_regressor):
+        digest.update(np.ascontiguousarray(array, dtype=np.float32).tobytes())
+    return user_cache("fitters") / f"{digest.hexdigest()[:32]}.safetensors"

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from shapepose_fg.body.fitting.energy import BodyEnergy, WhitenedTargets, robust_weight
@@ -24,18 +23,21 @@ from shapepose_fg.body.fitting.evidence import Evidence, weigh
 from shapepose_fg.body.fitting.fitter import BodyConfig, BodyFit, JointTargets
 from shapepose_fg.body.fitting.fitters import SmplFitter
 from shapepose_fg.body.fitting.priors import PosePrior
+from shapepose_fg.body.fitting.sizes import Sizes
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import LARGEST_M, RIDES_ON, KeypointOffsets
+from shapepose_fg.core.arrays import Real
 from shapepose_fg.core.bounds import Metres, Repeats, Settings
 from shapepose_fg.core.skeleton import BODY_25
-
-Array = NDArray[np.floating]
 
 _CHUNK = 128
 """Rows that are linearised at a time."""
 _POSE_WIDENING = 3.0
 """The pose prior is this many times as wide while offsets are learnt: a prior is never quite right about how poses
 vary, and what it has wrong would look like an offset, the same in hundreds of rows."""
+_MANY = 0.1
+"""Share of rows far from an adult's size from which on these are taken at that: a room full of children is no
+detector's habit. A row or two in a hundred is joints of two people."""
 _ROWS_PER_DRAW = 4.0
 """How many rows say as much as one that is independent: a detector's error lasts, and people come back."""
 
@@ -72,7 +74,13 @@ def learn_offsets(
     precision = np.linalg.inv(_prior_covariance(prior))
     model, fit = model.with_keypoint_offsets(_made(np.zeros(75), precision, np.zeros(25))), None
     for _ in range(prior.rounds):
-        fit = SmplFitter(model, wide, config).fit_whole(targets, fit)
+        fitter = SmplFitter(model, wide, config)
+        fit = fitter.fit_whole(targets, fit)
+        sizes = Sizes.of(model)
+        far = sizes.far(fit.betas)
+        if far.mean() > _MANY:
+            targets = targets.larger(np.where(far, 1 / sizes.ratio(fit.betas), 1.0))
+            fit = fitter.fit_whole(targets)
         if not fit.ok.any():
             break
         energy = BodyEnergy(model.to(torch.float64), wide)
@@ -82,7 +90,7 @@ def learn_offsets(
 
 
 def _solved(
-    energy: BodyEnergy, fit: BodyFit, evidence: Evidence, kernel_scale: float, precision: Array
+    energy: BodyEnergy, fit: BodyFit, evidence: Evidence, kernel_scale: float, precision: Real
 ) -> KeypointOffsets:
     """One Newton step in offsets and mean; the mean starts from zero, which is where the bodies were fitted."""
     rows, size = np.flatnonzero(fit.ok), 75 + energy.num_free
@@ -103,7 +111,7 @@ def _solved(
     return _made(current - np.linalg.solve(hessian, gradient)[:75], hessian, count)
 
 
-def _made(xyz_m: Array, precision: Array, count: Array) -> KeypointOffsets:
+def _made(xyz_m: Real, precision: Real, count: Real) -> KeypointOffsets:
     """Offsets (75,) with the sigmas that the joint `precision` (75 + ..., 75 + ...) leaves them."""
     variance = np.diagonal(np.linalg.inv(precision))[:75].reshape(25, 3).mean(axis=1)
     xyz = xyz_m.reshape(25, 3)
@@ -114,7 +122,7 @@ def _made(xyz_m: Array, precision: Array, count: Array) -> KeypointOffsets:
 
 def _eliminate(
     energy: BodyEnergy, free: Tensor, targets: WhitenedTargets, kernel_scale: float
-) -> tuple[Array, Array, Array]:
+) -> tuple[Real, Real, Real]:
     """Sums over the rows (R, P) `free`, each row's body eliminated.
 
     Returns Hessian and gradient by (offsets 75, mean of the free parameters P), and the prior's Hessian (P, P).
@@ -142,7 +150,7 @@ def _eliminate(
     return hessian.numpy(), gradient.numpy(), prior_hessian.sum(dim=0).numpy()
 
 
-def _prior_covariance(prior: OffsetPrior) -> Array:
+def _prior_covariance(prior: OffsetPrior) -> Real:
     """(75, 75) covariance of the offsets: what mirrored joints share, and what they do not."""
     flip = np.diag([-1.0, 1.0, 1.0])
     mirrored = np.zeros((75, 75))  # takes every offset to the mirrored one of its mirror joint

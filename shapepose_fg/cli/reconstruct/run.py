@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import shlex
 import shutil
 import time
 from collections.abc import Iterator
@@ -84,10 +85,15 @@ def carry_out(
         if asked.body is not None:
             model = BodyModel.load(asked.body).with_keypoints(recording.skeleton.joints)
             fitter = make_fitter(settings.body, model, settings.law)
+            if fitter.weights is None and settings.body.method != "plain":
+                cure = f"shapepose-fg train-fitter {shlex.join(['--body', str(asked.body)])}"
+                note(f"{asked.body}: fitted by the plain optimiser; {cure} trains a better one for it, once")
         task = Task(recording, rig, settings, span, times, cuts, fitter=fitter)
         inputs = reading.checksums((known.calibration, *recording.sources, *files[1:]))
         if settings.offsets.source not in ("recording", "none"):
             inputs |= checksums([settings.offsets.source])
+        if fitter is not None and fitter.weights is not None and fitter.weights.file is not None:
+            inputs |= checksums([fitter.weights.file])
         del reading  # of half a million files it is large
         return _Run(task, recording, known, inputs, execution).carried_out(resume=resume, restart=restart)
 

@@ -248,6 +248,12 @@ def write_together(
         os.close(descriptor)
 
 
+def user_cache(what: str) -> Path:
+    """The folder of the user's cache for `what` this program keeps; below XDG_CACHE_HOME where that is set."""
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "shapepose-fg" / what
+
+
 def sweep(folder: Path, name: str | None = None) -> None:
     """Remove what a killed process was writing in `folder`, as the file `name` or as any.
 

@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, MIRROR
+from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.core.storage.npz import read_npz
@@ -45,6 +47,8 @@ of unseen people 1.6 nats a frame and took 0.1 from everything else; without a c
 TARGET_FPS = 30.0
 """AMASS recordings are thinned to about this many frames a second: every k-th frame, nothing interpolated."""
 
+_LEANING_RAD = 0.15
+"""How far people who are drawn lean, one sigma."""
 _WRISTS, _HANDS, _TOES = (20, 21), (22, 23), (10, 11)
 _BODY_COLUMNS = 66
 """Root and 21 body joints, three columns each: what SMPL, SMPL+H and SMPL-X files agree on."""
@@ -81,7 +85,7 @@ class Motions:
 
     poses: NDArray[np.float32]
     """(N, 24, 3) axis-angle, rad: the root's in the world, the other joints' relative to their parents."""
-    weight: NDArray[np.float64]
+    weight: Array
     """(N,) how many frames this one counts for, at most 1: recordings, subjects and walking are capped within
     their split."""
     subject: NDArray[np.str_]
@@ -100,7 +104,7 @@ class Motions:
         """Count of frames, N."""
         return len(self.poses)
 
-    def rows(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> "Motions":
+    def rows(self, index: Index | Mask) -> "Motions":
         """The frames `index`, indices or a mask."""
         return Motions(*(value[index] for value in vars(self).values()))
 
@@ -110,6 +114,15 @@ class Motions:
             raise ValueError(f"split must be one of {' '.join(SPLITS)}, got {split!r}")
         subjects, place = np.unique(self.subject, return_inverse=True)
         return self.rows(np.array([split_of(str(name)) == split for name in subjects], dtype=bool)[place])
+
+
+def drawn_motions(count: int, seed: int) -> Motions:
+    """Poses of the pose prior, upright and of any heading: what there is to learn from without recordings."""
+    rng = np.random.default_rng(seed)
+    root = rng.normal(0, _LEANING_RAD, (count, 1, 3))
+    root[:, 0, 1] = rng.uniform(-np.pi, np.pi, count)
+    poses = np.concatenate((root, PosePrior.default().sample(rng, count)), axis=1).astype(np.float32)
+    return Motions(poses, np.ones(count), np.full(count, UNKNOWN_SUBJECT))
 
 
 _Recording = tuple[str, bool, NDArray[np.float32]]
@@ -141,9 +154,7 @@ def load_motions(path: str | Path) -> Motions:
     )
 
 
-def frame_weights(
-    length: NDArray[np.integer], subject: NDArray[np.str_], walking: NDArray[np.bool_]
-) -> NDArray[np.float64]:
+def frame_weights(length: Whole, subject: NDArray[np.str_], walking: Mask) -> Array:
     """Weight (S,) of a frame of each of S recordings: recordings, subjects and walking are capped, by split."""
     total = np.minimum(length.astype(np.float64), SEGMENT_CAP)
     for name in np.unique(subject):
@@ -176,7 +187,7 @@ def _read_amass(path: Path) -> _Recording:
     return path.parent.name, "walk" in path.stem.lower(), kept.astype(np.float32)
 
 
-def _amass_arrays(path: Path) -> tuple[NDArray[np.float64], float]:
+def _amass_arrays(path: Path) -> tuple[Array, float]:
     """`poses` (T, 66 or more) and frame rate of an AMASS file, checked."""
     rates = ("mocap_framerate", "mocap_frame_rate")
     arrays = read_npz(path, ("poses", *rates), "copy it again")

@@ -1,11 +1,11 @@
 """Trains the update network: draw people, corrupt their joints, unroll, judge every iterate; then calibrate."""
 
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.stats import chi2
 from torch import Tensor
 
@@ -17,13 +17,14 @@ from shapepose_fg.body.fitting.descent import (
     NetworkConfig,
     UpdateNetwork,
 )
-from shapepose_fg.body.fitting.fitter import JointTargets
+from shapepose_fg.body.fitting.fitter import BodyFitter, JointTargets
 from shapepose_fg.body.fitting.fitters import SmplFitter
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.weights import FitterWeights
 from shapepose_fg.body.model.body_model import BodyModel, accumulate
 from shapepose_fg.body.model.rotation import exp_so3, inverse_3x3
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, MIRROR, TARGET_SKELETONS, slots
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.simulation.training.corruption import CorruptionConfig, corrupt
 from shapepose_fg.simulation.training.motions import MIRROR_JOINTS, Motions
 
@@ -218,24 +219,6 @@ for _row, _names in enumerate(TARGET_SKELETONS.values()):
     _OFFERED[_row, list(slots(_names))] = 1
 
 
-class Validation:
-    """How far a network is from people who are the same each time."""
-
-    def __init__(self, source: PeopleSource, frame: PersonFrame, config: TrainingConfig, people: int):
-        generator = torch.Generator().manual_seed(1)
-        drawn = source.draw(people, generator)
-        self._model, self._scale = source.model, config.kernel_scale
-        self._targets, self._start, _, self._points = prepared(drawn, frame, config, generator)
-
-    @torch.no_grad()
-    def errors_mm(self, network: UpdateNetwork) -> list[float]:
-        """The mean joint error after each step."""
-        descent = LearnedDescent(self._model.points, _ALL, network.eval(), self._scale)
-        states = descent.unroll(self._start, self._targets)
-        distances = [body_points(self._model, state) - self._points for state in states]
-        return [1000 * float(torch.linalg.vector_norm(distance, dim=-1).mean()) for distance in distances]
-
-
 def _judge(
     model: BodyModel, state: BodyState, truth: BodyState, true_points: Tensor, config: TrainingConfig
 ) -> tuple[Tensor, Tensor]:
@@ -248,7 +231,7 @@ def _judge(
     return error.detach(), error + config.rotation_m * turn + config.shape_m * shape
 
 
-def calibrated(weights: FitterWeights, source: PeopleSource, model: BodyModel, count: int = 4096) -> FitterWeights:
+def calibrated(weights: FitterWeights, source: PeopleSource, count: int = 4096) -> FitterWeights:
     """The same weights with `spread` measured on `count` people of `source` for each skeleton.
 
     What is claimed of joints without their own target (`BodyFit.prior_covariance`, less the error of the model;
@@ -260,7 +243,7 @@ def calibrated(weights: FitterWeights, source: PeopleSource, model: BodyModel, c
     generator = torch.Generator().manual_seed(2)
     for name in _SKELETONS:
         places = slots(TARGET_SKELETONS[name])
-        squared = left_out_squared(plain, source, model, places, count, generator)
+        squared = left_out_squared(plain, source, places, count, generator)
         for place in places:
             both = np.concatenate([squared.get(place, np.zeros(0)), squared.get(MIRROR[place], np.zeros(0))])
             if len(both) >= _ENOUGH:
@@ -269,21 +252,47 @@ def calibrated(weights: FitterWeights, source: PeopleSource, model: BodyModel, c
 
 
 def left_out_squared(
-    weights: FitterWeights,
-    source: PeopleSource,
-    model: BodyModel,
-    places: tuple[int, ...],
-    count: int,
-    generator: torch.Generator,
-) -> dict[int, NDArray[np.float64]]:
+    weights: FitterWeights, source: PeopleSource, places: tuple[int, ...], count: int, generator: torch.Generator
+) -> dict[int, Array]:
     """By point: squared Mahalanobis distances of true joints to where the body puts them without their target."""
-    names = tuple(BODY_POINTS[place] for place in places)
-    fitter = SmplFitter(model.with_keypoints(names), weights=weights)
-    people = source.draw(count, generator)
-    target, information = corrupt(people.points, torch.ones(count, len(BODY_POINTS)), generator)
-    chosen = list(places)
-    fit = fitter.fit(JointTargets(target[:, chosen].double().numpy(), information[:, chosen].double().numpy()))
-    error = (fit.prior_xyz - people.points[:, chosen].double().numpy())[fit.ok]
+    model = source.model.with_keypoints(tuple(BODY_POINTS[place] for place in places))
+    fitter = SmplFitter(model, weights=weights)
+    truth, targets = _corrupted(source, places, count, generator)
+    fit = fitter.fit(targets)
+    error = (fit.prior_xyz - truth)[fit.ok]
     covariance = fit.prior_covariance[fit.ok] - fitter.config.model_sigma_m**2 * np.eye(3)
     squared = np.einsum("nji,njik,njk->nj", error, np.linalg.inv(covariance), error)
     return {place: squared[:, row] for row, place in enumerate(places)}
+
+
+def _corrupted(
+    source: PeopleSource, places: tuple[int, ...], count: int, generator: torch.Generator
+) -> tuple[Array, JointTargets]:
+    """True joints (count, J, 3) at some `places` of `BODY_POINTS`, and targets as `corrupt` makes them."""
+    points, chosen = source.draw(count, generator).points, list(places)
+    target, information = corrupt(points, torch.ones(count, len(BODY_POINTS)), generator)
+    truth, *given = (values[:, chosen].double().numpy() for values in (points, target, information))
+    return truth, JointTargets(*given)
+
+
+@dataclass(frozen=True)
+class Score:
+    """How a fitter does."""
+
+    joints_mm: float
+    """Mean error of all joints, with a target or without."""
+    ms: float
+    """Processor time of a fit, leave-one-out passes included."""
+
+
+def compared(fitters: Mapping[str, BodyFitter], source: PeopleSource, count: int = 512) -> dict[str, Score]:
+    """Scores of `fitters` of BODY_25's joints on the same people; rows that one does not finish count for none."""
+    places = slots(TARGET_SKELETONS["BODY_25"])
+    truth, targets = _corrupted(source, places, count, torch.Generator().manual_seed(3))
+    error, spent = dict[str, Array](), dict[str, float]()
+    for name, fitter in fitters.items():
+        begin = time.process_time()
+        error[name] = 1000 * np.linalg.norm(fitter.fit(targets).joints - truth, axis=-1).mean(axis=1)
+        spent[name] = 1000 * (time.process_time() - begin) / count
+    done = np.isfinite(list(error.values())).all(axis=0)
+    return {name: Score(float(each[done].mean()), spent[name]) for name, each in error.items()}

@@ -167,14 +167,14 @@ def test_calibrated_beliefs_hold_what_they_say_of_hidden_joints(frame):
     network = trainer.averaged.requires_grad_(False).eval()
     source = make_source(frame, still)
     raw = FitterWeights(network, frame, fingerprint(model))
-    weights = calibrated(raw, source, model, count=500)
+    weights = calibrated(raw, source, count=500)
     spread = weights.spread.numpy()
     assert (spread > 0).all() and np.ptp(spread) > 0
     generator = torch.Generator().manual_seed(5)  # others than those who were calibrated on
     places = tuple(range(25))
     inside = {}
     for name, judged in (("raw", raw), ("calibrated", weights)):
-        squared = left_out_squared(judged, source, model, places, 500, generator)
+        squared = left_out_squared(judged, source, places, 500, generator)
         inside[name] = np.mean(np.concatenate(list(squared.values())) < chi2.ppf(INSIDE, 3))
     # About 3,000 hidden joints that go missing by limbs: sigma of the share is about 1.5 %.
     assert inside["calibrated"] == pytest.approx(INSIDE, abs=0.04)

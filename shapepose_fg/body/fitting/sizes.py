@@ -1,0 +1,70 @@
+"""People whom the shapes of adults do not reach: children, and the very tall.
+
+A body's shapes are those of adults, and their stature extrapolates badly: at 1.10 m, five standard deviations
+below the mean, thighs are a sixth too short for a child, and joints that are where a child's are make a body that
+is 6 cm too tall. So whoever is so small or tall is fitted at the size of an adult. The body of that shape and size
+is then the nearest one that the model has *of the same stature*.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.body.model.target_skeletons import BODY_POINTS
+from shapepose_fg.core.arrays import Array, Mask
+
+_ADULT = 2.0
+"""Standard deviations from the mean that adults' stature is within."""
+_POINT_M = 0.02
+"""How near a point must be to its place to be worth a beta of 1."""
+
+
+def points_at_rest(body: BodyModel) -> tuple[Array, Array]:
+    """All points of the mean body's T-pose from its pelvis, (150,), metres, and how betas move them, (150, 10)."""
+    body = body.to(torch.float64)
+    still = torch.eye(3, dtype=torch.float64).expand(11, 24, 3, 3)
+    betas = torch.cat((torch.zeros(1, 10), torch.eye(10))).double()
+    xyz = body.points.positions(still, betas, betas.new_zeros(11, 3), body.points.feature(still)).numpy()
+    xyz = (xyz - xyz[:, [BODY_POINTS.index("pelvis")]]).reshape(11, -1)
+    return xyz[0], (xyz[1:] - xyz[0]).T
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """What a body model says of sizes."""
+
+    stature_m: float
+    """Of the mean body."""
+    taller: Array
+    """(10,) metres of stature for each beta."""
+
+    @classmethod
+    def of(cls, body: BodyModel) -> "Sizes":
+        """Of a body model."""
+        template, shapes = body.arrays.template, body.arrays.shapes
+        top, sole = template[:, 1].argmax(), template[:, 1].argmin()
+        return cls(float(template[top, 1] - template[sole, 1]), shapes[top, 1] - shapes[sole, 1])
+
+    def far(self, betas: Array) -> Mask:
+        """(G,) whose stature, of those of `betas` (G, 10), is not one of an adult."""
+        return np.abs(betas @ self.taller) > _ADULT * np.linalg.norm(self.taller)
+
+    def ratio(self, betas: Array) -> Array:
+        """(G,) how many times as tall as the mean body those of `betas` (G, 10) are."""
+        return 1 + betas @ self.taller / self.stature_m
+
+    def resized(self, body: BodyModel, betas: Array, size: Array) -> Array:
+        """(G, 10) betas near those of bodies `betas` (G, 10) that are `size` (G,) times as large, and as tall.
+
+        min |points - wanted|² / sigma² + |betas|², with the stature as a constraint.
+        """
+        mean, by_betas = points_at_rest(body)
+        wanted = size[:, None] * (mean + betas @ by_betas.T) - mean
+        taller = (size * self.ratio(betas) - 1) * self.stature_m
+        system = np.zeros((11, 11))
+        system[:10, :10] = by_betas.T @ by_betas + _POINT_M**2 * np.eye(10)
+        system[:10, 10] = system[10, :10] = self.taller
+        right = np.concatenate([wanted @ by_betas, taller[:, None]], axis=1)
+        return np.asarray(np.linalg.solve(system, right.T).T[:, :10], dtype=np.float64)

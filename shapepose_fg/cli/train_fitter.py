@@ -1,0 +1,62 @@
+"""The command `train-fitter`: weights of the learned fitter for a body model of one's own."""
+
+import time
+from pathlib import Path
+
+from shapepose_fg.cli.options import INPUT, REQUIRED, RESULT, RUN, grouped, option
+from shapepose_fg.cli.terminal import note, progress, show, table, warn
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.output_folder import prepare_output
+
+_DRAWN = 30_000
+"""Poses that are drawn where no recorded ones are given."""
+_WORSE = 1.1
+"""Times the plain optimiser's error, from which on weights that take half its time are of no use."""
+
+
+@grouped
+def train_fitter(
+    body: Path = option(INPUT, "Body model in SMPL's file format.", REQUIRED),
+    motions: Path | None = option(INPUT, "Recorded motions, a folder of AMASS's; without, poses are drawn."),
+    output: Path | None = option(RESULT, "File for the weights (body.weights); by default the user's cache."),
+    iterations: int = option(RUN, "Batches; 0 only says how sure fits may be.", 500, min=0),
+    batch: int = option(RUN, "People in each.", 256, min=16),
+    seed: int = option(RUN, "Of everything that is drawn.", 0),
+) -> None:
+    """Train the body fitter for a body model of yours; whatever has this --body then uses it.
+
+    It begins with the weights that ship with the package, and is compared with the plain optimiser at the end.
+    """
+    from shapepose_fg.body.fitting.weights import FitterWeights, adapted_file, fingerprint
+    from shapepose_fg.body.model.body_model import BodyModel
+    from shapepose_fg.body.threads import torch_threads
+    from shapepose_fg.simulation.training.adaptation import PLAIN, TRAINED, adapted
+    from shapepose_fg.simulation.training.motions import drawn_motions, load_motions
+    from shapepose_fg.simulation.training.train import TrainingConfig
+
+    model = BodyModel.load(body)
+    if output is None and fingerprint(model) == FitterWeights.default().body:
+        raise InputError(f"{body}: this body has weights, it ships with the package; give --output for others")
+    file = adapted_file(model) if output is None else output
+    prepare_output(file.parent, [file.name])
+    if motions is None:
+        learnt, unseen = (drawn_motions(_DRAWN, 2 * seed + part) for part in (0, 1))
+    else:
+        learnt, unseen = (load_motions(motions).of(split) for split in ("train", "validation"))
+    for split, part in (("train", learnt), ("validation", unseen)):
+        if len(part) == 0:
+            raise InputError(f"{motions}: no {split} subjects in it; add motions of more people")
+    config = TrainingConfig(iterations=iterations, batch=batch, seed=seed)
+    card = {"data": "poses drawn from the prior" if motions is None else f"{len(learnt)} frames of {motions.name}"}
+    start = time.perf_counter()
+    with torch_threads(1), progress("training", "batches") as shown:
+        weights, scores = adapted(model, learnt, unseen, config, card, shown)
+    rows = [(name, f"{score.joints_mm:.1f}", f"{score.ms:.1f}") for name, score in scores.items()]
+    minutes = (time.perf_counter() - start) / 60
+    caption = f"unseen poses, some joints missing; {minutes:.0f} minutes in all"
+    show(table(["fitter", "error, mm", "ms a fit"], rows, caption=caption))
+    if output is None and scores[TRAINED].joints_mm > _WORSE * scores[PLAIN].joints_mm:
+        warn(f"the plain optimiser is nearer on {body}: these weights are not kept; give more --iterations")
+        return
+    weights.save(file)
+    note(f"{file}: {file.stat().st_size / 1e6:.1f} MB" + ("" if output else f", for whatever has --body {body}"))
