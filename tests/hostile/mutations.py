@@ -1,10 +1,14 @@
 """A valid file with something wrong in it: text, numbers, structure, arrays, bytes."""
 
 import io
+import json
 import random
 import re
 import struct
 import zipfile
+
+import numpy as np
+import safetensors.numpy
 
 NUMBERS = [
     *"0 -1 1e400 -1e308 1e-320 nan NaN Infinity null true [] {}".split(),
@@ -37,6 +41,8 @@ def mutated(content: bytes, rng: random.Random) -> bytes:
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         if content[:2] == b"PK" and rng.random() < 0.9:
             content = _archive(content, rng)
+        elif content[8:10] == b'{"' and rng.random() < 0.8:
+            content = _tensors(content, rng)
         elif _TEXT.match(content) is not None and rng.random() < 0.9:
             content = _text(content.decode("utf-8", "replace"), rng).encode("utf-8", "replace")
         else:
@@ -125,6 +131,38 @@ def _header(array: bytes, rng: random.Random) -> bytes:
         at = 8 * rng.randrange(max(1, len(body) // 8))
         body = body[:at] + kind + body[at + 8 :]
     return head[:128] + body
+
+
+def _tensors(content: bytes, rng: random.Random) -> bytes:
+    """A `.safetensors` with one array, or what is said of them, changed; readable again."""
+    try:
+        arrays = safetensors.numpy.load(content)
+        said = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])["__metadata__"]
+    except Exception:
+        return _bytes(content, rng)
+    if len(arrays) == 0 or rng.random() < 0.2:
+        name = rng.choice(sorted(said))
+        return safetensors.numpy.save(arrays, said | {name: _text(said[name], rng)})
+    name = rng.choice(sorted(arrays))
+    array = arrays[name].copy()
+    match rng.randrange(7):
+        case 0:
+            del arrays[name]
+        case 1:
+            arrays[rng.choice((name + "x", *sorted(arrays)))] = arrays.pop(name)
+        case 2:
+            arrays[name] = array.reshape(-1)[: rng.randrange(array.size + 1)]
+        case 3:
+            arrays[name] = np.concatenate([array, array]) if array.ndim > 0 else array[None]
+        case 4:
+            arrays[name] = array.astype(rng.choice(("<f8", "<i8", "<f4", "u1", "?")))
+        case _ if array.size > 0:
+            numbers = (0, 1, -1, 255, 2**40, 2**62, 1e9, 1e200, np.nan, np.inf, -np.inf)
+            where = slice(None) if rng.random() < 0.3 else rng.randrange(array.size)
+            with np.errstate(all="ignore"):
+                array.reshape(-1)[where] = np.array(rng.choice(numbers)).astype(array.dtype)
+            arrays[name] = array
+    return safetensors.numpy.save(arrays, said)
 
 
 def _bytes(content: bytes, rng: random.Random) -> bytes:

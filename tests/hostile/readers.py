@@ -3,7 +3,6 @@
 import json
 import pickle
 import shutil
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -27,7 +26,6 @@ from shapepose_fg.io.config import read_config, toml_text
 from shapepose_fg.io.corrections import correct, read_corrections, take_back
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.io.export.markers import Markers, opensim_names, trc_text
-from shapepose_fg.io.export.registry import chosen, export_result
 from shapepose_fg.io.footage.placement import read_used_footage
 from shapepose_fg.io.pose2sim_project import read_pose2sim_project
 from shapepose_fg.io.skeleton_file import read_skeleton
@@ -37,6 +35,7 @@ from shapepose_fg.tracking.edits import Action, Edit
 from shapepose_fg.tracking.listing import list_saved_tracks
 from shapepose_fg.viz.report.writing import report_of
 from tests.core import test_reconstruction as results
+from tests.hostile import runs
 from tests.io import test_calibration_formats as rigs
 from tests.io import test_people_formats as people
 
@@ -197,35 +196,15 @@ def _result(folder: Path, seed: int) -> Read:
     return lambda: Reconstruction.load(folder)
 
 
-def _result_for(use: Callable[[Path], object]) -> Prepare:
-    """A result, of which `use` is made in a copy: what is written there is no file to be changed."""
-
-    def prepare(folder: Path, seed: int) -> Read:
-        results.people([0, 0, 3], seed).save(folder)
-        _unpack(folder / "people.npz")
-
-        def read() -> None:
-            with tempfile.TemporaryDirectory() as copy:
-                shutil.copytree(folder, copy, dirs_exist_ok=True)
-                use(Path(copy))
-
-        return read
-
-    return prepare
-
-
-def _exported(folder: Path) -> None:
-    for name in ("csv", "bvh", "c3d"):
-        export_result(folder, chosen([name]), folder / "export", up="z")
-
-
 def _listed(folder: Path) -> None:
     with Reconstruction.open(folder) as opened:
         list_saved_tracks(opened, read_body())
 
 
 def _merged(folder: Path) -> None:
-    correct(folder, Edit(Action.MERGE, 0, 2))
+    with Reconstruction.open(folder) as opened:
+        one, other = (np.unique(opened.person).tolist() * 2)[:2]
+    correct(folder, Edit(Action.SWAP, one, other, frame=int(opened.frame[-1])))
     take_back(folder)
 
 
@@ -342,10 +321,14 @@ READERS: dict[str, Prepare] = {
     "offsets": _offsets,
     "motion": _motion,
     "result": _result,
-    "result for export": _result_for(_exported),
-    "result for its report": _result_for(report_of),
-    "result for its tracks": _result_for(_listed),
-    "result for corrections": _result_for(_merged),
+    "result for export": runs.finished(runs.exported),
+    "result for its report": runs.finished(report_of),
+    "result for its tracks": runs.finished(_listed),
+    "result for corrections": runs.finished(_merged),
+    "run on its way": runs.unfinished(6, sealed=False),
+    "run before its end": runs.unfinished(99, sealed=False),
+    "run on its way, with digests": runs.unfinished(6, sealed=True),
+    "run before its end, with digests": runs.unfinished(99, sealed=True),
     "observations": _observations,
     "shapes": _shapes,
     "body": _body(False),

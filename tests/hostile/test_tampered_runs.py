@@ -4,6 +4,7 @@ import json
 import os
 import random
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,53 +17,23 @@ from shapepose_fg.core.reconstruction import Reconstruction, Status
 from shapepose_fg.core.storage.files import inside
 from shapepose_fg.core.storage.kept_arrays import InFolder
 from shapepose_fg.core.storage.output_folder import only_run_in
-from shapepose_fg.estimation.detector_offsets import OffsetConfig
-from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.pipeline import Task, reconstruct, reconstruct_parts
 from shapepose_fg.pipeline.runs.manifest import open_run
-from shapepose_fg.pipeline.windows import WindowConfig
-from shapepose_fg.simulation import built_in_scene, simulate
-from shapepose_fg.tracking import following
-from shapepose_fg.tracking.following import FollowingConfig
-
-CONFIG = PipelineConfig(
-    batch_frames=6,
-    following=FollowingConfig(look_ahead_s=0.15),
-    windows=WindowConfig(overlap_s=0.1),
-    offsets=OffsetConfig(frames=4),
-)
-
-
-class Ended(BaseException):
-    """A run is stopped from outside."""
-
-
-class Stopping(InFolder):
-    """Parts in a folder; the run is stopped behind so many writes."""
-
-    writes = 5
-
-    def keep(self, name, arrays, about=None) -> None:
-        super().keep(name, arrays, about)
-        self.writes -= 1
-        if self.writes == 0:
-            raise Ended
+from tests.hostile import runs
 
 
 @pytest.fixture(scope="module")
-def task():
-    before, following.BLOCK_S = following.BLOCK_S, 0.2
-    scene = built_in_scene(seed=1, people=2, cameras=3, frames=36)
-    yield Task(simulate(scene, seed=1), scene.rig, CONFIG)
-    following.BLOCK_S = before
+def task() -> Iterator[Task]:
+    with runs.short_blocks():
+        yield runs.task(frames=36)
 
 
 @pytest.fixture(scope="module")
 def stopped(task, tmp_path_factory) -> Path:
     """The parts of a run that was stopped when following stood between two windows, in the middle of a stretch."""
     folder = tmp_path_factory.mktemp("stopped")
-    with pytest.raises(Ended):
-        reconstruct_parts(Stopping(folder), task)
+    with pytest.raises(runs.Ended):
+        reconstruct_parts(runs.Stopping(folder), task)
     assert len(list(folder.glob("part-*"))) >= 2 and len(list(folder.glob("followed-*"))) in (1, 2)
     return folder
 

@@ -103,7 +103,7 @@ class InFolder(KeptArrays):
 
     def __init__(self, folder: Path, run: str = "") -> None:
         """`run` is the run that they are of: files of another one are refused."""
-        self.folder, self._run = folder, run
+        self.folder, self.run = folder, run
         self._checked: dict[tuple[str, str | None], tuple[int, ...]] = {}
 
     def names(self, prefix: str) -> list[str]:
@@ -139,7 +139,7 @@ class InFolder(KeptArrays):
 
     def _seal(self, name: str, said: Mapping[str, str]) -> str:
         """The digest of all that a file says but for its arrays, whose own digests are in it."""
-        return hashlib.sha256(json.dumps([self._run, name, said["about"], said["arrays"]]).encode()).hexdigest()
+        return hashlib.sha256(json.dumps([self.run, name, said["about"], said["arrays"]]).encode()).hexdigest()
 
     @contextmanager
     def _opened(self, name: str, key: str | None = None) -> Iterator[Any]:
