@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from shapepose_fg.cli.options import (
+    INPUT,
     REQUIRED,
     RESULT,
     RUN,
@@ -77,7 +78,8 @@ def detect(
     pictures: PictureOptions,
     network: NetworkOptions,
     clock: ClockOptions,
-    output: Path = option(RESULT, "Folder for the detections; made if it is not there.", REQUIRED),
+    project: Path | None = option(INPUT, "A Pose2Sim project: its cameras and videos; detections go into pose/."),
+    output: Path | None = option(RESULT, "Folder for the detections; made if it is not there."),
 ) -> None:
     """Detect people's joints in videos or pictures, for `reconstruct`: candidates with part affinities.
 
@@ -85,8 +87,17 @@ def detect(
     where it was when it is started again.
     """
     network.check()
-    if pictures.videos is None:
-        raise InputError("--videos: missing; give the cameras' videos or pictures")
+    if project is not None:
+        from shapepose_fg.io.pose2sim_project import footage_of
+
+        calibration, videos, pose = footage_of(project)
+        cameras = replace(cameras, calibration=cameras.calibration or calibration)
+        pictures, output = replace(pictures, videos=pictures.videos or [str(videos)]), output or pose
+    if pictures.videos is None or output is None:
+        option_missing = "--videos" if pictures.videos is None else "--output"
+        raise InputError(
+            f"{option_missing}: missing; give the cameras' videos or pictures, and a folder to write to"
+        )
     from shapepose_fg.detection2d.detector import CameraDetector
     from shapepose_fg.detection2d.recording import DetectionRun, run_detection
     from shapepose_fg.io.footage.lockstep import align, clocks_of
@@ -122,7 +133,7 @@ def detect(
         if failed > 0:
             note(f"camera {name}: {failed} of {report.moments} pictures cannot be read; nothing is detected there")
     show(_summary(run, report, time.perf_counter() - begin))
-    print(_next_command(run, cameras))
+    print(_next_command(output, cameras, project))
 
 
 def _shown_small(detectors: "Sequence[CameraDetector]", size: tuple[int, int]) -> str:
@@ -149,14 +160,18 @@ def _summary(run: "DetectionRun", report: "DetectionReport", seconds: float) -> 
     return table("camera pictures size turned network candidates".split(), rows, caption=caption)
 
 
-def _next_command(run: "DetectionRun", cameras: CameraOptions) -> str:
-    """How to go on, as a line to copy."""
+def _next_command(output: Path, cameras: CameraOptions, project: Path | None) -> str:
+    """How to go on, as a line to copy, wherever it is pasted."""
     import shlex
 
-    options = {"--calibration": cameras.calibration, "--detections": run.output, "--up": cameras.up}
-    options |= {"--unit": cameras.unit, "--image-size": cameras.image_size}
-    if run.moments.time_s is not None and len(run.moments) > 1:
-        options["--timestamps"] = run.output / "times.csv"
-    options["--output"] = "results"
+    files = {
+        "--calibration": cameras.calibration,
+        "--detections": output,
+        "--output": output.resolve().parent / "results",
+    }
+    if project is not None and output.resolve().parent == project.resolve():
+        files = {"--project": project}
+    options = {name: file.resolve() for name, file in files.items() if file is not None}
+    options |= {"--up": cameras.up, "--unit": cameras.unit, "--image-size": cameras.image_size}
     words = [word for name, value in options.items() if value is not None for word in (name, str(value))]
     return f"next: {shlex.join(['shapepose-fg', 'reconstruct', *words])}"

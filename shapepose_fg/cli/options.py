@@ -106,7 +106,7 @@ class RunOptions:
 class CameraOptions:
     """The cameras of a recording."""
 
-    calibration: Path = option(INPUT, "Cameras: a file, or a folder, of one of the formats known.", REQUIRED)
+    calibration: Path | None = option(INPUT, "Cameras: a file, or a folder, of one of the formats known.")
     up: str | None = option(INPUT, "World axis that points up: x -x y -y z -z.", metavar="AXIS")
     unit: str | None = option(INPUT, "Unit of the calibration: m, cm or mm.", metavar="UNIT")
     image_size: str | None = option(INPUT, "Size of calibrated pictures where the file has none.", metavar="WxH")
@@ -115,6 +115,8 @@ class CameraOptions:
         """The cameras; InputError where they cannot be used."""
         from shapepose_fg.io.calibration import read_rig
 
+        if self.calibration is None:
+            raise InputError("--calibration: missing; give the file, or the folder, of the cameras")
         match = re.fullmatch(r"\s*(\d{1,9})\s*[x×,]\s*(\d{1,9})\s*", self.image_size or "")
         if self.image_size is not None and match is None:
             raise InputError(f"--image-size {self.image_size}: must be WIDTHxHEIGHT in pixels, such as 1920x1080")
@@ -129,6 +131,13 @@ class DetectionOptions(CameraOptions):
 
     detections: Path = option(INPUT, "Folder with what a 2D detector wrote of every camera.", REQUIRED)
     skeleton: str | None = option(INPUT, "The detector's skeleton, or a TOML file of it.", metavar="NAME")
+
+    def rig(self) -> "Rig":
+        """The cameras; InputError where they cannot be used, or do not see depth."""
+        found = super().rig()
+        if len(found) < 2:
+            raise InputError(f"{self.calibration}: at least 2 cameras are needed to see depth, got {len(found)}")
+        return found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,9 +192,11 @@ def result_frames(text: str | None) -> range | None:
     return found
 
 
-def frame_range(text: str | None, count: int) -> range:
-    """Frames that `A:B` selects of a recording of `count` frames: half-open, either end optional."""
-    start, stop = (0, count) if text is None else ends(text)
+def frame_range(text: str | None, count: int, first: int = 0) -> range:
+    """Frames that `A:B` selects of a recording of `count` frames: half-open, either end optional; all from the
+    `first` on where it is None.
+    """
+    start, stop = (first, count) if text is None else ends(text)
     found = range(start, count if stop is None else stop)
     if text is not None and not (found and found.stop <= count):
         raise InputError(

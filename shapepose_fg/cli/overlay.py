@@ -60,7 +60,7 @@ def overlay(
     with Reconstruction.open(folder) as people:
         rig, run = read_rig(folder / CAMERAS), people.run
         names = pictures.named(rig) if drawn.cameras is None else _cameras(drawn.cameras, rig)
-        shown = pictures.of_result(run, rig, names, detections)
+        shown = pictures.of_result(folder, run, rig, names, detections)
         if drawn.points and not people.observed:
             note(f"{folder}: there is no observations.npz, so no detections are drawn")
         model, file = None, run.get("body")

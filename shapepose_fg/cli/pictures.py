@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from shapepose_fg.cli.options import INPUT, option
 from shapepose_fg.cli.terminal import note, progress
+from shapepose_fg.core.result_files import results_folder
 
 if TYPE_CHECKING:
     from shapepose_fg.core.camera import Rig
@@ -44,11 +45,19 @@ class PictureOptions:
         return [opened(name, path) for name, path in zip(rig.names, places, strict=True)]
 
     def of_result(
-        self, run: Mapping[str, Any], rig: "Rig", drawn: Sequence[str], detections: Path | None = None
+        self,
+        results: Path,
+        run: Mapping[str, Any],
+        rig: "Rig",
+        drawn: Sequence[str],
+        detections: Path | None = None,
     ) -> "list[tuple[CameraFootage, Footage]]":
-        """Those of a result, whose run.json says `run`, for the cameras `drawn`; see `pictures_of`."""
+        """Those of the result in `results`, whose run.json says `run`, for the cameras `drawn` (`pictures_of`)."""
+        from shapepose_fg.io.footage.placement import FOOTAGE
         from shapepose_fg.viz.overlay.result_pictures import Wanted, pictures_of
 
+        if detections is None and (results_folder(results) / FOOTAGE).is_file():
+            detections = results_folder(results)
         wanted = Wanted(drawn, self.videos, detections, tuple(self.image_placement or ()))
         return pictures_of(run, rig, wanted, opened, note)
 

@@ -24,7 +24,8 @@ def check_calibration(
     """
     from shapepose_fg.core.storage.kept_arrays import InFolder
     from shapepose_fg.io.detections import read_detections
-    from shapepose_fg.setup_check.diagnosis import other_sizes
+    from shapepose_fg.io.footage.placement import FOOTAGE
+    from shapepose_fg.setup_check.diagnosis import detected_sizes, other_sizes
     from shapepose_fg.setup_check.report import check_setup
     from shapepose_fg.setup_check.table import setup_report
 
@@ -33,7 +34,9 @@ def check_calibration(
         recording = read_detections(seen.detections, rig, seen.skeleton, InFolder(Path(folder)))
         note(*recording.notes)
         sizes = () if pictures.videos is None else other_sizes(pictures.videos, rig)
-        report = check_setup(recording, rig, frame_range(frames, len(recording)), sizes)
+        if pictures.videos is None and (used := seen.detections / FOOTAGE).is_file():
+            sizes = detected_sizes(used, rig)
+        report = check_setup(recording, rig, frame_range(frames, len(recording), recording.first), sizes)
     if as_json:
         print(json.dumps(report.as_dict(), indent=2, allow_nan=False))
     else:

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from shapepose_fg.cli.terminal import show, table
+from shapepose_fg.cli.terminal import note, show, table
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.result_files import results_folder
+from shapepose_fg.core.result_files import results_folder, set_aside
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -181,9 +181,12 @@ def _correct(context: typer.Context, action: str, person: int, **more: int | Non
 
 
 def _renew_report(folder: Path) -> None:
-    """The page of a result that was corrected, where there is one: it would say what is no longer true."""
+    """The page of a result that was corrected, where there is one, and what was made of it before: it would say
+    what is no longer true.
+    """
     from shapepose_fg.viz.report.writing import REPORT, report_of
 
+    note(*set_aside(folder))
     page = folder / REPORT
     if not page.is_file():
         return

@@ -1,8 +1,9 @@
 """The command `view`: a result in the rerun viewer."""
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shapepose_fg.cli.options import RUN, TakeOptions, grouped, option
+from shapepose_fg.cli.options import RESULT, RUN, TakeOptions, grouped, option
 from shapepose_fg.cli.pictures import PictureOptions
 from shapepose_fg.cli.terminal import note, progress
 from shapepose_fg.core.errors import InputError
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 def view(
     part: TakeOptions,
     pictures: PictureOptions,
+    save: Path | None = option(RESULT, "Write it into this .rrd instead, for `rerun FILE`.", metavar="FILE"),
     connect: str | None = option(RUN, "A viewer that runs already: rerun+http://HOST:9876/proxy.", metavar="URL"),
     statistics: bool = option(RUN, "Leave rerun's statistics of use as they are set.", False, "--statistics"),
 ) -> None:
@@ -26,23 +28,25 @@ def view(
     from shapepose_fg.io.export.rerun_log import log_pictures, log_take
 
     take = read_take(part.results, identities=False, **part.how())
-    shown = _pictures(take, pictures) if pictures.videos else []
-    stream = rerun_app.new_stream()
-    viewer = rerun_app.viewer_file()
-    if connect is None and not statistics and viewer is not None and rerun_app.switch_off(viewer):
+    if save is not None and connect is not None:
+        raise InputError("--save and --connect: this is written or shown; give one of them")
+    pairs = _pictures(part.results, take, pictures) if pictures.videos else []
+    viewer = rerun_app.viewer_file() if connect is None and save is None and not statistics else None
+    if viewer is not None and rerun_app.switch_off(viewer):
         note("rerun's statistics of use were on and are off now; `rerun analytics enable` switches them on")
-    rerun_app.open_viewer(stream, take, connect)
     arrays, missing = rerun_app.body_if_there(Job(take, part.results, part.body))
     note(*missing)
-    log_take(stream, take, arrays)
-    if len(shown) > 0:
-        with progress("showing pictures", "pictures") as done:
-            log_pictures(stream, take, shown, done)
-    stream.flush()
+    with rerun_app.shown(take, connect) if save is None else rerun_app.written(save, take) as stream:
+        log_take(stream, take, arrays)
+        if len(pairs) > 0:
+            with progress("showing pictures", "pictures") as done:
+                log_pictures(stream, take, pairs, done)
+    if save is not None:
+        print(f"written  {save}")
 
 
-def _pictures(take: "Take", pictures: PictureOptions) -> "list[tuple[CameraFootage, Footage]]":
+def _pictures(results: Path, take: "Take", pictures: PictureOptions) -> "list[tuple[CameraFootage, Footage]]":
     """The cameras' videos or pictures: of all, or of those that are given one by one."""
     if take.rig is None:
         raise InputError("--videos: there is no cameras.json beside the result, so no picture has a place")
-    return pictures.of_result(take.people.run, take.rig, pictures.named(take.rig))
+    return pictures.of_result(results, take.people.run, take.rig, pictures.named(take.rig))

@@ -192,8 +192,8 @@ class Rig:
 
     def __post_init__(self) -> None:
         names = [camera.name for camera in self.cameras]
-        if len(names) < 2:
-            raise ValueError(f"a rig needs at least 2 cameras to see depth, got {len(names)}")
+        if len(names) == 0:
+            raise ValueError("a rig needs a camera")
         if len(set(names)) != len(names):
             raise ValueError(f"camera names must differ, got {names}")
         if self.up not in ("x", "-x", "y", "-y", "z", "-z"):
@@ -313,3 +313,15 @@ class Views:
         """
         K, cTw = (array[:, None] if array.ndim == 4 else array for array in (self.K, self.cTw))
         return project_with_jacobian(points[:, :, None], K, cTw)
+
+
+def beside_segment(x: Array, y: Array, first: Sequence[Array], second: Sequence[Array]) -> tuple[Array, Array]:
+    """How far pixels (...) are from segments (...), squared pixels, and how deep a segment is where it is nearest.
+
+    `first` and `second` are x, y and depth of the segments' ends; all shapes broadcast.
+    """
+    (x0, y0, z0), (x1, y1, z1) = first, second
+    to_x, to_y, dx, dy = x - x0, y - y0, x1 - x0, y1 - y0
+    along = np.clip((to_x * dx + to_y * dy) / np.maximum(dx * dx + dy * dy, 1e-6), 0.0, 1.0)
+    to_x, to_y = to_x - along * dx, to_y - along * dy
+    return to_x * to_x + to_y * to_y, z0 + along * (z1 - z0)

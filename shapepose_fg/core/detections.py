@@ -7,6 +7,7 @@ from typing import Protocol
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.skeleton import Skeleton
 
 
@@ -26,10 +27,15 @@ class Detections:
     """(E, 2) two candidates of one view that a limb of the skeleton joins, first joint of the limb first."""
     affinity: Array
     """(E,) how well the image supports that the two belong to one person; a pair not listed has 0."""
+    place: Index = None  # type: ignore[assignment]
+    """(D,) the place of each among those of its view in the recording, whatever was left out since; counted here
+    where it is not given."""
 
     def __post_init__(self) -> None:
         count = len(self.view)
-        shapes = {"view": (count,), "joint": (count,), "xy": (count, 2), "confidence": (count,)}
+        if self.place is None:
+            object.__setattr__(self, "place", _place_in_view(self.view))
+        shapes = {"view": (count,), "joint": (count,), "xy": (count, 2), "confidence": (count,), "place": (count,)}
         shapes |= {"pairs": (len(self.affinity), 2), "affinity": (len(self.affinity),)}
         for name, shape in shapes.items():
             if np.shape(getattr(self, name)) != shape:
@@ -55,6 +61,7 @@ class Detections:
             self.confidence[index],
             pairs[both],
             self.affinity[both],
+            self.place[index],
         )
 
     @classmethod
@@ -62,6 +69,28 @@ class Detections:
         """A frame in which no view saw anything."""
         none = np.zeros(0, dtype=np.intp)
         return cls(none, none, np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2), dtype=np.intp), np.zeros(0))
+
+
+def _place_in_view(view: Index) -> Index:
+    """(D,) the place of each detection among those of the same view."""
+    order = np.argsort(view, kind="stable")
+    place = np.empty(len(view), dtype=np.intp)
+    place[order] = np.arange(len(view)) - np.searchsorted(view[order], view[order])
+    return place
+
+
+@dataclass(frozen=True)
+class Input:
+    """What the cameras give of one frame."""
+
+    frame: int
+    """Its number in the recording."""
+    time_s: Array
+    """(V,) when each view was exposed, seconds."""
+    detections: Detections
+    """What the detector saw."""
+    rig: Rig
+    """Where the cameras were."""
 
 
 class DetectionSequence(Protocol):

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from itertools import pairwise
 from typing import Any
 
@@ -13,6 +14,39 @@ _LEAST_FPS, _MOST_FPS = 1e-3, 1e6
 """No recording of people is slower, or faster."""
 ASSUMED_FPS = 30.0
 """Frames a second where nothing says how many."""
+
+
+def exact_rate(rate: float, apart: float) -> float:
+    """The rate that cameras have at most `apart` from `rate`; `rate` where there is none.
+
+    That is the nearest whole number or 1000 / 1001 of one (NTSC), else a fraction with up to 10 below the line.
+    """
+    whole, ntsc = Fraction(round(rate)), Fraction(1000 * round(1.001 * rate), 1001)
+    nearest = min(whole, ntsc, key=lambda each: abs(each - Fraction(rate)))
+    usual = (nearest, Fraction(rate).limit_denominator(10))
+    return next((float(each) for each in usual if each > 0 and abs(float(each) - rate) <= apart), rate)
+
+
+def typed_rate(fps: float) -> float:
+    """What a rate means that somebody, or a file, wrote in a few digits: 29.97 is 30000 / 1001."""
+    return exact_rate(fps, 2e-6 * fps)
+
+
+def rate_of(time_s: Array) -> float:
+    """Frames a second of frames at rising times (T,), T at least 2; exact where times are rounded, or jitter.
+
+    A step that is twice the median is a frame that was dropped, and so on. The rate is as uncertain as the times
+    are off the line through them; where they are off by more than a quarter of a step, the median says it.
+    """
+    time_s = time_s - time_s[0]
+    steps, lasts = np.diff(time_s), float(time_s[-1])
+    step = float(np.median(steps))
+    number = np.append(0, np.cumsum(np.maximum(np.rint(steps / step), 1)))
+    slope, start = (float(each) for each in np.polyfit(number, time_s, 1))
+    off = float(np.abs(time_s - start - slope * number).max())
+    if off > step / 4:
+        slope, off, lasts = step, 0.0, step
+    return exact_rate(1 / slope, min(2 * (off + 1e-6) / lasts, 0.01) / slope)
 
 
 @dataclass(frozen=True)
@@ -43,11 +77,11 @@ class FrameTimes:
 
     @classmethod
     def from_fps(cls, fps: float, frames: int) -> "FrameTimes":
-        """`frames` frames at `fps` frames a second, frame 0 at 0 s."""
+        """`frames` frames at `fps` frames a second, frame 0 at 0 s (`typed_rate`)."""
         if not _LEAST_FPS <= fps <= _MOST_FPS:
             bounds = f"{_LEAST_FPS:g} to {_MOST_FPS:g}"
             raise ValueError(f"fps must be a positive number of frames a second, {bounds}, got {fps}")
-        return cls(np.arange(frames) / fps, source="fps")
+        return cls(np.arange(frames) / typed_rate(fps), source="fps")
 
     @classmethod
     def assumed(cls, frames: int) -> "FrameTimes":
@@ -71,8 +105,8 @@ class FrameTimes:
             raise ValueError(f"times need a column for each of the {views} cameras, got {self.time_s.shape[1]}")
 
     def as_dict(self) -> dict[str, Any]:
-        """What run.json says of the times: where they come from, and the median rate."""
-        rate = 1.0 / float(np.median(np.diff(self.frame_s))) if len(self) > 1 else None
+        """What run.json says of the times: where they come from, and the rate."""
+        rate = rate_of(self.frame_s) if len(self) > 1 else None
         return {"source": self.source, "fps": rate, "per_camera": self.time_s.ndim == 2}
 
 
@@ -82,7 +116,7 @@ def rate_words(run: Mapping[str, Any]) -> str:
     if told.get("fps") is None:
         return ""
     assumed = " (assumed: give --fps)" if told.get("source") == "assumed" else ""
-    return f", {told['fps']:.4g} a second{assumed}"
+    return f", {told['fps']:.6g} a second{assumed}"
 
 
 def check_cuts(cuts: Sequence[int], frames: int) -> tuple[int, ...]:

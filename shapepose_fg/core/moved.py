@@ -12,7 +12,7 @@ _ROOMS = {
     "core": "errors camera skeleton detections observations observation_table frame_times bounds"
     " reconstruction provenance run_summary result_files",
     "core.storage": "files kept_arrays output_folder",
-    "pipeline": "engine windows workers cluster solving bodies_over_time runs",
+    "pipeline": "windows workers cluster solving bodies_over_time runs",
     "cli": "options terminal stopping demo batch",
     "viz": "rendering overlay report viewer",
     "io": "export",
@@ -22,6 +22,7 @@ _ROOMS = {
 MOVED = {name: f"{room}.{name}" for room, names in _ROOMS.items() for name in names.split()}
 """Old names to new ones, both within the package."""
 MOVED |= {"pipeline_config": "pipeline.config", "person_bodies": "pipeline.bodies_over_time"}
+MOVED |= dict.fromkeys(("engine", "pipeline.engine"), "pipeline.setup")
 
 
 class _Finder(MetaPathFinder, Loader):

@@ -109,10 +109,9 @@ class ObservationTable(Table):
     ) -> "ObservationTable":
         """The table of N solved rows: what they observed, and where their `joints` (N, J, 3) came to lie.
 
-        The rows are of the observations' `frame`, and of the person `track`. `place` (N, J, V) is each detection's
-        place among those of its view (`place_in_view`), `gate` (N, J, V) the codes of `Gate`; what was not seen is
-        recorded as that, whatever is there, and what was not used because the joint is not placed, or behind the
-        camera, as that.
+        The rows are of the observations' `frame`, and of the person `track`. `place` (N, J, V) is each one's
+        `Detections.place`, `gate` (N, J, V) the codes of `Gate`; what was not seen is recorded as that, whatever
+        is there, and what was not used because the joint is not placed, or behind the camera, as that.
         """
         seen = observations.seen
         projected, depth = (np.moveaxis(values, 0, 2) for values in rig.project(joints))
@@ -195,17 +194,3 @@ class ObservationTable(Table):
             opened.close()
             raise
         return opened
-
-
-def place_in_view(candidate: Whole, view: Whole) -> NDArray[np.int32]:
-    """Detections counted among those of their own view, from where they are counted over all views of a frame.
-
-    `candidate` of any shape holds rows of the frame's `Detections`, -1 for none (and stays so); `view` (D,) is
-    `Detections.view`.
-    """
-    order = np.argsort(view, kind="stable")
-    first = np.searchsorted(view[order], view[order])
-    # One more place, at the end: what -1 leads to.
-    place = np.full(len(view) + 1, -1, dtype=np.int32)
-    place[order] = np.arange(len(view)) - first
-    return place[candidate]

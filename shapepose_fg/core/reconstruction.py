@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.core.arrays import Array, Index, Mask, Whole
+from shapepose_fg.core.arrays import Array, Mask, Whole
 from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.observation_table import ObservationTable
 from shapepose_fg.core.result_files import OBSERVATIONS, PEOPLE, RUN, RUN_ID, SavedTable, check_id, write_result
@@ -223,7 +223,7 @@ class OpenedReconstruction(ExitStack):
         try:
             people = SavedTable(file, Reconstruction, "give the people.npz of a reconstruction")
             self._people = self.enter_context(people)
-            self.frame, self.person = (self._people.numbers(name) for name in ("frame", "person"))
+            self.frame, self.person = (self._people.column(name) for name in ("frame", "person"))
             """(N,) frame of each row, and identity of each row's person."""
             self.run = _read_run(file.with_name(RUN), self._people.run_id)
             """What run.json says."""
@@ -261,11 +261,19 @@ class OpenedReconstruction(ExitStack):
         every = max(1, -(-len(self) // most_rows))
         return self.rows(None if every == 1 else np.flatnonzero(self.frame % every == 0)), every
 
-    def rows(self, index: Index | None = None, *, observations: bool = True) -> Reconstruction:
-        """The rows `index` (R,), rising, or all; with what they were solved from, where that is wanted.
+    def __getattr__(self, name: str) -> Any:
+        """A whole column, as `Reconstruction` has it, read when it is asked for."""
+        if name not in (*Reconstruction.ROWS, "joint_names"):
+            raise AttributeError(f"{type(self).__name__!r} has no attribute {name!r}")
+        return self._people.column(name)
+
+    def rows(self, index: NDArray | None = None, *, observations: bool = True) -> Reconstruction:
+        """The rows `index`, a mask (N,) or numbers (R,) that rise, or all; with what they were solved from, where
+        that is wanted.
 
         InputError where a file is damaged, or they would not fit in memory.
         """
+        index = np.flatnonzero(index) if index is not None and index.dtype == bool else index
         people = self._people.read(index, run=self.run)
         if self._observed is None or not observations:
             return people

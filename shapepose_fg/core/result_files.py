@@ -5,6 +5,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
+from itertools import chain, count
 from pathlib import Path
 from typing import Any, BinaryIO, Generic, TypeVar, cast
 
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.filesize import decimal
 
-from shapepose_fg.core.arrays import Index, Whole
+from shapepose_fg.core.arrays import Index
 from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.run_summary import plain
 from shapepose_fg.core.storage.files import write_together
@@ -31,6 +32,19 @@ as one that was not."""
 def results_folder(results: Path) -> Path:
     """The folder of a result, which may be given as its people.npz too."""
     return results.parent if results.name == PEOPLE else results
+
+
+def set_aside(folder: Path) -> list[str]:
+    """Rename exports and overlays of the result in `folder`, which a new one takes the place of: nobody is to take
+    them for the new one's. What is to be said of it.
+    """
+    told = []
+    for made in (folder / name for name in ("export", "overlay")):
+        if made.is_dir():
+            names = (made.with_name(f"{made.name}-older{number}") for number in chain([""], count(2)))
+            made.rename(free := next(path for path in names if not path.exists()))
+            told.append(f"{made} is of the result before; it is called {free.name} now")
+    return told
 
 
 def write_result(
@@ -149,8 +163,10 @@ class SavedTable(ExitStack, Generic[T]):
             self.close()
             raise
 
-    def numbers(self, name: str) -> Whole:
-        """All of a column of whole numbers, checked: rows are chosen by it before the others are read."""
+    def column(self, name: str) -> NDArray[Any]:
+        """All of a column, checked: rows are chosen by it before the others are read."""
+        if name not in self._rows:  # a shared one, or files of earlier versions lack it
+            return self._shared[name] if name in self._shared else getattr(self.read(None), name)
         with naming(self.file, self.cure):
             column = self._columns[name].checked(name, self._npz.array(name), {"N": self.count})
             self._columns[name].check_range(name, column)

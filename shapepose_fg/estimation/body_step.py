@@ -47,7 +47,7 @@ class BodyStep:
         if rows is not None:
             targets = targets.rows(rows)
             last, groups = last.rows(rows), None if groups is None else groups[rows]
-        if self.config.refine.leave_one_out:
+        if self.config.refine.body_from_views:
             return self.fitter.fit(targets, last, groups)
         fit = self.fitter.fit_whole(targets, last) if groups is None else self.fitter.fit(targets, last, groups)
         return replace(fit, prior_xyz=fit.joints, prior_covariance=fit.covariance + MODEL_SIGMA_M**2 * np.eye(3))
@@ -57,7 +57,7 @@ class BodyStep:
         xyz, covariance = body.prior_xyz.copy(), body.prior_covariance.copy()
         ok = np.repeat(body.ok[:, None], xyz.shape[1], axis=1)
         tied = {each for person in self.people for each in person.coupled}
-        for joints in sorted(tied, key=sorted) if self.config.refine.leave_one_out else ():
+        for joints in sorted(tied, key=sorted) if self.config.refine.body_from_views else ():
             # Tied to each other, each would get the others' views twice: through the tie, and through the body.
             ties = [np.full(len(person), joints in person.coupled) for person in self.people]
             rows = np.flatnonzero(np.concatenate(ties))

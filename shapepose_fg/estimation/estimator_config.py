@@ -56,18 +56,12 @@ class RefineConfig(Settings):
     """A joint that its views put this many standard deviations from where the body can have it is seen wrongly:
     its gates are decided anew from the body's place, and the body is fitted again. 4 threw away more joints that
     were right than wrong ones, in simulated crowds. 0: nothing is thrown away, as in the paper."""
-    draft_reach_m: MetresOrNone = 0.05
-    """A draft's body is fitted to the detections around it, fit by fit, under a kernel that narrows to this, as in
-    SMPLify: the distance from the projection, as a length at the joint's depth, at which a detection counts a
-    quarter. 0: once, to what lies within `rho_2d_m` of where the views alone put each joint. On `tune`, frame by
-    frame, 0 / 5 cm: F1 91.9 / 93.8 %, MPJPE 44 / 35 mm."""
     complete_start: bool = True
     """Whether frame by frame joints that two views saw and stage I did not place are triangulated for X_0. In the
     paper they are missing until the body puts them somewhere."""
     body_from_views: bool = True
-    """Whether the body is fitted to what the views alone say of each joint; in Algorithm 1 to X_n, all alike."""
-    leave_one_out: bool = True
-    """Whether what the body says of a joint comes from a fit without that joint's own target."""
+    """Whether the body is fitted to what the views alone say of each joint, and what it says of a joint comes from
+    a fit without that joint's own views. In Algorithm 1 it is fitted to X_n, and its joints are the prior."""
 
     @classmethod
     def paper(cls) -> "RefineConfig":
@@ -76,10 +70,8 @@ class RefineConfig(Settings):
             alternations=10,
             settled_m=0.0,
             disagreement=0.0,
-            draft_reach_m=0.0,
             complete_start=False,
             body_from_views=False,
-            leave_one_out=False,
         )
 
     @property

@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
+from shapepose_fg.core.notes import Problem
 from shapepose_fg.core.reconstruction import Known, Status
 from shapepose_fg.estimation.calibration import Calibration, Clues, from_body, lasting_mean
 from shapepose_fg.estimation.doubt import association_spread, exchange_spread, limbs_to_exchange
@@ -14,7 +15,7 @@ from shapepose_fg.estimation.plain_view import SPEED_M_S, elsewhere_variance, li
 from shapepose_fg.estimation.state import SEEN_M, State
 from shapepose_fg.estimation.state_covariances import state_covariances
 from shapepose_fg.estimation.window_graph import WindowGraph
-from shapepose_fg.estimation.window_solution import PersonGraph, Problem, WindowSolution
+from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution
 
 RUNAWAY_M = 1.0
 """A joint with a factor of the user's own that ends this far from where its views first put it has run away."""

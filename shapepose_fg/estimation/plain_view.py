@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.core.camera import Views
+from shapepose_fg.core.camera import Views, beside_segment
 from shapepose_fg.estimation.limbs import ARMS_AND_LEGS
 
 Array = NDArray[np.float64]
@@ -58,13 +58,13 @@ def elsewhere_variance(
     missed = np.zeros(joints.shape[:2])
     for number in np.unique(frame[row]).tolist():
         here, of_frame = frame[row] == number, np.flatnonzero(frame == number)
-        hidden = _hidden((xy, depth), (row[here], joint[here]), of_frame, focal[row[here]], limbs)
+        hidden = _behind_limbs((xy, depth), (row[here], joint[here]), of_frame, focal[row[here]], limbs)
         missed[row[here], joint[here]] = (inside[row[here], joint[here]] & ~hidden).sum(axis=-1)
     unusual = UNUSUAL / (UNUSUAL + MISSED**missed)
     return np.where(missed >= LEAST_VIEWS, unusual * ELSEWHERE_M**2, 0.0)
 
 
-def _hidden(
+def _behind_limbs(
     projected: tuple[Array, Array],
     places: tuple[NDArray[np.intp], NDArray[np.intp]],
     people: NDArray[np.intp],
@@ -75,13 +75,11 @@ def _hidden(
     included; `projected` pixels and depths of all, `focal_px` (K, V).
     """
     (xy, depth), (row, joint), (ends, radius) = projected, places, limbs
-    first, along = xy[people][:, ends[:, 0]], xy[people][:, ends[:, 1]] - xy[people][:, ends[:, 0]]  # (P, L, V, 2)
-    away = xy[row, joint][:, None, None] - first  # (K, P, L, V, 2)
-    at = (away * along).sum(axis=-1) / np.maximum((along**2).sum(axis=-1), 1e-9)
-    at = np.clip(at, 0.0, 1.0)
-    beside = np.linalg.norm(away - at[..., None] * along, axis=-1)
-    ahead = (1 - at) * depth[people][:, ends[:, 0]] + at * depth[people][:, ends[:, 1]]
-    within = beside * ahead < radius[:, None] * focal_px[:, None, None]
-    hides = within & (ahead > 0) & (ahead < depth[row, joint][:, None, None] - _BEHIND_M)
+    coordinates = xy[..., 0], xy[..., 1], depth
+    first, second = ([each[people][:, end] for each in coordinates] for end in ends.T)  # (P, L, V)
+    x, y, deep = (each[row, joint][:, None, None] for each in coordinates)  # (K, 1, 1, V)
+    squared, ahead = beside_segment(x, y, first, second)
+    hides = (squared * ahead**2 < (radius[:, None] * focal_px[:, None, None]) ** 2) & (ahead > 0)
+    hides &= ahead < deep - _BEHIND_M
     own = (people == row[:, None])[..., None] & (ends == joint[:, None, None]).any(axis=-1)[:, None]  # (K, P, L)
     return (hides & ~own[..., None]).any(axis=(1, 2))

@@ -1,5 +1,6 @@
 """People of a window on their way through Algorithm 1."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -94,6 +95,12 @@ class State:
         for kept, new in ((self.of_views, evidence.message), (self.of_body, of_body)):
             kept.xyz[rows], kept.information[rows] = new.xyz, new.information
         self.fit = self.fit.with_rows(rows, fit)
+
+
+def parts_of(people: Sequence[WindowGraph]) -> list[tuple[WindowGraph, slice]]:
+    """Everybody with their place among the rows of all these people."""
+    ends = np.cumsum([len(person) for person in people]).tolist()
+    return [(person, slice(end - len(person), end)) for person, end in zip(people, ends, strict=True)]
 
 
 def window_rows(observations: Observations) -> list[NDArray[np.intp]]:

@@ -1,18 +1,24 @@
 """Covariances of all joints of solved windows at once: each joint is a chain of states, and chains go together.
 
-GTSAM's `Marginals` gives the same numbers for any graph, one variable a call (`WindowGraph.marginals`), at four
-times the cost. It is asked for frames that stand alone, and where a factor of the user's own ties joints, or
-frames that do not follow each other.
+GTSAM's `Marginals` gives the same numbers for any graph, one variable a call, at four times the cost. It is asked
+for frames that stand alone, and where a factor of the user's own ties joints, or frames that do not follow each
+other.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from shapepose_fg.estimation.window_graph import WindowGraph, is_determined
+from shapepose_fg.core.arrays import Array
+from shapepose_fg.estimation.window_graph import WindowGraph
+
+UNDETERMINED_M = 10.0
+"""A variable that the problem leaves less certain than this in some direction, metres or m/s, is not
+determined."""
 
 
 @dataclass(frozen=True)
@@ -21,12 +27,12 @@ class Chains:
     only.
     """
 
-    diagonal: NDArray[np.float64]
+    diagonal: Array
     """(C, T, n, n) of each state with itself."""
-    below: NDArray[np.float64]
+    below: Array
     """(C, T - 1, n, n) of each state, rows, with the one before it, columns."""
 
-    def covariances(self) -> NDArray[np.float64]:
+    def covariances(self) -> Array:
         """(C, T, n, n) marginal covariance of each state; NaN in all states of a chain that is not determined.
 
         The blocks on the diagonal of the inverse: block Cholesky down the chains, and back, for all together.
@@ -40,7 +46,7 @@ class Chains:
         single = (Chains(self.diagonal[n : n + 1], self.below[n : n + 1]) for n in range(len(self.diagonal)))
         return np.concatenate([chain.covariances() for chain in single])
 
-    def _blocks_of_inverse(self) -> NDArray[np.float64]:
+    def _blocks_of_inverse(self) -> Array:
         steps = self.diagonal.shape[1]
         inverse, gain = np.empty_like(self.diagonal), np.empty_like(self.below)
         for t in range(steps):
@@ -55,14 +61,13 @@ class Chains:
         return inverse
 
 
-def state_covariances(
-    graphs: Sequence[WindowGraph],
-) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+def state_covariances(graphs: Sequence[WindowGraph]) -> list[tuple[Array, Array]]:
     """For each solved graph of T frames the covariances (T, J, 3, 3) of positions, m², and of velocities, m²/s².
 
-    NaN where a variable is not in the problem, and where the problem leaves it undetermined.
+    NaN where a variable is not in the problem, and where the problem leaves it undetermined (`UNDETERMINED_M`):
+    singular systems raise no error.
     """
-    result: list[tuple[NDArray[np.float64], NDArray[np.float64]] | None] = [None] * len(graphs)
+    result: list[tuple[Array, Array] | None] = [None] * len(graphs)
     alike: dict[tuple[int, int], list[tuple[int, Chains]]] = {}
     for n, graph in enumerate(graphs):
         chains = _chains(graph) if graph.temporal and not graph.failure else None
@@ -75,11 +80,43 @@ def state_covariances(
         )
         found = np.split(together.covariances(), len(members))
         for (n, _), covariance in zip(members, found, strict=True):
-            result[n] = _of_present(graphs[n], covariance.swapaxes(0, 1))
+            of_states = np.where(graphs[n].present[..., None, None], covariance.swapaxes(0, 1), np.nan)
+            result[n] = _determined(of_states[..., :3, :3]), _determined(of_states[..., 3:6, 3:6])
     return [
-        (graph.marginals(graph.keys), graph.marginals(graph.velocity_keys)) if each is None else each
+        (_by_gtsam(graph, graph.keys), _by_gtsam(graph, graph.velocity_keys)) if each is None else each
         for graph, each in zip(graphs, result, strict=True)
     ]
+
+
+def _by_gtsam(graph: WindowGraph, keys: NDArray[np.int64]) -> Array:
+    """Marginal covariance (T, J, 3, 3) of `keys` (T, J), one variable after the other, of whatever graph."""
+    result = np.full((*keys.shape, 3, 3), np.nan)
+    inside = [(place, int(key)) for place, key in np.ndenumerate(keys) if graph.values.exists(int(key))]
+    for damped in (False, True) if len(inside) > 0 and not graph.failure else ():
+        try:
+            found = gtsam.Marginals(_damped(graph) if damped else graph.graph, graph.values)
+            for place, key in inside:
+                result[place] = found.marginalCovariance(key)
+            break
+        except RuntimeError:
+            result[:] = np.nan
+    return _determined(result)
+
+
+def _damped(graph: WindowGraph) -> gtsam.NonlinearFactorGraph:
+    """The problem with a prior of 100 m on all variables: what is then wider than 10 m is not determined."""
+    damped = gtsam.NonlinearFactorGraph(graph.graph)
+    wide = gtsam.noiseModel.Isotropic.Sigma(3, 100.0)
+    for key in graph.values.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
+        damped.push_back(gtsam.PriorFactorPoint3(key, graph.values.atPoint3(key), wide))
+    return damped
+
+
+def _determined(covariance: Array) -> Array:
+    """The same (..., 3, 3), NaN where it is more than `UNDETERMINED_M` in some direction."""
+    known = np.isfinite(covariance).all(axis=(-2, -1))
+    largest = np.linalg.eigvalsh(np.where(known[..., None, None], covariance, 0.0))[..., -1]
+    return np.where((known & (largest < UNDETERMINED_M**2))[..., None, None], covariance, np.nan)
 
 
 def _chains(graph: WindowGraph) -> Chains | None:
@@ -112,16 +149,3 @@ def _chains(graph: WindowGraph) -> Chains | None:
     absent = np.repeat(~present, 3, axis=2).swapaxes(0, 1)
     diagonal[absent[..., None] & np.eye(n, dtype=bool)] = 1.0
     return Chains(diagonal, below)
-
-
-def _of_present(
-    graph: WindowGraph, covariance: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Positions' and velocities' (T, J, 3, 3) from those of the states (T, J, n, n)."""
-    placed = graph.present
-    position, velocity = (np.full((*placed.shape, 3, 3), np.nan) for _ in range(2))
-    for result, first in ((position, 0), (velocity, 3)):
-        part = covariance[..., first : first + 3, first : first + 3]
-        determined = placed & is_determined(part)
-        result[determined] = part[determined]
-    return position, velocity

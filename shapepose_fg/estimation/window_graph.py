@@ -34,9 +34,6 @@ from shapepose_fg.estimation.motion_model import Lasting, MotionModel
 
 _OF_VIEWS, _OF_BODY = 0, 1
 """Sources of messages about joints, for the keys of their offsets."""
-UNDETERMINED_M = 10.0
-"""A variable that the problem leaves less certain than this in some direction, metres or m/s, is not
-determined."""
 
 
 class WindowGraph:
@@ -48,11 +45,11 @@ class WindowGraph:
     a window of several frames therefore
 
     - projections and body priors count with the share of their variance that is new in every frame, so that motion
-      smooths that only; `marginals` has nothing of the rest (`outcome.with_lasting` adds it);
+      smooths that only; `state_covariances` have nothing of the rest (`outcome.with_lasting` adds it);
     - where a joint is lost from sight (`lost` of `solve`) the body's prior gets an offset that decays slowly
       (`factors.motion`): the difference between joint and body when it was seen;
     - joints with factors of your own are solved with offsets of views and body both, and what the views say is one
-      Gaussian each: your factor is weighed against all of the error, and `marginals` holds it.
+      Gaussian each: your factor is weighed against all of the error, and the covariances hold it.
     """
 
     def __init__(
@@ -226,27 +223,6 @@ class WindowGraph:
         """(T, J, 3) velocities of the last solution, m/s; NaN where there are none."""
         return self._points()[1]
 
-    def marginals(self, keys: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Marginal covariance (..., 3, 3) of any of the window's keys (...,) at the last solution.
-
-        m² for positions, m²/s² for velocities. NaN where a variable is not in the problem, and where the problem
-        leaves it undetermined (more than 10 m or 10 m/s in some direction): singular systems raise no error.
-        """
-        result = np.full((keys.size, 3, 3), np.nan)
-        inside = [(n, key) for n, key in enumerate(keys.ravel().tolist()) if self.values.exists(key)]
-        if len(inside) == 0 or self.failure:
-            return result.reshape(*keys.shape, 3, 3)
-        for damped in (False, True):
-            try:
-                found = gtsam.Marginals(self._damped() if damped else self.graph, self.values)
-                for n, key in inside:
-                    result[n] = found.marginalCovariance(key)
-                break
-            except RuntimeError:
-                result[:] = np.nan
-        result[~is_determined(result)] = np.nan
-        return result.reshape(*keys.shape, 3, 3)
-
     @cached_property
     def _parameters(self) -> gtsam.LevenbergMarquardtParams:
         parameters = gtsam.LevenbergMarquardtParams()
@@ -254,14 +230,6 @@ class WindowGraph:
         # Of hundreds of joints that hardly move any more, a few thousandths of a sigma.
         parameters.setRelativeErrorTol(self.config.tolerance * (10.0 if self.temporal else 1.0))
         return parameters
-
-    def _damped(self) -> gtsam.NonlinearFactorGraph:
-        """The problem with a prior of 100 m on all variables: what is then wider than 10 m is not determined."""
-        damped = gtsam.NonlinearFactorGraph(self.graph)
-        wide = gtsam.noiseModel.Isotropic.Sigma(3, 100.0)
-        for key in self.values.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
-            damped.push_back(gtsam.PriorFactorPoint3(key, self.values.atPoint3(key), wide))
-        return damped
 
     def _optimise(self) -> None:
         """Levenberg-Marquardt from `values`; where it fails they stay as they are, and `failure` says why."""
@@ -352,13 +320,6 @@ class WindowGraph:
             if self.temporal:
                 speeds[present] = points[count : 2 * count]
         return positions.swapaxes(0, 1), speeds.swapaxes(0, 1)
-
-
-def is_determined(covariance: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """(...,) whether variables of this `covariance` (..., 3, 3), m² or m²/s², are known to `UNDETERMINED_M`."""
-    known = np.asarray(np.isfinite(covariance).all(axis=(-2, -1)))
-    largest = np.linalg.eigvalsh(np.where(known[..., None, None], covariance, 0.0))[..., -1]
-    return np.asarray(known & (largest < UNDETERMINED_M**2))
 
 
 ExtraFactors = Callable[[WindowGraph, NDArray[np.int64]], Iterable[gtsam.NonlinearFactor]]

@@ -1,5 +1,6 @@
 """A solved window: everybody's joints, covariances and bodies, and one graph a person that says all of it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 
@@ -9,7 +10,12 @@ from numpy.typing import NDArray
 
 from factors import lasting_difference_factors, offset_factors, offset_keys, reported_keys
 from shapepose_fg.body.fitting.fitter import BodyFit
+from shapepose_fg.core.arrays import Whole
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.notes import Problem
+from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.reconstruction import BODY, Reconstruction
 from shapepose_fg.estimation.motion_model import Lasting
 from shapepose_fg.estimation.window_graph import WindowGraph
 
@@ -18,22 +24,6 @@ LEAST_M = 1e-4
 larger, metres."""
 _OF_SOLUTION = 2
 """Source of the offset of the whole solution, for keys."""
-
-
-@dataclass(frozen=True)
-class Problem:
-    """What went wrong with one joint of one person in one frame."""
-
-    row: int
-    """Row of the solution."""
-    track: int
-    """Who."""
-    frame: int
-    """When."""
-    joint: int
-    """Which joint, an index into the skeleton."""
-    reason: str
-    """What happened, in words."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +74,28 @@ class WindowSolution:
                 kept[name] = value[index]
         kept |= {name: kept[name].rows(index) for name in ("observations", "fit")}
         return WindowSolution(**kept | {"problems": problems, "people": ()})
+
+    def result(self, place: Whole, rig: Rig, joint_names: Sequence[str]) -> Reconstruction:
+        """The rows as those of a result; bodies that were not fitted are NaN there.
+
+        `place` (N, J, V) is each detection's place among those of its view in the recording.
+        """
+        rows = self.observations
+        body = {name: getattr(self.fit, name).copy() for name in BODY}
+        for values in body.values():
+            values[~self.fit.ok] = np.nan
+        dropped = np.where(self.contradicts[..., None], Gate.CONTRADICTS_BODY, Gate.TOO_FAR)
+        gate = np.where(self.inlier, Gate.USED, dropped)
+        names = ("joints", "covariance", "velocity", "velocity_covariance", "known", "confidence", "status")
+        return Reconstruction(
+            frame=rows.frame,
+            person=rows.track,
+            time_s=rows.time_s.mean(axis=1),
+            joint_names=np.array(joint_names),
+            observations=ObservationTable.of(rows, place, self.joints, gate, rig, joint_names),
+            **{name: getattr(self, name) for name in names},
+            **body,
+        )
 
 
 @dataclass(frozen=True)

@@ -44,6 +44,8 @@ class DetectionTable:
     """The file or folder that each view was read from."""
     notes: tuple[str, ...] = ()
     """What the reader made of the files and left out, a sentence each."""
+    first: int = 0
+    """The first frame that a file says anything of."""
     _at_hand: dict[int, Arrays] = field(default_factory=dict, init=False, repr=False, compare=False)
     """The blocks that were asked for last."""
 

@@ -1,5 +1,6 @@
 """A Pose2Sim project as it lies: which of its files are what, and where its next steps look for results."""
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,9 +32,7 @@ class Pose2SimProject:
     detections: Path
     """The folder of 2D detections."""
     fps: float | None
-    """Frames a second; None where `times` says when frames were taken."""
-    times: Path | None
-    """The times that `shapepose-fg detect` wrote beside its detections."""
+    """Frames a second; None where the detections' times.csv says when frames were taken."""
     first_number: int
     """What the project calls its first frame: results have the project's numbers."""
     frames: tuple[int, int] | None
@@ -53,10 +52,15 @@ class Pose2SimProject:
         """Where Pose2Sim's next steps look for TRC and C3D."""
         return self.folder / "pose-3d"
 
+    @property
+    def name(self) -> str:
+        """The trial's name."""
+        return self.folder.resolve().name
+
     def name_of(self, person: int | None, first: int, last: int) -> str:
         """The name of a person's files, without ending, as Pose2Sim gives it; `person` None for the only one."""
         who = "" if person is None else f"_P{person}"
-        return f"{self.folder.resolve().name}{who}_{first}-{last}"
+        return f"{self.name}{who}_{first}-{last}"
 
     def span(self, count: int) -> range:
         """Frames of a recording of `count` that are wanted, counted from 0; InputError where there are none."""
@@ -82,7 +86,7 @@ def read_pose2sim_project(folder: Path) -> Pose2SimProject:
     calibration = _calibration(session, folder)
     entries = sorted((folder / "videos").iterdir()) if (folder / "videos").is_dir() else []
     videos = [each for each in entries if each.suffix.lower() in VIDEOS]
-    detections = _detections(folder, calibration, len(videos) > 0)
+    detections = _detections(folder, len(videos) > 0)
     times = detections / "times.csv"
     if rate == "auto" and times.is_file():
         fps, said = None, f"times from {times}"
@@ -100,7 +104,6 @@ def read_pose2sim_project(folder: Path) -> Pose2SimProject:
         calibration,
         detections,
         None if fps is None else float(fps),
-        times if fps is None else None,
         min(numbers, default=0),
         (span[0], span[1]) if isinstance(span, list) and len(span) == 2 else None,
         multi_person,
@@ -170,7 +173,7 @@ def _calibration(session: Path, folder: Path) -> Path:
     return found
 
 
-def _detections(folder: Path, calibration: Path, has_videos: bool) -> Path:
+def _detections(folder: Path, has_videos: bool) -> Path:
     """The folder of 2D detections; InputError with the command that makes them where there are videos only."""
 
     def is_pose(path: Path) -> bool:
@@ -184,7 +187,10 @@ def _detections(folder: Path, calibration: Path, has_videos: bool) -> Path:
     if not has_videos:
         problem = f"neither 2D detections ({' '.join(_POSES)}) nor videos here"
         raise InputError(f"{folder}: {problem}; put the videos into {videos} and detect people in them")
-    raise InputError(
-        f"{pose}: no 2D detections yet; run Pose2Sim's poseEstimation, or shapepose-fg detect --calibration"
-        f" {calibration} --videos {videos} --network NETWORK --output {pose}"
-    )
+    command = shlex.join(["shapepose-fg", "detect", "--project", str(folder.resolve()), "--network", "NETWORK"])
+    raise InputError(f"{pose}: no 2D detections yet; run Pose2Sim's poseEstimation, or {command}")
+
+
+def footage_of(folder: Path) -> tuple[Path, Path, Path]:
+    """Cameras and videos of the project in `folder`, and where 2D detections of them go; InputError as above."""
+    return _calibration(_settings(folder)[1], folder), folder / "videos", folder / "pose"

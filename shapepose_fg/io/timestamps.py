@@ -17,8 +17,8 @@ _FRAME, _TIME = "frame", "time_s"
 """Columns with a meaning of their own; every other column is a camera's."""
 _MOST_BYTES = 2**28
 """A line a frame: a day of 30 cameras."""
-_LONGEST_STEP_S = 10.0
-"""Frames farther apart than this are no recording of motion: the file is in milliseconds or less."""
+_SHORTEST_STEP_S, _LONGEST_STEP_S = 1e-6, 10.0
+"""Frames nearer or farther apart than this are no recording of motion: the file is in another unit."""
 _SAME_CLOCK_S = 1.0
 """Cameras that took one frame farther apart than this do not share a clock."""
 
@@ -52,8 +52,8 @@ def read_timestamps(path: str | Path, rig: Rig, frames: int) -> FrameTimes:
         line = lines[picked][int(np.argmax((steps <= 0).any(axis=1))) + 1]
         what = f"line {line} must be later than the frame before"
         raise InputError(f"{path}: {what}; put frames in order of their times")
-    if len(time_s) > 1 and (step := np.median(steps)) > _LONGEST_STEP_S:
-        raise InputError(f"{path}: frames would be {step:.0f} s apart; write seconds, not milliseconds")
+    if len(time_s) > 1 and not _SHORTEST_STEP_S <= (step := np.median(steps)) <= _LONGEST_STEP_S:
+        raise InputError(f"{path}: frames would be {step:.3g} s apart; write seconds")
     if (apart > _SAME_CLOCK_S).any():
         frame = int(np.argmax(apart > _SAME_CLOCK_S))
         what = f"the cameras' times of frame {frame} are {apart[frame]:.3g} s apart"

@@ -10,13 +10,14 @@ from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.errors import naming
+from shapepose_fg.core.notes import Notebook
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.core.storage.kept_arrays import ANEW, KeptArrays
 from shapepose_fg.estimation.detector_offsets import confident_targets, spread_frames
 from shapepose_fg.pipeline.config import PipelineConfig
-from shapepose_fg.pipeline.engine import Setup, StageOne
-from shapepose_fg.pipeline.runs.notes import Notebook
+from shapepose_fg.pipeline.setup import Setup
+from shapepose_fg.proposal.stage_one import StageOne
 from shapepose_fg.proposal.thinning import ThinnedFrames
 
 _OFFSETS = "keypoint-offsets"
@@ -71,10 +72,10 @@ def offsets_of(setup: Setup, detections: ThinnedFrames, book: Notebook) -> Keypo
     if source != "recording":
         return KeypointOffsets.load(source)
     with book.stage("offsets"):
-        spread = spread_frames(len(detections), config.offsets.frames)
+        spread = spread_frames(len(detections) - detections.first, config.offsets.frames)
         # Joints that three views see well are wanted: people whose hips they see are enough, and found faster.
-        hips = StageOne.of(config).by_hips()
-        people = [hips.people(detections[t], rig, setup.skeleton, Notebook()) for t in spread]
+        hips = StageOne(setup.skeleton, config.candidates, config.proposals, Notebook()).by_hips()
+        people = [hips(detections[detections.first + t], rig) for t in spread]
         if len(people) == 0:
             return KeypointOffsets.identity()
         targets = confident_targets(Observations.concatenate(people), rig, config.observations)

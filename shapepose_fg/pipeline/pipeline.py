@@ -14,6 +14,7 @@ from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.frame_times import FrameTimes, check_cuts, spans_of
+from shapepose_fg.core.notes import Notebook, Notes
 from shapepose_fg.core.provenance import versions
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.storage.kept_arrays import InMemory, KeptArrays
@@ -21,14 +22,13 @@ from shapepose_fg.estimation.floor import Floor
 from shapepose_fg.estimation.window_graph import ExtraFactors
 from shapepose_fg.pipeline.bodies_over_time import Person, fit_everybody
 from shapepose_fg.pipeline.config import PipelineConfig
-from shapepose_fg.pipeline.engine import Setup
-from shapepose_fg.pipeline.engine import find_people as find_people
 from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.offsets import estimate_offsets as estimate_offsets
 from shapepose_fg.pipeline.offsets import kept_offsets
 from shapepose_fg.pipeline.runs.assembly import Assembly
-from shapepose_fg.pipeline.runs.notes import Notebook, Notes
 from shapepose_fg.pipeline.runs.parts import Parts
+from shapepose_fg.pipeline.setup import Setup
+from shapepose_fg.pipeline.setup import find_people as find_people
 from shapepose_fg.pipeline.solved_windows import SolvedWindows
 from shapepose_fg.proposal.thinning import ThinnedFrames
 from shapepose_fg.tracking.presence import probability
@@ -99,6 +99,8 @@ class Task:
 
     def whole(self) -> tuple[range, FrameTimes, list[int]]:
         """Frames, times and cuts, those that are not given filled in; ValueError where they do not fit."""
+        if len(self.rig) < 2:
+            raise ValueError(f"at least 2 cameras are needed to see depth, got {len(self.rig)}")
         count = len(self.detections)
         frames = range(count) if self.frames is None else self.frames
         if frames.step != 1 or not 0 <= frames.start <= frames.stop <= count:

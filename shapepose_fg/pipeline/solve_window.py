@@ -5,27 +5,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.core.camera import Views
+from shapepose_fg.core.detections import Input
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.body_step import BodyStep, disagreement
-from shapepose_fg.estimation.contact import feet_of, walking
 from shapepose_fg.estimation.draft import Draft, redraft
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
-from shapepose_fg.estimation.in_time import interpolated
-from shapepose_fg.estimation.linearisation import Message, ViewEvidence, linearise, mean_confidence
-from shapepose_fg.estimation.motion_model import LOST_M, MotionModel
+from shapepose_fg.estimation.joint_step import solve_joints
+from shapepose_fg.estimation.linearisation import linearise, mean_confidence
+from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.outcome import outcome
 from shapepose_fg.estimation.smoothing import smoothed
-from shapepose_fg.estimation.state import State
-from shapepose_fg.estimation.window_graph import ExtraFactors, WindowGraph
+from shapepose_fg.estimation.state import State, parts_of
+from shapepose_fg.estimation.window_graph import ExtraFactors
 from shapepose_fg.estimation.window_solution import WindowSolution
-from shapepose_fg.tracking.reassociation import Survival, reassociate
-from shapepose_fg.tracking.worlds import Input
+from shapepose_fg.tracking.reassociation import Survival, changed, reassociate
 
 _SETTLED = 0.002
 """Detections are not assigned again when fewer than this share of them changed: in crowds before six cameras after
@@ -85,7 +83,7 @@ def solve_window(
         survival = None if assigning.over_time else Survival().at(n / max(assigning.rounds - 1, 1))
         before = observations
         observations = reassociate(assigning.frames, before, places, covariance, assigning.skeleton, survival)
-        if assigning.over_time and _changed(before, observations) < _SETTLED:
+        if assigning.over_time and changed(before, observations) < _SETTLED:
             break
     assigned = time.perf_counter()
 
@@ -121,9 +119,8 @@ def solve_window(
         of_body = step.message(body, targets, pulled)
 
         # Joints: the X step.
-        X_new = np.full(X.shape, np.nan)
-        for person, part in _parts(moving):
-            X_new[part] = _solved(person, evidence, of_body, part, config)
+        parts = parts_of(moving)
+        X_new = np.concatenate([solve_joints(person, evidence, of_body, part, config) for person, part in parts])
         state.put(rows, X_new, evidence, wrong, of_body, body)
 
         # Settled: the body was fitted to where the joints are now, and pulled joints stay where they were.
@@ -133,7 +130,7 @@ def solve_window(
         more = n + 1 < config.refine.window_alternations
         moving = [
             person
-            for person, part in _parts(moving)
+            for person, part in parts
             if not settled[part].all() and (more or not person.temporal or person.touched.any())
         ]
         if len(moving) == 0:
@@ -141,35 +138,3 @@ def solve_window(
     solution = outcome(state, fitter)
     solution.seconds.update({"associate again": assigned - began, "solve": time.perf_counter() - assigned})
     return solution
-
-
-def _changed(before: Observations, now: Observations) -> float:
-    """Share of the places where somebody is seen by a view, in the same rows, whose detection is another."""
-    seen = before.seen | now.seen
-    return float((before.candidate != now.candidate)[seen].sum() / max(seen.sum(), 1))
-
-
-def _parts(people: Sequence[WindowGraph]) -> list[tuple[WindowGraph, slice]]:
-    """Everybody with their place among the rows of all."""
-    ends = np.cumsum([len(person) for person in people]).tolist()
-    return [(person, slice(end - len(person), end)) for person, end in zip(people, ends, strict=True)]
-
-
-def _solved(
-    person: WindowGraph, evidence: ViewEvidence, of_body: Message, part: slice, config: EstimatorConfig
-) -> NDArray[np.float64]:
-    """X (T, J, 3) of one person, whose rows are a `part` of those of views and body."""
-    views, body = evidence.message.rows(part), of_body.rows(part)
-    inlier, sigma_m, points = evidence.inlier[part], evidence.sigma_m[part], evidence.points[part]
-    placed = sigma_m <= config.refine.max_sigma_m
-    initial = np.where(placed[..., None], points, np.where(body.known[..., None], body.xyz, np.nan))
-    if not person.temporal:
-        return person.solve(inlier & (placed | body.known)[..., None], views, body, initial)
-    initial = interpolated(np.where(np.isfinite(points), points, initial), person.times_s)
-    # X_0 alone is no evidence: a joint that nobody says anything of has nothing that determines it.
-    mentioned = (inlier.any(axis=-1) | body.known).any(axis=0) | person.touched
-    initial[:, ~mentioned] = np.nan
-    lost = sigma_m > LOST_M
-    feet = feet_of(config.joints if config.motion.contact else ())
-    standing = walking(person, (inlier, views, body), initial, lost, feet)
-    return person.solve(inlier, views, body, initial, lost, standing)

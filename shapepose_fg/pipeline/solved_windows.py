@@ -1,29 +1,22 @@
 """The windows of a recording, solved, in order: its people are followed here, or chunk by chunk in any process."""
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Array, Whole
-from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.detections import Input
 from shapepose_fg.core.frame_times import FrameTimes, segments
-from shapepose_fg.core.observation_table import Gate, ObservationTable, place_in_view
-from shapepose_fg.core.reconstruction import BODY, Reconstruction
-from shapepose_fg.estimation.window_solution import WindowSolution
-from shapepose_fg.pipeline.engine import Setup, Solved
+from shapepose_fg.core.notes import Notebook, Notes
 from shapepose_fg.pipeline.execution import Pool
 from shapepose_fg.pipeline.runs.chunks import Border, Chunk, Identities, cut_in_chunks, windows_of
-from shapepose_fg.pipeline.runs.notes import Notebook, Notes
 from shapepose_fg.pipeline.runs.parts import Checkpoint, Part
+from shapepose_fg.pipeline.setup import Setup
 from shapepose_fg.pipeline.windows import Span
 from shapepose_fg.proposal.thinning import ThinnedFrames
-from shapepose_fg.tracking.worlds import Input
-
-_FALSE_POSITIVE = "next to no detections of their own, or in somebody else's place"
-"""Why people are dropped when detections are reassociated."""
 
 
 @dataclass(frozen=True)
@@ -67,11 +60,10 @@ class SolvedWindows:
                 waiting.append((self.book.torn_off(), behind))
                 yield span
 
-        for solved in pool.map(Setup.solve, spans()):
+        for part in pool.map(Setup.solve, spans()):
             followed, behind = waiting.popleft()
-            notes = self._notes(solved)
-            notes.add(followed)
-            yield Part(self._rows(solved), notes, behind)
+            part.notes.add(followed)
+            yield replace(part, checkpoint=behind)
 
     def _followed(self, begin: Checkpoint) -> Iterator[tuple[Span, Checkpoint | None]]:
         """The windows as far as their people have been followed, and from where following goes on behind some."""
@@ -112,85 +104,23 @@ class SolvedWindows:
             chunk, read = waiting.popleft()
             names = identities.names(found.begins, alone=chunk.first == chunk.own.start)
             identities.remember(found.ends, names)
-            for solved in found.solved:
-                notes, last = self._notes(solved), solved is found.solved[-1]
+            for part in found.parts:
+                notes, rows, behind = part.notes, part.rows, None
                 notes.problems = [replace(each, track=name(each.track, names)) for each in notes.problems]
                 notes.evidence = {name(of, names): each for of, each in notes.evidence.items()}
-                track = [name(each, names) for each in solved.solution.observations.track.tolist()]
-                if last:
+                rows = rows.relabelled(np.array([name(each, names) for each in rows.person.tolist()], np.int64))
+                if part is found.parts[-1]:
                     notes.add(read)
                     notes.add(found.notes)
-                rows = replace(solved.solution.observations, track=np.array(track, dtype=np.intp))
-                behind = Checkpoint(chunk.own.stop, identities.next_id, border=identities.border)
-                named = replace(solved, solution=replace(solved.solution, observations=rows))
-                yield Part(self._rows(named), notes, behind if last else None)
-
-    def _notes(self, solved: Solved) -> Notes:
-        """What is to be said about a window; people are tracks, or frame by frame numbers within the frame."""
-        temporal, solution = self.setup.config.temporal, solved.solution
-        rows, problems = solution.observations, list(solution.problems)
-        if not temporal:
-            problems = [
-                replace(each, track=int(((rows.frame == each.frame) & (rows.track < each.track)).sum()))
-                for each in problems
-            ]
-        notes = Notes(solved.frames, Counter(solution.seconds), problems=problems)
-        if len(solved.false_positives) > 0:
-            notes.dropped[_FALSE_POSITIVE] = list(solved.false_positives)
-        said = np.isfinite(rows.evidence)
-        if temporal:
-            for track in np.unique(rows.track[said]).tolist():
-                own = rows.evidence[said & (rows.track == track)]
-                notes.evidence[track] = [float(own.sum()), len(own)]
-        else:
-            notes.probable = Counter(f"{tenth / 10:.1f}" for tenth in np.floor(10 * rows.evidence[said]))
-        return notes
-
-    def _rows(self, solved: Solved) -> Reconstruction:
-        """Solved rows as rows of the result, by frame and person; bodies that were not fitted are NaN there."""
-        rows = solved.solution.observations
-        solution = solved.solution.rows(np.lexsort((rows.track, rows.frame)))
-        rows = solution.observations
-        number_in_frame = np.arange(len(rows)) - np.searchsorted(rows.frame, rows.frame)
-        person = rows.track if self.setup.config.temporal else number_in_frame
-        place = np.full(rows.candidate.shape, -1, dtype=np.int32)
-        for frame in np.unique(rows.frame).tolist():
-            of_frame = rows.frame == frame
-            own = self.detections.in_recording(frame, rows.candidate[of_frame])
-            place[of_frame] = place_in_view(own, self.detections.frames[frame].view)
-        return result_rows(solution, place, self.setup.rig, self.setup.skeleton.joints, person)
-
-
-def result_rows(
-    solution: WindowSolution, place: Whole, rig: Rig, joint_names: Sequence[str], person: Whole
-) -> Reconstruction:
-    """N solved rows as a result, in their order; bodies that were not fitted are NaN there.
-
-    `place` (N, J, V) is each detection's place among those of its view (`place_in_view`), `person` (N,) who it is.
-    """
-    fit, observations = solution.fit, replace(solution.observations, track=person)
-    body = {name: getattr(fit, name).copy() for name in BODY}
-    for values in body.values():
-        values[~fit.ok] = np.nan
-    dropped = np.where(solution.contradicts[..., None], Gate.CONTRADICTS_BODY, Gate.TOO_FAR)
-    gate = np.where(solution.inlier, Gate.USED, dropped)
-    names = ("joints", "covariance", "velocity", "velocity_covariance", "known", "confidence", "status")
-    return Reconstruction(
-        frame=observations.frame,
-        person=person,
-        time_s=observations.time_s.mean(axis=1),
-        joint_names=np.array(joint_names),
-        observations=ObservationTable.of(observations, place, solution.joints, gate, rig, joint_names),
-        **{name: getattr(solution, name) for name in names},
-        **body,
-    )
+                    behind = Checkpoint(chunk.own.stop, identities.next_id, border=identities.border)
+                yield Part(rows.rows(np.lexsort((rows.person, rows.frame))), notes, behind)
 
 
 @dataclass(frozen=True)
 class SolvedChunk:
     """A chunk that is done; its tracks count from 0."""
 
-    solved: tuple[Solved, ...]
+    parts: tuple[Part, ...]
     """Its windows."""
     notes: Notes
     """What is to be said about following its people."""
@@ -214,7 +144,7 @@ def solve_chunk(setup: Setup, job: tuple[Chunk, Sequence[Input]]) -> SolvedChunk
     frames = [each.frame for span in spans for each, _ in span.decided[span.start : span.stop]]
     if frames != list(chunk.own):
         raise RuntimeError(f"windows of {len(frames)} frames were found for a chunk of {chunk.own}")
-    solved = tuple(map(setup.solve, spans))
+    parts = tuple(map(setup.solve, spans))
     notes = book.torn_off()
     notes.dropped = {why: [each for each in of if each in chunk.own] for why, of in notes.dropped.items()}
-    return SolvedChunk(solved, notes, Border.of(spans[0]), Border.of(spans[-1]))
+    return SolvedChunk(parts, notes, Border.of(spans[0]), Border.of(spans[-1]))

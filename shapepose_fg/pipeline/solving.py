@@ -22,7 +22,6 @@ from shapepose_fg.io.solved_setup import SolvedSetup, setup_of
 from shapepose_fg.pipeline.bodies_over_time import with_bodies_over_time
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.solve_window import solve_window
-from shapepose_fg.pipeline.solved_windows import result_rows
 from shapepose_fg.pipeline.windows import near_border, window_stop
 
 
@@ -57,8 +56,7 @@ def solve_rows(rows: Reconstruction, solver: Solver) -> Reconstruction:
     parts = []
     for own, part, solution in _solved(rows, solver, None):
         assert part.observations is not None
-        names = tuple(part.joint_names.tolist())
-        solved = result_rows(solution, part.observations.candidate, solver.rig, names, part.person)
+        solved = solution.result(part.observations.candidate, solver.rig, part.joint_names.tolist())
         parts.append(solved.rows(_inside(part.frame, own)))
     solved = replace(Reconstruction.concatenate(parts), run=rows.run) if parts else rows
     if solver.fitter.model is None or not solver.config.temporal:

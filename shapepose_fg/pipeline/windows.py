@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Mask
+from shapepose_fg.core.detections import Input
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.config import WindowConfig as WindowConfig
 from shapepose_fg.tracking.following import Decided, FollowState, alone, finish, follow
 from shapepose_fg.tracking.tracker import Tracker
-from shapepose_fg.tracking.worlds import Input
 
 
 def window_stop(start: int, end: int, frames: int) -> int:

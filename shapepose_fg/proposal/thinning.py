@@ -39,6 +39,11 @@ class ThinnedFrames:
         """The detector's joints."""
         return self.frames.skeleton
 
+    @property
+    def first(self) -> int:
+        """The first frame that the recording says anything of."""
+        return getattr(self.frames, "first", 0)
+
     def __len__(self) -> int:
         return len(self.frames)
 
@@ -47,10 +52,6 @@ class ThinnedFrames:
         found = every.rows(self._rows(every))
         order = np.lexsort(found.pairs.T)
         return replace(found, pairs=found.pairs[order], affinity=found.affinity[order])
-
-    def in_recording(self, frame: int, candidate: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Detections of a thinned frame, of any shape, -1 for none: which of the recording's own they are."""
-        return np.append(self._rows(self.frames[frame]), -1)[candidate]
 
     def is_thinned(self, frame: int) -> bool:
         """Whether detections of a frame were left out."""

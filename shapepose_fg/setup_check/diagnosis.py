@@ -6,6 +6,7 @@ Duplicates, the people's build and the sizes of pictures are told without compar
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from shapepose_fg.core.camera import Axis, Camera, Rig
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.io.footage.footage import glance, open_footage
+from shapepose_fg.io.footage.placement import read_used_footage
 from shapepose_fg.io.footage.places import VIDEOS, find_footage
 from shapepose_fg.setup_check.evidence import Evidence, Look, gather
 from shapepose_fg.setup_check.findings import Finding, Kind
@@ -87,6 +89,16 @@ def other_sizes(given: Sequence[str], rig: Rig) -> tuple[Finding, ...]:
         if (width, height) != rig.cameras[view].image_size:
             found.append(Finding(Kind.PICTURE_SIZE, (view,), shift_px=((float(width), float(height)),)))
     return tuple(found)
+
+
+def detected_sizes(file: Path, rig: Rig) -> tuple[Finding, ...]:
+    """Cameras that `detect` was told another calibrated size of, by the footage.json that it wrote."""
+    sizes = {each.name: each.placement.calibrated_size for each in read_used_footage(file)}
+    return tuple(
+        Finding(Kind.PICTURE_SIZE, (view,), shift_px=((float(sizes[each.name][0]), float(sizes[each.name][1])),))
+        for view, each in enumerate(rig.cameras)
+        if sizes.get(each.name, each.image_size) != each.image_size
+    )
 
 
 @dataclass(frozen=True)

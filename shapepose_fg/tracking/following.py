@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from shapepose_fg.core.bounds import Seconds, Settings
+from shapepose_fg.core.detections import Input
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.tracking.presence import Chosen, own_evidence
 from shapepose_fg.tracking.tracker import Tracker, Tracks
-from shapepose_fg.tracking.worlds import Hypotheses, Input, explained, times_of
+from shapepose_fg.tracking.worlds import Hypotheses, explained, times_of
 
 Array = NDArray[np.float64]
 

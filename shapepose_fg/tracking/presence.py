@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.camera import Rig, beside_segment
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.claims import mean_affinity, owned
@@ -88,7 +88,7 @@ def weighed(
     xy, depth = rig.project(np.where(known, places, centre[:, None]))
     inside = ((xy >= 0) & (xy < rig.image_sizes[:, None, None])).all(axis=-1) & (depth > 0)
     expected = np.maximum(inside.sum(axis=(0, 2)), 1)
-    hidden = ~known[..., 0] | _hidden(xy, depth, known[..., 0], rig, skeleton, world)
+    hidden = ~known[..., 0] | _behind_others(xy, depth, known[..., 0], rig, skeleton, world)
     price = np.where(inside, np.where(hidden, _PRICE_HIDDEN, _PRICE), 0.0)
     weight = np.zeros(candidate.shape)
     seen = candidate >= 0
@@ -100,7 +100,7 @@ def weighed(
     return weight / expected[:, None, None], price.sum(axis=(0, 2)) / expected
 
 
-def _hidden(
+def _behind_others(
     xy: Array,
     depth: Array,
     known: NDArray[np.bool_],
@@ -124,13 +124,10 @@ def _hidden(
     view, whose, who = np.nonzero(other & (least_m[:, None] < most_m[:, :, None] - _IN_FRONT_M))
     # Everything in arrays (pairs, joints, limbs), a coordinate each: sums over an axis of two are slow.
     x, y, z = (of.astype(np.float32) for of in (flat[..., 0], flat[..., 1], away))
-    (x0, x1), (y0, y1), (z0, z1) = ([of[view, who][:, None, end] for end in ends] for of in (x, y, z))
+    first, second = ([of[view, who][:, None, end] for of in (x, y, z)] for end in ends)
     place, deep = xy[view, whose, :, None].astype(np.float32), depth[view, whose, :, None]
-    to_x, to_y, dx, dy = place[..., 0] - x0, place[..., 1] - y0, x1 - x0, y1 - y0
-    along = np.clip((to_x * dx + to_y * dy) / np.maximum(dx * dx + dy * dy, 1e-6), 0.0, 1.0)
-    at = z0 + along * (z1 - z0)
-    to_x, to_y = to_x - along * dx, to_y - along * dy
-    hides = (to_x * to_x + to_y * to_y) * at * at < ((_LIMB_M * focal_px[view]) ** 2)[:, None, None]
+    squared, at = beside_segment(place[..., 0], place[..., 1], first, second)
+    hides = squared * at * at < ((_LIMB_M * focal_px[view]) ** 2)[:, None, None]
     hides &= at < deep.astype(np.float32) - _IN_FRONT_M
     hidden = np.zeros(depth.shape, dtype=bool)
     pair, joint = np.nonzero(hides.any(axis=2))

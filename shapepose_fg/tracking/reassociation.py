@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.priors import longest_bones
+from shapepose_fg.core.detections import Input
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.assignment import lesser
@@ -14,7 +15,6 @@ from shapepose_fg.proposal.possible_people import Frame, PossiblePeople, gaps
 from shapepose_fg.proposal.selection import PRIOR_WITH_BODY, existence
 from shapepose_fg.tracking.following import core_distance
 from shapepose_fg.tracking.view_assignment import Predicted, assign_with_probability
-from shapepose_fg.tracking.worlds import Input
 
 
 @dataclass(frozen=True)
@@ -65,6 +65,12 @@ def reassociate(
         who = {name: getattr(rows, name)[index] for name in ("track", "frame", "time_s")}
         parts.append(replace(part, probability=probability, evidence=evidence, **who))
     return Observations.concatenate(parts)
+
+
+def changed(before: Observations, now: Observations) -> float:
+    """Share of the places where somebody is seen by a view, in the same rows, whose detection is another."""
+    seen = before.seen | now.seen
+    return float((before.candidate != now.candidate)[seen].sum() / max(seen.sum(), 1))
 
 
 def _given_out(

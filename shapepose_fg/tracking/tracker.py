@@ -5,7 +5,7 @@ found the person in this frame. Several worlds are followed at once (`worlds.py`
 of whom each detection has one; worlds know nothing of each other.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,8 +24,8 @@ from shapepose_fg.tracking.plausibility import torn_joints
 from shapepose_fg.tracking.view_assignment import FARTHEST_M, Predicted, assign
 
 Array = NDArray[np.float64]
-FindPeople = Callable[[Detections, Rig, bool], Observations]
-"""Stage I of one frame: detections and rig to people; with True, hips that two views saw are enough."""
+FindPeople = Callable[[Detections, Rig], Observations]
+"""Stage I of one frame: detections and rig to people."""
 NoteDropped = Callable[[str, list[int]], None]
 """Notes down a reason, and the frames in which somebody was not kept for it."""
 
@@ -125,14 +125,12 @@ class Tracker:
     """The detector's joints."""
     scale: BodyScale
     """How large people are, and how fast they change speed."""
-    find: FindPeople
-    """Stage I, for new people."""
+    find: Sequence[FindPeople]
+    """Stage I, for new people: one way after the other, among what those before left over."""
     config: TrackingConfig
     """How people are followed."""
     observation: ObservationConfig
     """How far detections are trusted."""
-    weak_births: bool = True
-    """Whether people are sought whose hips two views saw."""
     drop: NoteDropped = lambda reason, frames: None
     """Is told why somebody was not kept, and in which frames."""
 
@@ -180,11 +178,11 @@ class Tracker:
         there, found, theirs = tracks.joints.position, [np.zeros((0, J, 3))], [np.zeros((0, J, len(rig)), np.intp)]
         free = np.ones(len(detections), dtype=bool)
         free[candidate[candidate >= 0]] = False
-        for weak in (False, True) if self.weak_births else (False,):
+        for find in self.find:
             if not self._enough(detections, free):
                 break
             rest = np.flatnonzero(free)
-            people = self.find(detections.only(free), rig, weak)
+            people = find(detections.only(free), rig)
             own = np.where(people.candidate >= 0, np.append(rest, -1)[people.candidate], -1)
             new = (own >= 0).sum(axis=2)[:, core] >= 2
             new = (new.sum(axis=1) >= self.config.min_new_joints) & _apart(people.initial, there)

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from shapepose_fg.core.camera import Rig
-from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.detections import Input
 from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.presence import Account, Chosen, weighed
 from shapepose_fg.tracking.tracker import Tracker, Tracks
@@ -41,20 +40,6 @@ _SAME_M = 0.02
 """Worlds with the same detections whose people are nowhere farther apart are one from there on."""
 _GAIN = 0.01
 """A round that explains less than this share more is the last one."""
-
-
-@dataclass(frozen=True)
-class Input:
-    """What the cameras give of one frame."""
-
-    frame: int
-    """Its number in the recording."""
-    time_s: NDArray[np.float64]
-    """(V,) when each view was exposed, seconds."""
-    detections: Detections
-    """What the detector saw."""
-    rig: Rig
-    """Where the cameras were."""
 
 
 @dataclass(frozen=True)

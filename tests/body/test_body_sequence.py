@@ -208,6 +208,7 @@ def test_order_groups_and_other_people_do_not_matter(fitter, targets, found):
     np.testing.assert_allclose(alone.fit.joints, found.fit.joints[rows], atol=2e-3)
 
 
+@pytest.mark.slow
 def test_where_long_chains_are_cut_is_not_seen(targets, found, monkeypatch):
     whole = SmplFitter().fit_sequence(targets, GROUP, TIME_S)
     monkeypatch.setattr(body_sequence, "SEGMENT_ROWS", 25)

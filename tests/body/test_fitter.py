@@ -182,6 +182,7 @@ def test_alone_in_a_batch_and_in_any_order_is_the_same(fitter, joints):
         np.testing.assert_allclose(alone.covariance[0], together.covariance[row], rtol=0.02, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_turning_and_moving_the_world_changes_nothing_else(fitter, joints):
     targets = make_targets(joints, 0.01)
     fit = fitter.fit(targets)
@@ -192,6 +193,7 @@ def test_turning_and_moving_the_world_changes_nothing_else(fitter, joints):
     np.testing.assert_allclose(moved.covariance, R @ fit.covariance @ R.T, rtol=0.05, atol=2e-6)
 
 
+@pytest.mark.slow
 def test_warm_start_is_quicker_and_ends_at_the_same_place(joints, monkeypatch):
     fitter, evaluations = SmplFitter(), []
     solve, linearise = fitter.optimiser.solve, fitter.energy.linearise

@@ -123,6 +123,7 @@ def test_gain_on_own_noise_is_nothing(fitter, people, fit):
         assert abs(gain) < 3 * y.std() / x.std() / np.sqrt(len(x)), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "median_m"),
     [
@@ -253,6 +254,7 @@ def test_covariance_is_that_of_a_linear_problem_and_the_sag_of_a_limb():
             torch.testing.assert_close(found[row, joint], C + sag**2 * torch.eye(3))
 
 
+@pytest.mark.slow
 def test_priors_are_calibrated_on_bodies_from_the_priors(people):
     """Squared Mahalanobis distances are chi-squared with 3 degrees of freedom: mean 3, median 2.37."""
     fit = SmplFitter().fit(make_targets(people[1]))

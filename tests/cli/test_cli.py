@@ -17,12 +17,12 @@ from shapepose_fg.body.shapes import SubjectShapes
 from shapepose_fg.cli.main import main
 from shapepose_fg.core.errors import WorkLost
 from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.notes import Notes
 from shapepose_fg.core.observation_table import ObservationTable
 from shapepose_fg.core.reconstruction import Known, Reconstruction, Status
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.pipeline.bodies_over_time import BodiesOverTime
 from shapepose_fg.pipeline.runs.assembly import Assembly
-from shapepose_fg.pipeline.runs.notes import Notes
 from shapepose_fg.pipeline.runs.parts import Part, Parts
 
 K = [1000.0, 0, 500, 0, 1000, 400, 0, 0, 1]
@@ -141,13 +141,20 @@ def test_times_cuts_and_time_itself_reach_the_pipeline(recording, pipeline, tmp_
     assert run(*recording) == 0
     assert pipeline["times"] is None and pipeline["cuts"] == () and pipeline["shapes"] is None
     assert pipeline["config"].temporal
-    assert run(*recording, "--fps", "25", "--cuts", "2,4", "--no-temporal") == 0
+    assert run(*recording, "--overwrite", "--fps", "25", "--cuts", "2,4", "--no-temporal") == 0
     np.testing.assert_allclose(pipeline["times"].frame_s, [0, 0.04, 0.08, 0.12, 0.16])
     assert pipeline["cuts"] == (2, 4) and not pipeline["config"].temporal
     stamps = tmp_path / "times.csv"
     stamps.write_text("right,left\n" + "".join(f"{0.05 * t},{0.05 * t + 0.01}\n" for t in range(5)))
     (tmp_path / "settings.toml").write_text("temporal = false\n")
-    options = ["--timestamps", str(stamps), "--config", str(tmp_path / "settings.toml"), "--temporal"]
+    options = [
+        "--timestamps",
+        str(stamps),
+        "--config",
+        str(tmp_path / "settings.toml"),
+        "--temporal",
+        "--overwrite",
+    ]
     assert run(*recording, *options) == 0
     np.testing.assert_allclose(
         pipeline["times"].time_s[:, 0], 0.05 * np.arange(5) + 0.01
@@ -175,7 +182,7 @@ def test_shapes_are_kept_from_one_recording_to_the_next(recording, pipeline, tmp
     assert run(*recording, "--shapes", str(file)) == 0
     assert len(pipeline["shapes"]) == 0
     assert "shapes of 1 people" in " ".join(capsys.readouterr().out.split())
-    assert run(*recording, "--shapes", str(file)) == 0
+    assert run(*recording, "--shapes", str(file), "--overwrite") == 0
     assert pipeline["shapes"].names.tolist() == ["0"]
     np.testing.assert_array_equal(pipeline["shapes"].betas, 0.5)
     assert str(file) in Reconstruction.load(tmp_path / "out").run["inputs"]
@@ -206,6 +213,56 @@ def test_other_formats_are_read_and_what_was_made_of_them_is_said(recording, pip
     printed = capsys.readouterr().err
     assert len(notes) == 2 and all(f"note: {note}" in printed for note in notes)
     assert "scores reach 50" in notes[0] and "COCO_17 has no Neck and no MidHip" in notes[1]
+
+
+def test_what_detect_wrote_is_found_and_kept_with_the_result(recording, pipeline, tmp_path, capsys):
+    """Times of 60 a second in microseconds are 60 a second; footage.json goes along, and away with the next."""
+    (tmp_path / "times.csv").write_text("frame, time_s\n" + "".join(f"{t}, {t / 60:.6f}\n" for t in range(5)))
+    footage = {"format": "shapepose-fg footage 1", "cameras": []}
+    (tmp_path / "footage.json").write_text(json.dumps(footage))
+    assert run(*recording) == 0
+    assert "5 (0:5) of 2 cameras, 60 a second" in " ".join(capsys.readouterr().out.split())
+    people = Reconstruction.load(tmp_path / "out")
+    assert people.run["time"] == {"source": str(tmp_path / "times.csv"), "fps": 60.0, "per_camera": False}
+    assert json.loads((tmp_path / "out" / "footage.json").read_text()) == footage
+    assert run(*recording, "--fps", "30", "--overwrite") == 0
+    assert Reconstruction.load(tmp_path / "out").run["time"]["fps"] == 30.0
+    (tmp_path / "footage.json").unlink()
+    assert run(*recording, "--overwrite") == 0
+    assert not (tmp_path / "out" / "footage.json").exists()
+
+
+def test_a_finished_result_stays_until_it_is_to_be_overwritten(recording, pipeline, tmp_path, capsys):
+    """And what was made of it is not taken for the new one's."""
+    assert run(*recording, "--fps", "60") == 0
+    before = (tmp_path / "out" / "people.npz").read_bytes()
+    for options in ((), ("--resume",), ("--restart",)):
+        capsys.readouterr()
+        assert run(*recording, "--fps", "30", *options) == 2
+        assert f"{tmp_path / 'out'}: a finished result is here; give another" in capsys.readouterr().err
+    assert (tmp_path / "out" / "people.npz").read_bytes() == before
+    for again in (1, 2):
+        (tmp_path / "out" / "export").mkdir()
+        (tmp_path / "out" / "export" / "joints.csv").write_text(f"of result {again}")
+        assert run(*recording, "--fps", "30", "--overwrite") == 0
+        assert "is of the result before; it is called export-older" in capsys.readouterr().err
+    assert not (tmp_path / "out" / "export").exists()
+    assert (tmp_path / "out" / "export-older" / "joints.csv").read_text() == "of result 1"
+    assert (tmp_path / "out" / "export-older2" / "joints.csv").read_text() == "of result 2"
+
+
+def test_warnings_are_warnings_unless_they_are_to_be_strict(recording, pipeline, capsys):
+    assert run(*recording) == 0
+    assert "warning: No camera sees a person" in capsys.readouterr().err
+    assert run(*recording, "--strict", "--overwrite") == 1
+    assert run(*recording, "--strict", "--overwrite", "--no-check") == 0
+
+
+def test_one_camera_is_no_recording(recording, pipeline, tmp_path, capsys):
+    cameras = json.loads((tmp_path / "calibration.json").read_text())
+    (tmp_path / "calibration.json").write_text(json.dumps({"left": cameras["left"]}))
+    assert run(*recording) == 2
+    assert "at least 2 cameras are needed to see depth, got 1" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -389,7 +446,7 @@ def test_a_report_is_left_or_taken_away(recording, pipeline, capsys):
     assert run(*recording) == 0
     assert "to look at, in a browser" in capsys.readouterr().out
     assert page.read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
-    assert run(*recording, "--no-report") == 0
+    assert run(*recording, "--no-report", "--overwrite") == 0
     assert not page.exists() and "to look at" not in capsys.readouterr().out
 
 
@@ -454,7 +511,7 @@ def test_chunks_and_a_cluster_reach_the_pipeline(recording, pipeline, capsys):
     assert run(*recording, "--chunk-frames", "200", "--cluster", "tcp://host:8786") == 0
     assert (pipeline["chunk_frames"], pipeline["cluster"]) == (200, "tcp://host:8786")
     capsys.readouterr()
-    assert run(*recording, "--chunk-frames", "20") == 2
+    assert run(*recording, "--chunk-frames", "20", "--overwrite") == 2
     assert "--chunk-frames 20: must be 96" in capsys.readouterr().err
 
 

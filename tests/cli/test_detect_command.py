@@ -1,6 +1,9 @@
 """`detect` from the command line: what it says of people's folders and options, and real recordings."""
 
+import json
 import re
+import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -79,8 +82,8 @@ def test_half_size_videos_at_two_rates_one_of_which_starts_late(kitchen, capsys)
     assert f"camera {a}: frames that another camera has no picture for were left out, 4 at the start" in told
     (command,) = re.findall("next: (.*)", said.out)
     assert command == (
-        "shapepose-fg reconstruct --calibration calibration.json --detections out --timestamps out/times.csv"
-        " --output results"
+        f"shapepose-fg reconstruct --calibration {kitchen}/calibration.json --detections {kitchen}/out"
+        f" --output {kitchen}/results"
     )
     table = read_detections("out", rig)
     assert len(table) == 8 and table.skeleton.name == "COCO_18"
@@ -108,6 +111,37 @@ def test_folders_of_pictures_need_no_rate(kitchen, capsys):
     assert [frame.view.tolist() for frame in table] == [[0, 1, 2], [0, 1, 2], [0, 2], [0, 1, 2]]
     assert run(*COMMON, "--images", "shots") == 2
     assert "there are detections already" in capsys.readouterr().err
+
+
+def test_a_project_is_detected_in_and_goes_on_as_a_project(kitchen, capsys, monkeypatch):
+    """Cameras, videos and places come from it; the next line is the project's, quoted, from any folder."""
+    rig, project = read_rig("calibration.json"), kitchen / "my walk"
+    (project / "calibration").mkdir(parents=True)
+    (kitchen / "calibration.json").rename(project / "calibration" / "rig.json")
+    (project / "Config.toml").write_text("[project]\nframe_rate = 'auto'\n")
+    (project / "videos").mkdir()
+    for name in rig.names:
+        film(project / "videos" / f"{name}.avi", rig, name, range(6), 50)
+    assert run("--project", "my walk", "--network", "network.onnx") == 0
+    (command,) = re.findall("next: (.*)", capsys.readouterr().out)
+    assert shlex.split(command) == ["shapepose-fg", "reconstruct", "--project", str(project)]
+    assert {each.name for each in (project / "pose").iterdir()} >= {"times.csv", "footage.json"}
+    monkeypatch.chdir("/")
+    with pytest.raises(SystemExit) as end:
+        main(shlex.split(command)[1:])
+    assert end.value.code == 0
+    told = json.loads((project / "shapepose-fg" / "run.json").read_text())
+    assert told["time"]["fps"] == 50.0 and told["project"] == "my walk"
+    assert "<title>my walk" in (project / "shapepose-fg" / "report.html").read_text(encoding="utf-8")
+    assert (project / "shapepose-fg" / "footage.json").is_file()
+
+
+def test_one_camera_is_enough_to_detect(kitchen):
+    rig = read_rig("calibration.json")
+    write_rig(replace(rig, cameras=rig.cameras[:1]), kitchen / "calibration.json")
+    film(kitchen / f"{rig.names[0]}.avi", rig, rig.names[0], range(3), 50)
+    assert run(*COMMON, "--videos", f"{rig.names[0]}={rig.names[0]}.avi") == 0
+    assert (kitchen / "out" / f"{rig.names[0]}.txt").is_file()
 
 
 @pytest.mark.parametrize("words, problem", [

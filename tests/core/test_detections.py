@@ -69,3 +69,12 @@ def test_only_some_candidates_keep_the_affinities_between_them():
     np.testing.assert_array_equal(some.xy, [[0, 1], [4, 5], [6, 7]])
     np.testing.assert_array_equal(some.pairs, [[1, 2]])
     np.testing.assert_array_equal(some.affinity, [0.3])
+
+
+def test_a_detection_knows_its_place_among_those_of_its_view():
+    view = np.array([2, 0, 2, 1, 2, 0])
+    none = np.zeros((0, 2), dtype=np.intp)
+    every = Detections(view, np.zeros(6, int), np.zeros((6, 2)), np.ones(6), none, np.zeros(0))
+    assert every.place.tolist() == [0, 0, 1, 0, 2, 1]
+    assert every.rows(np.array([4, 5, 0])).place.tolist() == [2, 1, 0], "also where others are left out"
+    assert Detections.empty().place.tolist() == []

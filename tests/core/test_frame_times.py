@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from shapepose_fg.core.frame_times import FrameTimes, check_cuts, segments
+from shapepose_fg.core.frame_times import FrameTimes, check_cuts, rate_of, segments
 
 
 def test_times_from_a_rate():
@@ -24,6 +24,24 @@ def test_a_dropped_frame_is_a_gap_and_cameras_may_have_times_of_their_own():
     np.testing.assert_allclose(apart.frame_s, [0.01, 0.11])
     np.testing.assert_allclose(apart.of_views(2)[:, 1], [0.02, 0.12])
     assert apart.as_dict()["per_camera"]
+
+
+@pytest.mark.parametrize("fps", [25, 30, 50, 60, 120, 240, 12.5, 30000 / 1001, 24000 / 1001, 60000 / 1001])
+def test_a_rate_is_recovered_exactly_from_times_of_few_digits(fps):
+    """Microseconds, also with frames dropped; milliseconds over some seconds; and times that jitter."""
+    times, rng = np.arange(5000) / fps, np.random.default_rng(0)
+    kept = np.delete(times[:100], [3, 50, 51, 70])
+    shaken = times + rng.uniform(-0.1, 0.1, len(times)) / fps
+    for each in (times[:3], times[:90].round(6), kept.round(6), times.round(3), shaken):
+        assert rate_of(each) == fps
+    assert FrameTimes(times[:200].round(6)).as_dict()["fps"] == fps
+
+
+def test_a_rate_of_no_camera_stays_what_it_is_and_29_97_is_30000_by_1001():
+    assert rate_of(np.arange(500) / 29.8123) == pytest.approx(29.8123, abs=1e-6)
+    for typed, exact in ((29.97, 30000 / 1001), (23.976, 24000 / 1001), (59.94, 60000 / 1001), (29.8, 29.8)):
+        assert FrameTimes.from_fps(typed, 200).as_dict()["fps"] == exact
+        np.testing.assert_array_equal(FrameTimes.from_fps(typed, 200).frame_s, np.arange(200) / exact)
 
 
 @pytest.mark.parametrize(

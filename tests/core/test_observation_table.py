@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.observation_table import Gate, ObservationTable, place_in_view
+from shapepose_fg.core.observation_table import Gate, ObservationTable
 
 
 def table() -> ObservationTable:
@@ -111,14 +111,6 @@ def test_bad_files(tmp_path, changed, sentence):
     assert str(caught.value).startswith(f"{file}: ") and sentence in str(caught.value)
 
 
-def test_a_detection_s_place_among_those_of_its_view():
-    assert place_in_view(np.array([0, 1, 2, 3, 4, 5, -1]), np.array([0, 0, 0, 1, 1, 4])).tolist() == [
-        0, 1, 2, 0, 1, 0, -1,
-    ]  # fmt: skip
-    assert place_in_view(np.array([[4, 3], [-1, 0]]), np.array([2, 0, 2, 1, 2, 0])).tolist() == [[2, 0], [-1, 0]]
-    assert place_in_view(np.array([-1]), np.zeros(0, int)).tolist() == [-1]
-
-
 def test_the_table_of_solved_rows(five_cameras, two_people, seen_exactly):
     """Detections without error, joints moved by hand: residuals are what the cameras say, reasons as they must."""
     from shapepose_fg.core.observations import Observations
@@ -142,7 +134,7 @@ def test_the_table_of_solved_rows(five_cameras, two_people, seen_exactly):
     gate[0, 4, 1], gate[1, 5], gate[1, 6, 0] = Gate.TOO_FAR, Gate.TOO_FAR, Gate.TOO_FAR
     solved = ObservationTable.of(
         observations,
-        place_in_view(candidate, seen.view),
+        np.append(seen.place, -1)[candidate],
         joints,
         gate,
         five_cameras,

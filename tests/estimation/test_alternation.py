@@ -20,7 +20,6 @@ from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, 
 from shapepose_fg.estimation.window_graph import WindowGraph
 from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.pipeline.solve_window import solve_window
-from shapepose_fg.pipeline.solved_windows import result_rows
 
 WRIST, ELBOW, KNEE = 4, 3, 13
 
@@ -243,7 +242,7 @@ def test_views_that_contradict_the_body_are_gated_anew_around_it(five_cameras, t
     assert np.argwhere(~result.inlier.any(axis=-1)).tolist() == [[0, KNEE]]
     assert result.confidence[0, KNEE] == 0
     place = np.zeros(seen.confidence.shape, dtype=np.int32)
-    rows = result_rows(result, place, five_cameras, BODY_25.joints, np.arange(2))
+    rows = result.result(place, five_cameras, BODY_25.joints)
     assert rows.observations is not None
     dropped = np.argwhere(rows.observations.gate == Gate.CONTRADICTS_BODY)
     assert dropped.tolist() == [[0, KNEE, 0], [0, KNEE, 1]] and rows.observations.reasons()["too far"] == 0
@@ -372,6 +371,7 @@ def seen_of(rig: Rig, detections: Detections, truth: NDArray[np.float64], within
     return replace(nowhere, initial=triangulate(nowhere, Views.of(rig), ObservationConfig()))
 
 
+@pytest.mark.slow
 def test_the_alternation_helps_on_the_built_in_scene():
     """Joints of low confidence end nearer the truth than triangulated, those of high confidence no farther."""
     from shapepose_fg.body.fitting.fitters import SmplFitter

@@ -76,6 +76,7 @@ def left_out_error_mm(model: BodyModel, scene: Scene) -> float:
     return float(1e3 * np.linalg.norm(fit.prior_xyz - targets.xyz, axis=-1).mean())
 
 
+@pytest.mark.slow
 def test_the_body_predicts_the_joints_of_the_detector(scene, odd_scene, odd_offsets):
     """What offsets are for. They are learnt from noisy detections and judged on the true joints."""
     before = left_out_error_mm(scene.body, odd_scene)
@@ -100,6 +101,7 @@ def test_offsets_that_no_pose_explains_are_recovered(odd_offsets):
     assert np.sqrt((off**2 / 3 / offsets.sigma_m**2).mean()) < 1.3
 
 
+@pytest.mark.slow
 def test_no_offsets_are_found_where_there_are_none(scene):
     recording = simulate(scene, seed=0)
     offsets = estimate_offsets(recording, scene.rig)
@@ -109,6 +111,7 @@ def test_no_offsets_are_found_where_there_are_none(scene):
     assert harmed < left_out_error_mm(scene.body, scene) + 1.0
 
 
+@pytest.mark.slow
 def test_offsets_are_learnt_from_frames_that_are_thinned_as_in_a_run(scene):
     """Every detection is there four times, 2 px aside; eight of a joint stay in a view, of four people."""
     config = PipelineConfig(people=PeopleConfig(most_pairs=1000))
@@ -126,6 +129,7 @@ def test_offsets_are_learnt_from_frames_that_are_thinned_as_in_a_run(scene):
     np.testing.assert_array_equal(found.xyz_m, expected.xyz_m)
 
 
+@pytest.mark.slow
 def test_left_and_right_are_mirrored_unless_the_data_insist():
     scene = built_in_scene(seed=0, frames=8)
     # One hip only: what is symmetric about it (half) is found, what is not is shrunk much harder.
@@ -201,6 +205,7 @@ def test_the_run_records_the_offsets_and_a_file_brings_them_back(scene, odd_reco
         reconstruct(odd_recording, scene.rig, missing)
 
 
+@pytest.mark.slow
 def test_frames_outside_the_span_are_learnt_from_and_not_counted(scene, odd_recording, odd_offsets):
     part = reconstruct(odd_recording, scene.rig, frames=range(3, 5))
     assert part.run["keypoint_offsets"] == odd_offsets.as_dict()

@@ -1,18 +1,32 @@
 """The other model of motion, the whole way: by one setting, with covariances that hold."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from factors import MOTIONS, Motion
+from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus
 from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.notes import Notebook
 from shapepose_fg.core.reconstruction import Status
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.pipeline.config import SolvingConfig
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
+from shapepose_fg.pipeline.setup import Setup
 from shapepose_fg.simulation import built_in_scene, simulate
 
 
+class NoFitter(BodyFitter):
+    """Nobody has a body."""
+
+    def fit(self, targets, initial=None, groups=None):
+        return BodyFit.failed(np.full(len(targets), FitStatus.TOO_FEW_JOINTS), targets.xyz.shape[1])
+
+
+@pytest.mark.slow
 def test_constant_acceleration_the_whole_way():
     """Two people before four cameras: tracked, solved, bodies linked, as near to the truth as by default."""
     scene = built_in_scene(people=2, cameras=4, frames=24)
@@ -44,6 +58,17 @@ def test_the_setting_is_checked():
         ValueError, match="motion must be one of constant velocity, constant acceleration, got straight"
     ):
         SolvingConfig(motion="straight")
+
+
+def test_other_processes_need_not_know_a_model_of_one_s_own(monkeypatch, five_cameras):
+    """What goes to a worker holds the model, whose name is known here alone."""
+    mine = Motion(3, (1.0, 4.0))
+    monkeypatch.setitem(MOTIONS, "mine", mine)
+    config = PipelineConfig(solving=SolvingConfig(motion="mine"))
+    content = pickle.dumps(Setup(five_cameras, BODY_25, config, NoFitter()))
+    monkeypatch.delitem(MOTIONS, "mine")
+    there = pickle.loads(content)
+    assert there.estimator.law == there.engine(Notebook()).tracker.scale.motion == mine
 
 
 def test_densities_are_those_of_equal_uncertainty():

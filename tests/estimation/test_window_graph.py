@@ -13,6 +13,7 @@ from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.estimator_config import EstimatorConfig, WindowGraphConfig
 from shapepose_fg.estimation.linearisation import Message, ObservationConfig
 from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.state_covariances import state_covariances
 from shapepose_fg.estimation.window_graph import WindowGraph
 
 EXACT = WindowGraphConfig(max_iterations=100, tolerance=1e-12)
@@ -72,7 +73,7 @@ class OneFrame:
         return self.window.solve(self.inlier[None], body, body, initial[None])[0]
 
     def covariance(self):
-        return self.window.marginals(self.window.keys)[0]
+        return state_covariances([self.window])[0][0][0]
 
     @property
     def graph(self):

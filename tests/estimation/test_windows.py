@@ -486,14 +486,17 @@ def test_chains_have_the_covariances_of_gtsam(walk, five_cameras, two_people, mo
 
     beside = BesideFitter(two_people[0], (0.0, 0.05, 0.0))
     solve(observations, five_cameras, beside, captured, around_s=0.1)
-    expected = [(graph.marginals(graph.keys), graph.marginals(graph.velocity_keys)) for graph in graphs]
-    asked = list[int]()
-    whole = WindowGraph.marginals
-    monkeypatch.setattr(WindowGraph, "marginals", lambda self, keys: (asked.append(1), whole(self, keys))[1])
+    whole = [gtsam.Marginals(graph.graph, graph.values) for graph in graphs]
+    asked, marginals = list[int](), gtsam.Marginals
+    monkeypatch.setattr(gtsam, "Marginals", lambda graph, values: (asked.append(1), marginals(graph, values))[1])
     found = state_covariances(graphs)
     assert [len(graph) for graph in graphs] == [28, 19] and len(asked) == calls
-    for (positions, velocities), (of_positions, of_velocities) in zip(found, expected, strict=True):
+    for graph, (positions, velocities), known in zip(graphs, found, whole, strict=True):
         assert np.isfinite(positions[:, WRIST]).all()
+        of_positions, of_velocities = (
+            np.array([[known.marginalCovariance(key) for key in row] for row in keys.tolist()])
+            for keys in (graph.keys, graph.velocity_keys)
+        )
         # Of variances of 1e-4 m² and 1e-2 m²/s².
         np.testing.assert_allclose(positions, of_positions, rtol=1e-6, atol=1e-11)
         np.testing.assert_allclose(velocities, of_velocities, rtol=1e-6, atol=1e-9)
@@ -551,7 +554,7 @@ def test_somebody_undetermined_takes_nobody_else_to_the_slow_path(walk, five_cam
         for key in window.velocity_keys[:, WRIST].tolist() if window.track == 0 else ():
             yield gtsam.PriorFactorPoint3(key, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 0.1))
 
-    monkeypatch.setattr(WindowGraph, "marginals", lambda self, keys: pytest.fail("the slow path is taken"))
+    monkeypatch.setattr(gtsam, "Marginals", lambda graph, values: pytest.fail("the slow path is taken"))
     found = solve(seen, five_cameras, NobodyFitter(), still)
     unknown = ~np.isfinite(found.covariance).all(axis=(2, 3))
     assert unknown[first, WRIST].all() and unknown.sum() == FRAMES

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25, COCO_17, COCO_18, COCO_133, HALPE_26, SKELETONS, Skeleton
+from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.detections import read_detections, reading
 from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock
@@ -285,11 +286,33 @@ def test_pictures_without_people_are_frames_where_the_file_lists_them(tmp_path, 
 
 
 @pytest.mark.parametrize("write", [coco, alphapose])
-def test_lists_that_begin_without_people_say_which_frame_is_the_first(tmp_path, rig, write):
+def test_lists_that_begin_without_people_keep_their_numbers(tmp_path, rig, write):
     person = people_of(COCO_17)["left"][0][0]
     write(tmp_path, dict.fromkeys(rig.names, [[]] * 37 + [[person]] * 3))
     table = read_detections(tmp_path, rig)
-    assert len(table) == 3 and "frame 0 is number 37 of the files" in table.notes
+    assert [number for number, frame in enumerate(table) if len(frame) > 0] == [37, 38, 39] and len(table) == 40
+    assert table.first == 37 and not any("number" in note for note in table.notes)
+
+
+def test_numbers_too_high_for_frames_count_from_the_first_and_it_is_said(tmp_path, rig):
+    keypoints = people_of(COCO_17)["left"][0][0].ravel().tolist()
+    found = [{"image_id": 10_128_340_000 + number, "keypoints": keypoints} for number in range(3)]
+    for name in rig.names:
+        (tmp_path / f"{name}.json").write_text(json.dumps(found))
+    table = read_detections(tmp_path, rig)
+    assert len(table) == 3 and table.first == 0
+    assert "frame 0 is number 10128340000 of the files" in table.notes
+
+
+def test_numbers_in_are_numbers_out_of_an_operating_room(shared_data):
+    """MVOR's second detector sees nobody in the first moment; the truth of moment 1 is then in frame 1."""
+    rig = read_rig(shared_data / "mvor" / "rig.json")
+    tables = [read_detections(shared_data / "mvor" / name, rig) for name in ("openpose", "rtpose")]
+    assert [len(table) for table in tables] == [387, 387] and [table.first for table in tables] == [0, 1]
+    for view, name in enumerate(rig.names):
+        found = json.loads((shared_data / "mvor" / "rtpose" / f"{name}.json").read_text())
+        numbers = {each["image_id"] for each in found}
+        assert {t for t, frame in enumerate(tables[1]) if view in frame.view} == numbers
 
 
 def test_what_macos_leaves_beside_a_file_is_no_frame(tmp_path, rig):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from shapepose_fg.cli.main import main
+from shapepose_fg.cli.reconstruct.request import Request, prepare
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Known, Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
@@ -113,7 +114,9 @@ def test_the_rate_is_the_video_s_where_the_project_says_auto(project):
     assert read_pose2sim_project(project).fps == 24.0
     (project / "pose" / "times.csv").write_text("time_s\n0\n0.1\n0.2\n0.3\n")
     found = read_pose2sim_project(project)
-    assert found.fps is None and found.times == project / "pose" / "times.csv"
+    assert found.fps is None
+    known = prepare(Request(project=project), None, tell=print)
+    assert known.request.fps is None and known.request.timestamps == project / "pose" / "times.csv"
 
 
 def test_what_is_missing_is_named_with_the_cure(project):
@@ -122,7 +125,7 @@ def test_what_is_missing_is_named_with_the_cure(project):
     (project / "videos").mkdir()
     (project / "videos" / "cam0.mp4").write_bytes(b"")
     said = refusal(project)
-    assert "shapepose-fg detect --calibration" in said and f"--output {project / 'pose'}" in said
+    assert f"shapepose-fg detect --project {project} --network NETWORK" in said
     (project / "calibration" / "rig.json").unlink()
     assert "no calibration that is known here, only nothing" in refusal(project)
     (project / "calibration").rmdir()

@@ -75,7 +75,7 @@ def test_a_recording_without_frames(tmp_path, rig):
         ("frame time_s\n0 0\n0 1\n", "frame 0 occurs twice; keep one line of it"),
         ("frame time_s\n0 0\n0.5 1\n", "line 3 must name a frame, 0 or more, got 0.5; correct it"),
         ("frame time_s\n1 0\n0 1\n2 2\n", "line 2 must be later than the frame before"),
-        ("0\n33\n67\n", "frames would be 34 s apart; write seconds, not milliseconds"),
+        ("0\n33\n67\n", "frames would be 33.5 s apart; write seconds"),
         (
             "cam0 cam1\n0 1000\n1 1001\n2 1002\n",
             "the cameras' times of frame 0 are 1e+03 s apart; give times of one",

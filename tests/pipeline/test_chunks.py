@@ -9,23 +9,22 @@ import torch
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.model.body_model import BodyParameters
 from shapepose_fg.cli.stopping import Stopped
-from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.detections import Detections, Input
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.reconstruction import Known, Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.core.storage.kept_arrays import InFolder, InMemory
-from shapepose_fg.pipeline.engine import Setup
 from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.pipeline import PipelineConfig, Task, reconstruct, reconstruct_parts
 from shapepose_fg.pipeline.runs import chunks
 from shapepose_fg.pipeline.runs.assembly import Assembly
 from shapepose_fg.pipeline.runs.chunks import Border, Chunk, cut_in_chunks, same_people, windows_of
+from shapepose_fg.pipeline.setup import Setup
 from shapepose_fg.pipeline.solved_windows import solve_chunk
 from shapepose_fg.pipeline.windows import Engine, WindowConfig
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.tracking.following import FollowingConfig
 from shapepose_fg.tracking.tracker import BodyScale, Tracks
-from shapepose_fg.tracking.worlds import Input
 
 CONFIG = PipelineConfig(
     batch_frames=12, following=FollowingConfig(look_ahead_s=0.3), windows=WindowConfig(overlap_s=0.16)

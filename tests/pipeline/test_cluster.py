@@ -75,7 +75,7 @@ class FakeClient:
     def result(self) -> int:
         return 0
 
-    def cancel(self) -> None:
+    def cancel(self, futures) -> None:
         pass
 
 

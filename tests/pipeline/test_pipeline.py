@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from factors import isotropic
+from factors import MOTIONS, Motion, isotropic
 from shapepose_fg.core.detections import Detections, Recording
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.reconstruction import Known, Reconstruction, Status
@@ -18,7 +18,7 @@ from shapepose_fg.evaluation.metrics import joint_metrics
 from shapepose_fg.evaluation.shelf import evaluate_shelf, read_shelf_ground_truth
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
-from shapepose_fg.pipeline.config import PeopleConfig
+from shapepose_fg.pipeline.config import PeopleConfig, SolvingConfig
 from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people, reconstruct
 from shapepose_fg.simulation import built_in_scene, simulate
@@ -85,6 +85,7 @@ def test_the_run_says_how_it_came_about(people):
     assert all(0.3 < each["evidence"] <= 1 and 0.9 < each["probability"] <= 1 for each in run["probability"])
 
 
+@pytest.mark.slow
 def test_without_time_frames_stand_alone_and_batches_do_not_matter(scene, recording):
     recording = Recording(BODY_25, [recording[t] for t in range(10)])
     whole = reconstruct(recording, scene.rig, ALONE)
@@ -103,9 +104,13 @@ def test_the_same_input_gives_the_same_bytes(scene, recording):
 
 
 @pytest.mark.slow
-def test_workers_change_no_byte(scene, recording):
-    """Windows of 8 frames, so that there are several; everything in the result, gates and shapes included."""
-    config = PipelineConfig(batch_frames=8)
+def test_workers_change_no_byte(scene, recording, monkeypatch):
+    """Windows of 8 frames, so that there are several; everything in the result, gates and shapes included.
+
+    By a model of motion whose name they do not know.
+    """
+    monkeypatch.setitem(MOTIONS, "known here alone", Motion(2, (1.5,)))
+    config = PipelineConfig(batch_frames=8, solving=SolvingConfig(motion="known here alone"))
     counts = list[int]()
     alone = reconstruct(recording, scene.rig, config)
     execution = Execution(workers=2, progress=lambda done, _: counts.append(done))
@@ -272,6 +277,7 @@ def test_the_observations_are_what_the_joints_were_solved_from(dance, scene, peo
     assert people.run["people"]["joints"]["seen"] == (people.known == Known.SEEN).sum()
 
 
+@pytest.mark.slow
 def test_detections_are_assigned_until_hardly_any_changes(scene: Scene, recording: Recording):
     """More rounds than that change nothing; with one, they are not there yet."""
     rounds = {}

@@ -16,7 +16,7 @@ from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.solved_setup import CAMERAS, read_setup
-from shapepose_fg.pipeline import engine, solving
+from shapepose_fg.pipeline import setup, solving
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.pipeline.solving import Solver, solve_rows
 from shapepose_fg.pipeline.windows import WindowConfig
@@ -70,14 +70,14 @@ LONG = PipelineConfig(batch_frames=6, windows=WindowConfig(overlap_s=0.1))
 
 def solved_frames(work: Callable[[], Reconstruction]) -> tuple[list[list[int]], Reconstruction]:
     """The frames of each window that is solved meanwhile, and what comes of it."""
-    frames, solve = [], engine.solve_window
+    frames, solve = [], setup.solve_window
 
     def noted(observations, *others, **more):
         frames.append(sorted(set(observations.frame.tolist())))
         return solve(observations, *others, **more)
 
     with pytest.MonkeyPatch.context() as patch:
-        for module in (engine, solving):
+        for module in (setup, solving):
             patch.setattr(module, "solve_window", noted)
         return frames, work()
 

@@ -129,6 +129,7 @@ def test_what_is_in_memory_and_what_is_in_the_files_is_the_same(dance, tmp_path)
         assert (tmp_path / name).read_bytes() == (whole / name).read_bytes(), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chunk_frames", [None, 6])
 def test_who_comes_when_a_run_goes_on_is_nobody_of_before(scene, recording, tmp_path, chunk_frames):
     """Stopped behind the first of two windows, between which the recording is cut: the same, and new names."""
@@ -158,6 +159,7 @@ def test_people_are_followed_on_from_where_a_run_was_stopped(scene, recording, t
         assert getattr(result, name).tobytes() == getattr(usual, name).tobytes(), name
 
 
+@pytest.mark.slow
 def test_without_time_it_goes_on_too(scene, recording, tmp_path):
     config = PipelineConfig(temporal=False, batch_frames=4, offsets=OffsetConfig(source="none"))
     frames = range(4, 12)
@@ -306,7 +308,7 @@ class _Done:
     """Parts of eight frames."""
 
     def notes(self):
-        from shapepose_fg.pipeline.runs.notes import Notes
+        from shapepose_fg.core.notes import Notes
 
         return Notes(frames=8)
 

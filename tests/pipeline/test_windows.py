@@ -66,6 +66,7 @@ def test_nothing_carries_over_a_cut(dance):
     assert both.run["cuts"] == [9]
 
 
+@pytest.mark.slow
 def test_twice_the_rate_is_twice_the_speed(dance):
     fps, usual = dance.scene.fps, dance.people.rows(dance.people.frame < 16)
     slow = reconstruct(first(dance.recording, 16), dance.scene.rig, times=FrameTimes.from_fps(fps / 2, 16))
@@ -80,6 +81,7 @@ def test_cameras_that_are_not_synchronised_are_refused_for_now(dance):
         reconstruct(first(dance.recording, 3), dance.scene.rig, times=FrameTimes(skewed))
 
 
+@pytest.mark.slow
 def test_one_frame_is_what_it_is_without_time(dance):
     recording, times = first(dance.recording, 5), FrameTimes(dance.times.time_s[:5])
     configs = (replace(PipelineConfig(), temporal=temporal) for temporal in (True, False))
@@ -89,6 +91,7 @@ def test_one_frame_is_what_it_is_without_time(dance):
     assert gap.min(axis=1).max() < 0.005
 
 
+@pytest.mark.slow
 def test_an_empty_recording_and_one_that_begins_empty(dance):
     scene, recording = dance.scene, dance.recording
     nothing = [Detections.empty()] * 5

@@ -96,6 +96,7 @@ def test_exchanged_cameras_are_named(recording, room):
     assert (found.kind, found.cameras) == (Kind.EXCHANGED, (0, 2))
 
 
+@pytest.mark.slow
 def test_a_camera_that_is_listed_twice_is_named(recording, room):
     found = only_finding(*listed_twice(recording, room, 1))
     assert (found.kind, found.cameras) == (Kind.DUPLICATE, (1, 5))
@@ -145,6 +146,7 @@ def test_too_little_to_judge_is_no_mistake(recording, room):
     assert diagnose(Recording(BODY_25, recording.frames[:5]), room).findings == ()
 
 
+@pytest.mark.slow
 def test_the_range_of_frames_is_kept_to(recording, room):
     late = delayed(recording, 1, 10)
     half = Recording(BODY_25, [*recording.frames[:20], *late.frames[20:]])

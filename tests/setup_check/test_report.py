@@ -80,6 +80,7 @@ def test_the_command_says_it_in_words(files, room, capsys):
     assert code == 1 and json.loads(out)["findings"][0]["kind"] == "focal length"
 
 
+@pytest.mark.slow
 def test_reconstruct_warns_and_stores_it(files, room, tmp_path, capsys):
     write_rig(Rig(room.cameras, "y"), files / "up.json")
     options = ["--detections", files / "openpose", "--frames", "0:8", "--output", tmp_path / "out", "--workers", 1]

@@ -241,6 +241,7 @@ def test_hands_that_are_near_are_brought_together(body: BodyModel):
     np.testing.assert_allclose(hold_hands(lead, away, 30.0)[0].joints, lead.joints, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_real_people_stand_on_the_floor(real_mocap: Mocap, body: BodyModel):
     for index, shape in ((237, 0), (262, 1), (118, 2), (202, 3), (253, 3), (278, 0)):
         performed = perform(body, SHAPES[shape], real_mocap.clip(index))

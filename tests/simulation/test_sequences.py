@@ -99,6 +99,7 @@ def test_dancers_are_the_pairs_and_nobody_else(real: dict[tuple[str, Split], Sce
         assert len(scene.clips) == len(scene.cuts) + 1
 
 
+@pytest.mark.slow
 def test_pairs_are_close_and_others_keep_their_distance(real: dict[tuple[str, Split], Scene]):
     for (name, _), scene in real.items():
         pairs, gaps = SEQUENCES[name].pairs, hip_gaps(scene)
@@ -130,6 +131,7 @@ def test_people_stay_in_the_room_and_nobody_jumps(real: dict[tuple[str, Split], 
         assert np.linalg.norm(np.diff(scene.keypoints[..., HIP, :], axis=0), axis=-1).max() > 0  # they do move
 
 
+@pytest.mark.slow
 def test_feet_are_on_the_floor(real: dict[tuple[str, Split], Scene]):
     for scene in real.values():
         lowest = np.array([scene.vertices_at(frame)[..., 2].min(axis=1) for frame in range(5, len(scene), 80)])
@@ -148,6 +150,7 @@ def test_the_same_seed_gives_the_same_bytes(tiny_mocap: Mocap):
     assert np.abs(first.motion.transl - other.motion.transl).max() > 0.05
 
 
+@pytest.mark.slow
 def test_the_beginning_of_a_sequence_is_as_in_the_whole_one(tiny_mocap: Mocap):
     whole = sequence("salsa", "tune", tiny_mocap, frames=190)
     some = sequence("salsa", "tune", tiny_mocap, frames=190, until=whole.cuts[0] + 1)

@@ -1,16 +1,17 @@
 """People with known motion before five cameras, and a tracker for them."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
 from shapepose_fg.core.camera import Rig
-from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.detections import Detections, Input
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.pipeline.config import PeopleConfig
 from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people
 from shapepose_fg.tracking.following import FollowingConfig, FollowState, finish, follow
 from shapepose_fg.tracking.tracker import BodyScale, Tracker, TrackingConfig, Tracks
-from shapepose_fg.tracking.worlds import Input
 
 FPS = 30.0
 
@@ -19,10 +20,7 @@ FPS = 30.0
 def tracker() -> Tracker:
     """Stage I as the pipeline makes it, bones of 0.7 m at most."""
     config, likely = PipelineConfig(), PipelineConfig(people=PeopleConfig(min_probability=0.15))
-
-    def find(detections, rig, weak):
-        return find_people(detections, rig, BODY_25, likely if weak else config)
-
+    find = [partial(find_people, skeleton=BODY_25, config=each) for each in (config, likely)]
     scale = BodyScale(np.full(25, 0.7), np.full(25, 10.0))
     return Tracker(BODY_25, scale, find, TrackingConfig(), config.observations)
 

@@ -6,11 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.detections import Detections, Input
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.tracking import view_assignment
-from shapepose_fg.tracking.following import Input
 from shapepose_fg.tracking.plausibility import torn_joints
 from shapepose_fg.tracking.reassociation import Survival, reassociate
 from shapepose_fg.tracking.view_assignment import Predicted, assign, assign_with_probability

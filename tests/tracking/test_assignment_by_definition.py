@@ -6,11 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from shapepose_fg.core.detections import Input
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.proposal import claims
 from shapepose_fg.tracking import view_assignment
-from shapepose_fg.tracking.following import Input
 from shapepose_fg.tracking.reassociation import Survival, _existence, _gone, reassociate
 from shapepose_fg.tracking.view_assignment import Predicted, assign
 

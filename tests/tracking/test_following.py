@@ -5,12 +5,12 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.detections import Detections, Input
 from shapepose_fg.pipeline.runs.parts import Checkpoint, checkpoint_arrays, checkpoint_of
 from shapepose_fg.pipeline.windows import StreamState
 from shapepose_fg.tracking.following import BLOCK_S, FollowingConfig, FollowState, finish, follow
 from shapepose_fg.tracking.tracker import Tracks
-from shapepose_fg.tracking.worlds import Input, Seed, follow_worlds
+from shapepose_fg.tracking.worlds import Seed, follow_worlds
 
 
 def who(rows, truth):

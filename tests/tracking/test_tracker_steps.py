@@ -172,20 +172,21 @@ def test_hips_that_two_views_saw_are_asked_for_last(tracker, five_cameras, two_p
     detections = seen_exactly(five_cameras, two_people[:1])
     asked = []
 
-    def find(left, rig, weak):
-        asked.append((len(left), weak))
-        everybody = tracker.find(left, rig, False)
-        return everybody if weak else everybody.rows(np.zeros(0, dtype=int))
+    def sure(left, rig):
+        asked.append((len(left), "sure"))
+        return tracker.find[0](left, rig).rows(np.zeros(0, dtype=int))
 
-    none, searching = np.zeros((0, 25, 5), dtype=int), replace(tracker, find=find)
+    def weak(left, rig):
+        asked.append((len(left), "weak"))
+        return tracker.find[0](left, rig)
+
+    none, searching = np.zeros((0, 25, 5), dtype=int), replace(tracker, find=(sure, weak))
     places, candidate = searching.newcomers(Tracks.none(BODY_25), none, detections, five_cameras)
-    assert asked == [(125, False), (125, True)] and len(places) == 1
+    assert asked == [(125, "sure"), (125, "weak")] and len(places) == 1
     assert sorted(candidate.ravel().tolist()) == list(range(125))
     asked.clear()
-    places, _ = replace(searching, weak_births=False).newcomers(
-        Tracks.none(BODY_25), none, detections, five_cameras
-    )
-    assert asked == [(125, False)] and len(places) == 0
+    places, _ = replace(searching, find=(sure,)).newcomers(Tracks.none(BODY_25), none, detections, five_cameras)
+    assert asked == [(125, "sure")] and len(places) == 0
     asked.clear()
     places, _ = searching.newcomers(tracks_at(two_people[:1]), candidate, detections, five_cameras)
     assert asked == [] and len(places) == 0

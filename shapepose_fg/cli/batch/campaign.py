@@ -26,6 +26,7 @@ from shapepose_fg.cli.reconstruct.run import Ended, carry_out
 from shapepose_fg.cli.stopping import Stopped, stoppable
 from shapepose_fg.cli.terminal import note, use_any_streams
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.result_files import PEOPLE
 from shapepose_fg.core.storage.files import inside, open_regular
 from shapepose_fg.core.storage.output_folder import prepare_output
 from shapepose_fg.io.corrections import refuse_corrected
@@ -223,7 +224,8 @@ def _lead(assignment: Assignment, tell: Connection, lifeline: Connection) -> Non
     try:
         with stoppable():
             known = prepare(assignment.request, assignment.folder)
-            tell.send(carry_out(known, execution, resume=assignment.resume, restart=assignment.restart))
+            again = {"resume": assignment.resume, "restart": assignment.restart, "overwrite": True}
+            tell.send(carry_out(known, execution, **again))
     except Stopped as stop:
         print(f"stopped: {stop.message}", flush=True)
     except InputError as error:
@@ -281,5 +283,7 @@ def _look_at(entry: Entry, folder: Path, begun: bool) -> int:
     refuse_corrected(folder)
     if (folder / PARTS).exists() and not begun:
         raise InputError(f"{folder / PARTS}: a run was stopped here; go on with --resume, or anew with --restart")
+    if (folder / PEOPLE).exists() and not begun:
+        raise InputError(f"{folder}: a finished result is here; move it away, or give another --output")
     files = (file for path in places for file in (path.rglob("*") if path.is_dir() else (path,)))
     return sum(file.stat().st_size for file in files if file.is_file())

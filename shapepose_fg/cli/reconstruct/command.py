@@ -4,6 +4,8 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import typer
+
 from shapepose_fg.cli.options import RESULT, TIME, RunOptions, grouped, option
 from shapepose_fg.cli.reconstruct.request import Request, prepare
 from shapepose_fg.core.errors import InputError
@@ -15,6 +17,8 @@ def reconstruct(
     running: RunOptions,
     cuts: str | None = option(TIME, "First frames after a cut: nothing carries over to them.", metavar="A,B"),
     output: Path | None = option(RESULT, "Folder for people.npz and run.json; made if it is not there."),
+    overwrite: bool = option(RESULT, "Take the place of a finished result in --output.", False, "--overwrite"),
+    strict: bool = option(RESULT, "Exit code 1 where something looks wrong, for pipelines.", False, "--strict"),
 ) -> None:
     """Reconstruct the people of a recording: 3D joints with covariances, and bodies."""
     running.check()
@@ -27,4 +31,6 @@ def reconstruct(
     from shapepose_fg.pipeline.execution import Execution
 
     execution = Execution(workers=running.workers, cluster=running.cluster)
-    carry_out(known, execution, resume=running.resume, restart=running.restart)
+    again = {"resume": running.resume, "restart": running.restart, "overwrite": overwrite}
+    if len(carry_out(known, execution, **again).warnings) > 0 and strict:
+        raise typer.Exit(1)

@@ -8,18 +8,26 @@ from rich.text import Text
 
 from shapepose_fg.cli.reconstruct.request import Prepared
 from shapepose_fg.cli.terminal import note, show, warn
+from shapepose_fg.core.arrays import Whole
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import rate_words
 from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.io.footage.placement import FOOTAGE
 from shapepose_fg.pipeline.pipeline import Task
 from shapepose_fg.pipeline.runs.assembly import Assembly
-from shapepose_fg.setup_check.diagnosis import other_sizes
+from shapepose_fg.setup_check.diagnosis import detected_sizes, other_sizes
 from shapepose_fg.setup_check.report import ResultCheck, result_check
 from shapepose_fg.setup_check.report import check_setup as check_detections
 from shapepose_fg.setup_check.table import use_table
 
 _SURE = 0.9
 """Whoever is less probable is named."""
+_LOST, _LOST_SHARE = 0.5, 0.2
+"""So many people a frame, and such a share of them, are missing before it is said."""
+_LOOKED_AT = 200
+"""Frames, spread over the recording, in which detections are counted for that."""
+_SHORT_S = 1.0
+"""In a recording shorter than this people whom two cameras see may lack evidence."""
 _KNOWN_WORDS = {
     "seen": "seen by two views",
     "weak": "seen by one or weakly",
@@ -32,8 +40,10 @@ _KNOWN_WORDS = {
 def check_setup(known: Prepared, task: Task, people: Reconstruction) -> ResultCheck:
     """Whether cameras, detections and, of a project, videos fit; `people` were reconstructed."""
     frames, sizes = task.whole()[0], ()
-    # Of its own detections `detect` knows which pictures they are of.
-    if known.project is not None and not (known.detections / "footage.json").is_file():
+    used = known.detections / FOOTAGE
+    if used.is_file():
+        sizes = detected_sizes(used, task.rig)
+    elif known.project is not None:
         videos = known.project.folder / "videos"
         try:
             sizes = other_sizes([str(videos)], task.rig) if videos.is_dir() else ()
@@ -43,12 +53,12 @@ def check_setup(known: Prepared, task: Task, people: Reconstruction) -> ResultCh
     return result_check(report, people, task.detections, task.rig, frames)
 
 
-def summary_table(result: Assembly, people: Reconstruction, span: range, cameras: int, seconds: float) -> Table:
+def summary_table(result: Assembly, people: Reconstruction, task: Task, seconds: float) -> Table:
     """What was reconstructed, how well it went, and how long it took.
 
-    `people` are rows of the `result` that say how sure the joints are.
+    `people` are rows of the `result` of `task` that say how sure the joints are.
     """
-    run, counts = result.run, result.counts()
+    run, counts, span, cameras = result.run, result.counts(), task.whole()[0], len(task.rig)
     per_frame = np.bincount(result.columns()["frame"].array() - span.start, minlength=len(span))
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     table.add_column(style="bold")
@@ -62,9 +72,13 @@ def summary_table(result: Assembly, people: Reconstruction, span: range, cameras
         table.add_row("", f"{count} {status}", style="green" if status == "ok" else "yellow")
     if len(doubtful := _doubtful(run)) > 0:
         table.add_row("", doubtful, style="yellow")
-    for reason, count in run.get("people", {}).get("dropped", {}).items():
-        where = _frames_words(run.get("dropped_frames", {}).get(reason, []))
-        table.add_row("", f"{count} dropped: {reason}{where}", style="dim")
+    lost = [
+        f"{count} rows dropped: {reason}{_frames_words(run.get('dropped_frames', {}).get(reason, []))}"
+        for reason, count in run.get("people", {}).get("dropped", {}).items()
+    ]
+    lost += unseen(task, per_frame)
+    if len(lost) > 0:
+        table.add_row("lost", "; ".join(lost), style="yellow")
     for what, spans in run.get("thinned_frames", {}).items():
         table.add_row("", f"too many {what}, the surest were taken{_frames_words(spans)}", style="yellow")
     if len(people) > 0:
@@ -75,6 +89,30 @@ def summary_table(result: Assembly, people: Reconstruction, span: range, cameras
     words = (f"{name} {1e3 * spent / len(span):.1f}" for name, spent in stages.items())
     table.add_row("", "  ".join(words), style="dim")
     return table
+
+
+def unseen(task: Task, per_frame: Whole) -> list[str]:
+    """A sentence where two cameras see more people than there are rows in a frame, `per_frame` (T,), and why.
+
+    A camera sees as many as it has detections of a core joint (median).
+    """
+    span, times, _ = task.whole()
+    core = list(task.detections.skeleton.core)
+    looked_at = np.unique(np.linspace(0, len(span) - 1, min(len(span), _LOOKED_AT)).astype(int))
+    seen = np.zeros((len(looked_at), len(task.rig)))
+    for row, frame in enumerate(looked_at.tolist()):
+        found = task.detections[span[frame]]
+        for view in range(len(task.rig)):
+            joints = np.bincount(found.joint[found.view == view], minlength=max(core) + 1)
+            seen[row, view] = np.median(joints[core])
+    by_two, here = float(np.sort(seen, axis=1)[:, -2].mean()), float(per_frame[looked_at].mean())
+    if by_two - here < max(_LOST, _LOST_SHARE * by_two):
+        return []
+    lasts = float(np.ptp(times.frame_s[span.start : span.stop])) * len(span) / max(len(span) - 1, 1)
+    why = "the others too little, or not as one"
+    if task.config.temporal and lasts < _SHORT_S:
+        why = f"{lasts:.2g} s are too little to be sure of everybody; give more frames, or --no-temporal"
+    return [f"two cameras see {by_two:.1f} people a frame, and {here:.1f} are found: {why}"]
 
 
 def _doubtful(run: dict[str, Any]) -> str:

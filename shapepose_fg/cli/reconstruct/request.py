@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from shapepose_fg.io.pose2sim_project import Pose2SimProject
     from shapepose_fg.pipeline.config import PipelineConfig
 
-OUTPUTS = (PEOPLE, RUN_FILE, OBSERVATIONS, "cameras.json", "report.html")
+OUTPUTS = (PEOPLE, RUN_FILE, OBSERVATIONS, "cameras.json", "footage.json", "report.html")
 """The files that are left in the folder of results."""
 
 
@@ -36,14 +36,13 @@ OUTPUTS = (PEOPLE, RUN_FILE, OBSERVATIONS, "cameras.json", "report.html")
 class Request(DetectionOptions):
     """One recording, and what is wanted of it: the options of `shapepose-fg reconstruct`, by their names."""
 
-    calibration: Path | None = option(INPUT, "Cameras: a file, or a folder, of one of the formats known.")
     detections: Path | None = option(INPUT, "Folder with what a 2D detector wrote of every camera.")
     project: Path | None = option(INPUT, "A Pose2Sim project: its cameras, detections, settings; adds TRC, C3D.")
     config: Path | None = option(RESULT, "Settings as TOML; `shapepose-fg config` prints all.")
     frames: str | None = frames_option()
     body: Path | None = option(INPUT, "Body model in SMPL's file format, instead of the built-in.")
-    fps: float | None = option(TIME, "Frames a second; 30 are assumed otherwise.")
-    timestamps: Path | None = option(TIME, "Text file with the time of every frame in seconds, also by camera.")
+    fps: float | None = option(TIME, "Frames a second; 30 where neither this nor times.csv says it.")
+    timestamps: Path | None = option(TIME, "Time of every frame, seconds; times.csv beside the detections.")
     cuts: tuple[int, ...] = ()
     """First frames after a cut."""
     temporal: bool | None = option(TIME, "People over time, or frame by frame.", None, "--temporal/--no-temporal")
@@ -87,11 +86,11 @@ class Prepared:
             raise InputError("--project: its files need people over time; leave out --no-temporal, or --project")
         return found
 
-    def span(self, count: int) -> range:
-        """The frames that are wanted of a recording of `count`."""
+    def span(self, count: int, first: int = 0) -> range:
+        """The frames that are wanted of a recording of `count`, in which nobody is seen before the `first`."""
         if self.project is not None and self.request.frames is None:
             return self.project.span(count)
-        return frame_range(self.request.frames, count)
+        return frame_range(self.request.frames, count, first)
 
     def times(self, rig: "Rig", count: int) -> "FrameTimes | None":
         """When the frames were taken; None where nothing says it."""
@@ -131,7 +130,7 @@ def prepare(request: Request, output: Path | None, tell: Callable[[str], None] =
         calibration, detections = request.calibration or project.calibration, request.detections
         request = replace(request, calibration=calibration, detections=detections or project.detections)
         if request.fps is None and request.timestamps is None:
-            request = replace(request, fps=project.fps, timestamps=project.times)
+            request = replace(request, fps=project.fps)
     calibration, detections = request.calibration, request.detections
     if calibration is None or detections is None or output is None:
         options = {"--calibration": calibration, "--detections": detections, "--output": output}
@@ -141,6 +140,9 @@ def prepare(request: Request, output: Path | None, tell: Callable[[str], None] =
     if request.fps is not None and request.timestamps is not None:
         raise InputError("--fps and --timestamps: both say when frames were taken; give one of them")
     check_fps(request.fps)
+    times = detections / "times.csv"
+    if request.fps is None and request.timestamps is None and times.is_file():
+        request = replace(request, timestamps=times)
     if request.frames is not None:
         ends(request.frames)
     return Prepared(request, project, calibration, detections, output)

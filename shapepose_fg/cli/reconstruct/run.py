@@ -21,8 +21,9 @@ from shapepose_fg.cli.terminal import note, progress, show
 from shapepose_fg.core.errors import InputError, failure
 from shapepose_fg.core.provenance import ReadInputs, checksums, program_digest, versions
 from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.result_files import PEOPLE, set_aside
 from shapepose_fg.core.run_summary import plain
-from shapepose_fg.core.storage.files import inside
+from shapepose_fg.core.storage.files import inside, read_text, write_content
 from shapepose_fg.core.storage.kept_arrays import InFolder
 from shapepose_fg.core.storage.output_folder import only_run_in, prepare_output
 from shapepose_fg.io.calibration import write_rig
@@ -30,6 +31,7 @@ from shapepose_fg.io.corrections import refuse_corrected
 from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.io.export.markers import write_pose2sim_files
+from shapepose_fg.io.footage.placement import FOOTAGE
 from shapepose_fg.io.solved_setup import CAMERAS
 from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.pipeline import Task, reconstruct_parts
@@ -53,23 +55,33 @@ class Ended:
     """What looks wrong with cameras and detections."""
 
 
-def carry_out(known: Prepared, execution: Execution, *, resume: bool = False, restart: bool = False) -> Ended:
+def carry_out(
+    known: Prepared,
+    execution: Execution,
+    *,
+    resume: bool = False,
+    restart: bool = False,
+    overwrite: bool = False,
+) -> Ended:
     """Reconstruct what is asked for into its folder, and say how it went.
 
-    `resume` and `restart` are the command's options; `execution` without `progress` shows a bar. InputError, one
-    sentence, for what cannot be used; `Stopped`, with where it stands, on Ctrl-C or a request to end.
+    `resume`, `restart` and `overwrite` are the command's options; `execution` without `progress` shows a bar.
+    InputError, one sentence, for what cannot be used; `Stopped`, with where it stands, on Ctrl-C or a request to
+    end.
     """
     asked, output = known.request, known.output
     files = (known.calibration, asked.config, asked.body, asked.timestamps)
     reading = ReadInputs((*files, known.detections))
     rig = asked.rig()
     refuse_corrected(output)
+    if (output / PEOPLE).exists() and not (overwrite or (resume and (output / manifest.PARTS).is_dir())):
+        raise InputError(f"{output}: a finished result is here; give another --output, or --overwrite")
     settings = known.settings()  # what is wrong with them is said before the whole recording is read
     with only_run_in(output, OUTPUTS), _recording_folder(inside(output, ".detections")) as kept:
         recording = read_detections(known.detections, rig, asked.skeleton, kept)
         note(*recording.notes)
         count = len(recording)
-        span, times, cuts = known.span(count), known.times(rig, count), known.cuts(count)
+        span, times, cuts = known.span(count, recording.first), known.times(rig, count), known.cuts(count)
         execution = replace(execution, chunk_frames=asked.chunk_frames).worth(len(span))
         if execution.workers != 1 and execution.cluster is None:
             get_ready("shapepose_fg.pipeline.pipeline")
@@ -168,7 +180,11 @@ class _Run:
         seconds = time.perf_counter() - start
         if file is not None and known is not None and len(known) > 0:
             inputs[str(file)] = manifest.checksum_at_start(kept)
-        result = result.with_run(inputs=inputs, notes=list(self.recording.notes), body=asked.body)
+        about = {"inputs": inputs, "notes": list(self.recording.notes)}
+        about |= {"body": None if asked.body is None else asked.body.resolve()}
+        about |= {} if self.recording.first == 0 else {"numbered_from": self.recording.first}
+        about |= {} if self.known.project is None else {"project": self.known.project.name}
+        result = result.with_run(**about)
         every = max(1, -(-len(result) // MOST_ROWS))
         if every > 1:
             note(f"check and report are made of every {th(every)} frame: the result has {len(result)} rows")
@@ -176,11 +192,17 @@ class _Run:
         checked = check_setup(self.known, self.task, people) if asked.check else None
         result = result if checked is None else result.with_run(**checked.as_run())
         people = people.with_run(**result.run)
+        note(*set_aside(output))
         result.save(output)
         # What the observations were seen with: to solve or draw them anew.
         if not (output / CAMERAS).exists() or not (output / CAMERAS).samefile(self.known.calibration):
             write_rig(rig, output / CAMERAS)
-        summary = summary_table(result, people, frames, len(rig), seconds)
+        used = self.known.detections / FOOTAGE
+        if used.is_file():
+            write_content(output / FOOTAGE, read_text(used))
+        else:
+            (output / FOOTAGE).unlink(missing_ok=True)
+        summary = summary_table(result, people, self.task, seconds)
         for n, written in enumerate(self._written(result, people, every)):
             summary.add_row("" if n > 0 else "written", written)
         if file is not None and known is not None and result.shapes is not None:

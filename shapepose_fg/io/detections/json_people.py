@@ -254,7 +254,8 @@ class _Collected:
     def camera(self, frames: list[int], listed: tuple[int, int]) -> CameraPeople:
         """All of them, who are in these `frames` (N); `listed` are the first and last that the file knows."""
         blocks, rerun = self._in_order(np.array(frames, dtype=np.intp)), _RERUN[self.program]
-        return CameraPeople(self.path, self.program, blocks, *listed, every_frame=False, rerun=rerun)
+        how = {"every_frame": False, "lists_people": self.program != _VIDEO, "rerun": rerun}
+        return CameraPeople(self.path, self.program, blocks, *listed, **how)
 
     def _in_order(self, frames: Index) -> Iterator[PeopleBlock]:
         """People in the order of their frames (N,), some frames at a time."""

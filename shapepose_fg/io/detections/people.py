@@ -62,6 +62,8 @@ class CameraPeople:
     every_frame: bool = True
     """Whether the files list every frame, those without people too. Where not, frames may be missing at both
     ends, and the other cameras tell how long the recording is."""
+    lists_people: bool = False
+    """Whether a frame is known by its people only: the first that is listed need not be the recording's first."""
     gaps: tuple[tuple[int, int], ...] = ()
     """First and last number of frames in between that are missing from the files: no people are seen in them."""
     rerun: str = "write the detections again"

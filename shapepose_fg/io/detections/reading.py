@@ -21,6 +21,8 @@ from shapepose_fg.io.skeleton_file import find_skeleton
 
 _MOST_FRAMES = 2_000_000
 """No recording is as long: ids of pictures that are not frames' numbers."""
+_MOST_EMPTY = 200_000
+"""Nor begins with so many frames without people: such numbers count from the first, and it is said."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,7 @@ def read_detections(
     kept = InMemory() if kept is None else kept
     form, places, notes = find_places(Path(path), rig)
     wanted = find_skeleton(skeleton)
-    streams, people = list[ViewStream](), list[KeptPeople]()
+    streams, people, first = list[ViewStream](), list[KeptPeople](), 0
     for n, (place, camera) in enumerate(zip(places, rig.cameras, strict=True)):
         read = form.read(place, camera)
         if isinstance(read, CameraPeople):
@@ -67,14 +69,14 @@ def read_detections(
             streams.append(read)
     if len(people) > 0:
         skeleton, how = _skeleton_of_people(people, wanted), "made as middles, where a person's two ends were seen"
-        streams, said = _streams_of(people, skeleton)
+        streams, said, first = _streams_of(people, skeleton)
         notes += said
     else:
         skeleton, how = _skeleton_of_streams(streams, wanted), "made between the two that one neighbour links"
     made = [skeleton.joints[joint] for joint, _, _ in skeleton.middles]
     notes += [f"{skeleton.name} has no {' and no '.join(made)}: {how}"] if made else []
     table = assemble(streams, rig, skeleton, kept)
-    return replace(table, notes=(*notes, *table.notes))
+    return replace(table, notes=(*notes, *table.notes), first=first)
 
 
 def find_places(path: Path, rig: Rig) -> tuple[Format, list[Path], list[str]]:
@@ -165,10 +167,15 @@ def _skeleton_of_people(people: Sequence[KeptPeople], wanted: Skeleton | None) -
     return found
 
 
-def _streams_of(people: Sequence[KeptPeople], skeleton: Skeleton) -> tuple[list[ViewStream], list[str]]:
-    """The people of every camera as candidates, and what was made of their scores and frames."""
+def _streams_of(people: Sequence[KeptPeople], skeleton: Skeleton) -> tuple[list[ViewStream], list[str], int]:
+    """The people of every camera as candidates, what was made of their scores and frames, and the table's `first`.
+
+    Where all files list people and not frames, their numbers are the frames': nobody is in those before the first.
+    """
     cameras = [each.camera for each in people]
     first, last = _span(cameras)
+    empty = first if first <= _MOST_EMPTY and all(camera.lists_people for camera in cameras) else 0
+    first -= empty
     rule, note = score_rule(people)
     for each, camera in zip(people, cameras, strict=True):
         if each.farthest is not None and each.farthest <= 1:
@@ -190,7 +197,7 @@ def _streams_of(people: Sequence[KeptPeople], skeleton: Skeleton) -> tuple[list[
             where = f"frame {since}" if since == until else f"frames {since} to {until}"
             have = "frames have" if count > 1 else "frame has"
             notes.append(f"{camera.source}: {count} {have} no file ({where}{more}); no people are seen there")
-    return streams, notes
+    return streams, notes, empty
 
 
 def _span(cameras: Sequence[CameraPeople]) -> tuple[int, int]:

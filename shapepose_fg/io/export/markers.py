@@ -128,7 +128,7 @@ def trc_text(markers: Markers, frames: Whole, times_s: Array, fps: float, name: 
     if len(rows) == 0:
         raise ValueError(f"{name}: no frame has a marker")
     frames, words = frames[rows], np.where(markers.there[..., None], np.char.mod("%.6f", markers.xyz), "NaN")[rows]
-    rate, count = f"{fps:.6g}", len(markers.names)
+    rate, count = f"{fps:.10g}", len(markers.names)
     lines = [
         f"PathFileType\t4\t(X/Y/Z)\t{name}",
         _TRC_HEAD,

@@ -92,7 +92,7 @@ def bvh_text(motion: Motion, fps: float) -> str:
     The pelvis' own offset is zero: some programs add it to the place of a frame, others do not.
     """
     count = len(motion.index)
-    lines = ["HIERARCHY", *_joint(0, motion.rest, ""), "MOTION", f"Frames: {count}", f"Frame Time: {1 / fps:.9f}"]
+    lines = ["HIERARCHY", *_joint(0, motion.rest, ""), "MOTION", f"Frames: {count}", f"Frame Time: {1 / fps:.12g}"]
     angles = _zxy_degrees(motion.rotations[:, _ORDER]).reshape(count, -1)
     # The rounding is a hundredth of a millimetre at the end of the longest chain.
     rows = np.concatenate([np.char.mod("%.6f", motion.pelvis), np.char.mod("%.5f", angles)], axis=1).tolist()

@@ -9,6 +9,8 @@ import shutil
 import subprocess
 import sysconfig
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -35,23 +37,26 @@ def new_stream() -> Any:
     return stream
 
 
-def open_viewer(stream: Any, take: Take, url: str | None) -> None:
-    """Send a recording to the viewer at `url`, or to one that is started; InputError where that fails."""
-    rr = optional("rerun", "view")
+@contextmanager
+def shown(take: Take, url: str | None) -> Iterator[Any]:
+    """A recording that the viewer at `url`, or one that is started, shows; InputError where that fails."""
+    stream, rr = new_stream(), optional("rerun", "view")
     try:
         if url is not None:
             stream.connect_grpc(url, default_blueprint=layout(take))
             stream.flush(timeout_sec=_CONNECT_S)
-            return
-        rr.spawn(
-            recording=stream,
-            default_blueprint=layout(take),
-            executable_path=viewer_file(),
-            hide_welcome_screen=True,  # it would ask the network for examples
-        )
+        else:
+            rr.spawn(
+                recording=stream,
+                default_blueprint=layout(take),
+                executable_path=viewer_file(),
+                hide_welcome_screen=True,  # it would ask the network for examples
+            )
     except (RuntimeError, ValueError, OSError) as error:
         place = "started" if url is None else f"reached at {url}"
         raise InputError(f"the rerun viewer cannot be {place}: {' '.join(str(error).split())}") from None
+    yield stream
+    stream.flush()
 
 
 def viewer_file() -> str | None:
@@ -67,19 +72,27 @@ def body_if_there(job: Job) -> tuple[SmplArrays | None, list[str]]:
         return None, [f"no bodies are drawn ({error})"]
 
 
-def write_rrd(job: Job) -> Written:
-    """`people.rrd`; without bodies where the body model is not there any more."""
-    stream, take, path = new_stream(), job.take, job.folder / "people.rrd"
-    arrays, notes = body_if_there(job)
-    notes += ["no cameras, for there is no cameras.json"] if take.rig is None else []
+@contextmanager
+def written(path: Path, take: Take) -> Iterator[Any]:
+    """A recording that is written to `path` when the block has filled it, whole or not at all."""
+    stream = new_stream()
     with tempfile.TemporaryDirectory() as folder:  # rerun writes to a path only
         draft = Path(folder) / "people.rrd"
         stream.save(draft, default_blueprint=layout(take))
-        log_take(stream, take, arrays)
+        yield stream
         stream.flush()
         stream.disconnect()
         with draft.open("rb") as source:
             write_atomically(path, lambda target: shutil.copyfileobj(source, target))
+
+
+def write_rrd(job: Job) -> Written:
+    """`people.rrd`; without bodies where the body model is not there any more."""
+    take, path = job.take, job.folder / "people.rrd"
+    arrays, notes = body_if_there(job)
+    notes += ["no cameras, for there is no cameras.json"] if take.rig is None else []
+    with written(path, take) as stream:
+        log_take(stream, take, arrays)
     return Written([path], [f"rrd: {note}" for note in notes])
 
 

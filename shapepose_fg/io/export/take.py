@@ -10,6 +10,7 @@ from rich.filesize import decimal
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Axis, Rig
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.frame_times import rate_of, typed_rate
 from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction
 from shapepose_fg.core.result_files import free_memory
 from shapepose_fg.core.run_summary import covered_frames
@@ -52,7 +53,7 @@ class Take:
     times_s: Array
     """(T,) when they were taken, seconds; rising."""
     fps: float
-    """Frames a second: one over the median step."""
+    """Frames a second (`rate_of`)."""
     up: Axis
     """Which axis of the world points up."""
     rig: Rig | None = None
@@ -101,7 +102,7 @@ class Take:
         steps = np.diff(times) / np.diff(frames)
         if len(steps) > 0 and not _SHORTEST_S <= np.median(steps) <= _LONGEST_S:
             raise ValueError(f"frames are {np.median(steps):g} s apart by time_s; give --fps")
-        rate = round(1 / float(np.median(steps)), 6) if len(steps) > 0 else fps or _fps_of(people)
+        rate = rate_of(times) if len(steps) > 0 else typed_rate(fps or _fps_of(people))
         return cls(people, persons.astype(np.int64), rows, frames, times, rate, up, rig)
 
     def column(self, name: str, person: int) -> NDArray[Any]:
@@ -162,7 +163,7 @@ def _seen(people: Reconstruction) -> Reconstruction:
 def _times(people: Reconstruction, frames: NDArray[np.int64], fps: float | None) -> Array:
     """When each frame was taken: frames without a row lie between those with one."""
     if fps is not None:
-        return frames / fps
+        return frames / typed_rate(fps)
     known, first = np.unique(people.frame, return_index=True)
     times = people.time_s[first]
     known, times = known[np.isfinite(times)], times[np.isfinite(times)]

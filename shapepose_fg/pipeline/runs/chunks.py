@@ -8,13 +8,13 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.detections import Input
 from shapepose_fg.core.frame_times import segments
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.storage.schema import Column, Table
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.windows import Engine, Span
 from shapepose_fg.tracking.following import BLOCK_S
-from shapepose_fg.tracking.worlds import Input
 
 WARM_S = 6.0
 """Before a chunk people are followed for so long: who is there is known after a second or two, and people who hide

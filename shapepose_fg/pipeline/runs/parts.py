@@ -8,19 +8,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.detections import Input
 from shapepose_fg.core.errors import naming
+from shapepose_fg.core.notes import Notes
 from shapepose_fg.core.observation_table import ObservationTable
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Reconstruction, Status
 from shapepose_fg.core.storage.kept_arrays import ANEW, KeptArrays
 from shapepose_fg.core.storage.schema import Column, columns_of
 from shapepose_fg.pipeline.runs.chunks import Border
-from shapepose_fg.pipeline.runs.notes import Notes
 from shapepose_fg.pipeline.windows import StreamState
 from shapepose_fg.tracking.following import FollowState
 from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.tracker import Tracks
-from shapepose_fg.tracking.worlds import Input
 
 _STATUS = np.array([*map(str, Status)])
 """A status is kept as its place in this list."""

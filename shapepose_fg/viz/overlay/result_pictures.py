@@ -27,7 +27,7 @@ class Wanted:
     videos: Sequence[str] | None = None
     """Where they are, as `find_footage` takes it; None for those that `detect` says it read."""
     detections: Path | None = None
-    """The folder where it says so; None for that beside the detections that the result was made from."""
+    """The folder where it says so; None for that beside the detections, of results that have no copy of it."""
     image_placement: Sequence[str] = ()
     """How those of another size than the calibration's came about, as `placements_of` takes it."""
 
@@ -79,27 +79,32 @@ def pictures_of(
     placements, concluded = placements_of(wanted.image_placement, sizes, rig)
     notes += concluded
     if len(unknown) > 0:
-        notes.append(f"frame 0 of the result is taken to be the first picture of {' '.join(unknown)}, and so on")
+        first = run.get("numbered_from")
+        picture = "the first picture" if first is None else f"picture {first}"
+        notes.append(
+            f"frame {first or 0} of the result is taken to be {picture} of {' '.join(unknown)}, and so on"
+        )
     for text in notes:
         tell(text)
     pairs = []
     for name, footage in opened.items():
-        index = used[name].places if name in used else _counted(footage)
+        index = used[name].places if name in used else _counted(footage, "numbered_from" in run)
         index = np.where(index < len(footage.number), index, -1)
         pairs.append((CameraFootage(name, footage.path, (placements | alike)[name], index), footage))
     return pairs
 
 
-def _counted(footage: Footage) -> Index:
-    """(T,) the picture of each frame, counted from the first picture's number; -1 where one is missing."""
-    count = int(footage.number[-1] - footage.number[0]) + 1
+def _counted(footage: Footage, numbered: bool) -> Index:
+    """(T,) the picture of each frame, -1 where one is missing: that of its number, or counted from the first."""
+    first = 0 if numbered else int(footage.number[0])
+    count = int(footage.number[-1]) - first + 1
     if count > _MOST_FRAMES:
         raise InputError(
             f"{footage.path}: pictures are numbered from {footage.number[0]} to {footage.number[-1]}; number them"
             " by the frames of the recording"
         )
     index = np.full(count, -1, dtype=np.intp)
-    index[footage.number - footage.number[0]] = np.arange(len(footage.number))
+    index[footage.number - first] = np.arange(len(footage.number))
     return index
 
 

@@ -61,7 +61,7 @@ def write_report(
             scene = scene_of(Take.of(people, up, rig=rig, fps=fps, identities=False), arrays, SCENE_BYTES)
         except ValueError as error:
             remarks.append(f"there is no scene: {error}")
-    title = folder.resolve().name or str(folder)
+    title = str(people.run.get("project") or folder.resolve().name or folder)
     text = page_text(title, people, list_tracks(people, arrays, every), scene, remarks)
     file = folder / REPORT
     # A name may hold half of a pair of surrogates, which no file can.

@@ -9,8 +9,24 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from shapepose_fg.estimation.window_solution import Problem
-from shapepose_fg.tracking.worlds import Input
+from shapepose_fg.core.detections import Input
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What went wrong with one joint of one person in one frame."""
+
+    row: int
+    """Row of the solution."""
+    track: int
+    """Who."""
+    frame: int
+    """When."""
+    joint: int
+    """Which joint, an index into the skeleton."""
+    reason: str
+    """What happened, in words."""
+
 
 _Count = Annotated[int, Field(ge=0, lt=2**53)]
 _Number = Annotated[float, Field(allow_inf_nan=False)]

@@ -8,7 +8,6 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Known, Status
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.window_solution import WindowSolution
-from shapepose_fg.pipeline.solved_windows import result_rows
 
 N, J, V = 4, 25, 5
 
@@ -43,10 +42,10 @@ def test_every_column_is_of_the_same_row(five_cameras, two_people):
         observations, joints, spread(J), rng.normal(size=(N, J, 3)), spread(J), rng.random((N, J)), inlier & seen,
         contradicts, rng.normal(size=(N, J, V, 2)), known, fit, status,
     )  # fmt: skip
-    place, person = rng.integers(0, 9, (N, J, V)), np.array([0, 1, 0, 1])
-    rows = result_rows(solution, place, five_cameras, BODY_25.joints, person)
+    place = rng.integers(0, 9, (N, J, V))
+    rows = solution.result(place, five_cameras, BODY_25.joints)
 
-    assert rows.frame.tolist() == [7, 7, 8, 8] and rows.person.tolist() == [0, 1, 0, 1]
+    assert rows.frame.tolist() == [7, 7, 8, 8] and rows.person.tolist() == [5, 6, 5, 6]
     np.testing.assert_allclose(rows.time_s, [0.72, 0.72, 0.82, 0.82])
     for name in ("joints", "covariance", "velocity", "velocity_covariance", "known", "confidence", "status"):
         np.testing.assert_array_equal(getattr(rows, name), getattr(solution, name), err_msg=name)

@@ -1,0 +1,115 @@
+"""All steps from frames to rows, made of the settings: what every process that takes part needs."""
+
+from collections import Counter
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from shapepose_fg.body.fitting.fitter import BodyFitter
+from shapepose_fg.body.fitting.priors import longest_bones
+from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.notes import Notebook, Notes
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.estimation.estimator_config import EstimatorConfig
+from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.window_graph import ExtraFactors
+from shapepose_fg.pipeline.config import PipelineConfig
+from shapepose_fg.pipeline.runs.parts import Part
+from shapepose_fg.pipeline.solve_window import Assigning, solve_window
+from shapepose_fg.pipeline.windows import Engine, Span
+from shapepose_fg.proposal.stage_one import StageOne
+from shapepose_fg.tracking.tracker import BodyScale, Tracker
+
+FAST_M_S = 3.0
+"""The tracker predicts joints as if they moved so fast: a hand that is thrown up or strikes."""
+UNSEEN_S = 0.3
+"""Over such gaps it must."""
+_ON_TRIAL = 0.5
+"""Share of the probability asked for otherwise that is enough in frames that stand alone: a body will tell."""
+_FALSE_POSITIVE = "next to no detections of their own, or in somebody else's place"
+"""Why people are dropped when detections are reassociated."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What all processes share: plain data, but for factors of the user's own."""
+
+    rig: Rig
+    """The cameras."""
+    skeleton: Skeleton
+    """The detector's joints."""
+    config: PipelineConfig
+    """The settings."""
+    fitter: BodyFitter
+    """Fits bodies."""
+    extra_factors: ExtraFactors | None = None
+    """The user's own factors."""
+    estimator: EstimatorConfig = field(init=False)
+    """The settings of stage II. The model of motion is in it and goes along: other processes need not know its
+    name."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "estimator", replace(self.config.estimator, joints=self.skeleton.joints))
+
+    def solve(self, span: Span) -> Part:
+        """One window, in whatever process: the rows of its own frames, by frame and person, and notes on them."""
+        given = [frame for frame, _ in span.decided]
+        rows = Observations.concatenate([part for _, part in span.decided])
+        windows = self.config.windows
+        rounds = windows.again_alone if span.alone else windows.again_over_time
+        solution = solve_window(
+            rows,
+            Views.of(self.rig),
+            self.fitter,
+            self.estimator,
+            assigning=Assigning(given, self.skeleton, rounds, over_time=not span.alone),
+            extra_factors=self.extra_factors,
+        )
+        own = {frame.frame: frame.detections for frame in given[span.start : span.stop]}
+        found = solution.observations
+        left = Counter(rows.frame.tolist()) - Counter(found.frame.tolist())
+        by_person = np.lexsort((found.track, found.frame))
+        solution = solution.rows(by_person[np.isin(found.frame[by_person], list(own))])
+        rows = solution.observations
+        if not self.config.temporal:  # a person is a number within the frame
+            number = np.arange(len(rows)) - np.searchsorted(rows.frame, rows.frame)
+            problems = tuple(replace(each, track=int(number[each.row])) for each in solution.problems)
+            solution = replace(solution, observations=replace(rows, track=number), problems=problems)
+        place = np.full(rows.candidate.shape, -1, dtype=np.int32)
+        for frame in np.unique(rows.frame).tolist():
+            of_frame = rows.frame == frame
+            place[of_frame] = np.append(own[frame].place, -1)[rows.candidate[of_frame]]
+        notes = Notes(len(own), Counter(solution.seconds), problems=list(solution.problems))
+        if dropped := sorted(frame for frame in left.elements() if frame in own):
+            notes.dropped[_FALSE_POSITIVE] = dropped
+        said = np.isfinite(rows.evidence)
+        if self.config.temporal:
+            for track in np.unique(rows.track[said]).tolist():
+                evidence = rows.evidence[said & (rows.track == track)]
+                notes.evidence[track] = [float(evidence.sum()), len(evidence)]
+        else:
+            notes.probable = Counter(f"{tenth / 10:.1f}" for tenth in np.floor(10 * rows.evidence[said]))
+        return Part(solution.result(place, self.rig, self.skeleton.joints), notes)
+
+    def engine(self, book: Notebook) -> Engine:
+        """Follows people; what it has to say goes into `book`."""
+        config, skeleton, tracking = self.config, self.skeleton, self.config.tracking
+        sure = StageOne(skeleton, config.candidates, config.proposals, book)
+        # What evidence leaves over may be people whose hips two views saw: whether they are, time tells.
+        hips = replace(sure.by_hips(), candidates=replace(sure.candidates, min_votes=1))
+        if sure.proposals.evidence and not config.temporal:
+            # In frames that stand alone evidence decides, when the detections are reassociated.
+            likely = replace(sure.proposals, min_probability=_ON_TRIAL * sure.proposals.min_probability)
+            sure, tracking = replace(sure, proposals=likely), replace(tracking, min_new_joints=3)
+        law = self.estimator.law
+        motion = MotionModel.load(skeleton.joints, config.motion, law)
+        scale = BodyScale(longest_bones(skeleton), motion.density(np.full(len(skeleton), FAST_M_S), UNSEEN_S), law)
+        find = (sure, hips) if config.temporal else (sure,)
+        return Engine(Tracker(skeleton, scale, find, tracking, config.observations, drop=book.drop_in), config)
+
+
+def find_people(detections: Detections, rig: Rig, skeleton: Skeleton, config: PipelineConfig) -> Observations:
+    """Stage I, one frame: the people's 2D observations and where their joints are to begin with."""
+    return StageOne(skeleton, config.candidates, config.proposals, Notebook())(detections, rig)

@@ -1,0 +1,72 @@
+"""Stage I: the people of one frame, by evidence or by their hips."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from shapepose_fg.body.fitting.priors import longest_bones
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.notes import Notebook
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.proposal.association import associate
+from shapepose_fg.proposal.candidates import CandidateConfig, PairPoints, triangulate_pairs, vote
+from shapepose_fg.proposal.people_2d import without_repeats
+from shapepose_fg.proposal.possible_people import Frame
+from shapepose_fg.proposal.proposals import ProposalConfig, propose
+from shapepose_fg.proposal.selection import choose
+from shapepose_fg.proposal.thinning import thinned_candidates, thinned_points
+
+
+@dataclass(frozen=True)
+class StageOne:
+    """How people are found in one frame: their 2D observations, and where their joints are to begin with."""
+
+    skeleton: Skeleton
+    """The detector's joints."""
+    candidates: CandidateConfig
+    """Pairs of views to 3D joint candidates."""
+    proposals: ProposalConfig
+    """Candidates to people, and people to their 2D observations."""
+    book: Notebook
+    """Where it takes notes."""
+
+    def by_hips(self) -> "StageOne":
+        """The same with people sought by their hips, as in the paper, and not judged by evidence."""
+        return replace(self, proposals=replace(self.proposals, evidence=False))
+
+    def __call__(self, detections: Detections, rig: Rig) -> Observations:
+        """The people of a frame."""
+        if not self.proposals.evidence:
+            return self._by_hips(detections, rig)
+        once, index = without_repeats(detections)
+        points = self._points(once, rig)
+        with self.book.stage("propose"):
+            frame = Frame(once, rig, self.skeleton, longest_bones(self.skeleton))
+            people, _ = choose(points, frame, self.proposals.min_probability)
+        chosen = np.where(people.chosen >= 0, np.append(index, -1)[people.chosen], -1)
+        return Observations.of(chosen, detections, people.places)
+
+    def _points(self, detections: Detections, rig: Rig) -> PairPoints:
+        """Pairs of detections, triangulated; not too many."""
+        with self.book.stage("triangulate"):
+            every = triangulate_pairs(detections, rig, self.candidates)
+            points = thinned_points(every, self.candidates)
+            self.book.thin("points", len(points.xyz) < len(every.xyz))
+        return points
+
+    def _by_hips(self, detections: Detections, rig: Rig) -> Observations:
+        """As the paper has it: votes, hips that anchor people, and joints linked to them."""
+        points, skeleton, book = self._points(detections, rig), self.skeleton, self.book
+        with book.stage("vote"):
+            every = vote(points, detections, len(rig), self.candidates)
+            candidates = thinned_candidates(every, detections, self.candidates)
+            book.thin("candidates", len(candidates) < len(every))
+        with book.stage("propose"):
+            proposals = propose(candidates, detections, skeleton, rig.up_vector, self.proposals)
+        with book.stage("associate"):
+            observations, phantoms = associate(proposals, candidates, detections, rig, skeleton, self.proposals)
+        for reason, count in (*proposals.dropped.items(), ("hardly any joint seen by two views", phantoms)):
+            book.drop(reason, count)
+        return observations
