@@ -26,9 +26,11 @@ from shapepose_fg.io.config import read_config, toml_text
 from shapepose_fg.io.corrections import correct, read_corrections, take_back
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.io.export.markers import Markers, opensim_names, trc_text
+from shapepose_fg.io.export.registry import FORMATS
 from shapepose_fg.io.footage.placement import read_used_footage
 from shapepose_fg.io.pose2sim_project import read_pose2sim_project
 from shapepose_fg.io.skeleton_file import read_skeleton
+from shapepose_fg.io.solved_setup import setup_of
 from shapepose_fg.io.timestamps import read_timestamps
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.tracking.edits import Action, Edit
@@ -36,13 +38,12 @@ from shapepose_fg.tracking.listing import list_saved_tracks
 from shapepose_fg.viz.report.writing import report_of
 from tests.core import test_reconstruction as results
 from tests.hostile import runs
+from tests.hostile.runs import Prepare
 from tests.io import test_calibration_formats as rigs
 from tests.io import test_people_formats as people
 
 Read = Callable[[], object]
 """Reads the files; raises InputError, or returns."""
-Prepare = Callable[[Path, int], Read]
-"""Writes valid files into a folder, other ones for another seed, and returns what reads them."""
 
 
 def _calibration(program: str) -> Prepare:
@@ -201,6 +202,11 @@ def _listed(folder: Path) -> None:
         list_saved_tracks(opened, read_body())
 
 
+def _settings_of(folder: Path) -> None:
+    with Reconstruction.open(folder) as opened:
+        setup_of(opened, read_rig(folder / "cameras.json"), PipelineConfig)
+
+
 def _merged(folder: Path) -> None:
     with Reconstruction.open(folder) as opened:
         one, other = (np.unique(opened.person).tolist() * 2)[:2]
@@ -217,8 +223,7 @@ def _observations(folder: Path, seed: int) -> Read:
 
 
 def _shapes(folder: Path, seed: int) -> Read:
-    betas, information = np.random.default_rng(seed).normal(size=(2, 10)), np.tile(np.eye(10), (2, 1, 1))
-    SubjectShapes(np.array(["a", "b"]), betas, information, "body").save(folder / "shapes.npz")
+    runs.shapes(seed).save(folder / "shapes.npz")
     _unpack(folder / "shapes.npz")
     return lambda: SubjectShapes.load(folder / "shapes.npz", "body")
 
@@ -321,14 +326,19 @@ READERS: dict[str, Prepare] = {
     "offsets": _offsets,
     "motion": _motion,
     "result": _result,
-    "result for export": runs.finished(runs.exported),
+    **{f"result as {name}": runs.finished(runs.exported(name)) for name in FORMATS},
     "result for its report": runs.finished(report_of),
     "result for its tracks": runs.finished(_listed),
     "result for corrections": runs.finished(_merged),
-    "run on its way": runs.unfinished(6, sealed=False),
-    "run before its end": runs.unfinished(99, sealed=False),
-    "run on its way, with digests": runs.unfinished(6, sealed=True),
-    "run before its end, with digests": runs.unfinished(99, sealed=True),
+    "result and its settings": runs.finished(_settings_of),
+    "run on its way": runs.unfinished(2, sealed=False),
+    "run in chunks": runs.unfinished(2, sealed=False, chunk_frames=6),
+    "run before its end": runs.unfinished(99, sealed=False, bodies=True),
+    "run on its way, with digests": runs.unfinished(2, sealed=True),
+    "run in chunks, with digests": runs.unfinished(2, sealed=True, chunk_frames=6),
+    "run before its end, with digests": runs.unfinished(99, sealed=True, bodies=True),
+    "run with known people": runs.known_people,
+    "detections of a run": runs.detections_kept,
     "observations": _observations,
     "shapes": _shapes,
     "body": _body(False),
