@@ -76,6 +76,8 @@ def fuzz(name: str, given: argparse.Namespace, left: float) -> tuple[int, int]:
             if not given.held_out:
                 _keep(name, broken)
         said = ended.stdout + ended.stderr
+        if ended.returncode != 0 and len(broken) == 0:
+            sys.exit(f"{said}{name}: the reader did not begin")
         if ended.returncode != 0:
             print("\n".join(said[max(said.find("=== Uncaught Python exception"), 0) :].splitlines()[-60:]))
         print(f"{name}: {cases} cases, {faults} faults{ended.stdout.rpartition('#')[2].rstrip()}", flush=True)

@@ -33,23 +33,7 @@ WORDS = [
     "<!DOCTYPE a>",
 ]
 VALUES = [0, 1, -1, 3, 0.5, -0.5, 1e-320, 1e9, 1e200, -1e308, 2**31, 2**62, 10**19, float("nan"), float("inf")]
-VALUES += [
-    "",
-    "a",
-    "../../x",
-    "a\0b",
-    "\ud800",
-    "\x1b[31m",
-    "=1+1",
-    True,
-    False,
-    None,
-    [],
-    {},
-    [[]],
-    [0],
-    {"a": 1},
-]
+VALUES += ["", "a", "../../x", "a\0b", "\ud800", "\x1b[31m", "=1+1", True, False, None, [], {}, [[]], {"a": 1}]
 _LARGEST = 2**18
 """Bytes of what comes out: readers are to be tried, not the disk."""
 _TEXT = re.compile(rb"[\t\n\r -~]{64}")
