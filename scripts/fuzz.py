@@ -7,7 +7,7 @@ tests/hostile/data/fuzz, where tests/hostile/test_every_reader.py tries it again
 
 With `--cases` each reader gets so many, the same ones each time. With `--seconds` they are guided by which lines
 of this project they reach (atheris, libFuzzer: pip install ".[fuzz]"). `--held-out` starts from other files and
-random numbers, which nothing was mended by, and keeps nothing.
+random numbers, which nothing was mended by, and keeps nothing. `--kills 50` kills `reconstruct` so often instead.
 """
 
 import argparse
@@ -36,6 +36,7 @@ def main() -> None:
     parser.add_argument("reader", nargs="*", help="which readers; all by default")
     parser.add_argument("--seconds", type=int, default=600, help="for all readers together")
     parser.add_argument("--cases", type=int, default=0, help="for each reader")
+    parser.add_argument("--kills", type=int, default=0, help="of reconstruct, every second one with a bit turned")
     parser.add_argument("--held-out", action="store_true", help="other files and random numbers")
     parser.add_argument("--worker", help=argparse.SUPPRESS)
     parser.add_argument("--begin", type=int, default=0, help=argparse.SUPPRESS)
@@ -45,6 +46,9 @@ def main() -> None:
     if given.worker is not None:
         (count if given.cases else guide)(given.worker, given)
         return
+    if given.kills:
+        kill(given.kills, HELD_OUT if given.held_out else 0)
+        return
     names = given.reader or list(importlib.import_module("tests.hostile.readers").READERS)
     cases = faults = 0
     for name in names:
@@ -52,6 +56,14 @@ def main() -> None:
         cases, faults = cases + ran, faults + failed
     print(f"all: {cases} cases, {faults} faults")
     sys.exit(1 if faults else 0)
+
+
+def kill(times: int, first: int) -> None:
+    """Kill `reconstruct` or a worker so many times: it ends with the same bytes, or says one sentence."""
+    with tempfile.TemporaryDirectory() as folder:
+        killing = importlib.import_module("tests.hostile.kills").Killing.of(Path(folder))
+        for number in range(first, first + times):
+            print(f"{number}: {killing.once(number, Path(folder) / str(number))}", flush=True)
 
 
 def fuzz(name: str, given: argparse.Namespace, left: float) -> tuple[int, int]:

@@ -337,6 +337,7 @@ READERS: dict[str, Prepare] = {
     "run on its way, with digests": runs.unfinished(2, sealed=True),
     "run in chunks, with digests": runs.unfinished(2, sealed=True, chunk_frames=6),
     "run before its end, with digests": runs.unfinished(99, sealed=True, bodies=True),
+    "run before its bodies, with digests": runs.unfinished(4, sealed=True, bodies=True),
     "run with known people": runs.known_people,
     "detections of a run": runs.detections_kept,
     "observations": _observations,
