@@ -14,18 +14,14 @@ import argparse
 import importlib
 import os
 import re
-import resource
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
-from random import Random
-from typing import Any
 
 ROOT = Path(__file__).parents[1]
 FOUND = ROOT / "tests" / "hostile" / "data" / "fuzz"
-CASE_MB = 1024
 HELD_OUT = 1_000_000
 """What other random numbers begin with."""
 
@@ -44,7 +40,7 @@ def main() -> None:
     # The project first: of an editable install `factors` would be the folder of tests.
     sys.path.insert(0, str(ROOT))
     if given.worker is not None:
-        (count if given.cases else guide)(given.worker, given)
+        work(given)
         return
     if given.kills:
         kill(given.kills, HELD_OUT if given.held_out else 0)
@@ -105,58 +101,20 @@ def _keep(name: str, broken: list[Path]) -> None:
             (place / f"{content[0]}-{file.rsplit('-', 1)[1][:8]}").write_bytes(content[1:])
 
 
-def count(name: str, given: argparse.Namespace) -> None:
-    """So many cases of one reader in this process, and what came of them."""
-    trying, readers = (importlib.import_module(f"tests.hostile.{each}") for each in ("trying", "readers"))
+def work(given: argparse.Namespace) -> None:
+    """Cases of one reader in this process."""
+    trying = importlib.import_module("tests.hostile.trying")
     Path("files").mkdir()
     tempfile.tempdir = str(Path.cwd())
-    trial = trying.Trial(readers.READERS[name], Path("files").resolve(), int(given.held_out))
-    seed = f"{name} {HELD_OUT if given.held_out else 0}"
-    tally = trying.tried(trial, seed, range(given.begin, given.cases), Path.cwd(), CASE_MB)
+    first = HELD_OUT if given.held_out else 0
+    if not given.cases:
+        trying.guided(given.worker, first + given.begin, given.seconds)
+        return
+    trial = trying.Trial(trying.reader(given.worker), Path("files").resolve(), int(given.held_out))
+    tally = trying.tried(trial, f"{given.worker} {first}", range(given.begin, given.cases))
     print(f"#{sum(tally.cases.values())}", file=sys.stderr)
-    files = ", ".join(f"{file} {number}" for file, number in sorted(tally.cases.items()))
-    slowest, of = tally.slowest
-    print(f"#, {tally.refused} refused; slowest {slowest} s, {of}; {files}")
+    print(f"#{tally}")
     sys.exit(1 if tally.faults else 0)
-
-
-def guide(name: str, given: argparse.Namespace) -> None:
-    """One reader in this process, until it breaks or the time is up."""
-    try:
-        atheris: Any = importlib.import_module("atheris")
-    except ImportError:
-        sys.exit('error: the fuzzer needs atheris; pip install -e ".[fuzz]"')
-    with atheris.instrument_imports(include=["shapepose_fg"]):
-        readers = importlib.import_module("tests.hostile.readers").READERS
-    trying, mutations = (importlib.import_module(f"tests.hostile.{each}") for each in ("trying", "mutations"))
-    for each in ("files", "corpus"):
-        Path(each).mkdir()
-    seed = given.begin + (HELD_OUT if given.held_out else 1)
-    trial = trying.Trial(readers[name], Path("files").resolve(), seed)
-    for index, content in enumerate(trial.valid[:64]):
-        Path("corpus", str(index)).write_bytes(bytes([index]) + content)
-
-    def case(data: bytes) -> None:
-        """The first byte says which file, the others are its content."""
-        if len(data) > 0:
-            trial.run(data[0] % len(trial.files), data[1:])
-
-    def change(data: bytes, most: int, number: int) -> bytes:
-        """Mostly by what the file is, now and then by libFuzzer's own changes."""
-        rng = Random(number)
-        if rng.random() < 0.2:
-            return atheris.Mutate(data, most)
-        index = data[0] % len(trial.files) if data else 0
-        content = data[1:] if rng.random() < 0.7 and len(data) > 1 else trial.valid[index]
-        return (bytes([index]) + mutations.mutated(content, rng))[:most]
-
-    case(bytes([0]) + trial.valid[0])  # what is loaded once is loaded now
-    used_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
-    largest = max(map(len, trial.valid)) + 20_000
-    options = [f"-max_total_time={given.seconds}", f"-timeout={trying.CASE_S}", f"-seed={seed}"]
-    options += [f"-rss_limit_mb={used_mb + CASE_MB}", f"-malloc_limit_mb={CASE_MB}", f"-max_len={largest}"]
-    atheris.Setup([sys.argv[0], *options, "-print_final_stats=1", "corpus"], case, custom_mutator=change)
-    atheris.Fuzz()
 
 
 if __name__ == "__main__":

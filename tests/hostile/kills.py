@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,10 +36,8 @@ class Killing:
     """What reconstructs it, but for the folder."""
     people: bytes
     """people.npz."""
-    begins_s: float
-    """When the run began to keep something."""
-    ends_s: float
-    """And when it was done."""
+    kept: int
+    """How many windows and bodies it keeps on its way."""
 
     @classmethod
     def of(cls, folder: Path, seed: int = 0) -> "Killing":
@@ -49,32 +48,26 @@ class Killing:
         command = ["reconstruct", "--calibration", str(files["cameras"]), "--detections", str(files["detections"])]
         command += ["--config", str(folder / "settings.toml"), "--fps", "30", "--workers", "2"]
         command += ["--no-report", "--no-check"]
-        began, start = 0.0, time.monotonic()
         process = _begun([*command, "--output", str(folder / "whole")])
-        while process.poll() is None:
-            if began == 0 and (folder / "whole" / "parts" / "manifest.json").exists():
-                began = time.monotonic() - start
-            time.sleep(0.01)
-        said, ends_s = process.communicate(), time.monotonic() - start
-        if process.returncode != 0:
-            raise AssertionError(f"{process.returncode}: {said}")
-        return cls(command, (folder / "whole" / "people.npz").read_bytes(), began, ends_s)
+        kept = max(_kept_so_far(process, folder / "whole"))
+        if (said := _ended(process)) != "":
+            raise AssertionError(said)
+        return cls(command, (folder / "whole" / "people.npz").read_bytes(), kept)
 
     def once(self, number: int, out: Path) -> str:
         """Kill a run into `out` and go on with it: what came of it. AssertionError for what may not."""
         rng = random.Random(number)
         process = _begun([*self.command, "--output", str(out)])
-        at_s = rng.uniform(0.9 * self.begins_s, self.ends_s)
-        try:
-            process.wait(at_s)
-        except subprocess.TimeoutExpired:
-            victims = _descendants(process.pid) if number % 4 < 2 else []
-            if len(victims) > 0:
-                os.kill(rng.choice(victims), signal.SIGKILL)
-            else:
-                os.killpg(process.pid, signal.SIGKILL)
-        else:
-            victims = []
+        least = rng.randint(-1, self.kept)
+        for kept in _kept_so_far(process, out):
+            if kept >= least:
+                break
+        time.sleep(rng.uniform(0, 1 if least < 0 else 0.3))
+        victims = _descendants(process.pid) if number % 4 < 2 else []
+        if len(victims) > 0:
+            os.kill(rng.choice(victims), signal.SIGKILL)
+        elif process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
         first = _ended(process)
         done = (out / "people.npz").exists() and not (out / "parts").exists()
         flipped = "nothing"
@@ -89,12 +82,20 @@ class Killing:
         second = "" if done else _ended(_begun([*self.command, "--output", str(out), "--resume"]))
         if second.startswith("error:"):
             if flipped == "nothing":
-                raise AssertionError(f"kill {number}, at {at_s:.1f} s: it did not go on: {second}")
+                raise AssertionError(f"kill {number}: it did not go on: {second}")
         elif (out / "people.npz").read_bytes() != self.people:
-            raise AssertionError(f"kill {number}, at {at_s:.1f} s, {flipped} flipped: other bytes than without it")
-        killed = "a worker" if len(victims) > 0 else "all"
+            raise AssertionError(f"kill {number}, {flipped} flipped: other bytes than without it")
+        killed = f"{'a worker' if len(victims) > 0 else 'all'} killed behind {least} of {self.kept} sets"
         left = "a finished result" if done else first or "nothing said"
-        return f"{killed} killed at {at_s:.1f} s, {left}; flipped {flipped}; {second or 'the same bytes'}"
+        return f"{killed}: {left}; flipped {flipped}; {second or 'the same bytes'}"
+
+
+def _kept_so_far(process: subprocess.Popen[str], out: Path) -> Iterator[int]:
+    """How many windows and bodies a run has kept, again and again until it ends; -1 before its first file."""
+    while process.poll() is None:
+        names = {file.name for file in (out / "parts").glob("*")}
+        yield sum(name.startswith(("part-", "bodies-")) for name in names) if names else -1
+        time.sleep(0.01)
 
 
 def _begun(words: list[str]) -> subprocess.Popen[str]:

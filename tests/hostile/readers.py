@@ -38,7 +38,7 @@ from shapepose_fg.tracking.listing import list_saved_tracks
 from shapepose_fg.viz.report.writing import report_of
 from tests.core import test_reconstruction as results
 from tests.hostile import runs
-from tests.hostile.runs import Prepare
+from tests.hostile.trying import Prepare
 from tests.io import test_calibration_formats as rigs
 from tests.io import test_people_formats as people
 

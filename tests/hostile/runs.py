@@ -34,7 +34,7 @@ from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.tracking import following
 from shapepose_fg.tracking.following import FollowingConfig
 from tests.estimation.test_windows import NobodyFitter
-from tests.hostile.trying import only_in
+from tests.hostile.trying import Prepare, only_in
 from tests.io import test_people_formats as people
 
 CONFIG = PipelineConfig(
@@ -46,8 +46,6 @@ CONFIG = PipelineConfig(
 """Windows of so few frames that a run of a second has several."""
 BEGUN = {"frames": [0, 24], "inputs": {}}
 """What the manifest says."""
-Prepare = Callable[[Path, int], Callable[[], object]]
-"""Writes valid files into a folder, other ones for another seed, and returns what reads them."""
 
 
 class Ended(BaseException):

@@ -1,6 +1,7 @@
 """A reader on changed files: what may come of it, and what is a fault."""
 
 import faulthandler
+import importlib
 import os
 import random
 import resource
@@ -18,8 +19,8 @@ from typing import Any
 from shapepose_fg.core.errors import InputError
 from tests.hostile.mutations import mutated
 
-CASE_S = 20
-"""So long a case may take."""
+CASE_S, CASE_MB = 20, 1024
+"""So long a case may take, and so much more memory than was in use before."""
 
 _WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
 _CHANGES = {
@@ -37,10 +38,14 @@ _outside: list[str] = []
 """What was to be changed elsewhere."""
 
 
+Prepare = Callable[[Path, int], Callable[[], object]]
+"""Writes valid files into a folder, other ones for another seed, and returns what reads them."""
+
+
 class Trial:
     """A reader with valid files in a folder, of which one at a time is changed."""
 
-    def __init__(self, prepare: Callable[[Path, int], Callable[[], object]], folder: Path, seed: int) -> None:
+    def __init__(self, prepare: Prepare, folder: Path, seed: int) -> None:
         """`prepare` writes the files there, other ones for another `seed`, and gives the reader."""
         self.folder, self.read = folder, prepare(folder, seed)
         self.files = sorted(path for path in folder.rglob("*") if path.is_file())
@@ -117,12 +122,16 @@ class Tally:
     slowest: tuple[float, str] = (0.0, "")
     """Seconds that the slowest took, and of which file."""
 
+    def __str__(self) -> str:
+        files = ", ".join(f"{file} {count}" for file, count in sorted(self.cases.items()))
+        return f", {self.refused} refused; slowest {self.slowest[0]} s, {self.slowest[1]}; {files}"
 
-def tried(trial: Trial, seed: str, numbers: range, keep: Path, most_mb: int = 1024) -> Tally:
+
+def tried(trial: Trial, seed: str, numbers: range) -> Tally:
     """What comes of changed files, each by its number.
 
-    Files that break the reader, one of each place in the code, are left in the folder `keep`. A case that hangs
-    ends this process, and one that takes over `most_mb` of memory is a fault.
+    What breaks the reader, one of each place in the code, is left in the working folder. A case that hangs ends
+    this process, and one that takes over `CASE_MB` is a fault.
     """
     tally, names = Tally(), [str(file.relative_to(trial.folder)) for file in trial.files]
     trial.run(0, trial.valid[0])  # what is loaded once is loaded now
@@ -130,12 +139,12 @@ def tried(trial: Trial, seed: str, numbers: range, keep: Path, most_mb: int = 10
         rng = random.Random(f"{seed} {number}")
         which = rng.randrange(len(names))
         content, start, used_mb = mutated(trial.valid[which], rng), time.perf_counter(), _used_mb()
-        case = keep / f"crash-{number:08x}"
+        case = Path(f"crash-{number:08x}")
         case.write_bytes(bytes([which]) + content)
         faulthandler.dump_traceback_later(CASE_S, exit=True)
         try:
             tally.refused += trial.run(which, content)
-            if _used_mb() > used_mb + most_mb:
+            if _used_mb() > used_mb + CASE_MB:
                 raise AssertionError(f"took {_used_mb() - used_mb} MiB of memory")
             case.unlink()
         except Exception as error:
@@ -153,6 +162,46 @@ def tried(trial: Trial, seed: str, numbers: range, keep: Path, most_mb: int = 10
         tally.cases[names[which]] += 1
         tally.slowest = max(tally.slowest, (round(time.perf_counter() - start, 2), names[which]))
     return tally
+
+
+def reader(name: str) -> Prepare:
+    """That of `readers.READERS`, which is only loaded now."""
+    return importlib.import_module("tests.hostile.readers").READERS[name]
+
+
+def guided(name: str, seed: int, seconds: int) -> None:
+    """Try files changed for a reader, guided by which lines they reach, until one breaks or the time is up."""
+    try:
+        atheris: Any = importlib.import_module("atheris")
+    except ImportError:
+        sys.exit('error: to be guided needs atheris; pip install -e ".[fuzz]", or give --cases')
+    with atheris.instrument_imports(include=["shapepose_fg"]):
+        prepare = reader(name)
+    trial, corpus = Trial(prepare, Path("files").resolve(), seed), Path("corpus")
+    corpus.mkdir()
+    for index, content in enumerate(trial.valid[:64]):
+        (corpus / str(index)).write_bytes(bytes([index]) + content)
+
+    def case(data: bytes) -> None:
+        """The first byte says which file, the others are its content."""
+        if len(data) > 0:
+            trial.run(data[0] % len(trial.files), data[1:])
+
+    def change(data: bytes, most: int, number: int) -> bytes:
+        """Mostly by what the file is, now and then by libFuzzer's own changes."""
+        rng = random.Random(number)
+        if rng.random() < 0.2:
+            return atheris.Mutate(data, most)
+        index = data[0] % len(trial.files) if data else 0
+        content = data[1:] if rng.random() < 0.7 and len(data) > 1 else trial.valid[index]
+        return (bytes([index]) + mutated(content, rng))[:most]
+
+    case(bytes([0]) + trial.valid[0])  # what is loaded once is loaded now
+    options = [f"-max_total_time={seconds}", f"-timeout={CASE_S}", f"-seed={seed + 1}", "-print_final_stats=1"]
+    options += [f"-rss_limit_mb={_used_mb() + CASE_MB}", f"-malloc_limit_mb={CASE_MB}"]
+    options += [f"-max_len={max(map(len, trial.valid)) + 20_000}", str(corpus)]
+    atheris.Setup([sys.argv[0], *options], case, custom_mutator=change)
+    atheris.Fuzz()
 
 
 def _used_mb() -> int:

@@ -171,17 +171,11 @@ _ROWS = {
     "evidence": Column("N", most=1e6),
 }
 """Of a row that waits to be solved; the rest is what the cameras gave."""
-_FOLLOWED = {
-    **{
-        "at": _NUMBERS("2"),
-        "state.numbers": _NUMBERS("2"),
-        "state.rows": _NUMBERS("D"),
-        "state.ids": _NUMBERS("A"),
-    },
-    **{"state.mean": Column("A J S", most=1e6), "state.covariance": Column("A J S S", most=1e12)},
-    **{f"rows.{name}": column for name, column in _ROWS.items()},
-    **{f"border.{name}": column for name, column in columns_of(Border).items()},
-}
+_FOLLOWED = {"at": _NUMBERS("2"), "state.numbers": _NUMBERS("2"), "state.rows": _NUMBERS("D")}
+_FOLLOWED |= {"state.ids": _NUMBERS("A"), "state.mean": Column("A J S", most=1e6)}
+_FOLLOWED |= {"state.covariance": Column("A J S S", most=1e12)}
+_FOLLOWED |= {f"rows.{name}": column for name, column in _ROWS.items()}
+_FOLLOWED |= {f"border.{name}": column for name, column in columns_of(Border).items()}
 """What `checkpoint_arrays` gives."""
 
 
