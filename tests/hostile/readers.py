@@ -5,6 +5,7 @@ import pickle
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -307,6 +308,12 @@ def _people_trc(folder: Path, seed: int) -> Read:
     return lambda: read_people(folder)
 
 
+PARTS: dict[str, tuple[int, dict[str, Any]]] = {
+    "parts on the way": (2, {}),
+    "parts in chunks": (2, {"chunk_frames": 6}),
+    "parts before the end": (99, {"bodies": True}),
+}
+"""Where a run was stopped: behind so many writes."""
 READERS: dict[str, Prepare] = {
     **{f"cameras of {program}": _calibration(program) for program in rigs.WRITERS},
     **{f"detections of {program}": _people(program) for program in people.WRITERS},
@@ -331,13 +338,15 @@ READERS: dict[str, Prepare] = {
     "result for its tracks": runs.finished(_listed),
     "result for corrections": runs.finished(_merged),
     "result and its settings": runs.finished(_settings_of),
-    "run on its way": runs.unfinished(2, sealed=False),
-    "run in chunks": runs.unfinished(2, sealed=False, chunk_frames=6),
-    "run before its end": runs.unfinished(99, sealed=False, bodies=True),
-    "run on its way, with digests": runs.unfinished(2, sealed=True),
-    "run in chunks, with digests": runs.unfinished(2, sealed=True, chunk_frames=6),
-    "run before its end, with digests": runs.unfinished(99, sealed=True, bodies=True),
-    "run before its bodies, with digests": runs.unfinished(4, sealed=True, bodies=True),
+    **{
+        f"{what}, {'with digests' if sealed else 'as they are'}": runs.parts_of(writes, sealed=sealed, **options)
+        for what, (writes, options) in PARTS.items()
+        for sealed in (False, True)
+    },
+    "run on its way": runs.unfinished(2),
+    "run in chunks": runs.unfinished(2, chunk_frames=6),
+    "run before its bodies": runs.unfinished(4, bodies=True),
+    "run before its end": runs.unfinished(99, bodies=True),
     "run with known people": runs.known_people,
     "detections of a run": runs.detections_kept,
     "observations": _observations,

@@ -15,6 +15,7 @@ from safetensors import SafetensorError, safe_open
 from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.core.notes import Notebook
 from shapepose_fg.core.reconstruction import Reconstruction, Status
 from shapepose_fg.core.shapes import SubjectShapes
 from shapepose_fg.core.skeleton import COCO_17
@@ -24,12 +25,19 @@ from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.io.export.registry import FORMATS, export_result
+from shapepose_fg.pipeline.bodies_over_time import fit_everybody
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.execution import Execution
+from shapepose_fg.pipeline.offsets import kept_offsets
 from shapepose_fg.pipeline.pipeline import Task, reconstruct_parts
 from shapepose_fg.pipeline.runs import manifest
+from shapepose_fg.pipeline.runs.assembly import Assembly
 from shapepose_fg.pipeline.runs.manifest import open_run
+from shapepose_fg.pipeline.runs.parts import Parts
+from shapepose_fg.pipeline.setup import Setup
+from shapepose_fg.pipeline.solved_windows import SolvedWindows
 from shapepose_fg.pipeline.windows import WindowConfig
+from shapepose_fg.proposal.thinning import ThinnedFrames
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.tracking import following
 from shapepose_fg.tracking.following import FollowingConfig
@@ -87,57 +95,92 @@ def task(seed: int = 1, frames: int = 24, people: int = 2, *, bodies: bool = Tru
 
 
 @cache
-def _files(
-    seed: int, writes: int, chunk_frames: int | None, *, bodies: bool
-) -> tuple[Task, dict[str, bytes], bytes]:
-    """A run, its parts when it had written so many times, and people.npz of the same that nobody stopped."""
+def _files(seed: int, writes: int, chunk_frames: int | None, *, bodies: bool) -> tuple[Task, dict[str, bytes]]:
+    """A run, and its parts when it had written so many times."""
     made = task(seed, 12 if bodies else 24, 1 if bodies else 2, bodies=bodies)
     with tempfile.TemporaryDirectory() as name, short_blocks():
         out, how = Path(name), Execution(chunk_frames=chunk_frames)
         open_run(out, BEGUN)
         kept = Stopping(out / "parts", open_run(out, BEGUN, resume=True).run)
         kept.writes = writes
-        result = None
         with suppress(Ended):
-            result = reconstruct_parts(kept, made, how)
-        parts = {file.name: file.read_bytes() for file in (out / "parts").iterdir()}
-        result = reconstruct_parts(InFolder(out / "parts", kept.run), made, how) if result is None else result
-        result.save(out)
-        return made, parts, (out / "people.npz").read_bytes()
+            reconstruct_parts(kept, made, how)
+        return made, {file.name: file.read_bytes() for file in (out / "parts").iterdir()}
 
 
-def unfinished(writes: int, *, sealed: bool, bodies: bool = False, chunk_frames: int | None = None) -> Prepare:
-    """A run that was stopped behind so many writes and goes on: to the same bytes, or to a sentence.
+def unfinished(writes: int, *, bodies: bool = False, chunk_frames: int | None = None) -> Prepare:
+    """A run that was stopped behind so many writes and goes on, for a window or to its end.
 
-    With `sealed` the digests of a changed file are made right before that, as by somebody who knows how: then the
-    result can be read.
+    The digests of a changed file are made right before that, as by somebody who knows how: the result can be read.
     """
 
     def prepare(folder: Path, seed: int) -> Callable[[], object]:
-        own, parts, expected = _files(1 + seed % 2, writes, chunk_frames, bodies=bodies)
+        own, parts = _files(1 + seed % 2, writes, chunk_frames, bodies=bodies)
         for name, content in parts.items():
             (folder / name).write_bytes(content)
 
         def read() -> None:
             with in_a_copy(folder, "parts") as out:
                 kept = open_run(out, BEGUN, resume=True)
-                if sealed:  # what it says goes on into the next window, that window into the result
-                    seal(kept, parts)
-                    kept = Stopping(kept.folder, kept.run)
-                    kept.writes = 1
+                seal(kept, parts)
+                kept = Stopping(kept.folder, kept.run)
+                kept.writes = 1
                 with short_blocks(), suppress(Ended):
                     reconstruct_parts(kept, own, Execution(chunk_frames=chunk_frames)).save(out)
-                if not (out / "people.npz").exists():
-                    return
-                result = Reconstruction.load(out)
-                if np.isnan(result.joints[result.status == Status.OK]).all(axis=(1, 2)).any():
-                    raise AssertionError("rows that are well without a number")
-                if not sealed and (out / "people.npz").read_bytes() != expected:
-                    raise AssertionError("other bytes than without the change")
+                    check_result(Reconstruction.load(out))
 
         return read
 
     return prepare
+
+
+def parts_of(writes: int, *, sealed: bool, bodies: bool = False, chunk_frames: int | None = None) -> Prepare:
+    """What `reconstruct` reads of such a run before it goes on; as it was written, but where it is `sealed`."""
+
+    def prepare(folder: Path, seed: int) -> Callable[[], object]:
+        own, valid = _files(1 + seed % 2, writes, chunk_frames, bodies=bodies)
+        (folder / "parts").mkdir()
+        for name, content in valid.items():
+            (folder / "parts" / name).write_bytes(content)
+        joints, (frames, times, cuts) = own.detections.skeleton.joints, own.whole()
+        assert own.fitter is not None
+        setup = Setup(own.rig, own.detections.skeleton, own.config, own.fitter)
+        detections = ThinnedFrames(own.detections, len(own.rig), own.config.candidates)
+        windows = SolvedWindows(setup, detections, times, frames, cuts, Notebook())
+        nobody = setup.engine(Notebook()).tracker.nobody()
+
+        def result() -> Reconstruction:
+            kept = open_run(folder, BEGUN, resume=True)
+            if sealed:
+                seal(kept, valid)
+            parts = Parts(kept)
+            parts.check(joints, own.rig.names, frames)
+            parts.checkpoint(windows.read, frames, nobody)
+            made = Assembly(parts, joints, own.rig.names)
+            if "bodies-0.safetensors" in valid:
+                known = SubjectShapes.empty("body")
+                kept_offsets(kept, setup, detections, Notebook())
+                made = replace(made, bodies=fit_everybody(made.rows_of, made.person, list, kept, known))
+            return made.reconstruction()
+
+        expected = result()
+
+        def read() -> None:
+            found = result()
+            check_result(found)
+            for name in () if sealed else ("joints", "transl"):
+                if not np.array_equal(getattr(found, name), getattr(expected, name), equal_nan=True):
+                    raise AssertionError(f"{name} are others than were written")
+
+        return read
+
+    return prepare
+
+
+def check_result(people: Reconstruction) -> None:
+    """AssertionError where a row that is well has no number."""
+    if np.isnan(people.joints[people.status == Status.OK]).all(axis=(1, 2)).any():
+        raise AssertionError("rows that are well without a number")
 
 
 def seal(kept: InFolder, valid: dict[str, bytes]) -> None:
