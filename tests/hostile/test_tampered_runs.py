@@ -40,11 +40,11 @@ def stopped(task, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def expected(task, tmp_path_factory) -> bytes:
-    """people.npz of the run that nobody touched."""
-    folder = tmp_path_factory.mktemp("expected")
+def whole(task, tmp_path_factory) -> Path:
+    """The parts and the result of the run that nobody touched."""
+    folder = tmp_path_factory.mktemp("whole")
     reconstruct_parts(InFolder(folder / "parts"), task).save(folder)
-    return (folder / "people.npz").read_bytes()
+    return folder
 
 
 @pytest.fixture
@@ -138,6 +138,20 @@ def test_what_has_the_right_digests_and_makes_no_sense_is_refused(parts, task, k
     assert re.search(sentence, text) and file.name in text
 
 
+def test_a_body_whose_shape_is_none_is_refused(task, whole, tmp_path):
+    """Found by scripts/fuzz.py: its digests were right."""
+    kept = InFolder(shutil.copytree(whole / "parts", tmp_path / "parts"))
+    arrays = {name: kept.array("bodies-0", name) for name in kept.keys("bodies-0")}
+    for name, value, sentence in (
+        ("information", -arrays["information"], "positive definite"),
+        ("mean", arrays["mean"] * np.nan, "betas and information must be finite"),
+        ("transl", arrays["transl"][1:], "transl must be"),
+    ):
+        kept.keep("bodies-0", arrays | {name: value})
+        text = refused(kept.folder, task)
+        assert sentence in text and "bodies-0.safetensors" in text
+
+
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs a system with pipes in folders")
 def test_a_pipe_or_a_link_among_the_parts_is_refused_at_once(parts, task, tmp_path):
     file = first(parts, "part")
@@ -152,9 +166,9 @@ def test_a_pipe_or_a_link_among_the_parts_is_refused_at_once(parts, task, tmp_pa
     assert "a link that leads out of its folder" in refused(parts, task)
 
 
-def test_one_flipped_bit_is_the_same_bytes_or_one_sentence(stopped, task, expected, tmp_path):
+def test_one_flipped_bit_is_the_same_bytes_or_one_sentence(stopped, task, whole, tmp_path):
     """And the result that is there already stays, whole, until a whole one takes its place."""
-    rng = random.Random(0)
+    rng, expected = random.Random(0), (whole / "people.npz").read_bytes()
     out = tmp_path / "out"
     people = reconstruct(task.detections, task.rig, task.config, frames=range(6))
     people.save(out)
