@@ -15,11 +15,12 @@ from safetensors import SafetensorError, safe_open
 from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.core.errors import naming
 from shapepose_fg.core.notes import Notebook
 from shapepose_fg.core.reconstruction import Reconstruction, Status
 from shapepose_fg.core.shapes import SubjectShapes
 from shapepose_fg.core.skeleton import COCO_17
-from shapepose_fg.core.storage.kept_arrays import InFolder
+from shapepose_fg.core.storage.kept_arrays import ANEW, InFolder
 from shapepose_fg.estimation.detector_offsets import OffsetConfig
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.detection_table import DetectionTable
@@ -125,7 +126,8 @@ def unfinished(writes: int, *, bodies: bool = False, chunk_frames: int | None = 
                 seal(kept, parts)
                 kept = Stopping(kept.folder, kept.run)
                 kept.writes = 1
-                with short_blocks(), suppress(Ended):
+                # As the command does it.
+                with naming(kept.folder, ANEW), short_blocks(), suppress(Ended):
                     reconstruct_parts(kept, own, Execution(chunk_frames=chunk_frames)).save(out)
                     check_result(Reconstruction.load(out))
 
@@ -154,7 +156,7 @@ def parts_of(writes: int, *, sealed: bool, bodies: bool = False, chunk_frames: i
             if sealed:
                 seal(kept, valid)
             parts = Parts(kept)
-            parts.check(joints, own.rig.names, frames)
+            parts.check(joints, own.rig.names, frames, times.frame_s)
             parts.checkpoint(windows.read, frames, nobody)
             made = Assembly(parts, joints, own.rig.names)
             if "bodies-0.safetensors" in valid:
@@ -286,6 +288,10 @@ def check_numbers(file: Path) -> None:
         case ".npz":
             with np.load(file) as archive:
                 found = any(each.dtype.kind == "f" and not np.isfinite(each).all() for each in archive.values())
+        case ".c3d":
+            content = file.read_bytes()
+            first = 512 * (int.from_bytes(content[16:18], "little") - 1)
+            found = not np.isfinite(np.frombuffer(content[first : len(content) // 4 * 4], "<f4")).all()
         case ".glb":
             content = file.read_bytes()
             length = int.from_bytes(content[12:16], "little")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.core.arrays import Index
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.detections import Input
 from shapepose_fg.core.errors import naming
 from shapepose_fg.core.notes import Notes
@@ -99,8 +99,11 @@ class Parts:
         values = self.kept.array(_name(n), shared if shared in ObservationTable.ROWS[:2] else name)
         return _STATUS[_CODE.checked(name, values, {})] if name == "status" else values
 
-    def check(self, joint_names: Sequence[str], view_names: Sequence[str], frames: range) -> None:
-        """InputError for a part that is none of a run of these joints, views and frames."""
+    def check(self, joint_names: Sequence[str], view_names: Sequence[str], frames: range, frame_s: Array) -> None:
+        """InputError for a part that is none of a run of these joints, views and frames; `frame_s` (T,) are the
+        times of all frames of the recording.
+        """
+        done = frames.start
         for n in range(len(self)):
             with naming(self.kept.place(_name(n)), ANEW):
                 own = {name: self.column(n, OBSERVED + name) for name in ObservationTable.ROWS}
@@ -109,10 +112,13 @@ class Parts:
                 rows = Reconstruction(**own, joint_names=table.joint_names, observations=table)
                 rows.check_ranges()
                 table.check_ranges()
-                wrong = (rows.frame < frames.start) | (rows.frame >= frames.stop)
                 notes = Notes.from_dict(self.kept.about(_name(n)))
-                if wrong.any() or any(each.joint >= len(joint_names) for each in notes.problems):
+                mine = range(done, min(done + notes.frames, frames.stop))
+                if not _are_of(rows, mine, frame_s) or any(
+                    each.joint >= len(joint_names) for each in notes.problems
+                ):
                     raise ValueError("its rows are not of this run")
+                done = mine.stop
 
     def drop(self, n: int) -> None:
         """Forget the rows of a part."""
@@ -140,6 +146,14 @@ class Parts:
         found = self.kept.columns(name, columns, {"J": joints, "S": size})
         with naming(self.kept.place(name), ANEW):
             return checkpoint_of(found, read, frames.start + self.notes().frames, frames, nobody)
+
+
+def _are_of(rows: Reconstruction, frames: range, frame_s: Array) -> bool:
+    """Whether rows are of these frames, at their times, and nobody is twice in one."""
+    if np.any((rows.frame < frames.start) | (rows.frame >= frames.stop)):
+        return False
+    each = np.unique(np.stack([rows.frame, rows.person], axis=1), axis=0)
+    return len(each) == len(rows) and bool((np.abs(rows.time_s - frame_s[rows.frame]) < 1e-6).all())
 
 
 def _name(n: int) -> str:
