@@ -148,8 +148,8 @@ class InFolder(KeptArrays):
 
         What is wrong with it, now or when it is read, is an InputError.
         """
+        file = self._file(name)
         try:
-            file = self._file(name)
             status = file.stat() if file.exists() else None
             stamp = () if status is None else (status.st_ino, status.st_size, status.st_mtime_ns)
             if self._checked.get((name, None)) != stamp:
@@ -169,10 +169,8 @@ class InFolder(KeptArrays):
         except InputError:
             raise
         except (OSError, SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise InputError(
-                f"{self._file(name)}: a part of an unfinished run cannot be read ({reason}); {ANEW}"
-            ) from None
+            reason = str(error) or type(error).__name__
+            raise InputError(f"{file}: a part of an unfinished run cannot be read ({reason}); {ANEW}") from None
 
 
 def _digest(key: str, array: NDArray[Any]) -> str:

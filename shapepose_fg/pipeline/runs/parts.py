@@ -114,9 +114,8 @@ class Parts:
                 table.check_ranges()
                 notes = Notes.from_dict(self.kept.about(_name(n)))
                 mine = range(done, min(done + notes.frames, frames.stop))
-                if not _are_of(rows, mine, frame_s) or any(
-                    each.joint >= len(joint_names) for each in notes.problems
-                ):
+                known = all(each.joint < len(joint_names) for each in notes.problems)
+                if not (known and _are_of(rows, mine, frame_s)):
                     raise ValueError("its rows are not of this run")
                 done = mine.stop
 
