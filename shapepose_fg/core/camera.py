@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from factors.pinhole import project_with_jacobian, to_pixels
-from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.arrays import Array, Index, Real
 
 Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
 """A world axis, as a calibration names the direction that is up."""
@@ -315,7 +315,7 @@ class Views:
         return project_with_jacobian(points[:, :, None], K, cTw)
 
 
-def beside_segment(x: Array, y: Array, first: Sequence[Array], second: Sequence[Array]) -> tuple[Array, Array]:
+def beside_segment(x: Real, y: Real, first: Sequence[Real], second: Sequence[Real]) -> tuple[Real, Real]:
     """How far pixels (...) are from segments (...), squared pixels, and how deep a segment is where it is nearest.
 
     `first` and `second` are x, y and depth of the segments' ends; all shapes broadcast.

@@ -86,11 +86,11 @@ class Notes:
     def from_dict(cls, values: Mapping[str, Any]) -> "Notes":
         """What `as_dict` gave; ValueError where `values` are something else."""
         try:
-            made = vars(_Kept.model_validate(values))
+            made: dict[str, Any] = vars(_Kept.model_validate(values))
         except ValidationError as error:
             problem = error.errors(include_url=False)[0]
             raise ValueError(f"notes: {'.'.join(map(str, problem['loc']))}: {problem['msg']}") from None
-        return cls(**made | {name: Counter(made[name]) for name in ("seconds", "probable")})
+        return cls(**{**made, "seconds": Counter(made["seconds"]), "probable": Counter(made["probable"])})
 
 
 class Notebook:

@@ -114,7 +114,7 @@ def _damped(graph: WindowGraph) -> gtsam.NonlinearFactorGraph:
 
 def _determined(covariance: Array) -> Array:
     """The same (..., 3, 3), NaN where it is more than `UNDETERMINED_M` in some direction."""
-    known = np.isfinite(covariance).all(axis=(-2, -1))
+    known = np.asarray(np.isfinite(covariance).all(axis=(-2, -1)))
     largest = np.linalg.eigvalsh(np.where(known[..., None, None], covariance, 0.0))[..., -1]
     return np.where((known & (largest < UNDETERMINED_M**2))[..., None, None], covariance, np.nan)
 

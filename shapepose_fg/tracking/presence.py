@@ -5,6 +5,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 
 from shapepose_fg.core.camera import Rig, beside_segment
 from shapepose_fg.core.detections import Detections
@@ -31,7 +32,7 @@ _ALONE = 0.5
 _APPEARS_S = 0.125
 """What it costs to appear or vanish while others are watched, as much as not being seen in plain view for 0.3
 seconds: people are where they were, and nobody comes out of nothing."""
-_WORLDS = 4
+_WORLDS = 8
 """How many worlds are tried as those that come first, the most promising ones."""
 _LEAST_S = 0.1
 """Least evidence of a person, seconds; of less than 0.4 seconds of frames a quarter of their time."""
@@ -202,24 +203,40 @@ class Account:
         span, least_s = (int(seen[0]), int(seen.max())), min(_LEAST_S, 0.25 * float(lasts_s.sum()))
         return cls(place, weights, price, there, lasts_s, count, *span, least_s)
 
-    def choose(self, world: NDArray[np.intp], *, on_trial: bool = False) -> Chosen:
-        """Choose hypotheses, and from when to when, so that each detection is evidence of one person only.
+    def choose(self, world: NDArray[np.intp]) -> Chosen:
+        """The first of `ways`."""
+        return self.ways(world)[0]
 
-        `world` (H,) are people who were followed together; `on_trial` takes those, too, who lack a little to be
-        chosen. The best segment of the best hypothesis comes first; its detections are evidence of nobody else
-        then. Where that is worse all in all, the people of one world come first: a hypothesis that goes over from
-        one person to another, always to who is seen better, is better than either of them, and leaves the others
-        with too little.
+    def ways(self, world: NDArray[np.intp], *, on_trial: bool = False) -> list[Chosen]:
+        """Ways to choose hypotheses, and from when to when, so that each detection is evidence of one person only.
+
+        What explains most is the first. `world` (H,) are people who were followed together; `on_trial` takes
+        those, too, who lack a little to be chosen. The best segment of the best hypothesis comes first; its
+        detections are evidence of nobody else then. In other ways the people of one world come first: a hypothesis
+        that goes over from one person to another, always to who is seen better, is better than either of them, and
+        leaves the others with too little.
         """
         account, first = self, np.zeros(len(world), dtype=bool)
         if on_trial:
             account = replace(self, appears_s=_ON_TRIAL * self.appears_s, least_s=_ON_TRIAL * self.least_s)
         if len(world) == 0:
-            return account.in_turn(first)
+            return [account.in_turn(first)]
         bound = np.bincount(world, np.maximum(account.best_segments(account.alone)[0], 0.0))
         tried = np.argsort(-bound, kind="stable")[:_WORLDS]
         found = [account.in_turn(first), *(account.in_turn(world == each) for each in tried)]
-        return max(found, key=lambda each: float(each.evidence_s.sum()))
+        return sorted(found, key=lambda each: -float(each.evidence_s.sum()))
+
+    def agreement(self, one: Chosen, other: Chosen) -> float:
+        """The share of the detections of `one` and `other` that are evidence of the same people in both."""
+        owners = np.full((2, self.detections + 1), -1)
+        for owner, chosen in zip(owners, (one, other), strict=True):
+            for n, (h, start, stop) in enumerate(zip(chosen.hypothesis, chosen.start, chosen.stop, strict=True)):
+                owner[self.place[h, start:stop]] = n
+        owners = owners[:, :-1][:, (owners[:, :-1] >= 0).any(axis=0)]
+        shared = np.zeros((len(one.start) + 1, len(other.start) + 1))
+        np.add.at(shared, tuple(owners), 1.0)  # the last row and column are nobody's
+        same = linear_sum_assignment(shared[:-1, :-1], maximize=True)
+        return float(shared[same].sum() / owners.shape[1]) if owners.shape[1] > 0 else 1.0
 
     def left_over(self, chosen: Chosen) -> Chosen:
         """Who would be there besides those whom `choose` has `chosen`, if appearing cost nothing."""

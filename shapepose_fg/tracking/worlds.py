@@ -31,6 +31,10 @@ _RESTART_S = 1.3
 """Whoever was chosen is followed again from a frame in each so many seconds."""
 _ROUNDS = 2
 """How often that is done."""
+_ALIKE = 0.95
+"""Two ways to choose people that agree on so many of the detections are one. The best is followed again, and the
+best of the others: of ten simulated recordings, most before three cameras, IDF1 is 95.0 (92.8 without; 95.2 with
+two others, for twice the time)."""
 _PLACED_M = 0.2
 """Sigma of a track's joint that counts as placed."""
 _PLAIN, _PLAIN_S = 0.25, 0.3
@@ -116,11 +120,13 @@ def explained(tracker: Tracker, frames: Sequence[Input], carried: Tracks, keep: 
     found = Hypotheses.concatenate([found, follow_worlds(tracker, frames, _seeds(tracker, frames), keep)])
     before = 0.0
     for _ in range(_ROUNDS):
-        on_trial = found.account.choose(found.world, on_trial=True)
-        if on_trial.evidence_s.sum() <= (1 + _GAIN) * before:
+        best, *others = found.account.ways(found.world, on_trial=True)
+        if best.evidence_s.sum() <= (1 + _GAIN) * before:
             break
-        before = float(on_trial.evidence_s.sum())
-        again = _restarts(tracker, frames, times, found, on_trial)
+        before = float(best.evidence_s.sum())
+        second = next((way for way in others if found.account.agreement(best, way) < _ALIKE), None)
+        ways = [best] if second is None else [best, second]
+        again = [seed for way in ways for seed in _restarts(tracker, frames, times, found, way)]
         found = Hypotheses.concatenate([found, follow_worlds(tracker, frames, again, keep)])
     return found, found.account.choose(found.world)
 

@@ -92,7 +92,7 @@ def test_reconstruct_warns_and_stores_it(files, room, tmp_path, capsys):
         assert 0 < each["used"] <= each["offered"]
         assert each["given"]["median_px"] < 3 and each["left_out"]["median_px"] < 5
     assert "left out px" in out
-    code, out, err = run(["reconstruct", "--calibration", files / "up.json", *options, "--no-check"], capsys)
+    code, out, err = run(["reconstruct", "--calibration", files / "up.json", *options, "--no-check", "--overwrite"], capsys)
     assert code == 0 and err == "" and "setup" not in json.loads((tmp_path / "out" / "run.json").read_text())
 
 

@@ -36,7 +36,7 @@ def test_what_is_simulated_can_be_reconstructed_and_compared(tmp_path: Path, cap
     assert truth.run["simulated"]["name"] == "demo" and truth.run["simulated"]["first_frame"] == 40
     for calibration in ("rig.json", "calibration.json"):
         files = ["--calibration", str(tmp_path / calibration), "--detections", str(tmp_path)]
-        assert run("reconstruct", *files, "--output", str(tmp_path)) == 0
+        assert run("reconstruct", *files, "--output", str(tmp_path), "--overwrite") == 0
         found = Reconstruction.load(tmp_path)
         metrics = joint_metrics(found, truth.joints.reshape(3, 4, 25, 3))
         assert metrics.people_found == 12 and metrics.recall > 0.9

@@ -85,7 +85,7 @@ def test_a_worker_that_dies_is_no_endless_wait(worker: VisibilityWorker, people:
     with closing(worker.all(people * 9, 2)) as seen:
         next(seen)
         multiprocessing.active_children()[0].kill()
-        with pytest.raises(RuntimeError, match="worker process ended"):
+        with pytest.raises(RuntimeError, match="worker process was killed"):
             list(seen)
 
 

@@ -18,6 +18,22 @@ PRICE = 0.15
 STEP_S = 0.1
 
 
+def account_of(
+    rows: Sequence[Sequence[list[int] | None]], times: int | None = None, step_s: float = STEP_S
+) -> Account:
+    """Of people's detections in each frame, numbers in the frame, at most 8. Each place costs `PRICE` unseen."""
+    T = times or len(rows[0])
+    candidate = np.full((len(rows), T, PLACES, 1), -1)
+    there = np.zeros((len(rows), T), dtype=bool)
+    for h, frames in enumerate(rows):
+        for t, own in enumerate(frames):
+            there[h, t] = own is not None
+            if own:
+                candidate[h, t, : len(own), 0] = own
+    weight, price = np.full(candidate.shape, (1 + PRICE) / PLACES), np.full((len(rows), T), PRICE)
+    return Account.of(candidate, weight, price, there, np.full(T, 8), np.full(T, step_s))
+
+
 def evidence_of(
     *rows: tuple[Sequence[list[int] | None], int],
     times: int | None = None,
@@ -25,20 +41,9 @@ def evidence_of(
     on_trial: bool = False,
     left: bool = False,
 ) -> Chosen:
-    """Choose among (detections in each frame, world); detections are numbers in the frame, at most 8. Each place
-    costs `PRICE` unseen. With `left` those whom the chosen leave over."""
-    T = times or len(rows[0][0])
-    candidate = np.full((len(rows), T, PLACES, 1), -1)
-    there = np.zeros((len(rows), T), dtype=bool)
-    for h, (frames, _) in enumerate(rows):
-        for t, own in enumerate(frames):
-            there[h, t] = own is not None
-            if own:
-                candidate[h, t, : len(own), 0] = own
-    weight, price = np.full(candidate.shape, (1 + PRICE) / PLACES), np.full((len(rows), T), PRICE)
-    world = np.array([world for _, world in rows])
-    account = Account.of(candidate, weight, price, there, np.full(T, 8), np.full(T, step_s))
-    chosen = account.choose(world, on_trial=on_trial)
+    """Choose among (detections in each frame, world). With `left` those whom the chosen leave over."""
+    account = account_of([frames for frames, _ in rows], times, step_s)
+    chosen = account.ways(np.array([world for _, world in rows]), on_trial=on_trial)[0]
     return account.left_over(chosen) if left else chosen
 
 
@@ -226,3 +231,29 @@ def test_joints_outside_the_picture_cost_nothing_and_unknown_ones_little(five_ca
     half[0, 10:] = np.nan
     price = weighed(none, half, detections, five_cameras, BODY_25, zero)[1]
     np.testing.assert_allclose(price, (10 * 0.4 + 15 * 0.05) / 25)
+
+
+def test_ways_agree_where_people_have_the_same_detections():
+    """Two people, in either order, agree; those who change places halfway agree in half; one is half of two."""
+    first, second = [[0, 1]] * 10, [[2, 3]] * 10
+    account = account_of([first, second, first[:5] + second[:5], second[:5] + first[:5]])
+
+    def way(*who: int) -> Chosen:
+        return Chosen(np.array(who), np.zeros(len(who), int), np.full(len(who), 10), np.ones(len(who)))
+
+    assert account.agreement(way(0, 1), way(1, 0)) == 1.0
+    assert account.agreement(way(0, 1), way(2, 3)) == 0.5
+    assert account.agreement(way(0, 1), way(1)) == 0.5
+    assert account.agreement(way(), way()) == 1.0
+
+
+def test_the_best_way_is_the_first():
+    """Who goes over from one person to another comes first in one way, the two of one world in a better one."""
+    first, second = [[0, 1, 2]] * 10, [[4, 5, 6]] * 10
+    changed = [[0, 1, 2, 3]] * 5 + [[4, 5, 6, 7]] * 5
+    account = account_of([first, second, changed])
+    best, *others = account.ways(np.array([0, 0, 1]))
+    assert {0, 1} <= set(best.hypothesis.tolist())
+    explained_s = [float(each.evidence_s.sum()) for each in (best, *others)]
+    assert explained_s == sorted(explained_s, reverse=True) and explained_s[0] > explained_s[-1]
+    assert any(each.hypothesis[0] == 2 for each in others)

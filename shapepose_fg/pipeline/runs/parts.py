@@ -109,7 +109,7 @@ class Parts:
                 own = {name: self.column(n, OBSERVED + name) for name in ObservationTable.ROWS}
                 table = ObservationTable(**own, joint_names=joint_names, view_names=view_names)  # type: ignore[arg-type]
                 own = {name: self.column(n, name) for name in Reconstruction.ROWS}
-                rows = Reconstruction(**own, joint_names=table.joint_names, observations=table)
+                rows = Reconstruction(**own, joint_names=table.joint_names, observations=table)  # type: ignore[arg-type]
                 rows.check_ranges()
                 table.check_ranges()
                 notes = Notes.from_dict(self.kept.about(_name(n)))

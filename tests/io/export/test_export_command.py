@@ -13,6 +13,7 @@ import pytest
 from shapepose_fg.cli.main import main
 from shapepose_fg.core.drawing import bones_of, thinned
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.reconstruction import BODY, Status
 from shapepose_fg.core.skeleton import BODY_25, COCO_17
 from shapepose_fg.io.export.registry import FORMATS
 from shapepose_fg.io.export.rerun_app import switch_off, viewer_file
@@ -80,7 +81,8 @@ def test_results_that_are_missing_or_damaged(tmp_path, capsys):
 
 
 def test_people_without_a_body_have_no_skeleton_to_export(result, copied, capsys):
-    bare = replace(result, **{name: getattr(result, name) * np.nan for name in ("betas", "transl")})
+    bodies = {name: getattr(result, name) * np.nan for name in BODY}
+    bare = replace(result, **bodies, status=np.full(len(result), Status.BODY_UNDETERMINED, result.status.dtype))
     bare.save(copied)
     assert run("export", copied, "bvh") == 2
     assert "bvh: person 3 has no body in any frame" in capsys.readouterr().err
