@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -64,10 +65,11 @@ class Killing:
                 break
         time.sleep(rng.uniform(0, 1 if least < 0 else 0.3))
         victims = _descendants(process.pid) if number % 4 < 2 else []
-        if len(victims) > 0:
-            os.kill(rng.choice(victims), signal.SIGKILL)
-        elif process.poll() is None:
-            os.killpg(process.pid, signal.SIGKILL)
+        with suppress(ProcessLookupError):  # it has just ended by itself
+            if len(victims) > 0:
+                os.kill(rng.choice(victims), signal.SIGKILL)
+            else:
+                os.killpg(process.pid, signal.SIGKILL)
         first = _ended(process)
         done = (out / "people.npz").exists() and not (out / "parts").exists()
         flipped = "nothing"
