@@ -3,16 +3,16 @@
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from shapepose_fg.body.model.smpl_file import SmplArrays, read_smpl_file
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.shapes import SubjectShapes as SubjectShapes
 
 _OPEN_BODY = Path(__file__).with_name("data") / "open_body.npz"
 
 
-def recognise(found: SubjectShapes, known: SubjectShapes, ratio: float = 10.0) -> NDArray[np.intp]:
+def recognise(found: SubjectShapes, known: SubjectShapes, ratio: float = 10.0) -> Index:
     """(G,) which of the `known` people each of the `found` ones is, by shape alone; -1 for a stranger.
 
     `found` were estimated from the adults' prior N(0, I). Somebody is recognised where what was seen is
@@ -40,12 +40,7 @@ def recognise(found: SubjectShapes, known: SubjectShapes, ratio: float = 10.0) -
     return whose
 
 
-def _log_evidence(
-    seen: NDArray[np.float64],
-    gradient: NDArray[np.float64],
-    mean: NDArray[np.float64],
-    information: NDArray[np.float64],
-) -> NDArray[np.float64]:
+def _log_evidence(seen: Array, gradient: Array, mean: Array, information: Array) -> Array:
     """(G, K) log of how likely observations are under each of K priors, up to a constant of each observation.
 
     `seen` (G, 10, 10) and `gradient` (G, 10) are information and information times mean of what was seen alone,
@@ -59,7 +54,7 @@ def _log_evidence(
     return 0.5 * (volume - np.einsum("ki,ki->k", pulled, mean) + fitted)
 
 
-def statures_m(betas: NDArray[np.float64], body: SmplArrays) -> NDArray[np.float64]:
+def statures_m(betas: Array, body: SmplArrays) -> Array:
     """(G,) how tall bodies with `betas` (G, 10) are in T-pose, metres: from the lowest vertex to the highest."""
     up = body.template[:, 1]
     # No shape within three standard deviations moves a vertex past another that is 10 cm higher.

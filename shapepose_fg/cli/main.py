@@ -100,7 +100,7 @@ def evaluate_shelf_command(
         show(score.table())
 
 
-_DEMO = """\
+DEMO = """\
 Built-in scene: 4 people in close motion, 6 cameras, 60 frames. A simulated
 detector sees them with noise, misses, false candidates and occlusion; from what
 it saw the people are reconstructed, over time."""
@@ -114,7 +114,7 @@ def demo(
 ) -> None:
     """Reconstruct a built-in scene of four people, compare it with the truth, and draw it."""
     prepare_output(output)
-    print(_DEMO, flush=True)
+    print(DEMO, flush=True)
     from shapepose_fg.cli.demo import run_demo
 
     with progress_bar("reconstructing") as progress:

@@ -203,7 +203,7 @@ def _solver(folder: Path) -> "Solve | None":
     Without time, too: then every row is solved by itself, whoever it is.
     """
     from shapepose_fg.core.reconstruction import Reconstruction
-    from shapepose_fg.io.solved_setup import CAMERAS, read_setup
+    from shapepose_fg.io.solved_setup import CAMERAS
 
     if not all((folder / name).is_file() for name in ("run.json", "observations.npz", CAMERAS)):
         return None
@@ -212,9 +212,8 @@ def _solver(folder: Path) -> "Solve | None":
             return None
 
     def solve(rows: "Reconstruction") -> "Reconstruction":
-        from shapepose_fg.pipeline.config import PipelineConfig
         from shapepose_fg.pipeline.solving import Solver, solve_rows
 
-        return solve_rows(rows, Solver.of(read_setup(folder, rows, PipelineConfig), rows.joint_names))
+        return solve_rows(rows, Solver.read(folder, rows))
 
     return solve

@@ -13,15 +13,10 @@ CELL_M = 0.02
 room."""
 
 
-def rgb(text: str) -> tuple[float, float, float]:
-    """Red, green and blue, 0 to 1 in sRGB, of a colour such as `#3f7fb8`."""
-    red, green, blue = (int(text[at : at + 2], 16) / 255 for at in (1, 3, 5))
-    return red, green, blue
-
-
 def colour_of(person: int) -> tuple[float, float, float]:
-    """The colour of an identity, the same in all files of a result."""
-    return rgb(PALETTE[person % len(PALETTE)])
+    """Red, green and blue of an identity, 0 to 1 in sRGB: the same in all files of a result."""
+    red, green, blue = (int(PALETTE[person % len(PALETTE)][at : at + 2], 16) / 255 for at in (1, 3, 5))
+    return red, green, blue
 
 
 def bones_of(joint_names: tuple[str, ...]) -> Index:
@@ -49,13 +44,18 @@ def vertex_normals(vertices: Real, faces: Whole) -> Array:
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
 
 
-def thinned(vertices: Array, faces: Whole, cell_m: float = CELL_M) -> tuple[Index, NDArray[np.int32]]:
-    """Which vertices (M,) of a mesh stay, and its triangles (F, 3) among these; for a T-pose, metres.
+def thinned(
+    vertices: Array, faces: Whole, cell_m: float = CELL_M, corner: Array | float = 0.0
+) -> tuple[Index, NDArray[np.int32], Index]:
+    """Which vertices (M,) of a mesh stay, its triangles (G, 3) among these, and which stands for each vertex (N,).
 
-    Of the vertices in a cell of a grid the one nearest to their middle stands for all of them, and triangles that
-    become lines or occur twice go (Rossignac and Borrel 1993).
+    Of the vertices in a cell of a grid, from its `corner` on, the one nearest to their middle stands for all of
+    them, and triangles that become lines or occur twice go (Rossignac and Borrel 1993). All stay if `cell_m` is 0.
     """
-    cells = np.floor(vertices / cell_m).astype(np.int64)
+    if cell_m <= 0:
+        every = np.arange(len(vertices))
+        return every, faces.astype(np.int32), every
+    cells = np.floor((vertices - corner) / cell_m).astype(np.int64)
     _, cell, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     cell = cell.reshape(-1)
     middle = np.stack([np.bincount(cell, axis) for axis in vertices.T], axis=1) / count[:, None]
@@ -66,4 +66,4 @@ def thinned(vertices: Array, faces: Whole, cell_m: float = CELL_M) -> tuple[Inde
     # A triangle is the same whichever vertex comes first.
     first = np.argmin(merged, axis=1)[:, None]
     turned = np.take_along_axis(merged, (first + np.arange(3)) % 3, axis=1)
-    return kept, np.unique(turned[whole], axis=0).astype(np.int32)
+    return kept, np.unique(turned[whole], axis=0).astype(np.int32), cell

@@ -124,10 +124,7 @@ def _vertex(
 
 
 def line_integrals(
-    fields: NDArray[np.float32],
-    start: NDArray[np.float64],
-    end: NDArray[np.float64],
-    limb: NDArray[np.intp],
+    fields: NDArray[np.float32], start: NDArray[np.float64], end: NDArray[np.float64], limb: NDArray[np.intp]
 ) -> NDArray[np.float64]:
     """(E,) the mean component of the affinity `fields` (2 L, H, W) along the lines from `start` to `end` (E, 2).
 

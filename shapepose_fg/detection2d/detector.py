@@ -29,12 +29,7 @@ class CameraDetector:
 
     @classmethod
     def of(
-        cls,
-        camera: Camera,
-        up: NDArray[np.float64],
-        placement: Placement,
-        network: HeatMapNetwork,
-        long_side: int,
+        cls, camera: Camera, up: NDArray[np.float64], placement: Placement, network: HeatMapNetwork, long_side: int
     ) -> "CameraDetector":
         """The detector for `camera` in a world where `up` (3,) points up."""
         roll_deg = roll_of(camera, up)

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.linearisation import Message, ViewEvidence
 from shapepose_fg.estimation.window_graph import WindowGraph
@@ -28,7 +28,7 @@ class BodyStep:
     config: EstimatorConfig
     """How."""
 
-    def targets(self, evidence: ViewEvidence, enough: NDArray[np.bool_]) -> JointTargets:
+    def targets(self, evidence: ViewEvidence, enough: Mask) -> JointTargets:
         """What the bodies of the rows whom their views determine, `enough` (R,), are fitted to."""
         if self.config.refine.body_from_views:
             return joint_targets(evidence, enough)
@@ -36,7 +36,7 @@ class BodyStep:
         information = known[..., None, None] * np.eye(3) / JOINT_SIGMA_M**2
         return JointTargets(np.nan_to_num(evidence.points), information)
 
-    def fit(self, targets: JointTargets, last: BodyFit, rows: NDArray[np.intp] | None = None) -> BodyFit:
+    def fit(self, targets: JointTargets, last: BodyFit, rows: Index | None = None) -> BodyFit:
         """Bodies of some `rows` (K,) or of all, from the `last` ones (R) on.
 
         A group's shape is then that of those of its rows that are in `rows`: a row fitted again has another shape
@@ -52,7 +52,7 @@ class BodyStep:
         fit = self.fitter.fit_whole(targets, last) if groups is None else self.fitter.fit(targets, last, groups)
         return replace(fit, prior_xyz=fit.joints, prior_covariance=fit.covariance + MODEL_SIGMA_M**2 * np.eye(3))
 
-    def message(self, body: BodyFit, targets: JointTargets, pulled: NDArray[np.bool_]) -> Message:
+    def message(self, body: BodyFit, targets: JointTargets, pulled: Mask) -> Message:
         """What the bodies say of the joints `pulled` (R, J): E_shape of Eq. 3."""
         xyz, covariance = body.prior_xyz.copy(), body.prior_covariance.copy()
         ok = np.repeat(body.ok[:, None], xyz.shape[1], axis=1)
@@ -75,13 +75,13 @@ class BodyStep:
         return Message(np.where(pulled[..., None], xyz, np.nan), information)
 
 
-def joint_targets(evidence: ViewEvidence, enough: NDArray[np.bool_]) -> JointTargets:
+def joint_targets(evidence: ViewEvidence, enough: Mask) -> JointTargets:
     """What the body is fitted to: what the views say of all joints, of rows whom they determine (`enough`)."""
     information = np.where(enough[:, None, None, None], evidence.information, 0.0)
     return JointTargets(np.nan_to_num(evidence.target), information)
 
 
-def disagreement(evidence: ViewEvidence, fit: BodyFit) -> NDArray[np.float64]:
+def disagreement(evidence: ViewEvidence, fit: BodyFit) -> Array:
     """How far (N, J) each joint's views put it from where the body can have it, in standard deviations.
 
     The smaller of two distances, each against the sum of both covariances: to where the rest of the body puts the
@@ -95,9 +95,7 @@ def disagreement(evidence: ViewEvidence, fit: BodyFit) -> NDArray[np.float64]:
     return np.where(fit.ok[:, None], np.fmin(prior, fitted), 0.0)
 
 
-def _sigmas_apart(
-    evidence: ViewEvidence, xyz: NDArray[np.float64], covariance: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _sigmas_apart(evidence: ViewEvidence, xyz: Array, covariance: Array) -> Array:
     """Distance (N, J) of what the views say from `xyz` (N, J, 3) +- `covariance`, standard deviations; NaN
     unknown.
     """

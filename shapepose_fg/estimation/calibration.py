@@ -4,11 +4,9 @@ from dataclasses import dataclass
 from importlib.resources import as_file, files
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Mask, Whole
 from shapepose_fg.core.storage.files import read_json
-
-Array = NDArray[np.float64]
 
 LASTS_S = 0.25
 """Doubts are the same before and after, over this time, seconds, one sigma; 0.5 and 1 s scored less."""
@@ -25,11 +23,11 @@ class Clues:
     The last four are means over the frames around (`lasting_mean`).
     """
 
-    frame: NDArray[np.integer]
+    frame: Whole
     """(N,) frame of each row."""
     joints: Array
     """(N, J, 3) the joints, metres; NaN where unknown."""
-    views: NDArray[np.integer]
+    views: Whole
     """(N, J) how many views see each."""
     covariance: Array
     """(N, J, 3, 3) of the graph, errors that last in it, m²."""
@@ -97,7 +95,7 @@ def from_body(joints: Array, covariance: Array, prior_xyz: Array, information: A
     return np.asarray((away.mT @ np.linalg.solve(both, information @ away))[..., 0, 0], dtype=np.float64)
 
 
-def lasting_mean(values: Array, times_s: Array, where: NDArray[np.bool_] | None = None) -> Array:
+def lasting_mean(values: Array, times_s: Array, where: Mask | None = None) -> Array:
     """Values (T, J, ...) of one person's joints, averaged over the frames around in which they are `where` (T, J).
 
     What leads a joint astray in one frame does so in the next; and a joint that is not seen is where doubtful

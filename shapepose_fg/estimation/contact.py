@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.estimation.in_time import near_in_time
 from shapepose_fg.estimation.linearisation import Message
 from shapepose_fg.estimation.state_covariances import state_covariances
@@ -35,18 +35,14 @@ FREE_M2_S = 0.02
 2.6 cm, and motion says more."""
 
 
-def feet_of(joints: Sequence[str]) -> NDArray[np.intp]:
+def feet_of(joints: Sequence[str]) -> Index:
     """(F,) which of a detector's joints stand while a foot does."""
     return np.array([n for n, name in enumerate(joints) if name[:1] in "RL" and name[1:] in FEET], dtype=np.intp)
 
 
 def walking(
-    graph: WindowGraph,
-    problem: tuple[NDArray[np.bool_], Message, Message],
-    initial: NDArray[np.float64],
-    lost: NDArray[np.bool_] | None,
-    feet: NDArray[np.intp],
-) -> NDArray[np.float64] | None:
+    graph: WindowGraph, problem: tuple[Mask, Message, Message], initial: Array, lost: Mask | None, feet: Index
+) -> Array | None:
     """(T - 1, J) `standing` of `WindowGraph.solve`, whose first arguments these are; None without `feet` (F,).
 
     The feet are solved by themselves, without knowing of any standing: their joints are chains of their own.
@@ -67,9 +63,7 @@ def walking(
     return result
 
 
-def standing_density(
-    velocity: NDArray[np.float64], covariance: NDArray[np.float64], times_s: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def standing_density(velocity: Array, covariance: Array, times_s: Array) -> Array:
     """(T - 1, F) density of the walk that joints make in each step, m²/s: small where they stand.
 
     `velocity` (T, F, 3) m/s and its `covariance` (T, F, 3, 3) are of a solution that knows nothing of standing,
@@ -84,7 +78,7 @@ def standing_density(
     return (density[1:] + density[:-1]) / 2
 
 
-def log_densities(velocity: NDArray[np.float64], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+def log_densities(velocity: Array, covariance: Array) -> Array:
     """(T, F, K) log density of velocities under each way to move, but for a constant."""
     values, axes = np.linalg.eigh(covariance)
     along = np.einsum("tfia,tfi->tfa", axes, velocity)
@@ -92,7 +86,7 @@ def log_densities(velocity: NDArray[np.float64], covariance: NDArray[np.float64]
     return -0.5 * (along[..., None] ** 2 / variance + np.log(variance)).sum(axis=2)
 
 
-def smoothed(log: NDArray[np.float64], times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+def smoothed(log: Array, times_s: Array) -> Array:
     """(T, F, K) how probable each way to move is in each frame, given all frames: forwards and backwards.
 
     `log` (T, F, K) are log densities of what was seen. A frame counts with the share of a look that it is.

@@ -3,15 +3,13 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factors import kernel_weight
+from shapepose_fg.core.arrays import Array, Index, Whole
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.limbs import ARMS_AND_LEGS
 from shapepose_fg.estimation.linearisation import LEAST_PROBABILITY, Message, ObservationConfig, ViewEvidence
-
-Array = NDArray[np.float64]
 
 CERTAIN = 0.99
 """Observations that are more probably the person's make no alternatives: four in five."""
@@ -26,7 +24,7 @@ were solved differ from their bodies' by."""
 _FEET = ("BigToe", "SmallToe", "Heel")
 
 
-def limbs_to_exchange(joints: Sequence[str]) -> NDArray[np.intp]:
+def limbs_to_exchange(joints: Sequence[str]) -> Index:
     """(L, 3) joints of a detector that get exchanged with a limb, and the two ends of the limb.
 
     A foot goes with its ankle.
@@ -37,7 +35,7 @@ def limbs_to_exchange(joints: Sequence[str]) -> NDArray[np.intp]:
     return np.array(there, dtype=np.intp).reshape(-1, 3)
 
 
-def exchange_spread(joints: Array, bodies: Array, frame: NDArray[np.integer], limbs: NDArray[np.intp]) -> Array:
+def exchange_spread(joints: Array, bodies: Array, frame: Whole, limbs: Index) -> Array:
     """(N, J, 3, 3) outer products of the ways from joints to others' that may be theirs, m².
 
     Of `joints` (N, J, 3) in the `frame` (N,). Two people's limbs can have been exchanged for long, and each frame

@@ -3,10 +3,10 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.body_step import MODEL_SIGMA_M, joint_targets
@@ -35,15 +35,15 @@ class Draft:
 
     observations: Observations
     """What it was made from: a row that was kept holds the probabilities that it was drafted with."""
-    places: NDArray[np.float64]
+    places: Array
     """(N, J, 3) metres; NaN where neither views nor body say any."""
-    covariance: NDArray[np.float64]
+    covariance: Array
     """(N, J, 3, 3) m²; NaN where the place is."""
 
 
 def draft(
     observations: Observations, views: Views, fitter: BodyFitter, config: EstimatorConfig
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Array, Array]:
     """About where the joints of N rows are (N, J, 3), metres, and how surely (N, J, 3, 3).
 
     What the views say, and where that is little, or contradicts the body, what the body says. Views are asked
@@ -90,7 +90,7 @@ def redraft(
     return Draft(replace(observations, probability=probability), places, covariance)
 
 
-def _unchanged(now: Observations, before: Observations) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _unchanged(now: Observations, before: Observations) -> tuple[Index, Index]:
     """(K,) rows whose detections are as in a row of the same track and frame `before`, and (K,) those rows."""
     width = int(max(now.track.max(initial=0), before.track.max(initial=0))) + 1
     names = [each.frame * width + each.track for each in (now, before)]
@@ -101,9 +101,7 @@ def _unchanged(now: Observations, before: Observations) -> tuple[NDArray[np.intp
     return here[same], there[same]
 
 
-def first_places(
-    observations: Observations, views: Views, fitter: BodyFitter, config: EstimatorConfig
-) -> NDArray[np.float64]:
+def first_places(observations: Observations, views: Views, fitter: BodyFitter, config: EstimatorConfig) -> Array:
     """X_0 (N, J, 3), metres: where stage I has the joints, else where views do, and in windows of several frames
     where a draft has them: a view that sees a joint counts from the first round on, then.
     """
@@ -121,7 +119,7 @@ def first_places(
     return complete
 
 
-def changed_targets(before: JointTargets, now: JointTargets) -> NDArray[np.intp]:
+def changed_targets(before: JointTargets, now: JointTargets) -> Index:
     """Which rows have a joint whose target moved by more than `MOVED_M`, or weighs twice or half what it did."""
     weights = [np.trace(each.information, axis1=2, axis2=3) for each in (before, now)]
     less, more = np.minimum(*weights), np.maximum(*weights)
@@ -129,9 +127,7 @@ def changed_targets(before: JointTargets, now: JointTargets) -> NDArray[np.intp]
     return np.flatnonzero((moved | (more > 2 * less)).any(axis=1))
 
 
-def drafted(
-    evidence: ViewEvidence, body: BodyFit, disagreement: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def drafted(evidence: ViewEvidence, body: BodyFit, disagreement: float) -> tuple[Array, Array]:
     """Places (N, J, 3), metres, and covariances (N, J, 3, 3) of joints; NaN where neither views nor body say any.
 
     What the views say and what the body says, weighted by their information. Views that are `disagreement`

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from shapepose_fg.core.arrays import Array, Index
 
 LOOK_S = 1.5
 """A foot that stands for so long is one look at the floor: so long errors are correlated
@@ -66,7 +65,7 @@ class Floor:
         return cls(normal=np.array(values["normal"]), **rest)
 
 
-def find_floor(points: Array, look: NDArray[np.intp], up: Array) -> Floor | str:
+def find_floor(points: Array, look: Index, up: Array) -> Floor | str:
     """The floor under `points` (N, 3), the lowest of feet that stand; else in words why there is none.
 
     `look` (N,) numbers what is seen as one. A robust plane, level but for `TILT_RAD`, starts at the height where

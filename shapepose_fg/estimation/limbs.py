@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitter import BodyFitter, JointTargets
+from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.estimation.in_time import near_in_time, smoothed_in_time, waited_s
 from shapepose_fg.estimation.linearisation import weakest_sigma
 from shapepose_fg.estimation.state import SEEN_M, State
@@ -30,7 +30,7 @@ _SWEEPS = 4
 elbow that the shoulder holds."""
 
 
-def limbs_kept(state: State, covariance: NDArray[np.float64], fitter: BodyFitter) -> NDArray[np.float64]:
+def limbs_kept(state: State, covariance: Array, fitter: BodyFitter) -> Array:
     """Joints (N, J, 3): those that no view saw, in windows of several frames, where a body can have them, and
     limbs as long as the body's where views leave an end open. `covariance` (N, J, 3, 3) is the joints' own.
 
@@ -55,12 +55,7 @@ def limbs_kept(state: State, covariance: NDArray[np.float64], fitter: BodyFitter
     return placed
 
 
-def limb_steps(
-    joints: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-    unseen: NDArray[np.bool_],
-    fitter: BodyFitter,
-) -> NDArray[np.float64]:
+def limb_steps(joints: Array, covariance: Array, unseen: Mask, fitter: BodyFitter) -> Array:
     """Steps (N, J, 3), metres, that take joints that no view saw, `unseen` (N, J), to where a body can have them.
 
     Motion carries each joint by itself: elbow and wrist, both hidden, drift apart. A body is fitted to all joints
@@ -89,7 +84,7 @@ def limbs_of(joints: Sequence[str]) -> list[tuple[int, int]]:
     return [(joints.index(a), joints.index(b)) for a, b in ends if a in joints and b in joints]
 
 
-def limb_lengths(body: NDArray[np.float64], limbs: Sequence[tuple[int, int]]) -> NDArray[np.float64]:
+def limb_lengths(body: Array, limbs: Sequence[tuple[int, int]]) -> Array:
     """(L,) length of each limb, metres: the median of those of one person's body in T frames; NaN where unknown.
 
     `body` (T, J, 3) are the body's joints, NaN in frames without a body.
@@ -101,12 +96,8 @@ def limb_lengths(body: NDArray[np.float64], limbs: Sequence[tuple[int, int]]) ->
 
 
 def with_lengths(
-    joints: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-    moved: NDArray[np.bool_],
-    lengths: NDArray[np.float64],
-    limbs: Sequence[tuple[int, int]],
-) -> NDArray[np.float64]:
+    joints: Array, covariance: Array, moved: Mask, lengths: Array, limbs: Sequence[tuple[int, int]]
+) -> Array:
     """Joints (N, J, 3), metres, of which those `moved` (N, J) go where limbs have their `lengths` (L,).
 
     In each of `_SWEEPS` sweeps each limb is observed to have its length to `LENGTH_SIGMA_M`, and its ends share

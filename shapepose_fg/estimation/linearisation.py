@@ -7,9 +7,9 @@ from typing import Annotated, Literal
 
 import numpy as np
 from annotated_types import Interval
-from numpy.typing import NDArray
 
 from factors import KernelName, in_front, inlier_gate, kernel_weight, sigma_px
+from shapepose_fg.core.arrays import Array, Index, Mask, Real
 from shapepose_fg.core.bounds import Factor, Metres, MetresOrNone, Settings, Share
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
@@ -65,7 +65,7 @@ class ObservationConfig(Settings):
             kernel="none",
         )
 
-    def weight(self, confidence: NDArray[np.float64]) -> NDArray[np.float64]:
+    def weight(self, confidence: Array) -> Array:
         """w_ij of Eq. 1 for observations of this confidence."""
         return (confidence**self.confidence_power + self.least_weight) / (1.0 + self.least_weight)
 
@@ -74,11 +74,11 @@ class ObservationConfig(Settings):
         """The kernel's name, None for plain least squares."""
         return None if self.kernel == "none" else self.kernel
 
-    def depth(self, depth: NDArray[np.float64]) -> NDArray[np.float64]:
+    def depth(self, depth: Array) -> Array:
         """The depths (...), metres, at which lengths are meant for joints at these depths (...)."""
         return np.full_like(depth, self.fixed_depth_m) if self.fixed_depth_m > 0 else depth
 
-    def scatter(self, joints: Sequence[str]) -> NDArray[np.float64]:
+    def scatter(self, joints: Sequence[str]) -> Array:
         """(J,) what sigma is multiplied with for each joint; 1 for names that are not known."""
         return np.array([JOINT_SCATTER.get(name, 1.0) if self.by_joint else 1.0 for name in joints])
 
@@ -102,22 +102,22 @@ statistics of real ones, and these, each view of Shelf against the others, give 
 class Message:
     """What is said of the joints of T frames (or of N rows), by the views or by the body, as Gaussians."""
 
-    xyz: NDArray[np.float64]
+    xyz: Array
     """(T, J, 3) where they are, metres; anything where the information is zero."""
-    information: NDArray[np.float64]
+    information: Array
     """(T, J, 3, 3) 1/m², positive semi-definite; zero where nothing is said."""
 
     @property
-    def known(self) -> NDArray[np.bool_]:
+    def known(self) -> Mask:
         """(T, J) of which joints anything is said."""
         return np.asarray(self.information.any(axis=(2, 3)))
 
-    def rows(self, index: NDArray[np.intp] | slice) -> "Message":
+    def rows(self, index: Index | slice) -> "Message":
         """Some of the rows."""
         return Message(self.xyz[index], self.information[index])
 
 
-def symmetric_roots(information: NDArray[np.float64]) -> NDArray[np.float64]:
+def symmetric_roots(information: Array) -> Array:
     """Symmetric square roots (D, 3, 3) of positive semi-definite matrices."""
     values, vectors = np.linalg.eigh(information)
     return np.einsum("dik,dk,djk->dij", vectors, np.sqrt(np.maximum(values, 0.0)), vectors)
@@ -127,24 +127,24 @@ def symmetric_roots(information: NDArray[np.float64]) -> NDArray[np.float64]:
 class ViewEvidence:
     """What the observations say of the joints when these are at `points`."""
 
-    points: NDArray[np.float64]
+    points: Array
     """(N, J, 3) the joints, metres in the world; NaN where not known."""
-    inlier: NDArray[np.bool_]
+    inlier: Mask
     """(N, J, V) delta_ij of Eq. 2: seen, in front of the camera and within rho_2D of the projection."""
-    residual_px: NDArray[np.float64]
+    residual_px: Array
     """(N, J, V, 2) projection minus observation; NaN where unseen or unknown."""
-    information: NDArray[np.float64]
+    information: Array
     """(N, J, 3, 3) J^T W J over the inliers, robust weights included, 1/m²; zero where there is none."""
-    gradient: NDArray[np.float64]
+    gradient: Array
     """(N, J, 3) J^T W r over the inliers, 1/m."""
 
     @cached_property
-    def _decomposed(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _decomposed(self) -> tuple[Array, Array]:
         """Eigenvalues (N, J, 3), rising, and eigenvectors (N, J, 3, 3) of the information."""
         return np.linalg.eigh(self.information)
 
     @cached_property
-    def target(self) -> NDArray[np.float64]:
+    def target(self) -> Array:
         """(N, J, 3) where the observations alone would put each joint: one Gauss-Newton step from `points`.
 
         A joint that one view saw stays at its depth and moves onto the ray: directions below 1e-6 of the strongest
@@ -162,19 +162,19 @@ class ViewEvidence:
         return Message(self.target, self.information)
 
     @cached_property
-    def sigma_m(self) -> NDArray[np.float64]:
+    def sigma_m(self) -> Array:
         """(N, J) standard deviation along the direction that the views know least, metres; infinite for a ray."""
         return _weakest(self._decomposed[0])
 
 
-def weakest_sigma(information: NDArray[np.float64]) -> NDArray[np.float64]:
+def weakest_sigma(information: Array) -> Array:
     """Standard deviation (...,) along the direction that `information` (..., 3, 3) knows least; infinite for a
     ray.
     """
     return _weakest(np.asarray(np.linalg.eigvalsh(information), dtype=np.float64))
 
 
-def _weakest(values: NDArray[np.floating]) -> NDArray[np.float64]:
+def _weakest(values: Real) -> Array:
     """The same from eigenvalues (..., 3), rising. Under 1e-10 of the strongest is rounding: nothing."""
     weakest = np.where(values[..., 0] > 1e-10 * values[..., 2], values[..., 0], 0.0)
     with np.errstate(divide="ignore"):
@@ -182,12 +182,8 @@ def _weakest(values: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def observation_sigmas(
-    observations: Observations,
-    points: NDArray[np.float64],
-    views: Views,
-    config: ObservationConfig,
-    joints: Sequence[str],
-) -> NDArray[np.float64]:
+    observations: Observations, points: Array, views: Views, config: ObservationConfig, joints: Sequence[str]
+) -> Array:
     """Sigma (N, J, V) in pixels of every observation, for joints near `points` (N, J, 3); 0 where unseen.
 
     `joints` are the J joints' names: some are seen more sharply than others. A joint whose place is not known
@@ -215,8 +211,8 @@ def observation_sigmas(
 
 def linearise(
     observations: Observations,
-    sigmas: NDArray[np.float64],
-    points: NDArray[np.float64],
+    sigmas: Array,
+    points: Array,
     views: Views,
     config: ObservationConfig,
     reach_m: float | None = None,
@@ -247,12 +243,12 @@ def linearise(
     return ViewEvidence(points, inlier, residual, information, gradient)
 
 
-def _per_joint(of_views: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.float64]:
+def _per_joint(of_views: Array, shape: tuple[int, ...]) -> Array:
     """A value of each view, (V,) or (N, V), for each joint: (N, J, V)."""
     return np.broadcast_to(of_views[:, None] if of_views.ndim == 2 else of_views, shape)
 
 
-def mean_confidence(observations: Observations, inlier: NDArray[np.bool_]) -> NDArray[np.float64]:
+def mean_confidence(observations: Observations, inlier: Mask) -> Array:
     """w_i of Eq. 4: (N, J) mean confidence of each joint over all views.
 
     A view that did not see the joint counts 0, and so does one whose observation the gate discards: where the
@@ -261,12 +257,7 @@ def mean_confidence(observations: Observations, inlier: NDArray[np.bool_]) -> ND
     return np.where(inlier, observations.confidence, 0.0).mean(axis=-1)
 
 
-def triangulate(
-    observations: Observations,
-    views: Views,
-    config: ObservationConfig,
-    steps: int = 3,
-) -> NDArray[np.float64]:
+def triangulate(observations: Observations, views: Views, config: ObservationConfig, steps: int = 3) -> Array:
     """X_0 made complete: joints that at least two views saw but stage I did not place, (N, J, 3) metres.
 
     Linear triangulation, iterated with robust weights; joints that stage I placed keep their place, and what

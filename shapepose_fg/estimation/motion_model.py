@@ -5,9 +5,9 @@ from importlib.resources import as_file, files
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factors import CONSTANT_VELOCITY, MEASURED_S, Motion
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.bounds import Factor, Seconds, Settings
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import read_json
@@ -61,11 +61,11 @@ class Lasting:
 class MotionModel:
     """The numbers of a window's motion factors for J joints."""
 
-    psd_still: NDArray[np.float64]
+    psd_still: Array
     """(J,) power spectral density of the acceleration of a joint that hardly moves, m²/s³, per axis."""
-    psd_speed: NDArray[np.float64]
+    psd_speed: Array
     """(J,) what is added to it for each (m/s)² of the joint's speed: fast joints turn faster, too."""
-    psd_lost: NDArray[np.float64]
+    psd_lost: Array
     """(J,) what it is at least while a joint is lost from sight, and its speed unknown: the mean over all
     speeds."""
     views: Lasting
@@ -77,11 +77,11 @@ class MotionModel:
     law: Motion = CONSTANT_VELOCITY
     """How a state goes on."""
 
-    def density(self, speed_m_s: NDArray[np.float64], within_s: float = MEASURED_S) -> NDArray[np.float64]:
+    def density(self, speed_m_s: Array, within_s: float = MEASURED_S) -> Array:
         """Density (..., J) of the noise in the motion of joints of this speed (..., J); see `Motion.density`."""
         return self.law.density(self.psd_still + self.psd_speed * np.asarray(speed_m_s) ** 2, within_s)
 
-    def density_lost(self, speed_m_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    def density_lost(self, speed_m_s: Array) -> Array:
         """The same while joints are lost from sight, and their speed is a guess."""
         return np.maximum(self.density(speed_m_s, GAP_S), self.law.density(self.psd_lost, GAP_S))
 

@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
+from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.notes import Problem
 from shapepose_fg.core.reconstruction import Known, Status
 from shapepose_fg.estimation.calibration import Calibration, Clues, from_body, lasting_mean
@@ -77,7 +78,7 @@ def outcome(state: State, fitter: BodyFitter) -> WindowSolution:
     )  # fmt: skip
 
 
-def final_bodies(state: State, covariance: NDArray[np.float64], fitter: BodyFitter) -> BodyFit:
+def final_bodies(state: State, covariance: Array, fitter: BodyFitter) -> BodyFit:
     """The bodies that are returned: where there are factors of the user's own, fitted to the joints as solved.
 
     The bodies follow these factors so. What they say goes nowhere else: joints and covariances are done.
@@ -99,9 +100,7 @@ def final_bodies(state: State, covariance: NDArray[np.float64], fitter: BodyFitt
     return fit.with_rows(rows[again.ok], again.rows(np.flatnonzero(again.ok)))
 
 
-def _calibrated(
-    state: State, X: NDArray[np.float64], covariance: NDArray[np.float64], final: ViewEvidence
-) -> NDArray[np.float64]:
+def _calibrated(state: State, X: Array, covariance: Array, final: ViewEvidence) -> Array:
     """Covariances (N, J, 3, 3) with all doubts: over time as calibrated, frame by frame of the detections.
 
     `covariance` is that of the graph, errors that last in it; `final` what the views say around the joints `X`.
@@ -128,7 +127,7 @@ def _calibrated(
     )
 
 
-def with_lasting(state: State, person: WindowGraph, marginal: NDArray[np.float64]) -> NDArray[np.float64]:
+def with_lasting(state: State, person: WindowGraph, marginal: Array) -> Array:
     """(T, J, 3, 3) covariance of joints, m²: `marginal` of the person's graph, and the errors that it left out.
 
     Added is the share that lasts, of what views and body leave in one frame; and of the share that motion smooths,
@@ -150,14 +149,14 @@ def with_lasting(state: State, person: WindowGraph, marginal: NDArray[np.float64
     return np.where(simple[..., None, None], total, marginal)
 
 
-def strong(state: State) -> NDArray[np.bool_]:
+def strong(state: State) -> Mask:
     """(N, J, V) the observations that are used and not weak."""
     observations = state.observations
     sure = (observations.confidence >= WEAK_SCORE) & (observations.probability > WEAK_PROBABILITY)
     return state.inlier & sure
 
 
-def how_known(state: State, covariance: NDArray[np.float64]) -> NDArray[np.uint8]:
+def how_known(state: State, covariance: Array) -> NDArray[np.uint8]:
     """(N, J) a `Known` for each joint, `covariance` (N, J, 3, 3) being its own.
 
     It is seen where two views' detections are used that are not weak. A joint that no view saw is carried by
@@ -173,7 +172,7 @@ def how_known(state: State, covariance: NDArray[np.float64]) -> NDArray[np.uint8
     return np.where(np.isfinite(state.joints).all(axis=-1), code, Known.UNKNOWN).astype(np.uint8)
 
 
-def problems(state: State, covariance: NDArray[np.float64]) -> tuple[Problem, ...]:
+def problems(state: State, covariance: Array) -> tuple[Problem, ...]:
     """Joints that could not be solved, by person, frame and joint."""
     X, first, observations = state.joints, state.first, state.observations
     finite = np.asarray(np.isfinite(X).all(axis=2))
@@ -202,6 +201,6 @@ def problems(state: State, covariance: NDArray[np.float64]) -> tuple[Problem, ..
     )
 
 
-def _pull(message: Message, X: NDArray[np.float64]) -> NDArray[np.float64]:
+def _pull(message: Message, X: Array) -> Array:
     """(N, J, 3) information times the way from `X` to where the message has the joint, 1/m."""
     return np.einsum("...ij,...j->...i", message.information, np.nan_to_num(message.xyz) - np.nan_to_num(X))

@@ -3,12 +3,10 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.camera import Views, beside_segment
 from shapepose_fg.estimation.limbs import ARMS_AND_LEGS
-
-Array = NDArray[np.float64]
 
 LEAST_VIEWS = 3
 """So many views must look at the joint in plain view and report nothing: fewer often miss it by chance."""
@@ -30,7 +28,7 @@ _TRUNK = {("Neck", "MidHip"): 0.17, ("Neck", "Nose"): 0.11, ("RShoulder", "RHip"
 """What hides others' joints beside arms and legs: from joint to joint, half its width in metres."""
 
 
-def limbs_that_hide(joints: Sequence[str]) -> tuple[NDArray[np.intp], Array]:
+def limbs_that_hide(joints: Sequence[str]) -> tuple[Index, Array]:
     """(L, 2) the ends of the limbs of a detector's joints, and (L,) half their widths, metres."""
     limbs = _TRUNK | {(f"{s}{a}", f"{s}{b}"): width for s in "RL" for (a, b), width in ARMS_AND_LEGS.items()}
     there = [(joints.index(a), joints.index(b), w) for (a, b), w in limbs.items() if {a, b} <= set(joints)]
@@ -39,11 +37,7 @@ def limbs_that_hide(joints: Sequence[str]) -> tuple[NDArray[np.intp], Array]:
 
 
 def elsewhere_variance(
-    joints: Array,
-    frame: NDArray[np.integer],
-    strong: NDArray[np.bool_],
-    views: Views,
-    limbs: tuple[NDArray[np.intp], Array],
+    joints: Array, frame: Whole, strong: Mask, views: Views, limbs: tuple[Index, Array]
 ) -> Array:
     """(N, J) variance that is added on every axis to joints that views ought to see and do not, m².
 
@@ -66,11 +60,11 @@ def elsewhere_variance(
 
 def _behind_limbs(
     projected: tuple[Array, Array],
-    places: tuple[NDArray[np.intp], NDArray[np.intp]],
-    people: NDArray[np.intp],
+    places: tuple[Index, Index],
+    people: Index,
     focal_px: Array,
-    limbs: tuple[NDArray[np.intp], Array],
-) -> NDArray[np.bool_]:
+    limbs: tuple[Index, Array],
+) -> Mask:
     """(K, V) whether joints, the rows and columns `places` (K,), lie behind a limb of the `people` (P,), theirs
     included; `projected` pixels and depths of all, `focal_px` (K, V).
     """

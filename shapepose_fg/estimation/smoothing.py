@@ -1,12 +1,10 @@
 """Drafts of joints, frame by frame, smoothed over time: what a few frames' wrong detections do not lead away."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factors import Motion
+from shapepose_fg.core.arrays import Array, Whole
 from shapepose_fg.estimation.motion_model import MotionModel
-
-Array = NDArray[np.float64]
 
 SPEED_M_S = 1.5
 """How fast a joint is taken to be for the density of its accelerations: a walker's, whose feet are faster."""
@@ -19,7 +17,7 @@ _UNKNOWN = 1e6
 
 
 def smoothed(
-    joints: Array, covariance: Array, track: NDArray[np.integer], time_s: Array, motion: MotionModel
+    joints: Array, covariance: Array, track: Whole, time_s: Array, motion: MotionModel
 ) -> tuple[Array, Array]:
     """Draft `joints` (N, J, 3), metres, known to `covariance` (N, J, 3, 3), smoothed along each `track` (N,).
 

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.draft import first_places
@@ -27,9 +27,9 @@ class State:
     """Which detections each row has."""
     views: Views
     """The cameras."""
-    sigmas: NDArray[np.float64]
+    sigmas: Array
     """(N, J, V) of the observations, pixels; 0 where there are none."""
-    first: NDArray[np.float64]
+    first: Array
     """(N, J, 3) X_0, metres; NaN where unknown."""
     config: EstimatorConfig
     """How."""
@@ -37,17 +37,17 @@ class State:
     """How joints move, and how long errors last."""
     people: list[WindowGraph]
     """Everybody's factors."""
-    joints: NDArray[np.float64]
+    joints: Array
     """(N, J, 3) X, metres; NaN where unknown."""
-    inlier: NDArray[np.bool_]
+    inlier: Mask
     """(N, J, V) delta_ij of Eq. 2: which observations were kept."""
-    contradicts: NDArray[np.bool_]
+    contradicts: Mask
     """(N, J) joints whose views the body contradicts (`disagreement`): gated anew from the body's place."""
     of_views: Message
     """What the views alone say of N rows, all of the error in it."""
     of_body: Message
     """What the body says of each joint without the joint's own views; zero where it does not pull."""
-    enough: NDArray[np.bool_]
+    enough: Mask
     """(N,) rows whose views place enough joints to place a person."""
     fit: BodyFit
     """Theta: the bodies, N rows."""
@@ -81,13 +81,7 @@ class State:
         )  # fmt: skip
 
     def put(
-        self,
-        rows: NDArray[np.intp],
-        joints: NDArray[np.float64],
-        evidence: ViewEvidence,
-        wrong: NDArray[np.bool_],
-        of_body: Message,
-        fit: BodyFit,
+        self, rows: Index, joints: Array, evidence: ViewEvidence, wrong: Mask, of_body: Message, fit: BodyFit
     ) -> None:
         """What a round found of some `rows` (R,)."""
         self.joints[rows], self.inlier[rows] = joints, evidence.inlier
@@ -103,7 +97,7 @@ def parts_of(people: Sequence[WindowGraph]) -> list[tuple[WindowGraph, slice]]:
     return [(person, slice(end - len(person), end)) for person, end in zip(people, ends, strict=True)]
 
 
-def window_rows(observations: Observations) -> list[NDArray[np.intp]]:
+def window_rows(observations: Observations) -> list[Index]:
     """Rows of each window, frames rising: those of one track.
 
     ValueError where a person is twice in a frame, or views of a frame are not taken at one time.

@@ -25,6 +25,7 @@ from factors import (
     standing_factors,
     state_keys,
 )
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
@@ -55,11 +56,11 @@ class WindowGraph:
     def __init__(
         self,
         observations: Observations,
-        sigmas_px: NDArray[np.float64],
+        sigmas_px: Array,
         views: Views,
         config: EstimatorConfig,
         motion: MotionModel,
-        rows: NDArray[np.intp] | None = None,
+        rows: Index | None = None,
     ) -> None:
         """Make the factors of all observations: T rows of one person, frames rising.
 
@@ -108,9 +109,11 @@ class WindowGraph:
             [offset_keys(self.track, joints, self.frames[:, None], source) for source in (_OF_VIEWS, _OF_BODY)]
         )
         self._added: list[tuple[gtsam.NonlinearFactor, frozenset[int]]] = []
-        self._touched = np.zeros(J, dtype=bool)
         self._tied: list[frozenset[int]] = []
-        self._present = np.zeros((T, J), dtype=bool)
+        self.touched: Mask = np.zeros(J, dtype=bool)
+        """(J,) joints on which there is a factor of your own."""
+        self.present: Mask = np.zeros((T, J), dtype=bool)
+        """(T, J) which joints were in the last problem."""
 
     @property
     def keys(self) -> NDArray[np.int64]:
@@ -134,11 +137,6 @@ class WindowGraph:
         return np.concatenate([self.state_keys, np.moveaxis(self._offset_keys, 0, -1)], axis=-1)
 
     @property
-    def present(self) -> NDArray[np.bool_]:
-        """(T, J) which joints were in the last problem."""
-        return self._present
-
-    @property
     def temporal(self) -> bool:
         """Whether there is more than one frame: then joints have velocities and motion factors."""
         return len(self) > 1
@@ -157,7 +155,7 @@ class WindowGraph:
             )
         self._added.append((factor, frozenset(keys)))
         joined = frozenset(split_key(key).joint for key in keys)
-        self._touched[list(joined)] = True
+        self.touched[list(joined)] = True
         apart = [each for each in self._tied if not each & joined]
         self._tied = [*apart, joined.union(*(each for each in self._tied if each & joined))]
 
@@ -167,24 +165,19 @@ class WindowGraph:
         return [each for each in self._tied if len(each) > 1]
 
     @property
-    def with_offsets(self) -> NDArray[np.bool_]:
+    def with_offsets(self) -> Mask:
         """(J,) joints with a factor of your own, in a window of several frames: solved with offsets throughout."""
-        return self._touched if self.temporal else np.zeros_like(self._touched)
-
-    @property
-    def touched(self) -> NDArray[np.bool_]:
-        """(J,) joints on which there is a factor of your own."""
-        return self._touched
+        return self.touched if self.temporal else np.zeros_like(self.touched)
 
     def solve(
         self,
-        inlier: NDArray[np.bool_],
+        inlier: Mask,
         views: Message,
         body: Message,
-        initial: NDArray[np.float64],
-        lost: NDArray[np.bool_] | None = None,
-        standing: NDArray[np.float64] | None = None,
-    ) -> NDArray[np.float64]:
+        initial: Array,
+        lost: Mask | None = None,
+        standing: Array | None = None,
+    ) -> Array:
         """Minimise over the joints, from `initial` (T, J, 3) metres; returns (T, J, 3).
 
         `inlier` (T, J, V) are the observations that count (delta_ij of Eq. 2), `views` what they say together at
@@ -193,23 +186,23 @@ class WindowGraph:
         seen. `standing` (T - 1, J): how little they walk in each step, m²/s, infinite where they do not stand.
         """
         self.failure = ""
-        self._present = np.asarray(np.isfinite(initial).all(axis=2))
+        self.present = np.asarray(np.isfinite(initial).all(axis=2))
         if self.temporal:
-            self._present &= np.asarray(self._present.all(axis=0))
-        of_views = self._present & self.with_offsets
+            self.present &= np.asarray(self.present.all(axis=0))
+        of_views = self.present & self.with_offsets
         of_body = of_views
         if self.temporal and lost is not None:
-            of_body = self._present & (self.with_offsets | near_in_time(lost, self.times_s, self._motion.around_s))
+            of_body = self.present & (self.with_offsets | near_in_time(lost, self.times_s, self._motion.around_s))
         self.values = self._start(initial, np.stack([spanned(of_views), spanned(of_body)]))
         self.graph = gtsam.NonlinearFactorGraph()
-        self._push(self._seen(inlier & (self._present & ~of_views)[..., None]))
-        self._push(self._priors(body, self._present & ~of_body))
+        self._push(self._seen(inlier & (self.present & ~of_views)[..., None]))
+        self._push(self._priors(body, self.present & ~of_body))
         self._push(self._lasting(views, 1.0 / self.config.weight_2d, self._motion.views, _OF_VIEWS, of_views))
         self._push(self._lasting(body, 1.0 / self.config.weight_shape, self._motion.body, _OF_BODY, of_body))
         if self.temporal:
             self._push(self._motions(initial, lost))
         if standing is not None:
-            step, joint = np.nonzero(np.isfinite(standing) & self._present[1:])
+            step, joint = np.nonzero(np.isfinite(standing) & self.present[1:])
             before, after = self.keys[step, joint], self.keys[step + 1, joint]
             self._push(standing_factors(before, after, np.diff(self.times_s)[step], standing[step, joint]))
         exists = self.values.exists
@@ -219,7 +212,7 @@ class WindowGraph:
         self._optimise()
         return self._points()[0]
 
-    def velocity(self) -> NDArray[np.float64]:
+    def velocity(self) -> Array:
         """(T, J, 3) velocities of the last solution, m/s; NaN where there are none."""
         return self._points()[1]
 
@@ -247,12 +240,12 @@ class WindowGraph:
         for factor in factors:
             push(factor)
 
-    def _seen(self, inlier: NDArray[np.bool_]) -> list[gtsam.NonlinearFactor]:
+    def _seen(self, inlier: Mask) -> list[gtsam.NonlinearFactor]:
         """The projection factors of `inlier` (T, J, V)."""
         chosen = np.flatnonzero(inlier[self._frame, self._joint, self._view])
         return [self._projections[n] for n in chosen.tolist()]
 
-    def _priors(self, body: Message, where: NDArray[np.bool_]) -> list[gtsam.NonlinearFactor]:
+    def _priors(self, body: Message, where: Mask) -> list[gtsam.NonlinearFactor]:
         """The body's pull on the joints of `where` (T, J)."""
         known = body.known & where
         share = self._motion.views.white_share if self.temporal else 1.0
@@ -261,7 +254,7 @@ class WindowGraph:
         return list(body_prior_factors(self.keys[known], body.xyz[known], symmetric))
 
     def _lasting(
-        self, said: Message, scale: float, errors: Lasting, source: int, chosen: NDArray[np.bool_]
+        self, said: Message, scale: float, errors: Lasting, source: int, chosen: Mask
     ) -> list[gtsam.NonlinearFactor]:
         """What is `said` of the joints of `chosen` (T, J), with an offset each that decays slowly."""
         known, keys = said.known & chosen, self._offset_keys[source]
@@ -274,7 +267,7 @@ class WindowGraph:
             factors += offset_factors(keys[there, joint], self.times_s[there], errors.correlation_s)
         return factors
 
-    def _motions(self, near: NDArray[np.float64], lost: NDArray[np.bool_] | None) -> list[gtsam.NonlinearFactor]:
+    def _motions(self, near: Array, lost: Mask | None) -> list[gtsam.NonlinearFactor]:
         """Motion of the joints that are in the problem; how far they may turn goes by their speed at `near`."""
         speed = speeds(near, self.times_s)
         density = self._motion.density(speed)
@@ -282,36 +275,36 @@ class WindowGraph:
             density = np.where(lost[1:] & lost[:-1], self._motion.density_lost(speed), density)
         law, factors = self._motion.law, list[gtsam.NonlinearFactor]()
         unknown = [diagonal(np.full(3, sigma)) for sigma in law.start]
-        for joint in np.flatnonzero(self._present[0]).tolist():
+        for joint in np.flatnonzero(self.present[0]).tolist():
             states = self.state_keys[:, joint]
             for key, noise in zip(states[0, 1:].tolist(), unknown, strict=True):
                 factors.append(gtsam.PriorFactorPoint3(key, np.zeros(3), noise))
             factors += law.factors(states, self.times_s, density[:, joint])
         return factors
 
-    def _start(self, initial: NDArray[np.float64], offsets: NDArray[np.bool_]) -> gtsam.Values:
+    def _start(self, initial: Array, offsets: Mask) -> gtsam.Values:
         """`initial` (T, J, 3) with its derivatives; `offsets` (2, T, J) of views and body start as they ended."""
         values = gtsam.Values()
         insert = values.insert
-        for key, point in zip(self.keys[self._present].tolist(), initial[self._present], strict=True):
+        for key, point in zip(self.keys[self.present].tolist(), initial[self.present], strict=True):
             insert(key, point)
         if not self.temporal:
             return values
         last, derivative = self.values, initial
         for keys in np.moveaxis(self.state_keys[..., 1:], -1, 0):
             derivative = np.gradient(derivative, self.times_s, axis=0)
-            for key, value in zip(keys[self._present].tolist(), derivative[self._present], strict=True):
+            for key, value in zip(keys[self.present].tolist(), derivative[self.present], strict=True):
                 insert(key, last.atPoint3(key) if last.exists(key) else value)
         zero = np.zeros(3)
         for key in self._offset_keys[offsets].tolist():
             insert(key, last.atPoint3(key) if last.exists(key) else zero)
         return values
 
-    def _points(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _points(self) -> tuple[Array, Array]:
         """Positions and velocities (T, J, 3) of the last solution. Values are sorted as keys are: by joint, then
         frame.
         """
-        present = self._present.T
+        present = self.present.T
         positions, speeds = (np.full((*present.shape, 3), np.nan) for _ in range(2))
         count = int(present.sum())
         if count > 0:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from factors import lasting_difference_factors, offset_factors, offset_keys, reported_keys
 from shapepose_fg.body.fitting.fitter import BodyFit
-from shapepose_fg.core.arrays import Whole
+from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.notes import Problem
 from shapepose_fg.core.observation_table import Gate, ObservationTable
@@ -32,21 +32,21 @@ class WindowSolution:
 
     observations: Observations
     """Who, when, and from which detections, as they were assigned last."""
-    joints: NDArray[np.float64]
+    joints: Array
     """(N, J, 3) X, metres in the world; NaN where unknown."""
-    covariance: NDArray[np.float64]
+    covariance: Array
     """(N, J, 3, 3) covariance of each joint, m², errors that last in it; NaN where unknown."""
-    velocity: NDArray[np.float64]
+    velocity: Array
     """(N, J, 3) m/s; NaN where unknown, and in rows that stand alone."""
-    velocity_covariance: NDArray[np.float64]
+    velocity_covariance: Array
     """(N, J, 3, 3) m²/s²; NaN where the velocity is."""
-    confidence: NDArray[np.float64]
+    confidence: Array
     """(N, J) w_i of Eq. 4, mean confidence over all views of the observations that were kept."""
-    inlier: NDArray[np.bool_]
+    inlier: Mask
     """(N, J, V) delta_ij of Eq. 2: which observations were kept."""
-    contradicts: NDArray[np.bool_]
+    contradicts: Mask
     """(N, J) joints whose views the body contradicts."""
-    residual_px: NDArray[np.float64]
+    residual_px: Array
     """(N, J, V, 2) projection of the joint minus observation; NaN where unseen or unknown."""
     known: NDArray[np.uint8]
     """(N, J) a `Known` each."""
@@ -64,7 +64,7 @@ class WindowSolution:
     def __len__(self) -> int:
         return len(self.joints)
 
-    def rows(self, index: NDArray[np.intp]) -> "WindowSolution":
+    def rows(self, index: Index) -> "WindowSolution":
         """Some of the rows, without graphs: plain data, which can be sent to another process."""
         place = {row: n for n, row in enumerate(index.tolist())}
         problems = tuple(replace(each, row=place[each.row]) for each in self.problems if each.row in place)
@@ -110,15 +110,15 @@ class PersonGraph:
 
     window: WindowGraph
     """What the solver solved."""
-    joints: NDArray[np.float64]
+    joints: Array
     """(T, J, 3) where the joints are reported, metres in the world; NaN where unknown."""
-    covariance: NDArray[np.float64]
+    covariance: Array
     """(T, J, 3, 3) as it is reported, m²; NaN where unknown."""
     bodies: BodyFit
     """The bodies, T rows."""
-    solved: NDArray[np.float64]
+    solved: Array
     """(T, J, 3) where the solver has the joints, metres."""
-    solved_covariance: NDArray[np.float64]
+    solved_covariance: Array
     """(T, J, 3, 3) and how surely: marginals of its graph, m²."""
     lasting: Lasting
     """How the error goes on that is in the report and not in the solver's graph."""
@@ -129,12 +129,12 @@ class PersonGraph:
         return self.window.track
 
     @property
-    def frames(self) -> NDArray[np.integer]:
+    def frames(self) -> Whole:
         """(T,) frame of each row."""
         return self.window.frames
 
     @property
-    def rows(self) -> NDArray[np.intp]:
+    def rows(self) -> Index:
         """(T,) rows of the solution, frames rising."""
         return self.window.rows
 
@@ -189,7 +189,7 @@ class PersonGraph:
         return offset_keys(self.person, np.arange(self.joints.shape[1]), self.frames[:, None], _OF_SOLUTION)
 
     @property
-    def _known(self) -> NDArray[np.bool_]:
+    def _known(self) -> Mask:
         """(T, J) joints that are reported, and how surely."""
         finite = np.isfinite(self.covariance).all(axis=(2, 3)) & np.isfinite(self.solved_covariance).all(
             axis=(2, 3)
@@ -197,7 +197,7 @@ class PersonGraph:
         return np.asarray(finite & np.isfinite(self.joints).all(axis=2) & self.window.present)
 
     @property
-    def _more(self) -> NDArray[np.float64]:
+    def _more(self) -> Array:
         """(T, J, 3, 3) what the reported covariances are larger by, m²: positive definite."""
         more = np.where(self._known[..., None, None], self.covariance - self.solved_covariance, np.eye(3))
         values, vectors = np.linalg.eigh((more + more.mT) / 2)

@@ -4,9 +4,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factors import project_with_jacobian, sigma_px
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.detections import DetectionSequence, Recording
 from shapepose_fg.core.reconstruction import Reconstruction
@@ -18,7 +18,6 @@ NEAR_M = 0.3
 INSIDE_95 = 5.991
 """A chi-squared variable with 2 degrees of freedom is under this in 95 of 100 cases."""
 
-Array = NDArray[np.float64]
 Solve = Callable[[DetectionSequence, Rig], Reconstruction]
 """Reconstruct a recording: `reconstruct`, with the settings in it."""
 

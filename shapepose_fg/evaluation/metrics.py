@@ -9,10 +9,8 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.special import gammaincinv
 
+from shapepose_fg.core.arrays import Array, Index, Real, Whole
 from shapepose_fg.core.skeleton import BODY_25
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 MAX_DISTANCE_M = 0.5
 """Metres. A prediction this far from a person, in the mean over joints, is not that person."""
@@ -22,12 +20,12 @@ class People(Protocol):
     """What is scored: a `Reconstruction`, or anything with its two arrays."""
 
     @property
-    def frame(self) -> NDArray[np.integer]:
+    def frame(self) -> Whole:
         """(N,) frame of each row."""
         ...
 
     @property
-    def joints(self) -> NDArray[np.floating]:
+    def joints(self) -> Real:
         """(N, J, 3) joints of each row, metres, NaN where unknown."""
         ...
 
@@ -64,12 +62,7 @@ class Matches:
     """(K, 2) frame and person of the people who are matched with no prediction."""
 
 
-def match_people(
-    frame: NDArray[np.integer],
-    joints: NDArray[np.floating],
-    truth: NDArray[np.floating],
-    frames: Sequence[int] | range | None = None,
-) -> Matches:
+def match_people(frame: Whole, joints: Real, truth: Real, frames: Sequence[int] | range | None = None) -> Matches:
     """Match predictions `joints` (N, J, 3) of `frame` (N,) with `truth` (T, P, J, 3), all in metres.
 
     `frames` (T,) numbers the frames of the truth, 0 to T - 1 by default; predictions of other frames are left
@@ -179,8 +172,8 @@ class JointMetrics:
 
 
 def joint_metrics(
-    predicted: People | Sequence[NDArray[np.floating]],
-    truth: NDArray[np.floating],
+    predicted: People | Sequence[Real],
+    truth: Real,
     frames: Sequence[int] | range | None = None,
     *,
     correct_m: float = CORRECT_M,
@@ -243,9 +236,7 @@ class CovarianceCalibration:
         return float(self.nees.mean()) if len(self.nees) else float("nan")
 
 
-def covariance_calibration(
-    errors: NDArray[np.floating], covariances: NDArray[np.floating]
-) -> CovarianceCalibration:
+def covariance_calibration(errors: Real, covariances: Real) -> CovarianceCalibration:
     """Compare `errors` (..., 3), metres, with the `covariances` (..., 3, 3), m², that came with them.
 
     Pairs with NaN are left out. ValueError for a covariance that is not positive definite.

@@ -6,14 +6,15 @@ from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Axis
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25, MID_HIP
 from shapepose_fg.core.storage.files import open_regular, read_text
 from shapepose_fg.evaluation.metrics import PlainPeople
+from shapepose_fg.io.calibration.written import METRES
 from shapepose_fg.io.export.take import opensim_axes
 
 SHELF_JOINTS = tuple(
@@ -33,8 +34,6 @@ _MAX_PEOPLE, _MAX_FRAMES, _MAX_JOINTS = 1000, 10**7, 1000
 """Counts beyond these are none."""
 _FAR_M = 1e5
 """Nobody is so far from the origin of a room, metres: another unit, or a damaged file."""
-_METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
-"""What a unit of a TRC file's header is."""
 _MIDDLES = ("CHip", "Hip")
 """What Pose2Sim calls the middle of the hips."""
 _FILTERED = "_filt_"
@@ -82,7 +81,7 @@ def _beginning(path: Path) -> str:
 
 def _in_body_25(paths: Sequence[Path], parts: Sequence[PlainPeople]) -> PlainPeople:
     """The people of all files in BODY_25's joints, sorted by frame and person, numbered by their files."""
-    placed = list[NDArray[np.float64]]()
+    placed = list[Array]()
     for path, part in zip(paths, parts, strict=True):
         known = [place for place, name in enumerate(part.joint_names) if name in BODY_25.joints]
         if len(known) == 0:
@@ -99,7 +98,7 @@ def _in_body_25(paths: Sequence[Path], parts: Sequence[PlainPeople]) -> PlainPeo
     return PlainPeople(frame[order], np.concatenate(placed)[order], person[order])
 
 
-def _check_near(path: Path, joints: NDArray[np.float64]) -> None:
+def _check_near(path: Path, joints: Array) -> None:
     """InputError where a joint is in no room."""
     farthest = np.abs(np.nan_to_num(joints)).max(initial=0.0)
     if farthest > _FAR_M:
@@ -119,7 +118,7 @@ def read_skeleton_text(path: Path, *, shelf: bool = False) -> PlainPeople:
         lines.refuse(f"must say {len(SHELF_JOINTS)} joints and the number of frames, got {joints} and {frames}")
     if not 0 < joints <= _MAX_JOINTS or not 0 <= frames <= _MAX_FRAMES:
         lines.refuse(f"must say how many joints and frames there are, got {joints} and {frames}")
-    who, rows = list[tuple[int, int]](), list[NDArray[np.float64]]()
+    who, rows = list[tuple[int, int]](), list[Array]()
     for frame in range(frames):
         (people,) = lines.integers(1, f"the number of people in frame {frame}")
         if not 0 <= people <= _MAX_PEOPLE:
@@ -142,7 +141,7 @@ def read_skeleton_text(path: Path, *, shelf: bool = False) -> PlainPeople:
     return PlainPeople(frame, xyz, person, _text_joints(path, xyz))
 
 
-def _text_joints(path: Path, joints: NDArray[np.float64]) -> tuple[str, ...]:
+def _text_joints(path: Path, joints: Array) -> tuple[str, ...]:
     """The names of the joints (N, J, 3) of a file, by their number; InputError where that is none that is known.
 
     15 are Shelf's, where the middle of the hips is the last joint, or SKEL_15, where it is the first: the hips
@@ -183,7 +182,7 @@ class _Lines:
         except ValueError:
             self.refuse(f"must hold {meaning}, got {' '.join(words)[:40]!r}")
 
-    def numbers(self, count: int, meaning: str, unknown: bool) -> NDArray[np.float64]:
+    def numbers(self, count: int, meaning: str, unknown: bool) -> Array:
         """`count` numbers; NaN among them only where they may be `unknown`, infinity never."""
         words = self._next(count, meaning)
         try:
@@ -242,7 +241,7 @@ def read_trc(path: Path, up: Axis = "z") -> PlainPeople:
     for heading in ("nummarkers", "units"):
         if heading not in header:
             refuse(3, f"has no value for {heading}")
-    if header["units"].lower() not in _METRES:
+    if header["units"].lower() not in METRES:
         refuse(3, f"has the unit {header['units'][:20]!r}; it must be m, cm or mm")
     count, names = header["nummarkers"], [cell.strip() for cell in lines[3][2:] if cell.strip()]
     if not count.isdecimal() or not 0 < int(count[:9]) <= _MAX_JOINTS:
@@ -265,7 +264,7 @@ def read_trc(path: Path, up: Axis = "z") -> PlainPeople:
             refuse(place, f"holds more than {len(names)} markers")
         rows.append(row[:width])
     table = np.array(rows, dtype=np.float64).reshape(len(rows), width)
-    xyz = _METRES[header["units"].lower()] * table[:, 2:].reshape(len(rows), len(names), 3)
+    xyz = METRES[header["units"].lower()] * table[:, 2:].reshape(len(rows), len(names), 3)
     # A marker of which one coordinate is missing is missing.
     xyz = np.where(np.isfinite(xyz).all(axis=-1, keepdims=True), xyz, np.nan) @ opensim_axes(up)
     frame, named = table[:, 0].astype(np.int64), tuple(MID_HIP if name in _MIDDLES else name for name in names)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.core.skeleton import BODY_25
@@ -71,7 +72,7 @@ class ShelfScore:
     """Frames with an annotated actor."""
 
     @property
-    def pcp(self) -> NDArray[np.float64]:
+    def pcp(self) -> Array:
         """(3,) percentage of right limbs of each actor; NaN for one who is not in the scored frames."""
         return _percent(self.limbs_right.sum(axis=1), self.limbs_all.sum(axis=1))
 
@@ -162,7 +163,7 @@ def evaluate_shelf(people: People, ground_truth: PlainPeople, frames: Iterable[i
     )
 
 
-def _distances(truth: NDArray[np.float64], frame: NDArray[np.int64], people: People) -> NDArray[np.float64]:
+def _distances(truth: Array, frame: NDArray[np.int64], people: People) -> Array:
     """(G, 15) distances of the joints that annotated people (G, 15, 3) take, metres; NaN where there is none."""
     joints = np.asarray(people.joints, dtype=np.float64)
     names = tuple(getattr(people, "joint_names", BODY_25.joints))
@@ -179,7 +180,7 @@ def _distances(truth: NDArray[np.float64], frame: NDArray[np.int64], people: Peo
     return taken
 
 
-def shelf_joints(body25: NDArray[np.float64]) -> NDArray[np.float64]:
+def shelf_joints(body25: Array) -> Array:
     """Map BODY_25 joints (N, 25, 3), metres, z up, to Shelf's (N, 15, 3); NaN stays NaN.
 
     The hips, limbs and MidHip are the joints of the same name. With s and e the middles of shoulders and
@@ -206,7 +207,7 @@ def shelf_joints(body25: NDArray[np.float64]) -> NDArray[np.float64]:
     return result
 
 
-def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+def _unit(vectors: Array) -> Array:
     """Vectors (N, 3) of length one; NaN for one of no length."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return vectors / np.where(length > 0, length, np.nan)
@@ -229,7 +230,7 @@ def _spans(frames: NDArray[np.int64]) -> str:
     return ", ".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs)
 
 
-def _percent(part: Any, whole: Any) -> NDArray[np.float64]:
+def _percent(part: Any, whole: Any) -> Array:
     """100 part / whole, NaN where there is nothing."""
     whole = np.asarray(whole, dtype=np.float64)
     return 100 * np.asarray(part) / np.where(whole > 0, whole, np.nan)

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factors import project_with_jacobian
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.errors import InputError
@@ -20,8 +20,6 @@ from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.linearisation import ObservationConfig, triangulate
 from shapepose_fg.proposal.candidates import CandidateConfig, triangulate_pairs
-
-Array = NDArray[np.float64]
 
 SINGLE_FPS = 60.0
 MIDDLE_M = 1.5
@@ -91,13 +89,13 @@ def measure_single_person(
     )
 
 
-def man_of(people: Reconstruction, rig: Rig) -> NDArray[np.intp]:
+def man_of(people: Reconstruction, rig: Rig) -> Index:
     """(M,) the row of the man in each frame that has one, in the order of frames."""
     middle = (rig.centres @ _floor(rig).T).mean(axis=0)
     return _one_a_frame(people, np.linalg.norm(_places(people, rig) - middle, axis=1), MIDDLE_M)
 
 
-def bystander_seen(recording: DetectionSequence, rig: Rig) -> NDArray[np.bool_]:
+def bystander_seen(recording: DetectionSequence, rig: Rig) -> Mask:
     """(T,) frames in which two views have five of the bystander's joints: rays that meet at their place."""
     seen = np.zeros(len(recording), dtype=bool)
     for frame in range(len(recording)):
@@ -137,7 +135,7 @@ def _places(people: Reconstruction, rig: Rig) -> Array:
     return np.where(count > 0, mean @ _floor(rig).T, np.inf)
 
 
-def _one_a_frame(people: Reconstruction, distance: Array, limit: float) -> NDArray[np.intp]:
+def _one_a_frame(people: Reconstruction, distance: Array, limit: float) -> Index:
     """(M,) in each frame the row of least `distance` (N,), if under `limit`; in the order of frames."""
     order = np.lexsort((distance, people.frame))
     _, first = np.unique(people.frame[order], return_index=True)
@@ -157,9 +155,9 @@ def _accelerations(people: Reconstruction, fps: float) -> Array:
 class AnnotatedArms:
     """A annotated joints in space."""
 
-    frame: NDArray[np.intp]
+    frame: Index
     """(A,) frame of the recording."""
-    joint: NDArray[np.intp]
+    joint: Index
     """(A,) index into `ARMS`."""
     xyz: Array
     """(A, 3) position, metres, where the marks of two views or more meet."""
@@ -181,7 +179,7 @@ class AnnotatedArms:
 class ArmErrors:
     """What `measure_arms` found, joint by joint; a joint that has no place is infinitely far away."""
 
-    joint: NDArray[np.intp]
+    joint: Index
     """(A,) index into `ARMS`."""
     error_m: Array
     """(A,) distance from the annotation, metres."""

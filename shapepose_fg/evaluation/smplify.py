@@ -11,24 +11,22 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from shapepose_fg.body.fitting.energy import BodyEnergy, robust_weight
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
-from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.rotation import log_so3
 from shapepose_fg.body.model.target_skeletons import slots
 from shapepose_fg.body.threads import torch_threads
+from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.estimation.linearisation import ObservationConfig, triangulate
 from shapepose_fg.evaluation.metrics import PlainPeople
-
-Array = NDArray[np.float64]
+from shapepose_fg.evaluation.tracking import detector_s_body
 
 TORSO = ("Neck", "RShoulder", "LShoulder", "MidHip", "RHip", "LHip")
 """What the root is found by."""
@@ -65,10 +63,8 @@ def smpl_only(people: Reconstruction, rig: Rig, config: ObservationConfig) -> Sm
     if people.observations is None:
         raise ValueError("people without observations: reconstruct them again")
     observations = people.observations.observations(np.full_like(people.joints, np.nan), people.time_s)
-    offsets, model = people.run.get("keypoint_offsets"), BodyModel.default()
-    if offsets is not None:
-        model = model.with_keypoint_offsets(KeypointOffsets.from_dict(offsets))
-    start, fitter = triangulate(observations, Views.of(rig), config), MultiViewSmplify(model)
+    start = triangulate(observations, Views.of(rig), config)
+    fitter = MultiViewSmplify(detector_s_body(people))
     with torch_threads(1):
         began = time.process_time()
         joints, _ = fitter.fit(observations, rig, start)
@@ -103,7 +99,7 @@ class MultiViewSmplify:
         free = torch.full((N, self._energy.num_free), torch.nan)
         if len(rows) > 0:
             rotation, pelvis = self._root(start[rows], placed[rows])
-            views = _ViewTargets.of(observations.rows(rows), rig, pelvis.numpy(), _SIGMA_M)
+            views = ViewTargets.of(observations.rows(rows), rig, pelvis.numpy(), _SIGMA_M)
             solved = self._solve(rotation, views)
             joints[rows] = (
                 self.model.keypoints(self._energy.complete(solved)).double().numpy() + pelvis.numpy()[:, None]
@@ -112,7 +108,7 @@ class MultiViewSmplify:
             free[torch.from_numpy(rows)] = solved
         return joints, self._energy.complete(free)
 
-    def _root(self, start: Array, placed: NDArray[np.bool_]) -> tuple[Tensor, Tensor]:
+    def _root(self, start: Array, placed: Mask) -> tuple[Tensor, Tensor]:
         """Rotations (B, 3, 3) and places (B, 3) of the root, by the torso's joints, or by all if these are few."""
         torso = placed & self._torso.numpy()
         used = np.where(torso.sum(axis=1, keepdims=True) >= _MIN_START_JOINTS, torso, placed)
@@ -122,7 +118,7 @@ class MultiViewSmplify:
         xyz = torch.from_numpy(np.where(used[..., None], start, centre))
         return self._frame.place(xyz, torch.from_numpy(variance), self._slots)
 
-    def _solve(self, rotation: Tensor, views: "_ViewTargets") -> Tensor:
+    def _solve(self, rotation: Tensor, views: "ViewTargets") -> Tensor:
         """Free parameters (B, P) around the root's start: all steps of Adam (Kingma and Ba 2015)."""
         energy, B = self._energy, len(rotation)
         angles = self._mean_angles.expand(B, -1)
@@ -151,7 +147,7 @@ class MultiViewSmplify:
 
 
 @dataclass(frozen=True)
-class _ViewTargets:
+class ViewTargets:
     """The detections of B rows as lengths at each row's depth, around each row's own origin."""
 
     cTw: Tensor
@@ -166,7 +162,7 @@ class _ViewTargets:
     """(B, V) depth of the origin over sigma: from normalised coordinates to sigmas."""
 
     @classmethod
-    def of(cls, observations: Observations, rig: Rig, origin: Array, sigma_m: float) -> "_ViewTargets":
+    def of(cls, observations: Observations, rig: Rig, origin: Array, sigma_m: float) -> "ViewTargets":
         """The detections of B rows, with `origin` (B, 3) in the world."""
         B, J, V = observations.confidence.shape
         view = np.tile(np.arange(V), B * J)

@@ -10,6 +10,7 @@ from scipy.optimize import linear_sum_assignment
 
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
+from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.metrics import (
@@ -23,8 +24,6 @@ from shapepose_fg.evaluation.metrics import (
     metrics_of,
     share,
 )
-
-Array = NDArray[np.float64]
 
 WRISTS = [BODY_25.index("RWrist"), BODY_25.index("LWrist")]
 FAST_M_S = 1.5
@@ -159,7 +158,7 @@ def score_tracks(
 
 
 def identity_metrics(
-    matches: Matches, index: NDArray[np.integer], identity: NDArray[np.integer], joints: Array, truth: Array
+    matches: Matches, index: Whole, identity: Whole, joints: Array, truth: Array
 ) -> IdentityMetrics:
     """Compare the identities of rows with those of the truth (T, P, J, 3), NaN where a person is absent.
 
@@ -197,16 +196,20 @@ def identity_metrics(
 
 def body_joints(people: Reconstruction) -> Array:
     """(N, J, 3) joints of the fitted bodies, with the offsets that the run learnt; NaN where there is no body."""
-    model, offsets = BodyModel.default(), people.run.get("keypoint_offsets")
-    if offsets is not None:
-        model = model.with_keypoint_offsets(KeypointOffsets.from_dict(offsets))
+    model = detector_s_body(people)
     columns = (people.betas, people.global_orient, people.body_pose, people.transl)
     with torch.no_grad():
         bodies = BodyParameters(*(torch.from_numpy(column).to(model.dtype) for column in columns))
         return model.keypoints(bodies).double().numpy()
 
 
-def views_used(people: Reconstruction) -> NDArray[np.intp]:
+def detector_s_body(people: Reconstruction) -> BodyModel:
+    """The open body, its joints where the run has learnt that the detector puts them."""
+    model, offsets = BodyModel.default(), people.run.get("keypoint_offsets")
+    return model if offsets is None else model.with_keypoint_offsets(KeypointOffsets.from_dict(offsets))
+
+
+def views_used(people: Reconstruction) -> Index:
     """(N, J) how many views' detections each joint was solved from.
 
     Without a record of observations a joint with a confidence counts as seen by two: nothing tells more.
@@ -225,7 +228,7 @@ def joints_by_frame(people: Reconstruction) -> Array:
     return table
 
 
-def acceleration_errors(placed: Array, truth: Array, follows: NDArray[np.bool_], fps: float) -> Array:
+def acceleration_errors(placed: Array, truth: Array, follows: Mask, fps: float) -> Array:
     """(T - 2, P, J) error of second differences, m/s², of `placed` and `truth` (T, P, J, 3), metres.
 
     NaN where one of the three frames does not follow (T, P) the one before.
@@ -251,7 +254,7 @@ def fast_wrist_errors(placed: Array, truth: Array, fps: float) -> Array:
     return error[fast & np.isfinite(error)]
 
 
-def frames_unseen(seen: NDArray[np.bool_], frame: NDArray[np.integer], identity: NDArray[np.integer]) -> NDArray:
+def frames_unseen(seen: Mask, frame: Whole, identity: Whole) -> NDArray:
     """(N, J) for how many frames, up to this one and with it, a joint of an identity has not been `seen` (N, J).
 
     The count begins anew where the identity has no row in the frame before.

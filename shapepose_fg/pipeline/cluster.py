@@ -59,7 +59,7 @@ class Cluster(Generic[Shared]):
                 address = opened.enter_context(local_cluster(self._count)).address
             client = opened.enter_context(_client(address))
             if self._address is not None:
-                _refuse_other_programs(client, address)
+                refuse_other_programs(client, address)
             # A task, not data that was scattered: what is lost with a process can be made again.
             self._client, self._at = client, client.submit(_same, self._shared, pure=False)
             self._open = opened.pop_all()
@@ -81,7 +81,7 @@ class Cluster(Generic[Shared]):
         if client is None:
             raise RuntimeError("a cluster is a context: use it in `with`")
         how = {"pure": False, "retries": RETRIES}
-        submit = partial(client.submit, _work, tuple(_program().items()), work, self._at, **how)
+        submit = partial(client.submit, one_item, tuple(this_program().items()), work, self._at, **how)
         try:
             yield from in_order(submit, items, self._most_under_way, client.cancel)
         except KilledWorker as error:
@@ -147,7 +147,7 @@ def has_dashboard() -> bool:
 def look_at(address: str) -> Scheduler:
     """The scheduler at an address, whose processes have this very program; InputError otherwise."""
     with _client(address) as client:
-        _refuse_other_programs(client, address)
+        refuse_other_programs(client, address)
         shown = "dashboard" in client.scheduler_info().get("services", {})
         return Scheduler(address, len(client.nthreads()), client.dashboard_link if shown else None)
 
@@ -170,15 +170,15 @@ def _client(address: str) -> Iterator[Any]:
         yield client
 
 
-def _refuse_other_programs(client: Any, address: str) -> None:
+def refuse_other_programs(client: Any, address: str) -> None:
     """InputError where a process has another version of this program, or of what decides on numbers."""
-    for process, theirs in client.run(_program, on_error="return").items():
+    for process, theirs in client.run(this_program, on_error="return").items():
         if not isinstance(theirs, dict):
             raise InputError(
                 f"--cluster {address}: its process {process} cannot run this program"
                 f' ({" ".join(str(theirs).split())[:200]}); install "shapepose-fg[cluster]" there'
             )
-        _refuse_other(f"--cluster {address}: its process {process}", _program(), theirs)
+        _refuse_other(f"--cluster {address}: its process {process}", this_program(), theirs)
 
 
 def _refuse_other(process: str, own: dict[str, str], theirs: dict[str, str]) -> None:
@@ -193,7 +193,7 @@ def _refuse_other(process: str, own: dict[str, str], theirs: dict[str, str]) -> 
 
 
 @cache
-def _program() -> dict[str, str]:
+def this_program() -> dict[str, str]:
     """What decides about the numbers of this process."""
     return {**versions(), _ITSELF: program_digest()}
 
@@ -211,14 +211,14 @@ def _same(shared: Shared) -> Shared:
     return shared
 
 
-def _work(program: tuple[tuple[str, str], ...], work: Callable[[Any, Any], Any], shared: Any, item: Any) -> Any:
+def one_item(program: tuple[tuple[str, str], ...], work: Callable[[Any, Any], Any], shared: Any, item: Any) -> Any:
     """One item, in a process of the cluster; InputError where it has another `program` than the one that asks.
 
     Processes may come at any time, after the others were looked at.
     """
     import torch
 
-    _refuse_other(f"--cluster: one of its processes, {socket.gethostname()},", dict(program), _program())
+    _refuse_other(f"--cluster: one of its processes, {socket.gethostname()},", dict(program), this_program())
     if torch.get_num_threads() != 1:
         torch.set_num_threads(1)
     return work(shared, item)

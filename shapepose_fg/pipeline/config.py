@@ -53,7 +53,7 @@ class WindowConfig(Settings):
     changes. Fewer rounds are faster; with 3, crowds before three cameras lose one to two points of F1."""
     again_alone: RepeatsOrNone = 5
     """The same frame by frame; 0: never, as in the paper. From round to round more is asked of who stays
-    (`Survival`): who goes leaves detections to others, so the least sure goes first. Fewer rounds are faster."""
+    (`LEAST_PROBABILITY`): who goes leaves detections to others, so the least sure goes first. Fewer are faster."""
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from shapepose_fg.estimation.smoothing import smoothed
 from shapepose_fg.estimation.state import State, parts_of
 from shapepose_fg.estimation.window_graph import ExtraFactors
 from shapepose_fg.estimation.window_solution import WindowSolution
-from shapepose_fg.tracking.reassociation import Survival, changed, reassociate
+from shapepose_fg.tracking.reassociation import LEAST_PROBABILITY, changed, reassociate
 
 _SETTLED = 0.002
 """Detections are not assigned again when fewer than this share of them changed: in crowds before six cameras after
@@ -41,7 +41,8 @@ class Assigning:
     rounds: int
     """How often."""
     over_time: bool
-    """Whether people are the same from frame to frame. If not, each round asks more of who stays (`Survival`)."""
+    """Whether people are the same from frame to frame. If not, each round asks more of who stays
+    (`LEAST_PROBABILITY`)."""
 
 
 def solve_window(
@@ -80,9 +81,9 @@ def solve_window(
         if assigning.over_time:
             times_s = observations.time_s.mean(axis=1)
             places, covariance = smoothed(places, covariance, observations.track, times_s, motion)
-        survival = None if assigning.over_time else Survival().at(n / max(assigning.rounds - 1, 1))
+        least = None if assigning.over_time else n / max(assigning.rounds - 1, 1) * LEAST_PROBABILITY
         before = observations
-        observations = reassociate(assigning.frames, before, places, covariance, assigning.skeleton, survival)
+        observations = reassociate(assigning.frames, before, places, covariance, assigning.skeleton, least)
         if assigning.over_time and changed(before, observations) < _SETTLED:
             break
     assigned = time.perf_counter()

@@ -2,23 +2,27 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.core.arrays import Index, Mask, Whole
 from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import segments
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.estimation.floor import Floor
 from shapepose_fg.estimation.window_graph import ExtraFactors
 from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution
-from shapepose_fg.io.solved_setup import SolvedSetup, setup_of
+from shapepose_fg.io.calibration import read_rig
+from shapepose_fg.io.config import ANOTHER_VERSION, config_from
+from shapepose_fg.io.solved_setup import CAMERAS
 from shapepose_fg.pipeline.bodies_over_time import with_bodies_over_time
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.solve_window import solve_window
@@ -37,14 +41,26 @@ class Solver:
     """Fits bodies; it knows where the detector puts its joints (`run["keypoint_offsets"]`)."""
 
     @classmethod
-    def of(cls, setup: SolvedSetup[PipelineConfig], joint_names: NDArray[np.str_]) -> "Solver":
-        """What a result with these joints was solved with."""
-        model = BodyModel.default() if setup.body is None else BodyModel.load(setup.body)
-        settings, names = setup.settings, tuple(joint_names.tolist())
-        fitter = make_fitter(settings.body, model.with_keypoints(names), settings.law)
-        if setup.offsets is not None:
-            fitter = fitter.with_keypoint_offsets(setup.offsets)
-        return cls(setup.rig, setup.settings, fitter)
+    def of(cls, people: Reconstruction, rig: Rig, run_file: Path = Path("run.json")) -> "Solver":
+        """What a result before these cameras was solved with; InputError where its `run_file` does not say it."""
+        configuration = people.run.get("configuration")
+        if not isinstance(configuration, dict):
+            raise InputError(f"{run_file}: configuration is missing; reconstruct the recording again")
+        config = config_from(configuration, PipelineConfig, run_file, cure=ANOTHER_VERSION)
+        told, body = people.run.get("keypoint_offsets"), people.run.get("body")
+        offsets = None if told is None else KeypointOffsets.read(told, run_file)
+        model = BodyModel.default() if body is None else BodyModel.load(Path(str(body)))
+        fitter = make_fitter(config.body, model.with_keypoints(tuple(people.joint_names.tolist())), config.law)
+        return cls(rig, config, fitter if offsets is None else fitter.with_keypoint_offsets(offsets))
+
+    @classmethod
+    def read(cls, folder: Path, people: Reconstruction) -> "Solver":
+        """The same of a result that was loaded from `folder`; InputError too where its cameras are others."""
+        rig, table = read_rig(folder / CAMERAS), people.observations
+        if table is not None and tuple(table.view_names.tolist()) != rig.names:
+            problem = "the cameras are not those of observations.npz"
+            raise InputError(f"{folder / CAMERAS}: {problem}; reconstruct the recording again")
+        return cls.of(people, rig, folder / "run.json")
 
 
 def solve_rows(rows: Reconstruction, solver: Solver) -> Reconstruction:
@@ -74,7 +90,7 @@ def window_solutions(
     are joints and covariances. Windows overlap: frames near a border are in two. InputError where `people.run`
     does not say the settings, ValueError where there are no observations.
     """
-    solver = Solver.of(setup_of(people, rig, PipelineConfig), people.joint_names)
+    solver = Solver.of(people, rig)
     for _, part, solution in _solved(people, solver, extra_factors):
         for person in solution.people:
             as_reported = {"joints": part.joints[person.rows], "covariance": part.covariance[person.rows]}

@@ -1,17 +1,16 @@
 """Who gets what: greedy one-to-one matching of whole arrays."""
 
 import numpy as np
-from numpy.typing import NDArray
+
+from shapepose_fg.core.arrays import Array, Index, Mask, Real, Whole
 
 
-def lesser(value: NDArray[np.floating] | NDArray[np.integer]) -> NDArray[np.bool_]:
+def lesser(value: Real | Whole) -> Mask:
     """(P, P) whether one has less of `value` (P,) than another; of equal ones the later has."""
     return (value[:, None] < value) | ((value[:, None] == value) & np.tri(len(value), k=-1, dtype=bool))
 
 
-def match_best_first(
-    left: NDArray[np.intp], right: NDArray[np.intp], score: NDArray[np.float64]
-) -> NDArray[np.intp]:
+def match_best_first(left: Index, right: Index, score: Array) -> Index:
     """Greedy one-to-one matching of edges (left, right) by falling score; returns indices of picked edges.
 
     Edges that are the best of both their ends would be picked before any rival, so all of them are picked in a

@@ -4,8 +4,8 @@ Stage I (e) of the paper (section 3.1): gives each person *their* 2D observation
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.observations import Observations
@@ -39,7 +39,7 @@ def associate(
     joint seen by two views are dropped, and what they took is reassigned; the second value is their number.
     """
     claims = _claims(proposals.places, detections, rig, skeleton)
-    owns = _by_support(proposals, candidates, len(detections))
+    owns = by_support(proposals, candidates, len(detections))
     real = np.ones(len(proposals), dtype=bool)
     chosen = np.full((*proposals.candidate.shape, len(rig)), -1, dtype=np.intp)
     rounds = 1 + _PASSES
@@ -56,7 +56,7 @@ def associate(
     return Observations.of(chosen, detections, proposals.places[real]), int((~real).sum())
 
 
-def _claims(places: NDArray[np.float64], detections: Detections, rig: Rig, skeleton: Skeleton) -> Claims:
+def _claims(places: Array, detections: Detections, rig: Rig, skeleton: Skeleton) -> Claims:
     """What people with joints at `places` (P, J, 3) may claim."""
     projected = rig.project(places)
     distance_m = projected_distances(projected, detections.joint, detections, rig)
@@ -70,12 +70,12 @@ def _claims(places: NDArray[np.float64], detections: Detections, rig: Rig, skele
     return Claims(detections, skeleton, len(rig), distance_m, _NEAR_M**2, inside, reachable, LEAST_AFFINITY)
 
 
-def seen_twice(seen: NDArray[np.bool_], skeleton: Skeleton) -> NDArray[np.bool_]:
+def seen_twice(seen: Mask, skeleton: Skeleton) -> Mask:
     """(P, K) which of each person's core joints two views see, of `seen` (P, J, V)."""
     return (seen.sum(axis=2) >= 2)[:, list(skeleton.core)]
 
 
-def _by_support(proposals: Proposals, candidates: Candidates, count: int) -> NDArray[np.bool_]:
+def by_support(proposals: Proposals, candidates: Candidates, count: int) -> Mask:
     """(P, D) whether a detection supports one of the person's candidates."""
     has = np.zeros((len(proposals), len(candidates) + 1), dtype=bool)
     np.put_along_axis(has, proposals.candidate, True, axis=1)  # -1 marks the spare last column

@@ -8,9 +8,9 @@ from typing import Annotated
 
 import numpy as np
 from annotated_types import Interval
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.bounds import Count, Metres, Settings
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
@@ -71,13 +71,13 @@ class CandidateConfig(Settings):
 class PairPoints:
     """Points triangulated from two detections of the same joint in different views."""
 
-    xyz: NDArray[np.float64]
+    xyz: Array
     """(M, 3) position in the world, metres."""
-    joint: NDArray[np.intp]
+    joint: Index
     """(M,) index of the joint in the skeleton."""
-    pair: NDArray[np.intp]
+    pair: Index
     """(M, 2) indices of the two detections."""
-    score: NDArray[np.float64]
+    score: Array
     """(M,) confidence of the point: the geometric mean of the two detections' confidences."""
 
 
@@ -85,17 +85,17 @@ class PairPoints:
 class Candidates:
     """3D joint candidates: clusters of pair points."""
 
-    xyz: NDArray[np.float64]
+    xyz: Array
     """(C, 3) position in the world, metres."""
-    joint: NDArray[np.intp]
+    joint: Index
     """(C,) index of the joint in the skeleton."""
-    score: NDArray[np.float64]
+    score: Array
     """(C,) mean confidence of the supporting detections."""
-    votes: NDArray[np.intp]
+    votes: Index
     """(C,) number of pair points in the cluster."""
-    strong: NDArray[np.bool_]
+    strong: Mask
     """(C,) whether the cluster has the votes that the paper asks for."""
-    support: NDArray[np.intp]
+    support: Index
     """(S, 2) rows (candidate, detection): the detections that made each candidate, one a view, sorted."""
 
     def __len__(self) -> int:
@@ -144,7 +144,7 @@ def vote(points: PairPoints, detections: Detections, views: int, config: Candida
     if len(points.xyz) == 0:
         none = np.zeros(0, dtype=np.intp)
         return Candidates(np.zeros((0, 3)), none, np.zeros(0), none, none > 0, np.zeros((0, 2), dtype=np.intp))
-    seed = _greedy_seeds(points, config.vote_radius_m)
+    seed = greedy_seeds(points, config.vote_radius_m)
     _, cluster = np.unique(seed, return_inverse=True)
     count = cluster.max() + 1
     votes = np.bincount(cluster, minlength=count)
@@ -174,7 +174,7 @@ def _needed_votes(views: int, config: CandidateConfig) -> int:
     return min(max(config.min_votes, seen_by * (seen_by - 1) // 2), views * (views - 1) // 2)
 
 
-def _support(cluster: NDArray[np.intp], detection: NDArray[np.intp], detections: Detections) -> NDArray[np.intp]:
+def _support(cluster: Index, detection: Index, detections: Detections) -> Index:
     """Rows (candidate, detection), sorted: in each view the detection that made most of the candidate's points."""
     key, points = np.unique(cluster * len(detections) + detection, return_counts=True)
     cluster, detection = np.divmod(key, len(detections))
@@ -186,7 +186,7 @@ def _support(cluster: NDArray[np.intp], detection: NDArray[np.intp], detections:
     return np.stack([cluster[first], detection[first]], axis=1)
 
 
-def _same_joint_pairs(detections: Detections) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _same_joint_pairs(detections: Detections) -> tuple[Index, Index]:
     """Indices of all unordered pairs of detections of the same joint in different views."""
     order = np.argsort(detections.joint, kind="stable")
     joint = detections.joint[order]
@@ -203,13 +203,7 @@ _PAIRS_AT_ONCE = 2**19
 """Pairs of rays that are looked at together: more take more memory, not less time."""
 
 
-def _rays_meet(
-    rays: NDArray[np.float64],
-    origins: NDArray[np.float64],
-    first: NDArray[np.intp],
-    second: NDArray[np.intp],
-    config: CandidateConfig,
-) -> NDArray[np.bool_]:
+def _rays_meet(rays: Array, origins: Array, first: Index, second: Index, config: CandidateConfig) -> Mask:
     """Cheap test before triangulation: do two of the `rays` (3, D) pass each other at less than twice the gate?"""
     (ax, ay, az), (bx, by, bz) = rays[:, first], rays[:, second]
     normal = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
@@ -221,13 +215,7 @@ def _rays_meet(
     return (gap < 2.0 * config.gate_m * sine) & (sine > parallel)
 
 
-def _linear_points(
-    rig: Rig,
-    view: NDArray[np.intp],
-    normalised: NDArray[np.float64],
-    first: NDArray[np.intp],
-    second: NDArray[np.intp],
-) -> NDArray[np.float64]:
+def _linear_points(rig: Rig, view: Index, normalised: Array, first: Index, second: Index) -> Array:
     """Solve A y = 0, two rows x P_3 - P_1 and y P_3 - P_2 a view, for y = (X, 1): (M, 3)."""
     P = rig.cTw[view]
     rows = normalised[:, :, None] * P[:, 2:3, :] - P[:, :2, :]
@@ -236,9 +224,7 @@ def _linear_points(
     return np.asarray(np.linalg.solve(At @ A[:, :, :3], -At @ A[:, :, 3:])[:, :, 0], dtype=np.float64)
 
 
-def _reprojection_error(
-    rig: Rig, view: NDArray[np.intp], normalised: NDArray[np.float64], xyz: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _reprojection_error(rig: Rig, view: Index, normalised: Array, xyz: Array) -> Array:
     """Reprojection error (M,) as a length at the point's depth, metres; infinite behind the camera."""
     P = rig.cTw[view]
     camera = np.einsum("mij,mj->mi", P[:, :, :3], xyz) + P[:, :, 3]
@@ -250,7 +236,7 @@ _POINTS_AT_ONCE = 4096
 """Points whose neighbours among each other are looked up at once: before 30 cameras a joint has 400 of them."""
 
 
-def _greedy_seeds(points: PairPoints, radius_m: float) -> NDArray[np.intp]:
+def greedy_seeds(points: PairPoints, radius_m: float) -> Index:
     """The seed (M,) whose cluster each point joins, as if points were picked one by one by confidence.
 
     The most confident points are clustered first; what lies near their seeds is theirs, and the rest goes on.
@@ -280,7 +266,7 @@ def _greedy_seeds(points: PairPoints, radius_m: float) -> NDArray[np.intp]:
     return order[seed][np.argsort(order)]
 
 
-def _seeds_of_ranked(places: NDArray[np.float64], radius_m: float) -> NDArray[np.intp]:
+def _seeds_of_ranked(places: Array, radius_m: float) -> Index:
     """The seed (M,) of each of a few points that stand in the order in which they are picked."""
     count = len(places)
     edges = KDTree(places).query_pairs(radius_m, output_type="ndarray")

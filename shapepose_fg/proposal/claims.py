@@ -9,14 +9,12 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.assignment import match_best_first
-
-Array = NDArray[np.float64]
 
 LEAST_AFFINITY = 0.3
 """What counts as affinity where no neighbour is seen, and half of the least score: unrelated pairs are mostly 0,
@@ -31,7 +29,7 @@ class Scored(NamedTuple):
 
     score: Array
     """(P, D) nearness and affinity."""
-    likely: NDArray[np.bool_]
+    likely: Mask
     """(P, D) where these are enough."""
     affinity: Array
     """(P, D) mean affinity to what the person has of the joint's neighbours; 0 where that is nothing."""
@@ -52,9 +50,9 @@ class Claims:
     variance: Array | float
     """(P, D) or one for all, m²: how closeness falls off, a Gaussian. A detector is 2 cm off on a visible joint
     and several on a hidden one."""
-    inside: NDArray[np.bool_]
+    inside: Mask
     """(P, D) near enough to a joint whose place is known."""
-    reachable: NDArray[np.bool_]
+    reachable: Mask
     """(P, D) of a joint whose place is not known, where it may be: only affinity tells."""
     sure_affinity: float
     """And so much of it must be there."""
@@ -64,12 +62,12 @@ class Claims:
         """(P, D) 1 on the projected joint, 0 far from it."""
         return np.exp(-0.5 * self.distance_m**2 / self.variance)
 
-    def of(self, people: NDArray[np.bool_]) -> "Claims":
+    def of(self, people: Mask) -> "Claims":
         """The claims of some of the people, where `variance` is one for all."""
         arrays = {name: getattr(self, name)[people] for name in ("distance_m", "inside", "reachable")}
         return replace(self, **arrays)
 
-    def scored(self, owns: NDArray[np.bool_]) -> Scored:
+    def scored(self, owns: Mask) -> Scored:
         """The rule, for people who are thought to have the detections `owns` (P, D)."""
         affinity, neighbours = mean_affinity(owns, self.detections, self.skeleton, self.views)
         # Where no neighbour is seen, the affinities say nothing: neither for nor against.
@@ -78,7 +76,7 @@ class Claims:
         likely |= self.reachable & (neighbours > 0) & (affinity >= self.sure_affinity)
         return Scored(score, likely, affinity)
 
-    def matched(self, scored: Scored, world: NDArray[np.intp] | None = None) -> NDArray[np.intp]:
+    def matched(self, scored: Scored, world: Index | None = None) -> Index:
         """(P, J, V) the detections matched to people, joints and views, best score first, each serving one; -1
         for none. People of different worlds (P,) do not compete.
         """
@@ -91,7 +89,7 @@ class Claims:
         chosen.reshape(-1)[slot[picked]] = detection[picked]
         return chosen
 
-    def share(self, chosen: NDArray[np.intp], affinity: Array) -> None:
+    def share(self, chosen: Index, affinity: Array) -> None:
         """Let a detection on a joint serve that joint too where it has none among those `chosen` (P, J, V)."""
         person, detection = np.nonzero((self.distance_m < OVERLAP_M) & (affinity >= LEAST_AFFINITY))
         joint, view = self.detections.joint[detection], self.detections.view[detection]
@@ -100,9 +98,7 @@ class Claims:
         chosen[person[empty], joint[empty], view[empty]] = detection[empty]
 
 
-def projected_distances(
-    projected: tuple[Array, Array], joint: NDArray[np.intp], detections: Detections, rig: Rig
-) -> Array:
+def projected_distances(projected: tuple[Array, Array], joint: Index, detections: Detections, rig: Rig) -> Array:
     """Distance (P, D) of each detection to the projection of a `joint` (D,), metres at its depth.
 
     `projected` is what `rig.project` gives of people's joints; infinite where a joint is not known.
@@ -114,7 +110,7 @@ def projected_distances(
     return np.where(np.isnan(distance_px), np.inf, distance_m)
 
 
-def owned(chosen: NDArray[np.intp], count: int) -> NDArray[np.bool_]:
+def owned(chosen: Index, count: int) -> Mask:
     """(P, D) whether a detection is chosen for a person."""
     owns = np.zeros((len(chosen), count), dtype=bool)
     person, _, _ = np.nonzero(chosen >= 0)
@@ -122,9 +118,7 @@ def owned(chosen: NDArray[np.intp], count: int) -> NDArray[np.bool_]:
     return owns
 
 
-def mean_affinity(
-    owns: NDArray[np.bool_], detections: Detections, skeleton: Skeleton, views: int
-) -> tuple[Array, NDArray[np.intp]]:
+def mean_affinity(owns: Mask, detections: Detections, skeleton: Skeleton, views: int) -> tuple[Array, Index]:
     """(P, D) mean affinity of each detection to what the person owns at its limbs' other ends, and the number."""
     people, count = owns.shape
     head, tail = detections.pairs.T

@@ -8,8 +8,8 @@ from typing import Annotated
 
 import numpy as np
 from annotated_types import Interval
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.bounds import Metres, MetresOrNone, RepeatsOrNone, Settings, Share
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import Skeleton
@@ -39,9 +39,9 @@ class GrowthConfig(Settings):
 class Links:
     """Limbs between 3D candidates, as the part affinities of all views support them."""
 
-    ends: NDArray[np.intp]
+    ends: Index
     """(L, 2) two candidates, joined by a limb of the skeleton, first joint of the limb first."""
-    score: NDArray[np.float64]
+    score: Array
     """(L,) sum over the views that see both of (affinity - doubt): positive when the views agree."""
 
 
@@ -69,13 +69,7 @@ def link(candidates: Candidates, detections: Detections, config: GrowthConfig) -
     return Links(ends[plausible], (total - config.doubt * shared)[plausible])
 
 
-def grow(
-    anchors: NDArray[np.intp],
-    candidates: Candidates,
-    links: Links,
-    skeleton: Skeleton,
-    config: GrowthConfig,
-) -> NDArray[np.intp]:
+def grow(anchors: Index, candidates: Candidates, links: Links, skeleton: Skeleton, config: GrowthConfig) -> Index:
     """Choose a candidate per person and joint: (P, J), -1 where none is linked to the person.
 
     First outwards from the hip, level by level of the skeleton's tree, then `sweeps` times all joints at once,
@@ -112,9 +106,9 @@ def grow(
 
 
 def _bridge(
-    chosen: NDArray[np.intp],
-    support: NDArray[np.float64],
-    evidence: NDArray[np.float64],
+    chosen: Index,
+    support: Array,
+    evidence: Array,
     candidates: Candidates,
     skeleton: Skeleton,
     config: GrowthConfig,
@@ -144,7 +138,7 @@ def _bridge(
     return len(picked) > 0
 
 
-def _nearest_known(chosen: NDArray[np.intp], skeleton: Skeleton) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _nearest_known(chosen: Index, skeleton: Skeleton) -> tuple[Index, Index]:
     """The nearest joint towards the root (P, J) that a person has, and how many bones away (P, J) it is."""
     ancestor = np.full(chosen.shape, skeleton.root)
     bones = np.ones(chosen.shape, dtype=np.intp)
@@ -157,9 +151,7 @@ def _nearest_known(chosen: NDArray[np.intp], skeleton: Skeleton) -> tuple[NDArra
     return ancestor, bones
 
 
-def _support(
-    chosen: NDArray[np.intp], ends: NDArray[np.intp], score: NDArray[np.float64], count: int
-) -> NDArray[np.float64]:
+def _support(chosen: Index, ends: Index, score: Array, count: int) -> Array:
     """(P, C) sum of the links from each person's chosen candidates to every candidate."""
     has = np.zeros((len(chosen), count + 1), dtype=bool)
     np.put_along_axis(has, chosen, True, axis=1)  # -1 marks the spare last column
@@ -168,13 +160,7 @@ def _support(
     return np.bincount(key, score[edge], len(chosen) * count).reshape(len(chosen), count).astype(float)
 
 
-def _choose(
-    chosen: NDArray[np.intp],
-    support: NDArray[np.float64],
-    evidence: NDArray[np.float64],
-    candidates: Candidates,
-    joints: NDArray[np.intp],
-) -> None:
+def _choose(chosen: Index, support: Array, evidence: Array, candidates: Candidates, joints: Index) -> None:
     """Set `chosen` of these joints to the best supported candidates, one candidate serving one person."""
     person, candidate = np.nonzero(support > 0)
     of_these = np.isin(candidates.joint[candidate], joints)

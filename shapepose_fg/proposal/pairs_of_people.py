@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Index, Mask
 from shapepose_fg.proposal.candidates import PairPoints
 from shapepose_fg.proposal.people_2d import group_people
 from shapepose_fg.proposal.possible_people import Array, Frame, PossiblePeople, connected, settled, sizes
@@ -27,7 +27,7 @@ _PASSES = 3
 """How often detections are chosen around the joints, and joints triangulated."""
 
 
-def pooled(points: PairPoints, free: NDArray[np.bool_], frame: Frame) -> PossiblePeople:
+def pooled(points: PairPoints, free: Mask, frame: Frame) -> PossiblePeople:
     """People who may be there by the detections that are `free` (D,), each with all that it would explain.
 
     The pair points of two 2D people's joints, in parts that bones connect, are where a person may be; views that
@@ -52,7 +52,7 @@ def pooled(points: PairPoints, free: NDArray[np.bool_], frame: Frame) -> Possibl
     return settled(places[different], owns, frame, _PASSES)
 
 
-def _groups(free: NDArray[np.bool_], frame: Frame) -> NDArray[np.intp]:
+def _groups(free: Mask, frame: Frame) -> Index:
     """(D,) which 2D person each free detection is of; -1 for those of none, and of persons of few joints."""
     detections = frame.detections
     tied = free[detections.pairs].all(axis=1) & (detections.affinity >= _LEAST_AFFINITY)
@@ -63,7 +63,7 @@ def _groups(free: NDArray[np.bool_], frame: Frame) -> NDArray[np.intp]:
     return group
 
 
-def _meeting(points: PairPoints, group: NDArray[np.intp], frame: Frame) -> tuple[Array, NDArray[np.intp]]:
+def _meeting(points: PairPoints, group: Index, frame: Frame) -> tuple[Array, Index]:
     """Places (M, J, 3) at which enough joints of two 2D people meet, and which two (M, 2) these are."""
     count, joints = group.max(initial=-1) + 1, len(frame.skeleton)
     ends = np.sort(group[points.pair], axis=1)
@@ -80,7 +80,7 @@ def _meeting(points: PairPoints, group: NDArray[np.intp], frame: Frame) -> tuple
     return places[enough], owners[enough]
 
 
-def _different(places: Array, weight: Array) -> NDArray[np.intp]:
+def _different(places: Array, weight: Array) -> Index:
     """Which of `places` (H, J, 3) stay when those that become the same person are one, heaviest first."""
     # Equal weights are told apart by place: the order of cameras and detections must not decide.
     order = np.lexsort((*np.nansum(places, axis=1).T, -np.round(weight, 9)))

@@ -1,12 +1,12 @@
 """Who is in each picture: candidates grouped by their part affinities, greedily, as OpenPose does."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Index
 from shapepose_fg.core.detections import Detections
 
 
-def without_repeats(found: Detections) -> tuple[Detections, NDArray[np.intp]]:
+def without_repeats(found: Detections) -> tuple[Detections, Index]:
     """The detections with what is listed twice listed once, and which of `found` each of them is.
 
     Some detectors give a person twice, or two people with the same arm: each view saw it once.
@@ -28,7 +28,7 @@ def without_repeats(found: Detections) -> tuple[Detections, NDArray[np.intp]]:
     ), first
 
 
-def group_people(found: Detections) -> list[NDArray[np.intp]]:
+def group_people(found: Detections) -> list[Index]:
     """Candidates grouped into people, greedily: the rows (N,) of each group, single candidates included.
 
     As OpenPose does, by the affinities alone: pairs in falling order; a pair joins its two groups unless

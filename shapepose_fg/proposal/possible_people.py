@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Index, Mask
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import Skeleton
@@ -45,7 +46,7 @@ class Frame:
         return self.rig.rays(self.detections.view, self.detections.xy)
 
     @cached_property
-    def spans(self) -> tuple[NDArray[np.intp], Array]:
+    def spans(self) -> tuple[Index, Array]:
         """Pairs of joints (E, 2) at most three bones apart, and how far they are at most (E,), metres."""
         joints = np.arange(len(self.skeleton))
         bones = np.where(joints[:, None] == joints, 0, len(joints))
@@ -68,7 +69,7 @@ class PossiblePeople:
 
     places: Array
     """(H, J, 3) where two views or more put the joints, metres; NaN elsewhere."""
-    chosen: NDArray[np.intp]
+    chosen: Index
     """(H, J, V) the detections that each would explain, -1 for none."""
     gap_m: Array
     """(H, J, V) how far from the joint the detection's ray passes; NaN where there is none, or no place."""
@@ -103,9 +104,7 @@ class PossiblePeople:
         return cls(np.zeros((*shape[:2], 3)), np.full(shape, -1, dtype=np.intp), np.zeros(shape))
 
 
-def settled(
-    places: Array, owns: NDArray[np.bool_], frame: Frame, passes: int, *, exclusive: bool = False
-) -> PossiblePeople:
+def settled(places: Array, owns: Mask, frame: Frame, passes: int, *, exclusive: bool = False) -> PossiblePeople:
     """People at `places` (H, J, 3) who are thought to own `owns` (H, D): detections chosen, joints triangulated.
 
     Several times in turn. With `exclusive` each detection is one person's; without, each takes what it would
@@ -125,7 +124,7 @@ def settled(
     return PossiblePeople(places, chosen, gap_m)
 
 
-def _claimed(places: Array, owns: NDArray[np.bool_], frame: Frame, *, exclusive: bool) -> NDArray[np.intp]:
+def _claimed(places: Array, owns: Mask, frame: Frame, *, exclusive: bool) -> Index:
     """(H, J, V) the detections nearest to the joints; where no place is known, those of affinity to the owned."""
     found, rig = frame.detections, frame.rig
     distance_m = projected_distances(rig.project(places), found.joint, found, rig)
@@ -139,7 +138,7 @@ def _claimed(places: Array, owns: NDArray[np.bool_], frame: Frame, *, exclusive:
     return chosen
 
 
-def triangulated(chosen: NDArray[np.intp], frame: Frame) -> tuple[Array, Array]:
+def triangulated(chosen: Index, frame: Frame) -> tuple[Array, Array]:
     """Joints (H, J, 3) nearest to the rays of their detections `chosen` (H, J, V), and the gaps (H, J, V), metres.
 
     Weighted by confidence, under a Cauchy kernel. NaN for joints that fewer than two views see; a ray that meets
@@ -163,7 +162,7 @@ def triangulated(chosen: NDArray[np.intp], frame: Frame) -> tuple[Array, Array]:
     return places, gap_m
 
 
-def gaps(places: Array, chosen: NDArray[np.intp], frame: Frame) -> Array:
+def gaps(places: Array, chosen: Index, frame: Frame) -> Array:
     """(H, J, V) how far the rays of detections `chosen` (H, J, V) pass `places` (H, J, 3), metres; NaN for none.
 
     A ray that meets its joint behind the camera is infinitely far.
@@ -176,7 +175,7 @@ def gaps(places: Array, chosen: NDArray[np.intp], frame: Frame) -> Array:
     return np.where(chosen >= 0, np.where(depth <= 0, np.inf, across_m), np.nan)
 
 
-def connected(places: Array, frame: Frame) -> NDArray[np.intp]:
+def connected(places: Array, frame: Frame) -> Index:
     """(H, J) which joints of `places` (H, J, 3) hang together by bones no longer than people's.
 
     The number of the part's first joint; -1 where a joint has no place.
@@ -197,7 +196,7 @@ def connected(places: Array, frame: Frame) -> NDArray[np.intp]:
         part = least
 
 
-def sizes(part: NDArray[np.intp]) -> NDArray[np.intp]:
+def sizes(part: Index) -> Index:
     """(H, J) how many joints each part of `connected` has, at the number of the part."""
     people, joints = part.shape
     row, column = np.nonzero(part >= 0)

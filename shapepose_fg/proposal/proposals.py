@@ -5,16 +5,13 @@ Stage I (d) and the first half of (e) of the paper (section 3.1, "Human Proposal
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
-from typing import Annotated
 
 import numpy as np
-from annotated_types import Interval
-from numpy.typing import NDArray
 
-from shapepose_fg.core.bounds import Count, Metres, MetresOrNone, Settings, Share
+from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.bounds import Count, Metres, Settings, Share
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.proposal.assignment import lesser
 from shapepose_fg.proposal.candidates import Candidates
 from shapepose_fg.proposal.growth import GrowthConfig, Links, grow, link
 
@@ -48,11 +45,6 @@ class ProposalConfig(Settings):
     separation_m: Metres = 0.2
     """Non-maximum suppression: of two anchors closer than this the better one stays. A pelvis is about 20 cm
     deep and 30 cm wide: the middles of two are not closer even when people hug."""
-    split_m: MetresOrNone = 0.4
-    """Two anchors nearer than this, with hardly a joint that both have, are one person's trunk and legs. 0: none
-    are, as in the paper."""
-    split_shared: Annotated[int, Interval(ge=0, le=1000)] = 2
-    """Core joints that the two may both have."""
     min_grown_parts: Share = 0.4
     """Least fraction of the core joints that must have a strong candidate linked to the hip: one whose upper body
     alone shows has 0.6. On simulated people in close motion real ones have over 0.47, and most phantoms, whose
@@ -81,7 +73,6 @@ class ProposalConfig(Settings):
             min_parts=0.9,
             min_grown_parts=0.0,
             min_observed_parts=0.0,
-            split_m=0.0,
             weak_anchors=False,
             growth=GrowthConfig(bridge_m=0.0),
         )
@@ -91,12 +82,12 @@ class ProposalConfig(Settings):
 class Proposals:
     """People found in one frame, each with a candidate per joint."""
 
-    candidate: NDArray[np.intp]
+    candidate: Index
     """(P, J) index of the 3D candidate of each joint, -1 where there is none."""
-    places: NDArray[np.float64]
+    places: Array
     """(P, J, 3) where the joints are thought to be, metres: the candidates, and the middle of the hips as the root
     of a person whose root no two views saw; NaN elsewhere."""
-    score: NDArray[np.float64]
+    score: Array
     """(P,) mean confidence of the box's best candidates."""
     dropped: dict[str, int]
     """How many anchors were dropped, by reason."""
@@ -106,11 +97,7 @@ class Proposals:
 
 
 def propose(
-    candidates: Candidates,
-    detections: Detections,
-    skeleton: Skeleton,
-    up: NDArray[np.float64],
-    config: ProposalConfig,
+    candidates: Candidates, detections: Detections, skeleton: Skeleton, up: Array, config: ProposalConfig
 ) -> Proposals:
     """Find the people of a frame: anchors at the root joint, their boxes checked, their joints grown.
 
@@ -118,7 +105,7 @@ def propose(
     saw: weak root candidates anchor them, and in the end the middles between two hips. `up` is the (3,) unit
     vector that points up. Two people do not share a candidate.
     """
-    search = _Search(
+    search = Search(
         candidates, link(candidates, detections, config.growth), detections, skeleton, up, config, Counter()
     )
     roots = candidates.joint == skeleton.root
@@ -141,24 +128,24 @@ def propose(
 
 
 @dataclass(frozen=True)
-class _Search:
+class Search:
     """The search for people in one frame."""
 
     candidates: Candidates
     links: Links
     detections: Detections
     skeleton: Skeleton
-    up: NDArray[np.float64]
+    up: Array
     config: ProposalConfig
     dropped: Counter[str]
 
-    def anchors(self, roots: NDArray[np.intp], taken: NDArray[np.intp]) -> NDArray[np.intp]:
+    def anchors(self, roots: Index, taken: Index) -> Index:
         """The root candidates `roots` whose box holds enough confident parts and that stand apart, best first."""
         parts, score = self.boxes(roots)
         enough = parts >= self.config.min_parts
         confident = score >= self.config.min_confidence
         anchors = roots[enough & confident]
-        kept = _apart(anchors, taken, self.candidates, self.detections, self.config)
+        kept = standing_apart(anchors, taken, self.candidates, self.detections, self.config)
         self.dropped["hip seen as a better one's"] += len(anchors) - len(kept)
         self.dropped["more people than are looked for"] += max(0, len(kept) - self.config.most_people)
         kept = kept[: self.config.most_people]
@@ -166,7 +153,7 @@ class _Search:
         self.dropped["low confidence"] += int((enough & ~confident).sum())
         return kept
 
-    def boxes(self, roots: NDArray[np.intp]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def boxes(self, roots: Index) -> tuple[Array, Array]:
         """Fraction (H,) of the core parts in the box around each root, and mean confidence (H,) of the best."""
         candidates, config = self.candidates, self.config
         offset = candidates.xyz[None] - candidates.xyz[roots, None]
@@ -180,33 +167,20 @@ class _Search:
         core = best[:, self.skeleton.core]
         return (core > 0).mean(axis=1), core.sum(axis=1) / np.maximum((core > 0).sum(axis=1), 1)
 
-    def linked(self, anchors: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    def linked(self, anchors: Index) -> tuple[Index, Index]:
         """The anchors that enough strong joints are linked to, and what each chose (P, J)."""
         chosen = grow(anchors, self.candidates, self.links, self.skeleton, self.config.growth)
         core = chosen[:, self.skeleton.core]
         strong = (core >= 0) & self.candidates.strong[core]
         linked = strong.mean(axis=1) >= self.config.min_grown_parts
-        half = linked & self._halves(anchors, strong & linked[:, None])
-        if linked.all() and not half.any():
+        if linked.all():
             return anchors, chosen
         self.dropped["too few joints linked to the hip"] += int((~linked).sum())
-        self.dropped["the other half of a person"] += int(half.sum())
         # What the dropped had taken goes back to those whom it belongs to.
-        kept = anchors[linked & ~half]
+        kept = anchors[linked]
         return kept, grow(kept, self.candidates, self.links, self.skeleton, self.config.growth)
 
-    def _halves(self, anchors: NDArray[np.intp], strong: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """(P,) who has what somebody beside them lacks, and nearly nothing else: legs without trunk and arms, say.
-
-        `strong` (P, K) tells who has a strong candidate for which core joint. Two real people have both.
-        """
-        hips = self.candidates.xyz[anchors]
-        near = np.linalg.norm(hips[:, None] - hips[None], axis=-1) < self.config.split_m
-        count = strong.sum(axis=1)
-        shared = strong.astype(np.intp) @ strong.T
-        return (near & lesser(count) & (shared <= self.config.split_shared)).any(axis=1)
-
-    def unclaimed(self, chosen: NDArray[np.intp]) -> NDArray[np.bool_] | None:
+    def unclaimed(self, chosen: Index) -> Mask | None:
         """(C,) the candidates that nobody chose, if there are strong ones of enough joints to be a person.
 
         A candidate needs `_OWN_DETECTIONS`: others made what somebody chose.
@@ -221,19 +195,19 @@ class _Search:
         )
         return free if enough else None
 
-    def among(self, free: NDArray[np.bool_]) -> "_Search":
+    def among(self, free: Mask) -> "Search":
         """The same search among some candidates only; what it drops is not counted."""
         both = free[self.links.ends].all(axis=1)
         links = Links(self.links.ends[both], self.links.score[both])
         hidden = replace(self.candidates, joint=np.where(free, self.candidates.joint, -1))
         return replace(self, candidates=hidden, links=links, dropped=Counter())
 
-    def people(self, taken: NDArray[np.intp]) -> NDArray[np.intp]:
+    def people(self, taken: Index) -> Index:
         """Anchors, strong or weak, of people beside those `taken`."""
         roots = np.flatnonzero(self.candidates.joint == self.skeleton.root)
         return self.linked(self.anchors(roots, taken))[0]
 
-    def with_middles(self, free: NDArray[np.bool_]) -> "_Search":
+    def with_middles(self, free: Mask) -> "Search":
         """Add root candidates where nobody saw one: in the middle of two free hips, linked to both."""
         candidates, count = self.candidates, len(self.candidates)
         right, left = self.skeleton.hips
@@ -264,13 +238,9 @@ class _Search:
         return replace(self, candidates=more, links=links)
 
 
-def _apart(
-    anchors: NDArray[np.intp],
-    taken: NDArray[np.intp],
-    candidates: Candidates,
-    detections: Detections,
-    config: ProposalConfig,
-) -> NDArray[np.intp]:
+def standing_apart(
+    anchors: Index, taken: Index, candidates: Candidates, detections: Detections, config: ProposalConfig
+) -> Index:
     """Non-maximum suppression: `anchors` that stand apart from better ones and from `taken`, best first.
 
     A detection counts for one anchor only: what is left of a candidate without those that made better anchors

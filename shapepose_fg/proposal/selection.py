@@ -6,8 +6,8 @@ Evidence is what only this person explains, against what should be seen of that 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Index, Mask
 from shapepose_fg.proposal.candidates import PairPoints
 from shapepose_fg.proposal.claims import LEAST_AFFINITY, mean_affinity, owned
 from shapepose_fg.proposal.pairs_of_people import pooled
@@ -62,11 +62,11 @@ cameras 1 to 4 points more people are found than without, with fewer phantoms, w
 class Evidence:
     """What speaks for and against each of H people, but for what others explain."""
 
-    chosen: NDArray[np.intp]
+    chosen: Index
     """(H, J, V) the detections that each explains, -1 for none."""
     worth: Array
     """(H, J, V) how much a detection speaks for the person: confidence, affinity, and how near its ray passes."""
-    expected: NDArray[np.bool_]
+    expected: Mask
     """(H, J, V) places in the pictures where a joint should be."""
     bones: Array
     """(H,) how much the lengths of the bones speak for a person."""
@@ -89,7 +89,7 @@ class Evidence:
         expected = inside & has.any(axis=2, keepdims=True)
         return cls(chosen, np.where(has, worth, 0.0), expected, _bones(people, frame))
 
-    def score(self, taken: NDArray[np.bool_]) -> Array:
+    def score(self, taken: Mask) -> Array:
         """(H,) evidence for each person where others explain the detections `taken` (D,)."""
         has = self.chosen >= 0
         own = has & ~taken[self.chosen] if len(taken) > 0 else has
@@ -140,7 +140,7 @@ def choose(points: PairPoints, frame: Frame, least: float) -> tuple[PossiblePeop
 
 
 def _greedy(
-    pool: PossiblePeople, people: PossiblePeople, taken: NDArray[np.bool_], frame: Frame, least: float
+    pool: PossiblePeople, people: PossiblePeople, taken: Mask, frame: Frame, least: float
 ) -> PossiblePeople | None:
     """`people`, who have the detections `taken` (D,), and who else of the pool is there, the surest first.
 

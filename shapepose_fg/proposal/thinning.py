@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Index, Mask
 from shapepose_fg.core.detections import Detections, DetectionSequence
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.candidates import CandidateConfig, Candidates, PairPoints
@@ -57,14 +58,14 @@ class ThinnedFrames:
         """Whether detections of a frame were left out."""
         return kept_detections(self.frames[frame], self.views, self.config) is not None
 
-    def _rows(self, every: Detections) -> NDArray[np.intp]:
+    def _rows(self, every: Detections) -> Index:
         """Which detections stay, in order."""
         order = np.lexsort((every.confidence, every.joint, *every.xy.T))
         kept = kept_detections(every.rows(order), self.views, self.config)
         return order if kept is None else order[kept]
 
 
-def kept_detections(detections: Detections, views: int, config: CandidateConfig) -> NDArray[np.bool_] | None:
+def kept_detections(detections: Detections, views: int, config: CandidateConfig) -> Mask | None:
     """(D,) the detections that stay; None where all do.
 
     Of each joint each view keeps its most confident ones, as many as make at most `config.most_pairs` pairs of
@@ -120,7 +121,7 @@ def _with_most(candidates: Candidates, most: int) -> Candidates:
     return replace(candidates, **columns, support=np.column_stack([place[support[:, 0]], support[:, 1]]))
 
 
-def _best(group: NDArray[np.intp], most: int, order: tuple[NDArray[Any], ...]) -> NDArray[np.bool_]:
+def _best(group: Index, most: int, order: tuple[NDArray[Any], ...]) -> Mask:
     """(N,) the first `most` of each group by `order` (last key first), then as they stand."""
     ranked = np.lexsort((*order, group))
     sizes = np.bincount(group)

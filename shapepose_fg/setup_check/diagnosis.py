@@ -9,8 +9,8 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.camera import Axis, Camera, Rig
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.skeleton import Skeleton
@@ -23,9 +23,6 @@ from shapepose_fg.setup_check.fit import difference
 from shapepose_fg.setup_check.hypotheses import Lag, gross_mistake, lag_of, lags
 from shapepose_fg.setup_check.matching import same_frame
 from shapepose_fg.setup_check.small import SHIFT, Problem, SmallErrors
-
-Mask = NDArray[np.bool_]
-Array = NDArray[np.float64]
 
 _SAME_PX = 0.6
 """Detections of one picture, stored with a pixel's accuracy, lie no farther apart."""

@@ -5,14 +5,12 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.setup_check.fit import Others, Pinhole, match, possible_matches
 from shapepose_fg.setup_check.matching import GATE, Groups, Pairs, Sightings, centres_of, median_of
-
-Array = NDArray[np.float64]
 
 _STEPS = 6
 """Gauss-Newton steps of a robust triangulation; errors fall under a hundredth of a pixel in four."""
@@ -36,7 +34,7 @@ _MOST_PAIRS = 25_000
 class Evidence:
     """The people that were seen, whatever the calibration."""
 
-    anchors: NDArray[np.intp]
+    anchors: Index
     """(F,) frames that are looked at."""
     sightings: Sightings
     """At these frames, and at their neighbours."""
@@ -150,7 +148,7 @@ class Look:
     """The people that were seen."""
     views: Views
     """What the V cameras are thought to be."""
-    lag: NDArray[np.intp]
+    lag: Index
     """(V,) frames by which each is thought to be late."""
     _others: dict[tuple[int, ...], Others] = field(init=False, default_factory=dict)
 

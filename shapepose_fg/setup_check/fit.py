@@ -5,15 +5,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
 from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Sightings, distances, same_frame
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 PARAMETERS = ("turn x", "turn y", "turn z", "move x", "move y", "move z", "centre x", "centre y", "focal")
 """Of a camera: a turn about its own axes (rad) where it stands, a move along them (unit of the calibration), the
@@ -128,18 +125,8 @@ def posed_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
     return Pinhole(camera.K, np.column_stack([R, scale * move[:, 0] - R @ middle]))
 
 
-def zoomed_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
-    """The camera with the focal length by which it sees `points` (N, 3) at `xy` (N, 2)."""
-    return _scaled_to(points, xy, camera, camera.K[:2, 2])
-
-
-def resized_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
-    """The camera of pictures that are larger or smaller, in which `points` (N, 3) lie at `xy` (N, 2)."""
-    return _scaled_to(points, xy, camera, CORNER)
-
-
-def _scaled_to(points: Array, xy: Array, camera: Pinhole, centre: Array) -> Pinhole | None:
-    """The camera scaled by how much farther from `centre` (2,) than it says the points are seen."""
+def scaled_to(points: Array, xy: Array, camera: Pinhole, centre: Array) -> Pinhole | None:
+    """The camera `scaled` by how much farther from `centre` (2,) than it says `points` (N, 3) are seen at `xy`."""
     at = (points @ camera.cTw[:, :3].T + camera.cTw[:, 3]) @ camera.K.T
     if not (at[:, 2] > 0).all():
         return None

@@ -5,15 +5,13 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.setup_check import fit
 from shapepose_fg.setup_check.evidence import Look
 from shapepose_fg.setup_check.findings import Finding, Kind
 from shapepose_fg.setup_check.fit import FOCAL, POSE, TURN, Others, Pinhole, match
 from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Sightings, least_of_each, residuals, same_frame
-
-Array = NDArray[np.float64]
 
 _MIN_AGREEMENT = 0.12
 _MIN_LAG_GAIN = 0.004
@@ -85,9 +83,9 @@ def _worth(lag: Lag) -> float:
 class _Nearest:
     """Each person's nearest sighting at some offset."""
 
-    there: NDArray[np.bool_]
+    there: Mask
     """(P,) whether the camera has that frame at all."""
-    sighting: NDArray[np.intp]
+    sighting: Index
     """(P,) -1 where none is within the gate."""
     error: Array
     """(P, J) distance of each joint, a part of the size, no more than GATE; NaN where the joint is not seen."""
@@ -109,7 +107,7 @@ def _nearest(others: Others, seen: Sightings, camera: Pinhole, lag: int) -> _Nea
     return _Nearest(np.isin(others.frame + lag, seen.frame), found, errors)
 
 
-def _compare(lag: int, frame: NDArray[np.integer], seen: Sightings, still: _Nearest, moved: _Nearest) -> Lag:
+def _compare(lag: int, frame: Whole, seen: Sightings, still: _Nearest, moved: _Nearest) -> Lag:
     """How much better people fit at an offset than without: joints of people that both have, or one has."""
     usable = still.there & moved.there & ((still.sighting >= 0) | (moved.sighting >= 0))
     a, b = still.sighting[usable], moved.sighting[usable]
@@ -144,8 +142,8 @@ _MISREAD: dict[Kind, Callable[[Array, Array], tuple[Array, Array]]] = {
 _FITTED: tuple[tuple[Kind, Fit, list[int]], ...] = (
     (Kind.TURNED, fit.turned_to, TURN),
     (Kind.MOVED, fit.posed_to, POSE),
-    (Kind.FOCAL, fit.zoomed_to, FOCAL),
-    (Kind.RESIZED, fit.resized_to, []),
+    (Kind.FOCAL, lambda points, xy, camera: fit.scaled_to(points, xy, camera, camera.K[:2, 2]), FOCAL),
+    (Kind.RESIZED, lambda points, xy, camera: fit.scaled_to(points, xy, camera, fit.CORNER), []),
 )
 """What is fitted of one camera: to one person exactly, then its parameters (`fit.PARAMETERS`) to all."""
 _FACTORS = (0.25, 1 / 3, 0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0, 3.0, 4.0)
@@ -230,9 +228,8 @@ def _of_one(look: Look, view: int, rng: np.random.Generator) -> Iterator[Change]
         best = fit.refined(others, seen, best, columns) if columns else best
         turn, moved = fit.difference(camera.cTw, best.cTw)
         size = float(best.K[0, 0] / camera.K[0, 0])
-        amount = {Kind.FOCAL: 1 / size, Kind.RESIZED: size}.get(
-            kind, turn
-        )  # what the calibration has over what fits
+        # What the calibration has over what fits.
+        amount = {Kind.FOCAL: 1 / size, Kind.RESIZED: size}.get(kind, turn)
         finding = Finding(Kind.TURNED if turn > _PLAIN_TURN_DEG else kind, (view,), amount, moved=moved)
         score = match(others, seen, best).score
         yield Change(finding, look.with_cameras({view: best}), score, max(len(columns), 1))

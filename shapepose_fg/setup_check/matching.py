@@ -9,16 +9,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.detections import Detections, DetectionSequence
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.people_2d import group_people
-
-Mask = NDArray[np.bool_]
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 MIN_JOINTS = 5
 """A person with fewer core joints in view says too little about the camera."""
@@ -56,7 +52,7 @@ class Sightings:
         names = ("frame", "view", "xy", "confidence")
         return cls(*(np.concatenate([getattr(part, name) for part in (none, *parts)]) for name in names))
 
-    def only(self, keep: NDArray[np.bool_] | Index) -> "Sightings":
+    def only(self, keep: Mask | Index) -> "Sightings":
         """Some of the sightings."""
         return Sightings(self.frame[keep], self.view[keep], self.xy[keep], self.confidence[keep])
 

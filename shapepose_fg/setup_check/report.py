@@ -9,8 +9,8 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.observation_table import Gate, ObservationTable
@@ -20,8 +20,6 @@ from shapepose_fg.setup_check.evidence import Look, triangulate
 from shapepose_fg.setup_check.findings import Finding, Kind, sentence
 from shapepose_fg.setup_check.fit import match
 from shapepose_fg.setup_check.matching import GATE, residuals, size_of
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

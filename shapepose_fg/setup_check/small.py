@@ -11,16 +11,14 @@ from functools import partial
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import C, K, P
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
 from shapepose_fg.setup_check.evidence import KERNEL, Look, Structure, observed, triangulate
 from shapepose_fg.setup_check.findings import Finding, Kind
 from shapepose_fg.setup_check.fit import CENTRE, FOCAL, POSE, Q, changed, difference
 from shapepose_fg.setup_check.matching import Groups
-
-Array = NDArray[np.float64]
 
 _ROLL = [2]
 Parts = tuple[tuple[list[int], float], ...]
@@ -46,7 +44,7 @@ class Normal:
     g: Array
     """(V Q,)."""
 
-    def solve(self, columns: NDArray[np.intp]) -> Array:
+    def solve(self, columns: Index) -> Array:
         """The change (n,) of some parameters that lowers the squares most."""
         H = self.H[np.ix_(columns, columns)]
         return np.asarray(-np.linalg.lstsq(H, self.g[columns], rcond=1e-10)[0], dtype=np.float64)

@@ -4,16 +4,14 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.simulation.limbs import turned_about
 from shapepose_fg.simulation.mocap import Clip, Mocap, blend
 from shapepose_fg.simulation.motion import along, left_of
 from shapepose_fg.simulation.performance import Figure, Performance, grounded, perform
-
-Array = NDArray[np.float64]
 
 _SEAM_S = 0.5
 """Length of the crossfade from the end of a clip to its beginning."""

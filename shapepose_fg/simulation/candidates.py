@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.simulation.detector_statistics import JOINT_GROUP, LIMB_GROUP, DetectorStatistics
-
-Array = NDArray[np.float64]
 
 
 class NoiseProcess:
@@ -70,12 +69,12 @@ class Table:
 class FalseCandidates(Table):
     """False candidates that are there now: F of them."""
 
-    view: NDArray[np.intp]
-    person: NDArray[np.intp]
+    view: Index
+    person: Index
     """The person that it goes with, or -1."""
-    anchor: NDArray[np.intp]
+    anchor: Index
     """The joint that it keeps its distance to."""
-    joint: NDArray[np.intp]
+    joint: Index
     """What it claims to be."""
     offset: Array
     """(F, 2) from the anchor in metres, or a place as a share of the image."""
@@ -147,11 +146,11 @@ _LEAST_LENGTH_PX = 8.0
 class Candidates(Table):
     """Candidates while they are made: D of them."""
 
-    view: NDArray[np.intp]
-    joint: NDArray[np.intp]
+    view: Index
+    joint: Index
     xy: Array
     confidence: Array
-    owner: NDArray[np.bool_]
+    owner: Mask
     """(D, P) whose joint a candidate is; none's where it is false, two people's where two are one."""
     reach_px: Array
     """(D,) nearer than this to a better candidate of the same joint it is not seen as one of its own."""
@@ -160,13 +159,13 @@ class Candidates(Table):
 def affinities(
     found: Candidates,
     true_xy: Array,
-    captors: NDArray[np.intp],
+    captors: Index,
     statistics: DetectorStatistics,
     *,
     doubt: float,
     wrong: float,
     rng: np.random.Generator,
-) -> tuple[NDArray[np.intp], Array]:
+) -> tuple[Index, Array]:
     """Pairs (E, 2) of D candidates and their affinities (E,), those above 0.
 
     `true_xy` (V, P, 25, 2) is where joints truly are, `captors` (2, V, P, 25) who stands before a missed joint and
@@ -202,9 +201,7 @@ def affinities(
     return np.stack([first, second], axis=1)[used], affinity[used]
 
 
-def _pairs(
-    view: NDArray[np.intp], joint: NDArray[np.intp], views: int
-) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+def _pairs(view: Index, joint: Index, views: int) -> tuple[Index, Index, Index]:
     """All pairs (E,), (E,) of candidates of one view that a limb joins, and the limb (E,)."""
     label = view * 25 + joint
     order = np.argsort(label, kind="stable")
@@ -219,7 +216,7 @@ def _pairs(
     return table[v, _A[limb], i], table[v, _B[limb], j], limb
 
 
-def _detour(found: Candidates, near: NDArray[np.intp], far: NDArray[np.intp], true_xy: Array) -> Array:
+def _detour(found: Candidates, near: Index, far: Index, true_xy: Array) -> Array:
     """(E,) how far candidates `far` are from that joint of those who own `near`, in limb lengths, or inf."""
     if found.owner.shape[1] == 0:
         return np.full(len(near), np.inf)

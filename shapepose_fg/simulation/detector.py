@@ -11,11 +11,11 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.threads import torch_threads
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections, Recording
 from shapepose_fg.core.skeleton import BODY_25
@@ -35,8 +35,6 @@ from shapepose_fg.simulation.visibility import (
     VisibilityWorker,
     seen_from_the_front,
 )
-
-Array = NDArray[np.float64]
 
 _MIRROR = np.array(BODY_25.mirror)
 _MIRROR_APART_M = 0.12
@@ -182,7 +180,7 @@ class Detector:
         visibility: Visibility,
         noise: Array,
         rng: np.random.Generator,
-    ) -> tuple[Candidates, NDArray[np.bool_]]:
+    ) -> tuple[Candidates, Mask]:
         """The joints of people that are reported, each with its error; and which they are, (V, P, 25)."""
         table, config, sizes = self._table, self._config, self._rig.image_sizes
         seen = seen_from_the_front(visibility.seen, joints, self._rig.centres, table.facing)
@@ -253,7 +251,7 @@ class Detector:
         return buried + np.maximum(_HALF_LOST + slope * (noise[NoiseProcess.LOST] - half), 0.0)
 
     def _sigma_px(
-        self, confidence: Array, seen: Array, hidden_as: NDArray[np.intp], px_a_metre: Array, scale: Array
+        self, confidence: Array, seen: Array, hidden_as: Index, px_a_metre: Array, scale: Array
     ) -> Array:
         """Sigmas (D,) of the errors of reported joints, px, whose tails are drawn by `scale` (D,), normal."""
         table = self._table
@@ -269,8 +267,8 @@ class Detector:
         return sigma_px * np.exp(_between(tail[which], tail[0], seen) * scale)
 
     def _captors(
-        self, reported: NDArray[np.bool_], true_xy: Array, metres_a_px: Array, visibility: Visibility, noise: Array
-    ) -> NDArray[np.intp]:
+        self, reported: Mask, true_xy: Array, metres_a_px: Array, visibility: Visibility, noise: Array
+    ) -> Index:
         """(2, V, P, 25) who stands before a missed joint and captured it (`affinities`), or did not; -1: none."""
         table = self._table
         view, person, joint = np.nonzero((visibility.hidden_by >= 0) & visibility.in_image & ~reported)

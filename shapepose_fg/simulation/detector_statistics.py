@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.skeleton import BODY_25
 
 _FILE = Path(__file__).parent / "data" / "detector.json"
@@ -23,8 +23,6 @@ _LIMBS = np.array(BODY_25.limbs)
 _LIMB_NAMES = [min(tuple(limb), tuple(_MIRROR[limb].tolist())) for limb in _LIMBS.tolist()]
 LIMB_GROUP = np.array([sorted(set(_LIMB_NAMES)).index(name) for name in _LIMB_NAMES])
 """(26,) the same for limbs, 14 rows."""
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,18 +5,16 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.smpl_file import NUM_BETAS, SMPL_PARENTS
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.simulation.motion import Motion
 from shapepose_fg.simulation.performance import Figure
 from shapepose_fg.simulation.scene import Scene
-
-Array = NDArray[np.float64]
 
 DETECTOR_S_OWN = KeypointOffsets.symmetric(
     {

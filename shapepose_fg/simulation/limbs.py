@@ -7,10 +7,9 @@ form. All of it is batched over frames, for one person at a time.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-Array = NDArray[np.float64]
+from shapepose_fg.core.arrays import Array
 
 PELVIS, SPINE, NECK, HEAD = 0, (3, 6, 9), 12, 15
 LEGS = ((1, 4, 7), (2, 5, 8))

@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.npz import read_npz
-
-Array = NDArray[np.float64]
 
 _OF_CLIP = "seq_start seq_len fps names subject action tier wrist_valid toe_valid leg_m floor_y".split()
 _ARRAYS = {"poses": ("N", 24, 3), "trans": ("N", 3), **dict.fromkeys(_OF_CLIP, ("S",))}

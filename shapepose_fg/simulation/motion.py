@@ -8,11 +8,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.simulation.limbs import LEGS, Puppet, pose
-
-Array = NDArray[np.float64]
 
 COUPLE, LOOP, WAVER = np.array([[-0.15, 0.0], [1.05, 0.0], [0.92, -0.1]])
 """Where in a group the middle of the couple, of the walker's loop, and who waves are, metres."""

@@ -3,17 +3,15 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d, minimum_filter1d
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.simulation.limbs import turned_about
 from shapepose_fg.simulation.mocap import Clip, shoulder_rhythm
 from shapepose_fg.simulation.motion import Motion
-
-Array = NDArray[np.float64]
 
 _FEET = (7, 8, 10, 11)
 """Ankles and balls of the feet, left and right."""

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.simulation.motion import Build, Motion, close_motion
 from shapepose_fg.viz.rendering import look_at
@@ -47,7 +48,7 @@ class Scene:
         return len(self.motion.betas)
 
     @cached_property
-    def keypoints(self) -> NDArray[np.float64]:
+    def keypoints(self) -> Array:
         """(T, P, 25, 3) true BODY_25 keypoints."""
         return keypoints_of(self.body, self.motion)
 
@@ -63,11 +64,11 @@ class Scene:
         cuts = tuple(first - span.start for first in self.cuts if span.start < first < span.stop)
         return replace(self, motion=self.motion[span.start : span.stop], cuts=cuts, clips=clips)
 
-    def truth_at(self, frame: int) -> NDArray[np.float64]:
+    def truth_at(self, frame: int) -> Array:
         """(P, 25, 3) true BODY_25 keypoints of one frame."""
         return self.keypoints[frame]
 
-    def vertices_at(self, frame: int, only: NDArray[np.intp] | None = None) -> NDArray[np.float32]:
+    def vertices_at(self, frame: int, only: Index | None = None) -> NDArray[np.float32]:
         """(P, Nv, 3) the true surfaces of one frame; or (P, M, 3), the vertices `only` (M,) of them."""
         import torch
 
@@ -130,7 +131,7 @@ def ring_of_cameras(
     return Rig(tuple(cameras), up="z")
 
 
-def builds_of(body: "BodyModel", betas: NDArray[np.float64]) -> list[Build]:
+def builds_of(body: "BodyModel", betas: Array) -> list[Build]:
     """The measures of P shapes `betas` (P, 10) that motions are made to."""
     import torch
 
@@ -141,7 +142,7 @@ def builds_of(body: "BodyModel", betas: NDArray[np.float64]) -> list[Build]:
     return [Build(rest, float(floor)) for rest, floor in zip(joints, floors, strict=True)]
 
 
-def keypoints_of(body: "BodyModel", motion: Motion) -> NDArray[np.float64]:
+def keypoints_of(body: "BodyModel", motion: Motion) -> Array:
     """BODY_25 keypoints (T, P, 25, 3) of a motion."""
     import torch
 

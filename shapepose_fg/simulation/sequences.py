@@ -11,17 +11,15 @@ from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.simulation.bystanders import stand, standing_clips, walk_along, walking_clips, way_through
 from shapepose_fg.simulation.limbs import turned_about
 from shapepose_fg.simulation.mocap import Clip, Mocap
 from shapepose_fg.simulation.motion import Motion
 from shapepose_fg.simulation.performance import Figure, Performance, hold_hands, perform, together
 from shapepose_fg.simulation.scene import Scene, ring_of_cameras
-
-Array = NDArray[np.float64]
 
 _TORSO = (0, 6, 9, 12)
 """Pelvis, spine and neck: what no one else may come into."""

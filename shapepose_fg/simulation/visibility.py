@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index, Mask, Real
 from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.drawing import thinned
 from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 from shapepose_fg.pipeline.workers import Workers
 from shapepose_fg.viz.rendering import first_surface_at, scaled
@@ -31,7 +33,7 @@ FACE = tuple(BODY_25.index(name) for name in ("Nose", "REye", "LEye", "REar", "L
 _RAYS = np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (0.7, 0.7), (-0.7, 0.7), (0.7, -0.7), (-0.7, -0.7)])
 """Where rays go around a joint, in units of the probe's radius."""
 
-FramePeople = tuple[NDArray[np.float64], NDArray[np.float32]]
+FramePeople = tuple[Array, NDArray[np.float32]]
 """One frame: BODY_25 joints (P, 25, 3) and surfaces (P, M, 3) of everybody, metres."""
 AHEAD = 4
 """Frames a worker that are under way: they are short work."""
@@ -59,11 +61,11 @@ class VisibilityConfig:
 class Visibility:
     """How much of each joint each view sees, and what hides it."""
 
-    seen: NDArray[np.float64]
+    seen: Array
     """(V, P, J) share of the rays to a joint that arrive, 0 to 1; 0 outside the image."""
-    in_image: NDArray[np.bool_]
+    in_image: Mask
     """(V, P, J) whether the joint projects into the image."""
-    hidden_by: NDArray[np.intp]
+    hidden_by: Index
     """(V, P, J) NOBODY (-1) where at least half of the rays arrive; else what stops most of the others: a
     person's index, or ITSELF (-2), its own body; BORDER (-3) outside the image."""
 
@@ -72,25 +74,24 @@ class Visibility:
 class Skin:
     """The surface that is drawn for every person, and which joints each part of it shows."""
 
-    vertices: NDArray[np.intp]
+    vertices: Index
     """(M,) vertices of the body's mesh that are in use."""
     faces: NDArray[np.int32]
     """(G, 3) triangles over those."""
-    shows: NDArray[np.bool_]
+    shows: Mask
     """(M, J) whether a vertex is skinned to the joint's own bone or one next to it: by half its weight or more."""
 
     @classmethod
     def of(cls, body: "BodyModel", cell_m: float) -> "Skin":
         """The surface of `body`, with vertices merged that are within a cube of `cell_m` in the mean T-pose."""
-        vertices, faces, cell = coarsen(body.arrays.template, body.faces, cell_m)
+        template = body.arrays.template
+        vertices, faces, cell = thinned(template, body.faces, cell_m, template.min(axis=0))
         shown = body.arrays.weights @ _bones_near(body.parents).T
         mean = np.stack([np.bincount(cell, share) for share in shown.T], axis=1) / np.bincount(cell)[:, None]
-        return cls(vertices, faces.astype(np.int32), mean >= 0.5)
+        return cls(vertices, faces, mean >= 0.5)
 
 
-def see(
-    rig: Rig, joints: NDArray[np.float64], surfaces: NDArray[np.floating], skin: Skin, config: VisibilityConfig
-) -> Visibility:
+def see(rig: Rig, joints: Array, surfaces: Real, skin: Skin, config: VisibilityConfig) -> Visibility:
     """See BODY_25 `joints` (P, 25, 3) of people whose `surfaces` are (P, M, 3), the vertices of `skin`.
 
     A ray arrives when the first surface on it is skinned to the joint's own bones or adjacent ones of the
@@ -151,7 +152,7 @@ class VisibilityWorker:
             yield from pool.map(VisibilityWorker.one, frames)
 
 
-def facing(joints: NDArray[np.float64], centres: NDArray[np.float64]) -> NDArray[np.float64]:
+def facing(joints: Array, centres: Array) -> Array:
     """Cosine (V, P, 5) of face `joints` (P, 25, 3) between the way out of the head and that to cameras (V, 3)."""
     face = joints[:, FACE]
     outward = face - joints[:, FACE[3:]].mean(axis=1, keepdims=True)
@@ -160,9 +161,7 @@ def facing(joints: NDArray[np.float64], centres: NDArray[np.float64]) -> NDArray
     return (outward * to_camera).sum(axis=-1) / np.maximum(length, 1e-9)
 
 
-def seen_from_the_front(
-    seen: NDArray[np.float64], joints: NDArray[np.float64], centres: NDArray[np.float64], ramp: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def seen_from_the_front(seen: Array, joints: Array, centres: Array, ramp: Array) -> Array:
     """`seen` (V, P, 25) where a face joint's share is less the more it faces away, whatever the depth buffer says.
 
     `ramp` (5, 2) holds the cosines at which a face joint is wholly lost and wholly there.
@@ -173,44 +172,17 @@ def seen_from_the_front(
     return result
 
 
-def _commonest(who: NDArray[np.intp], counts: NDArray[np.bool_]) -> NDArray[np.intp]:
+def _commonest(who: Index, counts: Mask) -> Index:
     """The value of `who` (..., R) that comes most often among those that count; of equals, the first."""
     votes = ((who[..., :, None] == who[..., None, :]) & counts[..., None, :]).sum(axis=-1)
     best = np.where(counts, votes, 0).argmax(axis=-1)
     return np.take_along_axis(who, best[..., None], axis=-1)[..., 0]
 
 
-def _bones_near(parents: tuple[int, ...]) -> NDArray[np.float64]:
+def _bones_near(parents: tuple[int, ...]) -> Array:
     """(25, 24) 1 where a bone is a joint's own, or the parent or child of one."""
     adjacent = np.eye(len(parents))
     child, parent = np.arange(1, len(parents)), np.array(parents[1:])
     adjacent[child, parent] = adjacent[parent, child] = 1
     own = np.array([[name in names.split("+") for name in SMPL_24] for names in _BONES], dtype=np.float64)
     return np.minimum(own @ adjacent, 1.0)
-
-
-def coarsen(
-    vertices: NDArray[np.floating], faces: NDArray[np.integer], cell_m: float
-) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """Fewer triangles over some of the vertices (N, 3): one vertex per cube of `cell_m`.
-
-    Returns the indices (M,) of the vertices that stay, faces (G, 3) over those, and the cube (N,) of each
-    vertex, from 0 to M - 1. A cube keeps the vertex nearest to its vertices' mean; triangles that collapse
-    or come twice go.
-    """
-    if cell_m <= 0:
-        every = np.arange(len(vertices))
-        return every, np.asarray(faces, dtype=np.intp), every
-    cells = np.floor((vertices - vertices.min(axis=0)) / cell_m).astype(np.int64)
-    _, cell = np.unique(cells, axis=0, return_inverse=True)
-    cell = cell.ravel()
-    size = np.bincount(cell)
-    mean = np.stack([np.bincount(cell, vertices[:, axis]) / size for axis in range(3)], axis=1)
-    order = np.lexsort((np.linalg.norm(vertices - mean[cell], axis=1), cell))
-    chosen = order[np.concatenate([[0], np.cumsum(size)[:-1]])]  # the first of each cell
-    small = cell[faces]
-    distinct = (small[:, 0] != small[:, 1]) & (small[:, 1] != small[:, 2]) & (small[:, 2] != small[:, 0])
-    small = small[distinct]
-    # Turn each triangle to begin with its smallest index: copies are equal and keep their winding.
-    turn = (small.argmin(axis=1)[:, None] + np.arange(3)) % 3
-    return chosen, np.unique(np.take_along_axis(small, turn, axis=1), axis=0), cell

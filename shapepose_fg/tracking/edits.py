@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Mask, Whole
 from shapepose_fg.core.reconstruction import MOST_NUMBER, Reconstruction
 
 Solve = Callable[[Reconstruction], Reconstruction]
@@ -72,14 +72,8 @@ class Edited:
     changed: frozenset[int] = frozenset()
     """Identities whose rows are not what they were solved from: these are to be solved anew."""
 
-    @property
-    def spans(self) -> dict[int, range]:
-        """The frames of each changed identity, first to last."""
-        frames = {person: self.people.frame[self.people.person == person] for person in sorted(self.changed)}
-        return {person: range(int(rows.min()), int(rows.max()) + 1) for person, rows in frames.items()}
 
-
-def free_number(person: NDArray[np.integer]) -> int:
+def free_number(person: Whole) -> int:
     """The number that a new identity gets, where these are the rows' (N,)."""
     return int(person.max(initial=-1)) + 1
 
@@ -150,11 +144,7 @@ def in_order(people: Reconstruction) -> Reconstruction:
     return people.rows(np.lexsort((people.person, people.frame)))
 
 
-Rows = NDArray[np.bool_]
-"""(N,) some rows of a result."""
-
-
-def _merge(people: Reconstruction, edit: Edit, rows: Rows, others: Rows) -> Edited:
+def _merge(people: Reconstruction, edit: Edit, rows: Mask, others: Mask) -> Edited:
     both = np.intersect1d(people.frame[rows], people.frame[others])
     if len(both) > 0:
         raise ValueError(
@@ -164,7 +154,7 @@ def _merge(people: Reconstruction, edit: Edit, rows: Rows, others: Rows) -> Edit
     return _relabelled(people, {_other(edit): edit.person}, others, changed={edit.person})
 
 
-def _split(people: Reconstruction, edit: Edit, rows: Rows) -> Edited:
+def _split(people: Reconstruction, edit: Edit, rows: Mask) -> Edited:
     assert edit.frame is not None
     later = rows & (people.frame >= edit.frame)
     if not later.any() or (later == rows).all():
@@ -176,7 +166,7 @@ def _split(people: Reconstruction, edit: Edit, rows: Rows) -> Edited:
     return _relabelled(people, {edit.person: _other(edit)}, later, changed={edit.person, _other(edit)})
 
 
-def _swap(people: Reconstruction, edit: Edit, rows: Rows, others: Rows) -> Edited:
+def _swap(people: Reconstruction, edit: Edit, rows: Mask, others: Mask) -> Edited:
     assert edit.frame is not None
     later = (rows | others) & (people.frame >= edit.frame)
     if not later.any():
@@ -189,7 +179,7 @@ def _swap(people: Reconstruction, edit: Edit, rows: Rows, others: Rows) -> Edite
     return _relabelled(people, names, later, changed=set() if only_names else set(names))
 
 
-def _relabelled(people: Reconstruction, names: dict[int, int], rows: Rows, changed: set[int]) -> Edited:
+def _relabelled(people: Reconstruction, names: dict[int, int], rows: Mask, changed: set[int]) -> Edited:
     """`people` with other identities in `rows` (N,); identities that lost all their rows are not to be solved."""
     person = people.person.copy()
     for old, new in names.items():
@@ -197,7 +187,7 @@ def _relabelled(people: Reconstruction, names: dict[int, int], rows: Rows, chang
     return Edited(in_order(people.relabelled(person)), frozenset(changed) & frozenset(person.tolist()))
 
 
-def _rows_of(people: Reconstruction, person: int) -> Rows:
+def _rows_of(people: Reconstruction, person: int) -> Mask:
     """(N,) the rows of one identity; ValueError where there is nobody of that number."""
     rows = people.person == person
     if not rows.any():

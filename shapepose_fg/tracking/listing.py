@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shapepose_fg.body.model.smpl_file import SmplArrays
 from shapepose_fg.body.shapes import statures_m
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.frame_times import ASSUMED_FPS
 from shapepose_fg.core.reconstruction import Known, OpenedReconstruction, Reconstruction
 
@@ -73,15 +73,13 @@ def list_tracks(people: Reconstruction, body: SmplArrays | None = None, every: i
     ]
 
 
-def _mean_betas(betas: NDArray[np.float64]) -> NDArray[np.float64]:
+def _mean_betas(betas: Array) -> Array:
     """(10,) the mean shape of one person's rows (N, 10); NaN where none has a body."""
     fitted = np.isfinite(betas).all(axis=1)
     return betas[fitted].mean(axis=0) if fitted.any() else np.full(betas.shape[1], np.nan)
 
 
-def _summary(
-    people: Reconstruction, person: int, rows: NDArray[np.intp], stature_m: float, every: int
-) -> TrackSummary:
+def _summary(people: Reconstruction, person: int, rows: Index, stature_m: float, every: int) -> TrackSummary:
     """The summary of the identity in `rows`, which are sorted by frame."""
     frame, known = people.frame[rows], people.known[rows]
     placed = np.isfinite(people.joints[rows]).all(axis=-1)
@@ -99,7 +97,7 @@ def _summary(
     )
 
 
-def _walked_m(people: Reconstruction, rows: NDArray[np.intp]) -> float:
+def _walked_m(people: Reconstruction, rows: Index) -> float:
     """How far the middle of a person's placed joints went: hips alone may be hidden."""
     count = np.isfinite(people.joints[rows].sum(axis=-1)).sum(axis=1)
     rows, count = rows[count > 0], count[count > 0]

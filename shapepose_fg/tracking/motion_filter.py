@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import Motion
-
-Array = NDArray[np.float64]
+from shapepose_fg.core.arrays import Array, Mask
 
 
 @dataclass(frozen=True)
@@ -83,7 +82,7 @@ class JointStates:
         covariance = self.covariance - gain @ information @ self.covariance[..., :3, :]
         return JointStates(mean, (covariance + np.swapaxes(covariance, -1, -2)) / 2)
 
-    def replaced(self, where: NDArray[np.bool_], other: "JointStates") -> "JointStates":
+    def replaced(self, where: Mask, other: "JointStates") -> "JointStates":
         """The same, with the joints `where` (A, J) from another."""
         return JointStates(
             np.where(where[..., None], other.mean, self.mean),

@@ -1,19 +1,14 @@
 """Which joints cannot be a person's own: those that are farther from their neighbours than any bone is long."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.skeleton import Skeleton
 
 
 def torn_joints(
-    places: NDArray[np.float64],
-    trusted: NDArray[np.bool_],
-    views: NDArray[np.intp],
-    longest_m: NDArray[np.float64],
-    skeleton: Skeleton,
-    reach_m: float,
-) -> NDArray[np.bool_]:
+    places: Array, trusted: Mask, views: Index, longest_m: Array, skeleton: Skeleton, reach_m: float
+) -> Mask:
     """(A, J) joints without which no bone of a person is longer than `longest_m` (J,), from each joint's parent.
 
     `places` (A, J, 3); only joints that are `trusted` (A, J) are judged. Of two ends of a bone the one goes of
@@ -45,9 +40,7 @@ def torn_joints(
         torn[rows, share[rows].argmax(axis=1)] = True
 
 
-def _judged_above(
-    judged: NDArray[np.bool_], longest_m: NDArray[np.float64], skeleton: Skeleton
-) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+def _judged_above(judged: Mask, longest_m: Array, skeleton: Skeleton) -> tuple[Index, Array]:
     """For each joint the nearest `judged` (A, J) one above it, (A, J), and the longest way there, metres.
 
     Joints with none above them have the first of these, by way of the root; that one has itself.

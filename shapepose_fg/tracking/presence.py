@@ -7,12 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from shapepose_fg.core.arrays import Array, Index, Mask, Real, Whole
 from shapepose_fg.core.camera import Rig, beside_segment
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.claims import mean_affinity, owned
-
-Array = NDArray[np.float64]
 
 _PRICE = 0.4
 """What a place costs where a joint should be seen and is not, in places that are seen: the price of being there is
@@ -50,11 +49,11 @@ were there."""
 class Chosen:
     """K people and from when to when they are there, in the order in which they were chosen, best first."""
 
-    hypothesis: NDArray[np.intp]
+    hypothesis: Index
     """(K,) which hypothesis."""
-    start: NDArray[np.intp]
+    start: Index
     """(K,) index of the first frame."""
-    stop: NDArray[np.intp]
+    stop: Index
     """(K,) the one after the last."""
     evidence_s: Array
     """(K,) evidence, in seconds in which all of a person is seen by all views; what being there costs taken
@@ -63,18 +62,13 @@ class Chosen:
     def __len__(self) -> int:
         return len(self.hypothesis)
 
-    def during(self, frame: int) -> NDArray[np.bool_]:
+    def during(self, frame: int) -> Mask:
         """(K,) who is there in a frame."""
         return (self.start <= frame) & (frame < self.stop)
 
 
 def weighed(
-    candidate: NDArray[np.intp],
-    places: Array,
-    detections: Detections,
-    rig: Rig,
-    skeleton: Skeleton,
-    world: NDArray[np.intp],
+    candidate: Index, places: Array, detections: Detections, rig: Rig, skeleton: Skeleton, world: Index
 ) -> tuple[Array, Array]:
     """What each detection of A people counts (A, J, V), and what being there costs (A,), both as shares of the
     places where they should be seen.
@@ -101,14 +95,7 @@ def weighed(
     return weight / expected[:, None, None], price.sum(axis=(0, 2)) / expected
 
 
-def _behind_others(
-    xy: Array,
-    depth: Array,
-    known: NDArray[np.bool_],
-    rig: Rig,
-    skeleton: Skeleton,
-    world: NDArray[np.intp],
-) -> NDArray[np.bool_]:
+def _behind_others(xy: Array, depth: Array, known: Mask, rig: Rig, skeleton: Skeleton, world: Index) -> Mask:
     """(V, A, J) joints, at pixels (V, A, J, 2) and depths, behind a limb of somebody else of the same world.
 
     Limbs hide whose both ends are `known` (A, J).
@@ -136,9 +123,7 @@ def _behind_others(
     return hidden
 
 
-def own_evidence(
-    candidate: NDArray[np.integer], weight: NDArray[np.floating], price: NDArray[np.floating]
-) -> Array:
+def own_evidence(candidate: Whole, weight: Real, price: Real) -> Array:
     """(A,) evidence of A people in a frame, for each second that it stands for: 1 where all of a person is seen.
 
     Of their detections `candidate` (A, J, V), with `weight` (A, J, V) and `price` (A,) of `weighed`; a detection
@@ -161,13 +146,13 @@ def probability(evidence: float) -> float:
 class Account:
     """H hypotheses as detections with weights, in T frames: who of them is there is chosen from this."""
 
-    place: NDArray[np.intp]
+    place: Index
     """(H, T, J V) each detection's place among those of all frames; one more stands for none."""
     weight: NDArray[np.float32]
     """(H, T, J V) what it counts."""
-    price: NDArray[np.floating]
+    price: Real
     """(H, T) what being there costs."""
-    there: NDArray[np.bool_]
+    there: Mask
     """(H, T) where there is something to say."""
     lasts_s: Array
     """(T,) what each frame stands for, seconds."""
@@ -184,13 +169,7 @@ class Account:
 
     @classmethod
     def of(
-        cls,
-        candidate: NDArray[np.integer],
-        weight: NDArray[np.floating],
-        price: NDArray[np.floating],
-        there: NDArray[np.bool_],
-        counts: NDArray[np.intp],
-        lasts_s: Array,
+        cls, candidate: Whole, weight: Real, price: Real, there: Mask, counts: Index, lasts_s: Array
     ) -> "Account":
         """Of detections `candidate` (H, T, J, V), of `counts` (T,) in each frame, with `weight` (H, T, J, V) and
         `price` (H, T) of `weighed`.
@@ -203,11 +182,11 @@ class Account:
         span, least_s = (int(seen[0]), int(seen.max())), min(_LEAST_S, 0.25 * float(lasts_s.sum()))
         return cls(place, weights, price, there, lasts_s, count, *span, least_s)
 
-    def choose(self, world: NDArray[np.intp]) -> Chosen:
+    def choose(self, world: Index) -> Chosen:
         """The first of `ways`."""
         return self.ways(world)[0]
 
-    def ways(self, world: NDArray[np.intp], *, on_trial: bool = False) -> list[Chosen]:
+    def ways(self, world: Index, *, on_trial: bool = False) -> list[Chosen]:
         """Ways to choose hypotheses, and from when to when, so that each detection is evidence of one person only.
 
         What explains most is the first. `world` (H,) are people who were followed together; `on_trial` takes
@@ -257,7 +236,7 @@ class Account:
         share = np.einsum("htk,htk->ht", self.weight[:, span], free[self.place[:, span]])
         return np.where(self.there[:, span], (share - self.price[:, span]) * self.lasts_s[span], -np.inf)
 
-    def in_turn(self, first: NDArray[np.bool_], before: Chosen | None = None) -> Chosen:
+    def in_turn(self, first: Mask, before: Chosen | None = None) -> Chosen:
         """People one after the other, the best of those `first` (H,) before all others, besides those `before`."""
         free, gains, chosen = self.free, self.alone.copy(), list[tuple[int, int, int, float]]()
         taken, least = np.zeros(self.there.shape, dtype=bool), self.least_s
@@ -282,7 +261,7 @@ class Account:
         hypothesis, start, stop = columns[:3].astype(np.intp)
         return Chosen(hypothesis, start, stop, columns[3])
 
-    def best_segments(self, gains: Array) -> tuple[Array, NDArray[np.intp], NDArray[np.intp]]:
+    def best_segments(self, gains: Array) -> tuple[Array, Index, Index]:
         """The segment with the greatest sum of each row of `gains` (H, T): value (H,), start (H,), stop (H,).
 
         Where a segment begins after the first frame in which anything is seen, or stops before the last, it costs

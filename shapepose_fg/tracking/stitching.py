@@ -6,15 +6,12 @@ from typing import Annotated
 
 import numpy as np
 from annotated_types import Interval
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.bounds import Settings
 from shapepose_fg.core.skeleton import Skeleton
-
-Array = NDArray[np.float64]
-
 
 _BONE_SIGMA_M = 0.015
 """Error of a bone's mean length in a track: errors of detectors last, so that it does not vanish with time."""
@@ -74,7 +71,7 @@ class Trace:
 class Ends:
     """Where and when G tracks begin and end, and how their people are built."""
 
-    track: NDArray[np.intp]
+    track: Index
     """(G,) identities."""
     time_s: Array
     """(G, 2) of the first and the last row."""
@@ -119,9 +116,7 @@ def stitch(ends: Ends, config: StitchingConfig, cuts_s: Sequence[float] = ()) ->
     return {int(ends.track[place]): int(name) for place, name in names.items()}
 
 
-def _pairs(
-    ends: Ends, config: StitchingConfig, cuts_s: Sequence[float]
-) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
+def _pairs(ends: Ends, config: StitchingConfig, cuts_s: Sequence[float]) -> tuple[Index, Index, Array]:
     """Tracks (K,) of whom others (K,) may be what comes after, and what that costs: see `_costs`."""
     begin_s, end_s = ends.time_s.T
     order = np.argsort(begin_s, kind="stable")
@@ -167,7 +162,7 @@ def _costs(apart_m: Array, reach_m: Array, unlike: Array) -> Array:
     return (apart_m / sigma_m) ** 2 + 4 * np.log(sigma_m / _PLACE_SIGMA_M) + unlike
 
 
-def _matched(before: NDArray[np.intp], after: NDArray[np.intp], cost: Array) -> dict[int, int]:
+def _matched(before: Index, after: Index, cost: Array) -> dict[int, int]:
     """For tracks that are joined the one before, of pairs (K,) that may be: as many as can be, the likeliest."""
     rows, row = np.unique(before, return_inverse=True)
     columns, column = np.unique(after, return_inverse=True)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import CONSTANT_VELOCITY, Motion
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.bounds import Count, Seconds, Settings
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import Detections
@@ -23,7 +24,6 @@ from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.plausibility import torn_joints
 from shapepose_fg.tracking.view_assignment import FARTHEST_M, Predicted, assign
 
-Array = NDArray[np.float64]
 FindPeople = Callable[[Detections, Rig], Observations]
 """Stage I of one frame: detections and rig to people."""
 NoteDropped = Callable[[str, list[int]], None]
@@ -81,9 +81,9 @@ class Tracks:
 
     time_s: float
     """Time of the last frame."""
-    ids: NDArray[np.intp]
+    ids: Index
     """(A,) number of each track."""
-    world: NDArray[np.intp]
+    world: Index
     """(A,) the world that it is in."""
     joints: JointStates
     """Where the A people's joints were."""
@@ -138,28 +138,26 @@ class Tracker:
         """Tracks of no people."""
         return Tracks.none(self.skeleton, self.scale.motion)
 
-    def step(
-        self, tracks: Tracks, detections: Detections, rig: Rig, time_s: float
-    ) -> tuple[Tracks, NDArray[np.intp]]:
+    def step(self, tracks: Tracks, detections: Detections, rig: Rig, time_s: float) -> tuple[Tracks, Index]:
         """The next frame, at `time_s` (earlier than the last where time runs backwards), and the detections of
         each track (A, J, V), -1 for none. No track ends here.
         """
         before = tracks.joints.across_m
-        joints = self._predict(tracks.joints, time_s - tracks.time_s) if len(tracks) > 0 else tracks.joints
+        joints = self.predict(tracks.joints, time_s - tracks.time_s) if len(tracks) > 0 else tracks.joints
         lost = (joints.across_m > _LOST_M) & (before > _TRUSTED_M)
         lost &= ~lost[:, list(self.skeleton.core)].all(axis=1, keepdims=True)  # beside whom would they be sought?
-        joints = self._beside_neighbours(joints, lost)
+        joints = self.beside_neighbours(joints, lost)
         predicted = Predicted(joints.position, joints.sigma_m, lost, tracks.world)
         candidate = assign(predicted, detections, rig, self.skeleton)
         joints, candidate = self._measure(joints, lost, candidate, detections, rig)
-        evident_s = np.where(self._evident(candidate), time_s, tracks.evident_s)
+        evident_s = np.where(self.evident(candidate), time_s, tracks.evident_s)
         return replace(tracks, time_s=time_s, joints=joints, evident_s=evident_s), candidate
 
-    def alive(self, tracks: Tracks) -> NDArray[np.bool_]:
+    def alive(self, tracks: Tracks) -> Mask:
         """(A,) tracks that had evidence lately."""
         return np.abs(tracks.time_s - tracks.evident_s) <= self.config.patience_s
 
-    def at(self, places: Array, ids: NDArray[np.intp], world: NDArray[np.intp], time_s: float) -> Tracks:
+    def at(self, places: Array, ids: Index, world: Index, time_s: float) -> Tracks:
         """People at `places` (P, J, 3), metres, at `time_s`; joints that are NaN are lost."""
         known = np.asarray(np.isfinite(places).all(axis=-1))
         count = np.maximum(known.sum(axis=1), 1)[:, None]
@@ -168,9 +166,7 @@ class Tracker:
         joints = JointStates.at(np.where(known[..., None], places, centre), sigma, self.scale.motion.start)
         return Tracks(time_s, ids, world, joints, np.full(len(places), time_s))
 
-    def newcomers(
-        self, tracks: Tracks, candidate: NDArray[np.intp], detections: Detections, rig: Rig
-    ) -> tuple[Array, NDArray[np.intp]]:
+    def newcomers(self, tracks: Tracks, candidate: Index, detections: Detections, rig: Rig) -> tuple[Array, Index]:
         """New people among the detections that the `tracks` of one world do not have: places (P, J, 3), metres,
         with NaN where unknown, and their detections (P, J, V).
         """
@@ -179,20 +175,20 @@ class Tracker:
         free = np.ones(len(detections), dtype=bool)
         free[candidate[candidate >= 0]] = False
         for find in self.find:
-            if not self._enough(detections, free):
+            if not self.enough(detections, free):
                 break
             rest = np.flatnonzero(free)
             people = find(detections.only(free), rig)
             own = np.where(people.candidate >= 0, np.append(rest, -1)[people.candidate], -1)
             new = (own >= 0).sum(axis=2)[:, core] >= 2
-            new = (new.sum(axis=1) >= self.config.min_new_joints) & _apart(people.initial, there)
+            new = (new.sum(axis=1) >= self.config.min_new_joints) & standing_apart(people.initial, there)
             found.append(people.initial[new])
             theirs.append(own[new])
             there = np.concatenate([there, people.initial[new]])
             free[own[new][own[new] >= 0]] = False
         return np.concatenate(found), np.concatenate(theirs)
 
-    def _predict(self, joints: JointStates, step_s: float) -> JointStates:
+    def predict(self, joints: JointStates, step_s: float) -> JointStates:
         """Joints `step_s` later; an unseen joint comes to move as the person does, straight on."""
         core = list(self.skeleton.core)
         certainty = 1 / joints.sigma_m[:, core, None] ** 2
@@ -205,7 +201,7 @@ class Tracker:
         joints = joints.with_derivatives(np.where(unseen, following, joints.velocity), fading)
         return joints.predicted(step_s, self.scale.motion, self.scale.density)
 
-    def _beside_neighbours(self, joints: JointStates, lost: NDArray[np.bool_]) -> JointStates:
+    def beside_neighbours(self, joints: JointStates, lost: Mask) -> JointStates:
         """Lost joints are put where their parents are, known to a bone's length; a lost root between its hips."""
         if not lost.any():
             return joints
@@ -227,13 +223,8 @@ class Tracker:
         return JointStates(mean, covariance)
 
     def _measure(
-        self,
-        joints: JointStates,
-        lost: NDArray[np.bool_],
-        candidate: NDArray[np.intp],
-        detections: Detections,
-        rig: Rig,
-    ) -> tuple[JointStates, NDArray[np.intp]]:
+        self, joints: JointStates, lost: Mask, candidate: Index, detections: Detections, rig: Rig
+    ) -> tuple[JointStates, Index]:
         """Joints after this frame's observations, and those of them that were kept."""
         if len(joints) == 0:
             return joints, candidate
@@ -256,13 +247,13 @@ class Tracker:
         measured = measured.replaced(torn, doubted)
         return measured, np.where(inlier & ~torn[..., None], candidate, -1)
 
-    def _evident(self, candidate: NDArray[np.intp]) -> NDArray[np.bool_]:
+    def evident(self, candidate: Index) -> Mask:
         """(A,) whether enough core joints are seen by two views, or by one."""
         seen = candidate >= 0
         in_a_view = seen[:, list(self.skeleton.core)].sum(axis=1).max(axis=1, initial=0)
         return (seen_twice(seen, self.skeleton).sum(axis=1) >= _MIN_SEEN_TWICE) | (in_a_view >= _MIN_IN_A_VIEW)
 
-    def _enough(self, detections: Detections, free: NDArray[np.bool_]) -> bool:
+    def enough(self, detections: Detections, free: Mask) -> bool:
         """Whether the free detections can be a person: enough core joints, each in two views."""
         core = np.zeros(len(self.skeleton), dtype=bool)
         core[list(self.skeleton.core)] = True
@@ -273,7 +264,7 @@ class Tracker:
         return int(twice.sum()) >= self.config.min_new_joints
 
 
-def _apart(places: Array, others: Array) -> NDArray[np.bool_]:
+def standing_apart(places: Array, others: Array) -> Mask:
     """(P,) people at `places` (P, J, 3) who stand apart from all `others` (A, J, 3); NaN joints count nothing."""
     distance = np.linalg.norm(places[:, None] - others[None], axis=-1)
     known = np.isfinite(distance)

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import Skeleton
@@ -37,17 +37,17 @@ _MESSAGES = 6
 class Predicted:
     """Where the joints of A people should be."""
 
-    places: NDArray[np.float64]
+    places: Array
     """(A, J, 3) metres."""
-    sigma_m: NDArray[np.float64]
+    sigma_m: Array
     """(A, J) how surely."""
-    lost: NDArray[np.bool_]
+    lost: Mask
     """(A, J) joints that are found by affinity alone; their place is that of their neighbour."""
-    world: NDArray[np.intp] | None = None
+    world: Index | None = None
     """(A,) people of different worlds do not compete for detections."""
 
 
-def assign(predicted: Predicted, detections: Detections, rig: Rig, skeleton: Skeleton) -> NDArray[np.intp]:
+def assign(predicted: Predicted, detections: Detections, rig: Rig, skeleton: Skeleton) -> Index:
     """The detection (A, J, V) of each person's joint in each view, -1 where there is none: the best score first
     (`Claims`), each detection once, but for those on which several people's joints lie.
     """
@@ -56,7 +56,7 @@ def assign(predicted: Predicted, detections: Detections, rig: Rig, skeleton: Ske
 
 def assign_with_probability(
     predicted: Predicted, detections: Detections, rig: Rig, skeleton: Skeleton
-) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+) -> tuple[Index, Array]:
     """What `assign` gives, and how probably (A, J, V) each of these detections is the person's; 0 where none is.
 
     A detection that serves two people, because it lies on the joints of both, is in the right place for either if
@@ -73,9 +73,7 @@ def assign_with_probability(
     return chosen, np.where(chosen >= 0, probable[whose, chosen], 0.0)
 
 
-def probabilities(
-    score: NDArray[np.float64], possible: NDArray[np.bool_], detections: Detections, views: int
-) -> NDArray[np.float64]:
+def probabilities(score: Array, possible: Mask, detections: Detections, views: int) -> Array:
     """(A, D) how probably each detection is each person's, of those that are `possible` (A, D), by their `score`.
 
     A person has at most one detection of a joint in a view, and a detection is one person's or nobody's: the
@@ -101,7 +99,7 @@ def probabilities(
 
 def _assigned(
     predicted: Predicted, detections: Detections, rig: Rig, skeleton: Skeleton
-) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.bool_]]:
+) -> tuple[Index, Array, Mask]:
     """The detections (A, J, V), every one's score (A, D) for each person, and whether it can be theirs (A, D)."""
     distance_m = projected_distances(rig.project(predicted.places), detections.joint, detections, rig)
     sigma, astray = predicted.sigma_m[:, detections.joint], predicted.lost[:, detections.joint]

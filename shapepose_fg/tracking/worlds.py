@@ -221,12 +221,7 @@ def follow_worlds(tracker: Tracker, frames: Sequence[Input], seeds: Sequence[See
 
 
 def _follow(
-    tracker: Tracker,
-    frames: Sequence[Input],
-    seeds: Iterable[Followed],
-    log: "_Log",
-    *,
-    forwards: bool,
+    tracker: Tracker, frames: Sequence[Input], seeds: Iterable[Followed], log: "_Log", *, forwards: bool
 ) -> list[Followed]:
     """One way through the frames, each seed from its frame on; returns who was found on the way."""
     tracks, births = tracker.nobody(), dict[int, int]()

@@ -182,7 +182,7 @@ def test_another_program_on_a_worker_is_noticed(monkeypatch):
         def run(self, _, on_error):
             return {"tcp://a:1": own, "tcp://b:2": self.theirs}
 
-    own = cluster._program()
+    own = cluster.this_program()
     for theirs, words in (
         ({**own, "numpy": "1.0"}, r"its process tcp://b:2 has another version of numpy \(1\.0 there, .* here\)"),
         (
@@ -192,5 +192,5 @@ def test_another_program_on_a_worker_is_noticed(monkeypatch):
         (ModuleNotFoundError("No module named 'shapepose_fg'"), r"cannot run this program \(No module named"),
     ):
         with pytest.raises(InputError, match=words):
-            cluster._refuse_other_programs(Client(theirs), "tcp://s:1")
-    cluster._refuse_other_programs(Client(own), "tcp://s:1")
+            cluster.refuse_other_programs(Client(theirs), "tcp://s:1")
+    cluster.refuse_other_programs(Client(own), "tcp://s:1")

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from shapepose_fg.cli.batch import campaign as module
-from shapepose_fg.cli.batch.campaign import Assignment, Campaign, Failed, Leader
-from shapepose_fg.cli.batch.command import _standings
+from shapepose_fg.cli.batch.campaign import Assignment, Campaign, Leader
+from shapepose_fg.cli.batch.command import standings_of
 from shapepose_fg.cli.batch.standing import Standing, Standings, read_standings
 from shapepose_fg.cli.batch.table import Entry
 from shapepose_fg.cli.reconstruct.request import Request
@@ -24,7 +24,7 @@ class Stage:
 
     def __init__(self) -> None:
         self.begun: list[Assignment] = []
-        self.ends: dict[str, list[Ended | Failed]] = {}
+        self.ends: dict[str, list[Ended | str]] = {}
         self.frameless: list[str] = []
         """Whose first attempt ends before any frame is done."""
         self.heard: list[tuple] = []
@@ -95,7 +95,7 @@ def entries(*names: str) -> list[Entry]:
 
 
 def test_the_largest_are_begun_first_and_who_failed_comes_again_at_the_end(stage, tmp_path):
-    stage.ends = {"bbb": [Failed("disk full"), DONE], "cc": [Failed("no"), Failed("no again")], "a": [DONE]}
+    stage.ends = {"bbb": ["disk full", DONE], "cc": ["no", "no again"], "a": [DONE]}
     (tmp_path / "bbb" / "parts").mkdir(parents=True)
     standings = run(stage, tmp_path, entries("a", "bbb", "cc"), anew=("bbb", "cc"))
     assert [each.name for each in stage.begun] == ["bbb", "cc", "a", "bbb", "cc"]
@@ -120,7 +120,7 @@ def test_the_largest_are_begun_first_and_who_failed_comes_again_at_the_end(stage
 
 def test_who_is_to_begin_anew_does_so_until_frames_are_done(stage, tmp_path, monkeypatch):
     """A first attempt that ends before its run is begun leaves what was there before: nothing to go on with."""
-    stage.ends, stage.frameless = {"a": [Failed("no memory"), DONE]}, ["a"]
+    stage.ends, stage.frameless = {"a": ["no memory", DONE]}, ["a"]
     (tmp_path / "a" / "parts").mkdir(parents=True)
     standings = run(stage, tmp_path, entries("a"), anew=("a",))
     assert [(each.restart, each.resume) for each in stage.begun] == [(True, False), (True, False)]
@@ -134,7 +134,7 @@ def test_who_is_to_begin_anew_does_so_until_frames_are_done(stage, tmp_path, mon
         standings = Standings(tmp_path / "batch.json", "t", {"a": Standing({}, anew=True)})
         standings.write()
         with pytest.raises(Stopped):
-            stage.ends = {"a": [Failed("stopped")]}
+            stage.ends = {"a": ["stopped"]}
             Campaign(entries("a"), {"a": 1}, tmp_path, "tcp://x", 1).run(standings, stage)
         assert read_standings(tmp_path / "batch.json")["a"].anew == anew
         monkeypatch.undo()
@@ -147,7 +147,7 @@ def test_a_batch_that_goes_on_knows_who_was_to_begin_anew(tmp_path):
 
     def anew(entries: list[Entry], **how: bool) -> list[str]:
         options = {"resume": False, "restart": False} | how
-        found = _standings(entries, tmp_path, **options)
+        found = standings_of(entries, tmp_path, **options)
         Standings(tmp_path / "batch.json", "t", found).write()
         return [name for name, each in found.items() if each.anew]
 
@@ -166,7 +166,7 @@ def test_no_more_are_led_at_a_time_than_asked(stage, tmp_path):
 
 
 def test_recordings_with_shared_shapes_are_led_in_turn_and_not_without_those_before(stage, tmp_path):
-    stage.ends = {"bb": [Failed("no"), Failed("no")]}
+    stage.ends = {"bb": ["no", "no"]}
     chain = [Entry("a", Request()), Entry("bb", Request(), "a"), Entry("ccc", Request(), "bb")]
     chain += [Entry("dddd", Request(), "ccc")]
     standings = run(stage, tmp_path, chain, at_once=4)
@@ -202,9 +202,9 @@ def test_a_leader_that_fails_says_why_and_one_that_is_killed_is_noticed(tmp_path
     leader = Leader(lost)
     told = leader.next()
     assert leader.end() is None
-    assert isinstance(told, Failed) and told.reason.startswith(f"{tmp_path / 'no.json'}: there is no such file")
+    assert isinstance(told, str) and told.startswith(f"{tmp_path / 'no.json'}: there is no such file")
     assert "error: " in (tmp_path / "log.txt").read_text()
     leader = Leader(lost)
     leader._process.kill()
-    assert leader.next() == Failed("its process was killed by signal 9; there may be too little memory")
+    assert leader.next() == "its process was killed by signal 9; there may be too little memory"
     leader.end()

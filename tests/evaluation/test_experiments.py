@@ -4,19 +4,17 @@ import importlib.util
 import json
 import re
 import sys
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.evaluation.experiments import ablation, scenes
+from shapepose_fg.evaluation.experiments import scenes
 from shapepose_fg.evaluation.experiments.experiment import Case, Column, Experiment, measured
 from shapepose_fg.evaluation.experiments.registry import experiments
 from shapepose_fg.evaluation.experiments.scenes import Scale, Segment
-from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.simulation.training.motions import split_of
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
@@ -28,8 +26,6 @@ QUICK = {each.name: each for each in experiments(Scale(quick=True))}
 @pytest.mark.parametrize("name", QUICK)
 def test_every_experiment_makes_a_table_of_plain_figures(name, tmp_path):
     experiment = QUICK[name]
-    if name == "ablation":  # one configuration is measured as the other
-        experiment = experiment.only(lambda case: case.startswith("ours, over time"))
     figures, seconds = measured(experiment, tmp_path, told=lambda _: None)
     assert seconds > 0
     assert json.loads(json.dumps(figures, allow_nan=False)) == figures
@@ -153,30 +149,6 @@ def test_a_folder_without_recordings_is_named(script, tmp_path, capsys):
     with pytest.raises(SystemExit):
         script("--data", str(tmp_path), "--only", "shelf", "--list")
     assert f"{tmp_path / 'data'} has no shelf, cmu_mocap" in capsys.readouterr().err
-
-
-def differing(one: Any, other: Any, prefix: str = "") -> list[str]:
-    """The names of all settings in which two configurations differ, as `table.name`."""
-    found = []
-    for field in fields(one):
-        a, b, name = getattr(one, field.name), getattr(other, field.name), f"{prefix}{field.name}"
-        if is_dataclass(a):
-            found += differing(a, b, f"{name}.")
-        elif a != b:
-            found.append(name)
-    return found
-
-
-def test_every_setting_that_differs_from_the_paper_has_its_switch():
-    switched = {name for names in ablation.SWITCHES.values() for name in names}
-    assert switched | {"temporal"} == set(differing(ablation.PAPER, ablation.varied(PipelineConfig())))
-
-
-def test_all_switches_together_lead_from_one_to_the_other():
-    everything = [name for names in ablation.SWITCHES.values() for name in names]
-    assert ablation.with_settings_of(ablation.PAPER, ablation.OURS, everything) == ablation.OURS
-    one = ablation.with_settings_of(ablation.OURS, ablation.PAPER, everything[:1])
-    assert differing(one, ablation.OURS) == everything[:1]
 
 
 @pytest.mark.slow

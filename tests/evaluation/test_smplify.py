@@ -13,7 +13,7 @@ from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.linearisation import ObservationConfig, triangulate
 from shapepose_fg.evaluation.experiments.methods import scored
 from shapepose_fg.evaluation.metrics import PlainPeople, joint_metrics
-from shapepose_fg.evaluation.smplify import MultiViewSmplify, _ViewTargets, smpl_only
+from shapepose_fg.evaluation.smplify import MultiViewSmplify, ViewTargets, smpl_only
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.simulation import built_in_scene, simulate
 
@@ -81,8 +81,8 @@ def test_forces_are_the_slope_of_the_energy(scene, exact):
     observations, joints = exact
     rng = np.random.default_rng(0)
     origin = joints[:, BODY_25.root]
-    targets = _ViewTargets.of(observations, scene.rig, origin, 0.02)
-    double = _ViewTargets(*(value.double() for value in vars(targets).values()))
+    targets = ViewTargets.of(observations, scene.rig, origin, 0.02)
+    double = ViewTargets(*(value.double() for value in vars(targets).values()))
     xyz = torch.from_numpy(joints - origin[:, None] + rng.normal(0, 0.03, joints.shape)).requires_grad_()
     scale, weight = 2.5, 0.3
     camera = torch.einsum("vij,bkj->bkvi", double.cTw, xyz) + double.origin[:, None]

@@ -8,7 +8,7 @@ import pytest
 
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.footage.footage import PictureFiles, Video, open_footage
-from shapepose_fg.io.footage.lockstep import _rate, _start
+from shapepose_fg.io.footage.lockstep import typed_rate, typed_start
 from shapepose_fg.io.footage.placement import (
     CameraFootage,
     Placement,
@@ -248,14 +248,14 @@ GOOD_RATES = {"0.01": 0.01, "100000": 1e5, "29.97": 29.97}
 @pytest.mark.parametrize("text", [*GOOD_RATES, "0.005", "0", "-25", "1e5.", "100000.5", "nan"])
 def test_rates_are_a_hundredth_to_a_hundred_thousand_frames_a_second(text):
     if text in GOOD_RATES:
-        assert _rate(text) == GOOD_RATES[text]
+        assert typed_rate(text) == GOOD_RATES[text]
         return
     with pytest.raises(InputError, match=f"--fps {text}: must be a number of frames a second"):
-        _rate(text)
+        typed_rate(text)
 
 
 @pytest.mark.parametrize(
     ("text", "seconds"), [(None, 0.0), ("0.2s", 0.2), ("-3f", -0.12), (" .5 s ", 0.5), ("12 f", 0.48)]
 )
 def test_starts_are_seconds_or_the_camera_s_own_frames(text, seconds):
-    assert _start(text, 0.04, True) == pytest.approx(seconds)
+    assert typed_start(text, 0.04, True) == pytest.approx(seconds)

@@ -7,7 +7,7 @@ import time
 import pytest
 
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.pipeline.cluster import Cluster, _program, _work, has_dashboard, local_cluster
+from shapepose_fg.pipeline.cluster import Cluster, has_dashboard, local_cluster, one_item, this_program
 
 
 def power(base: int, exponent: int) -> int:
@@ -56,11 +56,11 @@ def test_a_killed_process_costs_only_its_own_work(tmp_path):
 
 def test_a_process_that_comes_later_with_another_program_does_no_work():
     """Whoever asks says what it has; a process compares, whenever it came."""
-    own = _program()
-    assert _work(tuple(own.items()), power, 2, 5) == 32
+    own = this_program()
+    assert one_item(tuple(own.items()), power, 2, 5) == 32
     other = tuple((own | {"numpy": "1.0"}).items())
     with pytest.raises(InputError, match=r"another version of numpy \(\S+ there, 1\.0 here\); install the same"):
-        _work(other, power, 2, 5)
+        one_item(other, power, 2, 5)
 
 
 class FakeClient:

@@ -146,7 +146,6 @@ def test_the_paper_makes_n_rounds_and_starts_from_stage_i_alone(five_cameras, tw
 @pytest.mark.parametrize(
     ("part", "value"),
     [
-        ("proposals", {"split_m": -1.0}),
         ("refine", {"disagreement": -1.0}),
         ("window_graph", {"shape_sigma_m": -1}),
     ],
@@ -201,7 +200,7 @@ def test_stage_one_s_settings_of_the_paper():
     assert (c.min_votes, c.vote_radius_m, c.weak, c.weighted_centre) == (3, 0.06, False, False)
     assert c.gate_m >= 10 and c.min_angle_deg < 0.01 and c.min_view_fraction < 0.01
     assert (p.min_parts, p.separation_m, p.min_grown_parts, p.min_observed_parts) == (0.9, 0.6, 0.0, 0.0)
-    assert (p.split_m, p.weak_anchors, p.growth.bridge_m) == (0.0, False, 0.0)
+    assert (p.weak_anchors, p.growth.bridge_m) == (False, 0.0)
 
 
 def test_stage_two_s_settings_of_the_paper():

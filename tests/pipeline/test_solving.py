@@ -15,7 +15,7 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.io.calibration import write_rig
-from shapepose_fg.io.solved_setup import CAMERAS, read_setup
+from shapepose_fg.io.solved_setup import CAMERAS
 from shapepose_fg.pipeline import setup, solving
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.pipeline.solving import Solver, solve_rows
@@ -166,22 +166,21 @@ def test_a_result_without_its_cameras_changes_identities_only(people, tmp_path, 
 def test_the_setup_of_a_result(scene, people, tmp_path):
     folder = saved(people, scene, tmp_path / "results")
     loaded = Reconstruction.load(folder)
-    setup = read_setup(folder, loaded, PipelineConfig)
-    assert setup.settings == CONFIG and setup.body is None
-    np.testing.assert_allclose(setup.rig.cTw, scene.rig.cTw)
-    np.testing.assert_allclose(
-        setup.offsets.xyz_m, KeypointOffsets.from_dict(people.run["keypoint_offsets"]).xyz_m
-    )
+    solver = Solver.read(folder, loaded)
+    assert solver.config == CONFIG
+    np.testing.assert_allclose(solver.rig.cTw, scene.rig.cTw)
+    offsets = solver.fitter.model.keypoint_offsets
+    np.testing.assert_allclose(offsets.xyz_m, KeypointOffsets.from_dict(people.run["keypoint_offsets"]).xyz_m)
     assert (people.observations.gate == Gate.USED).any()
     write_rig(built_in_scene(cameras=5, frames=1).rig, folder / CAMERAS)
     with pytest.raises(InputError, match=r"cameras.json: the cameras are not those of observations.npz"):
-        read_setup(folder, loaded, PipelineConfig)
+        Solver.read(folder, loaded)
     other = replace(loaded, run=loaded.run | {"configuration": {"speed": 3}})
     write_rig(scene.rig, folder / CAMERAS)
     with pytest.raises(InputError, match=r"run.json: speed is not a known key; another version .* reconstruct"):
-        read_setup(folder, other, PipelineConfig)
+        Solver.read(folder, other)
     with pytest.raises(InputError, match=r"run.json: configuration is missing"):
-        read_setup(folder, replace(loaded, run={}), PipelineConfig)
+        Solver.read(folder, replace(loaded, run={}))
 
 
 @pytest.mark.slow

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.proposal.association import _by_support, associate
+from shapepose_fg.proposal.association import associate, by_support
 from shapepose_fg.proposal.candidates import CandidateConfig, triangulate_pairs, vote
 from shapepose_fg.proposal.claims import owned
 from shapepose_fg.proposal.proposals import ProposalConfig, Proposals, propose
@@ -84,7 +84,7 @@ def test_observations_are_chosen_again_until_nobody_more_is_dropped(least, propo
     for person, joints in enumerate(proposals.candidate.tolist()):
         for candidate, row in candidates.support.tolist():
             owns[person, row] |= candidate in joints
-    np.testing.assert_array_equal(_by_support(proposals, candidates, len(crowded)), owns)
+    np.testing.assert_array_equal(by_support(proposals, candidates, len(crowded)), owns)
     left, rounds, chosen = np.arange(len(proposals)), 3, np.zeros((0, 25, 5), dtype=int)
     while rounds > 0:
         chosen = chosen_for(proposals.places[left], owns, crowded, five_cameras)

@@ -15,7 +15,7 @@ from shapepose_fg.core.skeleton import BODY_25, Skeleton
 from shapepose_fg.proposal.candidates import CandidateConfig, Candidates, PairPoints, triangulate_pairs, vote
 from shapepose_fg.proposal.claims import LEAST_AFFINITY, Claims, mean_affinity
 from shapepose_fg.proposal.growth import GrowthConfig, Links, grow, link
-from shapepose_fg.proposal.proposals import ProposalConfig, _apart, _Search
+from shapepose_fg.proposal.proposals import ProposalConfig, Search, standing_apart
 
 CONFIG = CandidateConfig()
 GATE_M, ANGLE_DEG, RHO_M = 0.07, 3.0, 0.12
@@ -337,17 +337,17 @@ def test_anchors_stand_apart_in_space_and_by_their_detections(candidates, crowde
     hips = np.flatnonzero(candidates.joint == BODY_25.root)
     assert len(hips) > 6
     expected = apart(hips.tolist(), [], candidates, crowded, stated)
-    assert _apart(hips, hips[:0], candidates, crowded, config).tolist() == expected
+    assert standing_apart(hips, hips[:0], candidates, crowded, config).tolist() == expected
     taken = expected[1:2]
     others = [n for n in hips.tolist() if n not in taken]
     beside = apart(others, taken, candidates, crowded, stated)
-    assert _apart(np.array(others), np.array(taken), candidates, crowded, config).tolist() == beside
+    assert standing_apart(np.array(others), np.array(taken), candidates, crowded, config).tolist() == beside
     assert 1 <= len(expected) < len(hips)
 
 
-def search(candidates: Candidates, links: Links, crowded, **settings) -> _Search:
+def search(candidates: Candidates, links: Links, crowded, **settings) -> Search:
     up = np.array([0.0, 0.0, 1.0])
-    return _Search(candidates, links, crowded, BODY_25, up, ProposalConfig(**settings), Counter())
+    return Search(candidates, links, crowded, BODY_25, up, ProposalConfig(**settings), Counter())
 
 
 @pytest.mark.parametrize("settings", [{}, {"box_horizontal_m": 0.3, "box_vertical_m": 0.5}])
@@ -411,38 +411,6 @@ def test_middles_of_two_hips_are_roots_of_last_resort(candidates, links, crowded
         new = more.links.ends[len(links.ends) :]
         assert sorted(map(tuple, new.tolist())) == sorted(ends)
         assert (more.links.score[len(links.ends) :] == 1.0).all()
-
-
-def test_halves_of_one_person_are_those_that_share_hardly_a_joint(links, crowded):
-    """Four anchors: legs 0.3 m from a trunk, legs 0.5 m from one, and somebody who shares three joints with it."""
-    core = len(BODY_25.core)
-    hips = np.array([[0.0, 0, 1], [0.3, 0, 1], [0.5, 0, 1], [0.0, 0.35, 1]])
-    none = np.zeros((0, 2), dtype=np.intp)
-    anchors = Candidates(hips, np.full(4, BODY_25.root), np.ones(4), np.full(4, 3), np.ones(4, dtype=bool), none)
-    has = np.zeros((4, core), dtype=bool)
-    has[0, :9] = True
-    has[1, 7:13] = has[2, 7:13] = True  # two shared with the first
-    has[3, 6:12] = True  # three shared with the first, five with the legs
-    here = search(anchors, links, crowded)
-    assert here._halves(np.arange(4), has).tolist() == [False, True, False, False]
-    assert search(anchors, links, crowded, split_m=0.6)._halves(np.arange(4), has).tolist() == [
-        False,
-        True,
-        True,
-        False,
-    ]
-    assert search(anchors, links, crowded, split_shared=3)._halves(np.arange(4), has).tolist() == [
-        False,
-        True,
-        False,
-        True,
-    ]
-    assert not search(anchors, links, crowded, split_m=0.0)._halves(np.arange(4), has).any()
-    # Of two that have equally much the later one goes.
-    equal = np.zeros((2, core), dtype=bool)
-    equal[0, :5] = equal[1, 5:10] = True
-    pair = search(anchors, links, crowded)
-    assert pair._halves(np.array([0, 1]), equal).tolist() == [False, True]
 
 
 def test_unclaimed_are_candidates_with_detections_of_their_own(candidates, links, crowded):

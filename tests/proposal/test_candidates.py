@@ -4,7 +4,7 @@ import pytest
 
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
-from shapepose_fg.proposal.candidates import CandidateConfig, PairPoints, _greedy_seeds, triangulate_pairs, vote
+from shapepose_fg.proposal.candidates import CandidateConfig, PairPoints, greedy_seeds, triangulate_pairs, vote
 
 
 def test_pairs_of_one_person_are_where_the_joints_are(five_cameras, two_people, seen_exactly):
@@ -63,7 +63,7 @@ def test_voting_all_at_once_equals_one_by_one():
     centres = rng.uniform(-1, 1, (12, 3))
     xyz = centres[rng.integers(12, size=600)] + rng.normal(0, 0.08, (600, 3))
     points = PairPoints(xyz, rng.integers(3, size=600), np.zeros((600, 2), dtype=np.intp), rng.random(600))
-    np.testing.assert_array_equal(_greedy_seeds(points, 0.12), one_by_one(points, 0.12))
+    np.testing.assert_array_equal(greedy_seeds(points, 0.12), one_by_one(points, 0.12))
 
 
 def test_clusters_are_the_joints_and_know_their_support(five_cameras, two_people, seen_exactly):

@@ -15,7 +15,7 @@ from shapepose_fg.proposal.candidates import (
     CandidateConfig,
     Candidates,
     PairPoints,
-    _greedy_seeds,
+    greedy_seeds,
     triangulate_pairs,
     vote,
 )
@@ -127,7 +127,7 @@ def test_many_points_are_clustered_as_if_one_by_one():
         if expected[pick] < 0:
             near = (np.linalg.norm(points.xyz - points.xyz[pick], axis=1) <= radius) & (expected < 0)
             expected[near & (points.joint == points.joint[pick])] = pick
-    np.testing.assert_array_equal(_greedy_seeds(points, radius), expected)
+    np.testing.assert_array_equal(greedy_seeds(points, radius), expected)
 
 
 @pytest.mark.slow

@@ -8,7 +8,12 @@ import pytest
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import Detections, Recording
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.evaluation.spoiled_setups import (
+from shapepose_fg.io.calibration import read_rig
+from shapepose_fg.io.detections import read_detections
+from shapepose_fg.setup_check.diagnosis import diagnose
+from shapepose_fg.setup_check.findings import Kind, sentence
+from shapepose_fg.setup_check.fit import FOCAL, Q, changed
+from tests.setup_check.spoiled_setups import (
     delayed,
     exchanged,
     inverted,
@@ -20,11 +25,6 @@ from shapepose_fg.evaluation.spoiled_setups import (
     turned,
     zoomed,
 )
-from shapepose_fg.io.calibration import read_rig
-from shapepose_fg.io.detections import read_detections
-from shapepose_fg.setup_check.diagnosis import diagnose
-from shapepose_fg.setup_check.findings import Kind, sentence
-from shapepose_fg.setup_check.fit import FOCAL, Q, changed
 
 
 def only_finding(recording, rig):
@@ -161,7 +161,7 @@ def test_shelf_says_nothing_and_its_mistakes_are_named(shared_data):
     assert diagnose(recording, rig).findings == ()
     for frames in (range(110), range(120)):  # somebody comes back to where they were a second ago
         assert diagnose(recording, rig, frames).findings == ()
-    # Some here; all of them are in scripts/evaluate_setup_checks.py.
+    # Some here; all of them take minutes (docs/setup_checks.md).
     recording = Recording(BODY_25, [recording[frame] for frame in range(120)])
     wanted = {"turned 1": 2, "late 6 to 10 frames": 1, "exchanged": 3}
     for each in spoiled(recording, rig, seed=5):

@@ -10,11 +10,11 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.frame_times import spans_of
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.evaluation.spoiled_setups import turned, zoomed
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.write_detections import write_openpose
 from shapepose_fg.setup_check.findings import Finding, Kind, sentence
 from shapepose_fg.setup_check.report import Distances, camera_use, check_setup
+from tests.setup_check.spoiled_setups import turned, zoomed
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +92,9 @@ def test_reconstruct_warns_and_stores_it(files, room, tmp_path, capsys):
         assert 0 < each["used"] <= each["offered"]
         assert each["given"]["median_px"] < 3 and each["left_out"]["median_px"] < 5
     assert "left out px" in out
-    code, out, err = run(["reconstruct", "--calibration", files / "up.json", *options, "--no-check", "--overwrite"], capsys)
+    code, out, err = run(
+        ["reconstruct", "--calibration", files / "up.json", *options, "--no-check", "--overwrite"], capsys
+    )
     assert code == 0 and err == "" and "setup" not in json.loads((tmp_path / "out" / "run.json").read_text())
 
 

@@ -5,6 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.drawing import thinned
 from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 from shapepose_fg.simulation import Scene, built_in_scene
 from shapepose_fg.simulation.visibility import (
@@ -14,7 +15,6 @@ from shapepose_fg.simulation.visibility import (
     Skin,
     Visibility,
     VisibilityConfig,
-    coarsen,
     see,
 )
 from shapepose_fg.viz.rendering import look_at
@@ -170,7 +170,7 @@ def test_nobody_is_seen_where_nobody_is(scene: Scene):
 
 def test_a_coarse_surface_is_a_surface(scene: Scene):
     body = scene.body
-    kept, faces, cell = coarsen(body.arrays.template, body.faces, 0.04)
+    kept, faces, cell = thinned(body.arrays.template, body.faces, 0.04)
     assert len(kept) < 2000 and len(cell) == body.num_vertices
     assert faces.min() >= 0 and faces.max() < len(kept)
     np.testing.assert_array_equal(cell[kept], np.arange(len(kept)))

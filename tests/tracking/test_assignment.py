@@ -11,7 +11,7 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.tracking import view_assignment
 from shapepose_fg.tracking.plausibility import torn_joints
-from shapepose_fg.tracking.reassociation import Survival, reassociate
+from shapepose_fg.tracking.reassociation import LEAST_PROBABILITY, reassociate
 from shapepose_fg.tracking.view_assignment import Predicted, assign, assign_with_probability
 
 WRIST, ELBOW = BODY_25.index("RWrist"), BODY_25.index("RElbow")
@@ -114,7 +114,7 @@ def test_detections_are_given_out_again_and_doubles_go(five_cameras, two_people,
     rows = replace(rows, track=np.array([4, 5, 6]), frame=np.full(3, 7), time_s=np.full((3, 5), 0.5))
     kept = reassociate(given, rows, joints, covariance, BODY_25)
     assert kept.track.tolist() == [4, 5, 6] and (kept.time_s == 0.5).all()
-    alone = reassociate(given, rows, joints, covariance, BODY_25, Survival())
+    alone = reassociate(given, rows, joints, covariance, BODY_25, LEAST_PROBABILITY)
     assert alone.track.tolist() == [4, 5]
     share, total = own(detections, five_cameras, two_people, alone.candidate)
     assert share == 1.0 and total == 250
@@ -130,8 +130,7 @@ def test_the_first_detection_of_a_frame_counts_as_any_other(five_cameras, two_pe
     rows = Observations.of(np.full((1, 25, 5), -1), detections, two_people[:1])
     covariance = np.broadcast_to(0.02**2 * np.eye(3), (1, 25, 3, 3))
     for least, people in ((0.5, 1), (0.95, 0)):
-        survival = Survival(min_probability=least)
-        asked = given, rows, two_people[:1], covariance, BODY_25, survival
+        asked = given, rows, two_people[:1], covariance, BODY_25, least
         assert len(reassociate(*asked)) == people
 
 
@@ -152,7 +151,7 @@ def test_nothing_is_expected_where_a_person_is_outside_of_the_picture(
     rows = Observations.of(np.full((1, 25, 5), -1), detections, two_people[:1])
     covariance = np.broadcast_to(0.02**2 * np.eye(3), (1, 25, 3, 3))
     asked = [Input(0, np.zeros(5), detections, rig)], rows, two_people[:1], covariance, BODY_25
-    assert len(reassociate(*asked, Survival(min_probability=0.99))) == 1
+    assert len(reassociate(*asked, 0.99)) == 1
 
 
 def by_enumeration(weight, slot):

@@ -11,7 +11,7 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.proposal import claims
 from shapepose_fg.tracking import view_assignment
-from shapepose_fg.tracking.reassociation import Survival, _existence, _gone, reassociate
+from shapepose_fg.tracking.reassociation import LEAST_PROBABILITY, probabilities_of, reassociate, who_goes
 from shapepose_fg.tracking.view_assignment import Predicted, assign
 
 CORE = list(BODY_25.core)
@@ -155,31 +155,25 @@ def three(five_cameras, two_people, seen_exactly):
 def test_who_has_too_little_or_is_a_double_goes(three):
     frame, candidate, places = three
 
-    def gone(candidate, places, survival):
-        return _gone(_existence(frame, candidate, places, BODY_25), places, BODY_25, survival)
+    def gone(candidate, places, *asked):
+        return who_goes(probabilities_of(frame, candidate, places, BODY_25), places, BODY_25, *asked)
 
-    any_share = Survival(min_probability=0.0)
-    assert gone(candidate, places, any_share).tolist() == [False, False, True], "a double"
-    closer = replace(any_share, double_m=0.14)
-    assert not gone(candidate, places, closer).any()
-    assert gone(candidate, places, replace(closer, min_probability=0.5)).tolist() == [
-        False,
-        False,
-        True,
-    ]
+    assert gone(candidate, places, 0.0).tolist() == [False, False, True], "a double"
+    assert not gone(candidate, places, 0.0, 0.14).any()
+    assert gone(candidate, places, 0.5, 0.14).tolist() == [False, False, True]
     # Joints that one view sees are next to nothing.
     few = candidate.copy()
     few[1, :, 1:] = -1
-    assert gone(few[:2], places[:2], Survival()).tolist() == [False, True]
+    assert gone(few[:2], places[:2], LEAST_PROBABILITY).tolist() == [False, True]
     # Of two that have equally much the later one goes; who is not placed is nobody's double.
     equal = np.stack([candidate[0], candidate[1], candidate[0]])
-    assert gone(equal, places, any_share).tolist() == [False, False, True]
+    assert gone(equal, places, 0.0).tolist() == [False, False, True]
     lost = places.copy()
     lost[2] = np.nan
-    assert not gone(candidate, lost, any_share).any()
+    assert not gone(candidate, lost, 0.0).any()
     part = places.copy()
     part[2, CORE[:10]] = np.nan  # the distance is of the joints that both have
-    assert gone(candidate, part, any_share).tolist() == [False, False, True]
+    assert gone(candidate, part, 0.0).tolist() == [False, False, True]
 
 
 def test_rows_without_a_joint_are_carried_by_motion_unless_they_must_survive(three, two_people):
@@ -191,7 +185,7 @@ def test_rows_without_a_joint_are_carried_by_motion_unless_they_must_survive(thr
     covariance = np.where(np.isnan(joints)[..., None], np.nan, 0.02**2 * np.eye(3))
     kept = reassociate([frame], rows, joints, covariance, BODY_25)
     assert kept.track.tolist() == [4, 5, 6] and not kept.seen[2].any() and kept.seen[:2].all()
-    left = reassociate([frame], rows, joints, covariance, BODY_25, Survival())
+    left = reassociate([frame], rows, joints, covariance, BODY_25, LEAST_PROBABILITY)
     assert left.track.tolist() == [4, 5]
 
 
@@ -228,7 +222,7 @@ def test_somebody_alone_in_a_frame_may_be_nobody(five_cameras, two_people, seen_
     )
     covariance = np.broadcast_to(0.02**2 * np.eye(3), (1, 25, 3, 3))
     asked = [frame], rows, joints, covariance, BODY_25
-    assert len(reassociate(*asked)) == 1 and len(reassociate(*asked, Survival())) == 0
+    assert len(reassociate(*asked)) == 1 and len(reassociate(*asked, LEAST_PROBABILITY)) == 0
 
 
 @pytest.mark.parametrize(("away_m", "taken"), [(0.155, True), (0.165, False)])

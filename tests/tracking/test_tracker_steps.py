@@ -8,7 +8,7 @@ import pytest
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.tracking.motion_filter import JointStates
-from shapepose_fg.tracking.tracker import Tracks, _apart
+from shapepose_fg.tracking.tracker import Tracks, standing_apart
 
 CORE = list(BODY_25.core)
 HIP, SHOULDER, ELBOW, WRIST = (BODY_25.index(name) for name in ("MidHip", "RShoulder", "RElbow", "RWrist"))
@@ -29,14 +29,14 @@ def test_an_unseen_joint_comes_to_move_as_the_person_does(tracker, two_people):
     sigma = np.where(np.arange(25) == WRIST, 0.06, rng.uniform(0.01, 0.05, (1, 25)))
     velocity = rng.normal(0, 1, (1, 25, 3))
     before = JointStates.at(two_people[:1], sigma, (0.1,)).with_derivatives(velocity)
-    after = tracker._predict(before, 0.25)
+    after = tracker.predict(before, 0.25)
     certainty = sigma[0, CORE] ** -2.0
     person = certainty @ velocity[0, CORE] / (certainty.sum() + 0.1**-2)
     expected = velocity.copy()
     expected[0, WRIST] = person + (velocity[0, WRIST] - person) / np.e
     np.testing.assert_allclose(after.velocity, expected)
     np.testing.assert_allclose(after.position, two_people[:1] + 0.25 * expected)
-    back = tracker._predict(before, -0.25)
+    back = tracker.predict(before, -0.25)
     np.testing.assert_allclose(back.position, two_people[:1] - 0.25 * expected)
 
 
@@ -46,7 +46,7 @@ def test_a_lost_joint_is_sought_around_its_parent_and_a_lost_root_between_the_hi
     joints = joints.with_derivatives(np.random.default_rng(0).normal(0, 1, (2, 25, 3)))
     lost = np.zeros((2, 25), dtype=bool)
     lost[0, [ELBOW, WRIST]] = lost[1, HIP] = True
-    found = tracker._beside_neighbours(joints, lost)
+    found = tracker.beside_neighbours(joints, lost)
     np.testing.assert_allclose(found.mean[0, [ELBOW, WRIST]], joints.mean[0, [SHOULDER, SHOULDER]])
     reach = 0.7 / 1.5
     for joint, bones in ((ELBOW, 1), (WRIST, 2)):
@@ -57,7 +57,7 @@ def test_a_lost_joint_is_sought_around_its_parent_and_a_lost_root_between_the_hi
     others = ~lost
     np.testing.assert_array_equal(found.mean[others], joints.mean[others])
     np.testing.assert_array_equal(found.covariance[others], joints.covariance[others])
-    assert tracker._beside_neighbours(joints, np.zeros((2, 25), dtype=bool)) is joints
+    assert tracker.beside_neighbours(joints, np.zeros((2, 25), dtype=bool)) is joints
 
 
 def test_four_core_joints_that_two_views_see_are_evidence(tracker):
@@ -66,7 +66,7 @@ def test_four_core_joints_that_two_views_see_are_evidence(tracker):
         candidate[person, joints, :2] = 1
     candidate[2, CORE[3:8], 0] = 1  # one view only, and that sees eight
     candidate[2, [j for j in range(25) if j not in CORE], :3] = 1  # no core joints
-    assert tracker._evident(candidate).tolist() == [True, False, False]
+    assert tracker.evident(candidate).tolist() == [True, False, False]
 
 
 def lists(joints: list[int], views: list[int]) -> Detections:
@@ -78,29 +78,29 @@ def lists(joints: list[int], views: list[int]) -> Detections:
 def test_four_core_joints_that_two_views_see_may_be_somebody(tracker):
     four = lists(CORE[:4] * 2, [0] * 4 + [3] * 4)
     every = np.ones(8, dtype=bool)
-    assert tracker._enough(four, every)
+    assert tracker.enough(four, every)
     one_taken = every.copy()
     one_taken[2] = False
-    assert not tracker._enough(four, one_taken)
-    assert not tracker._enough(lists(CORE[:4] * 2, [0] * 7 + [3]), every), "twice in one view is one view"
+    assert not tracker.enough(four, one_taken)
+    assert not tracker.enough(lists(CORE[:4] * 2, [0] * 7 + [3]), every), "twice in one view is one view"
     others = [j for j in range(25) if j not in CORE][:4]
-    assert not tracker._enough(lists(others * 2, [0] * 4 + [3] * 4), every)
+    assert not tracker.enough(lists(others * 2, [0] * 4 + [3] * 4), every)
 
 
 def test_nine_core_joints_that_one_view_sees_are_evidence_too(tracker):
     candidate = np.full((2, 25, 5), -1)
     candidate[0, CORE[:9], 3] = candidate[1, CORE[:8], 3] = 1
     candidate[1, [j for j in range(25) if j not in CORE], 3] = 1
-    assert tracker._evident(candidate).tolist() == [True, False]
+    assert tracker.evident(candidate).tolist() == [True, False]
 
 
 @pytest.mark.parametrize(("beside_m", "apart"), [(0.24, False), (0.26, True)])
 def test_a_new_person_stands_apart_from_all_tracks(two_people, beside_m, apart):
     new = two_people[:1] + np.array([0.0, beside_m, 0.0])
     new[0, WRIST:] = np.nan  # joints that are not placed count nothing
-    assert _apart(new, two_people).tolist() == [apart]
-    assert _apart(new, two_people[1:]).tolist() == [True]
-    assert _apart(new, two_people[:0]).tolist() == [True]
+    assert standing_apart(new, two_people).tolist() == [apart]
+    assert standing_apart(new, two_people[1:]).tolist() == [True]
+    assert standing_apart(new, two_people[:0]).tolist() == [True]
 
 
 def test_new_joints_are_known_to_4_cm_and_unplaced_ones_are_lost(tracker, two_people):

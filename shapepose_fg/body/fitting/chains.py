@@ -41,13 +41,7 @@ class Segment:
 
 
 def cut_segments(
-    rows: NDArray[np.intp],
-    group: NDArray[np.intp],
-    time_s: Array,
-    *,
-    gap_s: float,
-    length: int,
-    overlap: int,
+    rows: NDArray[np.intp], group: NDArray[np.intp], time_s: Array, *, gap_s: float, length: int, overlap: int
 ) -> list[Segment]:
     """The `rows` (R,), of so many people `group` (B,) at the times `time_s` (B,), as segments.
 

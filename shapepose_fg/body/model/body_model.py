@@ -21,6 +21,7 @@ from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.body.model.skinned_points import SkinnedPoints, contract
 from shapepose_fg.body.model.smpl_file import NUM_BETAS, SMPL_PARENTS, SmplArrays, read_smpl_file
 from shapepose_fg.body.model.target_skeletons import slots
+from shapepose_fg.core.arrays import Array, Index, Real
 from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 
 _DEFAULT_FILE = Path(__file__).parents[1] / "data" / "open_body.npz"
@@ -89,7 +90,8 @@ class BodyModel:
 
         `contracted` is what another model made of the same arrays (`_contract`): it costs more than all else here.
         """
-        self._arrays = arrays
+        self.arrays = arrays
+        """What the file held, in float64."""
         self.dtype = dtype
         """Floating point type of parameters and results."""
         self.keypoint_offsets = KeypointOffsets.identity() if offsets is None else offsets
@@ -111,7 +113,7 @@ class BodyModel:
         return BodyModel.load(_DEFAULT_FILE)
 
     @classmethod
-    def load(cls, path: str | Path, *, keypoint_regressor: NDArray[np.floating] | None = None) -> "BodyModel":
+    def load(cls, path: str | Path, *, keypoint_regressor: Real | None = None) -> "BodyModel":
         """A model from SMPL's `.npz` or official `.pkl`; InputError where it cannot be used.
 
         `keypoint_regressor` (25, Nv) makes the BODY_25 keypoints from vertices. Without it the file's own
@@ -133,24 +135,19 @@ class BodyModel:
 
     def _with(self, **changed: Any) -> "BodyModel":
         kept = {"dtype": self.dtype, "offsets": self.keypoint_offsets, "keypoint_names": self.keypoint_names}
-        return BodyModel(self._arrays, **(kept | changed), contracted=self._contracted)
+        return BodyModel(self.arrays, **(kept | changed), contracted=self._contracted)
 
     @property
     def faces(self) -> NDArray[np.int64]:
         """(F, 3) vertex indices of the triangles, counter-clockwise seen from outside."""
-        return self._arrays.faces
+        return self.arrays.faces
 
     @property
     def num_vertices(self) -> int:
         """Vertices of the mesh, Nv."""
-        return len(self._arrays.template)
+        return len(self.arrays.template)
 
-    @property
-    def arrays(self) -> SmplArrays:
-        """What the file held, in float64."""
-        return self._arrays
-
-    def vertices(self, parameters: BodyParameters, only: NDArray[np.intp] | None = None) -> Tensor:
+    def vertices(self, parameters: BodyParameters, only: Index | None = None) -> Tensor:
         """(B, Nv, 3) the skinned mesh, metres; or (B, M, 3), the vertices `only` (M,) of it.
 
         The only thing here whose cost grows with the mesh. ValueError where `only` has other than one axis.
@@ -224,7 +221,7 @@ class BodyModel:
         local = exp_so3(torch.cat((parameters.global_orient[:, None], parameters.body_pose), 1))
         return local, accumulate(local)
 
-    def _part_of_mesh(self, only: NDArray[np.intp]) -> "_Mesh":
+    def _part_of_mesh(self, only: Index) -> "_Mesh":
         """What some of the vertices need; the last part is kept, for it is asked for frame after frame."""
         if only.ndim != 1:
             raise ValueError(f"only must be (M,) numbers of vertices, got {only.shape}")
@@ -236,7 +233,7 @@ class BodyModel:
     @cached_property
     def _mesh(self) -> "_Mesh":
         """The big arrays, made when vertices are first asked for."""
-        arrays = self._arrays
+        arrays = self.arrays
         shapes = arrays.shapes.transpose(2, 0, 1)  # (10, Nv, 3)
         rest, rest_shapes = arrays.joint_regressor @ arrays.template, arrays.joint_regressor @ shapes
         blend = arrays.pose_blend
@@ -267,7 +264,7 @@ class _Mesh:
     weights: Tensor
     """(Nv, 24) skinning weights."""
 
-    def part(self, vertices: NDArray[np.intp]) -> "_Mesh":
+    def part(self, vertices: Index) -> "_Mesh":
         """What some of the vertices need."""
         rows = torch.from_numpy(vertices)
         blend = self.pose_blend
@@ -314,7 +311,7 @@ def _contract(arrays: SmplArrays) -> SkinnedPoints:
     return keypoints.joined(head).joined(own)
 
 
-def _regressed(arrays: SmplArrays, regressor: NDArray[np.float64], joints: NDArray[np.float64]) -> SkinnedPoints:
+def _regressed(arrays: SmplArrays, regressor: Array, joints: Array) -> SkinnedPoints:
     """The contraction of a regressor (K, Nv)."""
     touched = np.flatnonzero(np.any(regressor != 0, axis=0))
     regressor, weights = regressor[:, touched], arrays.weights[touched]

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 from shapepose_fg.core.storage.files import read_json, write_atomically
@@ -52,13 +52,13 @@ class KeypointOffsets:
     In the T-pose every bone's frame is the body's own: x to its left, y up, z to its front.
     """
 
-    xyz_m: NDArray[np.float64]
+    xyz_m: Array
     """(25, 3) added to each keypoint in the frame of its bone, metres."""
-    sigma_m: NDArray[np.float64]
+    sigma_m: Array
     """(25,) how surely each is known, root mean square over the axes, metres."""
-    count: NDArray[np.intp]
+    count: Index
     """(25,) how many observed joints each was learnt from; 0 where nothing was."""
-    bones: NDArray[np.intp]
+    bones: Index
     """(25,) index in `SMPL_24` of the bone that each joint rides on."""
 
     def __post_init__(self) -> None:

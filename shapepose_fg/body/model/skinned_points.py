@@ -14,8 +14,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
+
+from shapepose_fg.core.arrays import Array
 
 NUM_BONES = 24
 NUM_COLUMNS = 10 + 3 * NUM_BONES + 3
@@ -214,11 +215,11 @@ class SkinnedPoints:
 
 
 def contract(
-    moments: NDArray[np.float64],
-    shares: NDArray[np.float64],
-    joints: NDArray[np.float64],
+    moments: Array,
+    shares: Array,
+    joints: Array,
     parents: tuple[int, ...],
-    translation: NDArray[np.float64],
+    translation: Array,
     has_pose_blend: bool,
 ) -> SkinnedPoints:
     """The contraction of points with moments and shares per bone.

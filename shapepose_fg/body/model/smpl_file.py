@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.model.smpl_pickle import RefusedPickle, as_array, read_smpl_pickle
+from shapepose_fg.core.arrays import Array, Real
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 from shapepose_fg.core.storage.npz import read_npz
@@ -50,23 +51,23 @@ _RISING = ("ankle", "knee", "hip", "shoulder")
 class SmplArrays:
     """A body model's arrays, checked, in float64."""
 
-    template: NDArray[np.float64]
+    template: Array
     """(Nv, 3) vertices of the mean body in T-pose, metres, y up, facing +z."""
-    shapes: NDArray[np.float64]
+    shapes: Array
     """(Nv, 3, 10) metres per unit of each beta."""
-    pose_blend: NDArray[np.float64] | None
+    pose_blend: Array | None
     """(Nv, 3, 207) metres per unit of each entry of R - I; None where the file has none or only zeros."""
-    joint_regressor: NDArray[np.float64]
+    joint_regressor: Array
     """(24, Nv) joints from the shaped template."""
-    weights: NDArray[np.float64]
+    weights: Array
     """(Nv, 24) skinning weights; rows sum to 1."""
-    keypoint_regressor: NDArray[np.float64]
+    keypoint_regressor: Array
     """(25, Nv) BODY_25 keypoints from the posed vertices."""
     faces: NDArray[np.int64]
     """(F, 3) vertex indices of the triangles."""
 
 
-def read_smpl_file(path: Path, keypoint_regressor: NDArray[np.floating] | None = None) -> SmplArrays:
+def read_smpl_file(path: Path, keypoint_regressor: Real | None = None) -> SmplArrays:
     """The model in `path`; InputError naming the file, the key and the cure where it cannot be used."""
     entries = _Entries(path, _read_entries(path))
     template = entries.floats("v_template", (None, 3))
@@ -132,7 +133,7 @@ class _Entries:
         except Exception as error:  # records of a damaged pickle can hold anything
             raise InputError(f"{self.path}: {name} is not an array ({error}): fetch the file again") from error
 
-    def floats(self, name: str, shape: tuple[int | None, ...], value: Any = None) -> NDArray[np.float64]:
+    def floats(self, name: str, shape: tuple[int | None, ...], value: Any = None) -> Array:
         """The array called `name`, or a `value` for it, finite and of that shape; None is any length but 0."""
         value = self.array(name) if value is None else np.asarray(value)
         fits = value.ndim == len(shape) and all(
@@ -148,7 +149,7 @@ class _Entries:
             raise InputError(f"{self.path}: {name} holds NaN or infinity: fetch the file again")
         return np.ascontiguousarray(value, dtype=np.float64)
 
-    def shapes(self, count: int) -> NDArray[np.float64]:
+    def shapes(self, count: int) -> Array:
         """The first 10 shape components."""
         shapes = self.array("shapedirs")
         if shapes.ndim != 3 or shapes.shape[2] < NUM_BETAS:
@@ -158,13 +159,13 @@ class _Entries:
             )
         return self.floats("shapedirs", (count, 3, NUM_BETAS), shapes[..., :NUM_BETAS])
 
-    def pose_blend(self, count: int) -> NDArray[np.float64] | None:
+    def pose_blend(self, count: int) -> Array | None:
         """The pose blend shapes, or None for a model without."""
         if "posedirs" not in self.content or not np.any(self.array("posedirs")):
             return None
         return self.floats("posedirs", (count, 3, 207))
 
-    def weights(self, count: int) -> NDArray[np.float64]:
+    def weights(self, count: int) -> Array:
         """Skinning weights whose rows sum to 1 exactly."""
         weights = self.floats("weights", (count, 24))
         total = weights.sum(1, keepdims=True)
@@ -200,7 +201,7 @@ _KEYPOINTS = "keypoint_regressor"
 _KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f")
 
 
-def _smpl_keypoint_regressor(joint_regressor: NDArray[np.float64]) -> NDArray[np.float64]:
+def _smpl_keypoint_regressor(joint_regressor: Array) -> Array:
     """BODY_25 keypoints of SMPL's own mesh: its joints for the limbs, single vertices for face and feet."""
     regressor = np.zeros((_NUM_KEYPOINTS, _SMPL_NUM_VERTICES))
     for name, vertex in _SMPL_VERTEX_KEYPOINTS.items():
@@ -212,9 +213,7 @@ def _smpl_keypoint_regressor(joint_regressor: NDArray[np.float64]) -> NDArray[np
     return regressor
 
 
-def _implausible(
-    template: NDArray[np.float64], joint_regressor: NDArray[np.float64], keypoint_regressor: NDArray[np.float64]
-) -> str | None:
+def _implausible(template: Array, joint_regressor: Array, keypoint_regressor: Array) -> str | None:
     """What is wrong, as the end of a sentence that names the array; None where it may be a person.
 
     `template` (Nv, 3) in T-pose, y up, facing +z; regressors (24, Nv) and (25, Nv).
@@ -228,10 +227,8 @@ def _implausible(
             return (
                 f"{name} has rows that do not sum to 1 (off by {off:.2g}): use the file of one and the same model"
             )
-    joints: dict[str, NDArray[np.float64]] = dict(zip(SMPL_24, joint_regressor @ template, strict=True))
-    keypoints: dict[str, NDArray[np.float64]] = dict(
-        zip(BODY_25.joints, keypoint_regressor @ template, strict=True)
-    )
+    joints: dict[str, Array] = dict(zip(SMPL_24, joint_regressor @ template, strict=True))
+    keypoints: dict[str, Array] = dict(zip(BODY_25.joints, keypoint_regressor @ template, strict=True))
     for part in (*_RISING, "elbow", "wrist"):
         if not joints[f"left_{part}"][0] > joints[f"right_{part}"][0]:
             return f"J_regressor puts left_{part} to the right of right_{part}: the body's left is +x"

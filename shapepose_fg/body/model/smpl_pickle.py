@@ -18,6 +18,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.storage.files import read_bytes
 
 _MOST_STEPS = 200_000
@@ -225,7 +226,7 @@ def _raw_bytes(value: Any) -> bytes:
     raise TypeError(f"an array made of {type(value).__name__}")
 
 
-def _sparse_array(value: Record) -> NDArray[np.float64]:
+def _sparse_array(value: Record) -> Array:
     """The dense form of a compressed sparse matrix."""
     state = value.state
     shape = as_array(state["_shape"] if "_shape" in state else state["shape"]).astype(np.int64)

@@ -2,10 +2,10 @@
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.skeleton import SMPL_24
 
 _BONES = tuple([SMPL_24.index(f"{side}_{name}") for name in ("ankle", "foot")] for side in ("right", "left"))
@@ -19,12 +19,11 @@ _OF_FEET, _BEYOND = 3, 10
 _ROWS = 256
 """Bodies whose vertices are made at a time."""
 
-Array = NDArray[np.float64]
 Bodies = tuple[Array, Array, Array, Array]
 """`betas` (B, 10), `global_orient` (B, 3), `body_pose` (B, 23, 3) and `transl` (B, 3) as in `BodyParameters`."""
 
 
-def feet_vertices(model: BodyModel) -> list[NDArray[np.intp]]:
+def feet_vertices(model: BodyModel) -> list[Index]:
     """Vertices of the right foot, and of the left."""
     bone = model.arrays.weights.argmax(axis=1)
     return [np.flatnonzero(np.isin(bone, bones))[::_OF_FEET] for bones in _BONES]
@@ -78,7 +77,7 @@ def _lowest(model: BodyModel, bodies: Bodies, normal: Array) -> Array:
 
 
 @torch.no_grad()
-def _vertices(model: BodyModel, bodies: Bodies, only: NDArray[np.intp]) -> Array:
+def _vertices(model: BodyModel, bodies: Bodies, only: Index) -> Array:
     """(B, M, 3) some of the vertices."""
     columns = [torch.from_numpy(column).to(model.dtype) for column in bodies]
     parts = [

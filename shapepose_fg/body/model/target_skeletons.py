@@ -1,6 +1,6 @@
 """Which points of a body a detector's joints are: one list of all, and the skeletons as parts of it."""
 
-from shapepose_fg.core.skeleton import BODY_25, SMPL_24
+from shapepose_fg.core.skeleton import BODY_25, COCO_17, HALPE_26, SMPL_24
 
 HEAD_TOP = "Head"
 """HALPE's top of the head."""
@@ -8,14 +8,10 @@ HEAD_TOP = "Head"
 BODY_POINTS: tuple[str, ...] = (*BODY_25.joints, HEAD_TOP, *SMPL_24)
 """(K,) every point that a body can be fitted to: BODY_25's, HALPE's top of the head, SMPL's own joints."""
 
-_LIMB_JOINTS = "LShoulder RShoulder LElbow RElbow LWrist RWrist LHip RHip LKnee RKnee LAnkle RAnkle".split()
-_COCO_17 = ("Nose", "LEye", "REye", "LEar", "REar", *_LIMB_JOINTS)
-_HALPE_FEET = "LBigToe RBigToe LSmallToe RSmallToe LHeel RHeel".split()
-
 TARGET_SKELETONS: dict[str, tuple[str, ...]] = {
     "BODY_25": BODY_25.joints,
-    "COCO_17": _COCO_17,
-    "HALPE_26": (*_COCO_17, HEAD_TOP, "Neck", "MidHip", *_HALPE_FEET),
+    "COCO_17": COCO_17.joints[:17],
+    "HALPE_26": HALPE_26.joints,
     "SMPL_24": SMPL_24,
 }
 """Names of the joints of each skeleton, in its own order, as `BODY_POINTS` calls them."""

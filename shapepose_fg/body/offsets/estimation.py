@@ -82,11 +82,7 @@ def learn_offsets(
 
 
 def _solved(
-    energy: BodyEnergy,
-    fit: BodyFit,
-    evidence: Evidence,
-    kernel_scale: float,
-    precision: Array,
+    energy: BodyEnergy, fit: BodyFit, evidence: Evidence, kernel_scale: float, precision: Array
 ) -> KeypointOffsets:
     """One Newton step in offsets and mean; the mean starts from zero, which is where the bodies were fitted."""
     rows, size = np.flatnonzero(fit.ok), 75 + energy.num_free

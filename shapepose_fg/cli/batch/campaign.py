@@ -65,14 +65,6 @@ class Assignment:
 
 
 @dataclass(frozen=True)
-class Failed:
-    """A recording is not reconstructed."""
-
-    reason: str
-    """In a sentence."""
-
-
-@dataclass(frozen=True)
 class Campaign:
     """What is to be done, and with what."""
 
@@ -145,9 +137,9 @@ class Campaign:
             self._done(leader, told, standings)
             watcher.ended(name, failed=None, again=False)
         else:
-            now = standings.of[name].failed(told.reason, time.monotonic() - leader.began, ATTEMPTS)
+            now = standings.of[name].failed(told, time.monotonic() - leader.began, ATTEMPTS)
             standings.set(name, now)
-            watcher.ended(name, failed=told.reason, again=now.status == "waiting")
+            watcher.ended(name, failed=told, again=now.status == "waiting")
         return True
 
     def _done(self, leader: "Leader", found: Ended, standings: Standings) -> None:
@@ -166,7 +158,7 @@ class Leader:
         self.began = time.monotonic()
         """When it was started, by the clock of `time.monotonic`."""
         self.told, tell = context.Pipe(duplex=False)
-        """What it tells: (frames done, all frames), in the end `Ended` or `Failed`."""
+        """What it tells: (frames done, all frames), in the end `Ended`, or why it failed."""
         held, self._lifeline = context.Pipe(duplex=False)
         self._process = context.Process(target=_lead, args=(assignment, tell, held), name=assignment.name)
         with what_workers_inherit():
@@ -174,15 +166,15 @@ class Leader:
         tell.close()
         held.close()
 
-    def next(self) -> tuple[int, int] | Ended | Failed:
-        """What it tells next; `Failed` too where it has died."""
+    def next(self) -> tuple[int, int] | Ended | str:
+        """What it tells next; where it has died, that."""
         try:
             return self.told.recv()
         except (EOFError, OSError):
             self._process.join(_PATIENCE_S)
             code = self._process.exitcode
             how = f"was killed by signal {-code}" if code is not None and code < 0 else f"ended with code {code}"
-            return Failed(f"its process {how}; there may be too little memory")
+            return f"its process {how}; there may be too little memory"
 
     def end(self) -> Ended | None:
         """Wait for its end, or bring it about where it does not come; what it `Ended` with after all."""
@@ -230,11 +222,11 @@ def _lead(assignment: Assignment, tell: Connection, lifeline: Connection) -> Non
         print(f"stopped: {stop.message}", flush=True)
     except InputError as error:
         print(f"error: {error}", flush=True)
-        tell.send(Failed(" ".join(str(error).split())))
+        tell.send(" ".join(str(error).split()))
     except Exception as error:
         traceback.print_exc()
         words = " ".join(str(error).split())[:300]
-        tell.send(Failed(f"{type(error).__name__}: {words} (all of it in {log})"))
+        tell.send(f"{type(error).__name__}: {words} (all of it in {log})")
 
 
 def look_at_all(table: Path, entries: Sequence[Entry], output: Path, *, begun: bool) -> dict[str, int]:

@@ -52,7 +52,7 @@ def _run(table: Path, entries: "list[Entry]", output: Path, running: RunOptions,
     from shapepose_fg.pipeline.workers import cores
 
     begin = time.monotonic()
-    of = _standings(entries, output, resume=running.resume, restart=running.restart)
+    of = standings_of(entries, output, resume=running.resume, restart=running.restart)
     standings = Standings(output / BATCH, str(table), of)
     todo = [entry for entry in entries if standings.of[entry.name].status == "waiting"]
     sizes = look_at_all(table, todo, output, begun=running.resume or running.restart)
@@ -80,13 +80,13 @@ def _run(table: Path, entries: "list[Entry]", output: Path, running: RunOptions,
                 raise Stopped(stop.number, where) from None
     show(standings.summary(time.monotonic() - begin))
     print(f"written  {output / BATCH}")
-    for sentence in standings.failures():
-        warn(sentence)
-    if len(standings.names("failed")) > 0:
+    for name in (failed := standings.names("failed")):
+        warn(f"{name}: {standings.of[name].reasons[-1]}")
+    if len(failed) > 0:
         raise typer.Exit(1)
 
 
-def _standings(entries: "list[Entry]", output: Path, *, resume: bool, restart: bool) -> "dict[str, Standing]":
+def standings_of(entries: "list[Entry]", output: Path, *, resume: bool, restart: bool) -> "dict[str, Standing]":
     """How far every recording is, and which begin anew: by `restart`, or with something else wanted."""
     from shapepose_fg.cli.batch.standing import Standing, read_standings
     from shapepose_fg.cli.batch.table import asked

@@ -1,7 +1,6 @@
 """How far the recordings of an archive are: batch.json, and what `shapepose-fg batch` says of them."""
 
 import json
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -101,10 +100,6 @@ class Standings:
         caption = f"{', '.join(counts)}; {frames} frames; this time {clock(seconds)}"
         heads = ("recording", "", "frames", "people", "rows", "time", "warnings")
         return table(heads, rows, left=2, caption=caption)
-
-    def failures(self) -> Sequence[str]:
-        """A sentence for each recording that failed."""
-        return [f"{name}: {self.of[name].reasons[-1]}" for name in self.names("failed")]
 
 
 def read_standings(file: Path) -> dict[str, Standing]:

@@ -56,12 +56,7 @@ class Ended:
 
 
 def carry_out(
-    known: Prepared,
-    execution: Execution,
-    *,
-    resume: bool = False,
-    restart: bool = False,
-    overwrite: bool = False,
+    known: Prepared, execution: Execution, *, resume: bool = False, restart: bool = False, overwrite: bool = False
 ) -> Ended:
     """Reconstruct what is asked for into its folder, and say how it went.
 

@@ -5,8 +5,8 @@ from collections.abc import Callable
 from functools import lru_cache, partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Real
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.observations import Observations
@@ -63,7 +63,7 @@ def _measure(segment: Segment, make: Callable[[Segment], tuple[People, Figures]]
     return scored(people, segment.scene.keypoints) | {"cpu_ms": cpu_ms} | more
 
 
-def scored(people: People, truth: NDArray[np.float64]) -> Figures:
+def scored(people: People, truth: Array) -> Figures:
     """Precision, recall and F1 at each threshold, per cent, and MPJPE; `truth` (T, P, J, 3), metres.
 
     `_hip` is of the mid-hip alone at 0.2 m, with people matched by it: the paper's measure of human proposals.
@@ -79,7 +79,7 @@ def scored(people: People, truth: NDArray[np.float64]) -> Figures:
     return {name: value if np.isfinite(value) else None for name, value in figures.items()} | counts
 
 
-def _with_joints(people: People, joints: NDArray[np.floating]) -> PlainPeople:
+def _with_joints(people: People, joints: Real) -> PlainPeople:
     return PlainPeople(people.frame.astype(np.int64), joints.astype(np.float64))
 
 

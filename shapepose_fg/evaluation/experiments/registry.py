@@ -3,14 +3,13 @@
 from collections.abc import Iterator
 
 from shapepose_fg.evaluation.experiments import footage, scenes
-from shapepose_fg.evaluation.experiments.ablation import ablation
 from shapepose_fg.evaluation.experiments.experiment import Experiment
 from shapepose_fg.evaluation.experiments.methods import interactions
 from shapepose_fg.evaluation.experiments.scenes import Scale
 
 _EVERY = (
     *(footage.shelf, footage.shelf_limbs, scenes.in_time, scenes.held_back, scenes.who_is_there),
-    *(footage.views, footage.single, interactions, ablation, scenes.foreign),
+    *(footage.views, footage.single, interactions, scenes.foreign),
 )
 
 

@@ -72,7 +72,7 @@ def log_take(stream: Any, take: Take, arrays: SmplArrays | None) -> None:
     if take.rig is not None:
         _log_cameras(rr, stream, take.rig)
         _log_observations(rr, stream, take, take.rig)
-    mesh = None if arrays is None else thinned(arrays.template, arrays.faces)
+    mesh = None if arrays is None else thinned(arrays.template, arrays.faces)[:2]
     for person in range(len(take.persons)):
         _log_person(rr, stream, take, person)
         if arrays is not None and mesh is not None:

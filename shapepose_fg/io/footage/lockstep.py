@@ -57,7 +57,7 @@ def clocks_of(
 
     `fps` and `start` are options, as `per_camera` reads them.
     """
-    rates = [_rate(text) for text in per_camera("--fps", fps, cameras, one_for_all=True)]
+    rates = [typed_rate(text) for text in per_camera("--fps", fps, cameras, one_for_all=True)]
     starts = per_camera("--start", start, cameras)
     timed = [rate is not None or each.time_s is not None for rate, each in zip(rates, footage, strict=True)]
     has_clock = any(timed)
@@ -76,11 +76,11 @@ def clocks_of(
             period = float(np.median(np.diff(taken))) if len(taken) > 1 else 1 / 30
         else:
             taken, period = number.astype(np.float64), 1.0
-        clocks.append(CameraClock(name, taken + _start(text, period, has_clock), period))
+        clocks.append(CameraClock(name, taken + typed_start(text, period, has_clock), period))
     return clocks, has_clock
 
 
-def _rate(text: str | None) -> float | None:
+def typed_rate(text: str | None) -> float | None:
     """Frames a second."""
     if text is None:
         return None
@@ -89,7 +89,7 @@ def _rate(text: str | None) -> float | None:
     return float(text)
 
 
-def _start(text: str | None, period: float, has_clock: bool) -> float:
+def typed_start(text: str | None, period: float, has_clock: bool) -> float:
     """When a camera's first frame was taken, in seconds, or in frames where there is no clock."""
     if text is None:
         return 0.0

@@ -33,7 +33,8 @@ def page_text(
     page.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
     page.filters |= {"dash": _dash, "share": _share, "percent": _percent, "count": _count, "path": _path}
     scripts = [_asset(name) for name in _SCRIPTS] if scene is not None else []
-    hashes = " ".join(f"'sha256-{_sha256(text)}'" for text in scripts) or "'none'"
+    digests = (base64.b64encode(hashlib.sha256(text.encode("utf-8")).digest()).decode("ascii") for text in scripts)
+    hashes = " ".join(f"'sha256-{digest}'" for digest in digests) or "'none'"
     by_person = known_counts(people, np.searchsorted([each.person for each in tracks], people.person))
     by_joint, kinds = known_counts(people), [kind.name.lower() for kind in KINDS]
     return page.from_string(_asset("page.html")).render(
@@ -96,7 +97,3 @@ def _path(values: list[float | None], most: float) -> str:
 def _asset(name: str) -> str:
     """Text of a file that ships beside this one."""
     return (files("shapepose_fg.viz.report") / "data" / name).read_text(encoding="utf-8")
-
-
-def _sha256(script: str) -> str:
-    return base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii")

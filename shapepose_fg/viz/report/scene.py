@@ -176,7 +176,7 @@ def _bodies(
     (P, M, 3) and `rest_joints` (P, 24, 3) are people in the T-pose; `turns` (N, 24, 4) are quaternions x y z w of
     bones against their parents, and `pelvis` (N, 3) is where it is. Rows without a body are missing in them.
     """
-    kept, faces = thinned(arrays.template, arrays.faces, CELL_M)
+    kept, faces, _ = thinned(arrays.template, arrays.faces, CELL_M)
     order = np.argsort(-arrays.weights[kept], axis=1, kind="stable")[:, :_MOST_BONES]
     weights = np.take_along_axis(arrays.weights[kept], order, axis=1)
     weights = np.rint(255 * weights / weights.sum(axis=1, keepdims=True))

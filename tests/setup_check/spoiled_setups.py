@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 from typing import get_args
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Axis, Camera, Rig
 from shapepose_fg.core.detections import Detections, DetectionSequence, Recording
 from shapepose_fg.setup_check.findings import Finding, Kind
@@ -67,7 +67,7 @@ def spoiled(detections: DetectionSequence, rig: Rig, seed: int = 0) -> Iterator[
             yield Spoiled("wrong up axis", detections, Rig(rig.cameras, name), Kind.UP, ())
 
 
-def turned(rig: Rig, view: int, degrees: float, axis: NDArray[np.float64]) -> Rig:
+def turned(rig: Rig, view: int, degrees: float, axis: Array) -> Rig:
     """One camera turned about an axis (3,) of its own, where it stands."""
     turn = np.eye(4)
     turn[:3, :3] = Rotation.from_rotvec(np.deg2rad(degrees) * axis / np.linalg.norm(axis)).as_matrix()
