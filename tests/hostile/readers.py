@@ -31,9 +31,9 @@ from shapepose_fg.io.export.registry import FORMATS
 from shapepose_fg.io.footage.placement import read_used_footage
 from shapepose_fg.io.pose2sim_project import read_pose2sim_project
 from shapepose_fg.io.skeleton_file import read_skeleton
-from shapepose_fg.io.solved_setup import setup_of
 from shapepose_fg.io.timestamps import read_timestamps
 from shapepose_fg.pipeline.pipeline import PipelineConfig
+from shapepose_fg.pipeline.solving import Solver
 from shapepose_fg.tracking.edits import Action, Edit
 from shapepose_fg.tracking.listing import list_saved_tracks
 from shapepose_fg.viz.report.writing import report_of
@@ -204,8 +204,7 @@ def _listed(folder: Path) -> None:
 
 
 def _settings_of(folder: Path) -> None:
-    with Reconstruction.open(folder) as opened:
-        setup_of(opened, read_rig(folder / "cameras.json"), PipelineConfig)
+    Solver.read(folder, Reconstruction.load(folder))
 
 
 def _merged(folder: Path) -> None:

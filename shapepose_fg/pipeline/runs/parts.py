@@ -193,11 +193,7 @@ _FOLLOWED |= {f"border.{name}": column for name, column in columns_of(Border).it
 
 
 def checkpoint_of(
-    arrays: Mapping[str, NDArray[Any]],
-    read: Callable[[int], Input],
-    solved: int,
-    frames: range,
-    nobody: Tracks,
+    arrays: Mapping[str, NDArray[Any]], read: Callable[[int], Input], solved: int, frames: range, nobody: Tracks
 ) -> Checkpoint:
     """The checkpoint that `checkpoint_arrays` made the `arrays` of.
 
