@@ -54,12 +54,11 @@ class PictureOptions:
     ) -> "list[tuple[CameraFootage, Footage]]":
         """Those of the result in `results`, whose run.json says `run`, for the cameras `drawn` (`pictures_of`)."""
         from shapepose_fg.io.footage.placement import FOOTAGE
-        from shapepose_fg.viz.overlay.result_pictures import Wanted, pictures_of
+        from shapepose_fg.viz.overlay.result_pictures import pictures_of
 
         if detections is None and (results_folder(results) / FOOTAGE).is_file():
             detections = results_folder(results)
-        wanted = Wanted(drawn, self.videos, detections, tuple(self.image_placement or ()))
-        return pictures_of(run, rig, wanted, opened, note)
+        return pictures_of(run, rig, drawn, self.videos, detections, self.image_placement or (), opened, note)
 
 
 def opened(name: str, path: Path) -> "Footage":

@@ -1,17 +1,16 @@
 """A network's heat maps and part affinity fields as joint candidates with affinities.
 
 Cao et al., "OpenPose: Realtime Multi-Person 2D Pose Estimation using Part Affinity Fields", PAMI 2021, section 3.
-All joints, and all pairs of candidates of all limbs, are decoded at once.
 """
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from shapepose_fg.detection2d.networks import NetworkLayout
+from shapepose_fg.core.arrays import Array, Index, Mask, Real
+from shapepose_fg.io.detections.association_text import TextSkeleton
 
 _MIN_SCORE = 0.1
 """Heights of peaks below this are noise."""
@@ -27,89 +26,75 @@ _MIN_SUPPORTED = 0.7
 class Candidates:
     """Joint candidates of one picture, sorted by joint, and affinities between them."""
 
-    joint: NDArray[np.intp]
-    """(D,) joint of each candidate, in the layout's order."""
-    xy: NDArray[np.float64]
+    joint: Index
+    """(D,) joint of each candidate, in the network's order."""
+    xy: Array
     """(D, 2) position."""
-    score: NDArray[np.float64]
+    score: Array
     """(D,) height of the peak, 0 to 1."""
-    pairs: NDArray[np.intp]
+    pairs: Index
     """(E, 2) candidates that a limb joins, the limb's first joint first."""
-    limb: NDArray[np.intp]
+    limb: Index
     """(E,) the limb that joins each pair."""
-    affinity: NDArray[np.float64]
+    affinity: Array
     """(E,) mean of the field's component along the limb, 0 to 1; pairs without support are not listed."""
 
     def __len__(self) -> int:
         return len(self.joint)
 
-    @classmethod
-    def none(cls) -> "Candidates":
-        """Those of a picture in which nothing is."""
-        index, number = np.zeros(0, dtype=np.intp), np.zeros(0)
-        return cls(index, number.reshape(0, 2), number, index.reshape(0, 2), index, number)
-
-    def only(self, keep: NDArray[np.bool_]) -> "Candidates":
-        """The candidates of the mask `keep` (D,), and the affinities between them."""
-        place = np.cumsum(keep) - 1
-        both = keep[self.pairs].all(axis=1)
-        return Candidates(
-            self.joint[keep],
-            self.xy[keep],
-            self.score[keep],
-            place[self.pairs[both]],
-            self.limb[both],
-            self.affinity[both],
-        )
+    def moved(self, xy: Array, inside: Mask) -> "Candidates":
+        """The same at other positions; those that are not `inside` (D,) are left out."""
+        place = np.cumsum(inside) - 1
+        both = inside[self.pairs].all(axis=1)
+        joint, score, pairs = self.joint[inside], self.score[inside], place[self.pairs[both]]
+        return Candidates(joint, xy[inside], score, pairs, self.limb[both], self.affinity[both])
 
 
-def decode(output: NDArray[np.float32], layout: NetworkLayout) -> Candidates:
+def decode(output: NDArray[np.float32], skeleton: TextSkeleton) -> Candidates:
     """Candidates of one picture from the network's `output` (C, H, W).
 
-    Positions are in cells of the output; (0, 0) is the centre of the first. What is not finite in
-    the output is taken for 0.
+    That is a map for each of the `skeleton`'s J joints, one of the background, and two (x, y) for each limb.
+    Positions are in cells; (0, 0) is the centre of the first. What is not finite in the output is taken for 0.
     """
     output = np.nan_to_num(output, nan=0.0, posinf=0.0, neginf=0.0)
-    heat = output[layout.first_heat_map : layout.first_heat_map + len(layout.joints)]
-    joint, xy, score = peaks(heat)
-    first, second, limb = _all_pairs(joint, layout)
-    fields = output[layout.first_affinity : layout.first_affinity + 2 * len(layout.limbs)]
-    affinity = line_integrals(fields, xy[first], xy[second], limb)
+    joint, xy, score = peaks(output[: len(skeleton.joints)])
+    of = [np.flatnonzero(joint == each) for each in range(len(skeleton.joints))]
+    joined = [
+        np.stack(np.meshgrid(of[a], of[b], indexing="ij"), axis=-1).reshape(-1, 2) for a, b in skeleton.limbs
+    ]
+    pairs, limb = np.concatenate(joined), np.repeat(np.arange(len(joined)), [len(each) for each in joined])
+    affinity = line_integrals(output[len(skeleton.joints) + 1 :], xy[pairs[:, 0]], xy[pairs[:, 1]], limb)
     there = affinity > 0
-    pairs = np.column_stack([first, second])[there]
-    return Candidates(joint, xy, score, pairs, limb[there], affinity[there])
+    return Candidates(joint, xy, score, pairs[there], limb[there], affinity[there])
 
 
-def peaks(
-    heat: NDArray[np.float32], min_score: float = _MIN_SCORE
-) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
+def peaks(heat: NDArray[np.float32], min_score: float = _MIN_SCORE) -> tuple[Index, Array, Array]:
     """Joint (D,), position (D, 2) in cells, and height (D,) of the local maxima of heat maps (J, H, W).
 
     A maximum is no lower than its eight neighbours. Between cells its place and height are those of a Gaussian
     through it and its neighbours, along each axis.
     """
     padded = np.pad(heat, ((0, 0), (1, 1), (1, 1)), constant_values=-np.inf)
-    stack = padded.transpose(1, 2, 0)  # OpenCV filters all channels of a picture at once
-    largest = cv2.dilate(np.ascontiguousarray(stack), np.ones((3, 3), np.uint8)).reshape(stack.shape)
-    is_peak = (stack >= largest) & (stack >= min_score)
-    row, column, joint = np.nonzero(is_peak)
-    order = np.lexsort((column, row, joint))
-    joint, row, column = joint[order], row[order], column[order]
-    # Of a plateau of equal cells only the first is kept.
-    equal_before = np.zeros(len(joint), dtype=bool)
-    for dr, dc in ((-1, -1), (-1, 0), (-1, 1), (0, -1)):
-        equal_before |= padded[joint, row + dr, column + dc] == padded[joint, row, column]
-    joint, row, column = joint[~equal_before], row[~equal_before], column[~equal_before]
-    centre = padded[joint, row, column].astype(np.float64)
-    x, rise_x = _vertex(padded[joint, row, column - 1], centre, padded[joint, row, column + 1])
-    y, rise_y = _vertex(padded[joint, row - 1, column], centre, padded[joint, row + 1, column])
-    xy = np.column_stack([column - 1 + x, row - 1 + y])
-    return joint, xy, np.minimum(centre * np.exp(rise_x + rise_y), 1.0)
+    rows, columns = heat.shape[1:]
+    is_peak = heat >= min_score
+    for down, right in np.ndindex(3, 3):
+        other = padded[:, down : down + rows, right : right + columns]
+        # Of a plateau of equal cells only the first is kept.
+        is_peak &= heat > other if (down, right) < (1, 1) else heat >= other
+    joint, row, column = np.nonzero(is_peak)
+    xy, height = between_cells(padded, joint, row + 1, column + 1)
+    return joint, xy - 1, np.minimum(height, 1.0)
 
 
-def _vertex(
-    before: NDArray[np.floating], centre: NDArray[np.float64], after: NDArray[np.floating]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def between_cells(maps: Real, which: Index, row: Index, column: Index) -> tuple[Array, Array]:
+    """Places (N, 2) and heights (N,) of maxima of `maps` (M, H, W), none of which lies at an edge."""
+    centre = maps[which, row, column].astype(np.float64)
+    x, rise_x = _vertex(maps[which, row, column - 1], centre, maps[which, row, column + 1])
+    y, rise_y = _vertex(maps[which, row - 1, column], centre, maps[which, row + 1, column])
+    return np.column_stack([column + x, row + y]), centre * np.exp(rise_x + rise_y)
+
+
+def _vertex(before: Real, centre: Array, after: Real) -> tuple[Array, Array]:
     """Where a Gaussian through three neighbours is highest, -0.5 to 0.5 cells, and the logarithm of its rise.
 
     0 and 0 at the edge of the map.
@@ -123,9 +108,7 @@ def _vertex(
     return shift, -0.25 * (low - high) * shift
 
 
-def line_integrals(
-    fields: NDArray[np.float32], start: NDArray[np.float64], end: NDArray[np.float64], limb: NDArray[np.intp]
-) -> NDArray[np.float64]:
+def line_integrals(fields: NDArray[np.float32], start: Array, end: Array, limb: Index) -> Array:
     """(E,) the mean component of the affinity `fields` (2 L, H, W) along the lines from `start` to `end` (E, 2).
 
     `limb` (E,) says whose field each line is read from. 0 where too few places along the line support it.
@@ -143,20 +126,3 @@ def line_integrals(
         component += map_coordinates(fields, places, np.float64, order=1) * direction[:, axis, None]
     supported = (component >= _MIN_ALONG).mean(axis=1) >= _MIN_SUPPORTED
     return np.where(supported & (length > 0), np.clip(component.mean(axis=1), 0.0, 1.0), 0.0)
-
-
-def _all_pairs(
-    joint: NDArray[np.intp], layout: NetworkLayout
-) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """First candidate, second candidate, and limb, each (E,), of all pairs that any limb could join.
-
-    `joint` (D,) is sorted.
-    """
-    count = np.bincount(joint, minlength=len(layout.joints))
-    start = np.cumsum(count) - count
-    ends = layout.limb_ends
-    sizes = count[ends[:, 0]] * count[ends[:, 1]]
-    limb = np.repeat(np.arange(len(ends)), sizes)
-    within = np.arange(len(limb)) - (np.cumsum(sizes) - sizes)[limb]
-    row, column = np.divmod(within, np.maximum(count[ends[limb, 1]], 1))
-    return start[ends[limb, 0]] + row, start[ends[limb, 1]] + column, limb

@@ -2,43 +2,67 @@
 
 import json
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
-from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.camera import Camera
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import inside, read_json, write_atomically, write_content
 from shapepose_fg.detection2d.decoding import Candidates
-from shapepose_fg.detection2d.detector import CameraDetector
-from shapepose_fg.io.detections.association_text import TEXT_SKELETONS
-from shapepose_fg.io.footage.footage import Footage
+from shapepose_fg.detection2d.opening import Network
+from shapepose_fg.detection2d.top_down import People
+from shapepose_fg.detection2d.upright import UprightView, roll_of
+from shapepose_fg.io.footage.footage import Footage, Progress
 from shapepose_fg.io.footage.lockstep import Lockstep
-from shapepose_fg.io.footage.placement import FOOTAGE, CameraFootage, write_used_footage
-from shapepose_fg.io.write_detections import association_lines
+from shapepose_fg.io.footage.placement import FOOTAGE, CameraFootage, Placement, write_used_footage
 
 BLOCK = 16
 """Moments that are kept together: what a run that is killed loses at most."""
 _UNFINISHED = "unfinished"
 _SETTINGS = "settings.json"
 
-Progress = Callable[[int, int], None]
-"""Told how many pictures of how many are done."""
+
+@dataclass(frozen=True)
+class CameraDetector:
+    """The detector for the pictures of one camera."""
+
+    camera: Camera
+    """The camera."""
+    footage: Footage
+    """Its pictures."""
+    placement: Placement
+    """Where calibrated pixels lie in them."""
+    network: Network
+    """What detects."""
+    view: UprightView
+    """What the network is shown."""
+
+    @classmethod
+    def of(cls, camera: Camera, up: Array, footage: Footage, placement: Placement, network: Network) -> Self:
+        """The detector for `camera` in a world where `up` (3,) points up."""
+        view = network.view(placement.region, roll_of(camera, up))
+        return cls(camera, footage, placement, network, view)
+
+    def detect(self, picture: NDArray[np.uint8]) -> Candidates | People:
+        """What is in a `picture` (H, W, 3), blue green red, in calibrated pixels, as the lens gives them."""
+        found = self.network.detect(self.view.input_of(picture))
+        xy = self.view.picture_from_input(found.xy)
+        # In the corners beside a turned picture there is nothing to see.
+        return found.moved(self.placement.to_calibrated(xy), self.view.inside(xy))
 
 
 @dataclass(frozen=True)
 class DetectionRun:
     """What is to be detected."""
 
-    rig: Rig
-    """The cameras."""
-    footage: Sequence[Footage]
-    """(V,) their pictures."""
-    detectors: Sequence[CameraDetector]
-    """(V,) how each camera's pictures are read."""
+    cameras: Sequence[CameraDetector]
+    """(V,) how each camera's pictures are read, by one network."""
     moments: Lockstep
     """Which pictures belong together."""
     output: Path
@@ -47,46 +71,31 @@ class DetectionRun:
     @property
     def settings(self) -> dict[str, Any]:
         """What the detections depend on: equal for a run that goes on."""
-        first = self.detectors[0]
         cameras = [
             {
-                "name": name,
-                "path": str(footage.path.resolve()),
-                "state": _state(footage.path),
-                "placement": str(detector.placement.kind),
-                "roll_deg": detector.roll_deg,
+                "name": each.camera.name,
+                "path": str(each.footage.path.resolve()),
+                "state": _state(each.footage.path),
+                "placement": str(each.placement.kind),
+                "turned_deg": each.view.turn_deg,
                 "frames": self.moments.picture[:, view].tolist(),
             }
-            for view, (name, footage, detector) in enumerate(
-                zip(self.rig.names, self.footage, self.detectors, strict=True)
-            )
+            for view, each in enumerate(self.cameras)
         ]
-        network = {"sha256": first.network.sha256, "layout": first.network.layout.name}
-        return {"network": network, "detection": {"long_side": first.long_side}, "cameras": cameras}
+        return {**self.cameras[0].network.settings, "cameras": cameras}
 
 
-@dataclass(frozen=True)
-class DetectionReport:
-    """What came of it."""
+def run_detection(run: DetectionRun, progress: Progress = lambda done, total: None) -> tuple[list[int], list[int]]:
+    """Detect in all pictures, and write <camera>.txt or <camera>.json, times.csv and footage.json into the output.
 
-    moments: int
-    """T, the frames of the detections."""
-    candidates: tuple[int, ...]
-    """(V,) how many candidates each camera has."""
-    unreadable: tuple[int, ...]
-    """(V,) how many pictures of each camera could not be read."""
-
-
-def run_detection(run: DetectionRun, progress: Progress = lambda done, total: None) -> DetectionReport:
-    """Detect in all pictures, and write <camera>.txt (4D Association), times.csv and footage.json into the output.
-
-    Blocks that an earlier run of the same settings left are not done again; the files come out the same.
-    InputError where the folder holds detections, or a run of other settings.
+    (V,) how many joints were found in each camera's pictures, and (V,) how many of these could not be read. Blocks
+    that an earlier run of the same settings left are not done again; the files come out the same. InputError where
+    the folder holds detections, or a run of other settings.
     """
     unfinished = inside(run.output, _UNFINISHED)
     _refuse_others(run, unfinished)
-    write_content(unfinished / _SETTINGS, _json(run.settings))
-    total, views = len(run.moments), len(run.rig)
+    write_content(unfinished / _SETTINGS, json.dumps(run.settings, allow_nan=False))
+    total, views = len(run.moments), len(run.cameras)
     files, counts = list[Path](), np.zeros((2, views), dtype=np.intp)
     for start in range(0, total, BLOCK):
         files.append(unfinished / f"{start:09d}.json")
@@ -95,53 +104,44 @@ def run_detection(run: DetectionRun, progress: Progress = lambda done, total: No
             _write_block(run, moments, files[-1], progress)
         counts += [_read_block(files[-1], views, name) for name in ("found", "failed")]
         progress(moments.stop * views, total * views)
-    skeleton = TEXT_SKELETONS[run.detectors[0].network.layout.skeleton]
+    network = run.cameras[0].network
 
     def text_of(view: int) -> Iterator[bytes]:
-        yield f"{skeleton.number} {total}\n".encode()
+        yield network.head(total).encode()
         for file in files:
             yield _read_block(file, views, "text")[view].encode()
+        yield network.tail.encode()
 
-    for view, name in enumerate(run.rig.names):
-        write_atomically(run.output / f"{name}.txt", lambda stream, view=view: stream.writelines(text_of(view)))
+    used = []
+    for view, each in enumerate(run.cameras):
+        file = run.output / f"{each.camera.name}{network.suffix}"
+        write_atomically(file, lambda stream, view=view: stream.writelines(text_of(view)))
+        places = run.moments.picture[:, view]
+        used.append(CameraFootage(each.camera.name, each.footage.path.resolve(), each.placement, places))
     _write_times(run)
-    used = [
-        CameraFootage(name, footage.path.resolve(), detector.placement, run.moments.picture[:, view])
-        for view, (name, footage, detector) in enumerate(
-            zip(run.rig.names, run.footage, run.detectors, strict=True)
-        )
-    ]
-    write_used_footage(run.output / FOOTAGE, used, {key: run.settings[key] for key in ("network", "detection")})
+    write_used_footage(run.output / FOOTAGE, used, network.settings)
     shutil.rmtree(unfinished)
-    return DetectionReport(total, *(tuple(each) for each in counts.tolist()))
+    joints, unreadable = counts.tolist()
+    return joints, unreadable
 
 
 def _write_block(run: DetectionRun, moments: range, file: Path, progress: Progress) -> None:
     """Detect in the pictures of some moments, camera after camera of each moment, and keep what was found.
 
-    For each camera that is its text, how many candidates it has, and how many pictures could not be read.
+    For each camera that is its text, how many joints it has, and how many pictures could not be read.
     """
-    views = len(run.rig)
-    lines: list[list[str]] = [[] for _ in range(views)]
-    found, failed = [0] * views, [0] * views
+    views = len(run.cameras)
+    text, found, failed = [""] * views, [0] * views, [0] * views
     for t in moments:
-        for v, detector in enumerate(run.detectors):
+        for v, each in enumerate(run.cameras):
             place = int(run.moments.picture[t, v])
-            picture = run.footage[v].at(place) if place >= 0 else None
+            picture = each.footage.at(place) if place >= 0 else None
             failed[v] += place >= 0 and picture is None
-            candidates = Candidates.none() if picture is None else detector.detect(picture)
-            found[v] += len(candidates)
-            lines[v] += association_lines(
-                TEXT_SKELETONS[detector.network.layout.skeleton],
-                candidates.joint,
-                candidates.xy / (np.array(run.rig.cameras[v].image_size) - 1.0),
-                candidates.score,
-                candidates.pairs,
-                candidates.affinity,
-            )
+            seen = None if picture is None else each.detect(picture)
+            found[v] += 0 if seen is None else len(seen)
+            text[v] += each.network.text(t, seen, each.camera.image_size)
             progress(t * views + v + 1, len(run.moments) * views)
-    text = ["".join(f"{line}\n" for line in each) for each in lines]
-    write_content(file, _json({"text": text, "found": found, "failed": failed}))
+    write_content(file, json.dumps({"text": text, "found": found, "failed": failed}))
 
 
 def _read_block(file: Path, views: int, name: str) -> list[Any]:
@@ -162,7 +162,7 @@ def _write_times(run: DetectionRun) -> None:
         file.unlink(missing_ok=True)
         return
     time_s = time_s - time_s.min()
-    names = list(run.rig.names)
+    names = [each.camera.name for each in run.cameras]
     apart = not run.moments.synchronised and not any(set(name) & set(", \t#") for name in names)
     columns = time_s if apart else time_s.mean(axis=1, keepdims=True)
     lines = [", ".join(["frame", *(names if apart else ["time_s"])])]
@@ -172,33 +172,22 @@ def _write_times(run: DetectionRun) -> None:
 
 def _refuse_others(run: DetectionRun, unfinished: Path) -> None:
     """InputError where the output folder holds other detections, or an unfinished run of other settings."""
-    for name in run.rig.names:
-        if Path(name).name != name or name in (".", ".."):
-            raise InputError(f"camera {name!r}: the name cannot be that of a file; rename it in the calibration")
+    names = [each.camera.name for each in run.cameras]
+    if Path(FOOTAGE).stem in names:
+        raise InputError(f"camera {Path(FOOTAGE).stem!r}: {FOOTAGE} is another file; rename it in the calibration")
+    places = [run.output / f"{name}{suffix}" for name in names for suffix in (".txt", ".json")]
     if (unfinished / _SETTINGS).is_file():
-        before, now = read_json(unfinished / _SETTINGS), json.loads(_json(run.settings))
+        before, now = read_json(unfinished / _SETTINGS), run.settings
         if before != now:
+            differ = [key for key in now if not isinstance(before, dict) or before.get(key) != now[key]]
             raise InputError(
-                f"{unfinished}: a run with {_difference(before, now)} was stopped here; start it as it was to go"
-                " on, or delete this folder"
+                f"{unfinished}: a run that differs in its {' and '.join(differ)} was stopped here; start it as it"
+                " was to go on, or delete this folder"
             )
-    elif unfinished.exists():
-        if any(unfinished.iterdir()):
-            raise InputError(
-                f"{unfinished}: not a run of this program; delete the folder, or give another --output"
-            )
-    elif there := [name for name in run.rig.names if (run.output / f"{name}.txt").exists()]:
-        raise InputError(
-            f"{run.output / there[0]}.txt: there are detections already; delete them, or give another --output"
-        )
-
-
-def _difference(before: Any, now: dict[str, Any]) -> str:
-    """Which settings of an earlier run differ."""
-    words = {"network": "another network", "detection": "other settings", "cameras": "other videos or cameras"}
-    if not isinstance(before, dict):
-        return "other settings"
-    return " and ".join(what for key, what in words.items() if before.get(key) != now[key]) or "other settings"
+    elif unfinished.exists() and any(unfinished.iterdir()):
+        raise InputError(f"{unfinished}: not a run of this program; delete the folder, or give another --output")
+    elif there := [place for place in places if place.exists()]:
+        raise InputError(f"{there[0]}: there are detections already; delete them, or give another --output")
 
 
 def _state(path: Path) -> list[int]:
@@ -206,7 +195,3 @@ def _state(path: Path) -> list[int]:
     files = [path] if path.is_file() else sorted(each for each in path.iterdir() if each.is_file())
     states = [each.stat() for each in files]
     return [sum(each.st_size for each in states), max((each.st_mtime_ns for each in states), default=0)]
-
-
-def _json(value: Any) -> str:
-    return json.dumps(value, allow_nan=False)

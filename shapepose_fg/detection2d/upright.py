@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.camera import Camera
-from shapepose_fg.detection2d.networks import NetworkLayout
 
 LEVEL_DEG = 5.0
 """Pictures that are rolled by less stay as they are: people lean by as much, and turning costs corners."""
@@ -19,7 +19,7 @@ _LOOKS_DOWN = 0.17
 no direction of the picture is up."""
 
 
-def roll_of(camera: Camera, up: NDArray[np.float64]) -> float:
+def roll_of(camera: Camera, up: Array) -> float:
     """How far the picture of `camera` is to be turned for `up` (3,) to point up in its middle: degrees clockwise.
 
     0 where the camera looks straight up or down.
@@ -40,12 +40,10 @@ class UprightView:
 
     size: tuple[int, int]
     """(width, height) of the network's input, pixels."""
-    input_from_picture: NDArray[np.float64]
+    input_from_picture: Array
     """(2, 3) affine map of the picture's pixels to those of the input."""
     region: tuple[float, float, float, float]
     """Left, top, right, bottom edge of the region, pixels of the picture; the centre of the first pixel is 0."""
-    cell_px: int
-    """Pixels of the input per cell of the output."""
     turn_deg: float
     """By how much the picture is turned clockwise, degrees."""
 
@@ -59,15 +57,16 @@ class UprightView:
         cls,
         region: tuple[float, float, float, float],
         roll_deg: float,
-        long_side: int,
-        layout: NetworkLayout,
+        long_side: int | None = None,
+        multiple: int = 1,
         only_size: tuple[int, int] | None = None,
     ) -> "UprightView":
         """The view of a `region` turned clockwise by `roll_deg`, about `long_side` pixels along its longer side.
 
-        Rolls under `LEVEL_DEG` from a multiple of 90 degrees are turned by that multiple. Both sides are the
-        nearest multiples of what the network takes, so the axes' scales differ by a few per cent. A network that
-        takes pictures of `only_size` (width, height) gets the region in the middle of such a picture.
+        Without `long_side` it is as large as it is. Rolls under `LEVEL_DEG` from a multiple of 90 degrees are
+        turned by that multiple. Both sides are the nearest multiples of `multiple`, so the axes' scales differ by
+        a few per cent. A network that takes pictures of `only_size` (width, height) gets the region in the middle
+        of such a picture.
         """
         quarter = 90.0 * round(roll_deg / 90.0)
         roll_deg = quarter if abs(roll_deg - quarter) < LEVEL_DEG else roll_deg
@@ -78,14 +77,15 @@ class UprightView:
         low, high = corners.min(axis=0), corners.max(axis=0)
         sides = high - low
         if only_size is None:
-            size = np.maximum(np.round(sides * long_side / sides.max() / layout.multiple), 1) * layout.multiple
+            scale = 1.0 if long_side is None else long_side / sides.max()
+            size = np.maximum(np.round(sides * scale / multiple), 1) * multiple
             stretch = np.diag(size / sides)
         else:
             size = np.array(only_size)
             stretch = np.eye(2) * (size / sides).min()
         # Edges, not centres, of pixels are scaled: hence the half pixel.
         matrix = np.column_stack([stretch @ turn, (size - stretch @ (low + high)) / 2 - 0.5])
-        return cls((int(size[0]), int(size[1])), matrix, region, layout.stride, roll_deg)
+        return cls((int(size[0]), int(size[1])), matrix, region, roll_deg)
 
     def input_of(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The network's input (height, width, 3) of a `picture`; outside the region it has the mean colour."""
@@ -93,33 +93,20 @@ class UprightView:
         part = picture[max(top, 0) : bottom, max(left, 0) : right]
         matrix = self.input_from_picture.copy()
         matrix[:, 2] += matrix[:, :2] @ (max(left, 0), max(top, 0))
-        # Halves first: sampling a picture that is much too large would pass over most of its pixels.
-        shrink = self.scale
-        size = np.maximum(np.round(np.array(part.shape[1::-1]) * shrink), 1).astype(int)
-        if shrink < 1:
-            small = cv2.resize(part, size.tolist(), interpolation=cv2.INTER_AREA)
-            ratio = np.array(part.shape[1::-1]) / size
-            matrix[:, 2] += matrix[:, :2] @ (0.5 * ratio - 0.5)
-            matrix[:, :2] = matrix[:, :2] * ratio
-        else:
-            small = part
-        turned = cv2.warpAffine(
-            small,
-            matrix,
-            self.size,
-            flags=cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_CONSTANT,
-            borderValue=cv2.mean(small)[:3],
-        )
+        # Made smaller by areas first: sampling a picture that is much too large passes over most of its pixels.
+        size = np.maximum(np.round(np.array(part.shape[1::-1]) * min(self.scale, 1.0)), 1).astype(int)
+        small, ratio = cv2.resize(part, size.tolist(), interpolation=cv2.INTER_AREA), part.shape[1::-1] / size
+        matrix[:, 2] += matrix[:, :2] @ (0.5 * ratio - 0.5)
+        matrix[:, :2] = matrix[:, :2] * ratio
+        turned = cv2.warpAffine(small, matrix, self.size, flags=cv2.INTER_LINEAR, borderValue=cv2.mean(small)[:3])
         return np.asarray(turned, dtype=np.uint8)
 
-    def picture_from_cells(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Pixels (N, 2) of the picture from positions (N, 2) in cells of the network's output."""
-        pixels = (xy + 0.5) * self.cell_px - 0.5
-        return (pixels - self.input_from_picture[:, 2]) @ np.linalg.inv(self.input_from_picture[:, :2]).T
+    def picture_from_input(self, xy: Array) -> Array:
+        """Pixels (..., 2) of the picture from those of the input."""
+        return (xy - self.input_from_picture[:, 2]) @ np.linalg.inv(self.input_from_picture[:, :2]).T
 
-    def inside(self, xy: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """(N,) which pixels (N, 2) of the picture lie in the region."""
+    def inside(self, xy: Array) -> Mask:
+        """(...,) which pixels (..., 2) of the picture lie in the region."""
         left, top, right, bottom = self.region
-        x, y = xy.T
+        x, y = xy[..., 0], xy[..., 1]
         return (x >= left) & (x <= right) & (y >= top) & (y <= bottom)

@@ -12,8 +12,8 @@ import pytest
 
 from shapepose_fg.cli.main import main
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.detection2d.network import HeatMapNetwork
-from shapepose_fg.detection2d.networks import layouts
+from shapepose_fg.detection2d.heat_maps import HeatMapNetwork, layouts
+from shapepose_fg.detection2d.onnx_network import OnnxNetwork
 from shapepose_fg.evaluation.single_person import man_of
 from shapepose_fg.io.calibration import read_rig, write_rig
 from shapepose_fg.io.detections import read_detections
@@ -36,8 +36,9 @@ def kitchen(tmp_path, monkeypatch) -> Path:
         output[0, 4] = cv2.GaussianBlur(light.astype(np.float32), (0, 0), 1.0)
         return output
 
-    network = HeatMapNetwork(layouts()["tf-pose"], "0" * 64, see)
-    monkeypatch.setattr(HeatMapNetwork, "load", lambda *_: network)
+    opened = OnnxNetwork(Path("network.onnx"), "0" * 64, lambda blob: [see(blob)])
+    network = HeatMapNetwork(opened, layouts()["tf-pose"])
+    monkeypatch.setattr(HeatMapNetwork, "load", lambda *_, **__: network)
     return tmp_path
 
 

@@ -1,6 +1,7 @@
 """People painted as coloured discs, a network that sees them, and networks as ONNX files."""
 
 import itertools
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -8,9 +9,12 @@ import numpy as np
 import pytest
 
 from shapepose_fg.core.camera import Camera, Rig
-from shapepose_fg.detection2d.network import HeatMapNetwork
-from shapepose_fg.detection2d.networks import layouts
+from shapepose_fg.detection2d.heat_maps import HeatMapNetwork, layouts
+from shapepose_fg.detection2d.onnx_network import OnnxNetwork
 from shapepose_fg.viz.rendering import look_at
+
+Sides = Sequence[int | str]
+"""The shape of an input or output; names are sides of any length."""
 
 CODES = np.array([code for code in itertools.product((0, 128, 255), repeat=3) if any(code)][:25])
 """The colour of each joint of BODY_25."""
@@ -47,7 +51,8 @@ def see_discs(blob: np.ndarray) -> np.ndarray:
 
 @pytest.fixture
 def painted_network() -> HeatMapNetwork:
-    return HeatMapNetwork(layouts()["openpose-body25"], "0" * 64, see_discs)
+    network = OnnxNetwork(Path("painted.onnx"), "0" * 64, lambda blob: [see_discs(blob)])
+    return HeatMapNetwork(network, layouts()["openpose-body25"])
 
 
 @pytest.fixture(scope="session")
@@ -65,21 +70,41 @@ def rolled_rig() -> Rig:
 
 
 def onnx_file(path: Path, weights: np.ndarray, fixed: tuple[int, int] | None = None) -> Path:
-    """An ONNX file of one convolution with a stride of its kernel's size: `weights` (out, 3, k, k).
+    """An ONNX file of one convolution with a stride of its kernel's size: `weights` (out, 3, k, k)."""
+    side = weights.shape[2]
+    nodes = [node("Conv", "x w", "y", kernel_shape=[side] * 2, strides=[side] * 2)]
+    height, width = fixed or ("h", "w")
+    return onnx_model(path, nodes, {"w": weights}, (1, 3, height, width), {"y": (1, len(weights), "p", "q")})
+
+
+def onnx_model(path: Path, nodes: list[bytes], weights: dict[str, np.ndarray], takes: Sides, gives: dict) -> Path:
+    """An ONNX file that takes x of the shape `takes` and gives arrays of known names and shapes.
 
     Written by hand, after the format's own description (onnx.proto), so that no test needs the package onnx.
     """
-    size = weights.shape[2]
-    tensor = b"".join(varint(1, n) for n in weights.shape) + varint(2, 1) + blob(8, b"w")
-    tensor += blob(9, weights.astype("<f4").tobytes())
-    attributes = _ints(b"kernel_shape", [size] * 2) + _ints(b"strides", [size] * 2)
-    node = blob(1, b"x") + blob(1, b"w") + blob(2, b"y") + blob(4, b"Conv") + attributes
-    height, width = fixed or (b"h", b"w")
-    graph = blob(1, node) + blob(2, b"g") + blob(5, tensor) + blob(11, _value(b"x", [1, 3, height, width]))
-    graph += blob(12, _value(b"y", [1, weights.shape[0], b"p", b"q"]))
-    model = varint(1, 7) + blob(7, graph) + blob(8, blob(1, b"") + varint(2, 13))
-    path.write_bytes(model)
+    graph = b"".join(blob(1, each) for each in nodes) + blob(2, b"g")
+    for name, array in weights.items():
+        whole = array.dtype.kind == "i"
+        tensor = (
+            b"".join(varint(1, n) for n in array.shape) + varint(2, 7 if whole else 1) + blob(8, name.encode())
+        )
+        graph += blob(5, tensor + blob(9, array.astype("<i8" if whole else "<f4").tobytes()))
+    graph += blob(11, _value("x", takes))
+    for name, shape in gives.items():
+        graph += blob(12, _value(name, shape, whole=name == "labels"))
+    path.write_bytes(varint(1, 7) + blob(7, graph) + blob(8, blob(1, b"") + varint(2, 13)))
     return path
+
+
+def node(operator: str, takes: str, gives: str, **attributes: int | list[int]) -> bytes:
+    """A step of a network: names of what it takes and gives, separated by blanks, and its attributes."""
+    content = b"".join(blob(1, name.encode()) for name in takes.split())
+    content += b"".join(blob(2, name.encode()) for name in gives.split()) + blob(4, operator.encode())
+    for name, value in attributes.items():
+        whole = varint(3, value) + varint(20, 2) if isinstance(value, int) else b""
+        several = b"".join(varint(8, n) for n in value) + varint(20, 7) if isinstance(value, list) else b""
+        content += blob(5, blob(1, name.encode()) + whole + several)
+    return content
 
 
 def _varint(n: int) -> bytes:
@@ -97,10 +122,61 @@ def blob(field: int, content: bytes) -> bytes:
     return _varint(field << 3 | 2) + _varint(len(content)) + content
 
 
-def _ints(name: bytes, values: list[int]) -> bytes:
-    return blob(5, blob(1, name) + b"".join(varint(8, n) for n in values) + varint(20, 7))
+def _value(name: str, shape: Sides, *, whole: bool = False) -> bytes:
+    sides = b"".join(
+        blob(1, blob(2, side.encode()) if isinstance(side, str) else varint(1, side)) for side in shape
+    )
+    return blob(1, name.encode()) + blob(2, blob(1, varint(1, 7 if whole else 1) + blob(2, sides)))
 
 
-def _value(name: bytes, shape: list[int | bytes]) -> bytes:
-    sides = b"".join(blob(1, blob(2, side) if isinstance(side, bytes) else varint(1, side)) for side in shape)
-    return blob(1, name) + blob(2, blob(1, varint(1, 1) + blob(2, sides)))
+def rtmpose_file(path: Path, joints: int, size: tuple[int, int], seed: int, batch: int | str = "batch") -> Path:
+    """A network with RTMPose's input and outputs, of random weights; its curves depend on all of the crop."""
+    rng, (width, height) = np.random.default_rng(seed), size
+    cells = width * height // 256
+    weights = {
+        "w": rng.normal(0, 0.03, (joints, 3, 16, 16)),
+        "flat": np.array([0, joints, -1]),
+        "along_x": rng.normal(0, 0.02, (cells, 2 * width)),
+        "along_y": rng.normal(0, 0.02, (cells, 2 * height)),
+    }
+    nodes = [
+        node("Conv", "x w", "cells", kernel_shape=[16, 16], strides=[16, 16]),
+        node("Reshape", "cells flat", "seen"),
+        node("MatMul", "seen along_x", "simcc_x"),
+        node("MatMul", "seen along_y", "simcc_y"),
+    ]
+    gives = {"simcc_x": (batch, joints, 2 * width), "simcc_y": (batch, joints, 2 * height)}
+    return onnx_model(path, nodes, weights, (batch, 3, height, width), gives)
+
+
+def yolox_file(path: Path, size: tuple[int, int], seed: int, classes: int = 1, suppressed: bool = False) -> Path:
+    """A network with YOLOX's input and outputs, `suppressed` as mmdeploy exports it: boxes that overlap a lot."""
+    rng, (width, height) = np.random.default_rng(seed), size
+    steps = (32,) if suppressed else (8, 16, 32)
+    nodes, weights, grids = [], {"flat": np.array([1, 5 + classes - suppressed, -1])}, []
+    for step in steps:
+        how = {"kernel_shape": [step, step], "strides": [step, step]}
+        for part, channels, bias in (
+            ("place", 4, [0.5, 0.5, 2.0, 2.0]),
+            ("sure", 1 + classes - suppressed, [-1.5 if suppressed else 1.1]),
+        ):
+            weights[f"{part}{step}"] = rng.normal(0, 1 / (200 * step), (channels, 3, step, step))
+            weights[f"{part}{step}b"] = np.resize(bias, channels)
+            nodes.append(node("Conv", f"x {part}{step} {part}{step}b", f"{part}{step}o", **how))
+        nodes.append(node("Sigmoid", f"sure{step}o", f"sure{step}s"))
+        nodes.append(node("Concat", f"place{step}o sure{step}s", f"both{step}", axis=1))
+        nodes.append(node("Reshape", f"both{step} flat", f"grid{step}"))
+        grids.append(f"grid{step}")
+    count = sum((width // step) * (height // step) for step in steps)
+    last = "moved" if suppressed else "dets"
+    nodes += [node("Concat", " ".join(grids), "every", axis=2), node("Transpose", "every", last, perm=[0, 2, 1])]
+    gives: dict[str, Sides] = {"dets": (1, count, 4 + 1 + classes - suppressed)}
+    if suppressed:
+        low = rng.uniform(0, 0.7, (count, 2)) * size
+        weights["base"] = np.hstack([low, low + rng.uniform(0.1, 0.3, (count, 2)) * size, np.zeros((count, 1))])[
+            None
+        ]
+        weights["given"] = np.arange(count)[None] % classes
+        nodes += [node("Add", "moved base", "dets"), node("Identity", "given", "labels")]
+        gives["labels"] = (1, count)
+    return onnx_model(path, nodes, weights, (1, 3, height, width), gives)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from shapepose_fg.detection2d.decoding import decode, line_integrals, peaks
-from shapepose_fg.detection2d.networks import NetworkLayout, layouts
+from shapepose_fg.detection2d.heat_maps import NetworkLayout, layouts
 
 LAYOUT = layouts()["tf-pose"]
 
@@ -18,9 +18,9 @@ def people_output(people: np.ndarray, layout: NetworkLayout, size: tuple[int, in
     """(C, H, W) what a perfect network gives of people (P, J, 2), cells: peaks of 0.9, fields 3 cells wide."""
     output = np.zeros((layout.channels, size[1], size[0]), dtype=np.float32)
     x, y = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
-    for joint in range(len(layout.joints)):
-        output[layout.first_heat_map + joint] = 0.9 * gaussians(people[:, joint], size)
-    for limb, (a, b) in enumerate(layout.limbs):
+    for joint in range(len(layout.text.joints)):
+        output[joint] = 0.9 * gaussians(people[:, joint], size)
+    for limb, (a, b) in enumerate(layout.text.limbs):
         for person in people:
             along = person[b] - person[a]
             length = np.linalg.norm(along)
@@ -29,7 +29,7 @@ def people_output(people: np.ndarray, layout: NetworkLayout, size: tuple[int, in
             t, off = to @ unit, np.abs(to @ np.array([-unit[1], unit[0]]))
             on = (t > -1) & (t < length + 1) & (off < 1.5)
             for axis in range(2):
-                output[layout.first_affinity + 2 * limb + axis][on] = 0.8 * unit[axis]
+                output[len(layout.text.joints) + 1 + 2 * limb + axis][on] = 0.8 * unit[axis]
     return output
 
 
@@ -60,18 +60,20 @@ def test_a_plateau_is_one_peak_and_the_edge_has_peaks_too():
 def test_two_people_are_linked_to_themselves_alone(name):
     layout = layouts()[name]
     rng = np.random.default_rng(3)
-    one = np.column_stack([rng.uniform(6, 24, len(layout.joints)), rng.permutation(len(layout.joints)) * 1.4 + 2])
+    one = np.column_stack(
+        [rng.uniform(6, 24, len(layout.text.joints)), rng.permutation(len(layout.text.joints)) * 1.4 + 2]
+    )
     people = one + np.array([[[0.0, 0.0]], [[30.0, 1.0]]])
-    found = decode(people_output(people, layout), layout)
+    found = decode(people_output(people, layout), layout.text)
     truth = people[:, found.joint]
     whose = np.linalg.norm(truth - found.xy, axis=-1).argmin(axis=0)
     assert np.linalg.norm(truth[whose, np.arange(len(found))] - found.xy, axis=1).max() < 0.2
-    assert np.bincount(found.joint, minlength=len(layout.joints)).tolist() == [2] * len(layout.joints)
+    assert np.bincount(found.joint, minlength=len(layout.text.joints)).tolist() == [2] * len(layout.text.joints)
     first, second = found.pairs.T
-    ends = layout.limb_ends[found.limb]
+    ends = np.array(layout.text.limbs)[found.limb]
     assert (found.joint[first] == ends[:, 0]).all() and (found.joint[second] == ends[:, 1]).all()
     own = whose[first] == whose[second]
-    assert own.sum() == 2 * len(layout.limbs)
+    assert own.sum() == 2 * len(layout.text.limbs)
     assert found.affinity[own].min() > 0.6  # the fields' 0.8, less their ends
     assert (~own).sum() == 0
 
@@ -87,15 +89,15 @@ def test_a_line_across_the_field_has_no_affinity():
 def test_what_is_no_number_and_an_empty_output_give_nobody():
     output = np.full((LAYOUT.channels, 12, 16), np.nan, dtype=np.float32)
     for each in (output, np.zeros_like(output)):
-        found = decode(each, LAYOUT)
+        found = decode(each, LAYOUT.text)
         assert len(found) == 0 and found.pairs.shape == (0, 2)
 
 
 def test_leaving_candidates_out_keeps_the_pairs_between_the_rest():
     rng = np.random.default_rng(5)
     one = np.column_stack([rng.uniform(6, 24, 18), np.arange(18) * 2.0 + 2])
-    found = decode(people_output(one[None], LAYOUT), LAYOUT)
-    part = found.only(found.joint != 1)
+    found = decode(people_output(one[None], LAYOUT), LAYOUT.text)
+    part = found.moved(found.xy, found.joint != 1)
     assert 1 not in part.joint
-    assert len(part.pairs) == (~(np.array(LAYOUT.limbs) == 1).any(axis=1)).sum()
-    assert (part.joint[part.pairs] == LAYOUT.limb_ends[part.limb]).all()
+    assert len(part.pairs) == (~(np.array(LAYOUT.text.limbs) == 1).any(axis=1)).sum()
+    assert (part.joint[part.pairs] == np.array(LAYOUT.text.limbs)[part.limb]).all()

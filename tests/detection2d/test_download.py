@@ -1,35 +1,49 @@
 """Networks fetched from a server on this machine."""
 
 import hashlib
+import io
 import threading
+import zipfile
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
 
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.detection2d import download
-from shapepose_fg.detection2d.download import cache_folder, find_network
-from shapepose_fg.detection2d.networks import KnownNetwork, known_networks
+from shapepose_fg.detection2d.download import BASES, cache_folder, named_file, named_networks
 
-CONTENT = bytes(range(256)) * 400
+NETWORK = bytes(range(256)) * 400
+NAME, FILE = "rtmpose-m", named_networks()["rtmpose-m"].file
+
+
+def archive(*files: tuple[str, bytes]) -> bytes:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as opened:
+        for name, content in files:
+            opened.writestr(name, content)
+    return stream.getvalue()
 
 
 @pytest.fixture
-def server():
-    """The address of a server: /right, /wrong, /endless, and nothing else; `asked` counts."""
+def server(monkeypatch, tmp_path):
+    """A server with pages that a test fills: bytes, a place to go on to, or None that never ends."""
+    pages: dict[str, bytes | str | None] = {}
     asked: list[str] = []
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self):
             asked.append(self.path)
-            if self.path not in ("/right", "/wrong", "/endless"):
+            page = pages.get(self.path, 404)
+            if page == 404:
                 self.send_error(404)
                 return
-            self.send_response(200)
+            self.send_response(302 if isinstance(page, str) else 200)
+            if isinstance(page, str):
+                self.send_header("Location", page)
             self.end_headers()
             try:
-                for _ in range(10_000 if self.path == "/endless" else 1):
-                    self.wfile.write(CONTENT if self.path != "/wrong" else CONTENT[::-1])
+                for _ in range(10_000 if page is None else 1):
+                    self.wfile.write(NETWORK if page is None else page if isinstance(page, bytes) else b"")
             except OSError:
                 pass  # the other side has had enough
 
@@ -39,79 +53,69 @@ def server():
     served = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
     thread = threading.Thread(target=served.serve_forever, kwargs={"poll_interval": 0.01})
     thread.start()
-    yield f"http://127.0.0.1:{served.server_port}", asked
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+    address = f"http://127.0.0.1:{served.server_port}"
+    monkeypatch.setattr(download, "BASES", (f"{address}/first", f"{address}/mirror"))
+    yield pages, asked
     served.shutdown()
     thread.join()
     served.server_close()
 
 
-@pytest.fixture(autouse=True)
-def known(monkeypatch, tmp_path, server) -> None:
-    """Two networks of ours, kept in a cache of this test's own; no proxy on the way to this machine."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
-        monkeypatch.delenv(name, raising=False)
-    digest = hashlib.sha256(CONTENT).hexdigest()
-    networks = {
-        "open": KnownNetwork("open", "a test's", "tf-pose", digest, len(CONTENT), f"{server[0]}/right"),
-        "homeless": KnownNetwork("homeless", "a test's", "tf-pose", digest, len(CONTENT), None),
-    }
-    monkeypatch.setattr(download, "known_networks", lambda: networks)
-
-
-def test_a_network_is_fetched_once_and_only_when_asked(server):
-    asked = server[1]
-    with pytest.raises(InputError, match=r"has not been fetched yet; add --download to fetch 0\.1 MB once"):
-        find_network("open")
+def test_a_network_is_fetched_once_when_asked_and_is_the_same_ever_after(server):
+    pages, asked = server
+    pages[f"/first/{FILE}"] = archive(("2023/pose/end2end.onnx", NETWORK), ("2023/pose/detail.json", b"{}"))
+    with pytest.raises(InputError, match="rtmpose-m: it has not been fetched yet; --download rtmpose-m does so"):
+        named_file(NAME)
     assert asked == [] and not cache_folder().exists()
-    told = []
-    file = find_network("open", download=True, progress=lambda done, total: told.append((done, total)))
-    assert file.read_bytes() == CONTENT
-    assert told[-1] == (len(CONTENT), len(CONTENT))
-    assert find_network("open") == find_network("open", download=True) == file
-    assert asked == ["/right"]
+    said, told = [], []
+    file = named_file(NAME, fetch=True, say=said.append, progress=lambda done, total: told.append((done, total)))
+    assert file.read_bytes() == NETWORK and told[-1][0] == len(pages[f"/first/{FILE}"])
+    digest = hashlib.sha256(NETWORK).hexdigest()
+    assert said == [f"rtmpose-m: sha256 {digest} is pinned in {cache_folder() / 'rtmpose-m.sha256'}"]
+    assert named_file(NAME, say=said.append) == named_file(NAME, fetch=True, say=said.append) == file
+    assert len(said) == 1 and asked == [f"/first/{FILE}"]
+    # A file that was changed, and another that comes in its place.
     file.write_bytes(b"damaged")
-    with pytest.raises(InputError, match="add --download"):
-        find_network("open")
+    with pytest.raises(InputError, match=rf"the sha256 of the file is .*, and {digest} was pinned at first use"):
+        named_file(NAME)
+    file.unlink()
+    pages[f"/first/{FILE}"] = archive(("end2end.onnx", NETWORK[::-1]))
+    with pytest.raises(InputError, match=r"the sha256 of what came is .* was pinned at first use; if that"):
+        named_file(NAME, fetch=True)
+    assert not file.exists()
+    (cache_folder() / "rtmpose-m.sha256").unlink()
+    assert named_file(NAME, fetch=True).read_bytes() == NETWORK[::-1]
 
 
-def test_a_file_is_taken_as_it_is(tmp_path, server):
-    file = tmp_path / "my.onnx"
-    file.write_bytes(b"mine")
-    assert find_network(str(file), download=True) == file
-    assert server[1] == []
+def test_the_mirror_is_asked_where_the_first_address_fails(server):
+    server[0][f"/mirror/{FILE}"] = archive(("end2end.onnx", NETWORK))
+    assert named_file(NAME, fetch=True).read_bytes() == NETWORK
+    assert [path.split("/")[1] for path in server[1]] == ["first", "mirror"]
 
 
-@pytest.mark.parametrize("path, problem", [
-    ("/wrong", r"what came \(102400 bytes\) is not the network open, its checksum differs; nothing was kept"),
-    ("/endless", r"what came \(more than 102400 bytes\) is not the network open"),
-    ("/nothing", "cannot be fetched .*404"),
+@pytest.mark.parametrize("page, problem", [
+    (b"<html>", "File is not a zip file"),
+    (archive(("end2end.onnx", NETWORK))[:-30], "File is not a zip file"),
+    (archive(("other.onnx", NETWORK)), "it holds 0 files end2end.onnx"),
+    (archive(("a/end2end.onnx", NETWORK), ("../../end2end.onnx", NETWORK)), "it holds 2 files end2end.onnx"),
+    (archive(("end2end.onnx", bytes(10_000_000))), "its end2end.onnx has over 1000000 bytes"),
+    (None, "it has no end"),
+    ("http://127.0.0.1:9/elsewhere", "leads on to http://127.0.0.1:9/elsewhere, which is not https"),
+    ("file:///etc/passwd", "302"),
 ])  # fmt: skip
-def test_what_is_not_the_network_is_not_kept(server, path, problem):
-    with pytest.raises(InputError, match=problem):
-        find_network("open", download=True, address=server[0] + path)
+def test_what_is_not_a_network_is_not_kept(server, monkeypatch, page, problem):
+    monkeypatch.setattr(download, "MOST_BYTES", 1_000_000)
+    server[0][f"/first/{FILE}"] = server[0][f"/mirror/{FILE}"] = page
+    with pytest.raises(InputError, match=f"cannot be fetched from .*{problem}.*; fetch it by hand"):
+        named_file(NAME, fetch=True)
     assert not cache_folder().exists()
 
 
-def test_an_address_may_be_named_where_none_is_known(server):
-    with pytest.raises(InputError, match="no public address of this file is known; name one"):
-        find_network("homeless", download=True)
-    assert find_network("homeless", download=True, address=f"{server[0]}/right").read_bytes() == CONTENT
-
-
-@pytest.mark.parametrize("address", ["file:///etc/passwd", "ftp://127.0.0.1/x", "right", "http://127.0.0.1:1/x"])
-def test_other_addresses_are_refused(address):
-    with pytest.raises(InputError, match=r"must be an address that begins with https|cannot be fetched"):
-        find_network("open", download=True, address=address)
-
-
-def test_names_that_are_not_known_are_listed():
-    with pytest.raises(InputError, match="there is no such file, and no network of this name; named networks are"):
-        find_network("clever")
-
-
-def test_the_networks_that_ship_have_checksums_and_layouts():
-    for network in known_networks().values():
-        assert len(bytes.fromhex(network.sha256)) == 32
-        assert network.bytes > 1000
-        assert network.address is None or network.address.startswith("https://")
+def test_the_named_networks_are_rtmlib_s():
+    assert all(base.startswith("https://") for base in BASES)
+    for network in named_networks().values():
+        assert network.file.endswith(".zip") and "/" not in network.file
+        assert network.boxes is None or named_networks()[network.boxes].boxes is None

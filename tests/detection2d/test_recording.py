@@ -1,6 +1,7 @@
 """Painted people through the whole of `detect` but the network, which is a function here."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,8 +11,7 @@ import pytest
 import shapepose_fg.detection2d.recording as recording
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.detection2d.detector import CameraDetector
-from shapepose_fg.detection2d.recording import DetectionRun, run_detection
+from shapepose_fg.detection2d.recording import CameraDetector, DetectionRun, run_detection
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.io.footage.footage import open_footage
 from shapepose_fg.io.footage.lockstep import CameraClock, align
@@ -54,23 +54,24 @@ def pictures(rolled_rig, apart, tmp_path_factory) -> Path:
 
 
 def run_of(rig: Rig, pictures: Path, output: Path, network, long_side: int = 640) -> DetectionRun:
+    network = replace(network, long_side=long_side)
     footage = [open_footage(pictures / name) for name in rig.names]
     placements = [Placement(PlacementKind.SAME, each.size, each.size) for each in footage]
     detectors = [
-        CameraDetector.of(camera, rig.up_vector, placement, network, long_side)
-        for camera, placement in zip(rig.cameras, placements, strict=True)
+        CameraDetector.of(camera, rig.up_vector, each, placement, network)
+        for camera, each, placement in zip(rig.cameras, footage, placements, strict=True)
     ]
     clocks = [CameraClock(name, np.arange(FRAMES) / 25, 1 / 25) for name in rig.names]
-    return DetectionRun(rig, footage, detectors, align(clocks, True), output)
+    return DetectionRun(detectors, align(clocks, True), output)
 
 
 def test_joints_are_found_where_each_lens_puts_them(rolled_rig, apart, pictures, tmp_path, painted_network):
     """Read by our own reader, undistorted, against the projection; one camera is rolled by 30 degrees."""
     told = []
     run = run_of(rolled_rig, pictures, tmp_path, painted_network)
-    report = run_detection(run, lambda done, total: told.append((done, total)))
+    _, unreadable = run_detection(run, lambda done, total: told.append((done, total)))
     assert told[-1] == (3 * FRAMES, 3 * FRAMES)
-    assert report.unreadable == (0, 0, 0)
+    assert unreadable == [0, 0, 0]
     table = read_detections(tmp_path, rolled_rig)
     assert len(table) == FRAMES and table.skeleton.name == "BODY_25"
     for frame in range(FRAMES):
@@ -107,9 +108,9 @@ def test_a_stopped_run_goes_on_to_the_same_end(rolled_rig, pictures, tmp_path, p
     assert [path.name for path in parted.iterdir()] == ["unfinished"]
     seen = []
     run = run_of(rolled_rig, pictures, parted, painted_network)
-    for footage in run.footage:
-        at = footage.at
-        footage.at = lambda place, at=at: seen.append(place) or at(place)
+    for camera in run.cameras:
+        at = camera.footage.at
+        camera.footage.at = lambda place, at=at: seen.append(place) or at(place)
     run_detection(run)
     assert min(seen) == 2  # frames 0 and 1 were kept
     for name in ("a.txt", "b.txt", "c.txt", "times.csv", FOOTAGE):
@@ -122,11 +123,13 @@ def test_runs_do_not_mix(rolled_rig, pictures, tmp_path, painted_network):
 
     with pytest.raises(Stopped):
         run_detection(run_of(rolled_rig, pictures, tmp_path, painted_network), stop)
-    with pytest.raises(InputError, match="a run with other settings was stopped here; start it as it was"):
+    with pytest.raises(
+        InputError, match="a run that differs in its detection was stopped here; start it as it was"
+    ):
         run_detection(run_of(rolled_rig, pictures, tmp_path, painted_network, long_side=320))
     moved = tmp_path / "moved"
     shutil.copytree(pictures, moved)
-    with pytest.raises(InputError, match="a run with other videos or cameras was stopped"):
+    with pytest.raises(InputError, match="a run that differs in its cameras was stopped"):
         run_detection(run_of(rolled_rig, moved, tmp_path, painted_network))
     run_detection(run_of(rolled_rig, pictures, tmp_path, painted_network))
     with pytest.raises(InputError, match=r"a\.txt: there are detections already; delete them"):
@@ -142,8 +145,8 @@ def test_where_a_picture_cannot_be_read_nobody_is_seen(rolled_rig, pictures, tmp
     spoilt = tmp_path / "spoilt"
     shutil.copytree(pictures, spoilt)
     (spoilt / "b" / "002.png").write_bytes(b"\x89PNG but no more")
-    report = run_detection(run_of(rolled_rig, spoilt, tmp_path / "out", painted_network))
-    assert report.unreadable == (0, 1, 0)
+    _, unreadable = run_detection(run_of(rolled_rig, spoilt, tmp_path / "out", painted_network))
+    assert unreadable == [0, 1, 0]
     table = read_detections(tmp_path / "out", rolled_rig)
     assert 1 not in table[2].view and {0, 2} <= set(table[2].view.tolist())
     assert 1 in table[1].view
@@ -151,7 +154,5 @@ def test_where_a_picture_cannot_be_read_nobody_is_seen(rolled_rig, pictures, tmp
 
 def test_no_camera_s_name_leads_out_of_the_folder(rolled_rig):
     """Its detections are a file called so: the camera itself is refused."""
-    from dataclasses import replace
-
     with pytest.raises(ValueError, match="must not lead out of a folder"):
         replace(rolled_rig.cameras[0], name="../a")

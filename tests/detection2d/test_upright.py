@@ -3,11 +3,9 @@ import numpy as np
 import pytest
 
 from shapepose_fg.core.camera import Camera
-from shapepose_fg.detection2d.networks import layouts
 from shapepose_fg.detection2d.upright import UprightView, roll_of
 from shapepose_fg.viz.rendering import look_at
 
-LAYOUT = layouts()["tf-pose"]
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -21,7 +19,7 @@ def rolled(degrees: float, eye=(4.0, 0.5, 1.8)) -> Camera:
 @pytest.mark.parametrize("degrees", [-170, -90, -26, 0, 13, 45, 90, 150])
 def test_what_is_up_in_the_world_is_up_in_the_turned_picture(degrees):
     camera = rolled(degrees)
-    view = UprightView.of((-0.5, -0.5, 639.5, 479.5), roll_of(camera, UP), 656, LAYOUT)
+    view = UprightView.of((-0.5, -0.5, 639.5, 479.5), roll_of(camera, UP), 656, 16)
     xy, _ = camera.project(np.array([[0, 0, 1.0], [0, 0, 1.1]]))
     low, high = xy @ view.input_from_picture[:, :2].T + view.input_from_picture[:, 2]
     across, up = high[0] - low[0], low[1] - high[1]
@@ -33,9 +31,9 @@ def test_what_is_up_in_the_world_is_up_in_the_turned_picture(degrees):
 
 def test_a_little_roll_is_left_and_a_camera_that_looks_down_is_not_turned():
     region = (-0.5, -0.5, 639.5, 479.5)
-    assert UprightView.of(region, 3.0, 656, LAYOUT).turn_deg == 0
-    assert UprightView.of(region, 88.0, 656, LAYOUT).turn_deg == 90
-    assert UprightView.of(region, 12.0, 656, LAYOUT).turn_deg == 12
+    assert UprightView.of(region, 3.0, 656, 16).turn_deg == 0
+    assert UprightView.of(region, 88.0, 656, 16).turn_deg == 90
+    assert UprightView.of(region, 12.0, 656, 16).turn_deg == 12
     assert roll_of(rolled(40, eye=(0.01, 0.0, 5.0)), UP) == 0.0
 
 
@@ -44,7 +42,7 @@ def test_a_little_roll_is_left_and_a_camera_that_looks_down_is_not_turned():
 def test_a_dot_of_the_input_is_where_it_is_in_the_picture(degrees, only_size):
     """Through a region of the picture, as letterboxed pictures have it; in both directions."""
     region = (29.5, 19.5, 1229.5, 819.5)
-    view = UprightView.of(region, degrees, 656, LAYOUT, only_size)
+    view = UprightView.of(region, degrees, 656, 16, only_size)
     assert only_size is None or view.size == only_size
     for x, y in ((60, 40), (700, 444), (1200, 800)):
         picture = np.zeros((860, 1280, 3), dtype=np.uint8)
@@ -54,12 +52,11 @@ def test_a_dot_of_the_input_is_where_it_is_in_the_picture(degrees, only_size):
         weight = shown[..., 0].astype(float) * (shown[..., 0] > 60)  # the mean colour outside is dark
         rows, columns = np.indices(weight.shape)
         middle = np.array([(columns * weight).sum(), (rows * weight).sum()]) / weight.sum()
-        cell = (middle + 0.5) / 8 - 0.5
         # Half a pixel of the input is a pixel of the picture.
-        np.testing.assert_allclose(view.picture_from_cells(cell[None])[0], [x, y], atol=1.0)
+        np.testing.assert_allclose(view.picture_from_input(middle), [x, y], atol=1.0)
 
 
 def test_inside_is_the_region():
-    view = UprightView.of((9.5, -0.5, 99.5, 49.5), 0.0, 128, LAYOUT)
+    view = UprightView.of((9.5, -0.5, 99.5, 49.5), 0.0, 128, 16)
     xy = np.array([[9.0, 10], [10, 10], [99, 49], [100, 10], [50, 50]])
     assert view.inside(xy).tolist() == [False, True, True, False, False]

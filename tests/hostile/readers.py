@@ -19,7 +19,7 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.observation_table import ObservationTable
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25, COCO_17
-from shapepose_fg.detection2d.onnx_file import read_onnx
+from shapepose_fg.detection2d.opening import read_form
 from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
 from shapepose_fg.evaluation.other_results import read_people
 from shapepose_fg.io.calibration import read_rig, write_rig
@@ -152,15 +152,11 @@ def _batch(folder: Path, seed: int) -> Read:
 
 
 def _network(folder: Path, seed: int) -> Read:
-    """A graph in a node's attribute, and a tensor in each."""
-
-    def field(number: int, content: bytes) -> bytes:
-        return bytes([number << 3 | 2, len(content)]) + content
-
-    tensor = field(9, bytes(40)) + bytes([2 << 3, 1])
-    inside = field(6, field(5, tensor))
-    (folder / "n.onnx").write_bytes(field(7, field(5, tensor) + field(1, field(5, inside))))
-    return lambda: read_onnx(folder / "n.onnx")
+    """A network's TOML file; of the ONNX files that it names nothing is read yet."""
+    lines = ['network = "pose.onnx"', 'skeleton = "COCO_17"', 'decoding = "heat map"', "size = [192, 256]"]
+    lines += ['joints = ["Nose", "", "LHip"]', "mean = [0.0, 1, 2]", "std = [58.4, 57.1, 57.4]", "[boxes]"]
+    (folder / "n.toml").write_text("\n".join([*lines, 'network = "boxes.onnx"', "min_score = 0.5", ""]))
+    return lambda: read_form(folder / "n.toml")
 
 
 def _corrections(folder: Path, seed: int) -> Read:

@@ -178,10 +178,8 @@ def _capture(path: Path) -> Any:
         capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
     finally:
         cv2.utils.logging.setLogLevel(level)
-        if before is None:
-            del os.environ[_READ_OPTIONS]
-        else:
-            os.environ[_READ_OPTIONS] = before
+        os.environ.pop(_READ_OPTIONS)
+        os.environ.update({} if before is None else {_READ_OPTIONS: before})
     if not capture.isOpened():
         raise InputError(f"{path}: not a video that can be read; give another copy, or convert it to H.264 in MP4")
     return capture

@@ -124,21 +124,19 @@ def align(clocks: Sequence[CameraClock], has_clock: bool) -> Lockstep:
         )
     nearest = [_nearest(each, moment) for each in clocks]
     picture = np.column_stack([place for place, _ in nearest])
-    notes, misfits = list[str](), list[str]()
+    notes = list[str]()
     for each, (place, off) in zip(clocks, nearest, strict=True):
-        left_out = _left_out(each, place, slowest)
-        if left_out:
-            notes.append(
-                f"camera {each.name}: frames that another camera has no picture for were left out, {left_out}"
-            )
         missing, misfit = np.flatnonzero(place < 0), 1e3 * off[place >= 0]
+        if left_out := _left_out(each, place, slowest):
+            what = "frames that another camera has no picture for were left out"
+            notes.append(f"camera {each.name}: {what}, {left_out}")
         if len(missing) > 0:
             notes.append(
                 f"camera {each.name}: no picture within half a frame of {len(missing)} of {len(moment)} moments"
                 f" (the first is frame {missing[0]}); it sees no people there"
             )
         if has_clock and misfit.max(initial=0.0) > 1e3 * _MISFIT_S:
-            misfits.append(
+            notes.append(
                 f"camera {each.name}: pictures are up to {misfit.max():.1f} ms from the moment they stand"
                 f" for ({misfit.mean():.1f} ms in the mean)"
             )
@@ -146,7 +144,7 @@ def align(clocks: Sequence[CameraClock], has_clock: bool) -> Lockstep:
     if has_clock:
         taken = [np.where(picture[:, v] >= 0, each.time[picture[:, v]], moment) for v, each in enumerate(clocks)]
         time_s = np.column_stack(taken)
-    return Lockstep(picture, time_s, (*notes, *misfits))
+    return Lockstep(picture, time_s, tuple(notes))
 
 
 def _nearest(clock: CameraClock, moment: Array) -> tuple[Index, Array]:

@@ -1,7 +1,6 @@
 """Where the pictures of a result are, and which of them belongs to which of its frames."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,45 +17,36 @@ _MOST_FRAMES = 10_000_000
 """No recording is as long: numbers in the names of pictures that are not those of frames."""
 
 
-@dataclass(frozen=True)
-class Wanted:
-    """Which pictures are wanted."""
-
-    drawn: Sequence[str]
-    """Of which cameras."""
-    videos: Sequence[str] | None = None
-    """Where they are, as `find_footage` takes it; None for those that `detect` says it read."""
-    detections: Path | None = None
-    """The folder where it says so; None for that beside the detections, of results that have no copy of it."""
-    image_placement: Sequence[str] = ()
-    """How those of another size than the calibration's came about, as `placements_of` takes it."""
-
-
 def pictures_of(
     run: Mapping[str, Any],
     rig: Rig,
-    wanted: Wanted,
+    drawn: Sequence[str],
+    videos: Sequence[str] | None = None,
+    detections: Path | None = None,
+    image_placement: Sequence[str] = (),
     open_one: Callable[[str, Path], Footage] = lambda _, path: open_footage(path),
     tell: Callable[[str], None] = print,
 ) -> list[tuple[CameraFootage, Footage]]:
-    """The pictures that are wanted, and which belongs to which frame; InputError where they are missing.
+    """The pictures of the cameras `drawn`, and which belongs to which frame; InputError where they are missing.
 
-    `run` is what the result's run.json says. `open_one` opens the pictures of a camera, by its name; `tell` is
-    given what was taken to be what.
+    `run` is what the result's run.json says. They are in `videos`, as `find_footage` takes it, or where `detect`
+    says in the folder `detections`, or beside what the result was made from. `image_placement` is how those of
+    another size than the calibration's came about, as `placements_of` takes it. `open_one` opens the pictures of a
+    camera, by its name; `tell` is given what was taken to be what.
     """
-    used = {each.name: each for each in _used_footage(run, wanted.detections)}
-    unknown = [name for name in wanted.drawn if name not in used]
+    used = {each.name: each for each in _used_footage(run, detections)}
+    unknown = [name for name in drawn if name not in used]
     notes: list[str] = []
-    if wanted.videos is not None:
-        places, notes = find_footage(wanted.videos, wanted.drawn)
-        paths = dict(zip(wanted.drawn, places, strict=True))
+    if videos is not None:
+        places, notes = find_footage(videos, drawn)
+        paths = dict(zip(drawn, places, strict=True))
     elif len(unknown) > 0:
         raise InputError(
             f"nothing says where the pictures of camera {unknown[0]} are; give --videos, or with --detections the"
             " folder that `shapepose-fg detect` wrote"
         )
     else:
-        paths = {name: used[name].path for name in wanted.drawn}
+        paths = {name: used[name].path for name in drawn}
     for name, path in paths.items():
         if not path.exists():
             raise InputError(f"{path}: the pictures of camera {name} are not there any more; give --videos")
@@ -65,7 +55,7 @@ def pictures_of(
     alike = {
         name: used[name].placement
         for name, each in opened.items()
-        if name in used and used[name].placement.picture_size == each.size and not wanted.image_placement
+        if name in used and used[name].placement.picture_size == each.size and not image_placement
     }
     for name, placement in alike.items():
         size = rig.cameras[rig.names.index(name)].image_size
@@ -76,7 +66,7 @@ def pictures_of(
                 f" result is for {ours}; give --detections with the folder of this result, or --image-placement"
             )
     sizes = {name: each.size for name, each in opened.items() if name not in alike}
-    placements, concluded = placements_of(wanted.image_placement, sizes, rig)
+    placements, concluded = placements_of(image_placement, sizes, rig)
     notes += concluded
     if len(unknown) > 0:
         first = run.get("numbered_from")
@@ -117,5 +107,5 @@ def _used_footage(run: Mapping[str, Any], detections: Path | None) -> list[Camer
         return read_used_footage(file)
     inputs = run.get("inputs")
     texts = [Path(str(each)) for each in (inputs if isinstance(inputs, dict) else ())]
-    files = [each.parent / FOOTAGE for each in texts if each.suffix == ".txt"]
+    files = [each.parent / FOOTAGE for each in texts if each.suffix in (".txt", ".json")]
     return next((read_used_footage(file) for file in files if file.is_file()), [])

@@ -15,7 +15,7 @@ from shapepose_fg.io.export.registry import read_take
 from shapepose_fg.io.export.rerun_app import new_stream
 from shapepose_fg.io.export.rerun_log import log_pictures, undistorting
 from shapepose_fg.io.footage.placement import Placement, PlacementKind
-from shapepose_fg.viz.overlay.result_pictures import Wanted, pictures_of
+from shapepose_fg.viz.overlay.result_pictures import pictures_of
 
 from .conftest import FIRST
 
@@ -80,7 +80,7 @@ def test_pictures_are_logged_in_their_frames(filmed, result, tmp_path, capsys):
     rerun = pytest.importorskip("rerun")
     take = read_take(filmed, frames=range(FIRST, FIRST + 3))
     assert take.rig is not None
-    pictures = pictures_of(take.people.run, take.rig, Wanted(["cam0"], [f"cam0={filmed / 'cam0'}"]), opened)
+    pictures = pictures_of(take.people.run, take.rig, ["cam0"], [f"cam0={filmed / 'cam0'}"], open_one=opened)
     stream, told = new_stream(), []
     stream.save(tmp_path / "pictures.rrd")
     log_pictures(stream, take, pictures, lambda done, total: told.append((done, total)))
@@ -108,7 +108,7 @@ def test_pictures_whose_numbers_are_no_frames_are_refused(filmed):
     assert take.rig is not None
     (filmed / "cam0" / f"{FIRST + 1:06d}.png").rename(filmed / "cam0" / "20261122061.png")
     with pytest.raises(InputError, match="pictures are numbered from 0 to 20261122061; number them by the frames"):
-        pictures_of({}, take.rig, Wanted(["cam0"], [f"cam0={filmed / 'cam0'}"]))
+        pictures_of({}, take.rig, ["cam0"], [f"cam0={filmed / 'cam0'}"])
 
 
 @pytest.mark.parametrize(

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.detection2d import onnx_file as onnx_file_reader
-from shapepose_fg.detection2d.network import HeatMapNetwork
-from shapepose_fg.detection2d.networks import layouts
+from shapepose_fg.detection2d import onnx_network
+from shapepose_fg.detection2d.heat_maps import HeatMapNetwork, layouts
 from tests.detection2d.conftest import blob, onnx_file, varint
 
 
@@ -42,7 +41,10 @@ def test_body_25_is_told_by_its_channels_and_coco_must_be_named(tmp_path):
     network = HeatMapNetwork.load(onnx_file(tmp_path / "n.onnx", means(78)))
     assert network.layout.name == "openpose-body25"
     coco = onnx_file(tmp_path / "coco.onnx", means(57))
-    with pytest.raises(InputError, match=r"gives 57 channels.*give --layout tf-pose or openpose-coco"):
+    with pytest.raises(
+        InputError,
+        match=r"makes 1 x 57 x 8 x 8 numbers of 64 x 64 pixels, which several.*--layout tf-pose or openpose-coco",
+    ):
         HeatMapNetwork.load(coco)
     assert HeatMapNetwork.load(coco, "openpose-coco").layout.offset == -0.5
 
@@ -51,7 +53,7 @@ def test_onnxruntime_keeps_to_the_size_that_the_file_fixes(tmp_path):
     pytest.importorskip("onnxruntime", reason="onnxruntime is an extra: shapepose-fg[detect]")
     file = onnx_file(tmp_path / "n.onnx", means(78), fixed=(32, 64))
     network = HeatMapNetwork.load(file, backend="onnxruntime")
-    assert network.only_size == (64, 32)
+    assert network.network.size == (64, 32)
     assert network.run(np.zeros((32, 64, 3), np.uint8)).shape == (78, 4, 8)
 
 
@@ -59,7 +61,7 @@ def test_onnxruntime_keeps_to_the_size_that_the_file_fixes(tmp_path):
 def test_what_is_no_such_network_is_said(tmp_path, backend):
     if backend == "onnxruntime":
         pytest.importorskip("onnxruntime", reason="onnxruntime is an extra: shapepose-fg[detect]")
-    with pytest.raises(InputError, match="there is no such file; give the ONNX file"):
+    with pytest.raises(InputError, match="there is no such file"):
         HeatMapNetwork.load(tmp_path / "no.onnx", backend=backend)
     with pytest.raises(InputError, match="this is a folder"):
         HeatMapNetwork.load(tmp_path, backend=backend)
@@ -69,22 +71,24 @@ def test_what_is_no_such_network_is_said(tmp_path, backend):
         with pytest.raises(InputError, match=re.escape(str(cut))):
             HeatMapNetwork.load(cut, backend=backend)
     other = onnx_file(tmp_path / "other.onnx", means(7))
-    with pytest.raises(InputError, match=r"gives 7 channels, .*give --layout another network"):
+    with pytest.raises(
+        InputError, match=r"makes 1 x 7 x 8 x 8 numbers.* no layout known.*give another network, or --boxes"
+    ):
         HeatMapNetwork.load(other, backend=backend)
-    with pytest.raises(InputError, match=r"makes 1 x 7 x 8 x 8 numbers.*expects 1 x 57 x 8 x 8"):
+    with pytest.raises(InputError, match=r"makes 1 x 7 x 8 x 8 numbers.* no layout known does"):
         HeatMapNetwork.load(other, "tf-pose", backend)
-    with pytest.raises(InputError, match="--layout mine: not known; known are tf-pose"):
+    with pytest.raises(InputError, match="--layout mine: there is no such layout; give one of tf-pose"):
         HeatMapNetwork.load(other, "mine", backend)
 
 
 def test_a_file_that_is_too_large_is_not_read(tmp_path, monkeypatch):
     file = onnx_file(tmp_path / "n.onnx", means(78))
-    monkeypatch.setattr(onnx_file_reader, "MOST_BYTES", file.stat().st_size)
-    assert onnx_file_reader.read_onnx(file) == file.read_bytes()
+    monkeypatch.setattr(onnx_network, "MOST_BYTES", file.stat().st_size)
+    assert HeatMapNetwork.load(file).layout.channels == 78
     with file.open("ab") as stream:
         stream.truncate(2**40)  # a hole: takes no room on the disk
     monkeypatch.undo()
-    with pytest.raises(InputError, match=r"over 512 MiB are too much for a network of this kind"):
+    with pytest.raises(InputError, match=r"over 512 MiB are too much for such a file"):
         HeatMapNetwork.load(file)
 
 
@@ -98,21 +102,15 @@ def test_weights_in_other_files_are_refused_wherever_they_stand(tmp_path):
     file, whole = tmp_path / "n.onnx", onnx_file(tmp_path / "whole.onnx", means(78)).read_bytes()
     for model in models:
         file.write_bytes(whole + model)
-        with pytest.raises(
-            InputError, match=r"its weights lie in another file \('\.\./\.\./etc/passwd'\); give a"
-        ):
+        with pytest.raises(InputError, match="its weights lie in another file; give a network that holds them"):
             HeatMapNetwork.load(file)
 
 
-def test_graphs_without_end_are_no_network(tmp_path, monkeypatch):
+def test_graphs_without_end_are_no_network(tmp_path):
     file, graph = tmp_path / "n.onnx", b""
     for _ in range(200):
         graph = blob(1, blob(5, blob(6, graph)))
     file.write_bytes(blob(7, graph))
-    with pytest.raises(InputError, match="not an ONNX network"):
-        HeatMapNetwork.load(file)
-    monkeypatch.setattr(onnx_file_reader, "_MOST_FIELDS", 1000)
-    file.write_bytes(blob(7, 1001 * varint(3, 1)))
     with pytest.raises(InputError, match="not an ONNX network"):
         HeatMapNetwork.load(file)
 

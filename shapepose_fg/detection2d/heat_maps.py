@@ -1,0 +1,136 @@
+"""Networks of OpenPose's kind: heat maps and part affinity fields of a whole picture."""
+
+import json
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.detection2d.decoding import Candidates, decode
+from shapepose_fg.detection2d.onnx_network import Backend, Blob, OnnxNetwork, words
+from shapepose_fg.detection2d.upright import UprightView
+from shapepose_fg.io.detections.association_text import TEXT_SKELETONS, TextSkeleton
+from shapepose_fg.io.write_detections import association_lines
+
+_STRIDE, _MULTIPLE = 8, 16
+"""Pixels of the input per cell of the output, along each axis; what both sides of the input are multiples of."""
+_TRIAL = (64, 64)
+"""(width, height) of the empty picture that a new network is tried on."""
+_LONG_SIDE = 656
+
+
+@dataclass(frozen=True)
+class NetworkLayout:
+    """What a network takes, and which joints and limbs its output has, one after the other (`decode`)."""
+
+    name: str
+    """What it is called."""
+    text: TextSkeleton
+    """The joints and limbs, in order."""
+    scale: float
+    """The input is `scale` * colour + `offset`, with colours (blue, green, red) from 0 to 255."""
+    offset: float
+    """See `scale`."""
+    sha256: str = ""
+    """Checksum of a known network that has it."""
+
+    @property
+    def channels(self) -> int:
+        """How many channels the output has."""
+        return len(self.text.joints) + 1 + 2 * len(self.text.limbs)
+
+
+@lru_cache(maxsize=1)
+def layouts() -> dict[str, NetworkLayout]:
+    """All layouts by name."""
+    table = json.loads((files("shapepose_fg.detection2d") / "data" / "layouts.json").read_text(encoding="utf-8"))
+    return {
+        name: NetworkLayout(name, text=TEXT_SKELETONS[entry.pop("text")], **entry) for name, entry in table.items()
+    }
+
+
+@dataclass(frozen=True)
+class HeatMapNetwork:
+    """A network that makes heat maps and part affinity fields of a picture; they are made people later, in 3D."""
+
+    network: OnnxNetwork
+    """What is run."""
+    layout: NetworkLayout
+    """How its output is to be read."""
+    long_side: int = _LONG_SIDE
+    """The longer side of its input, pixels: more finds smaller people, and takes longer."""
+    suffix, tail = ".txt", ""
+
+    @classmethod
+    def load(
+        cls,
+        file: str | Path,
+        layout: str | None = None,
+        backend: Backend | None = None,
+        device: str = "cpu",
+        long_side: int | None = None,
+    ) -> "HeatMapNetwork":
+        """The network in the ONNX `file`. `layout` names one of `layouts()`; without it the file must tell.
+
+        On the CPU OpenCV runs it, at any size, unless `backend` says otherwise. InputError where the file is
+        missing, is no ONNX network, or does not fit the layout.
+        """
+        every = layouts()
+        if layout not in (None, *every):
+            raise InputError(f"--layout {layout}: there is no such layout; give one of {' '.join(every)}")
+        network = OnnxNetwork.open(file, backend or ("opencv" if device == "cpu" else "onnxruntime"), device)
+        width, height = network.size or _TRIAL
+        shape = network.run(np.zeros((1, 3, height, width), dtype=np.float32))[0].shape
+        fitting = [each for each in every.values() if layout in (None, each.name)]
+        cells = (height // _STRIDE, width // _STRIDE)
+        fitting = [each for each in fitting if shape == (1, each.channels, *cells)]
+        fitting = [each for each in fitting if each.sha256 == network.sha256] or fitting
+        if len(fitting) != 1:
+            which = "no layout known does; give another network, or --boxes with RTMPose and its like"
+            if len(fitting) > 1:
+                which = f"several layouts do; give --layout {' or '.join(each.name for each in fitting)}"
+            raise InputError(
+                f"{file}: it makes {words(shape)} numbers of {width} x {height} pixels, which {which}"
+            )
+        return cls(network, fitting[0], long_side or _LONG_SIDE)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What its detections depend on."""
+        network = {"sha256": self.network.sha256, "layout": self.layout.name}
+        return {"network": network, "detection": {"long_side": self.long_side}}
+
+    def head(self, frames: int) -> str:
+        """The beginning of 4D Association's text."""
+        return f"{self.layout.text.number} {frames}\n"
+
+    def text(self, number: int, found: Any, size: tuple[int, int]) -> str:
+        """A frame in it: `Candidates` in a picture of the calibrated `size`, None where there was no picture."""
+        if found is None:
+            return "0\n" * len(self.layout.text.joints)
+        fractions = found.xy / (np.array(size) - 1.0)
+        lines = association_lines(
+            self.layout.text, found.joint, fractions, found.score, found.pairs, found.affinity
+        )
+        return "".join(f"{line}\n" for line in lines)
+
+    def view(self, region: tuple[float, float, float, float], roll_deg: float) -> UprightView:
+        """What it is shown of pictures with such a region and roll."""
+        return UprightView.of(region, roll_deg, self.long_side, _MULTIPLE, self.network.size)
+
+    def run(self, picture: NDArray[np.uint8]) -> Blob:
+        """The output (C, H / 8, W / 8) of a `picture` (H, W, 3), blue green red; its sides are multiples of 16."""
+        blob = np.ascontiguousarray(picture.transpose(2, 0, 1)[None], dtype=np.float32)
+        if (self.layout.scale, self.layout.offset) != (1.0, 0.0):
+            blob = blob * np.float32(self.layout.scale) + np.float32(self.layout.offset)
+        return self.network.run(blob)[0][0]
+
+    def detect(self, picture: NDArray[np.uint8]) -> Candidates:
+        """Candidates in a `picture` (H, W, 3) of the view's size, in its pixels."""
+        found = decode(self.run(picture), self.layout.text)
+        return replace(found, xy=(found.xy + 0.5) * _STRIDE - 0.5)

@@ -1,0 +1,144 @@
+"""A network in an ONNX file from outside, read within bounds and run by OpenCV or by onnxruntime."""
+
+import hashlib
+import os
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import read_bytes
+
+Backend = Literal["opencv", "onnxruntime"]
+"""What runs the network."""
+Blob = NDArray[np.float32]
+"""What it takes and gives."""
+PROVIDERS = {"cpu": "CPU", "cuda": "CUDA", "rocm": "ROCM", "coreml": "CoreML", "directml": "Dml"}
+"""onnxruntime's names of devices."""
+MOST_BYTES = 2**29
+"""Networks of people's joints have 2 to 400 MB."""
+_BATCH = 32
+"""Pictures at once: a crowd fills no memory."""
+_ELSEWHERE = re.compile(rb"(?:\x0a|\x8a\x80*\0)(?:\x08|\x88\x80*\0)location")
+"""How protobuf writes the key under which a tensor says which file its numbers are in: field 1, 8 bytes; both
+numbers may be spelt with zeros behind."""
+
+
+@dataclass(frozen=True)
+class OnnxNetwork:
+    """A network that takes pictures and gives arrays."""
+
+    file: Path
+    """Where it lies, for messages."""
+    sha256: str
+    """Checksum of its file."""
+    forward: Callable[[Blob], list[Blob]]
+    """All its outputs for pictures (B, 3, height, width)."""
+    size: tuple[int, int] | None = None
+    """(width, height) that the file fixes; None where it takes pictures of any."""
+    inputs: tuple[str, ...] = ()
+    """The inputs' names, where they are known."""
+    outputs: tuple[str, ...] = ()
+    """The outputs' names, where they are known."""
+    at_once: int = 1
+    """Pictures that it takes at once, at most."""
+
+    @classmethod
+    def open(cls, file: str | Path, backend: Backend = "onnxruntime", device: str = "cpu") -> "OnnxNetwork":
+        """The network in `file`; `device` is one of `PROVIDERS`, "cuda:1" its second.
+
+        InputError where the file is missing, no network or too large, where the device is not there, and where
+        weights lie in other files: their paths are looked up wherever this program runs, and may lead anywhere.
+        """
+        file = Path(file)
+        content = read_bytes(file, MOST_BYTES)
+        if b"location" in content and _ELSEWHERE.search(content):
+            raise InputError(
+                f"{file}: its weights lie in another file; give a network that holds them itself, as"
+                " onnx.save_model(onnx.load(FILE), NEW) writes it"
+            )
+        run_by = _with_opencv if backend == "opencv" else _with_onnxruntime
+        return cls(file, hashlib.sha256(content).hexdigest(), *run_by(file, content, device))
+
+    def run(self, pictures: Blob) -> list[Blob]:
+        """All outputs for pictures (B, 3, height, width); InputError where it cannot be run on such."""
+        try:
+            return self.forward(pictures)
+        except Exception as error:
+            raise InputError(
+                f"{self.file}: it cannot be run on {words(pictures.shape)} numbers ({_first_line(error)});"
+                " give one that takes pictures, 1 x 3 x height x width; RTMPose and its like need --boxes"
+            ) from None
+
+
+def _with_opencv(file: Path, content: bytes, device: str) -> tuple[Any, ...]:
+    """`forward` of the network run by OpenCV's dnn, on the CPU, which takes pictures of any size."""
+    try:
+        net = cv2.dnn.readNetFromONNX(np.frombuffer(content, dtype=np.uint8))
+        empty = net.empty()
+    except cv2.error as error:
+        raise InputError(f"{file}: not an ONNX network that OpenCV can read ({error.err.strip()[:160]})") from None
+    if empty:
+        raise InputError(f"{file}: not an ONNX network; give the ONNX file of a network")
+
+    def forward(pictures: Blob) -> list[Blob]:
+        net.setInput(pictures)
+        return [np.asarray(net.forward(), dtype=np.float32)]
+
+    return (forward,)
+
+
+def _with_onnxruntime(file: Path, content: bytes, device: str) -> tuple[Any, ...]:
+    """`forward` and what follows in `OnnxNetwork`, by onnxruntime; on the CPU on as many threads as OpenCV has."""
+    try:
+        onnxruntime: Any = import_module("onnxruntime")
+    except ImportError:
+        raise InputError(
+            f'{file}: the package onnxruntime runs it, which is missing; pip install "shapepose-fg[detect]"'
+        ) from None
+    kind, _, number = device.partition(":")
+    provider, there = f"{PROVIDERS.get(kind)}ExecutionProvider", onnxruntime.get_available_providers()
+    if provider not in there or not (number or "0").isdecimal():
+        known = " ".join(name for name, each in PROVIDERS.items() if f"{each}ExecutionProvider" in there)
+        raise InputError(
+            f"--device {device}: the onnxruntime that is installed has {known}; install its package for the device"
+        )
+    options: Any = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = min(cv2.getNumThreads(), os.cpu_count() or 1)
+    options.log_severity_level = 4
+    try:
+        providers = [(provider, {"device_id": number} if number else {})]
+        session: Any = onnxruntime.InferenceSession(content, options, providers=providers)
+    except Exception as error:
+        raise InputError(f"{file}: not an ONNX network that onnxruntime can read ({_first_line(error)})") from None
+    if provider not in session.get_providers():  # it goes on with the CPU in silence
+        raise InputError(f"--device {device}: the device cannot be used; check its driver, or leave --device out")
+    takes = session.get_inputs()
+    if len(takes) != 1:
+        raise InputError(f"{file}: the network takes {len(takes)} inputs; give one that takes pictures alone")
+    shape = [side if type(side) is int else None for side in takes[0].shape]
+    batch, _, height, width = shape if len(shape) == 4 else (1, 3, None, None)
+
+    def forward(pictures: Blob) -> list[Blob]:
+        return [np.asarray(each, dtype=np.float32) for each in session.run(None, {takes[0].name: pictures})]
+
+    size = None if height is None or width is None else (width, height)
+    names = [tuple(each.name for each in ends) for ends in (takes, session.get_outputs())]
+    return forward, size, *names, _BATCH if batch is None else 1
+
+
+def words(shape: Sequence[int]) -> str:
+    """An array's shape in words."""
+    return " x ".join(map(str, shape))
+
+
+def _first_line(error: BaseException) -> str:
+    """The first line of a library's message, short."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0][:160]

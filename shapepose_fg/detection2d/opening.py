@@ -1,0 +1,97 @@
+"""A network by its name, its ONNX file or its TOML file, ready to detect."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.skeleton import SKELETONS
+from shapepose_fg.core.storage.files import read_toml
+from shapepose_fg.detection2d.boxes import BoxForm, BoxNetwork
+from shapepose_fg.detection2d.download import NamedNetwork, named_networks
+from shapepose_fg.detection2d.heat_maps import HeatMapNetwork
+from shapepose_fg.detection2d.onnx_network import OnnxNetwork
+from shapepose_fg.detection2d.top_down import KeypointForm, TopDownNetwork
+from shapepose_fg.io.skeleton_file import find_skeleton
+from shapepose_fg.io.validation import validated
+
+Network = HeatMapNetwork | TopDownNetwork
+"""What finds joints in upright pictures. Each says what it is shown of a picture (`view`), what it finds in that
+(`detect`), how a file says it (`suffix`, `head`, `text`, `tail`), and what it depends on (`settings`)."""
+
+
+def open_network(
+    network: str, boxes: str | None, named_file: Callable[[str], Path], device: str = "cpu", **openpose: Any
+) -> Network:
+    """What `network` is: an ONNX file, a network's TOML file, or a name that `named_file` finds.
+
+    `boxes` is an ONNX file or a name of what finds people, in place of the network's own; an ONNX file without is
+    of OpenPose's kind, and `openpose` what else `HeatMapNetwork.load` takes. InputError, one sentence.
+    """
+    named = _named("--network", network)
+    if network.endswith(".toml"):
+        form = read_form(Path(network))
+    elif named is None and boxes is None:
+        return HeatMapNetwork.load(network, device=device, **openpose)
+    elif named is None:
+        form = KeypointForm(network=network)
+    elif named.boxes is None:
+        raise InputError(f"--network {network}: it finds people, not their joints; name it with --boxes")
+    else:
+        form, boxes = KeypointForm(network=str(named_file(network)), size=named.size), boxes or named.boxes
+    for name in (name for name, value in openpose.items() if value is not None):
+        raise InputError(f"--{name.replace('_', '-')} is for networks of OpenPose's kind; leave it out")
+    people = form.boxes
+    if boxes is not None:
+        named = _named("--boxes", boxes)
+        people = BoxForm(network=str(named_file(boxes)), size=named.size) if named else BoxForm(network=boxes)
+    opened = None
+    if people is not None:
+        opened = OnnxNetwork.open(people.network, device=device)
+        opened = BoxNetwork(opened, people.model_copy(update={"size": opened.size or people.size}))
+        opened.find(np.zeros((64, 64, 3), dtype=np.uint8))
+    keypoints = OnnxNetwork.open(form.network, device=device)
+    for name, there in (form.input, keypoints.inputs), *((each, keypoints.outputs) for each in form.outputs or ()):
+        if name is not None and name not in there:
+            raise InputError(f"{network}: the network has no {name!r}, but {' '.join(there)}; name that instead")
+    form = form.model_copy(update={"size": keypoints.size or form.size})
+    return TopDownNetwork.of(keypoints, form, find_skeleton(form.skeleton), opened)
+
+
+def _named(option: str, name: str) -> NamedNetwork | None:
+    """The network of a name; None where it is a file, InputError where it is neither."""
+    named = named_networks()
+    if Path(name).is_file():
+        return None
+    if name not in named:
+        names = " ".join(named)
+        raise InputError(f"{option} {name}: there is no such file, and no network of this name; names are {names}")
+    return named[name]
+
+
+def read_form(path: Path) -> KeypointForm:
+    """What a network's TOML file says, with paths that are found from its folder.
+
+    InputError, one sentence that names the file, the key and the cure.
+    """
+    form = validated(KeypointForm, read_toml(path), path, "docs/detection.md describes the file")
+    found = {"network": _beside(path, "network", form.network)}
+    if form.skeleton is not None and form.skeleton not in SKELETONS:
+        found["skeleton"] = _beside(path, "skeleton", form.skeleton)
+    boxes = form.boxes
+    if boxes is not None:
+        boxes = boxes.model_copy(update={"network": _beside(path, "boxes.network", boxes.network)})
+    return form.model_copy(update={**found, "boxes": boxes})
+
+
+def _beside(path: Path, key: str, name: str) -> str:
+    """A file in the folder of the TOML file, or below it."""
+    try:
+        found = path.parent / name
+        if name and found.resolve().is_relative_to(path.parent.resolve()):
+            return str(found)
+    except (OSError, RuntimeError, ValueError):  # links in a circle, a zero byte
+        pass
+    raise InputError(f"{path}: {key} {name[:80]!r} must be a file in the same folder; put it there and name it")

@@ -1,0 +1,242 @@
+"""People one by one, as RTMPose and its like see them: boxes around people, and the joints of whoever is in each.
+
+Boxes and joints are those of `rtmlib` to a hundredth of a pixel (tests/detection2d/test_against_rtmlib.py).
+"""
+
+import json
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+
+from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.skeleton import SKELETONS, Skeleton
+from shapepose_fg.detection2d.boxes import BoxForm, BoxNetwork, Side
+from shapepose_fg.detection2d.decoding import between_cells
+from shapepose_fg.detection2d.onnx_network import Blob, OnnxNetwork, words
+from shapepose_fg.detection2d.upright import UprightView
+
+_Three = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+_Above0 = Annotated[FiniteFloat, Field(gt=0)]
+_AXES = {"simcc": [3, 3], "heat map": [4], "coordinates": [3]}
+"""How many axes the outputs of each decoding have."""
+
+
+class KeypointForm(BaseModel):
+    """How a network of keypoints is to be read: a TOML file, RTMPose's kind where it says nothing else."""
+
+    model_config = ConfigDict(extra="forbid")
+    network: str = ""
+    """Its ONNX file."""
+    skeleton: str | None = None
+    """One of `SKELETONS`, or a skeleton's TOML file; None where the number of joints tells."""
+    joints: list[str] | None = None
+    """What each joint of the network is called in the skeleton, "" for none; None for its keypoints in order."""
+    decoding: Literal["simcc", "heat map", "coordinates"] = "simcc"
+    """What it gives: for each joint two curves, along x and along y; a map; or x, y and score."""
+    input: str | None = None
+    """The name of its input; None for whichever it has."""
+    outputs: list[str] | None = None
+    """Names of its outputs that are read: x and y of SimCC, otherwise one; None for the first ones."""
+    size: tuple[Side, Side] = (192, 256)
+    """(width, height) of its input, where the ONNX file does not fix it."""
+    colours: Literal["bgr", "rgb"] = "bgr"
+    """Their order. RTMPose was trained on the other; so is it run by rtmlib, and by everybody since."""
+    mean: _Three = (123.675, 116.28, 103.53)
+    """Taken off colours from 0 to 255, in their order."""
+    std: tuple[_Above0, _Above0, _Above0] = (58.395, 57.12, 57.375)
+    """Colours are divided by this then."""
+    cells: Literal["corners", "edges"] = "corners"
+    """Whether the outer cells of a heat map have their centres on the input's outer pixels, or fill it."""
+    scale: tuple[FiniteFloat, FiniteFloat] = (1.0, 1.0)
+    """Pixels of the input per unit of coordinates, x and y."""
+    padding: Annotated[FiniteFloat, Field(ge=1, le=4)] = 1.25
+    """How much larger than its box the network is shown a person."""
+    boxes: BoxForm | None = None
+    """What finds people; None where it is shown whole pictures."""
+
+
+@dataclass(frozen=True)
+class People:
+    """People of one picture, whose joints the network grouped."""
+
+    xy: Array
+    """(P, K, 2) positions, in the order of the skeleton's keypoints."""
+    score: Array
+    """(P, K) as the network gives them; 0 or less is a joint that was not seen."""
+
+    def __len__(self) -> int:
+        return int((self.score > 0).sum())
+
+    def moved(self, xy: Array, inside: Mask) -> "People":
+        """The same at other positions; those that are not `inside` (P, K) are left out."""
+        return replace(self, xy=xy, score=np.where(inside, self.score, 0.0))
+
+
+@dataclass(frozen=True)
+class TopDownNetwork:
+    """Boxes, and a network that finds the joints of the person in each."""
+
+    network: OnnxNetwork
+    """What finds joints."""
+    form: KeypointForm
+    """How it is to be read."""
+    skeleton: Skeleton
+    """Whose joints it finds."""
+    place: Index
+    """(N,) which of the skeleton's K keypoints each joint of the network is, -1 for none."""
+    boxes: BoxNetwork | None
+    """What finds people; None where the network is shown whole pictures."""
+    suffix, tail = ".json", "\n]\n"
+
+    @classmethod
+    def of(
+        cls, network: OnnxNetwork, form: KeypointForm, skeleton: Skeleton | None, boxes: BoxNetwork | None
+    ) -> "TopDownNetwork":
+        """Tried on an empty picture: InputError where the network does not fit its description."""
+        count = _decoded(network, form, np.zeros((1, 3, *form.size[::-1]), dtype=np.float32))[1].shape[1]
+        skeleton = skeleton or next((each for each in SKELETONS.values() if each.keypoint_count == count), None)
+        if skeleton is None:
+            raise InputError(
+                f"{network.file}: no skeleton known here has {count} joints; name one in a network's TOML file"
+            )
+        keypoints = range(len(skeleton)) if skeleton.keypoints is None else skeleton.keypoints
+        names = ["" if joint < 0 else skeleton.joints[joint] for joint in keypoints]
+        listed = names if form.joints is None else form.joints
+        if wrong := [name for name in listed if name and (name not in names or listed.count(name) > 1)]:
+            raise InputError(
+                f"{network.file}: joints has {wrong[0]!r}, which must be a keypoint of {skeleton.name}, once"
+                f' ({" ".join(filter(None, names))}), or ""'
+            )
+        if len(listed) != count:
+            raise InputError(
+                f"{network.file}: the network finds {count} joints, {len(listed)} are named ({skeleton.name});"
+                " name its skeleton, or its joints, in a TOML file"
+            )
+        place = np.array([names.index(name) if name else -1 for name in listed], dtype=np.intp)
+        return cls(network, form, skeleton, place, boxes)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What the detections depend on."""
+        said = [
+            part
+            and {"sha256": part.network.sha256, **part.form.model_dump(mode="json", exclude={"network", "boxes"})}
+            for part in (self, self.boxes)
+        ]
+        return {"network": said[0], "detection": {"boxes": said[1]}}
+
+    def head(self, frames: int) -> str:
+        """The beginning of MMPose's JSON of a video."""
+        return "["
+
+    def text(self, number: int, found: Any, size: tuple[int, int]) -> str:
+        """Frame `number` in it: `People`, None where there was no picture. Joints that were not seen are 0 0 0."""
+        people = []
+        for xy, score in zip(found.xy, found.score, strict=True) if found else ():
+            if (seen := score > 0).any():
+                xy, score = np.where(seen[:, None], xy, 0.0).round(3), np.where(seen, score, 0.0).round(6)
+                people.append({"keypoints": xy.tolist(), "keypoint_scores": score.tolist()})
+        return f"{',' if number else ''}\n{json.dumps({'frame_id': number, 'instances': people}, allow_nan=False)}"
+
+    def view(self, region: tuple[float, float, float, float], roll_deg: float) -> UprightView:
+        """What it is shown of pictures with such a region and roll: as many pixels as there are."""
+        return UprightView.of(region, roll_deg)
+
+    def detect(self, picture: NDArray[np.uint8]) -> People:
+        """The people in a `picture` (H, W, 3), blue green red, in its pixels."""
+        size, padding = np.array(self.form.size, dtype=np.float64), 1.0
+        boxes = np.array([[0.0, 0.0, picture.shape[1], picture.shape[0]]])
+        if self.boxes is not None:
+            boxes, padding = self.boxes.find(picture), self.form.padding
+        centre, extent = (boxes[:, :2] + boxes[:, 2:]) / 2, (boxes[:, 2:] - boxes[:, :2]) * padding
+        aspect, (wide, high) = float(size[0] / size[1]), extent.T
+        extent = np.where(wide > high * aspect, [wide, wide / aspect], [high * aspect, high]).T
+        count, step = self.skeleton.keypoint_count, self.network.at_once
+        positions, scores = [np.zeros((0, count, 2))], [np.zeros((0, count))]
+        for n in range(0, len(boxes), step):
+            middle, sides = centre[n : n + step], extent[n : n + step]
+            crops = [_crop(picture, *each, size) for each in zip(middle, sides, strict=True)]
+            xy, score = self._joints(np.stack(crops))
+            # A network of whole pictures may find several people in each.
+            middle, sides = (np.repeat(each, len(xy) // len(crops), axis=0)[:, None] for each in (middle, sides))
+            positions.append((xy / size - 0.5) * sides + middle)
+            scores.append(score)
+        return People(np.concatenate(positions), np.concatenate(scores))
+
+    def _joints(self, crops: NDArray[np.uint8]) -> tuple[Array, Array]:
+        """Positions (P, K, 2) in pixels of `crops` (B, H, W, 3), and scores (P, K).
+
+        P is B, or a multiple where the network finds several people in each. What was not found, or is no number,
+        has a score of 0.
+        """
+        ordered = crops if self.form.colours == "bgr" else crops[..., ::-1]
+        blob = ((ordered - np.array(self.form.mean)) / np.array(self.form.std)).transpose(0, 3, 1, 2)
+        xy, score = _decoded(self.network, self.form, np.ascontiguousarray(blob, dtype=np.float32))
+        found = np.zeros((len(xy), self.skeleton.keypoint_count, 3))
+        known = np.flatnonzero(self.place >= 0)
+        found[:, self.place[known]] = np.dstack([xy, score])[:, known]
+        found[~np.isfinite(found).all(axis=2)] = 0
+        return found[..., :2], found[..., 2]
+
+
+def _crop(picture: NDArray[np.uint8], centre: Array, extent: Array, size: Array) -> NDArray[np.uint8]:
+    """What is in a frame around `centre` (2,) with the sides `extent` (2,), at the `size` (2,) of the network.
+
+    It is black outside of the picture.
+    """
+    # By the three points that rtmlib takes, rounded as there: others would make other pixels here and there.
+    points = np.array([[centre, centre], [size / 2, size / 2]])
+    points[:, 1, 1] -= extent[0] / 2, size[0] / 2
+    points = points.astype(np.float32)
+    beside = points[:, 1] + (points[:, 1] - points[:, 0])[:, ::-1] * np.array([1, -1], dtype=np.float32)
+    matrix = cv2.getAffineTransform(*np.concatenate([points, beside[:, None]], axis=1))
+    crop = cv2.warpAffine(picture, matrix, (int(size[0]), int(size[1])), flags=cv2.INTER_LINEAR)
+    return np.asarray(crop, dtype=np.uint8)
+
+
+def _decoded(network: OnnxNetwork, form: KeypointForm, blob: Blob) -> tuple[Array, Array]:
+    """Positions (P, N, 2) of the network's joints in pixels of its input, and scores (P, N)."""
+    outputs, axes = network.run(blob), _AXES[form.decoding]
+    if form.outputs is not None:
+        outputs = [outputs[network.outputs.index(name)] for name in form.outputs]
+    read = [each.astype(np.float64) for each in outputs[: len(axes)]]
+    if form.decoding == "coordinates" and read[0].ndim == 4:  # several people of each picture
+        read = [read[0].reshape(-1, *read[0].shape[2:])]
+    shapes = [each.shape for each in read]
+    if (
+        [*map(len, shapes)] != axes
+        or not all(map(all, shapes))
+        or shapes[0][0] % len(blob) != 0
+        or shapes[0][:2] != shapes[-1][:2]
+        or (form.decoding == "coordinates" and shapes[0][2] not in (2, 3))
+    ):
+        raise InputError(
+            f"{network.file}: the network gives {' and '.join(words(each.shape) for each in outputs)}, which is no"
+            f" {form.decoding}; describe it in a TOML file (docs/detection.md)"
+        )
+    size = np.array(blob.shape[:1:-1])
+    if form.decoding == "simcc":
+        split = np.array([each.shape[2] for each in read]) / size
+        score = np.mean([each.max(axis=2) for each in read], axis=0)
+        return np.dstack([each.argmax(axis=2) for each in read]) / split, score
+    if form.decoding == "heat map":
+        return _peaks(read[0], size, form.cells == "corners")
+    (found,) = read
+    return found[..., :2] * form.scale, found[..., 2] if shapes[0][2] == 3 else np.ones(shapes[0][:2])
+
+
+def _peaks(maps: Array, size: Index, corners: bool) -> tuple[Array, Array]:
+    """Pixels (B, N, 2) and heights (B, N) of the highest places of maps (B, N, H, W), between the cells."""
+    shape = np.array(maps.shape[:1:-1])
+    flat = np.nan_to_num(maps, nan=0.0, posinf=0.0, neginf=0.0).reshape(-1, *maps.shape[2:])
+    row, column = np.divmod(flat.reshape(len(flat), -1).argmax(axis=1), shape[0])
+    padded = np.pad(flat, ((0, 0), (1, 1), (1, 1)), constant_values=-np.inf)
+    cell, height = between_cells(padded, np.arange(len(flat)), row + 1, column + 1)
+    cell -= 1
+    pixel = cell * (size - 1) / np.maximum(shape - 1, 1) if corners else (cell + 0.5) * size / shape - 0.5
+    return pixel.reshape(*maps.shape[:2], 2), height.reshape(maps.shape[:2])
