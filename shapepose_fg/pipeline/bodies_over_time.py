@@ -14,8 +14,9 @@ from shapepose_fg.body.fitting.weights import fingerprint
 from shapepose_fg.body.model.soles import above_floor
 from shapepose_fg.body.shapes import SubjectShapes, recognise
 from shapepose_fg.core.arrays import Array, Whole
+from shapepose_fg.core.errors import naming
 from shapepose_fg.core.reconstruction import BODY, Reconstruction, Status
-from shapepose_fg.core.storage.kept_arrays import InMemory, KeptArrays
+from shapepose_fg.core.storage.kept_arrays import ANEW, InMemory, KeptArrays
 from shapepose_fg.core.storage.schema import Column, columns_of
 from shapepose_fg.estimation.floor import Floor
 
@@ -147,7 +148,9 @@ def fit_everybody(
         """Fit what is not kept yet under these names: so many rows, of whom."""
         there = set(kept.names(""))
         for name in jobs.keys() & there:
-            kept.columns(name, _BODIES, {"N": jobs[name][0]})
+            bodies = kept.columns(name, _BODIES, {"N": jobs[name][0]})
+            with naming(kept.place(name), ANEW):
+                SubjectShapes(np.array([name]), bodies["mean"], bodies["information"], known.body)
         missing = [name for name in jobs if name not in there]
         for name, bodies in zip(missing, fits(jobs[name][1]() for name in missing), strict=True):
             kept.keep(name, bodies)

@@ -136,7 +136,7 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
         if offsets is not None:
             setup = replace(setup, fitter=fitter.with_keypoint_offsets(offsets))
         parts = Parts(kept)
-        parts.check(skeleton.joints, rig.names, frames)
+        parts.check(skeleton.joints, rig.names, frames, times.frame_s)
         done = parts.notes().frames
         windows = SolvedWindows(setup, detections, times, frames, cuts, book)
         with execution.pool(setup, len(frames)) as pool:

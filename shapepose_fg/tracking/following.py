@@ -12,13 +12,14 @@ from shapepose_fg.core.bounds import Seconds, Settings
 from shapepose_fg.core.detections import Input
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.presence import Chosen, own_evidence
 from shapepose_fg.tracking.tracker import Tracker, Tracks
 from shapepose_fg.tracking.worlds import Hypotheses, explained, times_of
 
 BLOCK_S = 3.0
 """People are decided for so long at a time: in some of its frames everybody is seen well."""
-_MOST_FRAMES = 256
+MOST_FRAMES = 256
 """Frames that a block has at the most, whatever the rate: memory."""
 _SAME_M = 0.35
 """Mean distance of core joints up to which somebody is whom another explanation has in the same frame."""
@@ -64,7 +65,7 @@ def follow(
 ) -> tuple[FollowState, list[Decided]]:
     """Take in the next frame; returns the rows of the frames that are decided by it, oldest first."""
     pending = (*state.pending, new)
-    full, lasts_s = len(pending) > _MOST_FRAMES, float(new.time_s.mean() - pending[0].time_s.mean())
+    full, lasts_s = len(pending) > MOST_FRAMES, float(new.time_s.mean() - pending[0].time_s.mean())
     if not full and lasts_s < BLOCK_S + config.look_ahead_s:
         return replace(state, pending=pending), []
     times = times_of(pending)
@@ -90,9 +91,14 @@ def _decide(tracker: Tracker, state: FollowState, own: int) -> tuple[FollowState
     decided = [(frame, _rows(frame, t, found, chosen, identity)) for t, frame in enumerate(frames[:own])]
     last = chosen.during(own - 1) & (identity >= 0)
     who = chosen.hypothesis[last]
-    time_s, zero = float(frames[own - 1].time_s.mean()), np.zeros(len(who), dtype=np.intp)
-    people = Tracks(time_s, identity[last], zero, found.joints.rows(who), np.full(len(who), time_s))
+    people = people_at(frames[own - 1], identity[last], found.joints.rows(who))
     return FollowState(people, next_id, frames[own:]), decided
+
+
+def people_at(frame: Input, ids: Index, joints: JointStates) -> Tracks:
+    """The people `ids` (A,) of a frame that is decided, and where their joints are."""
+    time_s, zero = float(frame.time_s.mean()), np.zeros(len(ids), dtype=np.intp)
+    return Tracks(time_s, ids, zero, joints, np.full(len(ids), time_s))
 
 
 def _with_detections(found: Hypotheses, chosen: Chosen, *, first: bool, last: bool) -> Chosen:
@@ -111,7 +117,7 @@ def alone(tracker: Tracker, given: Input, next_id: int) -> Observations:
     """The people whom stage I finds in a frame that has nothing to do with others, numbered from `next_id` on."""
     none = np.zeros((0, len(tracker.skeleton), len(given.rig)), dtype=np.intp)
     places, candidate = tracker.newcomers(tracker.nobody(), none, given.detections, given.rig)
-    return _observed(given, candidate, places, next_id + np.arange(len(places)))
+    return observed(given, candidate, places, next_id + np.arange(len(places)))
 
 
 def _rows(given: Input, t: int, found: Hypotheses, chosen: Chosen, identity: Index) -> Observations:
@@ -122,11 +128,11 @@ def _rows(given: Input, t: int, found: Hypotheses, chosen: Chosen, identity: Ind
     who = chosen.hypothesis[here]
     own = found.candidate[who, t].astype(np.intp)
     evidence = own_evidence(own, found.weight[who, t], found.price[who, t])
-    return replace(_observed(given, own, found.places[who, t], identity[here]), evidence=evidence)
+    return replace(observed(given, own, found.places[who, t], identity[here]), evidence=evidence)
 
 
-def _observed(given: Input, candidate: Index, places: Array, track: Index) -> Observations:
-    """People at `places` (P, J, 3) with their detections (P, J, V) as rows of a frame."""
+def observed(given: Input, candidate: Index, places: Array, track: Index) -> Observations:
+    """People at `places` (P, J, 3), metres, with their detections (P, J, V) as rows of a frame; -1 for none."""
     return replace(
         Observations.of(candidate, given.detections, places),
         track=track,

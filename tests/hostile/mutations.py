@@ -1,10 +1,15 @@
 """A valid file with something wrong in it: text, numbers, structure, arrays, bytes."""
 
 import io
+import json
 import random
 import re
 import struct
 import zipfile
+from typing import Any
+
+import numpy as np
+import safetensors.numpy
 
 NUMBERS = [
     *"0 -1 1e400 -1e308 1e-320 nan NaN Infinity null true [] {}".split(),
@@ -27,16 +32,23 @@ WORDS = [
     "!!python/object:os.system",
     "<!DOCTYPE a>",
 ]
+VALUES = [0, 1, -1, 3, 0.5, -0.5, 1e-320, 1e9, 1e200, -1e308, 2**31, 2**62, 10**19, float("nan"), float("inf")]
+VALUES += ["", "a", "../../x", "a\0b", "\ud800", "\x1b[31m", "=1+1", True, False, None, [], {}, [[]], {"a": 1}]
 _LARGEST = 2**18
 """Bytes of what comes out: readers are to be tried, not the disk."""
 _TEXT = re.compile(rb"[\t\n\r -~]{64}")
 
 
+@np.errstate(all="ignore")
 def mutated(content: bytes, rng: random.Random) -> bytes:
     """`content` with one to three things changed, as fits what it is."""
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         if content[:2] == b"PK" and rng.random() < 0.9:
             content = _archive(content, rng)
+        elif content[8:10] == b'{"' and rng.random() < 0.8:
+            content = _tensors(content, rng)
+        elif content[:1] in (b"{", b"[") and rng.random() < 0.6:
+            content = _json(content, rng)
         elif _TEXT.match(content) is not None and rng.random() < 0.9:
             content = _text(content.decode("utf-8", "replace"), rng).encode("utf-8", "replace")
         else:
@@ -72,6 +84,35 @@ def _text(text: str, rng: random.Random) -> str:
     return text[: chosen.start()] + new + text[chosen.end() :]
 
 
+def _json(content: bytes, rng: random.Random) -> bytes:
+    """A value of it is another one, taken out, or of another place; still JSON."""
+    try:
+        value = json.loads(content)
+        places: list[tuple[Any, Any]] = []
+        waiting = [value]
+        while len(waiting) > 0:
+            each = waiting.pop()
+            keys = list(each) if isinstance(each, dict) else range(len(each))
+            places += [(each, key) for key in keys]
+            waiting += [each[key] for key in keys if isinstance(each[key], dict | list)]
+        holder, key = rng.choice(places)
+        other, other_key = rng.choice(places)
+        match rng.randrange(5):
+            case 0:
+                del holder[key]
+            case 1:
+                holder[key] = other[other_key]
+            case 2 if isinstance(holder, list):
+                holder.insert(key, holder[key])
+            case 2:
+                holder[rng.choice(WORDS)] = holder[key]
+            case _:
+                holder[key] = rng.choice(VALUES)
+        return json.dumps(value).encode("utf-8", "surrogatepass")
+    except (ValueError, RecursionError, TypeError, IndexError):
+        return _bytes(content, rng)
+
+
 def _archive(content: bytes, rng: random.Random) -> bytes:
     """An `.npz` with one array changed, its checksum right again; or its own bytes changed."""
     try:
@@ -79,11 +120,13 @@ def _archive(content: bytes, rng: random.Random) -> bytes:
             members = {name: archive.read(name) for name in archive.namelist()}
     except Exception:
         return _bytes(content, rng)
-    if len(members) == 0 or rng.random() < 0.15:
+    if len(members) == 0 or rng.random() < 0.08:
         return _bytes(content, rng)
     name = rng.choice(sorted(members))
     if rng.random() < 0.1:
         members[rng.choice((name + "x", "frame.npy", "../x.npy"))] = members.pop(name)
+    elif rng.random() < 0.7:
+        members[name] = _member(members[name], rng)
     elif rng.random() < 0.5:
         members[name] = _header(members[name], rng)
     else:
@@ -92,6 +135,16 @@ def _archive(content: bytes, rng: random.Random) -> bytes:
     with zipfile.ZipFile(stream, "w", rng.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))) as archive:
         for key, value in members.items():
             archive.writestr(key, value)
+    return stream.getvalue()
+
+
+def _member(content: bytes, rng: random.Random) -> bytes:
+    """An array of an archive that is another one."""
+    stream = io.BytesIO()
+    try:
+        np.save(stream, _array(np.load(io.BytesIO(content)), rng))
+    except Exception:  # not an array any more
+        return _bytes(content, rng)
     return stream.getvalue()
 
 
@@ -125,6 +178,49 @@ def _header(array: bytes, rng: random.Random) -> bytes:
         at = 8 * rng.randrange(max(1, len(body) // 8))
         body = body[:at] + kind + body[at + 8 :]
     return head[:128] + body
+
+
+def _tensors(content: bytes, rng: random.Random) -> bytes:
+    """A `.safetensors` with one array, or what is said of them, changed; readable again."""
+    try:
+        arrays = safetensors.numpy.load(content)
+        said = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])["__metadata__"]
+    except Exception:
+        return _bytes(content, rng)
+    if len(arrays) == 0 or rng.random() < 0.2:
+        name = rng.choice(sorted(said))
+        return safetensors.numpy.save(arrays, said | {name: _text(said[name], rng)})
+    name = rng.choice(sorted(arrays))
+    match rng.randrange(7):
+        case 0:
+            del arrays[name]
+        case 1:
+            arrays[rng.choice((name + "x", *sorted(arrays)))] = arrays.pop(name)
+        case _:
+            arrays[name] = _array(arrays[name], rng)
+    return safetensors.numpy.save(arrays, said)
+
+
+def _array(array: np.ndarray, rng: random.Random) -> np.ndarray:
+    """An array cut, doubled, of another type, or with other values."""
+    match rng.randrange(6):
+        case 0:
+            return array.reshape(-1)[: rng.randrange(array.size + 1)]
+        case 1:
+            return np.concatenate([array, array]) if array.ndim > 0 else array[None]
+        case 2 if array.dtype.kind != "U":
+            return array.astype(rng.choice(("<f8", "<i8", "<f4", "u1", "?")))
+        case _ if array.size > 0:
+            array = array.copy()
+            numbers = (0, 1, -1, 3, 255, 2**40, 2**62, 1e-300, 0.5, 1e3, 1e9, 1e200, np.nan, np.inf, -np.inf)
+            where = slice(None) if rng.random() < 0.3 else rng.randrange(array.size)
+            if array.dtype.kind == "U":
+                array.reshape(-1)[where] = rng.choice(WORDS)
+            elif rng.random() < 0.3:
+                array.reshape(-1)[where] = array.reshape(-1)[rng.randrange(array.size)]
+            else:
+                array.reshape(-1)[where] = np.array(rng.choice(numbers)).astype(array.dtype)
+    return array
 
 
 def _bytes(content: bytes, rng: random.Random) -> bytes:

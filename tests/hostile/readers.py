@@ -3,9 +3,9 @@
 import json
 import pickle
 import shutil
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -27,23 +27,24 @@ from shapepose_fg.io.config import read_config, toml_text
 from shapepose_fg.io.corrections import correct, read_corrections, take_back
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.io.export.markers import Markers, opensim_names, trc_text
-from shapepose_fg.io.export.registry import chosen, export_result
+from shapepose_fg.io.export.registry import FORMATS
 from shapepose_fg.io.footage.placement import read_used_footage
 from shapepose_fg.io.pose2sim_project import read_pose2sim_project
 from shapepose_fg.io.skeleton_file import read_skeleton
 from shapepose_fg.io.timestamps import read_timestamps
 from shapepose_fg.pipeline.pipeline import PipelineConfig
+from shapepose_fg.pipeline.solving import Solver
 from shapepose_fg.tracking.edits import Action, Edit
 from shapepose_fg.tracking.listing import list_saved_tracks
 from shapepose_fg.viz.report.writing import report_of
 from tests.core import test_reconstruction as results
+from tests.hostile import runs
+from tests.hostile.trying import Prepare
 from tests.io import test_calibration_formats as rigs
 from tests.io import test_people_formats as people
 
 Read = Callable[[], object]
 """Reads the files; raises InputError, or returns."""
-Prepare = Callable[[Path, int], Read]
-"""Writes valid files into a folder, other ones for another seed, and returns what reads them."""
 
 
 def _calibration(program: str) -> Prepare:
@@ -193,35 +194,19 @@ def _result(folder: Path, seed: int) -> Read:
     return lambda: Reconstruction.load(folder)
 
 
-def _result_for(use: Callable[[Path], object]) -> Prepare:
-    """A result, of which `use` is made in a copy: what is written there is no file to be changed."""
-
-    def prepare(folder: Path, seed: int) -> Read:
-        results.people([0, 0, 3], seed).save(folder)
-        _unpack(folder / "people.npz")
-
-        def read() -> None:
-            with tempfile.TemporaryDirectory() as copy:
-                shutil.copytree(folder, copy, dirs_exist_ok=True)
-                use(Path(copy))
-
-        return read
-
-    return prepare
-
-
-def _exported(folder: Path) -> None:
-    for name in ("csv", "bvh", "c3d"):
-        export_result(folder, chosen([name]), folder / "export", up="z")
-
-
 def _listed(folder: Path) -> None:
     with Reconstruction.open(folder) as opened:
         list_saved_tracks(opened, read_body())
 
 
+def _settings_of(folder: Path) -> None:
+    Solver.read(folder, Reconstruction.load(folder))
+
+
 def _merged(folder: Path) -> None:
-    correct(folder, Edit(Action.MERGE, 0, 2))
+    with Reconstruction.open(folder) as opened:
+        one, other = (np.unique(opened.person).tolist() * 2)[:2]
+    correct(folder, Edit(Action.SWAP, one, other, frame=int(opened.frame[-1])))
     take_back(folder)
 
 
@@ -234,8 +219,7 @@ def _observations(folder: Path, seed: int) -> Read:
 
 
 def _shapes(folder: Path, seed: int) -> Read:
-    betas, information = np.random.default_rng(seed).normal(size=(2, 10)), np.tile(np.eye(10), (2, 1, 1))
-    SubjectShapes(np.array(["a", "b"]), betas, information, "body").save(folder / "shapes.npz")
+    runs.shapes(seed).save(folder / "shapes.npz")
     _unpack(folder / "shapes.npz")
     return lambda: SubjectShapes.load(folder / "shapes.npz", "body")
 
@@ -319,6 +303,12 @@ def _people_trc(folder: Path, seed: int) -> Read:
     return lambda: read_people(folder)
 
 
+PARTS: dict[str, tuple[int, dict[str, Any]]] = {
+    "parts on the way": (2, {}),
+    "parts in chunks": (2, {"chunk_frames": 6}),
+    "parts before the end": (99, {"bodies": True}),
+}
+"""Where a run was stopped: behind so many writes."""
 READERS: dict[str, Prepare] = {
     **{f"cameras of {program}": _calibration(program) for program in rigs.WRITERS},
     **{f"detections of {program}": _people(program) for program in people.WRITERS},
@@ -338,10 +328,22 @@ READERS: dict[str, Prepare] = {
     "offsets": _offsets,
     "motion": _motion,
     "result": _result,
-    "result for export": _result_for(_exported),
-    "result for its report": _result_for(report_of),
-    "result for its tracks": _result_for(_listed),
-    "result for corrections": _result_for(_merged),
+    **{f"result as {name}": runs.finished(runs.exported(name)) for name in FORMATS},
+    "result for its report": runs.finished(report_of),
+    "result for its tracks": runs.finished(_listed),
+    "result for corrections": runs.finished(_merged),
+    "result and its settings": runs.finished(_settings_of),
+    **{
+        f"{what}, {'with digests' if sealed else 'as they are'}": runs.parts_of(writes, sealed=sealed, **options)
+        for what, (writes, options) in PARTS.items()
+        for sealed in (False, True)
+    },
+    "run on its way": runs.unfinished(2),
+    "run in chunks": runs.unfinished(2, chunk_frames=6),
+    "run before its bodies": runs.unfinished(4, bodies=True),
+    "run before its end": runs.unfinished(99, bodies=True),
+    "run with known people": runs.known_people,
+    "detections of a run": runs.detections_kept,
     "observations": _observations,
     "shapes": _shapes,
     "body": _body(False),

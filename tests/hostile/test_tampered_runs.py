@@ -3,7 +3,9 @@
 import json
 import os
 import random
+import re
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,63 +18,33 @@ from shapepose_fg.core.reconstruction import Reconstruction, Status
 from shapepose_fg.core.storage.files import inside
 from shapepose_fg.core.storage.kept_arrays import InFolder
 from shapepose_fg.core.storage.output_folder import only_run_in
-from shapepose_fg.estimation.detector_offsets import OffsetConfig
-from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.pipeline import Task, reconstruct, reconstruct_parts
 from shapepose_fg.pipeline.runs.manifest import open_run
-from shapepose_fg.pipeline.windows import WindowConfig
-from shapepose_fg.simulation import built_in_scene, simulate
-from shapepose_fg.tracking import following
-from shapepose_fg.tracking.following import FollowingConfig
-
-CONFIG = PipelineConfig(
-    batch_frames=6,
-    following=FollowingConfig(look_ahead_s=0.15),
-    windows=WindowConfig(overlap_s=0.1),
-    offsets=OffsetConfig(frames=4),
-)
-
-
-class Ended(BaseException):
-    """A run is stopped from outside."""
-
-
-class Stopping(InFolder):
-    """Parts in a folder; the run is stopped behind so many writes."""
-
-    writes = 5
-
-    def keep(self, name, arrays, about=None) -> None:
-        super().keep(name, arrays, about)
-        self.writes -= 1
-        if self.writes == 0:
-            raise Ended
+from tests.hostile import runs
 
 
 @pytest.fixture(scope="module")
-def task():
-    before, following.BLOCK_S = following.BLOCK_S, 0.2
-    scene = built_in_scene(seed=1, people=2, cameras=3, frames=36)
-    yield Task(simulate(scene, seed=1), scene.rig, CONFIG)
-    following.BLOCK_S = before
+def task() -> Iterator[Task]:
+    with runs.short_blocks():
+        yield runs.task(frames=36)
 
 
 @pytest.fixture(scope="module")
 def stopped(task, tmp_path_factory) -> Path:
     """The parts of a run that was stopped when following stood between two windows, in the middle of a stretch."""
     folder = tmp_path_factory.mktemp("stopped")
-    with pytest.raises(Ended):
-        reconstruct_parts(Stopping(folder), task)
+    with pytest.raises(runs.Ended):
+        reconstruct_parts(runs.Stopping(folder), task)
     assert len(list(folder.glob("part-*"))) >= 2 and len(list(folder.glob("followed-*"))) in (1, 2)
     return folder
 
 
 @pytest.fixture(scope="module")
-def expected(task, tmp_path_factory) -> bytes:
-    """people.npz of the run that nobody touched."""
-    folder = tmp_path_factory.mktemp("expected")
+def whole(task, tmp_path_factory) -> Path:
+    """The parts and the result of the run that nobody touched."""
+    folder = tmp_path_factory.mktemp("whole")
     reconstruct_parts(InFolder(folder / "parts"), task).save(folder)
-    return (folder / "people.npz").read_bytes()
+    return folder
 
 
 @pytest.fixture
@@ -136,17 +108,25 @@ def test_parts_that_changed_places_or_are_of_another_run_are_refused(parts, task
         ("part", "joints", lambda joints: joints * 1e9, "joints must be at most"),
         ("part", "status", lambda status: status + 200, "codes below"),
         ("part", "frame", lambda frame: frame + 10**6, "its rows are not of this run"),
+        ("part", "frame", lambda frame: frame * 0, "its rows are not of this run"),
+        ("part", "person", lambda person: person * 0, "its rows are not of this run"),
+        ("part", "time_s", lambda time_s: time_s * 0 + 0.5, "its rows are not of this run"),
         ("part", "observations.gate", lambda gate: gate * 0, "must agree on what was seen"),
         ("part", "", lambda notes: notes | {"frames": -1}, "notes: frames"),
         ("part", "", lambda notes: [notes], "notes"),
         ("part", "", lambda notes: notes | {"evidence": {"x": 1}}, "notes: evidence"),
         ("followed", "at", lambda at: at * 0 + 10**12, "it goes on at frame 1000000000000"),
         ("followed", "at", lambda at: at.astype(float), "at must hold int64"),
-        ("followed", "people.mean", lambda mean: mean[..., :4], "must be"),
-        ("followed", "people.mean", lambda mean: mean * np.nan, "must be finite"),
-        ("followed", "numbers", lambda numbers: numbers - 10, "must not be negative"),
-        ("followed", "pending.frames", lambda frames: frames + 1, "it goes on at frame"),
-        ("followed", "decided.candidate", lambda candidate: candidate + 10**6, "of other detections"),
+        ("followed", "state.mean", lambda mean: mean[..., :4], "must be"),
+        ("followed", "state.mean", lambda mean: mean * np.nan, "must be finite"),
+        ("followed", "state.covariance", lambda covariance: covariance * 1e200, "covariance must be at most"),
+        ("followed", "state.ids", lambda ids: ids * 0, "different numbers"),
+        ("followed", "state.ids", lambda _: None, "state.ids"),
+        ("followed", "state.numbers", lambda numbers: numbers - 10, "must not be negative"),
+        ("followed", "state.rows", lambda rows: rows[1:], "it goes on at frame|rows are not of its frames"),
+        ("followed", "rows.candidate", lambda candidate: candidate + 10**6, "of other detections"),
+        ("followed", "rows.candidate", lambda candidate: candidate[:, ::-1], "of other detections"),
+        ("followed", "rows.track", lambda _: None, "rows.track"),
         ("keypoint", "xyz_m", lambda xyz: xyz + 10, "none longer than"),
     ],
 )
@@ -154,11 +134,25 @@ def test_what_has_the_right_digests_and_makes_no_sense_is_refused(parts, task, k
     file, kept = first(parts, kind), InFolder(parts)
     arrays, said = contents(file)
     about = json.loads(said["about"])
-    if name:
-        arrays[name] = change(arrays[name])
+    if name and (changed := change(arrays.pop(name))) is not None:
+        arrays[name] = changed
     kept.keep(file.stem, arrays, about if name else change(about))
     text = refused(parts, task)
-    assert sentence in text and file.name in text
+    assert re.search(sentence, text) and file.name in text
+
+
+def test_a_body_whose_shape_is_none_is_refused(task, whole, tmp_path):
+    """Found by scripts/fuzz.py: its digests were right."""
+    kept = InFolder(shutil.copytree(whole / "parts", tmp_path / "parts"))
+    arrays = {name: kept.array("bodies-0", name) for name in kept.keys("bodies-0")}
+    for name, value, sentence in (
+        ("information", -arrays["information"], "positive definite"),
+        ("mean", arrays["mean"] * np.nan, "betas and information must be finite"),
+        ("transl", arrays["transl"][1:], "transl must be"),
+    ):
+        kept.keep("bodies-0", arrays | {name: value})
+        text = refused(kept.folder, task)
+        assert sentence in text and "bodies-0.safetensors" in text
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs a system with pipes in folders")
@@ -175,9 +169,9 @@ def test_a_pipe_or_a_link_among_the_parts_is_refused_at_once(parts, task, tmp_pa
     assert "a link that leads out of its folder" in refused(parts, task)
 
 
-def test_one_flipped_bit_is_the_same_bytes_or_one_sentence(stopped, task, expected, tmp_path):
+def test_one_flipped_bit_is_the_same_bytes_or_one_sentence(stopped, task, whole, tmp_path):
     """And the result that is there already stays, whole, until a whole one takes its place."""
-    rng = random.Random(0)
+    rng, expected = random.Random(0), (whole / "people.npz").read_bytes()
     out = tmp_path / "out"
     people = reconstruct(task.detections, task.rig, task.config, frames=range(6))
     people.save(out)

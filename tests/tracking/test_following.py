@@ -258,7 +258,8 @@ def test_whoever_goes_on_from_a_checkpoint_finds_the_same_bytes(tracker, five_ca
                 assert len(state.pending) > 0 and len(state.people) == (2 if stop > 40 else 0)
                 arrays = checkpoint_arrays(Checkpoint(stop, state=StreamState(state)))
                 first = state.pending[0].frame
-                state = checkpoint_of(arrays, given.__getitem__, first, range(60)).state.follow
+                nobody = Tracks.none(tracker.skeleton)
+                state = checkpoint_of(arrays, given.__getitem__, first, range(60), nobody).state.follow
             state, more = follow(tracker, state, each, FollowingConfig())
             decided += more
         return state, decided + finish(tracker, state)[1]

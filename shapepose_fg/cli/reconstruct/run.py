@@ -19,13 +19,13 @@ from shapepose_fg.cli.reconstruct.ending import check_setup, show_check, summary
 from shapepose_fg.cli.reconstruct.request import OUTPUTS, Prepared
 from shapepose_fg.cli.stopping import Stopped
 from shapepose_fg.cli.terminal import note, progress, show
-from shapepose_fg.core.errors import InputError, failure
+from shapepose_fg.core.errors import InputError, failure, naming
 from shapepose_fg.core.provenance import ReadInputs, checksums, program_digest, versions
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.result_files import PEOPLE, set_aside
 from shapepose_fg.core.run_summary import plain
 from shapepose_fg.core.storage.files import inside, read_text, write_content
-from shapepose_fg.core.storage.kept_arrays import InFolder
+from shapepose_fg.core.storage.kept_arrays import ANEW, InFolder
 from shapepose_fg.core.storage.output_folder import only_run_in, prepare_output
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.corrections import refuse_corrected
@@ -158,7 +158,9 @@ class _Run:
                 note(f"{output}: no run was stopped here; this one begins anew")
         kept = manifest.open_run(output, self.begun(), resume=resume, restart=restart)
         try:
-            return self._finished(kept)
+            # Of what is kept everything may be in order, and yet make no sense.
+            with naming(kept.folder, ANEW) if resume else nullcontext():
+                return self._finished(kept)
         except Stopped as stop:
             raise Stopped(stop.number, self._standing()) from None
         except (OSError, MemoryError, RuntimeError) as error:

@@ -26,14 +26,14 @@ _MOST_DOTS = 100
 _LONG_NUMBER = re.compile(r"\d{19}")
 
 
-def open_regular(path: Path, cure: str = "check the path") -> BinaryIO:
+def open_regular(path: Path, cure: str = "check the path", most: int | None = None) -> BinaryIO:
     """The file at `path`, open for reading bytes.
 
-    InputError where it is missing, unreadable, or no regular file: a pipe would wait for ever, and a device may
-    have no end.
+    InputError where it is missing, unreadable, over `most` bytes, or no regular file: a pipe would wait for ever,
+    and a device may have no end.
     """
     try:
-        _refuse_irregular(path, path.stat().st_mode)
+        _refuse_unusable(path, path.stat(), most)
         # Whatever takes the file's place in between is not waited for.
         flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
         stream = os.fdopen(os.open(path, flags), "rb")
@@ -45,15 +45,17 @@ def open_regular(path: Path, cure: str = "check the path") -> BinaryIO:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
     except ValueError:  # a zero byte
         raise InputError(f"{str(path)!r}: no file has such a name; check the path") from None
-    _refuse_irregular(path, os.fstat(stream.fileno()).st_mode)
+    _refuse_unusable(path, os.fstat(stream.fileno()), most)
     return stream
 
 
-def _refuse_irregular(path: Path, mode: int) -> None:
-    if stat.S_ISDIR(mode):
+def _refuse_unusable(path: Path, status: os.stat_result, most: int | None) -> None:
+    if stat.S_ISDIR(status.st_mode):
         raise InputError(f"{path}: this is a folder; give the file inside it")
-    if not stat.S_ISREG(mode):
+    if not stat.S_ISREG(status.st_mode):
         raise InputError(f"{path}: this is a pipe or a device, no file; write it into a file first")
+    if most is not None:
+        _check_size(path, status.st_size, most)
 
 
 def inside(folder: Path, name: str) -> Path:
@@ -70,15 +72,13 @@ def inside(folder: Path, name: str) -> Path:
 
 def read_bytes(path: Path, most: int = LARGE) -> bytes:
     """What is in the file at `path`; InputError as of `open_regular`, and where it has more than `most` bytes."""
-    with open_regular(path) as stream:
-        check_size(path, os.fstat(stream.fileno()).st_size, most)
+    with open_regular(path, most=most) as stream:
         content = stream.read(most + 1)
-    check_size(path, len(content), most)
+    _check_size(path, len(content), most)
     return content
 
 
-def check_size(path: Path, size: int, most: int) -> None:
-    """InputError where the file at `path` has more than `most` bytes."""
+def _check_size(path: Path, size: int, most: int) -> None:
     if size > most:
         raise InputError(f"{path}: over {most >> 20} MiB are too much for such a file; check the path")
 
@@ -97,12 +97,11 @@ def read_text(path: Path, *, may_be_empty: bool = False, most: int = LARGE) -> s
 def text_pieces(path: Path) -> Iterator[str]:
     """Text of the UTF-8 file at `path` in pieces of up to `PIECE` bytes; InputError as of `read_text`."""
     decoder, at, empty = codecs.getincrementaldecoder("utf-8-sig")(), 0, True
-    with open_regular(path) as stream:
-        check_size(path, os.fstat(stream.fileno()).st_size, LARGE)
+    with open_regular(path, most=LARGE) as stream:
         ended = False
         while not ended:
             read = stream.read(PIECE)
-            check_size(path, at + len(read), LARGE)
+            _check_size(path, at + len(read), LARGE)
             waiting, ended = len(decoder.getstate()[0]), len(read) == 0
             try:
                 text = decoder.decode(read, final=ended)

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import mmap
-import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,7 +14,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from shapepose_fg.core.errors import InputError, naming
-from shapepose_fg.core.storage.files import LARGE, check_size, inside, open_regular, write_content
+from shapepose_fg.core.storage.files import LARGE, inside, open_regular, write_content
 from shapepose_fg.core.storage.schema import Column
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -23,6 +22,8 @@ Arrays = Mapping[str, NDArray[Any]]
 _SUFFIX = ".safetensors"
 ANEW = "begin that run anew with --restart"
 """What to do where a set is damaged."""
+_SAID = {"about", "arrays", "sha256"}
+"""What a file says of itself: what is to be said about the set, digests of the arrays, and one of all this."""
 _ALIGNED = 64
 """Bytes; arrays begin at multiples of it."""
 
@@ -103,7 +104,7 @@ class InFolder(KeptArrays):
 
     def __init__(self, folder: Path, run: str = "") -> None:
         """`run` is the run that they are of: files of another one are refused."""
-        self.folder, self._run = folder, run
+        self.folder, self.run = folder, run
         self._checked: dict[tuple[str, str | None], tuple[int, ...]] = {}
 
     def names(self, prefix: str) -> list[str]:
@@ -139,7 +140,7 @@ class InFolder(KeptArrays):
 
     def _seal(self, name: str, said: Mapping[str, str]) -> str:
         """The digest of all that a file says but for its arrays, whose own digests are in it."""
-        return hashlib.sha256(json.dumps([self._run, name, said["about"], said["arrays"]]).encode()).hexdigest()
+        return hashlib.sha256(json.dumps([self.run, name, said["about"], said["arrays"]]).encode()).hexdigest()
 
     @contextmanager
     def _opened(self, name: str, key: str | None = None) -> Iterator[Any]:
@@ -147,33 +148,29 @@ class InFolder(KeptArrays):
 
         What is wrong with it, now or when it is read, is an InputError.
         """
+        file = self._file(name)
         try:
-            file = inside(self.folder, f"{name}{_SUFFIX}")
-            with open_regular(file, ANEW) as stream:
-                status = os.fstat(stream.fileno())
-            check_size(file, status.st_size, LARGE)
-            stamp = status.st_ino, status.st_size, status.st_mtime_ns
+            status = file.stat() if file.exists() else None
+            stamp = () if status is None else (status.st_ino, status.st_size, status.st_mtime_ns)
+            if self._checked.get((name, None)) != stamp:
+                open_regular(inside(self.folder, file.name), ANEW, LARGE).close()
             with safe_open(file, framework="numpy") as content:
+                said, right = content.metadata() or {}, True
                 if self._checked.get((name, None)) != stamp:
-                    said = content.metadata() or {}
-                    if said.keys() != {"about", "arrays", "sha256"} or said["sha256"] != self._seal(name, said):
-                        raise ValueError(_CHANGED)
-                    self._checked[name, None] = stamp
-                if key is not None and self._checked.get((name, key)) != stamp:
-                    if json.loads(content.metadata()["arrays"])[key] != _digest(key, content.get_tensor(key)):
-                        raise ValueError(_CHANGED)
-                    self._checked[name, key] = stamp
+                    right = said.keys() == {"about", "arrays", "sha256"} and said["sha256"] == self._seal(
+                        name, said
+                    )
+                if right and key is not None and self._checked.get((name, key)) != stamp:
+                    right = json.loads(said["arrays"])[key] == _digest(key, content.get_tensor(key))
+                if not right:
+                    raise ValueError("it is not as it was written, or of another run")
+                self._checked[name, None] = self._checked[name, key] = stamp
                 yield content
         except InputError:
             raise
         except (OSError, SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise InputError(
-                f"{self._file(name)}: a part of an unfinished run cannot be read ({reason}); {ANEW}"
-            ) from None
-
-
-_CHANGED = "it is not as it was written, or of another run"
+            reason = str(error) or type(error).__name__
+            raise InputError(f"{file}: a part of an unfinished run cannot be read ({reason}); {ANEW}") from None
 
 
 def _digest(key: str, array: NDArray[Any]) -> str:

@@ -1,24 +1,24 @@
 """Solved windows, kept one after the other: what a run has done so far, and from where it can go on."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.detections import Input
 from shapepose_fg.core.errors import naming
 from shapepose_fg.core.notes import Notes
 from shapepose_fg.core.observation_table import ObservationTable
-from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Reconstruction, Status
 from shapepose_fg.core.storage.kept_arrays import ANEW, KeptArrays
 from shapepose_fg.core.storage.schema import Column, columns_of
 from shapepose_fg.pipeline.runs.chunks import Border
 from shapepose_fg.pipeline.windows import StreamState
-from shapepose_fg.tracking.following import FollowState
+from shapepose_fg.tracking.following import MOST_FRAMES, FollowState, observed, people_at
 from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.tracker import Tracks
 
@@ -99,8 +99,11 @@ class Parts:
         values = self.kept.array(_name(n), shared if shared in ObservationTable.ROWS[:2] else name)
         return _STATUS[_CODE.checked(name, values, {})] if name == "status" else values
 
-    def check(self, joint_names: Sequence[str], view_names: Sequence[str], frames: range) -> None:
-        """InputError for a part that is none of a run of these joints, views and frames."""
+    def check(self, joint_names: Sequence[str], view_names: Sequence[str], frames: range, frame_s: Array) -> None:
+        """InputError for a part that is none of a run of these joints, views and frames; `frame_s` (T,) are the
+        times of all frames of the recording.
+        """
+        done = frames.start
         for n in range(len(self)):
             with naming(self.kept.place(_name(n)), ANEW):
                 own = {name: self.column(n, OBSERVED + name) for name in ObservationTable.ROWS}
@@ -109,10 +112,12 @@ class Parts:
                 rows = Reconstruction(**own, joint_names=table.joint_names, observations=table)  # type: ignore[arg-type]
                 rows.check_ranges()
                 table.check_ranges()
-                wrong = (rows.frame < frames.start) | (rows.frame >= frames.stop)
                 notes = Notes.from_dict(self.kept.about(_name(n)))
-                if wrong.any() or any(each.joint >= len(joint_names) for each in notes.problems):
+                mine = range(done, min(done + notes.frames, frames.stop))
+                known = all(each.joint < len(joint_names) for each in notes.problems)
+                if not (known and _are_of(rows, mine, frame_s)):
                     raise ValueError("its rows are not of this run")
+                done = mine.stop
 
     def drop(self, n: int) -> None:
         """Forget the rows of a part."""
@@ -134,18 +139,24 @@ class Parts:
         name = self._followed
         if name is None:
             return None
-        keys, (joints, size) = self.kept.keys(name), nobody.joints.mean.shape[1:]
-        columns = {key: column for key, column in _FOLLOWED.items() if key in keys or key == "at"}
+        there = {"at", *(key.partition(".")[0] for key in self.kept.keys(name))}
+        columns = {key: column for key, column in _FOLLOWED.items() if key.partition(".")[0] in there}
+        joints, size = nobody.joints.mean.shape[1:]
         found = self.kept.columns(name, columns, {"J": joints, "S": size})
         with naming(self.kept.place(name), ANEW):
-            return checkpoint_of(found, read, frames.start + self.notes().frames, frames)
+            return checkpoint_of(found, read, frames.start + self.notes().frames, frames, nobody)
+
+
+def _are_of(rows: Reconstruction, frames: range, frame_s: Array) -> bool:
+    """Whether rows are of these frames, at their times, and nobody is twice in one."""
+    if np.any((rows.frame < frames.start) | (rows.frame >= frames.stop)):
+        return False
+    each = np.unique(np.stack([rows.frame, rows.person], axis=1), axis=0)
+    return len(each) == len(rows) and bool((np.abs(rows.time_s - frame_s[rows.frame]) < 1e-6).all())
 
 
 def _name(n: int) -> str:
     return f"part-{n:06d}"
-
-
-_TRACKS = ("ids", "world", "evident_s")
 
 
 def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray[Any]]:
@@ -156,33 +167,33 @@ def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray[Any]]:
     if checkpoint.state is None:
         return arrays
     follow, decided = checkpoint.state.follow, checkpoint.state.decided
-    people = follow.people
-    arrays |= {f"people.{name}": getattr(people, name) for name in _TRACKS}
-    arrays |= {"people.mean": people.joints.mean, "people.covariance": people.joints.covariance}
-    arrays |= {"people.time_s": np.array([people.time_s])}
-    arrays |= {"numbers": np.array([follow.next_id, checkpoint.state.before])}
-    arrays |= {"pending.frames": np.array([given.frame for given in follow.pending], dtype=np.int64)}
-    arrays |= {"decided.frames": np.array([given.frame for given, _ in decided], dtype=np.int64)}
-    arrays |= {"decided.counts": np.array([len(rows) for _, rows in decided], dtype=np.int64)}
-    for name in Observations.ROWS if len(decided) > 0 else ():
-        arrays[f"decided.{name}"] = np.concatenate([getattr(rows, name) for _, rows in decided])
+    arrays |= {"state.numbers": np.array([follow.next_id, checkpoint.state.before])}
+    arrays |= {"state.rows": np.array([len(rows) for _, rows in decided], dtype=np.int64)}
+    arrays |= {"state.ids": follow.people.ids, "state.mean": follow.people.joints.mean}
+    arrays |= {"state.covariance": follow.people.joints.covariance}
+    for name in _ROWS if len(decided) > 0 else ():
+        arrays[f"rows.{name}"] = np.concatenate([getattr(rows, name) for _, rows in decided])
     return arrays
 
 
-_WHOLE = partial(Column, dtype=np.int64, most=2**53)
-_FOLLOWED = {
-    **{"at": _WHOLE("2"), "numbers": _WHOLE("2"), "pending.frames": _WHOLE("P")},
-    **{"decided.frames": _WHOLE("D"), "decided.counts": _WHOLE("D")},
-    **{"people.ids": Column("A", np.intp), "people.world": Column("A", np.intp), "people.evident_s": Column("A")},
-    **{"people.mean": Column("A J S"), "people.covariance": Column("A J S S"), "people.time_s": Column("1")},
-    **{f"border.{name}": column for name, column in columns_of(Border).items()},
-    **{f"decided.{name}": column for name, column in columns_of(Observations).items()},
+_NUMBERS = partial(Column, dtype=np.int64, most=2**53)
+_ROWS = {
+    "track": _NUMBERS("N"),
+    "candidate": Column("N J V", np.intp),
+    "initial": Column("N J 3", most=1e6),
+    "evidence": Column("N", most=1e6),
 }
+"""Of a row that waits to be solved; the rest is what the cameras gave."""
+_FOLLOWED = {"at": _NUMBERS("2"), "state.numbers": _NUMBERS("2"), "state.rows": _NUMBERS("D")}
+_FOLLOWED |= {"state.ids": _NUMBERS("A"), "state.mean": Column("A J S", most=1e6)}
+_FOLLOWED |= {"state.covariance": Column("A J S S", most=1e12)}
+_FOLLOWED |= {f"rows.{name}": column for name, column in _ROWS.items()}
+_FOLLOWED |= {f"border.{name}": column for name, column in columns_of(Border).items()}
 """What `checkpoint_arrays` gives."""
 
 
 def checkpoint_of(
-    arrays: Mapping[str, NDArray[Any]], read: Callable[[int], Input], solved: int, frames: range
+    arrays: Mapping[str, NDArray[Any]], read: Callable[[int], Input], solved: int, frames: range, nobody: Tracks
 ) -> Checkpoint:
     """The checkpoint that `checkpoint_arrays` made the `arrays` of.
 
@@ -190,33 +201,47 @@ def checkpoint_of(
     `frames`. ValueError where the arrays are not of such a run.
     """
     following, next_id = arrays["at"].tolist()
-    if "numbers" not in arrays:
-        if following != solved or (following not in frames and following != frames.stop):
-            raise ValueError(f"it goes on at frame {following}, and the parts end at {solved}")
+    next_track, before = arrays["state.numbers"].tolist() if "state.numbers" in arrays else (0, 0)
+    counts = arrays["state.rows"].tolist() if "state.rows" in arrays else []
+    decided = range(solved - before, solved - before + len(counts))
+    possible = frames.start <= decided.start <= solved <= decided.stop <= following <= frames.stop
+    if not possible or following - decided.stop > (MOST_FRAMES if "state.numbers" in arrays else 0):
+        raise ValueError(f"it goes on at frame {following}, and the parts end at {solved}")
+    if "state.numbers" not in arrays:
         border = Border(*(arrays[f"border.{name}"] for name in Border.ROWS)) if "border.frame" in arrays else None
         return Checkpoint(following, next_id, border=border)
-    next_track, before = arrays["numbers"].tolist()
-    pending, decided_at = arrays["pending.frames"].tolist(), arrays["decided.frames"].tolist()
-    waiting = [*decided_at, *pending]
-    if following not in frames or waiting != list(range(solved - before, following)) or before > len(decided_at):
-        raise ValueError(f"it goes on at frame {following}, and the parts end at {solved}")
-    people = Tracks(
-        time_s=float(arrays["people.time_s"][0]),
-        joints=JointStates(arrays["people.mean"], arrays["people.covariance"]),
-        **{name: arrays[f"people.{name}"] for name in _TRACKS},
-    )
-    if not all(np.isfinite(each).all() for each in (people.joints.mean, people.joints.covariance)):
-        raise ValueError("its tracks must be finite")
-    given, decided = {frame: read(frame) for frame in waiting}, []
-    if len(decided_at) > 0:
-        rows = Observations(**{name: arrays[f"decided.{name}"] for name in Observations.ROWS})
-        if not np.array_equal(rows.frame, np.repeat(arrays["decided.frames"], arrays["decided.counts"])):
-            raise ValueError("its rows are not of its frames")
-        most = np.array([len(given[frame].detections) for frame in rows.frame.tolist()], dtype=np.intp)
-        if (rows.candidate >= most[:, None, None]).any():
-            raise ValueError("its rows are of other detections")
-        cuts = np.cumsum(arrays["decided.counts"])[:-1]
-        parts = [rows.rows(index) for index in np.split(np.arange(len(rows)), cuts)]
-        decided = [(given[frame], part) for frame, part in zip(decided_at, parts, strict=True)]
-    follow = FollowState(people, next_track, tuple(given[frame] for frame in pending))
-    return Checkpoint(following, next_id, StreamState(follow, tuple(decided), before))
+    given = {frame: read(frame) for frame in range(decided.start, following)}
+    rows = {name: arrays.get(f"rows.{name}", np.zeros(0)) for name in _ROWS}
+    if sum(counts) != len(rows["track"]):
+        raise ValueError("its rows are not of its frames")
+    found = []
+    for frame, stop, count in zip(decided, np.cumsum(counts).tolist(), counts, strict=True):
+        own = {name: column[stop - count : stop] for name, column in rows.items()}
+        _check_tracks(own["track"], next_track)
+        _check_candidates(own["candidate"], given[frame])
+        seen = observed(given[frame], own["candidate"], own["initial"], own["track"])
+        found.append((given[frame], replace(seen, evidence=own["evidence"])))
+    people, ids, joints = nobody, arrays["state.ids"], (arrays["state.mean"], arrays["state.covariance"])
+    if len(ids) > 0:
+        _check_tracks(ids, next_track)
+        if not all(np.isfinite(each).all() for each in joints):
+            raise ValueError("its tracks must be finite")
+        last = given[decided.stop - 1] if len(decided) > 0 else read(decided.stop - 1)
+        people = people_at(last, ids, JointStates(*joints))
+    follow = FollowState(people, next_track, tuple(given[frame] for frame in range(decided.stop, following)))
+    return Checkpoint(following, next_id, StreamState(follow, tuple(found), before))
+
+
+def _check_tracks(track: Index, next_id: int) -> None:
+    """ValueError for people of whom one is there twice, or who were not there yet."""
+    if len(np.unique(track)) < len(track) or np.any(track >= next_id):
+        raise ValueError(f"its tracks must be different numbers below {next_id}")
+
+
+def _check_candidates(candidate: Index, given: Input) -> None:
+    """ValueError where `candidate` (N, J, V) are not detections of these joints in these views, or -1."""
+    seen, joint, view = given.detections, *np.nonzero(candidate != -1)[1:]
+    chosen = candidate[candidate != -1]
+    wrong = candidate.shape[2:] != (len(given.rig),) or np.any((chosen < 0) | (chosen >= len(seen)))
+    if wrong or np.any((seen.joint[chosen] != joint) | (seen.view[chosen] != view)):
+        raise ValueError("its rows are of other detections")
