@@ -78,7 +78,7 @@ def learn_offsets(
         fit = fitter.fit_whole(targets, fit)
         sizes = Sizes.of(model)
         far = sizes.far(fit.betas)
-        if far.mean() > _MANY:
+        if np.count_nonzero(far) > _MANY * len(far):
             targets = targets.larger(np.where(far, 1 / sizes.ratio(fit.betas), 1.0))
             fit = fitter.fit_whole(targets)
         if not fit.ok.any():
