@@ -147,15 +147,8 @@ def test_times_cuts_and_time_itself_reach_the_pipeline(recording, pipeline, tmp_
     stamps = tmp_path / "times.csv"
     stamps.write_text("right,left\n" + "".join(f"{0.05 * t},{0.05 * t + 0.01}\n" for t in range(5)))
     (tmp_path / "settings.toml").write_text("temporal = false\n")
-    options = [
-        "--timestamps",
-        str(stamps),
-        "--config",
-        str(tmp_path / "settings.toml"),
-        "--temporal",
-        "--overwrite",
-    ]
-    assert run(*recording, *options) == 0
+    options = ["--timestamps", str(stamps), "--config", str(tmp_path / "settings.toml"), "--temporal"]
+    assert run(*recording, *options, "--overwrite") == 0
     np.testing.assert_allclose(
         pipeline["times"].time_s[:, 0], 0.05 * np.arange(5) + 0.01
     )  # left is first in the rig
@@ -256,6 +249,26 @@ def test_warnings_are_warnings_unless_they_are_to_be_strict(recording, pipeline,
     assert "warning: No camera sees a person" in capsys.readouterr().err
     assert run(*recording, "--strict", "--overwrite") == 1
     assert run(*recording, "--strict", "--overwrite", "--no-check") == 0
+
+
+def test_who_is_lost_says_so_in_one_line_with_the_cause(recording, pipeline, tmp_path, capsys, monkeypatch):
+    """Five frames in which both cameras see four people, and of which two come out, some dropped."""
+    joint = "4 0.1 0.3 0.5 0.7 0.5 0.5 0.5 0.5 1 1 1 1\n"
+    frame = joint * 25 + ("0 " * 16 + "\n") * len(BODY_25.limbs)
+    for name in ("left", "right"):
+        (tmp_path / f"{name}.txt").write_text("4 5\n" + frame * 5)
+    fake = shapepose_fg.cli.reconstruct.run.reconstruct_parts
+
+    def dropping(*arguments):
+        found, why = fake(*arguments), "there too briefly"
+        return found.with_run(people={"dropped": {why: 2}}, dropped_frames={why: [[3, 5]]})
+
+    monkeypatch.setattr(shapepose_fg.cli.reconstruct.run, "reconstruct_parts", dropping)
+    assert run(*recording, "--fps", "25", "--no-check") == 0
+    assert (
+        "lost 2 rows dropped: there too briefly (frames 3-4); two cameras see 4.0 people a frame, and 2.0 are"
+        " found: 0.2 s are too little to be sure of everybody; give more frames, or --no-temporal"
+    ) in " ".join(capsys.readouterr().out.split())
 
 
 def test_one_camera_is_no_recording(recording, pipeline, tmp_path, capsys):

@@ -98,6 +98,17 @@ def test_frames_and_people_are_those_of_the_whole(folder, result):
         opened.frames(0, 1)
 
 
+def test_snippets_for_a_result_in_memory_hold_for_an_open_one(folder, result):
+    """README's and using.md's: columns, rows that a mask chooses."""
+    with Reconstruction.open(folder) as opened:
+        for name in (*Reconstruction.ROWS, "joint_names"):
+            np.testing.assert_array_equal(getattr(opened, name), getattr(result, name))
+        same(opened.rows(opened.status == "ok"), result.rows(result.status == "ok"))
+        same(opened.rows(opened.time_s < 2.0), result.rows(result.frame < 50))
+        with pytest.raises(AttributeError, match="has no attribute 'colour'"):
+            _ = opened.colour
+
+
 def test_rows_in_the_middle_take_the_memory_of_these_rows(folder, result):
     """All rows are over 30 MB; ten of them may take what is unpacked at a time, 4 MB."""
     big = Reconstruction.concatenate(

@@ -22,7 +22,7 @@ from shapepose_fg.setup_check.table import use_table
 
 _SURE = 0.9
 """Whoever is less probable is named."""
-_LOST, _LOST_SHARE = 0.5, 0.2
+_LOST, _LOST_SHARE = 0.5, 0.1
 """So many people a frame, and such a share of them, are missing before it is said."""
 _LOOKED_AT = 200
 """Frames, spread over the recording, in which detections are counted for that."""
