@@ -5,8 +5,8 @@ PIP_ARGS ?=
 BIN := $(VENV)/bin
 # With more processes than this, the solvers' own threads fight over the cores.
 JOBS ?= 2
-# A file's tests share what they have made: one process runs them.
-PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist loadfile
+# One thread each, too. A file's tests share what they have made: one process runs them.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 
 .PHONY: demo test test-all check format benchmark clean
 .DEFAULT_GOAL := demo

@@ -14,6 +14,7 @@ from shapepose_fg.body.fitting.fitters import SmplFitter, make_fitter
 from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.core.skeleton import BODY_25, SMPL_24
+from tests.marks import slow
 
 PEOPLE, FRAMES, FPS = 3, 60, 30.0
 NOISE_M = 0.015
@@ -114,7 +115,7 @@ def test_joints_are_where_they_are(found, truth):
     assert error[~seen].mean() < 150  # half a second without elbow and wrist
 
 
-@pytest.mark.parametrize("size", [0.65, 1.2])
+@pytest.mark.parametrize("size", [0.65, *slow(1.2)])
 def test_bodies_far_from_an_adult_s_size_are_as_tall_as_they_are(fitter, found, truth, targets, size):
     small = fitter.fit_sequence(targets.larger(np.full(len(targets), size)), GROUP, TIME_S)
     expected = size * stature_m(found.shapes.mean)

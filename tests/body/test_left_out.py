@@ -17,19 +17,13 @@ from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.target_skeletons import TARGET_SKELETONS
 from shapepose_fg.core.skeleton import BODY_25
+from tests.marks import slow
 
 MODEL_SIGMA_M = 0.02
 NOISE_M = 0.01
 COUNT = 160
 FITTERS = {"plain": SmplFitter, "learned": make_fitter}
 """Every fitter that ships."""
-
-
-def slow(*values: object) -> list:
-    """Parameters that `make test` leaves out."""
-    return [
-        pytest.param(*(each if isinstance(each, tuple) else (each,)), marks=pytest.mark.slow) for each in values
-    ]
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from tests.hostile.mutations import mutated
 from tests.hostile.readers import READERS
 from tests.hostile.trying import Trial
+from tests.marks import slow
 
 FOUND = Path(__file__).parent / "data" / "fuzz"
 """What `scripts/fuzz.py` found once: folders called after the reader, with the files as they were."""
@@ -20,7 +21,10 @@ MOST_S = 5.0
 """No small file may take longer to read; most take a millisecond."""
 
 
-@pytest.mark.parametrize("name", READERS)
+HEAVY = ("result as amass", "result as glb", "result as rrd", "result for its report", "run before its bodies")
+
+
+@pytest.mark.parametrize("name", [*sorted(READERS.keys() - set(HEAVY)), *slow(*HEAVY)])
 def test_changed_files_are_read_or_refused(tmp_path, name):
     trial = Trial(READERS[name], tmp_path, 0)
     # Corrections belong to another result.

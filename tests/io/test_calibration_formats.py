@@ -12,6 +12,7 @@ import pytest
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.calibration import read_rig, write_rig
+from shapepose_fg.io.calibration.written import pose
 
 DATA = Path(__file__).parent / "data"
 NAMES = ("alpha", "beta", "gamma")
@@ -643,3 +644,9 @@ def test_voxelpose_s_rotations_are_matrices(tmp_path):
     content["beta"]["R"] = [0.1, 0.2, 0.3]
     path = written(tmp_path / "calibration.json", json.dumps(content))
     refuses(path, 'camera "beta": R must hold 9 numbers, got 3; write it as VoxelPose does')
+
+
+@pytest.mark.parametrize("centre", [False, True])
+def test_a_rotation_of_huge_numbers_is_refused_in_one_sentence(centre):
+    with pytest.raises(InputError, match=r"cam0: the rotation of R is not orthonormal"):
+        pose(np.eye(3) * 1e200, [1e200] * 3, "R", "cam0", centre=centre)

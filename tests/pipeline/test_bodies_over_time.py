@@ -162,6 +162,7 @@ def test_a_long_track_is_fitted_in_stretches_that_fit_together(fitter):
     assert apart_mm[[79, 159]].max() < 0.02
 
 
+@pytest.mark.slow
 def test_a_long_track_of_somebody_known(fitter):
     """Who is recognised is fitted with what was known before, in a track of several stretches as in one of one."""
     scene = built_in_scene(people=2, frames=96)

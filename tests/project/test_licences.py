@@ -8,6 +8,8 @@ import tomllib
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
@@ -33,6 +35,7 @@ def test_every_dependency_and_its_licence_is_listed():
     assert not any(re.search(r"\bA?GPL", text) for text in rows.values())
 
 
+@pytest.mark.slow
 def test_what_is_imported_is_asked_for():
     asked = [
         *PROJECT["dependencies"],

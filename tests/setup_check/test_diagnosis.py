@@ -13,6 +13,7 @@ from shapepose_fg.io.detections import read_detections
 from shapepose_fg.setup_check.diagnosis import diagnose
 from shapepose_fg.setup_check.findings import Kind, sentence
 from shapepose_fg.setup_check.fit import FOCAL, Q, changed
+from tests.marks import slow
 from tests.setup_check.spoiled_setups import (
     delayed,
     exchanged,
@@ -54,7 +55,7 @@ def test_nothing_is_said_of_fewer_cameras(recording, room, views):
     assert diagnose(*some_cameras(recording, room, views)).findings == ()
 
 
-@pytest.mark.parametrize("degrees", [1, 5, 30, 180])
+@pytest.mark.parametrize("degrees", [5, *slow(1, 30, 180)])
 def test_a_turned_camera_is_named_with_its_angle(recording, room, degrees):
     found = only_finding(recording, turned(room, 2, degrees, np.array([0.3, 1.0, 0.2])))
     assert (found.kind, found.cameras) == (Kind.TURNED, (2,))
@@ -62,13 +63,14 @@ def test_a_turned_camera_is_named_with_its_angle(recording, room, degrees):
     assert found.amount == pytest.approx(degrees, rel=0.05, abs=0.35)
 
 
-@pytest.mark.parametrize("frames", [6, 10, -8, 15])
+@pytest.mark.parametrize("frames", [10, *slow(6, -8, 15)])
 def test_a_late_camera_is_named_with_its_frames(recording, room, frames):
     found = only_finding(delayed(recording, 1, frames), room)
     assert (found.kind, found.cameras) == (Kind.LATE, (1,))
     assert abs(found.amount - frames) <= 1
 
 
+@pytest.mark.slow
 def test_mistakes_of_one_camera_are_told_apart(recording, room):
     for detections, rig, kind, amount in (
         (recording, zoomed(room, 3, 2.0), Kind.FOCAL, 2.0),

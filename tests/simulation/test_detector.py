@@ -153,6 +153,7 @@ def test_errors_are_as_large_as_their_confidence_says():
     assert np.abs(error_m.mean(axis=0)).max() < 0.002
 
 
+@pytest.mark.slow
 def test_errors_last_as_long_as_measured():
     rig, joints = crowd(12)
     table = drawing(tail=np.zeros_like(measured().tail))

@@ -82,6 +82,7 @@ def test_each_split_uses_its_own_takes_only(real_mocap: Mocap):
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_dancers_are_the_pairs_and_nobody_else(real: dict[tuple[str, Split], Scene]):
     for (name, split), scene in real.items():
         dancing = 2 * SEQUENCES[name].pairs
@@ -100,6 +101,7 @@ def test_dancers_are_the_pairs_and_nobody_else(real: dict[tuple[str, Split], Sce
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_pairs_are_close_and_others_keep_their_distance(real: dict[tuple[str, Split], Scene]):
     for (name, _), scene in real.items():
         pairs, gaps = SEQUENCES[name].pairs, hip_gaps(scene)
@@ -113,6 +115,7 @@ def test_pairs_are_close_and_others_keep_their_distance(real: dict[tuple[str, Sp
         assert np.median(others.min(axis=1)) < 1.0  # and yet somebody is within arm's reach
 
 
+@pytest.mark.slow
 def test_nobody_walks_through_a_body(real: dict[tuple[str, Split], Scene]):
     for (name, _), scene in real.items():
         pairs, points = SEQUENCES[name].pairs, scene.keypoints
@@ -124,6 +127,7 @@ def test_nobody_walks_through_a_body(real: dict[tuple[str, Split], Scene]):
                     assert np.linalg.norm(lines[0] - lines[1], axis=1).min() > 0.3
 
 
+@pytest.mark.slow
 def test_people_stay_in_the_room_and_nobody_jumps(real: dict[tuple[str, Split], Scene]):
     for scene in real.values():
         assert np.abs(scene.keypoints[:, :, HIP, :2]).max() < 2.0
@@ -131,6 +135,7 @@ def test_people_stay_in_the_room_and_nobody_jumps(real: dict[tuple[str, Split], 
         assert np.linalg.norm(np.diff(scene.keypoints[..., HIP, :], axis=0), axis=-1).max() > 0  # they do move
 
 
+@pytest.mark.slow
 @pytest.mark.slow
 def test_feet_are_on_the_floor(real: dict[tuple[str, Split], Scene]):
     for scene in real.values():

@@ -75,6 +75,7 @@ def bones_near(scene: Scene, own: str) -> NDArray:
     return np.array(sorted(near))
 
 
+@pytest.mark.slow
 def test_it_decides_as_rays_through_the_whole_mesh_do(scene: Scene):
     """The rule, worked out anew for joints that lie inside limbs: whose skin does a ray meet first."""
     owns = {"RElbow": "right_elbow", "LWrist": "left_wrist", "MidHip": "pelvis", "LHip": "left_hip"}

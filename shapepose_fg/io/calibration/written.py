@@ -148,8 +148,7 @@ class Node:
     def pose(self, R: str, t: str, *, centre: bool = False) -> Array:
         """World from camera, of a rotation (9 numbers, or axis times angle) and a translation, or `centre`."""
         turn, shift = self.needed(R, 9) if centre else self.needed(R, 9, 3), self.needed(t, 3)
-        shift = -turn.reshape(3, 3) @ shift if centre else shift
-        return pose(turn, shift, self.named(R) or R, self.place)
+        return pose(turn, shift, self.named(R) or R, self.place, centre=centre)
 
     def pose_of_rows(self, name: str) -> Array:
         """The same of camera from world, 3 x 4 numbers."""
@@ -176,8 +175,10 @@ class Node:
             yield float(value)
 
 
-def pose(R: ArrayLike, t: ArrayLike, key: str, place: str, *, world_from_camera: bool = False) -> Array:
-    """The world-from-camera matrix (4, 4) of a rotation and a translation (3).
+def pose(
+    R: ArrayLike, t: ArrayLike, key: str, place: str, *, world_from_camera: bool = False, centre: bool = False
+) -> Array:
+    """The world-from-camera matrix (4, 4) of a rotation and a translation (3), or the camera's `centre`.
 
     They are camera-from-world unless said otherwise. `R` is a matrix (nine numbers in any shape, row by row) or
     a rotation vector (three, axis times angle). InputError where it is no rotation: `key` is its name in the
@@ -198,7 +199,7 @@ def pose(R: ArrayLike, t: ArrayLike, key: str, place: str, *, world_from_camera:
         R = U @ Vt
     wTc = np.eye(4)
     wTc[:3, :3] = R if world_from_camera else R.T
-    wTc[:3, 3] = t if world_from_camera else -R.T @ t
+    wTc[:3, 3] = t if world_from_camera or centre else -R.T @ t
     return wTc
 
 

@@ -73,7 +73,7 @@ def _qualisys(camera: ET.Element, place: str) -> WrittenCamera:
     turn = values("transform", "r11 r12 r13 r21 r22 r23 r31 r32 r33").reshape(3, 3)
     # R = diag(1, -1, -1) M, and the centre is x y z.
     R = _TO_OPENCV @ turn
-    wTc = pose(R, -R @ values("transform", "x y z"), "transform", place)
+    wTc = pose(R, values("transform", "x y z"), "transform", place, centre=True)
     fx, fy, cx, cy = values("intrinsic", "focalLengthU focalLengthV centerPointU centerPointV") / _SUBPIXEL
     # The numbers are of the whole sensor; smaller pictures are resized, as Pose2Sim's read_qca has it.
     resolution = camera.get("video_resolution", _FULL)
@@ -103,7 +103,7 @@ def _vicon(camera: ET.Element, place: str) -> WrittenCamera:
     focal = float(frame.needed("FOCAL_LENGTH", 1)[0])
     K = intrinsics(focal, focal / aspect, *frame.needed("PRINCIPAL_POINT", 2))
     R = rotation_of(frame.needed("ORIENTATION", 4), "ORIENTATION", place)
-    wTc = pose(R, -R @ frame.needed("POSITION", 3), "ORIENTATION", place)
+    wTc = pose(R, frame.needed("POSITION", 3), "ORIENTATION", place, centre=True)
     distortion = list[float]()
     # VICON_RADIAL2 is a name, a centre and three radial coefficients, those of OpenCV; the older VICON_RADIAL
     # counts in pixels and runs the other way, so that it is read only where it is zero.

@@ -61,6 +61,7 @@ def test_parts_are_of_different_people_and_leave_nobody_out(cmu):
     assert not set(parts[0].subject) & {*VALIDATION_SUBJECTS, *TEST_SUBJECTS}
 
 
+@pytest.mark.slow
 def test_nobody_weighs_more_than_the_caps_allow(cmu):
     for split in SPLITS:
         part = cmu.of(split)
