@@ -3,6 +3,8 @@
 from pathlib import Path
 from typing import get_args
 
+import numpy as np
+
 from shapepose_fg.core.camera import Axis, Rig
 from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.io.calibration.colmap import COLMAP
@@ -25,6 +27,7 @@ _MISSING = {
 """What the user can say, and how, in the order of the sentence."""
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of numbers like 1e300, which are refused
 def read_rig(
     path: str | Path,
     *,
@@ -66,6 +69,7 @@ def read_rig(
         return Rig(tuple(camera.finished(METRES[unit], image_size, path) for camera in written.cameras), up)
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def is_calibration(path: Path) -> bool:
     """Whether a file or folder is of one of the formats, though it may be faulty."""
     try:

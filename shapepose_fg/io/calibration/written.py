@@ -186,8 +186,7 @@ def pose(
     """
     R, t = np.asarray(R, dtype=np.float64).ravel(), np.asarray(t, dtype=np.float64).ravel()
     R = np.asarray(cv2.Rodrigues(R)[0], dtype=np.float64) if R.size == 3 else R.reshape(3, 3)
-    with np.errstate(over="ignore", invalid="ignore"):  # of numbers like 1e300, which are refused here
-        off = np.abs(R @ R.T - np.eye(3)).max()
+    off = np.abs(R @ R.T - np.eye(3)).max()
     if not off <= _ROTATION_TOLERANCE:
         problem = f"the rotation of {key} is not orthonormal (R Rᵀ is off by {off:.2g})"
         raise InputError(f"{place}: {problem}; give a pure rotation without scale, row by row")
