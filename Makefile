@@ -15,7 +15,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 demo: $(VENV)/installed
 	$(BIN)/shapepose-fg demo --output demo
 
-## Lint, types, and the tests that are not marked slow: under three minutes on two cores.
+## Lint, types, and the tests that are not marked slow: three minutes on two cores.
 test: check
 	$(PYTEST) -m "not slow"
 
