@@ -50,11 +50,6 @@ def named_networks() -> dict[str, NamedNetwork]:
     return {name: NamedNetwork(**(entry | {"size": tuple(entry["size"])})) for name, entry in table.items()}
 
 
-def cache_folder() -> Path:
-    """Where fetched networks are kept: the user's cache, XDG_CACHE_HOME where it is set."""
-    return user_cache("networks")
-
-
 def named_file(
     name: str,
     *,
@@ -66,7 +61,7 @@ def named_file(
 
     The sha256 of the ONNX file is told to `say` and pinned at first use. InputError where it is another later.
     """
-    kept, pin = (cache_folder() / f"{name}.{ending}" for ending in ("onnx", "sha256"))
+    kept, pin = (user_cache("networks") / f"{name}.{ending}" for ending in ("onnx", "sha256"))
     there = kept.is_file()
     if not there and not fetch:
         raise InputError(f"{name}: it has not been fetched yet; --download {name} does so, or give a file's path")

@@ -9,6 +9,7 @@ take each other's detections.
 from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import islice
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -124,8 +125,8 @@ def explained(tracker: Tracker, frames: Sequence[Input], carried: Tracks, keep: 
         if best.evidence_s.sum() <= (1 + _GAIN) * before:
             break
         before = float(best.evidence_s.sum())
-        second = next((way for way in others if found.account.agreement(best, way) < _ALIKE), None)
-        ways = [best] if second is None else [best, second]
+        unlike = (way for way in others if found.account.agreement(best, way) < _ALIKE)
+        ways = (best, *islice(unlike, 1))
         again = [seed for way in ways for seed in _restarts(tracker, frames, times, found, way)]
         found = Hypotheses.concatenate([found, follow_worlds(tracker, frames, again, keep)])
     return found, found.account.choose(found.world)

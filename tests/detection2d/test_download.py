@@ -9,8 +9,9 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import pytest
 
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import user_cache
 from shapepose_fg.detection2d import download
-from shapepose_fg.detection2d.download import BASES, cache_folder, named_file, named_networks
+from shapepose_fg.detection2d.download import BASES, named_file, named_networks
 
 NETWORK = bytes(range(256)) * 400
 NAME, FILE = "rtmpose-m", named_networks()["rtmpose-m"].file
@@ -69,12 +70,12 @@ def test_a_network_is_fetched_once_when_asked_and_is_the_same_ever_after(server)
     pages[f"/first/{FILE}"] = archive(("2023/pose/end2end.onnx", NETWORK), ("2023/pose/detail.json", b"{}"))
     with pytest.raises(InputError, match="rtmpose-m: it has not been fetched yet; --download rtmpose-m does so"):
         named_file(NAME)
-    assert asked == [] and not cache_folder().exists()
+    assert asked == [] and not user_cache("networks").exists()
     said, told = [], []
     file = named_file(NAME, fetch=True, say=said.append, progress=lambda done, total: told.append((done, total)))
     assert file.read_bytes() == NETWORK and told[-1][0] == len(pages[f"/first/{FILE}"])
     digest = hashlib.sha256(NETWORK).hexdigest()
-    assert said == [f"rtmpose-m: sha256 {digest} is pinned in {cache_folder() / 'rtmpose-m.sha256'}"]
+    assert said == [f"rtmpose-m: sha256 {digest} is pinned in {user_cache('networks') / 'rtmpose-m.sha256'}"]
     assert named_file(NAME, say=said.append) == named_file(NAME, fetch=True, say=said.append) == file
     assert len(said) == 1 and asked == [f"/first/{FILE}"]
     # A file that was changed, and another that comes in its place.
@@ -86,7 +87,7 @@ def test_a_network_is_fetched_once_when_asked_and_is_the_same_ever_after(server)
     with pytest.raises(InputError, match=r"the sha256 of what came is .* was pinned at first use; if that"):
         named_file(NAME, fetch=True)
     assert not file.exists()
-    (cache_folder() / "rtmpose-m.sha256").unlink()
+    (user_cache("networks") / "rtmpose-m.sha256").unlink()
     assert named_file(NAME, fetch=True).read_bytes() == NETWORK[::-1]
 
 
@@ -111,7 +112,7 @@ def test_what_is_not_a_network_is_not_kept(server, monkeypatch, page, problem):
     server[0][f"/first/{FILE}"] = server[0][f"/mirror/{FILE}"] = page
     with pytest.raises(InputError, match=f"cannot be fetched from .*{problem}.*; fetch it by hand"):
         named_file(NAME, fetch=True)
-    assert not cache_folder().exists()
+    assert not user_cache("networks").exists()
 
 
 def test_the_named_networks_are_rtmlib_s():

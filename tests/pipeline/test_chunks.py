@@ -25,16 +25,12 @@ from shapepose_fg.pipeline.windows import Engine, WindowConfig
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.tracking.following import FollowingConfig
 from shapepose_fg.tracking.tracker import BodyScale, Tracks
+from tests.marks import slow
 
 CONFIG = PipelineConfig(
     batch_frames=12, following=FollowingConfig(look_ahead_s=0.3), windows=WindowConfig(overlap_s=0.16)
 )
 CUTS = (30,)
-
-
-def slow(value: float):
-    """A parameter that `make test` leaves out."""
-    return pytest.param(value, marks=pytest.mark.slow)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -217,8 +213,8 @@ class NobodyIsThere:
         return np.zeros((0, 25, 3)), np.zeros((0, 25, 1), dtype=np.intp)
 
 
-@pytest.mark.parametrize("fps", [3.0, slow(25.0), 50.0, slow(60.0)])
-@pytest.mark.parametrize("views", [slow(1), 3, slow(6)])
+@pytest.mark.parametrize("fps", [3.0, *slow(25.0), 50.0, *slow(60.0)])
+@pytest.mark.parametrize("views", [*slow(1), 3, *slow(6)])
 @pytest.mark.parametrize("batch", [1, 12])
 def test_every_chunk_gives_its_own_frames_and_whole_windows(fps, views, batch):
     """Times of views are rounded when their mean is taken: 0.4 s or 1 s are a frame more or less then."""

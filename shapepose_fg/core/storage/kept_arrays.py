@@ -176,5 +176,5 @@ class InFolder(KeptArrays):
 def _digest(key: str, array: NDArray[Any]) -> str:
     """Of an array by its name, type, shape and bytes."""
     digest = hashlib.sha256(json.dumps([key, array.dtype.str, array.shape]).encode())
-    digest.update(np.ascontiguousarray(array).tobytes())
+    digest.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
     return digest.hexdigest()
