@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 
 LEVELS = (
-    "factors core.arrays core.errors core.moved",
+    "factors core.arrays core.compiled core.errors core.moved",
     "core.camera core.skeleton",
     "core.drawing",
     "core.storage.files core.bounds",
