@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from shapepose_fg.core.arrays import Array, Index, Mask, Real, Whole
-from shapepose_fg.core.camera import Rig, beside_segment
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.proposal.claims import mean_affinity, owned
+from shapepose_fg.tracking.view_assignment import own_affinity
 
 _PRICE = 0.4
 """What a place costs where a joint should be seen and is not, in places that are seen: the price of being there is
@@ -78,49 +79,99 @@ def weighed(
     person's others, and pays for its place. A place is a joint in the picture of a view; joints whose place is
     unknown are thought to be where the others are in the mean.
     """
-    known = np.asarray(np.isfinite(places).all(axis=-1))[..., None]
-    centre = np.where(known, places, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
-    xy, depth = rig.project(np.where(known, places, centre[:, None]))
-    inside = ((xy >= 0) & (xy < rig.image_sizes[:, None, None])).all(axis=-1) & (depth > 0)
-    expected = np.maximum(inside.sum(axis=(0, 2)), 1)
-    hidden = ~known[..., 0] | _behind_others(xy, depth, known[..., 0], rig, skeleton, world)
-    price = np.where(inside, np.where(hidden, _PRICE_HIDDEN, _PRICE), 0.0)
-    weight = np.zeros(candidate.shape)
-    seen = candidate >= 0
-    if seen.any():
-        affinity, neighbours = mean_affinity(owned(candidate, len(detections)), detections, skeleton, len(rig))
-        counts = np.where(neighbours > 0, np.clip(affinity / _SURE_AFFINITY, 0.0, 1.0), _ALONE)
-        weight[seen] = counts[np.nonzero(seen)[0], candidate[seen]]
-    weight *= 1 + np.moveaxis(price, 0, 2)
-    return weight / expected[:, None, None], price.sum(axis=(0, 2)) / expected
-
-
-def _behind_others(xy: Array, depth: Array, known: Mask, rig: Rig, skeleton: Skeleton, world: Index) -> Mask:
-    """(V, A, J) joints, at pixels (V, A, J, 2) and depths, behind a limb of somebody else of the same world.
-
-    Limbs hide whose both ends are `known` (A, J).
-    """
+    affinity, neighbours = own_affinity(candidate, detections, skeleton)
+    counts = np.where(neighbours > 0, np.clip(affinity / _SURE_AFFINITY, 0.0, 1.0), _ALONE)
+    weight, price = np.where(candidate >= 0, counts, 0.0), np.zeros(len(candidate))
     core = set(skeleton.core)
-    ends = np.array([(skeleton.parents[j], j) for j in skeleton.core if skeleton.parents[j] in core]).T
-    away = np.where(known, depth, np.nan)
-    least_m, most_m = np.fmin.reduce(away, axis=2), np.fmax.reduce(away, axis=2)
-    focal_px, flat = rig.focal_px.astype(np.float32), np.where(known[..., None], xy, np.nan)
-    margin = (_LIMB_M * focal_px[:, None] / np.maximum(least_m, _LIMB_M))[..., None]
-    low, high = np.fmin.reduce(flat, axis=2) - margin, np.fmax.reduce(flat, axis=2) + margin
-    other = (world[:, None] == world) & ~np.eye(len(world), dtype=bool)
-    other = other & (low[:, :, None] < high[:, None]).all(axis=-1) & (low[:, None] < high[:, :, None]).all(axis=-1)
-    view, whose, who = np.nonzero(other & (least_m[:, None] < most_m[:, :, None] - _IN_FRONT_M))
-    # Everything in arrays (pairs, joints, limbs), a coordinate each: sums over an axis of two are slow.
-    x, y, z = (of.astype(np.float32) for of in (flat[..., 0], flat[..., 1], away))
-    first, second = ([of[view, who][:, None, end] for of in (x, y, z)] for end in ends)
-    place, deep = xy[view, whose, :, None].astype(np.float32), depth[view, whose, :, None]
-    squared, at = beside_segment(place[..., 0], place[..., 1], first, second)
-    hides = squared * at * at < ((_LIMB_M * focal_px[view]) ** 2)[:, None, None]
-    hides &= at < deep.astype(np.float32) - _IN_FRONT_M
-    hidden = np.zeros(depth.shape, dtype=bool)
-    pair, joint = np.nonzero(hides.any(axis=2))
-    hidden[view[pair], whose[pair], joint] = True
-    return hidden
+    limbs = np.array([(skeleton.parents[j], j) for j in skeleton.core if skeleton.parents[j] in core])
+    _weigh(places, world, rig.K @ rig.cTw, rig.focal_px, rig.image_sizes, limbs, weight, price)
+    return weight, price
+
+
+@kernel
+def _weigh(places, world, P, focal, sizes, limbs, weight, price):
+    """Make what detections count, `weight` (A, J, V), a share of the places; fill in `price` (A,)."""
+    people, joints, views = weight.shape
+    x, y, depth = np.empty((people, joints)), np.empty((people, joints)), np.empty((people, joints))
+    known, hidden = np.empty((people, joints), dtype=np.bool_), np.empty((people, joints), dtype=np.bool_)
+    expected, box = np.zeros(people), np.empty((people, 6))
+    for v in range(views):
+        for a in range(people):
+            _pictured(places[a], P[v], x[a], y[a], depth[a], known[a])
+            hidden[a] = ~known[a]
+            _enclose(x[a], y[a], depth[a], known[a], focal[v], box[a])
+        for a in range(people):
+            for b in range(people):
+                if a != b and world[a] == world[b]:
+                    _hide(x, y, depth, known, box, a, b, focal[v], limbs, hidden[a])
+            for j in range(joints):
+                if depth[a, j] > 0 and 0 <= x[a, j] < sizes[v, 0] and 0 <= y[a, j] < sizes[v, 1]:
+                    cost = _PRICE_HIDDEN if hidden[a, j] else _PRICE
+                    weight[a, j, v] *= 1 + cost
+                    price[a] += cost
+                    expected[a] += 1.0
+    for a in range(people):
+        price[a] /= max(expected[a], 1.0)
+        weight[a] /= max(expected[a], 1.0)
+
+
+@kernel
+def _pictured(places, P, x, y, depth, known):
+    """Pixels and depths of joints in a view, NaN pixels behind it; unknown joints are amidst the others."""
+    centre, count = np.zeros(3), 0
+    for j in range(len(places)):
+        known[j] = np.isfinite(places[j, 0] + places[j, 1] + places[j, 2])
+        if known[j]:
+            centre += places[j]
+            count += 1
+    centre /= max(count, 1)
+    for j in range(len(places)):
+        at = places[j] if known[j] else centre
+        depth[j] = P[2, 0] * at[0] + P[2, 1] * at[1] + P[2, 2] * at[2] + P[2, 3]
+        over = 1.0 / depth[j] if depth[j] > 0 else np.nan
+        x[j] = (P[0, 0] * at[0] + P[0, 1] * at[1] + P[0, 2] * at[2] + P[0, 3]) * over
+        y[j] = (P[1, 0] * at[0] + P[1, 1] * at[1] + P[1, 2] * at[2] + P[1, 3]) * over
+
+
+@kernel
+def _enclose(x, y, depth, known, focal, box):
+    """What known joints are between: left and right, top and bottom, with a limb's width; near and far; `box` (6,)."""
+    box[0] = box[2] = box[4] = np.inf
+    box[1] = box[3] = box[5] = -np.inf
+    for j in range(len(x)):
+        if known[j]:
+            box[4], box[5] = min(box[4], depth[j]), max(box[5], depth[j])
+            if depth[j] > 0:
+                box[0], box[1] = min(box[0], x[j]), max(box[1], x[j])
+                box[2], box[3] = min(box[2], y[j]), max(box[3], y[j])
+    margin = _LIMB_M * focal / max(box[4], _LIMB_M)
+    for low in (0, 2):
+        box[low] -= margin
+        box[low + 1] += margin
+
+
+@kernel
+def _hide(x, y, depth, known, box, a, b, focal, limbs, hidden):
+    """Mark the joints of `a` that are behind a limb of `b` in a view; limbs hide whose both ends are known."""
+    near, far = box[b], box[a]
+    if not (near[0] < far[1] and far[0] < near[1] and near[2] < far[3] and far[2] < near[3]):
+        return
+    for j in range(len(hidden)):
+        behind = depth[a, j] - _IN_FRONT_M
+        if hidden[j] or not (near[4] < behind and near[0] < x[a, j] < near[1] and near[2] < y[a, j] < near[3]):
+            continue
+        for limb in limbs:
+            one, two = limb[0], limb[1]
+            if not (known[b, one] and known[b, two]):
+                continue
+            to_x, to_y = x[a, j] - x[b, one], y[a, j] - y[b, one]
+            dx, dy = x[b, two] - x[b, one], y[b, two] - y[b, one]
+            along = min(max((to_x * dx + to_y * dy) / max(dx * dx + dy * dy, 1e-6), 0.0), 1.0)
+            to_x, to_y = to_x - along * dx, to_y - along * dy
+            at = depth[b, one] + along * (depth[b, two] - depth[b, one])
+            if (to_x * to_x + to_y * to_y) * at * at < (_LIMB_M * focal) ** 2 and at < behind:
+                hidden[j] = True
+                break
 
 
 def own_evidence(candidate: Whole, weight: Real, price: Real) -> Array:

@@ -1,14 +1,16 @@
 """Which detections are whose when it is known where people's joints should be: one-to-one in every view."""
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.proposal.claims import LEAST_AFFINITY, Claims, owned, projected_distances
+from shapepose_fg.proposal.claims import LEAST_AFFINITY, OVERLAP_M
 
 _NEAR_M = 0.06
 """How closeness to the predicted joint falls off where the prediction is exact: sigma of a Gaussian, as a length
@@ -47,9 +49,29 @@ class Predicted:
     """(A,) people of different worlds do not compete for detections."""
 
 
+@dataclass(frozen=True)
+class Near:
+    """N detections that are near people's joints, sorted by joint and view, then by people."""
+
+    first: Index
+    """(J V + 1,) where those of each joint and view begin."""
+    person: Index
+    """(N,) whose joint it is."""
+    detection: Index
+    """(N,) which of the frame's."""
+    distance_m: Array
+    """(N,) from the joint's projection, metres at its depth."""
+    inside: Mask
+    """(N,) near enough to a joint whose place is known."""
+    score: Array
+    """(N,) nearness, and affinity to what the person has at the other ends of the joint's limbs."""
+    likely: Mask
+    """(N,) whether these are enough."""
+
+
 def assign(predicted: Predicted, detections: Detections, rig: Rig, skeleton: Skeleton) -> Index:
-    """The detection (A, J, V) of each person's joint in each view, -1 where there is none: the best score first
-    (`Claims`), each detection once, but for those on which several people's joints lie.
+    """The detection (A, J, V) of each person's joint in each view, -1 where there is none: the best score first,
+    each detection once, but for those on which several people's joints lie.
     """
     return _assigned(predicted, detections, rig, skeleton)[0]
 
@@ -62,54 +84,281 @@ def assign_with_probability(
     A detection that serves two people, because it lies on the joints of both, is in the right place for either if
     it is anybody's.
     """
-    chosen, score, possible = _assigned(predicted, detections, rig, skeleton)
-    if possible.size == 0:
-        return chosen, np.zeros(chosen.shape)
-    probable = probabilities(score, possible, detections, len(rig))
-    serves = np.bincount(chosen[chosen >= 0], minlength=len(detections)) > 1
+    chosen, near = _assigned(predicted, detections, rig, skeleton)
+    probable = probabilities(near, len(detections))
+    of, count = near.detection, len(detections)
+    serves = np.bincount(chosen[chosen >= 0], minlength=count)[of] > 1
     # Marginals of competitors that form a cycle are not exact: their sum may be over 1 by a little.
-    probable = np.where(serves, np.minimum(probable.sum(axis=0), 1.0), probable)
-    whose = np.arange(len(chosen))[:, None, None]
-    return chosen, np.where(chosen >= 0, probable[whose, chosen], 0.0)
+    together = np.minimum(np.bincount(of, probable, count)[of], 1.0)
+    place = near.person, detections.joint[of], detections.view[of]
+    taken, probability = chosen[place] == of, np.zeros(chosen.shape)
+    probability[tuple(each[taken] for each in place)] = np.where(serves, together, probable)[taken]
+    return chosen, probability
 
 
-def probabilities(score: Array, possible: Mask, detections: Detections, views: int) -> Array:
-    """(A, D) how probably each detection is each person's, of those that are `possible` (A, D), by their `score`.
+def probabilities(near: Near, detections: int) -> Array:
+    """(N,) how probably each detection is each person's, of those that are `near`, by their score.
 
     A person has at most one detection of a joint in a view, and a detection is one person's or nobody's: the
     marginals of all ways to give them out, by belief propagation (Williams and Lau, 2014), which is exact where
     who competes for what has no cycle.
     """
-    order = np.argsort(detections.joint * views + detections.view, kind="stable")
-    slot = (detections.joint * views + detections.view)[order]
-    first = np.flatnonzero(np.diff(slot, prepend=-1))
-    which = np.repeat(np.arange(len(first)), np.diff(first, append=len(slot)))
-    weight = np.where(possible, np.exp(_ODDS * (score - _EVEN)), 0.0)[:, order]
-    unclaimed = np.ones_like(weight)
-    for _ in range(_MESSAGES):
-        open_weight = weight * unclaimed
-        others = np.add.reduceat(open_weight, first, axis=1)[:, which] - open_weight
-        claim = weight / (1 + np.maximum(others, 0.0))
-        unclaimed = 1 / (1 + claim.sum(axis=0) - claim)
-    open_weight = weight * unclaimed
+    weight = np.where(near.inside | near.likely, np.exp(_ODDS * (near.score - _EVEN)), 0.0)
     probable = np.empty_like(weight)
-    probable[:, order] = open_weight / (1 + np.add.reduceat(open_weight, first, axis=1)[:, which])
+    people = int(near.person.max(initial=-1)) + 1
+    _marginals(near.first, near.person, near.detection, weight, people, detections, _MESSAGES, probable)
     return probable
 
 
-def _assigned(
-    predicted: Predicted, detections: Detections, rig: Rig, skeleton: Skeleton
-) -> tuple[Index, Array, Mask]:
-    """The detections (A, J, V), every one's score (A, D) for each person, and whether it can be theirs (A, D)."""
-    distance_m = projected_distances(rig.project(predicted.places), detections.joint, detections, rig)
-    sigma, astray = predicted.sigma_m[:, detections.joint], predicted.lost[:, detections.joint]
-    inside = (distance_m < np.minimum(_FAR_M + 2 * sigma, FARTHEST_M)) & ~astray
-    reachable = (distance_m < _REACH_M) & astray
-    variance = _NEAR_M**2 + sigma**2
-    claims = Claims(detections, skeleton, len(rig), distance_m, variance, inside, reachable, LEAST_AFFINITY)
-    scored = claims.scored(np.zeros(distance_m.shape, dtype=bool))
-    for _ in range(_PASSES):
-        scored = claims.scored(owned(claims.matched(scored, predicted.world), len(detections)))
-    chosen = claims.matched(scored, predicted.world)
-    claims.share(chosen, scored.affinity)
-    return chosen, scored.score, inside | scored.likely
+def own_affinity(candidate: Index, detections: Detections, skeleton: Skeleton) -> tuple[Array, Index]:
+    """Mean affinity (A, J, V) of people's detections `candidate` (A, J, V) to what they have at the other ends of
+    the joint's limbs, and how many (A, J, V) of these there are.
+    """
+    affinity, neighbours = np.zeros(candidate.shape), np.zeros(candidate.shape, dtype=np.intp)
+    _affinities(candidate, *_facts(detections), *_limb_ends(skeleton), affinity, neighbours)
+    return affinity, neighbours
+
+
+def _assigned(predicted: Predicted, detections: Detections, rig: Rig, skeleton: Skeleton) -> tuple[Index, Near]:
+    """The detections (A, J, V), and all that are near."""
+    slot = detections.joint * len(rig) + detections.view
+    order = np.lexsort((detections.xy[:, 0], slot))
+    first = np.searchsorted(slot[order], np.arange(len(skeleton) * len(rig) + 1))
+    gate_m = np.where(predicted.lost, _REACH_M, np.minimum(_FAR_M + 2 * predicted.sigma_m, FARTHEST_M))
+    variance = _NEAR_M**2 + predicted.sigma_m**2
+    world = np.zeros(len(gate_m), dtype=np.intp) if predicted.world is None else predicted.world
+    people, places = np.argsort(world, kind="stable"), np.ascontiguousarray(predicted.places)
+    reach_m = np.maximum(gate_m, OVERLAP_M)
+    found = _near(places, reach_m, people, rig.K @ rig.cTw, rig.focal_px, first, order, detections.xy)
+    first, person, detection, distance_m = found
+    at = person, detections.joint[detection]
+    within, lost = distance_m < gate_m[at], predicted.lost[at]
+    chosen = np.empty((len(places), len(skeleton), len(rig)), dtype=np.intp)
+    claims = *found, distance_m**2 / variance[at], within, lost, world
+    constants = LEAST_AFFINITY, OVERLAP_M, _PASSES
+    score, likely = _give_out(*claims, *_facts(detections), *_limb_ends(skeleton), *constants, chosen)
+    return chosen, Near(first, person, detection, distance_m, within & ~lost, score, likely)
+
+
+def _facts(detections: Detections) -> tuple[Index, Index, Array, Array, Index, Array]:
+    """What kernels look at of a frame."""
+    seen = detections
+    return seen.joint, seen.view, seen.xy, seen.confidence, seen.pairs, seen.affinity
+
+
+@cache
+def _limb_ends(skeleton: Skeleton) -> tuple[Index, Index]:
+    """The joints at the other ends of each joint's limbs, one after the other, and where each joint's begin."""
+    joint, other = np.nonzero(skeleton.adjacency)
+    return np.searchsorted(joint, np.arange(len(skeleton) + 1)), other
+
+
+@kernel
+def _near(places, reach_m, people, P, focal, first, order, xy):
+    """Detections within `reach_m` (A, J) of `places` (A, J, 3): `Near.first`, person, detection and distance.
+
+    `order` (D,) sorts detections by joint and view, of which each begins at `first` (J V + 1,), and by x.
+    """
+    views, count = len(P), 0
+    starts = np.zeros(len(first), dtype=np.intp)
+    person, detection, distance_m = np.empty(64, dtype=np.intp), np.empty(64, dtype=np.intp), np.empty(64)
+    for slot in range(len(first) - 1):
+        j, v = slot // views, slot % views
+        for a in people:
+            depth = _along(P[v, 2], places[a, j])
+            if first[slot] == first[slot + 1] or not depth > 0:
+                continue
+            x, y = _along(P[v, 0], places[a, j]) / depth, _along(P[v, 1], places[a, j]) / depth
+            m_per_px = depth / focal[v]
+            reach_px = 1.000001 * reach_m[a, j] / m_per_px
+            low, high = first[slot], first[slot + 1]
+            while low < high:  # the first that is not too far to the left
+                middle = (low + high) // 2
+                if xy[order[middle], 0] < x - reach_px:
+                    low = middle + 1
+                else:
+                    high = middle
+            while low < first[slot + 1] and xy[order[low], 0] <= x + reach_px:
+                d = order[low]
+                low += 1
+                apart_m = np.hypot(x - xy[d, 0], y - xy[d, 1]) * m_per_px
+                if not apart_m < reach_m[a, j]:
+                    continue
+                if count == len(person):
+                    person, detection = np.append(person, person), np.append(detection, detection)
+                    distance_m = np.append(distance_m, distance_m)
+                person[count], detection[count], distance_m[count] = a, d, apart_m
+                count += 1
+        starts[slot + 1] = count
+    return starts, person[:count].copy(), detection[:count].copy(), distance_m[:count].copy()
+
+
+@kernel
+def _along(row, place):
+    """A row (4,) of a projection times a place (3,), in the world."""
+    return row[0] * place[0] + row[1] * place[1] + row[2] * place[2] + row[3]
+
+
+@kernel
+def _give_out(
+    first, person, detection, distance_m, squared, within, lost, world, joint, view, xy, confidence, pairs,
+    affinity, limb, ends, least, overlap_m, passes, chosen,
+):  # fmt: skip
+    """Fill in `chosen` (A, J, V); score and likely of `Near`. `squared` (N,) are distances in sigmas, squared."""
+    begin, other, value = _by_detection(pairs, affinity, len(joint))
+    count, views = len(person), chosen.shape[2]
+    score, likely, tied = np.empty(count), np.empty(count, dtype=np.bool_), np.empty(count)
+    before, taken = np.empty_like(chosen), np.full(len(joint), -1, dtype=np.intp)
+    chosen[:] = -1
+    for _ in range(passes + 1):
+        before[:] = chosen
+        for e in range(count):
+            d, own = detection[e], before[person[e]]
+            tied[e], neighbours = _affinity(d, own, joint, view, begin, other, value, limb, ends)
+            # Where no neighbour is seen, the affinities say nothing: neither for nor against.
+            score[e] = np.exp(-0.5 * squared[e]) + (tied[e] if neighbours > 0 else least)
+            enough = (neighbours > 0 and tied[e] >= least) if lost[e] else score[e] >= 2 * least
+            likely[e] = within[e] and enough
+        chosen[:] = -1
+        _match(first, person, detection, score, likely, world, xy, confidence, taken, chosen)
+        if (chosen == before).all():
+            break
+    for slot in range(len(first) - 1):
+        e = first[slot]
+        while e < first[slot + 1]:  # a person at a time: the nearest of an empty place serves it, too
+            a, best = person[e], -1
+            while e < first[slot + 1] and person[e] == a:
+                on_it = distance_m[e] < overlap_m and tied[e] >= least
+                if on_it and (best < 0 or distance_m[e] <= distance_m[best]):
+                    best = e
+                e += 1
+            if best >= 0 and chosen[a, slot // views, slot % views] < 0:
+                chosen[a, slot // views, slot % views] = detection[best]
+    return score, likely
+
+
+@kernel
+def _match(first, person, detection, score, likely, world, xy, confidence, taken, chosen):
+    """Give each detection of a joint and view to one person, and each person one, the best score first."""
+    views, queue, key = chosen.shape[2], np.empty(len(person), dtype=np.intp), np.empty(len(person))
+    for slot in range(len(first) - 1):
+        j, v, end = slot // views, slot % views, first[slot]
+        while end < first[slot + 1]:  # worlds stand one after the other, and do not compete
+            of, start, length = world[person[end]], end, 0
+            while end < first[slot + 1] and world[person[end]] == of:
+                if likely[end]:
+                    queue[length] = end
+                    length += 1
+                key[end] = np.rint(1e9 * score[end])
+                end += 1
+            _sort(queue, length, key, detection, xy, confidence)
+            for n in range(length):
+                a, d = person[queue[n]], detection[queue[n]]
+                if chosen[a, j, v] < 0 and taken[d] != start:
+                    chosen[a, j, v], taken[d] = d, start
+    taken[:] = -1
+
+
+@kernel
+def _sort(queue, length, key, detection, xy, confidence):
+    """Sort the first entries of a queue, best first (Shell's way)."""
+    gap = length // 2
+    while gap > 0:
+        for n in range(gap, length):
+            moved, place = queue[n], n
+            while place >= gap and _better(moved, queue[place - gap], key, detection, xy, confidence):
+                queue[place] = queue[place - gap]
+                place -= gap
+            queue[place] = moved
+        gap //= 2
+
+
+@kernel
+def _better(one, other, key, detection, xy, confidence):
+    """Whether one comes before another. Detections of equal scores are told apart by what they are, not by their
+    order: people whom the detector has grouped have affinities of exactly 1.
+    """
+    c, d = detection[one], detection[other]
+    if key[one] != key[other]:
+        return key[one] > key[other]
+    if c == d:
+        return one < other
+    if confidence[c] != confidence[d]:
+        return confidence[c] > confidence[d]
+    if xy[c, 1] != xy[d, 1]:
+        return xy[c, 1] > xy[d, 1]
+    return xy[c, 0] > xy[d, 0] if xy[c, 0] != xy[d, 0] else c > d
+
+
+@kernel
+def _affinity(d, own, joint, view, begin, other, value, limb, ends):
+    """Mean affinity of a detection to a person's `own` (J, V) at the other ends of its joint's limbs, and how many
+    these are.
+    """
+    neighbours, total = 0, 0.0
+    for n in range(limb[joint[d]], limb[joint[d] + 1]):
+        neighbours += own[ends[n], view[d]] >= 0
+    if neighbours > 0:
+        for n in range(begin[d], begin[d + 1]):
+            if own[joint[other[n]], view[other[n]]] == other[n]:
+                total += value[n]
+    return total / max(neighbours, 1), neighbours
+
+
+@kernel
+def _by_detection(pairs, affinity, count):
+    """The pairs of each detection one after the other: where each one's begin, the others, their affinities."""
+    begin = np.zeros(count + 2, dtype=np.intp)
+    for pair in pairs:
+        begin[pair[0] + 2] += 1
+        begin[pair[1] + 2] += 1
+    for d in range(count):
+        begin[d + 2] += begin[d + 1]
+    other, value = np.empty(2 * len(pairs), dtype=np.intp), np.empty(2 * len(pairs))
+    for e in range(len(pairs)):
+        for end in range(2):
+            place = begin[pairs[e, end] + 1]
+            other[place], value[place] = pairs[e, 1 - end], affinity[e]
+            begin[pairs[e, end] + 1] += 1
+    return begin, other, value
+
+
+@kernel
+def _affinities(candidate, joint, view, xy, confidence, pairs, affinity, limb, ends, mean, neighbours):
+    """Fill in what `own_affinity` returns."""
+    begin, other, value = _by_detection(pairs, affinity, len(joint))
+    people, joints, views = candidate.shape
+    for a in range(people):
+        for j in range(joints):
+            for v in range(views):
+                d = candidate[a, j, v]
+                if d >= 0:
+                    mean[a, j, v], neighbours[a, j, v] = _affinity(
+                        d, candidate[a], joint, view, begin, other, value, limb, ends
+                    )
+
+
+@kernel
+def _marginals(first, person, detection, weight, people, detections, rounds, probable):
+    """Fill in `probable` (N,) from `weight` (N,), joint by joint and view by view."""
+    of_person, of_detection, unclaimed = np.zeros(people), np.zeros(detections), np.ones(len(weight))
+    for slot in range(len(first) - 1):
+        span = range(first[slot], first[slot + 1])
+        for _ in range(rounds):
+            for e in span:
+                of_person[person[e]] += weight[e] * unclaimed[e]
+            for e in span:
+                others = of_person[person[e]] - weight[e] * unclaimed[e]
+                probable[e] = weight[e] / (1 + max(others, 0.0))
+                of_detection[detection[e]] += probable[e]
+            for e in span:
+                unclaimed[e] = 1 / (1 + of_detection[detection[e]] - probable[e])
+                of_person[person[e]] = 0.0
+            for e in span:
+                of_detection[detection[e]] = 0.0
+        for e in span:
+            of_person[person[e]] += weight[e] * unclaimed[e]
+        for e in span:
+            probable[e] = weight[e] * unclaimed[e] / (1 + of_person[person[e]])
+        for e in span:
+            of_person[person[e]] = 0.0
