@@ -1,6 +1,6 @@
 """Who was there, by evidence: what only a person explains, against what should have been seen of that person."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -135,7 +135,7 @@ def _pictured(places, P, x, y, depth, known):
 
 @kernel
 def _enclose(x, y, depth, known, focal, box):
-    """What known joints are between: left and right, top and bottom, with a limb's width; near and far; `box` (6,)."""
+    """What known joints are between: left and right, top and bottom, with a limb's width, then near and far."""
     box[0] = box[2] = box[4] = np.inf
     box[1] = box[3] = box[5] = -np.inf
     for j in range(len(x)):
@@ -201,7 +201,7 @@ class Account:
     """(H, T, J V) each detection's place among those of all frames; one more stands for none."""
     weight: NDArray[np.float32]
     """(H, T, J V) what it counts."""
-    price: Real
+    price: Array
     """(H, T) what being there costs."""
     there: Mask
     """(H, T) where there is something to say."""
@@ -215,8 +215,6 @@ class Account:
     """And the last."""
     least_s: float
     """Least evidence of a person, seconds."""
-    appears_s: float = _APPEARS_S
-    """What it costs to appear or vanish while others are watched, seconds."""
 
     @classmethod
     def of(
@@ -231,7 +229,7 @@ class Account:
         weights = np.where(candidate >= 0, weight, 0.0).reshape(shape).astype(np.float32)
         seen = np.append(np.flatnonzero(counts), 0)
         span, least_s = (int(seen[0]), int(seen.max())), min(_LEAST_S, 0.25 * float(lasts_s.sum()))
-        return cls(place, weights, price, there, lasts_s, count, *span, least_s)
+        return cls(place, weights, np.asarray(price, dtype=np.float64), there, lasts_s, count, *span, least_s)
 
     def choose(self, world: Index) -> Chosen:
         """The first of `ways`."""
@@ -246,14 +244,13 @@ class Account:
         that goes over from one person to another, always to who is seen better, is better than either of them, and
         leaves the others with too little.
         """
-        account, first = self, np.zeros(len(world), dtype=bool)
-        if on_trial:
-            account = replace(self, appears_s=_ON_TRIAL * self.appears_s, least_s=_ON_TRIAL * self.least_s)
+        first, asked = np.zeros(len(world), dtype=bool), _ON_TRIAL if on_trial else 1.0
         if len(world) == 0:
-            return [account.in_turn(first)]
-        bound = np.bincount(world, np.maximum(account.best_segments(account.alone)[0], 0.0))
+            return [self.in_turn(first)]
+        best_s = np.array([_best_segment(gains, *self._borders(asked))[0] for gains in self.alone])
+        bound = np.bincount(world, np.maximum(best_s, 0.0))
         tried = np.argsort(-bound, kind="stable")[:_WORLDS]
-        found = [account.in_turn(first), *(account.in_turn(world == each) for each in tried)]
+        found = [self.in_turn(each, asked) for each in (first, *(world == each for each in tried))]
         return sorted(found, key=lambda each: -float(each.evidence_s.sum()))
 
     def agreement(self, one: Chosen, other: Chosen) -> float:
@@ -270,68 +267,116 @@ class Account:
 
     def left_over(self, chosen: Chosen) -> Chosen:
         """Who would be there besides those whom `choose` has `chosen`, if appearing cost nothing."""
-        return replace(self, appears_s=0.0).in_turn(np.zeros(len(self.there), dtype=bool), chosen)
+        return self.in_turn(np.zeros(len(self.there), dtype=bool), besides=chosen)
 
-    @property
-    def free(self) -> NDArray[np.float32]:
-        """(D + 1,) 1 for every detection, as long as nobody has any; 0 for none."""
-        return np.append(np.ones(self.detections, dtype=np.float32), np.float32(0))
+    def _borders(self, asked: float) -> tuple[float, int, int]:
+        """What it costs to appear or vanish, if a share of that is `asked` for, and between which frames."""
+        return asked * _APPEARS_S, self.begins, self.ends
 
     @cached_property
     def alone(self) -> Array:
         """(H, T) evidence of each hypothesis, seconds, as if there were no other."""
-        return self.gains(self.free, slice(0, len(self.lasts_s)))
+        share = self.weight.sum(axis=2, dtype=np.float64)
+        return np.where(self.there, (share - self.price) * self.lasts_s, -np.inf)
 
-    def gains(self, free: NDArray[np.float32], span: slice) -> Array:
-        """(H, S) evidence of each hypothesis in the frames of `span`, seconds, of detections that are `free`."""
-        share = np.einsum("htk,htk->ht", self.weight[:, span], free[self.place[:, span]])
-        return np.where(self.there[:, span], (share - self.price[:, span]) * self.lasts_s[span], -np.inf)
-
-    def in_turn(self, first: Mask, before: Chosen | None = None) -> Chosen:
-        """People one after the other, the best of those `first` (H,) before all others, besides those `before`."""
-        free, gains, chosen = self.free, self.alone.copy(), list[tuple[int, int, int, float]]()
-        taken, least = np.zeros(self.there.shape, dtype=bool), self.least_s
-        if before is not None:
-            for h, start, stop in zip(before.hypothesis, before.start, before.stop, strict=True):
-                free[self.place[h, start:stop]] = 0.0
-                taken[h, start:stop] = True
-            gains = np.where(taken, -np.inf, self.gains(free, slice(0, len(self.lasts_s))))
-        while len(gains) > 0:
-            value, start, stop = self.best_segments(gains)
-            if first.any() and value[first].max() < least:
-                first = np.zeros_like(first)
-            best = int(np.where(first | ~first.any(), value, -np.inf).argmax())
-            if value[best] < least:
-                break
-            span = slice(int(start[best]), int(stop[best]))
-            chosen.append((best, span.start, span.stop, float(value[best])))
-            free[self.place[best, span]] = 0.0
-            taken[best, span] = True
-            gains[:, span] = np.where(taken[:, span], -np.inf, self.gains(free, span))
-        columns = np.array(chosen, dtype=np.float64).reshape(-1, 4).T
-        hypothesis, start, stop = columns[:3].astype(np.intp)
-        return Chosen(hypothesis, start, stop, columns[3])
-
-    def best_segments(self, gains: Array) -> tuple[Array, Index, Index]:
-        """The segment with the greatest sum of each row of `gains` (H, T): value (H,), start (H,), stop (H,).
-
-        Where a segment begins after the first frame in which anything is seen, or stops before the last, it costs
-        `appears_s` each. No part of it costs more than to vanish and to appear again.
+    @cached_property
+    def holders(self) -> tuple[Index, Index, Array]:
+        """Where those who have each detection begin, (D + 1,), who they are, and what it counts for them, one
+        detection after the other.
         """
-        H, T = gains.shape
-        running, peak, since = np.full(H, -np.inf), np.full(H, -np.inf), np.zeros(H, dtype=np.intp)
-        value, start, stop = np.full(H, -np.inf), np.zeros(H, dtype=np.intp), np.zeros(H, dtype=np.intp)
-        for t in range(T):
-            afresh = -self.appears_s if t > self.begins else 0.0
-            begins = running < np.maximum(afresh, peak - 2 * self.appears_s)
-            since = np.where(begins, t, since)
-            running = np.where(begins, afresh, running) + gains[:, t]
-            peak = np.where(begins, running, np.maximum(peak, running))
-            ends = running - (self.appears_s if t < self.ends else 0.0)
-            better = ends > value
-            value, start, stop = (
-                np.where(better, ends, value),
-                np.where(better, since, start),
-                np.where(better, t + 1, stop),
-            )
-        return value, start, stop
+        return _holders(self.place, self.weight, self.detections)
+
+    def in_turn(self, first: Mask, asked: float = 1.0, besides: Chosen | None = None) -> Chosen:
+        """People one after the other, the best of those `first` (H,) before all others: so many as have the least
+        evidence, or the share of it that is `asked` for.
+
+        Those `besides` come before all, and are not returned; for who comes besides them appearing costs nothing.
+        """
+        none = np.zeros(0, dtype=np.intp)
+        before = (none, none, none) if besides is None else (besides.hypothesis, besides.start, besides.stop)
+        borders, least_s = self._borders(asked if besides is None else 0.0), asked * self.least_s
+        given = self.alone.copy(), self.place, *self.holders, self.lasts_s, first
+        return Chosen(*_in_turn(*given, *before, *borders, least_s))
+
+
+@kernel
+def _holders(place, weight, detections):
+    """`Account.holders` of places and weights (H, T, K)."""
+    begin, each = np.zeros(detections + 2, dtype=np.intp), place.shape[1] * place.shape[2]
+    flat, counts = place.reshape(-1), weight.reshape(-1)
+    for d in flat:
+        if d < detections:
+            begin[d + 2] += 1
+    for d in range(detections):
+        begin[d + 2] += begin[d + 1]
+    who, what = np.empty(begin[-1], dtype=np.intp), np.empty(begin[-1])
+    for n in range(len(flat)):
+        if flat[n] < detections:
+            at = begin[flat[n] + 1]
+            who[at], what[at] = n // each, counts[n]
+            begin[flat[n] + 1] += 1
+    return begin[:-1], who, what
+
+
+@kernel
+def _in_turn(
+    gains, place, begin, who, what, lasts, first, besides, besides_from, besides_to, appears, begins, ends, least
+):  # fmt: skip
+    """Hypothesis, start, stop and evidence of those whom `Account.in_turn` chooses."""
+    people, frames = gains.shape
+    free, changed = np.ones(len(begin) - 1, dtype=np.bool_), np.ones(people, dtype=np.bool_)
+    start, stop, value = np.zeros(people, dtype=np.intp), np.zeros(people, dtype=np.intp), np.zeros(people)
+    chosen, count, evidence = np.empty((3, people * frames), dtype=np.intp), 0, np.empty(people * frames)
+    for n in range(len(besides)):
+        _take(besides[n], besides_from[n], besides_to[n], gains, place, begin, who, what, lasts, free, changed)
+    while people > 0:
+        before_all, best = False, -1
+        for h in range(people):
+            if changed[h]:
+                value[h], start[h], stop[h] = _best_segment(gains[h], appears, begins, ends)
+                changed[h] = False
+            before_all = before_all or (first[h] and value[h] >= least)
+        for h in range(people):
+            if (first[h] or not before_all) and (best < 0 or value[h] > value[best]):
+                best = h
+        if value[best] < least:
+            break
+        chosen[0, count], chosen[1, count], chosen[2, count] = best, start[best], stop[best]
+        evidence[count] = value[best]
+        count += 1
+        _take(best, start[best], stop[best], gains, place, begin, who, what, lasts, free, changed)
+    return chosen[0, :count].copy(), chosen[1, :count].copy(), chosen[2, :count].copy(), evidence[:count].copy()
+
+
+@kernel
+def _take(person, start, stop, gains, place, begin, who, what, lasts, free, changed):
+    """Somebody is there for some frames: their detections are evidence of nobody else."""
+    changed[person] = True
+    for t in range(start, stop):
+        gains[person, t] = -np.inf
+        for d in place[person, t]:
+            if d < len(free) and free[d]:
+                free[d] = False
+                for n in range(begin[d], begin[d + 1]):
+                    gains[who[n], t] -= what[n] * lasts[t]
+                    changed[who[n]] = True
+
+
+@kernel
+def _best_segment(gains, appears, begins, ends):
+    """The segment with the greatest sum of `gains` (T,): value, start, stop.
+
+    Where it begins after the frame `begins`, or stops before the frame `ends`, it costs `appears` each. No part of
+    it costs more than to vanish and to appear again.
+    """
+    running, peak, since, value, start, stop = -np.inf, -np.inf, 0, -np.inf, 0, 0
+    for t in range(len(gains)):
+        afresh = -appears if t > begins else 0.0
+        if running < max(afresh, peak - 2 * appears):
+            since, running, peak = t, afresh, -np.inf
+        running += gains[t]
+        peak = max(peak, running)
+        closed = running - (appears if t < ends else 0.0)
+        if closed > value:
+            value, start, stop = closed, since, t + 1
+    return value, start, stop
